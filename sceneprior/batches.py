@@ -1,0 +1,55 @@
+"""The two nouns learning meets at: what cameras saw (`SceneViews`), what was decoded (`DecodedScenes`)."""
+
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class SceneViews:
+    """What cameras saw of a batch of rooms; objects are padded to the largest room's count.
+
+    Cameras are OpenCV pinholes (x right, y down, z forward); see docs/conventions.md.
+    """
+
+    room_index: Int[Tensor, " rooms"]
+    """Row of each room in the data set: which latent vector is its own."""
+    object_class: Int[Tensor, "rooms objects"]
+    """Index into the label set; 0 where `is_object` is false."""
+    is_object: Bool[Tensor, "rooms objects"]
+    """False for padding. The first n entries of a room with n tracked objects are true."""
+    world_to_camera: Float[Tensor, "rooms views 4 4"]
+    intrinsics: Float[Tensor, "rooms views 3 3"]
+    """Pixels of an image of `image_size`."""
+    boxes: Float[Tensor, "rooms views objects 4"]
+    """x1, y1, x2, y2 of the visible mask, relative to the image size, in [0, 1]."""
+    visible: Bool[Tensor, "rooms views objects"]
+    image_size: tuple[int, int]
+    """Height and width in pixels that `intrinsics` refer to."""
+    instance_ids: Int[Tensor, "rooms views height width"] | None = None
+    """0 for nothing, k + 1 for object k; its own, smaller size. Only the shape stage has it."""
+    room_ids: tuple[str, ...] = ()
+
+    def to(self, device: torch.device | str) -> "SceneViews":
+        """The same views with every tensor on `device` (Lightning calls this)."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return SceneViews(
+            **{key: v.to(device) if isinstance(v, Tensor) else v for key, v in values.items()}
+        )
+
+
+@dataclass(frozen=True)
+class DecodedScenes:
+    """A batch of decoded latents: N objects a room, in the order of generation."""
+
+    class_logits: Float[Tensor, "rooms objects classes"]
+    centers_m: Float[Tensor, "rooms objects 3"]
+    """Box centres in the room frame; y already includes half the height."""
+    sizes_m: Float[Tensor, "rooms objects 3"]
+    """Full extents of the axis-aligned boxes."""
+    completeness_logits: Float[Tensor, "rooms objects"]
+    """Above 0 while the scene is still being filled (the paper's supplement B)."""
+    vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
+    """Mesh vertices in the room frame; None until the shape decoder ran."""

@@ -1,0 +1,282 @@
+"""View shards: the HDF5 files in which preparing and learning meet (docs/shard_format.md)."""
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sceneprior.classes import label_set
+from sceneprior.errors import ShardError
+
+FORMAT = "sceneprior-views"
+VERSION = 1
+INDEX_NAME = "index.json"
+MODELS_FOLDER = "models"
+
+
+@dataclass(frozen=True)
+class RoomViews:
+    """What cameras saw of one room: all that training may know.
+
+    Shapes: T views, n tracked objects (each seen in at least one view), H x W pixels.
+    """
+
+    room_id: str
+    object_class: np.ndarray
+    """(n,) int16, index into the shard's label set."""
+    world_to_camera: np.ndarray
+    """(T, 4, 4) float32, OpenCV axes, metres."""
+    intrinsics: np.ndarray
+    """(T, 3, 3) float32, pixels of the H x W image."""
+    boxes: np.ndarray
+    """(T, n, 4) float32: x1, y1, x2, y2 in [0, 1] of the visible mask; zeros where not visible."""
+    visible: np.ndarray
+    """(T, n) bool."""
+    mask_pixels: np.ndarray
+    """(T, n) int32, pixels of the visible mask."""
+    instance_ids: np.ndarray | None
+    """(T, H, W) uint8 (uint16 past 255 objects), 0 = nothing, k + 1 = object k; None: not read."""
+    image_size: tuple[int, int]
+    """(H, W)."""
+
+
+@dataclass(frozen=True)
+class RoomGroundTruth:
+    """The room in 3D, for evaluation only. The first n of its m rows are the tracked objects."""
+
+    object_class: np.ndarray
+    """(m,) int16."""
+    centers_m: np.ndarray
+    """(m, 3) float32, centres of the axis-aligned boxes in the room frame."""
+    sizes_m: np.ndarray
+    """(m, 3) float32, their full extents."""
+    yaw_rad: np.ndarray
+    """(m,) float32, the piece's own turn about +y."""
+    model_ids: tuple[str, ...]
+    """(m,) names of the files `models/<id>.ply`; '' where the data set has no mesh."""
+    model_to_room: np.ndarray
+    """(m, 4, 4) float32, from the model's vertices to the room frame (scale, turn, place)."""
+    floor_m: np.ndarray
+    """(P, 2) float32, x and z along the floor's outline."""
+    height_m: float
+    """Floor to ceiling."""
+
+
+_VIEW_ARRAYS = ("object_class", "world_to_camera", "intrinsics", "boxes", "visible", "mask_pixels")
+_TRUTH_ARRAYS = ("object_class", "centers_m", "sizes_m", "yaw_rad", "model_to_room", "floor_m")
+
+
+def write_shard(
+    path: Path,
+    label_set_name: str,
+    rooms: Sequence[tuple[RoomViews, RoomGroundTruth | None]],
+) -> None:
+    """Write rooms to one shard, whole or not at all; the same rooms give the same bytes.
+
+    Raises:
+        ShardError: a room's arrays disagree with each other.
+    """
+    for views, _ in rooms:
+        _check(path, views)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".part")
+    try:
+        with h5py.File(temporary, "w") as file:
+            file.attrs["format"] = FORMAT
+            file.attrs["version"] = VERSION
+            file.attrs["label_set"] = label_set_name
+            file.attrs["classes"] = json.dumps(label_set(label_set_name))
+            for views, truth in rooms:
+                _write_room(file.create_group(f"rooms/{_key(views.room_id)}"), views, truth)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _key(room_id: str) -> str:
+    # HDF5 reads "/" as a folder; ids such as <house>/<room> stay one name.
+    return room_id.replace("/", "|")
+
+
+def _write_room(group: h5py.Group, views: RoomViews, truth: RoomGroundTruth | None) -> None:
+    group.attrs["room_id"] = views.room_id
+    group.attrs["image_size"] = views.image_size
+    for name in _VIEW_ARRAYS:
+        group.create_dataset(name, data=getattr(views, name))
+    ids = views.instance_ids
+    group.create_dataset(
+        "instance_ids", data=ids, chunks=(1, *ids.shape[1:]), compression="gzip",
+        compression_opts=4, shuffle=False,
+    )  # fmt: skip
+    if truth is not None:
+        hidden = group.create_group("ground_truth")
+        for name in _TRUTH_ARRAYS:
+            hidden.create_dataset(name, data=getattr(truth, name))
+        hidden.attrs["model_ids"] = json.dumps(truth.model_ids)
+        hidden.attrs["height_m"] = truth.height_m
+
+
+def _check(path: Path, views: RoomViews) -> None:
+    count, objects = views.visible.shape
+    expected = {
+        "object_class": (objects,),
+        "world_to_camera": (count, 4, 4),
+        "intrinsics": (count, 3, 3),
+        "boxes": (count, objects, 4),
+        "mask_pixels": (count, objects),
+        "instance_ids": (count, *views.image_size),
+    }
+    for name, shape in expected.items():
+        array = getattr(views, name)
+        came = None if array is None else array.shape
+        if came != shape:
+            raise ShardError(
+                f"{path.name}, room {views.room_id}: {name} has shape {came}, expected {shape}."
+            )
+    if objects and int(views.instance_ids.max()) > objects:
+        raise ShardError(
+            f"{path.name}, room {views.room_id}: an instance id is {views.instance_ids.max()}, "
+            f"but the room has {objects} objects."
+        )
+
+
+class Shard:
+    """One shard, open for reading; close it or use it in a `with` block.
+
+    Raises:
+        ShardError: the file is missing, damaged or of another format.
+    """
+
+    def __init__(self, path: Path):
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise ShardError(f"No shard at {path}; `sceneprior prep-front` writes shards.")
+        try:
+            self._file = h5py.File(self.path, "r")
+            form, version = self._file.attrs.get("format"), self._file.attrs.get("version")
+        except OSError as error:
+            raise _damaged(self.path, error) from None
+        if form != FORMAT or version != VERSION:
+            self._file.close()
+            raise ShardError(
+                f"{path} says format '{form}' version {version}, expected '{FORMAT}' version "
+                f"{VERSION}. Prepare the data again with this release's `sceneprior prep-front`."
+            )
+        try:
+            self.label_set = str(self._file.attrs["label_set"])
+            self._keys = {
+                str(group.attrs["room_id"]): key
+                for key, group in self._file.get("rooms", {}).items()
+            }
+        except (OSError, KeyError, RuntimeError) as error:
+            raise _damaged(self.path, error) from None
+
+    def __enter__(self) -> "Shard":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the file."""
+        self._file.close()
+
+    @property
+    def room_ids(self) -> tuple[str, ...]:
+        """Ids of the rooms in this shard, in the order they are stored."""
+        return tuple(self._keys)
+
+    def read_room(self, room_id: str, images: bool = False) -> RoomViews:
+        """What cameras saw of a room; `images` also reads every instance-id image."""
+        try:
+            group = self._file["rooms"][self._keys[room_id]]
+            arrays = {name: group[name][()] for name in _VIEW_ARRAYS}
+            height, width = (int(side) for side in group.attrs["image_size"])
+            ids = group["instance_ids"][()] if images else None
+        except (OSError, KeyError, RuntimeError) as error:
+            raise _damaged(self.path, error, room_id) from None
+        return RoomViews(
+            room_id=room_id, instance_ids=ids, image_size=(height, width), **arrays
+        )
+
+    def read_instance_ids(
+        self, room_id: str, views: Sequence[int], step: int = 1
+    ) -> np.ndarray:
+        """Instance-id images of some views, every `step`-th pixel: (views, H/step, W/step)."""
+        try:
+            images = self._file["rooms"][self._keys[room_id]]["instance_ids"]
+            # Start in the middle of a block, so that the small image is not shifted.
+            return np.stack([images[view][step // 2 :: step, step // 2 :: step] for view in views])
+        except (OSError, KeyError, RuntimeError) as error:
+            raise _damaged(self.path, error, room_id) from None
+
+    def read_ground_truth(self, room_id: str) -> RoomGroundTruth:
+        """The room in 3D. Evaluation reads it; training never does."""
+        try:
+            group = self._file["rooms"][self._keys[room_id]]
+            if "ground_truth" not in group:
+                raise ShardError(
+                    f"{self.path}, room {room_id} carries no 3D ground truth, which this "
+                    "evaluation compares with. Use shards made from a data set that has it."
+                )
+            hidden = group["ground_truth"]
+            return RoomGroundTruth(
+                model_ids=tuple(json.loads(hidden.attrs["model_ids"])),
+                height_m=float(hidden.attrs["height_m"]),
+                **{name: hidden[name][()] for name in _TRUTH_ARRAYS},
+            )
+        except (OSError, KeyError, RuntimeError) as error:
+            raise _damaged(self.path, error, room_id) from None
+
+
+def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:
+    where = f", room {room_id}" if room_id else ""
+    return ShardError(
+        f"{path}{where} cannot be read ({str(error).splitlines()[0]}): the file is damaged. "
+        f"Delete it and run the same `sceneprior prep-front` command again."
+    )
+
+
+def list_shards(folder: Path, split: str) -> list[Path]:
+    """The shards of a split (`train` or `test`), sorted.
+
+    Raises:
+        ShardError: the folder is missing, or the split is empty.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ShardError(f"No folder of shards at {folder}; make one with `sceneprior prep-front`.")
+    paths = sorted((folder / split).glob("*.h5"))
+    if not paths:
+        raise ShardError(
+            f"The '{split}' split of {folder} holds no shards; check the split file given to "
+            "`sceneprior prep-front` and its report."
+        )
+    return paths
+
+
+def iterate_rooms(folder: Path, split: str) -> Iterator[tuple[Shard, str]]:
+    """Every room of a split with its open shard, in a fixed order."""
+    for path in list_shards(folder, split):
+        with Shard(path) as shard:
+            for room_id in shard.room_ids:
+                yield shard, room_id
+
+
+def read_index(folder: Path) -> dict[str, Any]:
+    """The folder's `index.json`: label set, room type, counts and the recipe that made it."""
+    path = Path(folder) / INDEX_NAME
+    try:
+        return json.loads(path.read_text())
+    except OSError:
+        raise ShardError(
+            f"{folder} has no {INDEX_NAME}; it is not a finished folder of shards. "
+            "Run `sceneprior prep-front` to its end."
+        ) from None
+    except ValueError as error:
+        raise ShardError(f"{path} is not JSON ({error}); prepare the folder again.") from None
