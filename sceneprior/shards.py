@@ -200,13 +200,9 @@ class Shard:
             ids = group["instance_ids"][()] if images else None
         except (OSError, KeyError, RuntimeError) as error:
             raise _damaged(self.path, error, room_id) from None
-        return RoomViews(
-            room_id=room_id, instance_ids=ids, image_size=(height, width), **arrays
-        )
+        return RoomViews(room_id=room_id, instance_ids=ids, image_size=(height, width), **arrays)
 
-    def read_instance_ids(
-        self, room_id: str, views: Sequence[int], step: int = 1
-    ) -> np.ndarray:
+    def read_instance_ids(self, room_id: str, views: Sequence[int], step: int = 1) -> np.ndarray:
         """Instance-id images of some views, every `step`-th pixel: (views, H/step, W/step)."""
         try:
             images = self._file["rooms"][self._keys[room_id]]["instance_ids"]

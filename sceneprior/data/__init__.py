@@ -1,1 +1,1 @@
-
+"""View shards in, batches of `SceneViews` out."""

@@ -1,1 +1,1 @@
-
+"""Pure tensor functions on cameras, boxes and meshes; nothing here has weights."""

@@ -1,1 +1,1 @@
-
+"""The prior: latents -> object features -> classes, boxes and meshes."""

@@ -1,1 +1,1 @@
-
+"""One LightningModule a training stage, and what runs them."""

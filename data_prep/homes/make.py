@@ -1,0 +1,151 @@
+"""A seed in, a folder of homes out: draws houses, has them furnished, writes the data set."""
+
+import shutil
+import uuid
+from os import getpid
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from data_prep.homes.bedroom import BEDS, furnish_bedroom
+from data_prep.homes.catalog import Shop, catalogue
+from data_prep.homes.layout import Plan
+from data_prep.homes.living import furnish_living_room
+from data_prep.homes.write import PlacedRoom, house_json, model_record, write_json, write_model
+from sceneprior.errors import InputError
+
+ROOM_TYPES = {
+    "bedroom": ("front3d_bedroom", furnish_bedroom),
+    "living": ("front3d_living", furnish_living_room),
+}
+"""Room type -> its label set, and who furnishes it."""
+
+ROOMS_IN_HOUSE = {1: 0.75, 2: 0.13, 3: 0.08, 4: 0.04}
+"""Rooms of a house -> share of the houses."""
+
+TEST_SHARE = 0.1
+
+_GOLDEN = (5**0.5 - 1) / 2
+
+
+def write_homes(out: Path, rooms: int, room_type: str, seed: int) -> None:
+    """Write the data set into `out`; it appears there whole, or not at all."""
+    out = Path(out).expanduser().absolute()
+    _check(out, rooms, room_type, seed)
+    staging = out.with_name(f".{out.name}.{getpid()}.partial")
+    try:
+        staging.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(
+            f"Cannot write beside {out} ({error.strerror}); choose a folder you may write to."
+        ) from error
+    try:
+        _write(staging, rooms, room_type, seed)
+        staging.replace(out)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def _check(out: Path, rooms: int, room_type: str, seed: int) -> None:
+    if room_type not in ROOM_TYPES:
+        raise InputError(
+            f"No room type is called '{room_type}'; choose one of {', '.join(ROOM_TYPES)}."
+        )
+    if rooms < 2:
+        raise InputError(
+            f"Expected at least 2 rooms, one to train on and one to test on, but got {rooms}; "
+            f"try --rooms 400."
+        )
+    if seed < 0:
+        raise InputError(f"A seed is 0 or more, but got {seed}; try --seed 0.")
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file; choose a new folder for the homes.")
+    if out.exists() and any(out.iterdir()):
+        raise InputError(
+            f"{out} already holds files; choose another folder, such as {out}_{room_type}_{seed}."
+        )
+
+
+def _write(folder: Path, rooms: int, room_type: str, seed: int) -> None:
+    shop = catalogue(seed, ROOM_TYPES[room_type][0])
+    for name in ("3D-FRONT", "3D-FUTURE-model", "splits"):
+        (folder / name).mkdir()
+    models = [model for variants in shop.values() for model in variants]
+    console = Console(stderr=True)
+    for model in track(models, "Building furniture", console=console, transient=True):
+        write_model(folder / "3D-FUTURE-model", model)
+    write_json(folder / "3D-FUTURE-model" / "model_info.json", [model_record(m) for m in models])
+    room_ids: list[str] = []
+    numbers = _house_numbers(rooms, room_type, seed)
+    for house, first, count in track(numbers, "Furnishing homes", console=console, transient=True):
+        uid = str(uuid.uuid5(uuid.NAMESPACE_OID, f"sceneprior homes {seed} {room_type} {house}"))
+        placed = _house(shop, room_type, seed, house, first, count)
+        write_json(folder / "3D-FRONT" / f"{uid}.json", house_json(uid, placed))
+        room_ids += [f"{uid}_{room.instanceid}" for room in placed]
+    _write_split(folder / "splits" / f"{room_type}.csv", room_ids, seed)
+
+
+def _seeded(seed: int, *stream: int | str) -> np.random.Generator:
+    """A generator of its own for each thing drawn: room 7 is the same in any number of rooms."""
+    words = [crc32(str(word).encode()) for word in stream]
+    return np.random.default_rng(np.random.SeedSequence([seed, *words]))
+
+
+def _house_numbers(rooms: int, room_type: str, seed: int) -> list[tuple[int, int, int]]:
+    """(number of the house, number of its first room, how many rooms) of each house."""
+    rng = _seeded(seed, room_type, "houses")
+    houses: list[tuple[int, int, int]] = []
+    first = 0
+    while first < rooms:
+        count = int(rng.choice(list(ROOMS_IN_HOUSE), p=list(ROOMS_IN_HOUSE.values())))
+        count = min(count, rooms - first)
+        houses.append((len(houses), first, count))
+        first += count
+    return houses
+
+
+def _house(
+    shop: Shop, room_type: str, seed: int, house: int, first: int, count: int
+) -> list[PlacedRoom]:
+    rng = _seeded(seed, room_type, "house", house)
+    x, z = (round(float(value), 2) for value in rng.uniform(-4, 4, 2))
+    placed: list[PlacedRoom] = []
+    for number in range(first, first + count):
+        plan = furnished(shop, room_type, seed, number)
+        kind = _kind(plan, {room.kind for room in placed})
+        placed.append(PlacedRoom(plan, kind, f"{kind}-{1000 + number}", x, z))
+        x = round(x + plan.width + float(rng.uniform(0.3, 1.0)), 2)
+    return placed
+
+
+def furnished(shop: Shop, room_type: str, seed: int, number: int) -> Plan:
+    """Room `number` of a data set, in its own frame.
+
+    Multiples of the golden ratio spread the rooms evenly over the histogram of counts, so
+    that a few hundred follow it as closely as thousands of independent draws would.
+    """
+    start = _seeded(seed, room_type, "counts").random()
+    share = (start + number * _GOLDEN) % 1.0
+    return ROOM_TYPES[room_type][1](shop, _seeded(seed, room_type, "room", number), share)
+
+
+def _kind(plan: Plan, taken: set[str]) -> str:
+    """3D-FRONT's name for such a room; one master bedroom a house."""
+    names = {piece.model.name for piece in plan.pieces}
+    if not names & set(BEDS):
+        dining = any(p.model.name == "table" and p.model.size_m[0] > 1.0 for p in plan.pieces)
+        return "LivingDiningRoom" if dining else "LivingRoom"
+    if "kids_bed" in names:
+        return "Bedroom"
+    master = "double_bed" in names and "MasterBedroom" not in taken
+    return "MasterBedroom" if master else "SecondBedroom"
+
+
+def _write_split(path: Path, room_ids: list[str], seed: int) -> None:
+    tests = max(1, round(TEST_SHARE * len(room_ids)))
+    chosen = set(_seeded(seed, "split").permutation(len(room_ids))[:tests].tolist())
+    rows = [f"{room},{'test' if k in chosen else 'train'}" for k, room in enumerate(room_ids)]
+    path.write_text("\n".join(rows) + "\n")

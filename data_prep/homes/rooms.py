@@ -1,0 +1,83 @@
+"""An empty room for so many pieces, and whether a furnished one can be lived in."""
+
+import numpy as np
+from shapely import box
+from shapely.geometry import Point, Polygon
+from shapely.ops import unary_union
+
+from data_prep.homes.layout import Plan, Rect
+
+DOOR_M = 0.9
+"""Width of a door, and how far before it the floor stays clear."""
+
+FREE_SHARE = 0.45
+"""Least share of the floor that no piece stands on."""
+
+SHOULDERS_M = 0.2
+"""Half of how wide a passage must be."""
+
+
+def count_at(histogram: dict[int, int], share: float) -> int:
+    """The number of pieces below which this share in [0, 1) of the histogram lies."""
+    total = np.cumsum(list(histogram.values()))
+    return list(histogram)[int(np.searchsorted(total, share * total[-1], side="right"))]
+
+
+def empty_room(
+    rng: np.random.Generator,
+    area_m2: float,
+    least_side_m: float,
+    most_side_m: float,
+    l_shaped_chance: float,
+) -> Plan:
+    """A rectangle of about this area, sometimes with a corner bitten off, and a door."""
+    aspect = rng.uniform(1.0, 1.55)
+    long = float(np.clip(np.sqrt(area_m2 * aspect), least_side_m, most_side_m))
+    short = float(np.clip(area_m2 / long, least_side_m, most_side_m))
+    width, depth = (long, short) if rng.random() < 0.5 else (short, long)
+    width, depth = round(width, 2), round(depth, 2)
+    notch = None
+    if rng.random() < l_shaped_chance and short > least_side_m + 0.4:
+        bite_x = round(width * rng.uniform(0.15, 0.35), 2)
+        bite_z = round(depth * rng.uniform(0.15, 0.35), 2)
+        x0 = 0.0 if rng.random() < 0.5 else round(width - bite_x, 2)
+        z0 = 0.0 if rng.random() < 0.5 else round(depth - bite_z, 2)
+        notch = (x0, z0, round(x0 + bite_x, 2), round(z0 + bite_z, 2))
+    plan = Plan(width, depth, round(float(rng.uniform(2.6, 3.0)), 2), notch)
+    plan.kept_clear.append(_door(plan, rng))
+    return plan
+
+
+def _door(plan: Plan, rng: np.random.Generator) -> Rect:
+    """Clear floor inside a door near one end of a wall."""
+    walls = [wall for wall in plan.walls if wall.length > 1.8]
+    wall = walls[rng.integers(len(walls))]
+    middle = 0.1 + DOOR_M / 2
+    if rng.random() < 0.5:
+        middle = wall.length - middle
+    x = wall.x + wall.along[0] * middle - wall.along[1] * DOOR_M / 2
+    z = wall.z + wall.along[1] * middle + wall.along[0] * DOOR_M / 2
+    return x - DOOR_M / 2, z - DOOR_M / 2, x + DOOR_M / 2, z + DOOR_M / 2
+
+
+def is_liveable(plan: Plan, reach: tuple[str, ...]) -> bool:
+    """Whether enough floor is free, and one can walk from the door to each class in `reach`."""
+    standing = [piece for piece in plan.pieces if piece.y == 0]
+    covered = sum(piece.size_m[0] * piece.size_m[2] for piece in standing)
+    if covered > (1 - FREE_SHARE) * plan.area:
+        return False
+    floor = Polygon(plan.outline).buffer(-SHOULDERS_M, join_style="mitre")
+    shapes = [box(*piece.rect) for piece in standing]
+    walkable = floor - unary_union(shapes).buffer(SHOULDERS_M, join_style="mitre")
+    door = plan.kept_clear[0]
+    entrance = Point((door[0] + door[2]) / 2, (door[1] + door[3]) / 2)
+    areas = list(getattr(walkable, "geoms", [walkable]))
+    here = next((area for area in areas if area.contains(entrance)), None)
+    if here is None:
+        return False
+    at_hand = here.buffer(2.5 * SHOULDERS_M)
+    return all(
+        at_hand.intersects(shape)
+        for piece, shape in zip(standing, shapes, strict=True)
+        if piece.model.name in reach
+    )

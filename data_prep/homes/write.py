@@ -1,0 +1,198 @@
+"""Homes to disk, as 3D-FRONT and 3D-FUTURE lay them out: plans and models in, files out."""
+
+import json
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_prep.homes.catalog import Model
+from data_prep.homes.layout import Piece, Plan
+
+WALL_M = 0.12
+"""How thick a wall is."""
+
+_IDENTITY = {"pos": [0, 0, 0], "rot": [0, 0, 0, 1], "scale": [1, 1, 1]}
+
+
+@dataclass(frozen=True)
+class PlacedRoom:
+    """A furnished room, its names in the data set, and where its corner lies in the house."""
+
+    plan: Plan
+    kind: str
+    instanceid: str
+    x: float
+    z: float
+
+
+def write_model(folder: Path, model: Model) -> None:
+    """`<jid>/raw_model.obj`, metres, y up, front +z."""
+    home = folder / model.jid
+    home.mkdir(parents=True)
+    lines = [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in model.mesh.vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (model.mesh.faces + 1).tolist()]
+    (home / "raw_model.obj").write_text("\n".join(lines) + "\n")
+
+
+def model_record(model: Model) -> dict[str, Any]:
+    """What `model_info.json` says of a model."""
+    return {
+        "model_id": model.jid,
+        "super-category": model.super_category,
+        "category": model.category,
+        "style": model.style_name,
+        "theme": None,
+        "material": None,
+    }
+
+
+def house_json(uid: str, rooms: list[PlacedRoom]) -> dict[str, Any]:
+    """A house file; its children's poses are in the house's frame, as in 3D-FRONT."""
+    meshes: list[dict[str, Any]] = []
+    catalog: dict[str, dict[str, Any]] = {}
+    room_entries = []
+    number = 100
+    for room in rooms:
+        children = []
+        corner = np.array([room.x, 0.0, room.z])
+        for kind, triangles in shell(room.plan):
+            number += 1
+            mesh = _mesh(uid, number, kind, triangles + corner)
+            meshes.append(mesh)
+            children.append({"ref": mesh["uid"], "instanceid": f"mesh/{number}", **_IDENTITY})
+        for piece in room.plan.pieces:
+            number += 1
+            entry = catalog.setdefault(piece.model.jid, _furniture(uid, len(catalog), piece.model))
+            children.append(_placement(entry["uid"], number, piece, room))
+        room_entries.append(
+            {
+                "type": room.kind,
+                "instanceid": room.instanceid,
+                "size": round(room.plan.area, 2),
+                **_IDENTITY,
+                "children": children,
+                "empty": 0,
+            }
+        )
+    return {
+        "uid": uid,
+        "jobid": "",
+        "design_version": "sceneprior-homes",
+        "code_version": "1",
+        "north_vector": [0, 1, 0],
+        "furniture": list(catalog.values()),
+        "mesh": meshes,
+        "material": [],
+        "lights": [],
+        "extension": {},
+        "scene": {"ref": "-1", **_IDENTITY, "room": room_entries},
+        "groups": [],
+        "materialList": [],
+        "version": "2.0",
+    }
+
+
+def shell(plan: Plan) -> list[tuple[str, np.ndarray]]:
+    """(type, (triangles, 3, 3)) of floor, ceiling and walls in the room's own frame.
+
+    Floor, ceiling and inner walls face the room, outer walls face away from it.
+    """
+    tiles = np.concatenate([_rectangle(rect) for rect in _rectangles(plan)])
+    ceiling = tiles[:, ::-1] + np.array([0.0, plan.height, 0.0])
+    inner, outer = [], []
+    corners = np.array(plan.outline)
+    outside = _offset(corners, WALL_M)
+    for k in range(len(corners)):
+        following = (k + 1) % len(corners)
+        inner.append(_wall(corners[k], corners[following], plan.height))
+        outer.append(_wall(outside[following], outside[k], plan.height))
+    walls = [("WallInner", part) for part in inner] + [("WallOuter", part) for part in outer]
+    return [("Floor", tiles), ("Ceiling", ceiling), *walls]
+
+
+def _rectangles(plan: Plan) -> list[tuple[float, float, float, float]]:
+    if plan.notch is None:
+        return [(0.0, 0.0, plan.width, plan.depth)]
+    x0, z0, x1, z1 = plan.notch
+    whole = (0.0, z1, plan.width, plan.depth) if z0 == 0 else (0.0, 0.0, plan.width, z0)
+    rest = (x1, plan.width) if x0 == 0 else (0.0, x0)
+    return [whole, (rest[0], z0, rest[1], z1)]
+
+
+def _rectangle(rect: tuple[float, float, float, float]) -> np.ndarray:
+    x0, z0, x1, z1 = rect
+    a, b, c, d = (x0, 0.0, z0), (x0, 0.0, z1), (x1, 0.0, z1), (x1, 0.0, z0)
+    return np.array([[a, b, c], [a, c, d]])
+
+
+def _wall(start: np.ndarray, end: np.ndarray, height: float) -> np.ndarray:
+    """Two triangles that face to the left of the way from start to end, seen in (x, z)."""
+    (x0, z0), (x1, z1) = start, end
+    a, b, c, d = (x0, 0.0, z0), (x1, 0.0, z1), (x1, height, z1), (x0, height, z0)
+    return np.array([[a, b, c], [a, c, d]])
+
+
+def _offset(corners: np.ndarray, distance: float) -> np.ndarray:
+    """The rectilinear outline, every side moved outwards."""
+    sides = np.roll(corners, -1, axis=0) - corners
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    outward = np.stack([sides[:, 1], -sides[:, 0]], axis=1)
+    return corners + distance * (outward + np.roll(outward, 1, axis=0))
+
+
+def _mesh(uid: str, number: int, kind: str, triangles: np.ndarray) -> dict[str, Any]:
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = triangles.reshape(-1, 3)
+    flat = [k for k in range(3) if k != int(np.argmax(np.abs(normals[0])))]
+    return {
+        "aid": [],
+        "jid": "",
+        "uid": f"{number}{uid[:8]}/0",
+        "xyz": _rounded(points),
+        "normal": _rounded(np.repeat(normals, 3, axis=0)),
+        "uv": _rounded(points[:, flat]),
+        "faces": list(range(len(points))),
+        "material": "",
+        "type": kind,
+        "constructid": str(number),
+    }
+
+
+def _furniture(uid: str, index: int, model: Model) -> dict[str, Any]:
+    width, height, depth = model.size_m
+    return {
+        "uid": f"{1000 + index}/model",
+        "jid": model.jid,
+        "aid": [],
+        "title": f"{model.super_category.lower()}/{model.category.lower()}",
+        "type": "standard",
+        "category": model.category,
+        "sourceCategoryId": str(uuid.uuid5(uuid.NAMESPACE_OID, model.category)),
+        "size": [width, depth, height],
+        "bbox": [width, depth, height],
+        "valid": True,
+    }
+
+
+def _placement(ref: str, number: int, piece: Piece, room: PlacedRoom) -> dict[str, Any]:
+    half = piece.yaw_rad / 2
+    return {
+        "ref": ref,
+        "instanceid": f"furniture/{number}",
+        "pos": _rounded(np.array([piece.x + room.x, piece.y, piece.z + room.z])),
+        "rot": _rounded(np.array([0.0, np.sin(half), 0.0, np.cos(half)])),
+        "scale": _rounded(np.array(piece.scale)),
+    }
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return (np.round(values.reshape(-1), 5) + 0.0).tolist()  # + 0.0 turns -0.0 into 0.0
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Compact JSON, the same bytes for the same content."""
+    path.write_text(json.dumps(content, separators=(",", ":")) + "\n")

@@ -1,0 +1,228 @@
+"""A run's YAML in, one frozen, checked `RunConfig` out. Only this module reads or writes YAML."""
+
+import difflib
+import importlib.resources
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from sceneprior.classes import LABEL_SETS
+from sceneprior.errors import ConfigError
+
+
+class _Section(BaseModel):
+    # Strict: "yes" is no number and 3.5 no count. Unknown keys are errors that name a neighbour.
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
+    )
+
+
+class DataConfig(_Section):
+    """Which shards, and how much of each room a step sees."""
+
+    shards: str
+    """Folder that `sceneprior prep-front` wrote; relative to where the command runs."""
+    views_per_room: int = Field(20, ge=1)
+    """Views drawn per room and step in the layout stage (paper: 20)."""
+    view_fraction: float = Field(1.0, gt=0, le=1)
+    """Share of each room's views that training may use (the paper's Table 4: 0.25, 0.5, 1)."""
+    augment_rotations: bool = True
+    """Add each room turned by 90, 180 and 270 degrees, each with a latent of its own."""
+    mask_step: int = Field(4, ge=1)
+    """Masks are compared at 1 / mask_step of the rendered resolution (paper: 4)."""
+    workers: int = Field(0, ge=0)
+    """Loader processes; 0 loads in the training process, which is fastest for small sets."""
+
+
+class ModelConfig(_Section):
+    """The network (section 3 and supplement A)."""
+
+    max_objects: int = Field(ge=1)
+    """N: 13 for bedrooms, 28 for living rooms, 53 for ScanNet."""
+    width: int = Field(512, ge=8)
+    """D_z, of latents and object features."""
+    anchors: int = Field(100, ge=2)
+    """M fixed unit vectors that latents are mixed from; 100 in the authors' code."""
+    heads: int = Field(4, ge=1)
+    hidden: int = Field(1024, ge=8)
+    """Inner width of the feed-forward layers."""
+    dropout: float = Field(0.1, ge=0, lt=1)
+    shape_width: int = Field(256, ge=8)
+    shape_level: int = Field(4, ge=0, le=6)
+    """Icosphere subdivisions of the template: 20 * 4**level faces."""
+    template: Literal["sphere", "box"] = "sphere"
+    """What shapes are deformed from; `box` starts from the box that the layout stage fitted."""
+    fit_box: bool = False
+    """Keep each mesh filling its box exactly, so that boxes stay the meshes' own."""
+
+    @model_validator(mode="after")
+    def _heads_divide_width(self) -> "ModelConfig":
+        if self.width % self.heads:
+            raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
+        return self
+
+
+class LossConfig(_Section):
+    """Weights of the terms (section 4)."""
+
+    class_: float = Field(1.0, ge=0, alias="class")
+    box: float = Field(5.0, ge=0)
+    completeness: float = Field(1.0, ge=0)
+    frustum: float = Field(1.0, ge=0)
+    mask: float = Field(2.0, ge=0)
+    """lambda_S."""
+    match_box: float = Field(5.0, ge=0)
+    """lambda_B of the matching cost."""
+    iou_gate: float = Field(0.5, ge=0, lt=1)
+    """Masks that overlap less than this teach no shape."""
+
+
+class StageConfig(_Section):
+    """How one stage is trained."""
+
+    epochs: int = Field(ge=1)
+    batch_size: int = Field(16, ge=1)
+    learning_rate: float = Field(1e-4, gt=0)
+    latent_learning_rate: float = Field(1e-4, gt=0)
+    """For the latent weights, which see one gradient an epoch; the paper uses one rate for all."""
+    milestones: tuple[int, ...] = Field((300,), strict=False)
+    """Epochs after which the rates are multiplied by `decay`."""
+    decay: float = Field(0.1, gt=0, le=1)
+    clip_gradient: float = Field(0.0, ge=0)
+    """Largest gradient norm; 0 does not clip."""
+    proxy: Literal["ellipsoid", "box"] = "ellipsoid"
+    """What an object's 2D box is taken from where its mesh is not decoded."""
+
+
+class ShapeConfig(StageConfig):
+    """How the shape stage is trained: the layout terms go on beside the mask term."""
+
+    views_per_room: int | None = Field(None, ge=1)
+    """Views drawn per room and step; None takes data.views_per_room."""
+    sigma_px2: float | None = Field(None, gt=0)
+    """Softness of silhouettes in squared pixels; None takes the paper's 1e-4 squared NDC."""
+    compositing: Literal["layered", "paper"] = "paper"
+    box_from: Literal["mesh", "proxy"] = "mesh"
+    """Whether 2D boxes come from the deformed mesh (paper) or still from the proxy."""
+
+
+class SamplingConfig(_Section):
+    """Where new latents come from."""
+
+    law: Literal["gaussian", "paper"] = "gaussian"
+    """`gaussian`: fitted to the training rooms' logits; `paper`: logits from N(0, 1)."""
+
+
+class RunConfig(_Section):
+    """Everything a run is; saved with it as `config.yaml`."""
+
+    label_set: str
+    seed: int = Field(0, ge=0)
+    data: DataConfig
+    model: ModelConfig
+    loss: LossConfig = LossConfig()
+    layout: StageConfig
+    shape: ShapeConfig
+    sampling: SamplingConfig = SamplingConfig()
+
+    @model_validator(mode="after")
+    def _known_label_set(self) -> "RunConfig":
+        if self.label_set not in LABEL_SETS:
+            raise ValueError(f"label_set '{self.label_set}' is none of {', '.join(LABEL_SETS)}")
+        return self
+
+
+def find_config(name: str) -> Path:
+    """A path to a YAML, or the name of a config that ships with the package.
+
+    Raises:
+        ConfigError: neither exists.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    folders = [
+        Path(str(importlib.resources.files("sceneprior"))) / "configs",
+        Path(__file__).resolve().parent.parent / "configs",
+    ]
+    for folder in folders:
+        if path.parent == Path() and (folder / name).is_file():
+            return folder / name
+    shipped = sorted({item.name for folder in folders for item in folder.glob("*.yaml")})
+    raise ConfigError(
+        f"No config '{name}': it is neither a file nor one of the shipped {', '.join(shipped)}."
+    )
+
+
+def load_config(name: str, overrides: tuple[str, ...] = ()) -> RunConfig:
+    """Read a config and apply `section.key=value` overrides.
+
+    Raises:
+        ConfigError: not found, not YAML, an unknown key or a wrong value; the message names the
+            file, the key and, for a typo, the nearest key.
+    """
+    path = find_config(name)
+    try:
+        data = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from None
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path} holds no settings; expected `section:` and `key: value` lines.")
+    for override in overrides:
+        _apply(data, override)
+    return check_config(data, str(path))
+
+
+def check_config(data: dict[str, Any], source: str) -> RunConfig:
+    """Turn plain data into a `RunConfig`, or say in one sentence what is wrong with it."""
+    try:
+        return RunConfig.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(_explain(error, source)) from None
+
+
+def dump_config(config: RunConfig, path: Path) -> None:
+    """Write the resolved settings, every default included."""
+    data = config.model_dump(mode="json", by_alias=True)
+    path.write_text(yaml.safe_dump(data, sort_keys=False))
+
+
+def _apply(data: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    if not equals:
+        raise ConfigError(f"--set takes section.key=value, got '{override}'.")
+    *parents, last = key.strip().split(".")
+    node = data
+    for parent in parents:
+        node = node.setdefault(parent, {})
+        if not isinstance(node, dict):
+            raise ConfigError(f"--set {override}: '{parent}' is a value, not a section.")
+    node[last] = yaml.safe_load(text)
+
+
+def _explain(error: ValidationError, source: str) -> str:
+    first, *others = error.errors(include_url=False)
+    location = [str(part) for part in first["loc"]]
+    key = ".".join(location)
+    more = f" ({len(others)} more problem{'s' * (len(others) > 1)} after it)" if others else ""
+    if first["type"] == "extra_forbidden":
+        known = _keys_beside(location)
+        near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.0)
+        return f"{source}: unknown key '{key}'; the nearest valid key is '{near[0]}'.{more}"
+    if first["type"] == "missing":
+        return f"{source}: '{key}' is missing and has no default; add it.{more}"
+    got = f" (got {first['input']!r})" if not isinstance(first["input"], dict) else ""
+    reason = first["msg"].removeprefix("Value error, ")
+    reason = reason[:1].lower() + reason[1:]
+    return f"{source}: {f'{chr(39)}{key}{chr(39)}: ' if key else ''}{reason}{got}.{more}"
+
+
+def _keys_beside(location: list[str]) -> list[str]:
+    section: type[BaseModel] = RunConfig
+    for part in location[:-1]:
+        annotation = section.model_fields[part].annotation
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            section = annotation
+    return [field.alias or name for name, field in section.model_fields.items()]

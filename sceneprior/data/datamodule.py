@@ -1,0 +1,60 @@
+"""A run's data settings in, Lightning loaders out."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from torch.utils.data import DataLoader, Sampler
+
+from sceneprior.batches import SceneViews
+from sceneprior.data.dataset import ViewDataset
+
+
+class DrawSampler(Sampler[list[tuple[int, int]]]):
+    """Batches of (row, epoch): a fresh order each epoch, split over processes.
+
+    Args:
+        rows: Size of the data set.
+        batch_size: Rows per batch and process; the last batch may be smaller.
+        seed: With the epoch, decides the order.
+        rank, world: This process and how many there are.
+    """
+
+    def __init__(self, rows: int, batch_size: int, seed: int, rank: int = 0, world: int = 1):
+        self.rows, self.batch_size, self.seed = rows, batch_size, seed
+        self.rank, self.world = rank, world
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Lightning calls this before each epoch."""
+        self.epoch = epoch
+
+    def _mine(self) -> int:
+        # Every process gets the same number, so that none waits for another: the first wrap.
+        return -(-self.rows // self.world)
+
+    def __len__(self) -> int:
+        return -(-self._mine() // self.batch_size)
+
+    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
+        order = np.random.default_rng([self.seed, self.epoch]).permutation(self.rows)
+        order = np.resize(order, self._mine() * self.world)[self.rank :: self.world]
+        for start in range(0, len(order), self.batch_size):
+            yield [(int(row), self.epoch) for row in order[start : start + self.batch_size]]
+
+
+def _as_it_is(batch: SceneViews) -> SceneViews:
+    return batch
+
+
+def make_loader(
+    dataset: ViewDataset, batch_size: int, seed: int, workers: int, rank: int = 0, world: int = 1
+) -> DataLoader:
+    """A loader whose batches are whole `SceneViews`."""
+    return DataLoader(
+        dataset,
+        batch_sampler=DrawSampler(len(dataset), batch_size, seed, rank, world),
+        collate_fn=_as_it_is,
+        num_workers=workers,
+        persistent_workers=workers > 0,
+        multiprocessing_context="spawn" if workers else None,
+    )

@@ -1,0 +1,164 @@
+"""One page that shows a run: scenes, scores and curves in, a self-contained HTML file out."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+
+from sceneprior import __version__
+from sceneprior.evaluation.layout_metrics import match_scenes
+from sceneprior.evaluation.protocol import score_rows
+from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.report_pictures import (
+    RoomPictures,
+    curves_svg,
+    input_views,
+    legend,
+    room_pictures,
+)
+from sceneprior.offscreen import Renderer
+from sceneprior.scene import Scene
+
+ROOMS_SHOWN = 8
+DECODED_SHOWN = 5
+UNFOLDING_SHOWN = 9
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class _Pair:
+    decoded: RoomPictures
+    truth: RoomPictures
+    summary: str
+
+
+def write_report(
+    path: Path,
+    *,
+    title: str,
+    shards: Path,
+    run: Path | str,
+    generated: Sequence[Scene],
+    scores: dict[str, Any],
+    commands: Sequence[str],
+    curves: dict[str, list[tuple[int, float]]],
+    decoded: Sequence[tuple[Scene, Scene]],
+    unfolding: Sequence[Scene],
+    renderer: Renderer,
+) -> None:
+    """Write one HTML file without scripts and without anything outside itself.
+
+    A part for which nothing is given is left out. The page names folders, never whole paths,
+    so that it can be passed on.
+
+    Args:
+        path: The HTML file; written under a temporary name, then moved into place.
+        title: Headline.
+        shards: Folder of shards: input views come from `train`, real rooms from `test`.
+        run: The run's folder or name.
+        generated: Synthesized rooms; the first 8 are shown.
+        scores: From `evaluate_synthesis`; class_accuracy, box_iou_3d, seconds and
+            peak_memory_gib are shown too where they stand in it.
+        commands: What was typed, in order.
+        curves: Points (step, value) by name; a panel each.
+        decoded: (decoded, true) training rooms; the first 5 are shown.
+        unfolding: Rooms along a geodesic of the hypersphere, from one room to another.
+        renderer: From `sceneprior.offscreen.open_renderer`.
+
+    Raises:
+        InputError: the shards cannot be read.
+    """
+    generated = list(generated)[:ROOMS_SHOWN]
+    test = reference_scenes(shards, "test", limit=ROOMS_SHOWN)
+    along = _spread(unfolding, UNFOLDING_SHOWN)
+    pairs = list(decoded)[:DECODED_SHOWN]
+    shown = [*generated, *test, *along, *(scene for pair in pairs for scene in pair)]
+    protocol = scores.get("protocol", {})
+    page = _template().render(
+        title=title,
+        version=__version__,
+        run=Path(run).resolve().name,
+        shards=Path(shards).resolve().name,
+        label_set=test[0].label_set.replace("_", " "),
+        tiles=_tiles(scores),
+        views=input_views(shards, rooms=3, views_per_room=2),
+        curves=curves_svg(curves) if curves else None,
+        decoded=[_pair(*pair, renderer) for pair in pairs],
+        generated=[room_pictures(scene, renderer) for scene in generated],
+        test=[room_pictures(scene, renderer) for scene in test],
+        unfolding=[room_pictures(scene, renderer) for scene in along],
+        legend=legend(shown),
+        rows=score_rows(scores),
+        protocol=protocol,
+        protocol_text=json.dumps(protocol, indent=1),
+        note=scores.get("note"),
+        commands=commands,
+    )
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".part")
+    try:
+        temporary.write_text(page, encoding="utf-8")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _template() -> Any:
+    text = files("sceneprior.evaluation").joinpath("report.html.jinja").read_text("utf-8")
+    # A misspelt name in the template is an error, not a blank.
+    return Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    ).from_string(text)
+
+
+def _spread(items: Sequence[_T], count: int) -> list[_T]:
+    """At most `count` items, both ends among them, evenly apart."""
+    rows = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[row] for row in rows]
+
+
+def _pair(decoded: Scene, truth: Scene, renderer: Renderer) -> _Pair:
+    match = match_scenes(decoded, truth)
+    accuracy, iou = match.class_accuracy, match.mean_iou
+    summary = (
+        "an empty room"
+        if accuracy is None or iou is None
+        else f"{accuracy:.0%} of {match.truth_count} classes right, mean 3D box IoU {iou:.2f}"
+    )
+    # The true floor under both, so that both pictures frame the same room.
+    decoded = replace(decoded, floor_m=truth.floor_m)
+    return _Pair(room_pictures(decoded, renderer), room_pictures(truth, renderer), summary)
+
+
+def _tiles(scores: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """(figure, what it is, beside what) for the top of the page; only what is known."""
+    known = {key: value for key, value in scores.items() if isinstance(value, (int, float))}
+    train = scores.get("train_rooms", {})
+    tiles = []
+    if "type_share" in known:
+        beside = f"{known['type_share_test']:.0%} of real test rooms"
+        tiles.append((f"{known['type_share']:.0%}", "hold their type's furniture", beside))
+    if "category_kl" in known:
+        beside = f"nats; real training rooms {train['category_kl']:.3f}"
+        tiles.append((f"{known['category_kl']:.3f}", "category KL to test rooms", beside))
+    if "mean_objects" in known:
+        beside = f"real test rooms {known['mean_objects_test']:.2f}"
+        tiles.append((f"{known['mean_objects']:.2f}", "objects in a generated room", beside))
+    if "class_accuracy" in known:
+        beside = "decoded training rooms, matched by box"
+        tiles.append((f"{known['class_accuracy']:.1%}", "of true classes right", beside))
+    if "box_iou_3d" in known:
+        beside = "decoded training rooms; 3D was never shown"
+        tiles.append((f"{known['box_iou_3d']:.2f}", "mean 3D box IoU", beside))
+    if "seconds" in known:
+        memory = known.get("peak_memory_gib")
+        beside = "" if memory is None else f"{memory:.1f} GiB of memory at most"
+        tiles.append((f"{known['seconds'] / 60:.1f} min", "from homes to scores", beside))
+    return tiles

@@ -1,0 +1,158 @@
+"""Pictures for the report: scenes, input views and learning curves in, data URIs out."""
+
+import base64
+import io
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from sceneprior.classes import class_colors, label_set
+from sceneprior.evaluation.topdown import perspective, topdown
+from sceneprior.offscreen import Renderer
+from sceneprior.scene import Scene
+from sceneprior.shards import Shard, iterate_rooms
+
+_POINTS_PER_CURVE = 400
+_EMPTY = (244, 245, 247)
+
+
+@dataclass(frozen=True)
+class RoomPictures:
+    """One scene as the page shows it."""
+
+    name: str
+    contents: str
+    """Its objects in words: "double bed, nightstand ×2"."""
+    topdown: str
+    """Data URI of the flat picture that scores compare, with borders, at half size."""
+    perspective: str
+    """Data URI of the shaded view from above a corner."""
+
+
+def room_pictures(scene: Scene, renderer: Renderer) -> RoomPictures:
+    """Draw one scene both ways."""
+    counts = Counter(item.label.replace("_", " ") for item in scene.objects)
+    words = [name if many == 1 else f"{name} ×{many}" for name, many in sorted(counts.items())]
+    flat = Image.fromarray(topdown(scene, renderer, outlines=True))
+    flat = flat.resize((256, 256), Image.Resampling.BOX)
+    solid = Image.fromarray(perspective(scene, renderer, (330, 440)))
+    return RoomPictures(
+        scene.name, ", ".join(words) or "nothing", _png(flat.quantize(64)), _jpeg(solid)
+    )
+
+
+def legend(scenes: Sequence[Scene]) -> list[tuple[str, str]]:
+    """(class name, CSS colour) of every class that occurs, in the label set's order."""
+    if not scenes:
+        return []
+    names = label_set(scenes[0].label_set)
+    colors = class_colors(len(names))
+    present = {item.label for scene in scenes for item in scene.objects}
+    return [
+        (name.replace("_", " "), f"#{bytes(color.tolist()).hex()}")
+        for name, color in zip(names, colors, strict=True)
+        if name in present
+    ]
+
+
+def input_views(shards: Path, rooms: int, views_per_room: int) -> list[tuple[str, str]]:
+    """What training sees: masks in class colours with their 2D boxes, as (caption, data URI).
+
+    Args:
+        shards: Folder of shards; the first rooms of its `train` split are shown.
+        rooms: At most this many.
+        views_per_room: The views of each room that see most objects.
+    """
+    pictures: list[tuple[str, str]] = []
+    for shown, (shard, room_id) in enumerate(iterate_rooms(shards, "train")):
+        if shown >= rooms:
+            break
+        visible = shard.read_room(room_id).visible.sum(1)
+        best = np.argsort(-visible, kind="stable")[:views_per_room]
+        pictures += [_input_view(shard, room_id, int(view)) for view in best]
+    return pictures
+
+
+def _input_view(shard: Shard, room_id: str, view: int) -> tuple[str, str]:
+    room = shard.read_room(room_id)
+    ids = shard.read_instance_ids(room_id, [view])[0].astype(np.int64)
+    names = label_set(shard.label_set)
+    colors = class_colors(len(names))[room.object_class]
+    image = np.concatenate([[_EMPTY], colors]).astype(np.uint8)[ids]
+    edge = np.zeros(ids.shape, dtype=bool)
+    edge[:, 1:] |= ids[:, 1:] != ids[:, :-1]
+    edge[1:] |= ids[1:] != ids[:-1]
+    image[edge] = image[edge] // 2
+    picture = Image.fromarray(image)
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size=11)
+    height, width = ids.shape
+    for row in np.flatnonzero(room.visible[view]):
+        x1, y1, x2, y2 = room.boxes[view, row] * (width, height, width, height)
+        dark = tuple(int(channel * 0.55) for channel in colors[row])
+        draw.rectangle((x1, y1, x2 - 1, y2 - 1), outline=dark, width=2)
+        label = names[int(room.object_class[row])].replace("_", " ")
+        left, top, right, bottom = draw.textbbox((x1 + 4, y1 + 3), label, font=font)
+        if right - left + 6 <= x2 - x1 and bottom - top + 6 <= y2 - y1:
+            draw.rectangle((left - 2, top - 2, right + 2, bottom + 2), fill=dark)
+            draw.text((x1 + 4, y1 + 3), label, font=font, fill="white")
+    count = int(room.visible[view].sum())
+    return f"{room_id}, view {view}: {count} objects", _png(picture.quantize(128))
+
+
+def curves_svg(curves: dict[str, list[tuple[int, float]]]) -> str:
+    """Learning curves as one SVG of small panels, a panel per name; a data URI.
+
+    A panel whose values span more than a factor of 20 has a logarithmic axis.
+    """
+    import matplotlib
+
+    # A figure of its own, not pyplot: nothing of the caller's backend is touched.
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator, NullFormatter
+
+    columns = min(3, max(len(curves), 1))
+    rows = -(-len(curves) // columns)
+    figure = Figure(figsize=(11.4, 2.35 * rows), layout="constrained")
+    FigureCanvasSVG(figure)
+    for index, (name, points) in enumerate(curves.items()):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        pairs = np.array(points, dtype=np.float64).reshape(-1, 2)
+        pairs = pairs[np.isfinite(pairs).all(1)]
+        pairs = pairs[:: max(1, -(-len(pairs) // _POINTS_PER_CURVE))]
+        axes.plot(pairs[:, 0], pairs[:, 1], color="#3b5bdb", linewidth=1.4)
+        if len(pairs) and pairs[:, 1].min() > 0 and np.ptp(np.log(pairs[:, 1])) > np.log(20):
+            axes.set_yscale("log")
+            axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+        axes.set_title(name, fontsize=9, loc="left", color="#343a40")
+        axes.tick_params(labelsize=8, colors="#868e96")
+        axes.grid(color="#e9ecef", linewidth=0.8)
+        axes.spines[:].set_visible(False)
+        if index >= len(curves) - columns:
+            axes.set_xlabel("step", fontsize=8, color="#868e96")
+    page = io.BytesIO()
+    # A fixed salt and no date: the same curves give the same bytes.
+    with matplotlib.rc_context({"svg.hashsalt": "sceneprior"}):
+        figure.savefig(page, format="svg", metadata={"Date": None})
+    return _data_uri("image/svg+xml", page.getvalue())
+
+
+def _png(image: Image.Image) -> str:
+    page = io.BytesIO()
+    image.save(page, format="PNG", optimize=True)
+    return _data_uri("image/png", page.getvalue())
+
+
+def _jpeg(image: Image.Image) -> str:
+    page = io.BytesIO()
+    image.save(page, format="JPEG", quality=86, optimize=True)
+    return _data_uri("image/jpeg", page.getvalue())
+
+
+def _data_uri(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"

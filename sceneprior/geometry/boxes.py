@@ -1,0 +1,31 @@
+"""Axis-aligned boxes (centre, size) in, corners out."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def box_corners(
+    centers_m: Float[Tensor, "*batch 3"], sizes_m: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 8 3"]:
+    """The eight corners of axis-aligned boxes, in the order of `unit_corners`."""
+    corners = unit_corners(centers_m)
+    return centers_m.unsqueeze(-2) + corners * (sizes_m / 2).unsqueeze(-2)
+
+
+def unit_corners(like: Tensor) -> Float[Tensor, "8 3"]:
+    """The corners of the cube [-1, 1]^3; x changes slowest."""
+    side = torch.tensor([-1.0, 1.0], dtype=like.dtype, device=like.device)
+    return torch.cartesian_prod(side, side, side)
+
+
+def place(
+    canonical: Float[Tensor, "rooms objects vertices 3"],
+    centers_m: Float[Tensor, "rooms objects 3"],
+    sizes_m: Float[Tensor, "rooms objects 3"],
+) -> Float[Tensor, "rooms objects vertices 3"]:
+    """Move canonical meshes into their boxes: o = M * s / 2 + c.
+
+    The cube [-1, 1]^3 fills the box, so the unit sphere touches all its sides.
+    """
+    return canonical * (sizes_m / 2).unsqueeze(-2) + centers_m.unsqueeze(-2)

@@ -1,0 +1,94 @@
+"""World points and cameras in, pixels and depths out (OpenCV axes, docs/conventions.md)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+MIN_DEPTH_M = 1e-3
+"""Depth that points at or behind the camera are moved to before the divide, as the authors do."""
+
+
+class Boxes2D(NamedTuple):
+    """2D boxes of objects and whether each object is in the view's frustum."""
+
+    boxes: Float[Tensor, "rooms views objects 4"]
+    in_frustum: Bool[Tensor, "rooms views objects"]
+
+
+def project(
+    points_m: Float[Tensor, "rooms objects points 3"],
+    world_to_camera: Float[Tensor, "rooms views 4 4"],
+    intrinsics: Float[Tensor, "rooms views 3 3"],
+) -> Float[Tensor, "rooms views objects points 3"]:
+    """Project points into every view of their room.
+
+    Args:
+        points_m: World positions in metres.
+        world_to_camera: Rigid transforms, column vectors.
+        intrinsics: Pixels.
+
+    Returns:
+        u and v in pixels and the depth z in metres. Where z is below `MIN_DEPTH_M`, u and v
+        are those of a point at that depth; the depth itself is returned as it is.
+    """
+    rooms, views = world_to_camera.shape[:2]
+    _, objects, points, _ = points_m.shape
+    rotation = intrinsics @ world_to_camera[..., :3, :3]
+    offset = (intrinsics @ world_to_camera[..., :3, 3:]).reshape(rooms, views, 1, 3)
+    flat = points_m.reshape(rooms, 1, objects * points, 3)
+    scaled = flat @ rotation.transpose(-1, -2) + offset
+    depth = scaled[..., 2:]
+    pixels = scaled[..., :2] / depth.clamp(min=MIN_DEPTH_M)
+    return torch.cat([pixels, depth], dim=-1).reshape(rooms, views, objects, points, 3)
+
+
+def boxes_of_points(
+    points_m: Float[Tensor, "rooms objects points 3"],
+    world_to_camera: Float[Tensor, "rooms views 4 4"],
+    intrinsics: Float[Tensor, "rooms views 3 3"],
+    image_size: tuple[int, int],
+) -> Boxes2D:
+    """The 2D box around each object's projected points in every view (paper, section 3.4).
+
+    Args:
+        points_m: Points of each object (mesh vertices or box corners), world metres.
+        world_to_camera: Rigid transforms.
+        intrinsics: Pixels of an image of `image_size`.
+        image_size: (height, width) in pixels.
+
+    Returns:
+        Boxes x1, y1, x2, y2 relative to the image size, clamped to [0, 1]; and `in_frustum`:
+        some point is in front of the camera and the unclamped box meets the image. Outside
+        the frustum the clamped box has no useful gradient; the frustum loss takes over there.
+    """
+    height, width = image_size
+    pixels = project(points_m, world_to_camera, intrinsics)
+    size = pixels.new_tensor([width, height])
+    low = pixels[..., :2].amin(dim=-2) / size
+    high = pixels[..., :2].amax(dim=-2) / size
+    in_front = (pixels[..., 2] > MIN_DEPTH_M).any(dim=-1)
+    meets_image = ((low < 1) & (high > 0)).all(dim=-1)
+    return Boxes2D(torch.cat([low, high], dim=-1).clamp(0, 1), in_front & meets_image)
+
+
+def camera_centers(
+    world_to_camera: Float[Tensor, "*batch 4 4"],
+) -> Float[Tensor, "*batch 3"]:
+    """Where the cameras stand, in world metres."""
+    rotation, translation = world_to_camera[..., :3, :3], world_to_camera[..., :3, 3:]
+    return -(rotation.transpose(-1, -2) @ translation)[..., 0]
+
+
+def pixel_rays(
+    pixels: Float[Tensor, "rooms views objects 2"],
+    world_to_camera: Float[Tensor, "rooms views 4 4"],
+    intrinsics: Float[Tensor, "rooms views 3 3"],
+) -> Float[Tensor, "rooms views objects 3"]:
+    """World directions (not normalised) from each camera through pixels u, v."""
+    focal = intrinsics[..., (0, 1), (0, 1)].unsqueeze(-2)
+    centre = intrinsics[..., :2, 2].unsqueeze(-2)
+    on_plane = (pixels - centre) / focal
+    directions = torch.cat([on_plane, torch.ones_like(on_plane[..., :1])], dim=-1)
+    return directions @ world_to_camera[..., :3, :3]

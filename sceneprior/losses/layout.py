@@ -1,0 +1,96 @@
+"""Class, box, completeness and frustum losses of matched predictions (section 3.4)."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from sceneprior.batches import DecodedScenes, SceneViews
+from sceneprior.geometry.cameras import Boxes2D, camera_centers, pixel_rays
+from sceneprior.losses.matching import Matches
+
+
+def take(values: Tensor, index: Int[Tensor, "rooms objects"], dim: int) -> Tensor:
+    """Reorder predictions (axis `dim`, after a room axis) to the objects they answer for."""
+    shape = [1] * values.dim()
+    shape[0], shape[dim] = index.shape
+    expanded = list(values.shape)
+    expanded[dim] = index.shape[1]
+    return values.gather(dim, index.reshape(shape).expand(expanded))
+
+
+def layout_losses(
+    scenes: DecodedScenes, boxes_2d: Boxes2D, views: SceneViews, matches: Matches
+) -> dict[str, Float[Tensor, ""]]:
+    """The four terms of L_layout, each averaged over the objects it applies to.
+
+    Returns:
+        `class`, `box`, `completeness` and `frustum`; weights are the caller's.
+    """
+    predicted = take(boxes_2d.boxes, matches.prediction, dim=2)
+    inside = take(boxes_2d.in_frustum, matches.prediction, dim=2)
+    centers = take(scenes.centers_m, matches.prediction, dim=1)
+    seen = views.visible & matches.valid.unsqueeze(1)
+    return {
+        "class": class_loss(scenes, views, matches),
+        "box": box_loss(predicted, views.boxes, seen & inside),
+        "completeness": completeness_loss(scenes, views),
+        "frustum": frustum_loss(centers, views, seen & ~inside),
+    }
+
+
+def class_loss(scenes: DecodedScenes, views: SceneViews, matches: Matches) -> Float[Tensor, ""]:
+    """Cross entropy between each object's class and the prediction that answers for it."""
+    logits = take(scenes.class_logits, matches.prediction, dim=1)
+    each = F.cross_entropy(logits.flatten(0, 1), views.object_class.flatten(), reduction="none")
+    return _mean(each, matches.valid.flatten())
+
+
+def box_loss(
+    predicted: Float[Tensor, "rooms views objects 4"],
+    target: Float[Tensor, "rooms views objects 4"],
+    counted: Bool[Tensor, "rooms views objects"],
+) -> Float[Tensor, ""]:
+    """L1 distance of 2D boxes (summed over x1, y1, x2, y2): mean over visible views, then objects.
+
+    The same distance as in the matching cost.
+    """
+    return _mean_of_objects((predicted - target).abs().sum(dim=-1), counted)
+
+
+def completeness_loss(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""]:
+    """Binary cross entropy of the completeness scores: ones for the first n, zeros after."""
+    logits = scenes.completeness_logits
+    counts = views.is_object.sum(dim=-1, keepdim=True)
+    position = torch.arange(logits.shape[1], device=logits.device)
+    return F.binary_cross_entropy_with_logits(logits, (position < counts).to(logits.dtype))
+
+
+def frustum_loss(
+    centers_m: Float[Tensor, "rooms objects 3"],
+    views: SceneViews,
+    counted: Bool[Tensor, "rooms views objects"],
+) -> Float[Tensor, ""]:
+    """1 - cosine between the ray to a prediction and the ray through its object's 2D centre.
+
+    Only views that see the object but not its prediction count (supplement B).
+    """
+    height, width = views.image_size
+    size = views.boxes.new_tensor([width, height])
+    middle = (views.boxes[..., :2] + views.boxes[..., 2:]) / 2 * size
+    target = pixel_rays(middle, views.world_to_camera, views.intrinsics)
+    ray = centers_m.unsqueeze(1) - camera_centers(views.world_to_camera).unsqueeze(2)
+    return _mean_of_objects(1 - F.cosine_similarity(ray, target, dim=-1), counted)
+
+
+def _mean_of_objects(
+    values: Float[Tensor, "rooms views objects"], counted: Bool[Tensor, "rooms views objects"]
+) -> Float[Tensor, ""]:
+    weights = counted.to(values.dtype)
+    per_object = (values * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
+    return _mean(per_object.flatten(), counted.any(dim=1).flatten())
+
+
+def _mean(values: Float[Tensor, " n"], counted: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+    weights = counted.to(values.dtype)
+    return (values * weights).sum() / weights.sum().clamp(min=1)

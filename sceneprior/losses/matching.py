@@ -1,0 +1,76 @@
+"""Which prediction answers for which tracked object: Hungarian matching in 2D (supplement B)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from sceneprior.batches import DecodedScenes, SceneViews
+from sceneprior.geometry.cameras import Boxes2D
+
+
+class Matches(NamedTuple):
+    """One entry a tracked object: the prediction that answers for it."""
+
+    prediction: Int[Tensor, "rooms objects"]
+    """Index of the matched prediction; 0 where `valid` is false."""
+    valid: Bool[Tensor, "rooms objects"]
+    """False for padding and for objects that no drawn view sees."""
+
+
+@torch.no_grad()
+def match_objects(
+    scenes: DecodedScenes, boxes_2d: Boxes2D, views: SceneViews, box_weight: float = 5.0
+) -> Matches:
+    """Find the cheapest one-to-one assignment of predictions to tracked objects.
+
+    cost = -p(class) + box_weight * mean over the object's visible views of |box - box|_1,
+    with 2D boxes relative to the image size. Of a room with n tracked objects only the first
+    n predictions take part. An object seen in none of the drawn views has no cost: it takes a
+    prediction that nobody needs, and the pair counts for nothing.
+
+    Args:
+        scenes: Predictions.
+        boxes_2d: The predictions' 2D boxes in the views.
+        views: What the cameras saw.
+        box_weight: lambda_B.
+
+    Raises:
+        ValueError: a room holds more objects than the prior can generate.
+    """
+    cost = matching_cost(scenes, boxes_2d, views, box_weight)
+    counts = views.is_object.sum(dim=-1)
+    rooms, slots, objects = cost.shape
+    if int(counts.max()) > slots:
+        raise ValueError(
+            f"A room holds {int(counts.max())} tracked objects but the prior generates "
+            f"{slots}; set model.max_objects to at least {int(counts.max())}."
+        )
+    prediction = torch.zeros(rooms, objects, dtype=torch.int64)
+    matrices = cost.cpu().numpy()
+    for room, count in enumerate(counts.tolist()):
+        rows, columns = linear_sum_assignment(matrices[room, :count, :count])
+        prediction[room, torch.from_numpy(columns)] = torch.from_numpy(rows)
+    return Matches(prediction.to(cost.device), views.is_object & views.visible.any(dim=1))
+
+
+def matching_cost(
+    scenes: DecodedScenes, boxes_2d: Boxes2D, views: SceneViews, box_weight: float
+) -> Float[Tensor, "rooms predictions objects"]:
+    """Pairwise costs of all predictions and all tracked objects."""
+    probability = scenes.class_logits.softmax(dim=-1)
+    rooms, slots, _ = probability.shape
+    wanted = views.object_class.unsqueeze(1).expand(-1, slots, -1)
+    cost = -probability.gather(-1, wanted)
+    seen = views.visible.to(cost.dtype)
+    distance = torch.zeros_like(cost)
+    # Coordinate by coordinate: a quarter of the memory of the full pairwise difference.
+    for side in range(4):
+        predicted = boxes_2d.boxes[..., side].unsqueeze(-1)
+        target = views.boxes[..., side].unsqueeze(-2)
+        distance += ((predicted - target).abs() * seen.unsqueeze(-2)).sum(dim=1)
+    distance = distance / seen.sum(dim=1).clamp(min=1).unsqueeze(-2)
+    cost = cost + box_weight * distance
+    return cost * seen.any(dim=1).unsqueeze(-2)

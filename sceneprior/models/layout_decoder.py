@@ -1,0 +1,66 @@
+"""Object features in; classes, axis-aligned boxes and completeness out (equation 5)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+class Layout(NamedTuple):
+    """What the layout decoder says of each object; metres in the room frame."""
+
+    class_logits: Float[Tensor, "rooms objects classes"]
+    centers_m: Float[Tensor, "rooms objects 3"]
+    sizes_m: Float[Tensor, "rooms objects 3"]
+    completeness_logits: Float[Tensor, "rooms objects"]
+
+
+class LayoutDecoder(nn.Module):
+    """MLP1 (shared with the shape decoder), then MLP2.
+
+    Args:
+        width: Size of an object feature.
+        classes: Size of the label set.
+        initial_size_m: Edge of every box before training.
+    """
+
+    def __init__(self, width: int, classes: int, initial_size_m: float = 0.7):
+        super().__init__()
+        hidden = 2 * width
+        self.classes = classes
+        self.mlp1 = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, hidden))
+        self.mlp2 = nn.Sequential(
+            nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, classes + 7)
+        )
+        self._start_at_floor_center(initial_size_m)
+
+    def _start_at_floor_center(self, size_m: float) -> None:
+        # Section 3.4: every object starts at the floor centre. Weights are small rather than
+        # zero, so that objects can part; y starts a little above 0, where ReLU has a slope.
+        last: nn.Linear = self.mlp2[-1]  # type: ignore[assignment]
+        with torch.no_grad():
+            last.weight[self.classes :] *= 0.1
+            last.bias[self.classes :] = 0
+            last.bias[self.classes + 1] = 0.1
+            last.bias[self.classes + 3 : self.classes + 6] = float(
+                torch.log(torch.expm1(torch.tensor(size_m)))
+            )
+
+    def forward(
+        self, features: Float[Tensor, "rooms objects width"]
+    ) -> tuple[Layout, Float[Tensor, "rooms objects hidden"]]:
+        """The layout, and MLP1's output, from which the shape decoder goes on.
+
+        Sizes pass a SoftPlus; the box's lower side is ReLU(y), so c'_y = ReLU(y) + s_y / 2
+        and no object reaches below the floor (supplement A).
+        """
+        shared = self.mlp1(features)
+        out = self.mlp2(shared)
+        logits, center, size, complete = out.split([self.classes, 3, 3, 1], dim=-1)
+        sizes = F.softplus(size)
+        x, y, z = center.unbind(-1)
+        y = F.relu(y) + sizes[..., 1] / 2
+        centers = torch.stack([x, y, z], dim=-1)
+        return Layout(logits, centers, sizes, complete[..., 0]), shared

@@ -1,0 +1,47 @@
+"""Stage 1: learn where objects are and what they are, from 2D boxes alone."""
+
+import lightning
+from torch import Tensor, nn
+
+from sceneprior.batches import SceneViews
+from sceneprior.config import RunConfig
+from sceneprior.models.scene_prior import ScenePrior
+from sceneprior.stages.view_loss import (
+    build_optimizer,
+    check_finite,
+    match_and_score,
+    proxy_points,
+    weighted_sum,
+)
+
+
+class LayoutStage(lightning.LightningModule):
+    """The layout loss of section 3.4, without shape decoding.
+
+    Args:
+        prior: The network; its shape decoder is left alone.
+        latents: One row of logits a training room.
+        config: The run.
+    """
+
+    def __init__(self, prior: ScenePrior, latents: nn.Embedding, config: RunConfig):
+        super().__init__()
+        self.prior = prior
+        self.latents = latents
+        self.config = config
+
+    def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+        scenes = self.prior(self.latents(views.room_index), with_shape=False)
+        points = proxy_points(scenes, self.config.layout.proxy)
+        losses, _ = match_and_score(scenes, points, views, self.config.loss.match_box)
+        total = weighted_sum(losses, self.config.loss)
+        check_finite(total, views)
+        named = {f"train/{name}": loss.detach() for name, loss in losses.items()}
+        named["train/loss"] = total.detach()
+        self.log_dict(
+            named, on_step=False, on_epoch=True, batch_size=len(views.room_index), sync_dist=True
+        )
+        return total
+
+    def configure_optimizers(self) -> dict:
+        return build_optimizer(self.prior, self.latents, self.config.layout)

@@ -1,0 +1,117 @@
+"""A run's folder: what `fit` leaves in it, and the trained prior that tasks take out.
+
+RUN/config.yaml            every setting, defaults included
+RUN/<stage>/last.ckpt      newest checkpoint of the stage: what `--resume` continues from
+RUN/<stage>/final.ckpt     the stage is done
+RUN/<stage>/metrics.csv    one line an epoch; TensorBoard's files lie beside it
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sceneprior.classes import label_set
+from sceneprior.config import RunConfig, load_config
+from sceneprior.errors import InputError
+from sceneprior.models.scene_prior import ScenePrior
+from sceneprior.stages.view_loss import build_latents, build_prior
+
+STAGES = ("layout", "shape")
+
+
+@dataclass(frozen=True)
+class TrainedPrior:
+    """A prior with the latents of the rooms it was trained on, ready for use."""
+
+    prior: ScenePrior
+    logits: Float[Tensor, "rooms anchors"]
+    room_ids: tuple[str, ...]
+    config: RunConfig
+    stage: str
+    checkpoint: Path
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the label set."""
+        return label_set(self.config.label_set)
+
+
+def checkpoint_extra(config: RunConfig, room_ids: tuple[str, ...]) -> dict[str, Any]:
+    """What a checkpoint says of its run beside the weights."""
+    return {"sceneprior": {"room_ids": list(room_ids), "label_set": config.label_set}}
+
+
+def find_checkpoint(run: Path) -> tuple[str, Path]:
+    """The furthest stage's checkpoint: finished before unfinished, shape before layout.
+
+    Raises:
+        InputError: the folder is no run, or nothing was saved in it yet.
+    """
+    if not (run / "config.yaml").is_file():
+        raise InputError(
+            f"{run} is not a run folder (no config.yaml in it); train one with "
+            "`sceneprior fit --config demo.yaml --run RUN`."
+        )
+    for name in ("final.ckpt", "last.ckpt"):
+        for stage in reversed(STAGES):
+            if (run / stage / name).is_file():
+                return stage, run / stage / name
+    raise InputError(
+        f"{run} holds no checkpoint yet; let `sceneprior fit --run {run} --resume` get further."
+    )
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """A checkpoint's contents, tensors and plain data only.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise InputError(
+            f"{path} cannot be read ({type(error).__name__}); it is damaged. Delete it and run "
+            "`sceneprior fit` with `--resume`."
+        ) from None
+
+
+def restore(config: RunConfig, path: Path) -> tuple[ScenePrior, nn.Embedding, tuple[str, ...]]:
+    """Network, latents and room ids of a checkpoint of this config.
+
+    Raises:
+        InputError: the checkpoint is of another network.
+    """
+    saved = read_checkpoint(path)
+    try:
+        room_ids = tuple(saved["sceneprior"]["room_ids"])
+        prior = build_prior(config, len(label_set(config.label_set)))
+        latents = build_latents(config, len(room_ids))
+        holder = nn.ModuleDict({"prior": prior, "latents": latents})
+        holder.load_state_dict(saved["state_dict"])
+    except (KeyError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"{path} does not fit the run's config.yaml ({reason}); use the config it was "
+            "trained with."
+        ) from None
+    return prior, latents, room_ids
+
+
+def load_run(run: Path) -> TrainedPrior:
+    """The trained prior of a run, in evaluation mode.
+
+    Raises:
+        InputError: the folder is no run, or its checkpoint is missing or damaged.
+    """
+    run = Path(run)
+    stage, path = find_checkpoint(run)
+    config = load_config(str(run / "config.yaml"))
+    prior, latents, room_ids = restore(config, path)
+    return TrainedPrior(
+        prior.eval().requires_grad_(False), latents.weight.detach(), room_ids, config, stage, path
+    )

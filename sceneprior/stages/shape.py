@@ -1,0 +1,77 @@
+"""Stage 2: layout and shape together, from 2D boxes and silhouettes."""
+
+import lightning
+import torch
+from torch import Tensor, nn
+
+from sceneprior.batches import DecodedScenes, SceneViews
+from sceneprior.config import RunConfig
+from sceneprior.losses.shape import mask_loss
+from sceneprior.models.scene_prior import ScenePrior
+from sceneprior.silhouettes.render import render_silhouettes
+from sceneprior.stages.view_loss import (
+    build_optimizer,
+    check_finite,
+    match_and_score,
+    proxy_points,
+    weighted_sum,
+)
+
+
+class ShapeStage(lightning.LightningModule):
+    """The layout loss, now of deformed meshes, plus the mask loss (equation 8).
+
+    Args:
+        prior: The network as the layout stage left it.
+        latents: Its latents.
+        config: The run.
+    """
+
+    def __init__(self, prior: ScenePrior, latents: nn.Embedding, config: RunConfig):
+        super().__init__()
+        self.prior = prior
+        self.latents = latents
+        self.config = config
+
+    def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+        scenes = self.prior(self.latents(views.room_index))
+        losses, matches = match_and_score(
+            scenes, self._box_points(scenes), views, self.config.loss.match_box
+        )
+        masks = self._render(scenes, views)
+        losses["mask"], overlap = mask_loss(masks, views, matches, self.config.loss.iou_gate)
+        total = weighted_sum(losses, self.config.loss)
+        check_finite(total, views)
+        named = {f"train/{name}": value.detach() for name, value in (losses | overlap).items()}
+        named["train/loss"] = total.detach()
+        self.log_dict(
+            named, on_step=False, on_epoch=True, batch_size=len(views.room_index), sync_dist=True
+        )
+        return total
+
+    def _box_points(self, scenes: DecodedScenes) -> Tensor:
+        if self.config.shape.box_from == "mesh" and scenes.vertices_m is not None:
+            return scenes.vertices_m
+        return proxy_points(scenes, self.config.shape.proxy)
+
+    def _render(self, scenes: DecodedScenes, views: SceneViews) -> Tensor:
+        # Only the first n predictions of a room answer for objects; the rest would hide them.
+        slots = torch.arange(scenes.centers_m.shape[1], device=scenes.centers_m.device)
+        drawn = slots < views.is_object.sum(dim=-1, keepdim=True)
+        height, width = views.instance_ids.shape[-2:]
+        scale = views.intrinsics.new_tensor(
+            [width / views.image_size[1], height / views.image_size[0], 1]
+        )
+        return render_silhouettes(
+            scenes.vertices_m,
+            self.prior.shape.faces,
+            views.world_to_camera,
+            views.intrinsics * scale[:, None],
+            (height, width),
+            sigma_px2=self.config.shape.sigma_px2,
+            compositing=self.config.shape.compositing,
+            drawn=drawn,
+        )
+
+    def configure_optimizers(self) -> dict:
+        return build_optimizer(self.prior, self.latents, self.config.shape)

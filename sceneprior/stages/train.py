@@ -1,0 +1,180 @@
+"""A config and a run folder in, trained stages out."""
+
+import logging
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from torch import nn
+
+from sceneprior.classes import label_set
+from sceneprior.config import RunConfig, dump_config, load_config
+from sceneprior.data.datamodule import make_loader
+from sceneprior.data.dataset import ViewDataset
+from sceneprior.errors import InputError
+from sceneprior.models.scene_prior import ScenePrior
+from sceneprior.stages.callbacks import RollingCheckpoint, RunProgress
+from sceneprior.stages.layout import LayoutStage
+from sceneprior.stages.runs import STAGES, checkpoint_extra, restore
+from sceneprior.stages.shape import ShapeStage
+from sceneprior.stages.view_loss import build_latents, build_prior
+
+CHECKPOINT_EVERY = 10
+"""Epochs between two writes of last.ckpt."""
+
+
+def fit(
+    config: RunConfig,
+    run: Path,
+    resume: bool = False,
+    loggers: tuple[str, ...] = ("csv", "tensorboard"),
+    trainer_options: dict[str, Any] | None = None,
+) -> None:
+    """Train the layout stage, then the shape stage.
+
+    Args:
+        config: The run's settings.
+        run: Where config, checkpoints and logs go.
+        resume: Continue an interrupted run: finished stages are not trained again.
+        loggers: Of `csv`, `tensorboard`, `wandb`.
+        trainer_options: Passed on to Lightning's Trainer (devices, accelerator, precision).
+
+    Raises:
+        InputError: the run exists and is not resumed, or its settings differ from `config`.
+    """
+    run = Path(run)
+    _open_run(config, run, resume)
+    previous = None
+    for stage in STAGES:
+        final = run / stage / "final.ckpt"
+        if not final.is_file():
+            _fit_stage(stage, config, run, previous, resume, loggers, trainer_options or {})
+        previous = final
+
+
+def _open_run(config: RunConfig, run: Path, resume: bool) -> None:
+    saved = run / "config.yaml"
+    if saved.is_file():
+        if not resume:
+            raise InputError(
+                f"{run} already holds a run; add --resume to continue it, or name another folder."
+            )
+        if load_config(str(saved)) != config:
+            raise InputError(
+                f"{saved} differs from the settings given now; resume with "
+                f"`--config {saved}` or name another folder."
+            )
+    run.mkdir(parents=True, exist_ok=True)
+    dump_config(config, saved)
+
+
+def _fit_stage(
+    stage: str,
+    config: RunConfig,
+    run: Path,
+    previous: Path | None,
+    resume: bool,
+    loggers: tuple[str, ...],
+    trainer_options: dict[str, Any],
+) -> None:
+    settings = getattr(config, stage)
+    dataset = _open_data(stage, config)
+    prior, latents = _start(config, dataset, previous)
+    module = {"layout": LayoutStage, "shape": ShapeStage}[stage](prior, latents, config)
+    folder = run / stage
+    folder.mkdir(exist_ok=True)
+    rolling = RollingCheckpoint(
+        folder, CHECKPOINT_EVERY, checkpoint_extra(config, dataset.room_ids)
+    )
+    _quiet_lightning()
+    lightning.seed_everything(config.seed, verbose=False)
+    trainer = lightning.Trainer(
+        max_epochs=settings.epochs,
+        gradient_clip_val=settings.clip_gradient or None,
+        logger=[_logger(name, folder) for name in loggers],
+        callbacks=[RunProgress(f"fit {stage} (epochs)"), rolling],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        log_every_n_steps=1,
+        **trainer_options,
+    )
+    loader = make_loader(
+        dataset, settings.batch_size, config.seed, config.data.workers,
+        trainer.global_rank, trainer.world_size,
+    )  # fmt: skip
+    last = folder / "last.ckpt"
+    trainer.fit(
+        module, loader, ckpt_path=last if resume and last.is_file() else None, weights_only=True
+    )
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    rolling.write(trainer, "final.ckpt")
+
+
+def _open_data(stage: str, config: RunConfig) -> ViewDataset:
+    data = config.data
+    views = data.views_per_room
+    if stage == "shape" and config.shape.views_per_room:
+        views = config.shape.views_per_room
+    dataset = ViewDataset(
+        Path(data.shards),
+        "train",
+        views_per_room=views,
+        rotations=4 if data.augment_rotations else 1,
+        view_fraction=data.view_fraction,
+        mask_step=data.mask_step if stage == "shape" else None,
+        seed=config.seed,
+    )
+    if dataset.label_set != config.label_set:
+        raise InputError(
+            f"{data.shards} is labelled '{dataset.label_set}' but the config says "
+            f"'{config.label_set}'; set label_set or point data.shards elsewhere."
+        )
+    if dataset.max_objects > config.model.max_objects:
+        raise InputError(
+            f"A room of {data.shards} has {dataset.max_objects} tracked objects but "
+            f"model.max_objects is {config.model.max_objects}; raise it."
+        )
+    return dataset
+
+
+def _start(
+    config: RunConfig, dataset: ViewDataset, previous: Path | None
+) -> tuple[ScenePrior, nn.Embedding]:
+    if previous is None:
+        prior = build_prior(config, len(label_set(config.label_set)))
+        return prior, build_latents(config, len(dataset))
+    prior, latents, room_ids = restore(config, previous)
+    if room_ids != dataset.room_ids:
+        raise InputError(
+            f"{config.data.shards} no longer holds the rooms of {previous}; the shape stage "
+            "needs the shards that the layout stage was trained on."
+        )
+    return prior, latents
+
+
+def _logger(name: str, folder: Path) -> Logger:
+    if name == "csv":
+        return CSVLogger(folder, name="", version="")
+    if name == "tensorboard":
+        return TensorBoardLogger(folder, name="", version="")
+    if name == "wandb":
+        from lightning.pytorch.loggers import WandbLogger
+
+        key = os.environ.get("WANDB_API_KEY") or Path("~/.netrc").expanduser().is_file()
+        return WandbLogger(project="sceneprior", save_dir=folder, name=folder.name, offline=not key)
+    raise InputError(f"No logger '{name}'; choose from csv, tensorboard, wandb.")
+
+
+def _quiet_lightning() -> None:
+    # Its hints (loader workers, litlogger, cores) are for other set-ups than this one.
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module="lightning")
+    torch.set_float32_matmul_precision("high")

@@ -1,0 +1,86 @@
+"""Decoded scenes and what cameras saw in, weighted losses out: the part both stages share."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sceneprior.batches import DecodedScenes, SceneViews
+from sceneprior.config import LossConfig, RunConfig, StageConfig
+from sceneprior.geometry.boxes import box_corners, place
+from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
+from sceneprior.geometry.meshes import icosphere
+from sceneprior.losses.layout import layout_losses
+from sceneprior.losses.matching import Matches, match_objects
+from sceneprior.models.scene_prior import ScenePrior
+
+ELLIPSOID_LEVEL = 2
+"""162 points stand for the ellipsoid; its 2D box differs from the smooth one by under 1%."""
+
+
+def proxy_points(scenes: DecodedScenes, proxy: str) -> Float[Tensor, "rooms objects points 3"]:
+    """Points whose 2D bounds stand for an object that has no mesh yet."""
+    if proxy == "box":
+        return box_corners(scenes.centers_m, scenes.sizes_m)
+    sphere = icosphere(ELLIPSOID_LEVEL)[0].to(scenes.centers_m)
+    return place(
+        sphere.expand(*scenes.centers_m.shape[:2], -1, -1), scenes.centers_m, scenes.sizes_m
+    )
+
+
+def match_and_score(
+    scenes: DecodedScenes,
+    points_m: Float[Tensor, "rooms objects points 3"],
+    views: SceneViews,
+    match_box: float,
+) -> tuple[dict[str, Float[Tensor, ""]], Matches]:
+    """Match predictions to tracked objects by their 2D boxes and take the layout losses."""
+    boxes: Boxes2D = boxes_of_points(
+        points_m, views.world_to_camera, views.intrinsics, views.image_size
+    )
+    matches = match_objects(scenes, boxes, views, match_box)
+    return layout_losses(scenes, boxes, views, matches), matches
+
+
+def weighted_sum(losses: dict[str, Tensor], weights: LossConfig) -> Float[Tensor, ""]:
+    """The total that is minimised."""
+    by_name = weights.model_dump(by_alias=True)
+    return torch.stack([by_name[name] * loss for name, loss in losses.items()]).sum()
+
+
+def check_finite(total: Tensor, views: SceneViews) -> None:
+    """Stop at the first loss that is not a number, and name the rooms that made it.
+
+    Raises:
+        FloatingPointError: the loss is NaN or infinite.
+    """
+    if not torch.isfinite(total):
+        raise FloatingPointError(
+            f"The loss is {float(total)} on rooms {', '.join(views.room_ids)}; lower the learning "
+            "rate, or look at these rooms with `sceneprior inspect`."
+        )
+
+
+def build_prior(config: RunConfig, classes: int) -> ScenePrior:
+    """The network a config describes, freshly initialised from its seed."""
+    torch.manual_seed(config.seed)
+    return ScenePrior(classes=classes, seed=config.seed, **config.model.model_dump())
+
+
+def build_latents(config: RunConfig, rooms: int) -> nn.Embedding:
+    """One row of latent logits a training room, drawn from N(0, 1)."""
+    generator = torch.Generator().manual_seed(config.seed + 1)
+    logits = torch.randn(rooms, config.model.anchors, generator=generator)
+    return nn.Embedding.from_pretrained(logits, freeze=False)
+
+
+def build_optimizer(prior: ScenePrior, latents: nn.Embedding, stage: StageConfig) -> dict:
+    """Adam with the stage's milestones, in the shape Lightning takes."""
+    groups = [
+        {"params": list(prior.parameters()), "lr": stage.learning_rate},
+        {"params": list(latents.parameters()), "lr": stage.latent_learning_rate},
+    ]
+    optimizer = torch.optim.Adam(groups, fused=True)
+    schedule = torch.optim.lr_scheduler.MultiStepLR(
+        optimizer, list(stage.milestones), gamma=stage.decay
+    )
+    return {"optimizer": optimizer, "lr_scheduler": schedule}

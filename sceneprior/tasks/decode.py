@@ -1,0 +1,70 @@
+"""Decoded batches in, single `Scene`s out; latents of training rooms and new ones."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneprior.batches import DecodedScenes
+from sceneprior.classes import label_set
+from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.stages.runs import TrainedPrior
+from sceneprior.tasks.sampling import sample_logits
+
+BATCH = 64
+
+
+def to_scenes(
+    decoded: DecodedScenes, faces: Tensor, label_set_name: str, names: list[str]
+) -> list[Scene]:
+    """Objects up to the first whose completeness falls to 0.5; their likeliest classes.
+
+    `void` is a class like any other to the network, but no furniture: such objects are left out.
+    """
+    classes = label_set(label_set_name)
+    kept = (decoded.completeness_logits > 0).long().cumprod(dim=1).bool()
+    labels = decoded.class_logits.argmax(dim=-1)
+    corners = faces.cpu().numpy()
+    scenes = []
+    for room, name in enumerate(names):
+        objects = []
+        for item in kept[room].nonzero()[:, 0].tolist():
+            label = classes[int(labels[room, item])]
+            if label == "void":
+                continue
+            mesh = None
+            if decoded.vertices_m is not None:
+                mesh = Mesh(decoded.vertices_m[room, item].cpu().numpy(), corners)
+            center = tuple(decoded.centers_m[room, item].tolist())
+            size = tuple(decoded.sizes_m[room, item].tolist())
+            objects.append(SceneObject(label, center, size, mesh))
+        scenes.append(Scene(name, label_set_name, tuple(objects)))
+    return scenes
+
+
+@torch.no_grad()
+def decode_latents(
+    trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: list[str]
+) -> list[Scene]:
+    """Scenes of points on the hypersphere; meshes once the shape stage has begun."""
+    scenes: list[Scene] = []
+    for start in range(0, len(z), BATCH):
+        part = slice(start, start + BATCH)
+        decoded = trained.prior.decode(z[part], with_shape=trained.stage == "shape")
+        scenes += to_scenes(
+            decoded, trained.prior.shape.faces, trained.config.label_set, names[part]
+        )
+    return scenes
+
+
+def decode_training_rooms(trained: TrainedPrior, limit: int | None = None) -> list[Scene]:
+    """The training rooms as the prior remembers them, named by their ids."""
+    z = trained.prior.sphere(trained.logits[:limit])
+    return decode_latents(trained, z, list(trained.room_ids[:limit]))
+
+
+def synthesize(trained: TrainedPrior, count: int, seed: int, law: str | None = None) -> list[Scene]:
+    """New scenes: latents sampled from the hypersphere, decoded."""
+    law = law or trained.config.sampling.law
+    logits = sample_logits(trained.logits, count, seed, law)
+    names = [f"seed{seed}_{index:04d}" for index in range(count)]
+    return decode_latents(trained, trained.prior.sphere(logits), names)

@@ -1,0 +1,210 @@
+"""Scenes to files (JSON, GLB, PNG) and back: a `Scene` in, a folder of them out, or reversed."""
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+from rich.console import Console
+from rich.progress import Progress
+
+from sceneprior.errors import InputError
+from sceneprior.evaluation.topdown import object_colors, scene_meshes, topdown
+from sceneprior.offscreen import Renderer
+from sceneprior.scene import FORMAT, Mesh, Scene, read_scene, scene_to_json
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> None:
+    """Write `<name>.glb`, `<name>.png` and `<name>.json`, each whole or not at all.
+
+    The JSON comes last: where it lies, the other two lie beside it. Axes and unit of the GLB
+    are the room frame's (y up, metres); it holds one node per object, called
+    `<index>_<class>`, in the class colour. An object without a mesh is written as its box.
+    The PNG looks straight down; it is what scores compare, with borders between objects.
+
+    Args:
+        scene: The room.
+        folder: Made if it does not exist.
+        name: File name without ending.
+        renderer: From `sceneprior.offscreen.open_renderer`; draws the PNG.
+
+    Raises:
+        InputError: `name` is empty or holds a path separator.
+    """
+    if not name or Path(name).name != name:
+        raise InputError(f"'{name}' cannot name a scene's files; use a plain name such as room_0.")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    picture = Image.fromarray(topdown(scene, renderer, outlines=True))
+    text = json.dumps(scene_to_json(scene), indent=1) + "\n"
+    _write_whole(folder / f"{name}.glb", lambda path: path.write_bytes(scene_to_glb(scene)))
+    _write_whole(folder / f"{name}.png", lambda path: picture.save(path, format="PNG"))
+    _write_whole(folder / f"{name}.json", lambda path: path.write_text(text))
+
+
+def write_scenes(
+    scenes: Sequence[Scene], folder: Path, renderer: Renderer, overwrite: bool = False
+) -> None:
+    """Write scenes to a folder, each under its own name.
+
+    Raises:
+        InputError: the folder holds something and `overwrite` is false.
+    """
+    folder = Path(folder)
+    if not overwrite and folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder} is not empty; add --overwrite or name another folder.")
+    with Progress(console=Console(stderr=True)) as progress:
+        for scene in progress.track(scenes, description="Writing scenes"):
+            write_scene(scene, folder, scene.name, renderer)
+
+
+def _write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    temporary = path.with_name(path.name + ".part")
+    try:
+        write(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def scene_to_glb(scene: Scene) -> bytes:
+    """The scene as binary glTF 2.0: a named node, mesh and material per object; no cameras."""
+    import trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    room = trimesh.Scene(base_frame="room")
+    for index, (item, mesh, color) in enumerate(
+        zip(scene.objects, scene_meshes(scene), object_colors(scene), strict=True)
+    ):
+        node = f"{index}_{item.label}"
+        material = PBRMaterial(
+            name=item.label,
+            baseColorFactor=_linear_rgba(color),
+            metallicFactor=0.0,
+            roughnessFactor=0.9,
+            # A learned mesh may fold over itself; its back should not be a hole.
+            doubleSided=True,
+        )
+        room.add_geometry(
+            trimesh.Trimesh(
+                np.asarray(mesh.vertices_m, dtype=np.float64),
+                np.asarray(mesh.faces, dtype=np.int64),
+                process=False,
+                visual=TextureVisuals(material=material),
+            ),
+            node_name=node,
+            geom_name=node,
+        )
+    if not scene.objects:
+        return _empty_glb()
+    # Without normals viewers shade each triangle flat: boxes keep their edges.
+    return bytes(room.export(file_type="glb", include_normals=False))
+
+
+def _linear_rgba(color: np.ndarray) -> list[float]:
+    # glTF wants base colours in linear light, class colours are sRGB.
+    srgb = color / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return [*(float(value) for value in linear), 1.0]
+
+
+def _empty_glb() -> bytes:
+    # trimesh refuses to export a scene without geometry; an empty room is still a room.
+    text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{}]}).encode()
+    text += b" " * (-len(text) % 4)
+    header = np.array([0x46546C67, 2, 20 + len(text), len(text), 0x4E4F534A], dtype="<u4")
+    return header.tobytes() + text
+
+
+def read_glb_meshes(path: Path) -> dict[str, Mesh]:
+    """The meshes of a GLB by node name, vertices in the room frame in metres.
+
+    Raises:
+        InputError: the file is missing or not a GLB.
+    """
+    import trimesh
+
+    try:
+        # process=False keeps vertices and faces as they were written.
+        loaded = trimesh.load_scene(Path(path), file_type="glb", process=False)
+        return {node: _node_mesh(loaded, node) for node in loaded.graph.nodes_geometry}
+    except Exception as error:  # what trimesh raises depends on which byte is damaged
+        raise InputError(
+            f"{path} cannot be read as a GLB ({type(error).__name__}: {error}); write the scene "
+            "again with `sceneprior synthesize`, or delete the file to use the boxes alone."
+        ) from None
+
+
+def _node_mesh(loaded: "trimesh.Scene", node: str) -> Mesh:
+    transform, name = loaded.graph[node]
+    mesh = loaded.geometry[name]
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    return Mesh(vertices @ transform[:3, :3].T + transform[:3, 3], np.asarray(mesh.faces))
+
+
+def load_scene(path: Path) -> Scene:
+    """A scene's JSON, with the meshes of the GLB of the same name where it lies beside.
+
+    Raises:
+        InputError: the JSON is not a scene, or the GLB belongs to another one.
+    """
+    path = Path(path)
+    scene = read_scene(path)
+    glb = path.with_suffix(".glb")
+    if not glb.is_file() or not scene.objects:
+        return scene
+    meshes = read_glb_meshes(glb)
+    wanted = [f"{index}_{item.label}" for index, item in enumerate(scene.objects)]
+    if set(meshes) != set(wanted):
+        strange = sorted(set(meshes) ^ set(wanted))
+        raise InputError(
+            f"{glb.name} and {path.name} describe different objects (only in one of them: "
+            f"{', '.join(strange[:4])}); write both again with `sceneprior synthesize`."
+        )
+    objects = tuple(
+        replace(item, mesh=meshes[node]) for node, item in zip(wanted, scene.objects, strict=True)
+    )
+    return replace(scene, objects=objects)
+
+
+def load_scene_folder(folder: Path) -> list[Scene]:
+    """Every scene of a folder, by name with numbers in counting order (room_2 before room_10).
+
+    JSON files of other formats (scores, say) are passed over; a damaged one is an error.
+
+    Raises:
+        InputError: the folder is missing, holds no scene, or a file in it is damaged.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"No folder of scenes at {folder}; `sceneprior synthesize` writes one.")
+    paths = sorted(folder.glob("*.json"), key=_counting_order)
+    scenes = [load_scene(path) for path in paths if _says_scene(path)]
+    if not scenes:
+        raise InputError(
+            f"{folder} holds no scene JSON; `sceneprior synthesize` writes them, and "
+            "docs/conventions.md describes the format."
+        )
+    return scenes
+
+
+def _counting_order(path: Path) -> list[str]:
+    # Numbers padded with zeros compare like numbers.
+    parts = re.split(r"(\d+)", path.stem)
+    return [part.zfill(20) if part.isdigit() else part for part in parts]
+
+
+def _says_scene(path: Path) -> bool:
+    try:
+        data = json.loads(path.read_text())
+    except ValueError:
+        return True  # read_scene says what is wrong with it
+    return isinstance(data, dict) and data.get("format") == FORMAT

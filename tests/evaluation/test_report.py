@@ -1,0 +1,151 @@
+"""The page stands alone: nothing outside itself, nothing of a machine, all it promises."""
+
+import base64
+import io
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneprior.classes import class_colors
+from sceneprior.evaluation.protocol import evaluate_synthesis
+from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.report import UNFOLDING_SHOWN, _spread, write_report
+from sceneprior.evaluation.report_pictures import curves_svg, input_views, legend, room_pictures
+from sceneprior.scene import Scene, SceneObject
+
+
+@pytest.fixture(scope="module")
+def generated(shards) -> list[Scene]:
+    scenes = reference_scenes(shards, "train", limit=4)
+    return [replace(scene.without_meshes(), floor_m=None) for scene in scenes]
+
+
+@pytest.fixture(scope="module")
+def page(shards, renderer, generated, tmp_path_factory) -> str:
+    path = tmp_path_factory.mktemp("report") / "new" / "report.html"
+    truth = reference_scenes(shards, "train", limit=2, tracked_only=True)
+    scores = evaluate_synthesis(generated, shards, renderer=renderer)
+    scores |= {"class_accuracy": 0.991, "box_iou_3d": 0.74, "seconds": 600.0}
+    write_report(
+        path,
+        title="Bedrooms <new> & real",
+        shards=shards,
+        run=path.parent / "my_run",
+        generated=generated,
+        scores=scores,
+        commands=["sceneprior synthesize --run RUN -n 16", "make demo && echo '<done>'"],
+        curves={"layout/box": [(step, 1 / (1 + step)) for step in range(1000)], "nothing": []},
+        decoded=[(generated[0], truth[0]), (generated[1], truth[1])],
+        unfolding=generated,
+        renderer=renderer,
+    )
+    assert [item.name for item in path.parent.iterdir()] == ["report.html"]
+    assert path.stat().st_size < 8e6
+    return path.read_text(encoding="utf-8")
+
+
+class Tags(HTMLParser):
+    """Every opened tag with its attributes, and a check that all are closed in order."""
+
+    EMPTY = ("meta", "img", "br")
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.tags: list[tuple[str, dict]] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in self.EMPTY:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_needs_nothing_outside_itself(page, shards):
+    assert not re.search(r"https?:", page)
+    parsed = Tags(page)
+    assert parsed.open == []
+    kinds = {tag for tag, _ in parsed.tags}
+    assert not kinds & {"script", "link", "iframe", "object"}
+    pictures = [attrs for tag, attrs in parsed.tags if tag == "img"]
+    assert all(attrs["src"].startswith("data:image/") and attrs["alt"] for attrs in pictures)
+    assert "url(" not in page and "@import" not in page
+    assert str(shards.parent) not in page
+    assert "my_run" in page and shards.name in page
+
+
+def test_every_part_is_there(page):
+    for heading in (
+        "New rooms beside real ones", "The sphere unfolding", "Scores", "What training saw",
+        "Training rooms, read back in 3D", "Learning curves", "The commands that made this",
+    ):  # fmt: skip
+        assert f"<h2>{heading}</h2>" in page
+    # 4 generated, 4 unfolding, 5 test rooms and 2 pairs, each drawn twice, 6 views, 1 of curves.
+    assert page.count("<img") == 2 * (4 + 4 + 5 + 2 * 2) + 6 + 1
+    assert "99.1%" in page and "10.0 min" in page and "not FID" in page
+    assert "can be compared with the paper" in page
+    assert "100% of 2 classes right, mean 3D box IoU 1.00" in page
+
+
+def test_text_is_escaped(page):
+    assert "Bedrooms &lt;new&gt; &amp; real" in page
+    assert "&#39;&lt;done&gt;&#39;" in page
+
+
+def test_parts_without_material_are_left_out(shards, renderer, tmp_path):
+    write_report(
+        tmp_path / "a.html", title="Bare", shards=shards, run="run", generated=[], scores={},
+        commands=[], curves={}, decoded=[], unfolding=[], renderer=renderer,
+    )  # fmt: skip
+    page = (tmp_path / "a.html").read_text()
+    assert re.findall("<h2>(.*)</h2>", page) == ["What training saw"]
+
+
+def decode(uri: str) -> np.ndarray:
+    content = base64.b64decode(uri.split(",", 1)[1])
+    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))
+
+
+def test_input_views_show_masks_in_class_colours_inside_their_boxes(shards):
+    views = input_views(shards, rooms=2, views_per_room=1)
+    assert [caption for caption, _ in views] == [
+        "house/train_0, view 0: 2 objects",
+        "house/train_1, view 0: 2 objects",
+    ]
+    image = decode(views[0][1])
+    desk, bed = class_colors(22)[[8, 9]]
+    assert image.shape == (60, 80, 3)
+    np.testing.assert_allclose(image[36, 20], desk, atol=4)  # quantised to 128 colours
+    np.testing.assert_allclose(image[46, 55], bed, atol=4)
+    # The box's line lies on the mask's own outermost pixels, darker.
+    np.testing.assert_allclose(image[30, 10], desk * 0.55, atol=4)
+    np.testing.assert_allclose(image[30, 9], (244, 245, 247), atol=4)
+
+
+def test_room_pictures_count_in_words(renderer):
+    stool = SceneObject("stool", (0.0, 0.2, 0.0), (0.4, 0.4, 0.4))
+    bed = SceneObject("double_bed", (1.0, 0.3, 1.0), (1.8, 0.6, 2.0))
+    room = Scene("a", "front3d_bedroom", (stool, bed, stool))
+    assert room_pictures(room, renderer).contents == "double bed, stool ×2"
+    assert room_pictures(replace(room, objects=()), renderer).contents == "nothing"
+    assert [name for name, _ in legend([room])] == ["double bed", "stool"]
+    assert legend([room])[0][1] == "#" + bytes(class_colors(22)[9].tolist()).hex()
+
+
+def test_curves_survive_nan_one_point_and_repeat_exactly():
+    curves = {"a": [(0, 1.0), (1, float("nan")), (2, 100.0)], "b": [(5, 0.0)], "c": []}
+    assert curves_svg(curves) == curves_svg(curves)
+    assert curves_svg(curves).startswith("data:image/svg+xml;base64,")
+
+
+def test_long_walks_are_thinned_with_both_ends_kept():
+    assert _spread(list(range(17)), UNFOLDING_SHOWN) == [0, 2, 4, 6, 8, 10, 12, 14, 16]
+    assert _spread([1, 2], UNFOLDING_SHOWN) == [1, 2]
+    assert _spread([], UNFOLDING_SHOWN) == []

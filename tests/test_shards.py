@@ -1,0 +1,163 @@
+"""The shard format: what is written is read, whole or not at all, and damage is one sentence."""
+
+from dataclasses import fields, replace
+
+import h5py
+import numpy as np
+import pytest
+
+from sceneprior.errors import ShardError
+from sceneprior.shards import (
+    RoomGroundTruth,
+    RoomViews,
+    Shard,
+    iterate_rooms,
+    list_shards,
+    read_index,
+    write_shard,
+)
+
+
+def make_room(room_id="house_A", views=3, objects=2, size=(12, 16), seed=0):
+    rng = np.random.default_rng(seed)
+    visible = rng.random((views, objects)) < 0.7
+    return RoomViews(
+        room_id=room_id,
+        object_class=rng.integers(1, 22, objects).astype(np.int16),
+        world_to_camera=rng.normal(size=(views, 4, 4)).astype(np.float32),
+        intrinsics=rng.normal(size=(views, 3, 3)).astype(np.float32),
+        boxes=rng.random((views, objects, 4)).astype(np.float32) * visible[..., None],
+        visible=visible,
+        mask_pixels=(rng.integers(25, 99, (views, objects)) * visible).astype(np.int32),
+        instance_ids=rng.integers(0, objects + 1, (views, *size)).astype(np.uint8),
+        image_size=size,
+    )
+
+
+def make_truth(objects=3, seed=0):
+    rng = np.random.default_rng(seed)
+    return RoomGroundTruth(
+        object_class=rng.integers(1, 22, objects).astype(np.int16),
+        centers_m=rng.normal(size=(objects, 3)).astype(np.float32),
+        sizes_m=rng.random((objects, 3)).astype(np.float32),
+        yaw_rad=rng.normal(size=objects).astype(np.float32),
+        model_ids=tuple(f"model-{k}" for k in range(objects)),
+        model_to_room=rng.normal(size=(objects, 4, 4)).astype(np.float32),
+        floor_m=rng.normal(size=(6, 2)).astype(np.float32),
+        height_m=2.7,
+    )
+
+
+def assert_same(one, other):
+    for item in fields(one):
+        left, right = getattr(one, item.name), getattr(other, item.name)
+        if isinstance(left, np.ndarray):
+            np.testing.assert_array_equal(left, right)
+            assert left.dtype == right.dtype, item.name
+        else:
+            assert left == right, item.name
+
+
+def test_round_trip(tmp_path):
+    path = tmp_path / "train" / "a.h5"
+    rooms = [(make_room("h/1", seed=1), make_truth(seed=1)), (make_room("h_2", 5, 3), None)]
+    write_shard(path, "front3d_bedroom", rooms)
+    with Shard(path) as shard:
+        assert shard.label_set == "front3d_bedroom"
+        assert sorted(shard.room_ids) == ["h/1", "h_2"]
+        for views, _ in rooms:
+            assert_same(views, shard.read_room(views.room_id, images=True))
+            assert shard.read_room(views.room_id).instance_ids is None
+        assert_same(rooms[0][1], shard.read_ground_truth("h/1"))
+        with pytest.raises(ShardError, match="room h_2 carries no 3D ground truth"):
+            shard.read_ground_truth("h_2")
+    assert {room_id for _, room_id in iterate_rooms(tmp_path, "train")} == {"h/1", "h_2"}
+
+
+def test_small_images_are_every_nth_pixel_from_the_middle_of_a_block(tmp_path):
+    room = make_room(views=4)
+    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, None)])
+    with Shard(tmp_path / "a.h5") as shard:
+        small = shard.read_instance_ids("house_A", [2, 0], step=4)
+    np.testing.assert_array_equal(small, room.instance_ids[[2, 0], 2::4, 2::4])
+
+
+def test_same_rooms_same_bytes(tmp_path):
+    for name in ("a.h5", "b.h5"):
+        write_shard(tmp_path / name, "front3d_bedroom", [(make_room(), make_truth())])
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("boxes", np.zeros((3, 1, 4), np.float32), r"house_A: boxes has shape \(3, 1, 4\), expect"),
+        ("instance_ids", np.zeros((2, 12, 16), np.uint8), "instance_ids has shape"),
+        ("instance_ids", np.full((3, 12, 16), 3, np.uint8), r"instance id is 3, but .* 2 objects"),
+        ("instance_ids", None, "instance_ids has shape None"),
+    ],
+)
+def test_rooms_that_disagree_with_themselves_write_nothing(tmp_path, name, value, message):
+    room = replace(make_room(), **{name: value})
+    with pytest.raises(ShardError, match=message):
+        write_shard(tmp_path / "a.h5", "front3d_bedroom", [(make_room("ok"), None), (room, None)])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failure_midway_leaves_nothing(tmp_path, monkeypatch):
+    def full_disk(*_):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("sceneprior.shards._write_room", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        write_shard(tmp_path / "a.h5", "front3d_bedroom", [(make_room(), None)])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("keep", [0, 100, 0.5, 0.9])
+def test_truncated_shards_are_one_sentence(tmp_path, keep):
+    path = tmp_path / "a.h5"
+    write_shard(path, "front3d_bedroom", [(make_room(size=(120, 160)), make_truth())])
+    data = path.read_bytes()
+    path.write_bytes(data[: int(keep * len(data)) if keep < 1 else keep])
+    with pytest.raises(ShardError, match=r"the file is damaged\. Delete it and run the same"):
+        Shard(path)
+
+
+def test_damaged_pixels_name_the_room(tmp_path):
+    path = tmp_path / "a.h5"
+    write_shard(path, "front3d_bedroom", [(make_room(size=(120, 160)), make_truth())])
+    with h5py.File(path) as file:
+        chunk = file["rooms/house_A/instance_ids"].id.get_chunk_info(1)
+    data = bytearray(path.read_bytes())
+    data[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
+    path.write_bytes(data)
+    with Shard(path) as shard:
+        shard.read_room("house_A")
+        shard.read_instance_ids("house_A", [0])
+        with pytest.raises(ShardError, match=r"a\.h5, room house_A cannot be read"):
+            shard.read_instance_ids("house_A", [1])
+
+
+def test_other_formats_and_missing_files(tmp_path):
+    with pytest.raises(ShardError, match="No shard at"):
+        Shard(tmp_path / "none.h5")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file.attrs["format"] = "something"
+    with pytest.raises(ShardError, match="says format 'something' version None, expected"):
+        Shard(tmp_path / "other.h5")
+    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(make_room(), None)])
+    with Shard(tmp_path / "a.h5") as shard, pytest.raises(ShardError, match="room house_Z"):
+        shard.read_room("house_Z")
+
+
+def test_folders(tmp_path):
+    with pytest.raises(ShardError, match="No folder of shards at"):
+        list_shards(tmp_path / "none", "train")
+    with pytest.raises(ShardError, match=r"The 'test' split of .* holds no shards"):
+        list_shards(tmp_path, "test")
+    with pytest.raises(ShardError, match=r"has no index\.json; it is not a finished folder"):
+        read_index(tmp_path)
+    (tmp_path / "index.json").write_text('{"a"')
+    with pytest.raises(ShardError, match="is not JSON"):
+        read_index(tmp_path)
