@@ -230,8 +230,13 @@ def _survey(
 
 
 def _nothing_left(job: FrontJob, lines: list[_Line]) -> str:
-    reasons = Counter(re.sub(r"[\d.]+", "#", line.reason) for line in lines)
-    often = f"; most often: {reasons.most_common(1)[0][0]}" if reasons else ""
+    # Reasons that differ only in their numbers are one; the first stands for all.
+    shapes = Counter(re.sub(r"[\d.]+", "#", line.reason) for line in lines)
+    often = ""
+    if shapes:
+        shape = shapes.most_common(1)[0][0]
+        often = next(x.reason for x in lines if re.sub(r"[\d.]+", "#", x.reason) == shape)
+        often = f"; most often as here: {often.rstrip('.')}"
     where = f" for --only {job.only}" if job.only else ""
     return (
         f"No room of {job.front} passes the recipe {job.recipe.name}{where} "

@@ -5,16 +5,14 @@ from typing import Annotated
 
 import typer
 
+from data_prep.homes.command import make_homes_command
+
 
 def add_commands(app: typer.Typer) -> None:
     """Mount prep-front, inspect and make-homes."""
+    app.command("make-homes")(make_homes_command)
     app.command("prep-front")(prep_front)
     app.command("inspect")(inspect)
-    try:
-        from data_prep.homes.command import make_homes_command
-    except ModuleNotFoundError:
-        return
-    app.command("make-homes")(make_homes_command)
 
 
 def prep_front(

@@ -46,6 +46,7 @@ def prepare_room(
             boxes=seen.boxes,
             visible=seen.visible,
             mask_pixels=seen.mask_pixels,
+            sides_clear=seen.sides_clear,
             instance_ids=seen.instance_ids,
             image_size=recipe.views.image_size,
         ),

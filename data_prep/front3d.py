@@ -125,11 +125,11 @@ def house_files(folder: Path) -> list[Path]:
         )
     if (folder / "model_info.json").exists():
         raise InputError(f"{folder} holds furniture models, not houses; give it as --future.")
-    files = sorted(folder.glob("*.json"))
+    inside = folder / "3D-FRONT"
+    files = [] if inside.is_dir() else sorted(folder.glob("*.json"))
     if not files:
-        inside = folder / "3D-FRONT"
-        hint = f"; did you mean {inside}" if inside.is_dir() else ""
-        raise InputError(f"{folder} holds no house JSONs (<uid>.json){hint}.")
+        hint = f"; did you mean {inside}?" if inside.is_dir() else "."
+        raise InputError(f"{folder} holds no house JSONs (<uid>.json){hint}")
     return files
 
 

@@ -8,6 +8,9 @@ from scipy import ndimage
 MIN_BOX_SIDE_PX = 4
 """A mask whose box is this narrow, or narrower, is not visible in that view."""
 
+TOUCH_PX = 4
+"""Another object this near to the outermost pixels of a mask may be what cuts it off there."""
+
 
 @dataclass(frozen=True)
 class Observations:
@@ -23,6 +26,9 @@ class Observations:
     """(T, n) bool."""
     mask_pixels: np.ndarray
     """(T, n) int32, 0 where not visible."""
+    sides_clear: np.ndarray
+    """(T, n, 4) bool: no other object touches the mask at the left, upper, right, lower side of
+    its box. A side that is not clear may belong to what stands in front."""
 
 
 def pixel_counts(image: np.ndarray, count: int) -> np.ndarray:
@@ -47,6 +53,7 @@ def observe(images: np.ndarray, is_object: np.ndarray) -> Observations:
     boxes = np.zeros((views, meshes, 4), dtype=np.float32)
     visible = np.zeros((views, meshes), dtype=bool)
     pixels = np.zeros((views, meshes), dtype=np.int32)
+    clear = np.zeros((views, meshes, 4), dtype=bool)
     for view, image in enumerate(images):
         counts = pixel_counts(image, meshes)
         for k, found in enumerate(ndimage.find_objects(image, max_label=meshes)):
@@ -63,9 +70,48 @@ def observe(images: np.ndarray, is_object: np.ndarray) -> Observations:
                 columns.stop / width,
                 rows.stop / height,
             )
+            clear[view, k] = clear_sides(image, k + 1, rows, columns)
     tracked = np.flatnonzero(visible.any(axis=0))
     number = np.zeros(meshes + 1, dtype=np.uint8 if len(tracked) <= 255 else np.uint16)
     number[tracked + 1] = np.arange(1, len(tracked) + 1)
     return Observations(
-        tracked, number[images], boxes[:, tracked], visible[:, tracked], pixels[:, tracked]
+        tracked=tracked,
+        instance_ids=number[images],
+        boxes=boxes[:, tracked],
+        visible=visible[:, tracked],
+        mask_pixels=pixels[:, tracked],
+        sides_clear=clear[:, tracked],
     )
+
+
+def clear_sides(
+    image: np.ndarray, number: int, rows: slice, columns: slice
+) -> tuple[bool, bool, bool, bool]:
+    """Whether nothing else touches a mask at the left, upper, right, lower side of its box.
+
+    Args:
+        image: (H, W) instance ids.
+        number: The mask's id.
+        rows, columns: Its box.
+    """
+    top, left = max(rows.start - TOUCH_PX, 0), max(columns.start - TOUCH_PX, 0)
+    around = image[top : rows.stop + TOUCH_PX, left : columns.stop + TOUCH_PX]
+    mine = around == number
+    other = (around != 0) & ~mine
+    return (
+        _clear(mine.T, other.T, columns.start - left, -1),
+        _clear(mine, other, rows.start - top, -1),
+        _clear(mine.T, other.T, columns.stop - 1 - left, 1),
+        _clear(mine, other, rows.stop - 1 - top, 1),
+    )
+
+
+def _clear(mine: np.ndarray, other: np.ndarray, last: int, outwards: int) -> bool:
+    """The same for one side: `last` is the outermost line of the mask along the first axis."""
+    if outwards < 0:
+        rim, around = slice(last, last + 3), slice(max(last - TOUCH_PX, 0), last + 3)
+    else:
+        inner = max(last - 2, 0)
+        rim, around = slice(inner, last + 1), slice(inner, last + 1 + TOUCH_PX)
+    places = np.flatnonzero(mine[rim].any(axis=0))
+    return not other[around, max(places[0] - TOUCH_PX, 0) : places[-1] + 1 + TOUCH_PX].any()

@@ -1,4 +1,4 @@
-"""The two nouns learning meets at: what cameras saw (`SceneViews`), what was decoded (`DecodedScenes`)."""
+"""Two nouns that learning meets at: `SceneViews` (what cameras saw) and `DecodedScenes`."""
 
 from dataclasses import dataclass, fields
 
@@ -26,6 +26,8 @@ class SceneViews:
     boxes: Float[Tensor, "rooms views objects 4"]
     """x1, y1, x2, y2 of the visible mask, relative to the image size, in [0, 1]."""
     visible: Bool[Tensor, "rooms views objects"]
+    sides_clear: Bool[Tensor, "rooms views objects 4"]
+    """Which sides of a box are the object's own; another object touches the mask at the rest."""
     image_size: tuple[int, int]
     """Height and width in pixels that `intrinsics` refer to."""
     instance_ids: Int[Tensor, "rooms views height width"] | None = None

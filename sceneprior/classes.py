@@ -1,4 +1,4 @@
-"""Label sets: the class names a prior distinguishes, in the paper's order, and a colour for each."""
+"""Label sets: the class names a prior distinguishes, in the paper's order, and their colours."""
 
 import colorsys
 

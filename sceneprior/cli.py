@@ -1,4 +1,4 @@
-"""The `sceneprior` command. Every verb imports what it needs when it is called, so help is instant."""
+"""The `sceneprior` command. A verb imports what it needs when called, so help is instant."""
 
 import os
 import sys
@@ -54,7 +54,7 @@ def fit(
         list[str] | None, typer.Option("--set", help="Override: model.width=256. Repeatable.")
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with an interrupted run.")
+        bool, typer.Option("--resume", help="Go on with a stopped run.")
     ] = False,
     logger: Annotated[
         list[str] | None, typer.Option(help="csv, tensorboard, wandb. Repeatable.")

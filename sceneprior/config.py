@@ -75,6 +75,9 @@ class LossConfig(_Section):
     """lambda_S."""
     match_box: float = Field(5.0, ge=0)
     """lambda_B of the matching cost."""
+    hidden_sides: Literal["count", "at_least"] = "count"
+    """What a side of a 2D box asks where another object touches the mask: `count` takes it at its
+    word (paper); `at_least` lets the object go on behind what stands in front."""
     iou_gate: float = Field(0.5, ge=0, lt=1)
     """Masks that overlap less than this teach no shape."""
 
@@ -87,9 +90,15 @@ class StageConfig(_Section):
     learning_rate: float = Field(1e-4, gt=0)
     latent_learning_rate: float = Field(1e-4, gt=0)
     """For the latent weights, which see one gradient an epoch; the paper uses one rate for all."""
+    schedule: Literal["steps", "cosine"] = "steps"
+    """`steps`: times `decay` after each milestone (paper); `cosine`: a short rise, then a
+    cosine down to zero, which reaches the same loss in fewer epochs."""
     milestones: tuple[int, ...] = Field((300,), strict=False)
     """Epochs after which the rates are multiplied by `decay`."""
     decay: float = Field(0.1, gt=0, le=1)
+    latent_noise: float = Field(0.0, ge=0)
+    """Length of the random step each latent takes on the sphere before it is decoded, so that
+    what lies between rooms is rooms, too. The paper takes none: 0."""
     clip_gradient: float = Field(0.0, ge=0)
     """Largest gradient norm; 0 does not clip."""
     proxy: Literal["ellipsoid", "box"] = "ellipsoid"

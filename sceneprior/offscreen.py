@@ -369,6 +369,8 @@ def _id_renderer_class() -> type:
     class IdRenderer(PyrenderRenderer):
         """No multisampling, no culling, a fixed drawing order, and no depth read back."""
 
+        _main_fb_dims: tuple[Any, Any]
+
         def _sorted_mesh_nodes(self, scene: Any) -> list[Any]:
             # pyrender walks a set: where two faces are equally near, its order would decide.
             return sorted(scene.mesh_nodes, key=lambda node: node.mesh.name)
@@ -410,7 +412,7 @@ def _id_renderer_class() -> type:
                 gl.glDeleteFramebuffers(1, [self._main_fb])
                 gl.glDeleteRenderbuffers(2, [self._main_cb, self._main_db])
             self._main_fb = self._main_fb_ms = self._main_cb = self._main_db = None
-            self._main_fb_dims: tuple[int | None, int | None] = (None, None)
+            self._main_fb_dims = (None, None)
 
         def _read_main_framebuffer(self, scene: Any, flags: int) -> tuple[np.ndarray, None]:
             width, height = self._main_fb_dims

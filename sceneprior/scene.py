@@ -98,7 +98,8 @@ def read_scene(path: Path) -> Scene:
         if data["format"] != FORMAT or data["version"] != VERSION:
             raise InputError(
                 f"{path} says format '{data['format']}' version {data['version']}; "
-                f"expected '{FORMAT}' version {VERSION}. Write it again with `sceneprior synthesize`."
+                f"expected '{FORMAT}' version {VERSION}. Write it again with "
+                "`sceneprior synthesize`."
             )
         names = label_set(data["label_set"])
         for item in data["objects"]:

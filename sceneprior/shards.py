@@ -1,7 +1,6 @@
 """View shards: the HDF5 files in which preparing and learning meet (docs/shard_format.md)."""
 
 import json
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +38,9 @@ class RoomViews:
     """(T, n) bool."""
     mask_pixels: np.ndarray
     """(T, n) int32, pixels of the visible mask."""
+    sides_clear: np.ndarray
+    """(T, n, 4) bool: no other object touches the mask at that side of its box, so the side is
+    the object's own rather than an occluder's."""
     instance_ids: np.ndarray | None
     """(T, H, W) uint8 (uint16 past 255 objects), 0 = nothing, k + 1 = object k; None: not read."""
     image_size: tuple[int, int]
@@ -67,7 +69,10 @@ class RoomGroundTruth:
     """Floor to ceiling."""
 
 
-_VIEW_ARRAYS = ("object_class", "world_to_camera", "intrinsics", "boxes", "visible", "mask_pixels")
+_VIEW_ARRAYS = (
+    "object_class", "world_to_camera", "intrinsics", "boxes", "visible", "mask_pixels",
+    "sides_clear",
+)  # fmt: skip
 _TRUTH_ARRAYS = ("object_class", "centers_m", "sizes_m", "yaw_rad", "model_to_room", "floor_m")
 
 
@@ -93,7 +98,7 @@ def write_shard(
             file.attrs["classes"] = json.dumps(label_set(label_set_name))
             for views, truth in rooms:
                 _write_room(file.create_group(f"rooms/{_key(views.room_id)}"), views, truth)
-        os.replace(temporary, path)
+        temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -129,6 +134,7 @@ def _check(path: Path, views: RoomViews) -> None:
         "intrinsics": (count, 3, 3),
         "boxes": (count, objects, 4),
         "mask_pixels": (count, objects),
+        "sides_clear": (count, objects, 4),
         "instance_ids": (count, *views.image_size),
     }
     for name, shape in expected.items():

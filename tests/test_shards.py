@@ -29,6 +29,7 @@ def make_room(room_id="house_A", views=3, objects=2, size=(12, 16), seed=0):
         boxes=rng.random((views, objects, 4)).astype(np.float32) * visible[..., None],
         visible=visible,
         mask_pixels=(rng.integers(25, 99, (views, objects)) * visible).astype(np.int32),
+        sides_clear=rng.random((views, objects, 4)) < 0.5,
         instance_ids=rng.integers(0, objects + 1, (views, *size)).astype(np.uint8),
         image_size=size,
     )

@@ -88,6 +88,7 @@ class ViewDataset(Dataset):
         real = np.zeros((len(rows), objects), dtype=bool)
         boxes = np.zeros((*shape, objects, 4), dtype=np.float32)
         visible = np.zeros((*shape, objects), dtype=bool)
+        clear = np.zeros((*shape, objects, 4), dtype=bool)
         poses = np.empty((*shape, 4, 4), dtype=np.float32)
         lenses = np.empty((*shape, 3, 3), dtype=np.float32)
         for slot, (row, room, views) in enumerate(zip(rows, rooms, chosen, strict=True)):
@@ -96,6 +97,7 @@ class ViewDataset(Dataset):
             real[slot, :count] = True
             boxes[slot, :, :count] = room.boxes[views]
             visible[slot, :, :count] = room.visible[views]
+            clear[slot, :, :count] = room.sides_clear[views]
             # The room turns by +a, so a camera sees the turned room as it saw the plain one.
             poses[slot] = room.world_to_camera[views] @ self._turns[row % self.rotations].T
             lenses[slot] = room.intrinsics[views]
@@ -112,6 +114,7 @@ class ViewDataset(Dataset):
             intrinsics=torch.from_numpy(lenses),
             boxes=torch.from_numpy(boxes),
             visible=torch.from_numpy(visible),
+            sides_clear=torch.from_numpy(clear),
             image_size=rooms[0].image_size,
             instance_ids=ids,
             room_ids=tuple(room.room_id for room in rooms),

@@ -7,7 +7,7 @@ from torch.nn import functional as F
 
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.geometry.cameras import Boxes2D, camera_centers, pixel_rays
-from sceneprior.losses.matching import Matches
+from sceneprior.losses.matching import Matches, side_distance
 
 
 def take(values: Tensor, index: Int[Tensor, "rooms objects"], dim: int) -> Tensor:
@@ -20,9 +20,20 @@ def take(values: Tensor, index: Int[Tensor, "rooms objects"], dim: int) -> Tenso
 
 
 def layout_losses(
-    scenes: DecodedScenes, boxes_2d: Boxes2D, views: SceneViews, matches: Matches
+    scenes: DecodedScenes,
+    boxes_2d: Boxes2D,
+    views: SceneViews,
+    matches: Matches,
+    hidden_sides: str = "count",
 ) -> dict[str, Float[Tensor, ""]]:
     """The four terms of L_layout, each averaged over the objects it applies to.
+
+    Args:
+        scenes: Predictions.
+        boxes_2d: Their 2D boxes in the views.
+        views: What the cameras saw.
+        matches: Which prediction answers for which object.
+        hidden_sides: `count` or `at_least`: see `side_distance`.
 
     Returns:
         `class`, `box`, `completeness` and `frustum`; weights are the caller's.
@@ -33,7 +44,7 @@ def layout_losses(
     seen = views.visible & matches.valid.unsqueeze(1)
     return {
         "class": class_loss(scenes, views, matches),
-        "box": box_loss(predicted, views.boxes, seen & inside),
+        "box": box_loss(predicted, views.boxes, views.sides_clear, seen & inside, hidden_sides),
         "completeness": completeness_loss(scenes, views),
         "frustum": frustum_loss(centers, views, seen & ~inside),
     }
@@ -49,13 +60,19 @@ def class_loss(scenes: DecodedScenes, views: SceneViews, matches: Matches) -> Fl
 def box_loss(
     predicted: Float[Tensor, "rooms views objects 4"],
     target: Float[Tensor, "rooms views objects 4"],
+    clear: Bool[Tensor, "rooms views objects 4"],
     counted: Bool[Tensor, "rooms views objects"],
+    hidden_sides: str = "count",
 ) -> Float[Tensor, ""]:
     """L1 distance of 2D boxes (summed over x1, y1, x2, y2): mean over visible views, then objects.
 
-    The same distance as in the matching cost.
+    The same distance as in the matching cost (`side_distance`).
     """
-    return _mean_of_objects((predicted - target).abs().sum(dim=-1), counted)
+    apart = [
+        side_distance(predicted[..., i], target[..., i], clear[..., i], i, hidden_sides)
+        for i in range(4)
+    ]
+    return _mean_of_objects(torch.stack(apart).sum(dim=0), counted)
 
 
 def completeness_loss(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""]:

@@ -22,7 +22,11 @@ class Matches(NamedTuple):
 
 @torch.no_grad()
 def match_objects(
-    scenes: DecodedScenes, boxes_2d: Boxes2D, views: SceneViews, box_weight: float = 5.0
+    scenes: DecodedScenes,
+    boxes_2d: Boxes2D,
+    views: SceneViews,
+    box_weight: float = 5.0,
+    hidden_sides: str = "count",
 ) -> Matches:
     """Find the cheapest one-to-one assignment of predictions to tracked objects.
 
@@ -36,11 +40,12 @@ def match_objects(
         boxes_2d: The predictions' 2D boxes in the views.
         views: What the cameras saw.
         box_weight: lambda_B.
+        hidden_sides: See `side_distance`.
 
     Raises:
         ValueError: a room holds more objects than the prior can generate.
     """
-    cost = matching_cost(scenes, boxes_2d, views, box_weight)
+    cost = matching_cost(scenes, boxes_2d, views, box_weight, hidden_sides)
     counts = views.is_object.sum(dim=-1)
     rooms, slots, objects = cost.shape
     if int(counts.max()) > slots:
@@ -56,12 +61,35 @@ def match_objects(
     return Matches(prediction.to(cost.device), views.is_object & views.visible.any(dim=1))
 
 
+def side_distance(
+    predicted: Tensor, observed: Tensor, clear: Tensor, side: int, hidden_sides: str
+) -> Tensor:
+    """How far one side of a predicted 2D box is from the observed one.
+
+    Args:
+        predicted, observed, clear: Of shapes that broadcast; relative to the image size.
+        side: 0 to 3: left, upper, right, lower.
+        hidden_sides: `count` takes the absolute difference everywhere (paper). `at_least` asks
+            of a side that is not clear only that the prediction reaches as far as what is
+            seen: where something stands in front, the object may go on behind it.
+    """
+    apart = predicted - observed
+    if hidden_sides == "count":
+        return apart.abs()
+    falls_short = (apart if side < 2 else -apart).clamp(min=0)
+    return torch.where(clear, apart.abs(), falls_short)
+
+
 def matching_cost(
-    scenes: DecodedScenes, boxes_2d: Boxes2D, views: SceneViews, box_weight: float
+    scenes: DecodedScenes,
+    boxes_2d: Boxes2D,
+    views: SceneViews,
+    box_weight: float,
+    hidden_sides: str = "count",
 ) -> Float[Tensor, "rooms predictions objects"]:
     """Pairwise costs of all predictions and all tracked objects."""
     probability = scenes.class_logits.softmax(dim=-1)
-    rooms, slots, _ = probability.shape
+    slots = probability.shape[1]
     wanted = views.object_class.unsqueeze(1).expand(-1, slots, -1)
     cost = -probability.gather(-1, wanted)
     seen = views.visible.to(cost.dtype)
@@ -70,7 +98,9 @@ def matching_cost(
     for side in range(4):
         predicted = boxes_2d.boxes[..., side].unsqueeze(-1)
         target = views.boxes[..., side].unsqueeze(-2)
-        distance += ((predicted - target).abs() * seen.unsqueeze(-2)).sum(dim=1)
+        clear = views.sides_clear[..., side].unsqueeze(-2)
+        apart = side_distance(predicted, target, clear, side, hidden_sides)
+        distance += (apart * seen.unsqueeze(-2)).sum(dim=1)
     distance = distance / seen.sum(dim=1).clamp(min=1).unsqueeze(-2)
     cost = cost + box_weight * distance
     return cost * seen.any(dim=1).unsqueeze(-2)

@@ -27,6 +27,15 @@ class LatentSphere(nn.Module):
         return F.normalize(logits.softmax(dim=-1) @ self.anchors, dim=-1)
 
 
+def jitter(
+    z: Float[Tensor, "rooms dimension"], length: float, seed: int
+) -> Float[Tensor, "rooms dimension"]:
+    """Move points a random step of about `length` on the sphere; the same seed, the same steps."""
+    generator = torch.Generator().manual_seed(seed)
+    step = torch.randn(z.shape, generator=generator).to(z) * (length / z.shape[-1] ** 0.5)
+    return F.normalize(z + step, dim=-1)
+
+
 def slerp(
     start: Float[Tensor, " dimension"], end: Float[Tensor, " dimension"], steps: int
 ) -> Float[Tensor, "steps dimension"]:

@@ -11,6 +11,8 @@ so a boundary between two objects moves the one in front, and reveals or hides t
 The order is by depth at the pixel and carries no gradient.
 """
 
+from typing import no_type_check
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -20,7 +22,9 @@ from torch import Tensor
 MODES = ("layered", "paper")
 
 
+# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 @njit(inline="always")
+@no_type_check
 def _order(depth, image, row, column, order):  # pragma: no cover - compiled
     """Objects that touch a pixel, nearest first (insertion sort: they are few)."""
     count = 0
@@ -38,6 +42,7 @@ def _order(depth, image, row, column, order):  # pragma: no cover - compiled
 
 
 @njit(parallel=True, cache=True, nogil=True)
+@no_type_check
 def _forward(coverage, depth, layered, visible):  # pragma: no cover - compiled
     images, objects, height, width = coverage.shape
     for image in prange(images):
@@ -56,6 +61,7 @@ def _forward(coverage, depth, layered, visible):  # pragma: no cover - compiled
 
 
 @njit(parallel=True, cache=True, nogil=True)
+@no_type_check
 def _backward(coverage, depth, layered, upstream, gradient):  # pragma: no cover - compiled
     images, objects, height, width = coverage.shape
     for image in prange(images):

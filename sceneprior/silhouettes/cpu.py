@@ -5,6 +5,8 @@ covered for certain: it adds nothing to the gradient and is passed over there, s
 grows with the outline. Meshes are independent, so the result does not depend on the threads.
 """
 
+from typing import no_type_check
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,7 +17,9 @@ CERTAIN = 18.0
 """-log of the chance to miss past which a pixel counts as covered: 1 - exp(-18) is 1 in float32."""
 
 
+# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 @njit(inline="always", fastmath=False)
+@no_type_check
 def _nearest_on_edge(px, py, ax, ay, bx, by):  # pragma: no cover - compiled
     """Squared distance from p to segment ab, and where on it (0 at a, 1 at b)."""
     ex, ey = bx - ax, by - ay
@@ -27,6 +31,7 @@ def _nearest_on_edge(px, py, ax, ay, bx, by):  # pragma: no cover - compiled
 
 
 @njit(inline="always")
+@no_type_check
 def _pixel_range(low, high, reach, size):  # pragma: no cover - compiled
     """First and one past the last pixel whose centre may lie within reach of [low, high]."""
     first = int(max(np.ceil(low - reach - 0.5), 0.0))
@@ -35,6 +40,7 @@ def _pixel_range(low, high, reach, size):  # pragma: no cover - compiled
 
 
 @njit(parallel=True, cache=True, nogil=True)
+@no_type_check
 def _forward(pixels, depths, faces, drawn, sigma, blur, near, missed, depth):  # pragma: no cover
     meshes, height, width = missed.shape
     reach = np.sqrt(blur)
@@ -81,6 +87,7 @@ def _forward(pixels, depths, faces, drawn, sigma, blur, near, missed, depth):  #
 
 
 @njit(parallel=True, cache=True, nogil=True)
+@no_type_check
 def _backward(pixels, depths, faces, drawn, sigma, blur, near, pull, gradient):  # pragma: no cover
     """`pull` is dL/dcoverage times the chance to miss; it is zero where nothing can change."""
     meshes, height, width = pull.shape
@@ -128,9 +135,8 @@ def _backward(pixels, depths, faces, drawn, sigma, blur, near, pull, gradient): 
                     if not inside and d >= blur:
                         continue
                     sign = 1.0 if inside else -1.0
-                    weight = (
-                        force * sign * inverse_sigma / (1.0 + np.exp(-sign * d * inverse_sigma))
-                    )
+                    missing = 1.0 / (1.0 + np.exp(-sign * d * inverse_sigma))
+                    weight = force * sign * inverse_sigma * missing
                     # Moving the nearest point of the edge by its ends' shares changes d.
                     gx = -2.0 * weight * (px - (sx + t * (ex - sx)))
                     gy = -2.0 * weight * (py - (sy + t * (ey - sy)))

@@ -1,7 +1,6 @@
 """What happens beside the training step: progress, checkpoints and a clean stop."""
 
 import contextlib
-import os
 from pathlib import Path
 
 import lightning
@@ -80,7 +79,7 @@ class RollingCheckpoint(Callback):
         part = self.folder / f"{name}.part"
         trainer.save_checkpoint(part)
         if trainer.is_global_zero:
-            os.replace(part, self.folder / name)
+            part.replace(self.folder / name)
 
     def on_exception(self, trainer: lightning.Trainer, pl_module, exception) -> None:
         # Only a stop by hand: after an error the state may be the error's.

@@ -11,6 +11,8 @@ from sceneprior.stages.view_loss import (
     check_finite,
     match_and_score,
     proxy_points,
+    step_seed,
+    training_latents,
     weighted_sum,
 )
 
@@ -31,9 +33,14 @@ class LayoutStage(lightning.LightningModule):
         self.config = config
 
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
-        scenes = self.prior(self.latents(views.room_index), with_shape=False)
-        points = proxy_points(scenes, self.config.layout.proxy)
-        losses, _ = match_and_score(scenes, points, views, self.config.loss.match_box)
+        settings = self.config.layout
+        seed = step_seed(self.config.seed, self.global_step, self.global_rank)
+        z = training_latents(
+            self.prior, self.latents, views.room_index, settings.latent_noise, seed
+        )
+        scenes = self.prior.decode(z, with_shape=False)
+        points = proxy_points(scenes, settings.proxy)
+        losses, _ = match_and_score(scenes, points, views, self.config.loss)
         total = weighted_sum(losses, self.config.loss)
         check_finite(total, views)
         named = {f"train/{name}": loss.detach() for name, loss in losses.items()}
@@ -44,4 +51,5 @@ class LayoutStage(lightning.LightningModule):
         return total
 
     def configure_optimizers(self) -> dict:
-        return build_optimizer(self.prior, self.latents, self.config.layout)
+        steps = int(self.trainer.estimated_stepping_batches)
+        return build_optimizer(self.prior, self.latents, self.config.layout, steps)

@@ -14,6 +14,8 @@ from sceneprior.stages.view_loss import (
     check_finite,
     match_and_score,
     proxy_points,
+    step_seed,
+    training_latents,
     weighted_sum,
 )
 
@@ -34,9 +36,12 @@ class ShapeStage(lightning.LightningModule):
         self.config = config
 
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
-        scenes = self.prior(self.latents(views.room_index))
+        noise = self.config.shape.latent_noise
+        seed = step_seed(self.config.seed, self.global_step, self.global_rank)
+        z = training_latents(self.prior, self.latents, views.room_index, noise, seed)
+        scenes = self.prior.decode(z)
         losses, matches = match_and_score(
-            scenes, self._box_points(scenes), views, self.config.loss.match_box
+            scenes, self._box_points(scenes), views, self.config.loss
         )
         masks = self._render(scenes, views)
         losses["mask"], overlap = mask_loss(masks, views, matches, self.config.loss.iou_gate)
@@ -74,4 +79,5 @@ class ShapeStage(lightning.LightningModule):
         )
 
     def configure_optimizers(self) -> dict:
-        return build_optimizer(self.prior, self.latents, self.config.shape)
+        steps = int(self.trainer.estimated_stepping_batches)
+        return build_optimizer(self.prior, self.latents, self.config.shape, steps)

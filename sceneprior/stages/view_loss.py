@@ -1,5 +1,6 @@
 """Decoded scenes and what cameras saw in, weighted losses out: the part both stages share."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -11,6 +12,7 @@ from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.losses.layout import layout_losses
 from sceneprior.losses.matching import Matches, match_objects
+from sceneprior.models.latents import jitter
 from sceneprior.models.scene_prior import ScenePrior
 
 ELLIPSOID_LEVEL = 2
@@ -31,14 +33,14 @@ def match_and_score(
     scenes: DecodedScenes,
     points_m: Float[Tensor, "rooms objects points 3"],
     views: SceneViews,
-    match_box: float,
+    weights: LossConfig,
 ) -> tuple[dict[str, Float[Tensor, ""]], Matches]:
     """Match predictions to tracked objects by their 2D boxes and take the layout losses."""
     boxes: Boxes2D = boxes_of_points(
         points_m, views.world_to_camera, views.intrinsics, views.image_size
     )
-    matches = match_objects(scenes, boxes, views, match_box)
-    return layout_losses(scenes, boxes, views, matches), matches
+    matches = match_objects(scenes, boxes, views, weights.match_box, weights.hidden_sides)
+    return layout_losses(scenes, boxes, views, matches, weights.hidden_sides), matches
 
 
 def weighted_sum(losses: dict[str, Tensor], weights: LossConfig) -> Float[Tensor, ""]:
@@ -73,14 +75,35 @@ def build_latents(config: RunConfig, rooms: int) -> nn.Embedding:
     return nn.Embedding.from_pretrained(logits, freeze=False)
 
 
-def build_optimizer(prior: ScenePrior, latents: nn.Embedding, stage: StageConfig) -> dict:
-    """Adam with the stage's milestones, in the shape Lightning takes."""
+def step_seed(seed: int, step: int, rank: int) -> int:
+    """A seed of its own for each step and process, the same when a run is resumed."""
+    return int(np.random.SeedSequence([seed, step, rank]).generate_state(1, np.uint64)[0] >> 1)
+
+
+def training_latents(
+    prior: ScenePrior, latents: nn.Embedding, rows: Tensor, noise: float, seed: int
+) -> Float[Tensor, "rooms width"]:
+    """The rooms' points on the sphere, moved a little where the stage asks for it."""
+    z = prior.sphere(latents(rows))
+    return jitter(z, noise, seed) if noise else z
+
+
+def build_optimizer(
+    prior: ScenePrior, latents: nn.Embedding, stage: StageConfig, steps: int
+) -> dict:
+    """Adam with the stage's schedule over `steps` updates, in the shape Lightning takes."""
     groups = [
         {"params": list(prior.parameters()), "lr": stage.learning_rate},
         {"params": list(latents.parameters()), "lr": stage.latent_learning_rate},
     ]
     optimizer = torch.optim.Adam(groups, fused=True)
-    schedule = torch.optim.lr_scheduler.MultiStepLR(
+    if stage.schedule == "cosine":
+        rates = [group["lr"] for group in groups]
+        rise = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer, rates, total_steps=steps + 1, pct_start=0.05, cycle_momentum=False
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rise, "interval": "step"}}
+    drops = torch.optim.lr_scheduler.MultiStepLR(
         optimizer, list(stage.milestones), gamma=stage.decay
     )
-    return {"optimizer": optimizer, "lr_scheduler": schedule}
+    return {"optimizer": optimizer, "lr_scheduler": drops}

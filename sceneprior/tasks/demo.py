@@ -5,7 +5,6 @@ ones that ran. Finished steps are noted in `steps.json` and not repeated.
 """
 
 import json
-import os
 import shlex
 import subprocess
 import sys
@@ -134,4 +133,4 @@ def _add_costs(scores: Path, done: dict[str, dict]) -> None:
 def _write_json(path: Path, data: dict) -> None:
     part = path.with_name(path.name + ".part")
     part.write_text(json.dumps(data, indent=2) + "\n")
-    os.replace(part, path)
+    part.replace(path)

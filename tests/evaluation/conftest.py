@@ -72,6 +72,7 @@ def make_room(room_id: str, rng: np.random.Generator) -> tuple[RoomViews, RoomGr
         boxes=np.tile(boxes.astype(np.float32), (2, 1, 1)),
         visible=np.ones((2, tracked), bool),
         mask_pixels=np.tile(np.array([400, 600], np.int32), (2, 1)),
+        sides_clear=np.ones((2, tracked, 4), bool),
         instance_ids=ids,
         image_size=(60, 80),
     )

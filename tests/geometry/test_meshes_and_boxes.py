@@ -1,0 +1,58 @@
+"""Templates and boxes: counts, extents, orientation."""
+
+import itertools
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from sceneprior.geometry.boxes import box_corners, place, unit_corners
+from sceneprior.geometry.meshes import icosphere, to_cube
+
+
+@pytest.mark.parametrize("level", [0, 1, 2, 4])
+def test_icosphere_is_a_closed_unit_sphere_of_known_size(level):
+    vertices, faces = icosphere(level)
+    assert len(faces) == 20 * 4**level
+    assert len(vertices) == 10 * 4**level + 2  # Euler: V - E + F = 2 with E = 3 F / 2
+    assert_close(vertices.norm(dim=-1), torch.ones(len(vertices)), rtol=0, atol=1e-6)
+    edges = torch.cat([faces[:, (0, 1)], faces[:, (1, 2)], faces[:, (2, 0)]])
+    # Closed and consistently wound: each edge is walked once each way.
+    walked = {tuple(edge) for edge in edges.tolist()}
+    assert len(walked) == len(edges)
+    assert all((b, a) in walked for a, b in walked)
+    a, b, c = vertices[faces].unbind(dim=1)
+    outward = (torch.linalg.cross(b - a, c - a) * (a + b + c)).sum(-1)
+    assert (outward > 0).all()
+
+
+def test_icosphere_gives_a_copy_each_time():
+    vertices, _ = icosphere(1)
+    vertices.zero_()
+    assert icosphere(1)[0].abs().max() > 0.5
+
+
+@pytest.mark.parametrize("level", [0, 1, 3])
+def test_to_cube_lands_on_the_cube_in_the_same_direction(level):
+    sphere, _ = icosphere(level)
+    cube = to_cube(sphere)
+    assert_close(cube.abs().amax(dim=-1), torch.ones(len(cube)), rtol=0, atol=1e-6)
+    assert_close(cube / cube.norm(dim=-1, keepdim=True), sphere, rtol=0, atol=1e-6)
+    assert_close(cube.amin(dim=0), -torch.ones(3), rtol=0, atol=1e-6)
+    assert_close(cube.amax(dim=0), torch.ones(3), rtol=0, atol=1e-6)
+
+
+def test_box_corners_are_center_plus_minus_half_a_size():
+    center, size = torch.tensor([1.0, 2, 3]), torch.tensor([0.2, 4, 6])
+    by_hand = [
+        [1 + x * 0.1, 2 + y * 2, 3 + z * 3] for x, y, z in itertools.product((-1, 1), repeat=3)
+    ]
+    assert_close(box_corners(center, size), torch.tensor(by_hand))
+    assert box_corners(torch.zeros(2, 5, 3), torch.ones(2, 5, 3)).shape == (2, 5, 8, 3)
+
+
+def test_place_puts_the_unit_cube_into_the_box():
+    centers = torch.tensor([[[1.0, 2, 3], [0, 0.5, 0]]], dtype=torch.float64)
+    sizes = torch.tensor([[[0.2, 4, 6], [1, 1, 2]]], dtype=torch.float64)
+    cube = unit_corners(centers).expand(1, 2, 8, 3)
+    assert_close(place(cube, centers, sizes), box_corners(centers, sizes), rtol=0, atol=1e-15)
