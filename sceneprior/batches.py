@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor
 
 
@@ -30,7 +30,7 @@ class SceneViews:
     """Which sides of a box are the object's own; another object touches the mask at the rest."""
     image_size: tuple[int, int]
     """Height and width in pixels that `intrinsics` refer to."""
-    instance_ids: Int[Tensor, "rooms views height width"] | None = None
+    instance_ids: Integer[Tensor, "rooms views height width"] | None = None
     """0 for nothing, k + 1 for object k; its own, smaller size. Only the shape stage has it."""
     room_ids: tuple[str, ...] = ()
 

@@ -25,7 +25,7 @@ RendererOption = Annotated[
 ]
 RunOption = Annotated[Path, typer.Option(help="Folder of a run that `fit` made.")]
 LawOption = Annotated[
-    str | None, typer.Option(help="Sampling law: gaussian, kernel or paper [the config's].")
+    str | None, typer.Option(help="Sampling law: geodesic, gaussian or paper [the config's].")
 ]
 
 
@@ -53,9 +53,7 @@ def fit(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Override: model.width=256. Repeatable.")
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with a stopped run.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")] = False,
     logger: Annotated[
         list[str] | None, typer.Option(help="csv, tensorboard, wandb. Repeatable.")
     ] = None,
@@ -155,7 +153,7 @@ def demo(
         "out/demo"
     ),
     config: Annotated[str, typer.Option(help="What to train.")] = "demo.yaml",
-    rooms: Annotated[int, typer.Option(min=20, help="Homes to make.")] = 640,
+    rooms: Annotated[int, typer.Option(min=20, help="Homes to make.")] = 512,
     count: Annotated[int, typer.Option(min=2, help="Rooms to generate and judge.")] = 200,
     renderer: RendererOption = "auto",
 ) -> None:

@@ -2,6 +2,7 @@
 
 import difflib
 import importlib.resources
+import re
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,6 +11,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from sceneprior.classes import LABEL_SETS
 from sceneprior.errors import ConfigError
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML in which 3e-4 is a number, as people write it; YAML 1.1 asks for 3.0e-4."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"),
+    [*"-+0123456789"],
+)
 
 
 class _Section(BaseModel):
@@ -75,9 +87,10 @@ class LossConfig(_Section):
     """lambda_S."""
     match_box: float = Field(5.0, ge=0)
     """lambda_B of the matching cost."""
-    hidden_sides: Literal["count", "at_least"] = "count"
-    """What a side of a 2D box asks where another object touches the mask: `count` takes it at its
-    word (paper); `at_least` lets the object go on behind what stands in front."""
+    hidden_overshoot: float = Field(1.0, ge=0, le=1)
+    """Where another object touches a mask, the side of its 2D box there may be an occluder's. The
+    part of a prediction that reaches further counts this much: 1 is the paper, which takes every
+    side at its word; 0 lets objects go on behind others without end."""
     iou_gate: float = Field(0.5, ge=0, lt=1)
     """Masks that overlap less than this teach no shape."""
 
@@ -99,8 +112,13 @@ class StageConfig(_Section):
     latent_noise: float = Field(0.0, ge=0)
     """Length of the random step each latent takes on the sphere before it is decoded, so that
     what lies between rooms is rooms, too. The paper takes none: 0."""
+    latent_noise_end: float | None = Field(None, ge=0)
+    """Where the noise ends, going there evenly over the stage; None keeps it as it is."""
     clip_gradient: float = Field(0.0, ge=0)
     """Largest gradient norm; 0 does not clip."""
+    cpu_threads: int | None = Field(None, ge=1)
+    """Torch threads where a CPU trains; None leaves torch's choice. A small network gains little
+    from a second thread and loses much when another program takes that core."""
     proxy: Literal["ellipsoid", "box"] = "ellipsoid"
     """What an object's 2D box is taken from where its mesh is not decoded."""
 
@@ -108,6 +126,8 @@ class StageConfig(_Section):
 class ShapeConfig(StageConfig):
     """How the shape stage is trained: the layout terms go on beside the mask term."""
 
+    decoder_learning_rate: float | None = Field(None, gt=0)
+    """For the shape decoder, which starts fresh where the rest is trained; None: the same rate."""
     views_per_room: int | None = Field(None, ge=1)
     """Views drawn per room and step; None takes data.views_per_room."""
     sigma_px2: float | None = Field(None, gt=0)
@@ -120,8 +140,9 @@ class ShapeConfig(StageConfig):
 class SamplingConfig(_Section):
     """Where new latents come from."""
 
-    law: Literal["gaussian", "paper"] = "gaussian"
-    """`gaussian`: fitted to the training rooms' logits; `paper`: logits from N(0, 1)."""
+    law: Literal["geodesic", "gaussian", "paper"] = "geodesic"
+    """`geodesic`: between two neighbouring training rooms; `gaussian`: fitted to the training rooms' logits;
+    `paper`: logits from N(0, 1)."""
 
 
 class RunConfig(_Section):
@@ -174,7 +195,7 @@ def load_config(name: str, overrides: tuple[str, ...] = ()) -> RunConfig:
     """
     path = find_config(name)
     try:
-        data = yaml.safe_load(path.read_text())
+        data = yaml.load(path.read_text(), _Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ConfigError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict):
@@ -208,7 +229,7 @@ def _apply(data: dict[str, Any], override: str) -> None:
         node = node.setdefault(parent, {})
         if not isinstance(node, dict):
             raise ConfigError(f"--set {override}: '{parent}' is a value, not a section.")
-    node[last] = yaml.safe_load(text)
+    node[last] = yaml.load(text, _Loader)
 
 
 def _explain(error: ValidationError, source: str) -> str:

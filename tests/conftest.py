@@ -1,11 +1,21 @@
 """What every test may use: toy rooms on disk, and a number generator."""
 
+import os
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 import torch
+from tiny_runs import tiny_config
 from toy_rooms import write_toy_shards
+
+# Toy tensors gain nothing from a second thread, and wait for it where cores are shared: thirty
+# times as long. Numba's OpenMP layer would set torch's number of threads back to all cores.
+torch.set_num_threads(1)
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("NUMBA_THREADING_LAYER", "workqueue")  # in processes that tests start
+numba.config.THREADING_LAYER = os.environ["NUMBA_THREADING_LAYER"]
 
 
 @pytest.fixture(scope="session")
@@ -24,3 +34,13 @@ def rng() -> np.random.Generator:
 @pytest.fixture
 def torch_rng() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def toy_run(toy_shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both stages trained on the toy rooms for a few epochs. Tests read it and change nothing."""
+    from sceneprior.stages.train import fit
+
+    run = tmp_path_factory.mktemp("toy") / "run"
+    fit(tiny_config(toy_shards, layout__epochs=20), run, trainer_options={"accelerator": "cpu"})
+    return run

@@ -23,6 +23,9 @@ class DrawSampler(Sampler[list[tuple[int, int]]]):
         self.rows, self.batch_size, self.seed = rows, batch_size, seed
         self.rank, self.world = rank, world
         self.epoch = 0
+        # Lightning tells the epoch to a loader's `sampler` and to its `batch_sampler.sampler`,
+        # never to the batch sampler itself, which is what this is.
+        self.sampler = self
 
     def set_epoch(self, epoch: int) -> None:
         """Lightning calls this before each epoch."""

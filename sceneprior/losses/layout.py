@@ -24,7 +24,7 @@ def layout_losses(
     boxes_2d: Boxes2D,
     views: SceneViews,
     matches: Matches,
-    hidden_sides: str = "count",
+    hidden_overshoot: float = 1.0,
 ) -> dict[str, Float[Tensor, ""]]:
     """The four terms of L_layout, each averaged over the objects it applies to.
 
@@ -33,7 +33,7 @@ def layout_losses(
         boxes_2d: Their 2D boxes in the views.
         views: What the cameras saw.
         matches: Which prediction answers for which object.
-        hidden_sides: `count` or `at_least`: see `side_distance`.
+        hidden_overshoot: See `side_distance`.
 
     Returns:
         `class`, `box`, `completeness` and `frustum`; weights are the caller's.
@@ -44,7 +44,7 @@ def layout_losses(
     seen = views.visible & matches.valid.unsqueeze(1)
     return {
         "class": class_loss(scenes, views, matches),
-        "box": box_loss(predicted, views.boxes, views.sides_clear, seen & inside, hidden_sides),
+        "box": box_loss(predicted, views.boxes, views.sides_clear, seen & inside, hidden_overshoot),
         "completeness": completeness_loss(scenes, views),
         "frustum": frustum_loss(centers, views, seen & ~inside),
     }
@@ -62,14 +62,14 @@ def box_loss(
     target: Float[Tensor, "rooms views objects 4"],
     clear: Bool[Tensor, "rooms views objects 4"],
     counted: Bool[Tensor, "rooms views objects"],
-    hidden_sides: str = "count",
+    hidden_overshoot: float = 1.0,
 ) -> Float[Tensor, ""]:
     """L1 distance of 2D boxes (summed over x1, y1, x2, y2): mean over visible views, then objects.
 
     The same distance as in the matching cost (`side_distance`).
     """
     apart = [
-        side_distance(predicted[..., i], target[..., i], clear[..., i], i, hidden_sides)
+        side_distance(predicted[..., i], target[..., i], clear[..., i], i, hidden_overshoot)
         for i in range(4)
     ]
     return _mean_of_objects(torch.stack(apart).sum(dim=0), counted)

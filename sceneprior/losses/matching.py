@@ -26,7 +26,7 @@ def match_objects(
     boxes_2d: Boxes2D,
     views: SceneViews,
     box_weight: float = 5.0,
-    hidden_sides: str = "count",
+    hidden_overshoot: float = 1.0,
 ) -> Matches:
     """Find the cheapest one-to-one assignment of predictions to tracked objects.
 
@@ -40,12 +40,12 @@ def match_objects(
         boxes_2d: The predictions' 2D boxes in the views.
         views: What the cameras saw.
         box_weight: lambda_B.
-        hidden_sides: See `side_distance`.
+        hidden_overshoot: See `side_distance`.
 
     Raises:
         ValueError: a room holds more objects than the prior can generate.
     """
-    cost = matching_cost(scenes, boxes_2d, views, box_weight, hidden_sides)
+    cost = matching_cost(scenes, boxes_2d, views, box_weight, hidden_overshoot)
     counts = views.is_object.sum(dim=-1)
     rooms, slots, objects = cost.shape
     if int(counts.max()) > slots:
@@ -54,7 +54,8 @@ def match_objects(
             f"{slots}; set model.max_objects to at least {int(counts.max())}."
         )
     prediction = torch.zeros(rooms, objects, dtype=torch.int64)
-    matrices = cost.cpu().numpy()
+    # SciPy refuses what is not a number; the loss will be none either, and its check names rooms.
+    matrices = cost.nan_to_num().cpu().numpy()
     for room, count in enumerate(counts.tolist()):
         rows, columns = linear_sum_assignment(matrices[room, :count, :count])
         prediction[room, torch.from_numpy(columns)] = torch.from_numpy(rows)
@@ -62,22 +63,24 @@ def match_objects(
 
 
 def side_distance(
-    predicted: Tensor, observed: Tensor, clear: Tensor, side: int, hidden_sides: str
+    predicted: Tensor, observed: Tensor, clear: Tensor, side: int, hidden_overshoot: float
 ) -> Tensor:
     """How far one side of a predicted 2D box is from the observed one.
 
     Args:
         predicted, observed, clear: Of shapes that broadcast; relative to the image size.
         side: 0 to 3: left, upper, right, lower.
-        hidden_sides: `count` takes the absolute difference everywhere (paper). `at_least` asks
-            of a side that is not clear only that the prediction reaches as far as what is
-            seen: where something stands in front, the object may go on behind it.
+        hidden_overshoot: Weight of reaching further than what is seen at a side that is not
+            clear. 1 takes the absolute difference everywhere (paper). Below, an object may go
+            on behind what stands in front, and the views that see its own edge decide where it
+            ends. At 0 nothing would hold back an object that always touches another.
     """
     apart = predicted - observed
-    if hidden_sides == "count":
-        return apart.abs()
-    falls_short = (apart if side < 2 else -apart).clamp(min=0)
-    return torch.where(clear, apart.abs(), falls_short)
+    distance = apart.abs()
+    if hidden_overshoot == 1:
+        return distance
+    beyond = apart < 0 if side < 2 else apart > 0
+    return torch.where(beyond & ~clear, hidden_overshoot * distance, distance)
 
 
 def matching_cost(
@@ -85,7 +88,7 @@ def matching_cost(
     boxes_2d: Boxes2D,
     views: SceneViews,
     box_weight: float,
-    hidden_sides: str = "count",
+    hidden_overshoot: float = 1.0,
 ) -> Float[Tensor, "rooms predictions objects"]:
     """Pairwise costs of all predictions and all tracked objects."""
     probability = scenes.class_logits.softmax(dim=-1)
@@ -99,7 +102,7 @@ def matching_cost(
         predicted = boxes_2d.boxes[..., side].unsqueeze(-1)
         target = views.boxes[..., side].unsqueeze(-2)
         clear = views.sides_clear[..., side].unsqueeze(-2)
-        apart = side_distance(predicted, target, clear, side, hidden_sides)
+        apart = side_distance(predicted, target, clear, side, hidden_overshoot)
         distance += (apart * seen.unsqueeze(-2)).sum(dim=1)
     distance = distance / seen.sum(dim=1).clamp(min=1).unsqueeze(-2)
     cost = cost + box_weight * distance

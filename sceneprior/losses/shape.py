@@ -1,11 +1,14 @@
 """Rendered and observed masks of matched objects in, the gated mask loss out (equation 8)."""
 
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 from torch import Tensor
 from torch.nn import functional as F
 
 from sceneprior.batches import SceneViews
 from sceneprior.losses.matching import Matches
+
+CERTAIN = 1e-6
+"""Pixels of a mask this near to 0 or 1 carry no gradient."""
 
 
 def mask_loss(
@@ -36,7 +39,9 @@ def mask_loss(
     observed = (_images(views)[room, view] == (item + 1)[:, None, None]).to(mine.dtype)
     iou = soft_iou(mine.detach(), observed)
     use = (iou > iou_gate).to(mine.dtype)
-    each = F.binary_cross_entropy(mine.clamp(0, 1), observed, reduction="none").mean(dim=(1, 2))
+    # Where a wrong mask rounds to 0 or 1, the gradient of log would be torch's 1e12.
+    certain = mine.clamp(CERTAIN, 1 - CERTAIN)
+    each = F.binary_cross_entropy(certain, observed, reduction="none").mean(dim=(1, 2))
     count = seen.sum(dim=1)
     share = 1 / count[room, item].to(mine.dtype)
     objects = (count > 0).sum().clamp(min=1)
@@ -53,7 +58,7 @@ def soft_iou(
     return both / (a.sum(dim=(1, 2)) + b.sum(dim=(1, 2)) - both).clamp(min=1e-6)
 
 
-def _images(views: SceneViews) -> Int[Tensor, "rooms views height width"]:
+def _images(views: SceneViews) -> Integer[Tensor, "rooms views height width"]:
     if views.instance_ids is None:
         raise ValueError("mask_loss needs views with instance_ids; load the data with a mask_step")
     return views.instance_ids

@@ -44,10 +44,25 @@ def slerp(
     Raises:
         ValueError: the two are opposite, so that no geodesic is the shortest.
     """
-    angle = torch.acos((start @ end).clamp(-1, 1))
-    if angle > torch.pi - 1e-4:
+    along = torch.linspace(0, 1, steps, dtype=start.dtype, device=start.device)
+    return slerp_pairs(start.expand(steps, -1), end.expand(steps, -1), along)
+
+
+def slerp_pairs(
+    start: Float[Tensor, "pairs dimension"],
+    end: Float[Tensor, "pairs dimension"],
+    along: Float[Tensor, " pairs"],
+) -> Float[Tensor, "pairs dimension"]:
+    """One point a pair of unit vectors, `along` (0 to 1) of the geodesic between them.
+
+    Raises:
+        ValueError: two vectors are opposite, so that no geodesic is the shortest.
+    """
+    angle = torch.acos((start * end).sum(dim=-1).clamp(-1, 1)).unsqueeze(-1)
+    if bool((angle > torch.pi - 1e-4).any()):
         raise ValueError("The two latents are opposite points; any great circle joins them.")
-    t = torch.linspace(0, 1, steps, dtype=start.dtype, device=start.device).unsqueeze(-1)
-    if angle < 1e-6:
-        return F.normalize(torch.lerp(start, end, t), dim=-1)
-    return (torch.sin((1 - t) * angle) * start + torch.sin(t * angle) * end) / torch.sin(angle)
+    t = along.unsqueeze(-1)
+    # Where the two all but coincide, sin(angle) vanishes and the chord is the geodesic.
+    straight = F.normalize(torch.lerp(start, end, t), dim=-1)
+    turned = torch.sin((1 - t) * angle) * start + torch.sin(t * angle) * end
+    return torch.where(angle < 1e-3, straight, turned / torch.sin(angle).clamp(min=1e-6))

@@ -28,8 +28,11 @@ class SceneDecoder(nn.Module):
     encoding) gives the scene context F_k; one decoder layer asks it with z as the query. Both
     layers normalise after the residual, as the library does that the paper builds on.
 
-    Queries, keys and values of an object never change once it is there, so each is computed
-    once and appended; the attention itself is recomputed, since old objects see new ones.
+    In the encoder, an object's query, key and value never change once it is there: each is
+    computed once and appended, and only the attention is taken anew, since old objects see
+    new ones. In the decoder there is one query, z, for all steps: instead of projecting every
+    context token to a key and a value, z's query is carried through the key projection once,
+    and the value projection is applied to the one weighted sum. Both are exact.
 
     Args:
         width: D_z, the size of z and of every object feature.
@@ -48,7 +51,8 @@ class SceneDecoder(nn.Module):
         self.encoder_norm = nn.LayerNorm(width)
         self.encoder_ff = FeedForward(width, hidden, dropout)
         self.decoder_query = nn.Linear(width, width)
-        self.decoder_kv = nn.Linear(width, 2 * width)
+        self.decoder_key = nn.Parameter(nn.Linear(width, width).weight.detach())
+        self.decoder_value = nn.Linear(width, width)
         self.decoder_out = nn.Linear(width, width)
         self.decoder_norm = nn.LayerNorm(width)
         self.decoder_ff = FeedForward(width, hidden, dropout)
@@ -64,15 +68,15 @@ class SceneDecoder(nn.Module):
         """
         z = z * z.shape[-1] ** 0.5
         tokens = self.start.expand(len(z), 1, -1)
-        qkv = self._split(self.encoder_qkv(tokens), 3)
-        query = self._split(self.decoder_query(z).unsqueeze(1), 1)[0]
+        qkv = self._split(self.encoder_qkv(tokens))
+        question = self._question(z)
         features: list[Tensor] = []
         for step in range(objects):
-            features.append(self._next(z, query, tokens, qkv))
+            features.append(self._next(z, question, tokens, qkv))
             if step + 1 < objects:
                 newest = features[-1].unsqueeze(1)
                 tokens = torch.cat([tokens, newest], dim=1)
-                added = self._split(self.encoder_qkv(newest), 3)
+                added = self._split(self.encoder_qkv(newest))
                 qkv = [torch.cat(pair, dim=2) for pair in zip(qkv, added, strict=True)]
         return torch.stack(features, dim=1)
 
@@ -84,24 +88,40 @@ class SceneDecoder(nn.Module):
         """The feature that follows a set of objects, in whatever order they are given."""
         z = z * z.shape[-1] ** 0.5
         tokens = torch.cat([self.start.expand(len(z), 1, -1), previous], dim=1)
-        query = self._split(self.decoder_query(z).unsqueeze(1), 1)[0]
-        return self._next(z, query, tokens, self._split(self.encoder_qkv(tokens), 3))
+        qkv = self._split(self.encoder_qkv(tokens))
+        return self._next(z, self._question(z), tokens, qkv)
 
-    def _next(self, z: Tensor, query: Tensor, tokens: Tensor, qkv: list[Tensor]) -> Tensor:
-        context = tokens + self._drop(self.encoder_out(self._attend(*qkv)))
-        context = self.encoder_ff(self.encoder_norm(context))
-        key, value = self._split(self.decoder_kv(context), 2)
-        answer = z + self._drop(self.decoder_out(self._attend(query, key, value))[:, 0])
+    def _next(self, z: Tensor, question: Tensor, tokens: Tensor, qkv: list[Tensor]) -> Tensor:
+        query, key, value = qkv
+        # Written out: on a dozen tokens torch's fused CPU attention is slower.
+        scores = query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5
+        mixed = (self._drop(scores.softmax(dim=-1)) @ value).transpose(1, 2).flatten(2)
+        context = self.encoder_norm(tokens + self._drop(self.encoder_out(mixed)))
+        context = self.encoder_ff(context)
+        answer = z + self._drop(self.decoder_out(self._ask(question, context)))
         return self.decoder_ff(self.decoder_norm(answer))
 
-    def _attend(self, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        dropout = self.dropout if self.training else 0.0
-        mixed = F.scaled_dot_product_attention(query, key, value, dropout_p=dropout)
-        return mixed.transpose(1, 2).flatten(2)
+    def _question(self, z: Tensor) -> Tensor:
+        """(rooms, heads, width): z's query of each head, carried through the key projection.
 
-    def _split(self, packed: Tensor, parts: int) -> list[Tensor]:
-        rooms, tokens, width = packed.shape
-        shape = (rooms, tokens, parts, self.heads, width // parts // self.heads)
+        The key's bias would add the same to every token's score, which a softmax does not see.
+        """
+        query = self.decoder_query(z).unflatten(-1, (self.heads, -1))
+        key = self.decoder_key.unflatten(0, (self.heads, -1))
+        return torch.einsum("rhd,hdw->rhw", query, key) / query.shape[-1] ** 0.5
+
+    def _ask(self, question: Tensor, context: Tensor) -> Tensor:
+        """(rooms, width): the values of the context, weighted per head by its answer to z."""
+        weights = self._drop((question @ context.transpose(1, 2)).softmax(dim=-1))
+        summed = (weights @ context).transpose(0, 1)
+        value = self.decoder_value.weight.unflatten(0, (self.heads, -1))
+        values = torch.baddbmm(
+            self.decoder_value.bias.view(self.heads, 1, -1), summed, value.transpose(1, 2)
+        )
+        return values.transpose(0, 1).flatten(1)
+
+    def _split(self, packed: Tensor) -> list[Tensor]:
+        shape = (*packed.shape[:2], 3, self.heads, packed.shape[-1] // 3 // self.heads)
         return list(packed.reshape(shape).permute(2, 0, 3, 1, 4).unbind(0))
 
     def _drop(self, x: Tensor) -> Tensor:

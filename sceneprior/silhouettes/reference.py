@@ -39,8 +39,9 @@ def _one_mesh(
     grid: Tensor, corners: Tensor, z: Tensor, sigma: float, blur: float
 ) -> tuple[Tensor, Tensor]:
     if len(corners) == 0:
-        empty = grid[:, 0, 0]
-        return torch.zeros_like(empty), torch.full_like(empty, float("inf"))
+        # The sum over no corners is 0, and carries a gradient of 0 instead of none.
+        empty = torch.zeros_like(grid[:, 0, 0]) + corners.sum()
+        return empty, torch.full_like(empty, float("inf"))
     a, b, c = corners.unbind(dim=1)
     squared = torch.stack(
         [_segment_distance2(grid, *edge) for edge in ((a, b), (b, c), (c, a))]

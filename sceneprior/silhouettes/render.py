@@ -67,6 +67,17 @@ def render_silhouettes(
 
     Source:
         Liu et al., "Soft Rasterizer", ICCV 2019; the paper's supplement A.
+
+    Example: a triangle with 1 m legs, 2 m ahead, at 32 px focal length covers 16 * 16 / 2 px.
+
+        >>> triangle = torch.tensor([[[[0.0, 0, 2], [1, 0, 2], [0, 1, 2]]]])
+        >>> ahead = torch.eye(4)[None, None]
+        >>> lens = torch.tensor([[[[32.0, 0, 16], [0, 32, 16], [0, 0, 1]]]])
+        >>> masks = render_silhouettes(
+        ...     triangle, torch.tensor([[0, 1, 2]]), ahead, lens, (32, 32), sigma_px2=1e-3
+        ... )
+        >>> masks.shape, round(masks.sum().item(), 3)
+        (torch.Size([1, 1, 1, 32, 32]), 128.0)
     """
     if compositing not in COMPOSITING:
         raise ValueError(f"compositing is '{compositing}'; expected one of {COMPOSITING}")

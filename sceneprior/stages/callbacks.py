@@ -1,9 +1,9 @@
 """What happens beside the training step: progress, checkpoints and a clean stop."""
 
-import contextlib
 from pathlib import Path
 
 import lightning
+import torch
 from lightning.pytorch.callbacks import Callback
 from rich.console import Console
 from rich.progress import (
@@ -14,6 +14,8 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from sceneprior.stages.view_loss import step_seed
 
 
 class RunProgress(Callback):
@@ -55,34 +57,43 @@ class RunProgress(Callback):
         self._stop()
 
 
+class EpochSeed(Callback):
+    """Seed each epoch anew, so that a resumed run drops out what it would have dropped out."""
+
+    def __init__(self, seed: int):
+        self.seed = seed
+
+    def on_train_epoch_start(self, trainer: lightning.Trainer, pl_module) -> None:
+        torch.manual_seed(step_seed(self.seed, trainer.current_epoch, trainer.global_rank))
+
+
 class RollingCheckpoint(Callback):
-    """Keep `last.ckpt` fresh: every few epochs and when the run is interrupted.
+    """Keep `last.ckpt` fresh: after every epoch, since only there a run can be taken up exactly.
+
+    A stop by hand loses the epoch it falls into, and the resumed run draws that epoch's views
+    again: it ends at the same weights as one that was never stopped.
 
     Args:
         folder: Where it goes.
-        every: Epochs between two writes.
         extra: Plain data stored under its own key.
     """
 
-    def __init__(self, folder: Path, every: int, extra: dict):
-        self.folder, self.every, self.extra = folder, every, extra
+    def __init__(self, folder: Path, extra: dict):
+        self.folder, self.extra = folder, extra
 
     def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict) -> None:
         checkpoint.update(self.extra)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
-        if (trainer.current_epoch + 1) % self.every == 0:
-            self.write(trainer, "last.ckpt")
+        self.write(trainer, "last.ckpt")
 
     def write(self, trainer: lightning.Trainer, name: str) -> None:
         """Write to a temporary name and move into place."""
         part = self.folder / f"{name}.part"
-        trainer.save_checkpoint(part)
-        if trainer.is_global_zero:
-            part.replace(self.folder / name)
-
-    def on_exception(self, trainer: lightning.Trainer, pl_module, exception) -> None:
-        # Only a stop by hand: after an error the state may be the error's.
-        if isinstance(exception, KeyboardInterrupt):
-            with contextlib.suppress(OSError):
-                self.write(trainer, "last.ckpt")
+        try:
+            trainer.save_checkpoint(part)
+            if trainer.is_global_zero:
+                part.replace(self.folder / name)
+        finally:
+            if trainer.is_global_zero:
+                part.unlink(missing_ok=True)

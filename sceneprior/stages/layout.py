@@ -36,7 +36,12 @@ class LayoutStage(lightning.LightningModule):
         settings = self.config.layout
         seed = step_seed(self.config.seed, self.global_step, self.global_rank)
         z = training_latents(
-            self.prior, self.latents, views.room_index, settings.latent_noise, seed
+            self.prior,
+            self.latents,
+            views.room_index,
+            settings,
+            self.current_epoch / settings.epochs,
+            seed,
         )
         scenes = self.prior.decode(z, with_shape=False)
         points = proxy_points(scenes, settings.proxy)

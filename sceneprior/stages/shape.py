@@ -36,13 +36,14 @@ class ShapeStage(lightning.LightningModule):
         self.config = config
 
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
-        noise = self.config.shape.latent_noise
+        settings = self.config.shape
+        progress = self.current_epoch / settings.epochs
         seed = step_seed(self.config.seed, self.global_step, self.global_rank)
-        z = training_latents(self.prior, self.latents, views.room_index, noise, seed)
+        z = training_latents(self.prior, self.latents, views.room_index, settings, progress, seed)
         scenes = self.prior.decode(z)
-        losses, matches = match_and_score(
-            scenes, self._box_points(scenes), views, self.config.loss
-        )
+        losses, matches = match_and_score(scenes, self._box_points(scenes), views, self.config.loss)
+        # Before rendering, too, which refuses vertices that are not finite and knows no rooms.
+        check_finite(weighted_sum(losses, self.config.loss), views)
         masks = self._render(scenes, views)
         losses["mask"], overlap = mask_loss(masks, views, matches, self.config.loss.iou_gate)
         total = weighted_sum(losses, self.config.loss)

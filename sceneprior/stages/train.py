@@ -1,7 +1,9 @@
 """A config and a run folder in, trained stages out."""
 
+import csv
 import logging
 import os
+import signal
 import warnings
 from pathlib import Path
 from typing import Any
@@ -17,14 +19,13 @@ from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.models.scene_prior import ScenePrior
-from sceneprior.stages.callbacks import RollingCheckpoint, RunProgress
+from sceneprior.stages.callbacks import EpochSeed, RollingCheckpoint, RunProgress
 from sceneprior.stages.layout import LayoutStage
 from sceneprior.stages.runs import STAGES, checkpoint_extra, restore
 from sceneprior.stages.shape import ShapeStage
 from sceneprior.stages.view_loss import build_latents, build_prior
 
-CHECKPOINT_EVERY = 10
-"""Epochs between two writes of last.ckpt."""
+LOGGERS = ("csv", "tensorboard", "wandb")
 
 
 def fit(
@@ -44,10 +45,14 @@ def fit(
         trainer_options: Passed on to Lightning's Trainer (devices, accelerator, precision).
 
     Raises:
-        InputError: the run exists and is not resumed, or its settings differ from `config`.
+        InputError: the run exists and is not resumed, its settings differ from `config`, or the
+            shards do not fit it; a run refused at its start leaves nothing behind.
     """
     run = Path(run)
-    _open_run(config, run, resume)
+    _check_run(config, run, resume)
+    for name in loggers:
+        if name not in LOGGERS:
+            raise InputError(f"No logger '{name}'; choose from {', '.join(LOGGERS)}.")
     previous = None
     for stage in STAGES:
         final = run / stage / "final.ckpt"
@@ -56,7 +61,7 @@ def fit(
         previous = final
 
 
-def _open_run(config: RunConfig, run: Path, resume: bool) -> None:
+def _check_run(config: RunConfig, run: Path, resume: bool) -> None:
     saved = run / "config.yaml"
     if saved.is_file():
         if not resume:
@@ -68,8 +73,6 @@ def _open_run(config: RunConfig, run: Path, resume: bool) -> None:
                 f"{saved} differs from the settings given now; resume with "
                 f"`--config {saved}` or name another folder."
             )
-    run.mkdir(parents=True, exist_ok=True)
-    dump_config(config, saved)
 
 
 def _fit_stage(
@@ -86,17 +89,19 @@ def _fit_stage(
     prior, latents = _start(config, dataset, previous)
     module = {"layout": LayoutStage, "shape": ShapeStage}[stage](prior, latents, config)
     folder = run / stage
-    folder.mkdir(exist_ok=True)
-    rolling = RollingCheckpoint(
-        folder, CHECKPOINT_EVERY, checkpoint_extra(config, dataset.room_ids)
-    )
+    # Only now: a run that is refused leaves nothing behind.
+    folder.mkdir(parents=True, exist_ok=True)
+    dump_config(config, run / "config.yaml")
+    rolling = RollingCheckpoint(folder, checkpoint_extra(config, dataset.room_ids))
     _quiet_lightning()
     lightning.seed_everything(config.seed, verbose=False)
+    if settings.cpu_threads is not None:
+        torch.set_num_threads(settings.cpu_threads)
     trainer = lightning.Trainer(
         max_epochs=settings.epochs,
         gradient_clip_val=settings.clip_gradient or None,
         logger=[_logger(name, folder) for name in loggers],
-        callbacks=[RunProgress(f"fit {stage} (epochs)"), rolling],
+        callbacks=[RunProgress(f"fit {stage} (epochs)"), EpochSeed(config.seed), rolling],
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -109,11 +114,16 @@ def _fit_stage(
         trainer.global_rank, trainer.world_size,
     )  # fmt: skip
     last = folder / "last.ckpt"
-    trainer.fit(
-        module, loader, ckpt_path=last if resume and last.is_file() else None, weights_only=True
-    )
-    if trainer.interrupted:
-        raise KeyboardInterrupt
+    start = last if resume and last.is_file() else None
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        trainer.fit(module, loader, ckpt_path=start, weights_only=True)
+    except SystemExit:
+        # Lightning answers Ctrl-C with sys.exit(1).
+        if not trainer.interrupted:
+            raise
+        signal.signal(signal.SIGINT, before)  # which Lightning left ignored
+        raise KeyboardInterrupt from None
     rolling.write(trainer, "final.ckpt")
 
 
@@ -161,15 +171,24 @@ def _start(
 
 def _logger(name: str, folder: Path) -> Logger:
     if name == "csv":
-        return CSVLogger(folder, name="", version="")
+        return _csv_logger(folder)
     if name == "tensorboard":
         return TensorBoardLogger(folder, name="", version="")
-    if name == "wandb":
-        from lightning.pytorch.loggers import WandbLogger
+    from lightning.pytorch.loggers import WandbLogger
 
-        key = os.environ.get("WANDB_API_KEY") or Path("~/.netrc").expanduser().is_file()
-        return WandbLogger(project="sceneprior", save_dir=folder, name=folder.name, offline=not key)
-    raise InputError(f"No logger '{name}'; choose from csv, tensorboard, wandb.")
+    key = os.environ.get("WANDB_API_KEY") or Path("~/.netrc").expanduser().is_file()
+    return WandbLogger(project="sceneprior", save_dir=folder, name=folder.name, offline=not key)
+
+
+def _csv_logger(folder: Path) -> CSVLogger:
+    # Lightning's deletes what it finds: hand it the rows of the epochs before the stop.
+    path = folder / "metrics.csv"
+    before = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
+    logger = CSVLogger(folder, name="", version="")
+    if before:
+        logger.experiment.metrics.extend(before)
+        logger.save()
+    return logger
 
 
 def _quiet_lightning() -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sceneprior.batches import DecodedScenes, SceneViews
@@ -39,8 +39,8 @@ def match_and_score(
     boxes: Boxes2D = boxes_of_points(
         points_m, views.world_to_camera, views.intrinsics, views.image_size
     )
-    matches = match_objects(scenes, boxes, views, weights.match_box, weights.hidden_sides)
-    return layout_losses(scenes, boxes, views, matches, weights.hidden_sides), matches
+    matches = match_objects(scenes, boxes, views, weights.match_box, weights.hidden_overshoot)
+    return layout_losses(scenes, boxes, views, matches, weights.hidden_overshoot), matches
 
 
 def weighted_sum(losses: dict[str, Tensor], weights: LossConfig) -> Float[Tensor, ""]:
@@ -81,10 +81,25 @@ def step_seed(seed: int, step: int, rank: int) -> int:
 
 
 def training_latents(
-    prior: ScenePrior, latents: nn.Embedding, rows: Tensor, noise: float, seed: int
+    prior: ScenePrior,
+    latents: nn.Embedding,
+    rows: Int[Tensor, " rooms"],
+    stage: StageConfig,
+    progress: float,
+    seed: int,
 ) -> Float[Tensor, "rooms width"]:
-    """The rooms' points on the sphere, moved a little where the stage asks for it."""
+    """The rooms' points on the sphere, moved a little where the stage asks for it.
+
+    Args:
+        prior, latents: Of the run.
+        rows: Which rooms.
+        stage: Says how far to move.
+        progress: Share of the stage that is done, 0 to 1.
+        seed: Of this step's noise.
+    """
     z = prior.sphere(latents(rows))
+    end = stage.latent_noise if stage.latent_noise_end is None else stage.latent_noise_end
+    noise = stage.latent_noise + progress * (end - stage.latent_noise)
     return jitter(z, noise, seed) if noise else z
 
 
@@ -92,8 +107,12 @@ def build_optimizer(
     prior: ScenePrior, latents: nn.Embedding, stage: StageConfig, steps: int
 ) -> dict:
     """Adam with the stage's schedule over `steps` updates, in the shape Lightning takes."""
+    fresh = list(prior.shape.parameters())
+    trained = [item for name, item in prior.named_parameters() if not name.startswith("shape.")]
+    fresh_rate = getattr(stage, "decoder_learning_rate", None) or stage.learning_rate
     groups = [
-        {"params": list(prior.parameters()), "lr": stage.learning_rate},
+        {"params": trained, "lr": stage.learning_rate},
+        {"params": fresh, "lr": fresh_rate},
         {"params": list(latents.parameters()), "lr": stage.latent_learning_rate},
     ]
     optimizer = torch.optim.Adam(groups, fused=True)

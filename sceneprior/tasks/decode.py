@@ -8,7 +8,7 @@ from sceneprior.batches import DecodedScenes
 from sceneprior.classes import label_set
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.stages.runs import TrainedPrior
-from sceneprior.tasks.sampling import sample_logits
+from sceneprior.tasks.sampling import sample_latents
 
 BATCH = 64
 
@@ -65,6 +65,6 @@ def decode_training_rooms(trained: TrainedPrior, limit: int | None = None) -> li
 def synthesize(trained: TrainedPrior, count: int, seed: int, law: str | None = None) -> list[Scene]:
     """New scenes: latents sampled from the hypersphere, decoded."""
     law = law or trained.config.sampling.law
-    logits = sample_logits(trained.logits, count, seed, law)
+    z = sample_latents(trained.prior.sphere, trained.logits, count, seed, law)
     names = [f"seed{seed}_{index:04d}" for index in range(count)]
-    return decode_latents(trained, trained.prior.sphere(logits), names)
+    return decode_latents(trained, z, names)

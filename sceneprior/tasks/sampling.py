@@ -5,33 +5,71 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneprior.errors import InputError
+from sceneprior.models.latents import LatentSphere, slerp_pairs
 
-LAWS = ("gaussian", "paper")
+NEIGHBOURS = 20
+"""Rooms that a geodesic may lead to. More reach further from the training rooms and miss the bed
+of a bedroom more often; docs/results.md has the figures."""
+
+LAWS = ("geodesic", "gaussian", "paper")
+
+
+def sample_latents(
+    sphere: LatentSphere,
+    trained: Float[Tensor, "rooms anchors"],
+    count: int,
+    seed: int,
+    law: str = "geodesic",
+) -> Float[Tensor, "count dimension"]:
+    """Draw points of the hypersphere.
+
+    Args:
+        sphere: Turns logits into points.
+        trained: The training rooms' logits.
+        count: How many to draw.
+        seed: Same seed, same rooms.
+        law: `geodesic`: a point anywhere on the geodesic between a training room drawn at
+            random and one of its `NEIGHBOURS` nearest. `gaussian` and `paper`: see
+            `sample_logits`.
+
+    Raises:
+        InputError: an unknown law, or fewer than two training rooms to draw between.
+    """
+    if law not in LAWS:
+        raise InputError(f"No sampling law '{law}'; choose from {', '.join(LAWS)}.")
+    if law != "paper" and len(trained) < 2:
+        raise InputError(f"The {law} law needs at least 2 training rooms; use --law paper.")
+    if law != "geodesic":
+        return sphere(sample_logits(trained, count, seed, law))
+    generator = torch.Generator().manual_seed(seed)
+    rooms = len(trained)
+    start = torch.randint(rooms, (count,), generator=generator)
+    z = sphere(trained)
+    closeness = z[start] @ z.T
+    closeness[torch.arange(count), start] = -torch.inf  # nobody is their own neighbour
+    nearest = closeness.topk(min(NEIGHBOURS, rooms - 1), dim=1).indices
+    pick = torch.randint(nearest.shape[1], (count, 1), generator=generator)
+    end = nearest.gather(1, pick)[:, 0]
+    along = torch.rand(count, generator=generator).to(trained.dtype)
+    return slerp_pairs(z[start], z[end], along)
 
 
 def sample_logits(
-    trained: Float[Tensor, "rooms anchors"], count: int, seed: int, law: str = "gaussian"
+    trained: Float[Tensor, "rooms anchors"], count: int, seed: int, law: str
 ) -> Float[Tensor, "count anchors"]:
     """Draw logits of latent weights.
 
     Args:
         trained: The training rooms' logits.
         count: How many to draw.
-        seed: Same seed, same rooms.
+        seed: Same seed, same logits.
         law: `paper`: N(0, 1), which is where training rooms' logits started, not where they
             ended. `gaussian`: the mean and covariance of the training rooms' logits.
-
-    Raises:
-        InputError: an unknown law, or too few rooms to fit one to.
     """
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(count, trained.shape[1], generator=generator, dtype=torch.float64)
     if law == "paper":
         return noise.to(trained.dtype)
-    if law != "gaussian":
-        raise InputError(f"No sampling law '{law}'; choose from {', '.join(LAWS)}.")
-    if len(trained) < 2:
-        raise InputError("The gaussian law needs at least 2 training rooms; use --law paper.")
     # A softmax does not see what is added to all its logits: take that freedom out first.
     logits = trained.double() - trained.double().mean(dim=1, keepdim=True)
     mean = logits.mean(dim=0)

@@ -23,7 +23,7 @@ SIZE = (24, 32)
 FRONT = torch.eye(4, dtype=torch.float64)[None, None]
 
 
-def random_scene(seed: int, rooms=2, objects=3, views=3, corners=9, faces=8, spread=2.5) -> dict:
+def random_scene(seed: int, rooms=2, objects=3, views=4, corners=9, faces=8, spread=3.0) -> dict:
     """Triangle soups around the origin, cameras among them: objects lie before, beside, behind."""
     rng = np.random.default_rng(seed)
     centers = rng.uniform(-spread, spread, (rooms, objects, 1, 3))
@@ -120,7 +120,7 @@ def test_numba_equals_the_reference_before_beside_behind_and_around_the_camera(s
 @pytest.mark.parametrize("mode", MODES)
 def test_meshes_whose_faces_share_edges(mode):
     masks = backends_agree(sphere_scene(), compositing=mode)
-    assert masks[0, 0, 0].sum() > 60
+    assert 40 < masks[0, 0, 0].sum() < 60  # pi * (16 * 0.6 / 2.5)**2 = 46, and a soft rim
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1), (17, 23)])
@@ -141,7 +141,9 @@ def test_triangles_smaller_than_a_pixel():
 
 
 def test_faces_without_an_area_are_not_drawn():
-    scene = triangles([[0, 0, 2], [1, 0, 2], [0, 1, 2]], [[-1, 0, 2], [0, 0, 2], [1, 0, 2]])
+    scene = triangles(
+        [[0, 0, 2], [1, 0.1, 2], [0.3, 1, 2]], [[-1, 0.2, 2], [0, 0.2, 2], [1, 0.2, 2]]
+    )
     scene["faces"] = torch.tensor([[0, 1, 2], [0, 0, 1], [2, 2, 2]])
     masks = backends_agree(scene, compositing="alone", sigma_px2=0.5)
     assert masks[0, 0, 0].max() > 0.9 and masks[0, 0, 1].max() == 0
@@ -217,8 +219,8 @@ def test_gradients_pass_gradcheck(mode, backend):
         "compositing": mode,
         "backend": backend,
     }
-    masks = render_silhouettes(scene["vertices_m"], **rest)
-    assert (masks.flatten(3).sum(-1) > 1).all()  # both objects are seen in both views
+    alone = render_silhouettes(scene["vertices_m"], **rest | {"compositing": "alone"})
+    assert (alone.flatten(3).sum(-1) > 1).all()  # both objects are seen in both views
     assert torch.autograd.gradcheck(
         lambda vertices: render_silhouettes(vertices, **rest),
         (scene["vertices_m"].requires_grad_(),),
@@ -264,7 +266,7 @@ def tensors(scene: dict) -> dict:
 
 @pytest.mark.parametrize("template", ["sphere", "box"])
 def test_a_shifted_and_shrunk_object_walks_back_under_its_masks(template):
-    """Three views, 80 steps of Adam on the soft masks: IoU of the hard masks above 0.9."""
+    """Three views, 90 steps of Adam on ever crisper masks: IoU of the hard masks above 0.9."""
     shape, faces = icosphere(1)
     shape = to_cube(shape) if template == "box" else shape
     truth = torch.tensor([[0.4, 0.5, -0.2], [0.7, 0.5, 0.4]])
@@ -289,9 +291,9 @@ def test_a_shifted_and_shrunk_object_walks_back_under_its_masks(template):
     log_size = start[1].log().requires_grad_()
     assert iou(center.detach(), log_size.exp().detach()) < 0.5
     optimizer = torch.optim.Adam([center, log_size], lr=0.03)
-    for step in range(80):
-        soft = masks(center, log_size.exp(), 4.0 if step < 40 else 0.5)
-        loss = torch.nn.functional.binary_cross_entropy(soft.clamp(0, 1), observed)
+    for sigma_px2 in [4.0] * 30 + [0.5] * 30 + [0.06] * 30:  # soft masks are too large
+        soft = masks(center, log_size.exp(), sigma_px2).clamp(1e-6, 1 - 1e-6)
+        loss = torch.nn.functional.binary_cross_entropy(soft, observed)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -1,0 +1,201 @@
+"""Batches of views: padding, draws, turned rooms, and who gets which room."""
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+from toy_rooms import make_toy_room
+
+from sceneprior.data.datamodule import DrawSampler, make_loader
+from sceneprior.data.dataset import ViewDataset
+from sceneprior.errors import ShardError
+from sceneprior.geometry.boxes import box_corners
+from sceneprior.geometry.cameras import boxes_of_points
+from sceneprior.shards import Shard, list_shards, write_shard
+
+
+def dataset(shards, **changes) -> ViewDataset:
+    return ViewDataset(shards, "train", **{"views_per_room": 5, **changes})
+
+
+def drawn_views(data: ViewDataset, row: int, epoch: int) -> list[int]:
+    """Which of the room's views a draw holds, told by their cameras."""
+    views = data.__getitems__([(row, epoch)])
+    room = data.rooms[row // data.rotations]
+    turn = data._turns[row % data.rotations]
+    known = room.world_to_camera @ turn.T
+    return [
+        int(np.abs(known - pose).sum(axis=(1, 2)).argmin())
+        for pose in views.world_to_camera[0].numpy()
+    ]
+
+
+def test_a_batch_holds_what_the_shards_hold_and_pads_the_rest(toy_shards):
+    data = dataset(toy_shards)
+    rows = list(range(12))
+    views = data.__getitems__([(row, 3) for row in rows])
+    assert views.room_index.tolist() == rows
+    assert views.room_ids == tuple(f"toy/train_{k:02d}" for k in rows)
+    assert views.boxes.shape == (12, 5, data.max_objects, 4)
+    assert views.image_size == (72, 96) and views.instance_ids is None
+    counts = {len(room.object_class) for room in data.rooms}
+    assert len(counts) > 1  # or nothing would be padded
+    for slot, room in enumerate(data.rooms):
+        n = len(room.object_class)
+        chosen = drawn_views(data, slot, 3)
+        assert views.object_class[slot].tolist() == [
+            *room.object_class,
+            *[0] * (len(views.is_object[slot]) - n),
+        ]
+        assert views.is_object[slot].tolist() == [k < n for k in range(data.max_objects)]
+        np.testing.assert_array_equal(views.boxes[slot, :, :n], room.boxes[chosen])
+        np.testing.assert_array_equal(views.visible[slot, :, :n], room.visible[chosen])
+        np.testing.assert_array_equal(views.sides_clear[slot, :, :n], room.sides_clear[chosen])
+        np.testing.assert_array_equal(views.world_to_camera[slot], room.world_to_camera[chosen])
+        assert not views.visible[slot, :, n:].any() and not views.boxes[slot, :, n:].any()
+        assert not views.sides_clear[slot, :, n:].any()
+
+
+def test_masks_are_every_fourth_pixel_of_the_same_views(toy_shards):
+    data = dataset(toy_shards, mask_step=4)
+    views = data.__getitems__([(2, 0), (7, 1)])
+    assert views.instance_ids.shape == (2, 5, 18, 24)
+    for slot, (row, epoch) in enumerate([(2, 0), (7, 1)]):
+        with Shard(data._paths[row]) as shard:
+            whole = shard.read_room(data.rooms[row].room_id, images=True).instance_ids
+        small = whole[drawn_views(data, row, epoch), 2::4, 2::4]
+        np.testing.assert_array_equal(views.instance_ids[slot], small)
+
+
+def test_draws_are_a_function_of_seed_row_and_epoch_alone(toy_shards):
+    data = dataset(toy_shards, seed=4)
+    first = [drawn_views(data, row, epoch) for row in range(3) for epoch in range(4)]
+    again = dataset(toy_shards, seed=4)
+    # In another order, in other batches, in another process: the same.
+    backwards = [drawn_views(again, row, epoch) for row in (2, 1, 0) for epoch in (3, 2, 1, 0)]
+    assert first == backwards[::-1]
+    in_batch = again.__getitems__([(1, 2), (0, 0), (2, 3)])
+    alone = again.__getitems__([(0, 0)])
+    assert torch.equal(in_batch.world_to_camera[1], alone.world_to_camera[0])
+    assert all(len(set(draw)) == 5 for draw in first)  # without replacement
+    assert len({tuple(draw) for draw in first}) > 8
+    other = dataset(toy_shards, seed=5)
+    assert [drawn_views(other, row, epoch) for row in range(3) for epoch in range(4)] != first
+
+
+def test_few_views_are_shown_about_equally_often(toy_shards):
+    data = dataset(toy_shards, views_per_room=20)
+    draw = drawn_views(data, 0, 0)
+    counts = np.bincount(draw, minlength=8)
+    assert len(draw) == 20 and counts.min() == 2 and counts.max() == 3
+
+
+@pytest.mark.parametrize(("fraction", "kept"), [(1.0, 8), (0.5, 4), (0.25, 2), (0.01, 1)])
+def test_view_fraction_keeps_the_same_share_of_each_rooms_views(toy_shards, fraction, kept):
+    data = dataset(toy_shards, view_fraction=fraction)
+    for row in range(4):
+        seen = set().union(*(drawn_views(data, row, epoch) for epoch in range(30)))
+        assert len(seen) == kept
+    if fraction == 0.5:
+        subsets = {tuple(allowed) for allowed in data._allowed}
+        assert len(subsets) > 6
+
+
+def test_a_turned_room_under_turned_cameras_looks_the_same(toy_shards):
+    """Rows 4k to 4k + 3 are room k turned by 0, 90, 180, 270 degrees about +y."""
+    data = dataset(toy_shards, rotations=4)
+    assert len(data) == 48
+    assert data.room_ids[:4] == tuple("toy/train_00" + turn for turn in ("", "@90", "@180", "@270"))
+    with Shard(data._paths[0]) as shard:
+        truth = shard.read_ground_truth(data.rooms[0].room_id)
+    n = len(data.rooms[0].object_class)
+    center = torch.from_numpy(truth.centers_m[:n])
+    size = torch.from_numpy(truth.sizes_m[:n])
+    for quarter in range(4):
+        views = data.__getitems__([(quarter, 0)])
+        found = boxes_of_points(
+            box_corners(center, size)[None], views.world_to_camera, views.intrinsics, (72, 96)
+        )
+        plain = [
+            boxes_of_points(
+                box_corners(
+                    torch.from_numpy(truth.centers_m[:n]), torch.from_numpy(truth.sizes_m[:n])
+                )[None],
+                torch.from_numpy(data.rooms[0].world_to_camera[[view]])[None],
+                views.intrinsics[:, :1],
+                (72, 96),
+            ).boxes[0, 0]
+            for view in drawn_views(data, quarter, 0)
+        ]
+        # Quarter turns are exact in floats; what is left is the order of sums.
+        assert_close(found.boxes[0], torch.stack(plain), rtol=0, atol=1e-5)
+        # +z turns towards +x: (x, z) -> (z, -x).
+        center = torch.stack([center[:, 2], center[:, 1], -center[:, 0]], dim=1)
+        size = size[:, [2, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    ("rows", "batch", "world"), [(12, 4, 1), (12, 5, 1), (13, 4, 2), (3, 2, 4)]
+)
+def test_each_epoch_visits_every_room_once_split_over_processes(rows, batch, world):
+    samplers = [DrawSampler(rows, batch, 7, rank, world) for rank in range(world)]
+    orders = []
+    for epoch in range(3):
+        visited = []
+        lengths = set()
+        for sampler in samplers:
+            sampler.set_epoch(epoch)
+            batches = list(sampler)
+            assert len(batches) == len(sampler)
+            assert {e for part in batches for _, e in part} == {epoch}
+            assert all(len(part) == batch for part in batches[:-1]) and len(batches[-1]) <= batch
+            visited += [row for part in batches for row, _ in part]
+            lengths.add(sum(map(len, batches)))
+        assert set(visited) == set(range(rows))
+        # All processes get the same number: the fewest possible rows come twice.
+        assert len(lengths) == 1 and len(visited) == -(-rows // world) * world
+        assert max(map(visited.count, range(rows))) <= 2
+        orders.append(visited)
+        again = DrawSampler(rows, batch, 7, 0, world)
+        again.set_epoch(epoch)
+        samplers[0].set_epoch(epoch)
+        assert list(again) == list(samplers[0])
+    assert orders[0] != orders[1] or rows < 4
+
+
+def test_the_loader_gives_whole_batches_and_learns_of_epochs(toy_shards):
+    data = dataset(toy_shards)
+    loader = make_loader(data, 5, 0, 0)
+    # As Lightning does it: it never speaks to the batch sampler itself.
+    loader.batch_sampler.sampler.set_epoch(2)
+    batches = list(loader)
+    assert [len(views.room_index) for views in batches] == [5, 5, 2]
+    row = int(batches[0].room_index[0])
+    assert torch.equal(
+        batches[0].world_to_camera[0], data.__getitems__([(row, 2)]).world_to_camera[0]
+    )
+
+
+def test_folders_that_cannot_be_used_say_so(tmp_path, toy_shards):
+    with pytest.raises(ShardError, match="No folder of shards at"):
+        dataset(tmp_path / "none")
+    with pytest.raises(ShardError, match=r"The 'val' split of .* holds no shards"):
+        ViewDataset(toy_shards, "val", 5)
+    write_shard(tmp_path / "train" / "a.h5", "front3d_bedroom", [])
+    with pytest.raises(ShardError, match=r"/train hold no rooms; prepare them again"):
+        dataset(tmp_path)
+    room = make_toy_room("a", np.random.default_rng(0))
+    write_shard(tmp_path / "train" / "a.h5", "front3d_bedroom", [room])
+    write_shard(tmp_path / "train" / "b.h5", "scannet", [room])
+    with pytest.raises(
+        ShardError, match="is labelled 'scannet' but its neighbours 'front3d_bedroo"
+    ):
+        dataset(tmp_path)
+    (tmp_path / "train" / "b.h5").write_bytes(b"nonsense")
+    with pytest.raises(ShardError, match=r"b\.h5 cannot be read .*damaged\. Delete it and run"):
+        dataset(tmp_path)
+
+
+def test_a_split_of_several_shards_is_read_in_order(toy_shards):
+    assert len(list_shards(toy_shards, "train")) == 2
+    assert list(dataset(toy_shards).room_ids) == [f"toy/train_{k:02d}" for k in range(12)]

@@ -1,0 +1,67 @@
+"""A built wheel works outside the repository: it carries the configs, the recipes, the page."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> Path:
+    """A folder with the wheel's contents and nothing else of ours."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    # Build from a copy: setuptools writes build/ and egg-info where it builds.
+    subprocess.run(["git", "clone", "-q", str(ROOT), str(source)], check=True)
+    pip = [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check"]
+    subprocess.run(
+        [*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", folder, source], check=True
+    )
+    (wheel,) = folder.glob("*.whl")
+    target = folder / "site"
+    subprocess.run([*pip, "install", "--no-deps", "--target", target, wheel], check=True)
+    return target
+
+
+def run(installed: Path, *arguments: str, cwd: Path) -> subprocess.CompletedProcess:
+    environment = os.environ | {"PYTHONPATH": str(installed)}
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=cwd, env=environment, capture_output=True, text=True
+    )
+
+
+def test_shipped_configs_are_found_by_name(installed, tmp_path):
+    code = (
+        "import sceneprior, data_prep.recipe\n"
+        "from sceneprior.config import load_config\n"
+        "assert load_config('bedroom.yaml').model.max_objects == 13\n"
+        "assert data_prep.recipe.load_recipe('front3d_bedroom')\n"
+        "print(sceneprior.__file__)"
+    )
+    done = run(installed, "-c", code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.strip()).is_relative_to(installed)
+
+
+def test_homes_become_shards_and_the_page_template_is_there(installed, tmp_path):
+    assert list(installed.glob("sceneprior/evaluation/*.jinja"))
+    done = run(installed, "-m", "sceneprior", "make-homes", "homes", "--rooms", "4", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = run(
+        installed, "-m", "sceneprior", "prep-front", "--front", "homes/3D-FRONT",
+        "--future", "homes/3D-FUTURE-model", "--splits", "homes/splits/bedroom.csv",
+        "--out", "shards", "--workers", "1", "--views-per-m2", "0.5", cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "shards/index.json").is_file()
+
+
+def test_a_wrong_name_lists_the_shipped_configs(installed, tmp_path):
+    done = run(installed, "-m", "sceneprior", "fit", "--config", "bedrom.yaml", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("Error: No config 'bedrom.yaml'")
+    assert "bedroom.yaml" in done.stderr and "Traceback" not in done.stderr
