@@ -25,13 +25,14 @@ def prep_front(
     ] = None,
     val: Annotated[str, typer.Option(help="Where val rooms go: train, test or none.")] = "train",
     views_per_m2: Annotated[
-        float | None, typer.Option(help="Views per square metre of floor [the recipe's: 2].")
+        float | None,
+        typer.Option(help="Views per square metre of floor (default: the recipe's: 2)."),
     ] = None,
     rule: Annotated[
         list[str] | None, typer.Option(help="Change a rule of the recipe: max_floor_m=8, or null.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
-    workers: Annotated[int | None, typer.Option(help="Processes [all cores].")] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes (default: all cores).")] = None,
     renderer: Annotated[str, typer.Option(help="auto, pyrender or software.")] = "auto",
     only: Annotated[
         str | None, typer.Option(help="One house or room: HOUSE, HOUSE/ROOM or a room id.")

@@ -1,6 +1,7 @@
 """Two nouns that learning meets at: `SceneViews` (what cameras saw) and `DecodedScenes`."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, Integer
@@ -37,9 +38,10 @@ class SceneViews:
     def to(self, device: torch.device | str) -> "SceneViews":
         """The same views with every tensor on `device` (Lightning calls this)."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return SceneViews(
-            **{key: v.to(device) if isinstance(v, Tensor) else v for key, v in values.items()}
-        )
+        moved: dict[str, Any] = {
+            key: v.to(device) for key, v in values.items() if isinstance(v, Tensor)
+        }
+        return replace(self, **moved)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ RendererOption = Annotated[
 ]
 RunOption = Annotated[Path, typer.Option(help="Folder of a run that `fit` made.")]
 LawOption = Annotated[
-    str | None, typer.Option(help="Sampling law: geodesic, gaussian or paper [the config's].")
+    str | None,
+    typer.Option(help="geodesic, gaussian or paper (default: the config's)."),
 ]
 
 
@@ -48,7 +49,7 @@ def _options(
 def fit(
     config: Annotated[str, typer.Option(help="A YAML file, or a shipped one such as demo.yaml.")],
     run: Annotated[
-        Path | None, typer.Option(help="Folder for checkpoints and logs [runs/<config>].")
+        Path | None, typer.Option(help="Folder for checkpoints and logs (default: runs/<config>).")
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Override: model.width=256. Repeatable.")
@@ -113,9 +114,9 @@ def eval_fid(
         Path | None, typer.Option(help="inception-2015-12-05.pt (TorchScript), for FID proper.")
     ] = None,
     shards: Annotated[
-        Path | None, typer.Option(help="Shards to judge against [those of the run].")
+        Path | None, typer.Option(help="Shards to judge against (default: those of the run).")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="JSON file [RUN/scores.json].")] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file (default: RUN/scores.json).")] = None,
     law: LawOption = None,
     renderer: RendererOption = "auto",
 ) -> None:
@@ -131,8 +132,8 @@ def eval_fid(
 @app.command()
 def report(
     run: RunOption,
-    scores: Annotated[Path | None, typer.Option(help="From eval-fid [RUN/scores.json].")] = None,
-    out: Annotated[Path | None, typer.Option(help="HTML file [RUN/report.html].")] = None,
+    scores: Annotated[Path | None, typer.Option(help="From eval-fid (RUN/scores.json).")] = None,
+    out: Annotated[Path | None, typer.Option(help="HTML file (default: RUN/report.html).")] = None,
     seed: Annotated[int, typer.Option(help="Of the generated rooms shown.")] = 0,
     command: Annotated[
         list[str] | None, typer.Option(help="A command to list on the page. Repeatable.")

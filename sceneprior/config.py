@@ -141,8 +141,8 @@ class SamplingConfig(_Section):
     """Where new latents come from."""
 
     law: Literal["geodesic", "gaussian", "paper"] = "geodesic"
-    """`geodesic`: between two neighbouring training rooms; `gaussian`: fitted to the training rooms' logits;
-    `paper`: logits from N(0, 1)."""
+    """`geodesic`: between neighbouring training rooms; `gaussian`: fitted to the training rooms'
+    logits; `paper`: logits from N(0, 1)."""
 
 
 class RunConfig(_Section):
@@ -229,7 +229,10 @@ def _apply(data: dict[str, Any], override: str) -> None:
         node = node.setdefault(parent, {})
         if not isinstance(node, dict):
             raise ConfigError(f"--set {override}: '{parent}' is a value, not a section.")
-    node[last] = yaml.load(text, _Loader)
+    try:
+        node[last] = yaml.load(text, _Loader)
+    except yaml.YAMLError:
+        raise ConfigError(f"--set {override}: '{text}' is not a YAML value.") from None
 
 
 def _explain(error: ValidationError, source: str) -> str:

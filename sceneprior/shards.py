@@ -113,7 +113,7 @@ def _write_room(group: h5py.Group, views: RoomViews, truth: RoomGroundTruth | No
     group.attrs["image_size"] = views.image_size
     for name in _VIEW_ARRAYS:
         group.create_dataset(name, data=getattr(views, name))
-    ids = views.instance_ids
+    ids = _images(views)
     group.create_dataset(
         "instance_ids", data=ids, chunks=(1, *ids.shape[1:]), compression="gzip",
         compression_opts=4, shuffle=False,
@@ -124,6 +124,14 @@ def _write_room(group: h5py.Group, views: RoomViews, truth: RoomGroundTruth | No
             hidden.create_dataset(name, data=getattr(truth, name))
         hidden.attrs["model_ids"] = json.dumps(truth.model_ids)
         hidden.attrs["height_m"] = truth.height_m
+
+
+def _images(views: RoomViews) -> np.ndarray:
+    if views.instance_ids is None:
+        raise ShardError(
+            f"Room {views.room_id} was read without its images; read them to write it."
+        )
+    return views.instance_ids
 
 
 def _check(path: Path, views: RoomViews) -> None:
@@ -144,9 +152,10 @@ def _check(path: Path, views: RoomViews) -> None:
             raise ShardError(
                 f"{path.name}, room {views.room_id}: {name} has shape {came}, expected {shape}."
             )
-    if objects and int(views.instance_ids.max()) > objects:
+    highest = int(_images(views).max(initial=0))
+    if highest > objects:
         raise ShardError(
-            f"{path.name}, room {views.room_id}: an instance id is {views.instance_ids.max()}, "
+            f"{path.name}, room {views.room_id}: an instance id is {highest}, "
             f"but the room has {objects} objects."
         )
 

@@ -1,6 +1,7 @@
 """A run's data settings in, Lightning loaders out."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from torch.utils.data import DataLoader, Sampler
@@ -45,7 +46,7 @@ class DrawSampler(Sampler[list[tuple[int, int]]]):
             yield [(int(row), self.epoch) for row in order[start : start + self.batch_size]]
 
 
-def _as_it_is(batch: SceneViews) -> SceneViews:
+def _as_it_is(batch: Any) -> SceneViews:
     return batch
 
 

@@ -36,7 +36,7 @@ def mask_loss(
     room, view, item = seen.nonzero(as_tuple=True)
     prediction = matches.prediction[room, item]
     mine = rendered[room, view, prediction]
-    observed = (_images(views)[room, view] == (item + 1)[:, None, None]).to(mine.dtype)
+    observed = (observed_ids(views)[room, view] == (item + 1)[:, None, None]).to(mine.dtype)
     iou = soft_iou(mine.detach(), observed)
     use = (iou > iou_gate).to(mine.dtype)
     # Where a wrong mask rounds to 0 or 1, the gradient of log would be torch's 1e12.
@@ -58,7 +58,12 @@ def soft_iou(
     return both / (a.sum(dim=(1, 2)) + b.sum(dim=(1, 2)) - both).clamp(min=1e-6)
 
 
-def _images(views: SceneViews) -> Integer[Tensor, "rooms views height width"]:
+def observed_ids(views: SceneViews) -> Integer[Tensor, "rooms views height width"]:
+    """The views' instance-id images.
+
+    Raises:
+        ValueError: the views were loaded without them.
+    """
     if views.instance_ids is None:
         raise ValueError("mask_loss needs views with instance_ids; load the data with a mask_step")
     return views.instance_ids

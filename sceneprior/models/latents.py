@@ -17,6 +17,7 @@ class LatentSphere(nn.Module):
 
     def __init__(self, anchors: int, dimension: int, seed: int = 0):
         super().__init__()
+        self.anchors: Tensor
         generator = torch.Generator().manual_seed(seed)
         # Normalised Gaussians are uniform on the sphere.
         vectors = torch.randn(anchors, dimension, generator=generator)

@@ -23,6 +23,8 @@ class ShapeDecoder(nn.Module):
         super().__init__()
         vertices, faces = icosphere(level)
         self.fit_box = fit_box
+        self.template: Tensor
+        self.faces: Tensor
         self.register_buffer("template", to_cube(vertices) if template == "box" else vertices)
         self.register_buffer("faces", faces)
         self.reduce = nn.Sequential(

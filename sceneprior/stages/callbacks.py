@@ -10,6 +10,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -24,7 +25,7 @@ class RunProgress(Callback):
     def __init__(self, title: str):
         self.title = title
         self._progress: Progress | None = None
-        self._task = None
+        self._task = TaskID(0)
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module) -> None:
         if not trainer.is_global_zero:
@@ -57,14 +58,14 @@ class RunProgress(Callback):
         self._stop()
 
 
-class EpochSeed(Callback):
-    """Seed each epoch anew, so that a resumed run drops out what it would have dropped out."""
+class StepSeed(Callback):
+    """Seed each step anew, so that a resumed run drops out what it would have dropped out."""
 
     def __init__(self, seed: int):
         self.seed = seed
 
-    def on_train_epoch_start(self, trainer: lightning.Trainer, pl_module) -> None:
-        torch.manual_seed(step_seed(self.seed, trainer.current_epoch, trainer.global_rank))
+    def on_train_batch_start(self, trainer: lightning.Trainer, pl_module, batch, batch_idx) -> None:
+        torch.manual_seed(step_seed(self.seed, trainer.global_step, trainer.global_rank))
 
 
 class RollingCheckpoint(Callback):

@@ -1,6 +1,7 @@
 """Stage 1: learn where objects are and what they are, from 2D boxes alone."""
 
 import lightning
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
 from sceneprior.batches import SceneViews
@@ -55,6 +56,6 @@ class LayoutStage(lightning.LightningModule):
         )
         return total
 
-    def configure_optimizers(self) -> dict:
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         steps = int(self.trainer.estimated_stepping_batches)
         return build_optimizer(self.prior, self.latents, self.config.layout, steps)

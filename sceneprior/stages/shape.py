@@ -2,11 +2,12 @@
 
 import lightning
 import torch
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.config import RunConfig
-from sceneprior.losses.shape import mask_loss
+from sceneprior.losses.shape import mask_loss, observed_ids
 from sceneprior.models.scene_prior import ScenePrior
 from sceneprior.silhouettes.render import render_silhouettes
 from sceneprior.stages.view_loss import (
@@ -64,10 +65,11 @@ class ShapeStage(lightning.LightningModule):
         # Only the first n predictions of a room answer for objects; the rest would hide them.
         slots = torch.arange(scenes.centers_m.shape[1], device=scenes.centers_m.device)
         drawn = slots < views.is_object.sum(dim=-1, keepdim=True)
-        height, width = views.instance_ids.shape[-2:]
+        height, width = observed_ids(views).shape[-2:]
         scale = views.intrinsics.new_tensor(
             [width / views.image_size[1], height / views.image_size[0], 1]
         )
+        assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
         return render_silhouettes(
             scenes.vertices_m,
             self.prior.shape.faces,
@@ -79,6 +81,6 @@ class ShapeStage(lightning.LightningModule):
             drawn=drawn,
         )
 
-    def configure_optimizers(self) -> dict:
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         steps = int(self.trainer.estimated_stepping_batches)
         return build_optimizer(self.prior, self.latents, self.config.shape, steps)

@@ -19,7 +19,7 @@ from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.models.scene_prior import ScenePrior
-from sceneprior.stages.callbacks import EpochSeed, RollingCheckpoint, RunProgress
+from sceneprior.stages.callbacks import RollingCheckpoint, RunProgress, StepSeed
 from sceneprior.stages.layout import LayoutStage
 from sceneprior.stages.runs import STAGES, checkpoint_extra, restore
 from sceneprior.stages.shape import ShapeStage
@@ -101,7 +101,7 @@ def _fit_stage(
         max_epochs=settings.epochs,
         gradient_clip_val=settings.clip_gradient or None,
         logger=[_logger(name, folder) for name in loggers],
-        callbacks=[RunProgress(f"fit {stage} (epochs)"), EpochSeed(config.seed), rolling],
+        callbacks=[RunProgress(f"fit {stage} (epochs)"), StepSeed(config.seed), rolling],
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,

@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
 from sceneprior.batches import DecodedScenes, SceneViews
@@ -105,7 +106,7 @@ def training_latents(
 
 def build_optimizer(
     prior: ScenePrior, latents: nn.Embedding, stage: StageConfig, steps: int
-) -> dict:
+) -> OptimizerLRSchedulerConfig:
     """Adam with the stage's schedule over `steps` updates, in the shape Lightning takes."""
     fresh = list(prior.shape.parameters())
     trained = [item for name, item in prior.named_parameters() if not name.startswith("shape.")]
@@ -117,7 +118,7 @@ def build_optimizer(
     ]
     optimizer = torch.optim.Adam(groups, fused=True)
     if stage.schedule == "cosine":
-        rates = [group["lr"] for group in groups]
+        rates = [group["lr"] for group in optimizer.param_groups]
         rise = torch.optim.lr_scheduler.OneCycleLR(
             optimizer, rates, total_steps=steps + 1, pct_start=0.05, cycle_momentum=False
         )

@@ -1,0 +1,154 @@
+"""The layer table of docs/architecture.md, read off the imports of every file."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FILES = sorted(path for name in ("sceneprior", "data_prep") for path in (ROOT / name).rglob("*.py"))
+
+ROWS = {
+    "geometry": 0, "silhouettes": 0, "classes": 0, "errors": 0, "config": 0,
+    "scene": 1, "batches": 1, "offscreen": 1, "shards": 1,
+    "data": 2, "models": 2, "losses": 2,
+    "data_prep": 3, "stages": 3,
+    "evaluation": 4,
+    "tasks": 5,
+    "cli": 6, "__main__": 6,
+}  # fmt: skip
+FOUNDATION = {name for name, row in ROWS.items() if row <= 1}
+"""Rows 0 and 1: all that preparing and judging may stand on, beside themselves."""
+
+OWNERS = {
+    "h5py": ["sceneprior/shards.py"],
+    "pyrender": ["sceneprior/offscreen.py"],
+    "OpenGL": ["sceneprior/offscreen.py"],
+    "numba": ["sceneprior/silhouettes/"],
+    "triton": ["sceneprior/silhouettes/"],
+    "lightning": ["sceneprior/stages/"],
+    "wandb": ["sceneprior/stages/"],
+    "yaml": ["sceneprior/config.py", "data_prep/recipe.py"],
+    "pydantic": ["sceneprior/config.py"],
+    "typer": [
+        "sceneprior/cli.py", "sceneprior/tasks/demo.py", "data_prep/cli.py",
+        "data_prep/homes/command.py",
+    ],
+    "jinja2": ["sceneprior/evaluation/"],
+    "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
+    "scipy.optimize": ["sceneprior/losses/matching.py", "sceneprior/evaluation/"],
+    "cv2": ["data_prep/"],
+}  # fmt: skip
+
+
+def imports(path: Path) -> set[str]:
+    """Full names of every module a file imports, wherever in the file."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative imports hide the layer"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
+    return found
+
+
+def layer_of(module: str) -> str | None:
+    """`sceneprior.losses.shape` -> losses; None for what is not ours."""
+    parts = module.split(".")
+    if parts[0] == "data_prep":
+        return "data_prep"
+    if parts[0] != "sceneprior" or len(parts) == 1 or parts[1] == "__version__":
+        return None
+    return parts[1]
+
+
+def layer_of_file(path: Path) -> str | None:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return layer_of(".".join(parts)) if parts[-1] != "__init__" or len(parts) > 2 else None
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def allowed(layer: str) -> set[str]:
+    if layer in ("data_prep", "evaluation"):
+        # Recipes and configs are strangers: `config` is for those who train.
+        return (FOUNDATION - {"config"}) | {layer}
+    below = {name for name, row in ROWS.items() if row <= ROWS[layer]}
+    if layer in ("cli", "__main__"):
+        return below
+    below -= {"data_prep"}
+    if layer == "stages":
+        return below
+    if layer == "tasks":
+        return below
+    # `config` is known to stages, tasks and cli alone.
+    return below - ({"config"} if layer != "config" else set())
+
+
+def test_every_module_has_a_row():
+    layers = {layer_of_file(path) for path in FILES} - {None}
+    assert layers == set(ROWS)
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_imports_look_down_only(path):
+    layer = layer_of_file(path)
+    if layer is None:
+        return
+    used = {layer_of(module) for module in imports(path)} - {None}
+    assert used <= allowed(layer), f"{name_of(path)} imports {sorted(used - allowed(layer))}"
+
+
+@pytest.mark.parametrize("library", OWNERS)
+def test_each_heavy_library_has_one_front_door(library):
+    users = [
+        name_of(path)
+        for path in FILES
+        if any(f"{module}.".startswith(f"{library}.") for module in imports(path))
+    ]
+    strangers = [user for user in users if not any(map(user.startswith, OWNERS[library]))]
+    assert strangers == []
+
+
+def test_the_rules_can_fail(tmp_path):
+    """A table that forbids nothing would pass, too."""
+    assert "stages" not in allowed("models") and "models" not in allowed("evaluation")
+    assert "tasks" not in allowed("evaluation") and "evaluation" in allowed("tasks")
+    assert "config" not in allowed("losses") and "data_prep" not in allowed("tasks")
+    path = tmp_path / "file.py"
+    path.write_text("def f():\n    from scipy.optimize import linear_sum_assignment\n")
+    assert "scipy.optimize" in imports(path)
+
+
+def loaded_after(code: str) -> set[str]:
+    """Top-level names in sys.modules after running code in a fresh process."""
+    code += "\nimport sys; print('|' + ' '.join({name.split('.')[0] for name in sys.modules}))"
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    return set(answer.stdout.rpartition("|")[2].split())
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    loaded = loaded_after("import sceneprior")
+    assert "sceneprior" in loaded
+    assert not loaded & {"torch", "numpy", "typer", "numba", "lightning", "h5py"}
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["fit", "--help"], ["prep-front", "--help"]])
+def test_help_loads_nothing_heavy(arguments):
+    code = (
+        "import sys\n"
+        f"sys.argv = ['sceneprior', *{arguments!r}]\n"
+        "from sceneprior.cli import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code"
+    )
+    loaded = loaded_after(code)
+    assert "typer" in loaded
+    heavy = {"torch", "numpy", "lightning", "trimesh", "numba", "scipy", "h5py", "pyrender", "cv2"}
+    assert not loaded & heavy
