@@ -30,7 +30,7 @@ LawOption = Annotated[
 ]
 
 
-def _show_version(wanted: bool) -> None:
+def _show_version(wanted: bool | None) -> None:
     if wanted:
         typer.echo(f"sceneprior {__version__}")
         raise typer.Exit
@@ -39,8 +39,9 @@ def _show_version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Say it.")
-    ] = False,
+        bool | None,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Say it."),
+    ] = None,
 ) -> None:
     pass
 
@@ -154,7 +155,7 @@ def demo(
         "out/demo"
     ),
     config: Annotated[str, typer.Option(help="What to train.")] = "demo.yaml",
-    rooms: Annotated[int, typer.Option(min=20, help="Homes to make.")] = 512,
+    rooms: Annotated[int, typer.Option(min=20, help="Homes to make.")] = 480,
     count: Annotated[int, typer.Option(min=2, help="Rooms to generate and judge.")] = 200,
     renderer: RendererOption = "auto",
 ) -> None:
@@ -169,6 +170,9 @@ def main() -> None:
     try:
         app()
     except InputError as error:
+        typer.echo(f"Error: {error}", err=True)
+        sys.exit(2)
+    except FloatingPointError as error:
         typer.echo(f"Error: {error}", err=True)
         sys.exit(2)
     except Exception as error:

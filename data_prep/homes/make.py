@@ -78,14 +78,16 @@ def _write(folder: Path, rooms: int, room_type: str, seed: int) -> None:
     for model in track(models, "Building furniture", console=console, transient=True):
         write_model(folder / "3D-FUTURE-model", model)
     write_json(folder / "3D-FUTURE-model" / "model_info.json", [model_record(m) for m in models])
-    room_ids: list[str] = []
+    contents: dict[str, list[str]] = {}
     numbers = _house_numbers(rooms, room_type, seed)
     for house, first, count in track(numbers, "Furnishing homes", console=console, transient=True):
         uid = str(uuid.uuid5(uuid.NAMESPACE_OID, f"sceneprior homes {seed} {room_type} {house}"))
         placed = _house(shop, room_type, seed, house, first, count)
         write_json(folder / "3D-FRONT" / f"{uid}.json", house_json(uid, placed))
-        room_ids += [f"{uid}_{room.instanceid}" for room in placed]
-    _write_split(folder / "splits" / f"{room_type}.csv", room_ids, seed)
+        for room in placed:
+            names = sorted(piece.model.name for piece in room.plan.pieces)
+            contents[f"{uid}_{room.instanceid}"] = names
+    _write_split(folder / "splits" / f"{room_type}.csv", contents, seed)
 
 
 def _seeded(seed: int, *stream: int | str) -> np.random.Generator:
@@ -144,8 +146,20 @@ def _kind(plan: Plan, taken: set[str]) -> str:
     return "MasterBedroom" if master else "SecondBedroom"
 
 
-def _write_split(path: Path, room_ids: list[str], seed: int) -> None:
-    tests = max(1, round(TEST_SHARE * len(room_ids)))
-    chosen = set(_seeded(seed, "split").permutation(len(room_ids))[:tests].tolist())
-    rows = [f"{room},{'test' if k in chosen else 'train'}" for k, room in enumerate(room_ids)]
+def _write_split(path: Path, contents: dict[str, list[str]], seed: int) -> None:
+    """Every tenth room of a list in which alike rooms are neighbours is a test room.
+
+    So a few dozen test rooms have the beds, counts and furniture of all the rooms; drawn
+    without such strata, 51 of 512 bedrooms were 0.05 nats from the training rooms themselves.
+    """
+
+    def kind(room: str) -> tuple[list[str], int, list[str]]:
+        names = contents[room]
+        return [name for name in names if name in BEDS], len(names), names
+
+    alike = sorted(contents, key=kind)
+    tests = max(1, round(TEST_SHARE * len(alike)))
+    start = _seeded(seed, "split").random()
+    chosen = {alike[int((k + start) * len(alike) / tests)] for k in range(tests)}
+    rows = [f"{room},{'test' if room in chosen else 'train'}" for room in contents]
     path.write_text("\n".join(rows) + "\n")

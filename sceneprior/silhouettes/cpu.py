@@ -5,13 +5,20 @@ covered for certain: it adds nothing to the gradient and is passed over there, s
 grows with the outline. Meshes are independent, so the result does not depend on the threads.
 """
 
+import os
 from typing import no_type_check
 
+import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from numba import njit, prange
 from torch import Tensor
+
+if "NUMBA_THREADING_LAYER" not in os.environ:
+    # Numba's OpenMP layer shares its threads with torch and sets torch's number of threads back
+    # to all cores, which stalls a small network where another program holds one of them.
+    numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
 
 CERTAIN = 18.0
 """-log of the chance to miss past which a pixel counts as covered: 1 - exp(-18) is 1 in float32."""

@@ -122,6 +122,9 @@ def test_what_is_wholly_behind_the_camera_is_not_in_the_frustum():
     corners = [[-0.4, -0.5, -2], [0.4, 0.5, -1]]
     points = torch.tensor([[corners]], dtype=torch.float64)
     assert not boxes_of_points(points, AHEAD[None, None], LENS[None, None], SIZE).in_frustum
+    # So large that its corners, moved before the camera, surround the image.
+    around = torch.tensor([[[[-9.0, -9, -1], [9, 9, -1]]]], dtype=torch.float64)
+    assert not boxes_of_points(around, AHEAD[None, None], LENS[None, None], SIZE).in_frustum
     straddling = torch.tensor([[[*corners, [0, 0, 1.0]]]], dtype=torch.float64)
     assert boxes_of_points(straddling, AHEAD[None, None], LENS[None, None], SIZE).in_frustum
 

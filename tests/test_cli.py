@@ -1,0 +1,228 @@
+"""The command line: verbs that work on a toy run, and one sentence for everything that does not."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tiny_runs import write_tiny_config
+
+from sceneprior import cli, offscreen
+from sceneprior.shards import list_shards
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Run `sceneprior <arguments>` in this process: (exit status, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["sceneprior", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        output = capsys.readouterr()
+        return int(end.value.code or 0), output.out, output.err
+
+    return run
+
+
+def one_sentence(result: tuple[int, str, str]) -> str:
+    """The whole story on one line of stderr, status 2, no traceback; the sentence itself."""
+    status, _, errors = result
+    assert status == 2, errors
+    lines = errors.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("Error: "), errors
+    assert "Traceback" not in errors and lines[0].count("Error:") == 1
+    assert lines[0][-1] in ".!" and len(lines[0]) > 40
+    return lines[0]
+
+
+def everything_in(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b""
+        for path in folder.rglob("*")
+    }
+
+
+def test_bad_shards_are_sentences_and_leave_no_run(command, toy_shards, tmp_path):
+    def fit(shards: Path, *more) -> str:
+        config = write_tiny_config(tmp_path / "tiny.yaml", shards)
+        before = everything_in(tmp_path)
+        said = one_sentence(
+            command("fit", "--config", config, "--run", "run", "--accelerator", "cpu", *more)
+        )
+        assert everything_in(tmp_path) == before  # nothing half-written
+        return said
+
+    assert "No folder of shards at " in fit(tmp_path / "nowhere")
+
+    empty = tmp_path / "empty"
+    (empty / "train").mkdir(parents=True)
+    assert "The 'train' split of " in fit(empty) and "holds no shards" in fit(empty)
+
+    corrupt = shutil.copytree(toy_shards, tmp_path / "corrupt")
+    victim = list_shards(corrupt, "train")[1]
+    victim.write_bytes(victim.read_bytes()[:3000])
+    said = fit(corrupt)
+    assert str(victim) in said and "the file is damaged. Delete it and run the same" in said
+    victim.write_bytes(b"")
+    assert "the file is damaged" in fit(corrupt)
+
+    assert "model.max_objects is 2; raise it." in fit(toy_shards, "--set", "model.max_objects=2")
+    assert "No logger 'paper'; choose from " in fit(toy_shards, "--logger", "paper")
+    assert "input should be" in fit(toy_shards, "--set", "layout.epochs=0")
+    assert "the nearest valid key is 'epochs'" in fit(toy_shards, "--set", "layout.epoch=3")
+
+
+def test_a_config_typo_names_key_file_and_nearest_key(command, toy_shards, tmp_path):
+    config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards)
+    config.write_text(config.read_text().replace("  dropout:", "  droput:"))
+    said = one_sentence(command("fit", "--config", config, "--run", "run"))
+    assert said == (
+        f"Error: {config}: unknown key 'model.droput'; the nearest valid key is 'dropout'."
+    )
+    said = one_sentence(command("fit", "--config", "dmeo.yaml", "--run", "run"))
+    assert "No config 'dmeo.yaml'" in said and "demo.yaml" in said
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "verb",
+    [("synthesize", "--out", "made"), ("eval-fid", "-n", "4"), ("report",)],
+    ids=lambda verb: verb[0],
+)
+def test_folders_that_are_no_run_or_hold_no_checkpoint(command, toy_run, tmp_path, verb):
+    name, *rest = verb
+    call = [name, "--run", "run", *rest, "--renderer", "software"]
+    said = one_sentence(command(*call))
+    assert "run is not a run folder (no config.yaml in it); train one with" in said
+    (tmp_path / "run").mkdir()
+    shutil.copy(toy_run / "config.yaml", tmp_path / "run")
+    before = everything_in(tmp_path)
+    said = one_sentence(command(*call))
+    assert (
+        "run holds no checkpoint yet; let `sceneprior fit --run run --resume` get further" in said
+    )
+    (tmp_path / "run" / "layout").mkdir()
+    (tmp_path / "run" / "layout" / "final.ckpt").write_bytes(b"PK nonsense")
+    assert "it is damaged. Delete it and run `sceneprior fit`" in one_sentence(command(*call))
+    shutil.rmtree(tmp_path / "run" / "layout")
+    assert everything_in(tmp_path) == before
+
+
+def test_an_existing_run_wants_resume_and_the_same_settings(command, toy_run, toy_shards, tmp_path):
+    config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards, layout__epochs=20)
+    before = everything_in(toy_run)
+    said = one_sentence(command("fit", "--config", config, "--run", toy_run))
+    assert "already holds a run; add --resume to continue it, or name another folder." in said
+    said = one_sentence(
+        command("fit", "--config", config, "--run", toy_run, "--resume", "--set", "seed=9")
+    )
+    assert "config.yaml differs from the settings given now; resume with" in said
+    status, out, _ = command("fit", "--config", config, "--run", toy_run, "--resume")
+    assert (status, out) == (0, f"Trained: {toy_run}\n")
+    assert everything_in(toy_run) == before
+
+
+def test_without_gl_pyrender_is_a_sentence_with_the_apt_line(
+    command, toy_run, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("SCENEPRIOR_NO_GL", "1")
+    monkeypatch.setattr(offscreen, "_pyrender", None)
+    monkeypatch.setattr(offscreen, "_failure", None)
+    said = one_sentence(
+        command("synthesize", "--run", toy_run, "--out", "made", "--renderer", "pyrender")
+    )
+    assert offscreen.APT_LINE in said and "--renderer software" in said
+    assert not (tmp_path / "made").exists()
+    said = one_sentence(
+        command("synthesize", "--run", toy_run, "--out", "made", "--renderer", "vulkan")
+    )
+    assert "No renderer is called 'vulkan'; there are auto, pyrender, software." in said
+
+
+def test_data_commands_refuse_in_sentences(command, tmp_path):
+    said = one_sentence(
+        command("prep-front", "--front", "no", "--future", "neither", "--out", "shards")
+    )
+    assert "No folder at " in said and not (tmp_path / "shards").exists()
+    assert "nowhere" in one_sentence(command("inspect", "nowhere"))
+
+
+def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
+    call = ["synthesize", "--run", toy_run, "-n", "3", "--seed", "5", "--renderer", "software"]
+    status, out, _ = command(*call, "--out", "made")
+    assert (status, out) == (0, "Wrote 3 rooms to made\n")
+    names = {f"seed5_000{k}.{kind}" for k in range(3) for kind in ("json", "glb", "png")}
+    assert {path.name for path in (tmp_path / "made").iterdir()} == names
+    scene = json.loads((tmp_path / "made" / "seed5_0000.json").read_text())
+    assert scene["label_set"] == "front3d_bedroom" and scene["units"] == "metres"
+    command(*call, "--out", "again")
+    assert everything_in(tmp_path / "made") == everything_in(tmp_path / "again")
+    before = everything_in(tmp_path)
+    said = one_sentence(command(*call, "--out", "made"))
+    assert "made is not empty; add --overwrite or name another folder." in said
+    said = one_sentence(command(*call, "--out", "other", "--law", "guess"))
+    assert "No sampling law 'guess'; choose from " in said
+    assert everything_in(tmp_path) == before
+    assert command(*call, "--out", "made", "--overwrite")[0] == 0
+    assert everything_in(tmp_path) == before
+
+
+def test_eval_fid_scores_a_tiny_run(command, toy_run, tmp_path):
+    call = [
+        "eval-fid",
+        "--run",
+        toy_run,
+        "-n",
+        "4",
+        "--out",
+        "scores.json",
+        "--renderer",
+        "software",
+    ]
+    status, out, _ = command(*call)
+    assert status == 0 and out.endswith("Wrote scores.json\n")
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    for name in (
+        "class_accuracy", "box_iou_3d", "category_kl", "type_share", "mean_objects",
+        "mean_objects_test", "overlap_pairs", "overlap_pairs_test", "fd_effnet_lite0",
+    ):  # fmt: skip
+        assert isinstance(scores[name], int | float), name
+    assert 0 <= scores["class_accuracy"] <= 1 and 0 <= scores["box_iou_3d"] <= 1
+    assert scores["protocol"]["stage"] == "shape"
+    before = (tmp_path / "scores.json").read_bytes()
+    status, out, errors = command(*call, "--inception", "none.pt")
+    # A progress bar may stand before it.
+    assert "No Inception network at none.pt." in one_sentence(
+        (status, out, errors[errors.index("Err") :])
+    )
+    assert (tmp_path / "scores.json").read_bytes() == before
+    said = one_sentence(command(*call, "--shards", "nowhere"))
+    assert "No folder of shards at nowhere" in said
+
+
+def test_unforeseen_errors_are_one_line_and_status_1(command, monkeypatch):
+    def broken(*_):
+        raise KeyError("surprise")
+
+    monkeypatch.setattr("sceneprior.config.load_config", broken)
+    status, _, errors = command("fit", "--config", "demo.yaml")
+    assert status == 1 and errors.startswith("Error: KeyError: 'surprise'\n")
+    assert "SCENEPRIOR_DEBUG=1" in errors and "Traceback" not in errors
+
+
+def test_the_module_is_the_command(tmp_path):
+    """In a process of its own, as a user meets it."""
+    call = [sys.executable, "-m", "sceneprior"]
+    answer = subprocess.run([*call, "--version"], capture_output=True, text=True, cwd=tmp_path)
+    assert answer.returncode == 0 and answer.stdout.startswith("sceneprior 0.")
+    answer = subprocess.run(
+        [*call, "synthesize", "--run", "none", "--out", "made"],
+        capture_output=True, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    one_sentence((answer.returncode, answer.stdout, answer.stderr))
+    assert not list(tmp_path.iterdir())
