@@ -41,8 +41,9 @@ class RunProgress(Callback):
         )
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
+        # Reading a metric reduces it over the processes: all must ask, though one shows it.
+        loss = trainer.callback_metrics.get("train/loss")
         if self._progress is not None:
-            loss = trainer.callback_metrics.get("train/loss")
             text = "" if loss is None else f"loss {float(loss):.4f}"
             self._progress.update(self._task, completed=trainer.current_epoch + 1, loss=text)
 

@@ -29,6 +29,8 @@ class LayoutStage(lightning.LightningModule):
 
     def __init__(self, prior: ScenePrior, latents: nn.Embedding, config: RunConfig):
         super().__init__()
+        # Several processes agree on gradients only of what takes part.
+        prior.shape.requires_grad_(False)
         self.prior = prior
         self.latents = latents
         self.config = config

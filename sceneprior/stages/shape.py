@@ -32,7 +32,7 @@ class ShapeStage(lightning.LightningModule):
 
     def __init__(self, prior: ScenePrior, latents: nn.Embedding, config: RunConfig):
         super().__init__()
-        self.prior = prior
+        self.prior = prior.requires_grad_(True)
         self.latents = latents
         self.config = config
 

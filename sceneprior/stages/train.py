@@ -62,6 +62,8 @@ def fit(
 
 
 def _check_run(config: RunConfig, run: Path, resume: bool) -> None:
+    if os.environ.get("LOCAL_RANK", "0") != "0":
+        return  # one of several processes: the first has checked, and the run is its own
     saved = run / "config.yaml"
     if saved.is_file():
         if not resume:

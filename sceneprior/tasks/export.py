@@ -8,17 +8,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 from rich.console import Console
 from rich.progress import Progress
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.topdown import object_colors, scene_meshes, topdown
+from sceneprior.evaluation.topdown import object_colors, perspective, scene_meshes, topdown
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import FORMAT, Mesh, Scene, read_scene, scene_to_json
 
 if TYPE_CHECKING:
     import trimesh
+
+
+OVERVIEW_ROOMS = 12
+OVERVIEW_TILE = (240, 320)
+"""Height and width of one room of the overview, in pixels."""
 
 
 def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> None:
@@ -52,7 +58,7 @@ def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> No
 def write_scenes(
     scenes: Sequence[Scene], folder: Path, renderer: Renderer, overwrite: bool = False
 ) -> None:
-    """Write scenes to a folder, each under its own name.
+    """Write scenes to a folder, each under its own name, and `overview.png` of the first few.
 
     Raises:
         InputError: the folder holds something and `overwrite` is false.
@@ -63,6 +69,26 @@ def write_scenes(
     with Progress(console=Console(stderr=True)) as progress:
         for scene in progress.track(scenes, description="Writing scenes"):
             write_scene(scene, folder, scene.name, renderer)
+    sheet = Image.fromarray(overview(scenes[:OVERVIEW_ROOMS], renderer))
+    _write_whole(folder / "overview.png", lambda path: sheet.save(path, format="PNG"))
+
+
+def overview(scenes: Sequence[Scene], renderer: Renderer) -> UInt8[np.ndarray, "height width 3"]:
+    """Rooms seen from above a corner, in rows of four, coloured by class.
+
+    Args:
+        scenes: At least one room.
+        renderer: From `sceneprior.offscreen.open_renderer`.
+    """
+    height, width = OVERVIEW_TILE
+    columns = min(4, len(scenes))
+    rows = -(-len(scenes) // columns)
+    sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
+    for index, scene in enumerate(scenes):
+        row, column = divmod(index, columns)
+        tile = perspective(scene, renderer, OVERVIEW_TILE)
+        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = tile
+    return sheet
 
 
 def _write_whole(path: Path, write: Callable[[Path], object]) -> None:

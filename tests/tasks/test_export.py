@@ -14,8 +14,10 @@ from sceneprior.evaluation.topdown import topdown
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.tasks.export import (
+    OVERVIEW_TILE,
     load_scene,
     load_scene_folder,
+    overview,
     read_glb_meshes,
     scene_to_glb,
     write_scene,
@@ -144,3 +146,14 @@ def test_bad_folders_and_files_say_what_to_do(scene, tmp_path, renderer):
     (tmp_path / "room.json").write_text("{")
     with pytest.raises(InputError, match="is not a scene JSON"):
         load_scene_folder(tmp_path)
+
+
+def test_an_overview_holds_each_room_in_its_place(renderer):
+    empty = Scene("empty", "front3d_bedroom")
+    bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
+    height, width = OVERVIEW_TILE
+    sheet = overview([empty] * 4 + [Scene("bed", "front3d_bedroom", (bed,))], renderer)
+    assert sheet.shape == (2 * height, 4 * width, 3)
+    tiles = sheet.reshape(2, height, 4, width, 3).swapaxes(1, 2).reshape(8, -1, 3)
+    colourful = (np.ptp(tiles.astype(int), axis=-1) > 60).sum(axis=1)
+    assert colourful[4] > 1000 and not np.delete(colourful, 4).any()
