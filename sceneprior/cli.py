@@ -26,7 +26,7 @@ RendererOption = Annotated[
 RunOption = Annotated[Path, typer.Option(help="Folder of a run that `fit` made.")]
 LawOption = Annotated[
     str | None,
-    typer.Option(help="geodesic, gaussian or paper (default: the config's)."),
+    typer.Option(help="kernel, geodesic, gaussian or paper (default: the config's)."),
 ]
 
 

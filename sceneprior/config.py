@@ -140,9 +140,9 @@ class ShapeConfig(StageConfig):
 class SamplingConfig(_Section):
     """Where new latents come from."""
 
-    law: Literal["geodesic", "gaussian", "paper"] = "geodesic"
-    """`geodesic`: between neighbouring training rooms; `gaussian`: fitted to the training rooms'
-    logits; `paper`: logits from N(0, 1)."""
+    law: Literal["kernel", "geodesic", "gaussian", "paper"] = "kernel"
+    """`kernel`: around training rooms; `geodesic`: between neighbouring ones; `gaussian`: fitted
+    to their logits; `paper`: logits from N(0, 1)."""
 
 
 class RunConfig(_Section):

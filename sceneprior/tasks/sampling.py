@@ -1,7 +1,7 @@
 """Latents of training rooms in, latents of new rooms out: the law that sampling follows."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.errors import InputError
@@ -11,7 +11,11 @@ NEIGHBOURS = 20
 """Rooms that a geodesic may lead to. More reach further from the training rooms and miss the bed
 of a bedroom more often; docs/results.md has the figures."""
 
-LAWS = ("geodesic", "gaussian", "paper")
+BANDWIDTH = 0.2
+"""Of the kernel law, in standard deviations of the training rooms' logits: 0 copies training rooms,
+1 is the gaussian law. Larger is newer, and more often a room without a bed or with two."""
+
+LAWS = ("kernel", "geodesic", "gaussian", "paper")
 
 
 def sample_latents(
@@ -19,7 +23,7 @@ def sample_latents(
     trained: Float[Tensor, "rooms anchors"],
     count: int,
     seed: int,
-    law: str = "geodesic",
+    law: str = "kernel",
 ) -> Float[Tensor, "count dimension"]:
     """Draw points of the hypersphere.
 
@@ -29,8 +33,7 @@ def sample_latents(
         count: How many to draw.
         seed: Same seed, same rooms.
         law: `geodesic`: a point anywhere on the geodesic between a training room drawn at
-            random and one of its `NEIGHBOURS` nearest. `gaussian` and `paper`: see
-            `sample_logits`.
+            random and one of its `NEIGHBOURS` nearest. The others: see `sample_logits`.
 
     Raises:
         InputError: an unknown law, or fewer than two training rooms to draw between.
@@ -42,12 +45,11 @@ def sample_latents(
     if law != "geodesic":
         return sphere(sample_logits(trained, count, seed, law))
     generator = torch.Generator().manual_seed(seed)
-    rooms = len(trained)
-    start = torch.randint(rooms, (count,), generator=generator)
+    start = _rooms_in_turn(len(trained), count, generator)
     z = sphere(trained)
     closeness = z[start] @ z.T
     closeness[torch.arange(count), start] = -torch.inf  # nobody is their own neighbour
-    nearest = closeness.topk(min(NEIGHBOURS, rooms - 1), dim=1).indices
+    nearest = closeness.topk(min(NEIGHBOURS, len(trained) - 1), dim=1).indices
     pick = torch.randint(nearest.shape[1], (count, 1), generator=generator)
     end = nearest.gather(1, pick)[:, 0]
     along = torch.rand(count, generator=generator).to(trained.dtype)
@@ -64,7 +66,9 @@ def sample_logits(
         count: How many to draw.
         seed: Same seed, same logits.
         law: `paper`: N(0, 1), which is where training rooms' logits started, not where they
-            ended. `gaussian`: the mean and covariance of the training rooms' logits.
+            ended. `gaussian`: the mean and covariance of the training rooms' logits. `kernel`:
+            the same mean and covariance, as a mixture of Gaussians around the training rooms
+            (a smoothed bootstrap of width `BANDWIDTH`).
     """
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(count, trained.shape[1], generator=generator, dtype=torch.float64)
@@ -73,7 +77,18 @@ def sample_logits(
     # A softmax does not see what is added to all its logits: take that freedom out first.
     logits = trained.double() - trained.double().mean(dim=1, keepdim=True)
     mean = logits.mean(dim=0)
-    centred = (logits - mean) / (len(logits) - 1) ** 0.5
+    centred = logits - mean
     # centred^T centred is the covariance; its square root needs no positive definiteness.
-    _, scale, axes = torch.linalg.svd(centred, full_matrices=False)
-    return (mean + (noise[:, : len(scale)] * scale) @ axes).to(trained.dtype)
+    _, scale, axes = torch.linalg.svd(centred / (len(logits) - 1) ** 0.5, full_matrices=False)
+    drawn = (noise[:, : len(scale)] * scale) @ axes
+    if law == "kernel":
+        start = centred[_rooms_in_turn(len(logits), count, generator)]
+        # Drawn in towards the mean by as much as the noise adds: the covariance stays.
+        drawn = (1 - BANDWIDTH**2) ** 0.5 * start + BANDWIDTH * drawn
+    return (mean + drawn).to(trained.dtype)
+
+
+def _rooms_in_turn(rooms: int, count: int, generator: torch.Generator) -> Int[Tensor, " count"]:
+    """Rooms in random order, none a second time before each was there once."""
+    rounds = [torch.randperm(rooms, generator=generator) for _ in range(-(-count // rooms))]
+    return torch.cat(rounds)[:count]

@@ -90,11 +90,32 @@ def test_geodesics_lead_from_rooms_to_their_nearest_neighbours(sphere, trained, 
 def test_laws_that_cannot_be_followed_are_sentences(sphere, trained):
     with pytest.raises(InputError) as error:
         sample_latents(sphere, trained, 3, 0, "guess")
-    assert str(error.value) == ("No sampling law 'guess'; choose from geodesic, gaussian, paper.")
-    for law in ("gaussian", "geodesic"):
+    assert str(error.value) == (
+        "No sampling law 'guess'; choose from kernel, geodesic, gaussian, paper."
+    )
+    for law in ("kernel", "gaussian", "geodesic"):
         with pytest.raises(InputError) as error:
             sample_latents(sphere, trained[:1], 3, 0, law)
         assert str(error.value) == (
             f"The {law} law needs at least 2 training rooms; use --law paper."
         )
     assert sample_latents(sphere, trained[:1], 3, 0, "paper").shape == (3, 12)
+
+
+def test_kernel_draws_around_each_training_room_in_turn():
+    generator = torch.Generator().manual_seed(0)
+    trained = 5 * torch.randn(12, 40, generator=generator, dtype=torch.float64)
+    trained -= trained.mean(dim=1, keepdim=True)
+    drawn = sample_logits(trained, 24, seed=0, law="kernel")
+    # Twelve points in forty dimensions lie far apart: the nearest is the one drawn around.
+    nearest = torch.cdist(drawn, trained).argmin(dim=1)
+    assert sorted(nearest[:12].tolist()) == sorted(nearest[12:].tolist()) == list(range(12))
+
+
+def test_kernel_keeps_mean_and_covariance():
+    generator = torch.Generator().manual_seed(0)
+    trained = torch.randn(50, 3, generator=generator, dtype=torch.float64) * torch.tensor([1, 2, 3])
+    centred = trained - trained.mean(dim=1, keepdim=True)
+    drawn = sample_logits(trained, 200_000, seed=0, law="kernel")
+    torch.testing.assert_close(drawn.mean(0), centred.mean(0), rtol=0, atol=0.01)
+    torch.testing.assert_close(torch.cov(drawn.T), torch.cov(centred.T), rtol=0.05, atol=0.02)
