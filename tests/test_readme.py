@@ -27,7 +27,7 @@ def test_steps_run_as_printed(tmp_path):
         assert done.returncode == 0, f"{command}\n{done.stderr[-2000:]}"
     made = tmp_path / "out/small"
     assert len(list((made / "scenes").glob("*.glb"))) == 4
-    assert (made / "run/report.html").read_text().startswith("<!DOCTYPE html>")
+    assert (made / "run/report.html").read_text().startswith("<!doctype html>")
     assert (made / "views.png").stat().st_size > 10_000
 
 

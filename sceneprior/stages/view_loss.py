@@ -58,7 +58,7 @@ def check_finite(total: Tensor, views: SceneViews) -> None:
     """
     if not torch.isfinite(total):
         raise FloatingPointError(
-            f"The loss is {float(total)} on rooms {', '.join(views.room_ids)}; lower the learning "
+            f"The loss is {total.item()} on rooms {', '.join(views.room_ids)}; lower the learning "
             "rate, or look at these rooms with `sceneprior inspect`."
         )
 
