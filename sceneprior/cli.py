@@ -77,8 +77,8 @@ def fit(
         run_fit(settings, folder, resume, tuple(logger or ("csv", "tensorboard")), options)
     except KeyboardInterrupt:
         typer.echo(
-            f"Stopped and saved. Go on with: sceneprior fit --config {config} --run {folder} "
-            "--resume",
+            "Stopped and saved. Go on with: sceneprior fit "
+            f"--config {folder / 'config.yaml'} --run {folder} --resume",
             err=True,
         )
         raise typer.Exit(130) from None

@@ -18,6 +18,11 @@ import typer
 from sceneprior.errors import InputError
 
 SAMPLE_EVERY_S = 0.5
+RESULTS = {
+    "homes": "homes", "shards": "shards/index.json", "fit": "run/shape/final.ckpt",
+    "scenes": "scenes/overview.png", "scores": "scores.json", "report": "report.html",
+}  # fmt: skip
+"""What each step leaves behind; a step whose result was deleted is done again."""
 
 
 def run_demo(out: Path, config: str, rooms: int, count: int, renderer: str) -> None:
@@ -30,18 +35,22 @@ def run_demo(out: Path, config: str, rooms: int, count: int, renderer: str) -> N
     journal = out / "steps.json"
     done = json.loads(journal.read_text()) if journal.is_file() else {}
     for name, arguments in _steps(out, config, rooms, count, renderer).items():
-        if done.get(name, {}).get("arguments") == arguments and done[name]["finished"]:
+        before = done.get(name, {})
+        same = before.get("arguments") == arguments and (out / RESULTS[name]).exists()
+        if same and before["finished"]:
             typer.echo(f"{name}: done before, {done[name]['seconds']:.0f} s", err=True)
             continue
         typer.echo(f"$ sceneprior {shlex.join(arguments)}", err=True)
+        told: list[str] = []
         if name == "report":
             _add_costs(out / "scores.json", done)
             for step in done.values():
-                arguments = [*arguments, "--command", f"sceneprior {shlex.join(step['arguments'])}"]
-        status, seconds, peak = _measure(arguments)
-        before = done.get(name, {}) if done.get(name, {}).get("finished") is False else {}
+                told += ["--command", f"sceneprior {shlex.join(step['arguments'])}"]
+        status, seconds, peak = _measure([*arguments, *told])
+        if before.get("finished"):
+            before = {}  # done again from the start; only a stopped step goes on
         done[name] = {
-            "arguments": arguments if name != "report" else arguments[: _own_length(arguments)],
+            "arguments": arguments,
             "seconds": seconds + before.get("seconds", 0.0),
             "peak_memory_gib": max(peak, before.get("peak_memory_gib", 0.0)),
             "finished": status == 0,
@@ -54,10 +63,6 @@ def run_demo(out: Path, config: str, rooms: int, count: int, renderer: str) -> N
             raise InputError(f"The demo stopped at '{name}'; mend that and run it again.")
     _add_costs(out / "scores.json", done)
     typer.echo(f"Open {out / 'report.html'}; figures are in {out / 'scores.json'}.")
-
-
-def _own_length(arguments: list[str]) -> int:
-    return arguments.index("--command") if "--command" in arguments else len(arguments)
 
 
 def _steps(out: Path, config: str, rooms: int, count: int, renderer: str) -> dict[str, list[str]]:

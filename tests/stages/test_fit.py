@@ -193,10 +193,8 @@ def test_ctrl_c_at_the_command_saves_and_resume_finishes(toy_shards, tmp_path):
     finally:
         process.kill()
     assert process.returncode == 130
-    assert (
-        f"Stopped and saved. Go on with: sceneprior fit --config {config} --run {run} --resume"
-        in errors
-    )
+    go_on = f"sceneprior fit --config {run / 'config.yaml'} --run {run} --resume"
+    assert f"Stopped and saved. Go on with: {go_on}" in errors
     assert "Traceback" not in errors
     assert not list(run.rglob("*.part")) and not (run / "layout" / "final.ckpt").exists()
     reached = read_checkpoint(run / "layout" / "last.ckpt")["epoch"]
