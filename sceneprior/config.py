@@ -1,4 +1,4 @@
-"""A run's YAML in, one frozen, checked `RunConfig` out. Only this module reads or writes YAML."""
+"""A run's YAML in, one frozen, checked `RunConfig` out: the one module here that knows YAML."""
 
 import difflib
 import importlib.resources
@@ -107,7 +107,7 @@ class StageConfig(_Section):
     """`steps`: times `decay` after each milestone (paper); `cosine`: a short rise, then a
     cosine down to zero, which reaches the same loss in fewer epochs."""
     milestones: tuple[int, ...] = Field((300,), strict=False)
-    """Epochs after which the rates are multiplied by `decay`."""
+    """Epochs after which the rates are multiplied by `decay`; `cosine` has no use for either."""
     decay: float = Field(0.1, gt=0, le=1)
     latent_noise: float = Field(0.0, ge=0)
     """Length of the random step each latent takes on the sphere before it is decoded, so that
@@ -120,7 +120,7 @@ class StageConfig(_Section):
     """Torch threads where a CPU trains; None leaves torch's choice. A small network gains little
     from a second thread and loses much when another program takes that core."""
     proxy: Literal["ellipsoid", "box"] = "ellipsoid"
-    """What an object's 2D box is taken from where its mesh is not decoded."""
+    """What an object's 2D box is taken from where its mesh is not (see `box_from`)."""
 
 
 class ShapeConfig(StageConfig):

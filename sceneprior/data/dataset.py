@@ -1,4 +1,4 @@
-"""One split of a shard folder in memory; lists of (room, draw) in, `SceneViews` out."""
+"""One split of a shard folder in memory; lists of (row, epoch) in, `SceneViews` out."""
 
 from pathlib import Path
 

@@ -32,12 +32,6 @@ class TrainedPrior:
     room_ids: tuple[str, ...]
     config: RunConfig
     stage: str
-    checkpoint: Path
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the label set."""
-        return label_set(self.config.label_set)
 
 
 def checkpoint_extra(config: RunConfig, room_ids: tuple[str, ...]) -> dict[str, Any]:
@@ -46,7 +40,7 @@ def checkpoint_extra(config: RunConfig, room_ids: tuple[str, ...]) -> dict[str, 
 
 
 def find_checkpoint(run: Path) -> tuple[str, Path]:
-    """The furthest stage's checkpoint: finished before unfinished, shape before layout.
+    """The furthest finished stage's checkpoint, else the furthest begun one's.
 
     Raises:
         InputError: the folder is no run, or nothing was saved in it yet.
@@ -61,7 +55,8 @@ def find_checkpoint(run: Path) -> tuple[str, Path]:
             if (run / stage / name).is_file():
                 return stage, run / stage / name
     raise InputError(
-        f"{run} holds no checkpoint yet; let `sceneprior fit --run {run} --resume` get further."
+        f"{run} holds no checkpoint yet; let `sceneprior fit --config {run / 'config.yaml'} "
+        f"--run {run} --resume` get further."
     )
 
 
@@ -113,5 +108,5 @@ def load_run(run: Path) -> TrainedPrior:
     config = load_config(str(run / "config.yaml"))
     prior, latents, room_ids = restore(config, path)
     return TrainedPrior(
-        prior.eval().requires_grad_(False), latents.weight.detach(), room_ids, config, stage, path
+        prior.eval().requires_grad_(False), latents.weight.detach(), room_ids, config, stage
     )

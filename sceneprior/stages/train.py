@@ -91,15 +91,13 @@ def _fit_stage(
     prior, latents = _start(config, dataset, previous)
     module = {"layout": LayoutStage, "shape": ShapeStage}[stage](prior, latents, config)
     folder = run / stage
-    # Only now: a run that is refused leaves nothing behind.
-    folder.mkdir(parents=True, exist_ok=True)
-    dump_config(config, run / "config.yaml")
     rolling = RollingCheckpoint(folder, checkpoint_extra(config, dataset.room_ids))
     _quiet_lightning()
     lightning.seed_everything(config.seed, verbose=False)
     if settings.cpu_threads is not None:
         torch.set_num_threads(settings.cpu_threads)
-    trainer = lightning.Trainer(
+    trainer = _trainer(
+        trainer_options,
         max_epochs=settings.epochs,
         gradient_clip_val=settings.clip_gradient or None,
         logger=[_logger(name, folder) for name in loggers],
@@ -109,8 +107,10 @@ def _fit_stage(
         enable_model_summary=False,
         use_distributed_sampler=False,
         log_every_n_steps=1,
-        **trainer_options,
     )
+    # Only now: a run that is refused leaves nothing behind.
+    folder.mkdir(parents=True, exist_ok=True)
+    dump_config(config, run / "config.yaml")
     loader = make_loader(
         dataset, settings.batch_size, config.seed, config.data.workers,
         trainer.global_rank, trainer.world_size,
@@ -127,6 +127,15 @@ def _fit_stage(
         signal.signal(signal.SIGINT, before)  # which Lightning left ignored
         raise KeyboardInterrupt from None
     rolling.write(trainer, "final.ckpt")
+
+
+def _trainer(options: dict[str, Any], **settings: Any) -> lightning.Trainer:
+    try:
+        return lightning.Trainer(**settings, **options)
+    except (ValueError, TypeError, RuntimeError) as error:
+        given = ", ".join(f"--{name} {value}" for name, value in options.items())
+        reason = " ".join(str(error).split())
+        raise InputError(f"Lightning cannot train with {given}: {reason}") from None
 
 
 def _open_data(stage: str, config: RunConfig) -> ViewDataset:

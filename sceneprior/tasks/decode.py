@@ -45,7 +45,7 @@ def to_scenes(
 def decode_latents(
     trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: list[str]
 ) -> list[Scene]:
-    """Scenes of points on the hypersphere; meshes once the shape stage has begun."""
+    """Scenes of points on the hypersphere; meshes once the shape stage has finished."""
     scenes: list[Scene] = []
     for start in range(0, len(z), BATCH):
         part = slice(start, start + BATCH)
@@ -56,10 +56,10 @@ def decode_latents(
     return scenes
 
 
-def decode_training_rooms(trained: TrainedPrior, limit: int | None = None) -> list[Scene]:
+def decode_training_rooms(trained: TrainedPrior) -> list[Scene]:
     """The training rooms as the prior remembers them, named by their ids."""
-    z = trained.prior.sphere(trained.logits[:limit])
-    return decode_latents(trained, z, list(trained.room_ids[:limit]))
+    z = trained.prior.sphere(trained.logits)
+    return decode_latents(trained, z, list(trained.room_ids))
 
 
 def synthesize(trained: TrainedPrior, count: int, seed: int, law: str | None = None) -> list[Scene]:

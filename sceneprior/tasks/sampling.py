@@ -8,8 +8,7 @@ from sceneprior.errors import InputError
 from sceneprior.models.latents import LatentSphere, slerp_pairs
 
 NEIGHBOURS = 20
-"""Rooms that a geodesic may lead to. More reach further from the training rooms and miss the bed
-of a bedroom more often; docs/results.md has the figures."""
+"""Rooms that a geodesic may lead to; more reach further from the training rooms."""
 
 BANDWIDTH = 0.2
 """Of the kernel law, in standard deviations of the training rooms' logits: 0 copies training rooms,
