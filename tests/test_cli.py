@@ -103,9 +103,8 @@ def test_folders_that_are_no_run_or_hold_no_checkpoint(command, toy_run, tmp_pat
     shutil.copy(toy_run / "config.yaml", tmp_path / "run")
     before = everything_in(tmp_path)
     said = one_sentence(command(*call))
-    assert (
-        "run holds no checkpoint yet; let `sceneprior fit --run run --resume` get further" in said
-    )
+    assert "run holds no checkpoint yet; let `sceneprior fit --config run/config.yaml" in said
+    assert "--run run --resume` get further" in said
     (tmp_path / "run" / "layout").mkdir()
     (tmp_path / "run" / "layout" / "final.ckpt").write_bytes(b"PK nonsense")
     assert "it is damaged. Delete it and run `sceneprior fit`" in one_sentence(command(*call))
@@ -226,3 +225,12 @@ def test_the_module_is_the_command(tmp_path):
     )  # fmt: skip
     one_sentence((answer.returncode, answer.stdout, answer.stderr))
     assert not list(tmp_path.iterdir())
+
+
+def test_options_that_lightning_refuses_are_a_sentence_and_leave_nothing(
+    command, toy_shards, tmp_path
+):
+    call = ["fit", "--config", "demo.yaml", "--run", "new", "--set", f"data.shards={toy_shards}"]
+    said = one_sentence(command(*call, "--accelerator", "quantum"))
+    assert "Lightning cannot train with --devices auto, --accelerator quantum" in said
+    assert not (tmp_path / "new").exists()

@@ -79,11 +79,10 @@ def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(toy_run, monk
 
 def test_training_rooms_are_decoded_under_their_own_names(toy_run):
     trained = load_run(toy_run)
-    assert [scene.name for scene in decode_training_rooms(trained)] == list(trained.room_ids)
-    limited = decode_training_rooms(trained, 3)
-    assert [scene.name for scene in limited] == list(trained.room_ids[:3])
-    z = trained.prior.sphere(trained.logits[:3])
-    for one, other in zip(limited, decode_latents(trained, z, ["a", "b", "c"]), strict=True):
+    decoded = decode_training_rooms(trained)
+    assert [scene.name for scene in decoded] == list(trained.room_ids)
+    z = trained.prior.sphere(trained.logits)
+    for one, other in zip(decoded, decode_latents(trained, z, ["x"] * len(z)), strict=True):
         np.testing.assert_array_equal(one.centers_m, other.centers_m)
 
 
