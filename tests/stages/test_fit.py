@@ -76,6 +76,7 @@ def test_both_stages_learn_and_leave_what_runs_py_promises(toy_run, toy_shards):
 
 def test_a_trained_run_is_ready_for_use(toy_run):
     trained = load_run(toy_run)
+    assert trained.stage == "shape"
     assert trained.room_ids == tuple(f"toy/train_{k:02d}" for k in range(12))
     assert trained.logits.shape == (12, 10) and not trained.logits.requires_grad
     assert not trained.prior.training
@@ -83,6 +84,7 @@ def test_a_trained_run_is_ready_for_use(toy_run):
     assert same(
         {f"prior.{k}": v for k, v in trained.prior.state_dict().items()}
         | {"latents.weight": trained.logits},
+        weights(toy_run / "shape" / "final.ckpt"),
     )
 
 
@@ -280,8 +282,7 @@ def test_damaged_or_foreign_checkpoints_are_sentences(toy_run, tmp_path):
     for path in run.rglob("*.ckpt"):
         path.unlink()
     with pytest.raises(
-        InputError,
-        match=r"holds no checkpoint yet; let `sceneprior fit --config .*config.yaml --run .* --r",
+        InputError, match=r"holds no checkpoint yet; let `sceneprior fit --config .*config.yaml --run .* --r"
     ):
         load_run(run)
     with pytest.raises(
