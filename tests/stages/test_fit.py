@@ -282,7 +282,7 @@ def test_damaged_or_foreign_checkpoints_are_sentences(toy_run, tmp_path):
     for path in run.rglob("*.ckpt"):
         path.unlink()
     with pytest.raises(
-        InputError, match=r"holds no checkpoint yet; let `sceneprior fit --config .*config.yaml --run .* --r"
+        InputError, match=r"holds no checkpoint yet; let `sceneprior fit --config .*config.yaml"
     ):
         load_run(run)
     with pytest.raises(
