@@ -146,7 +146,7 @@ def render_scene(
 
     Example: what a room's camera would label.
 
-        >>> triangle = torch.tensor([[[[0.0, 0, 2], [1, 0, 2], [0, 1, 2]]]])
+        >>> triangle = torch.tensor([[[[0.0, 0, 2], [0.9, 0, 2], [0, 0.9, 2]]]])
         >>> ahead = torch.eye(4)[None, None]
         >>> lens = torch.tensor([[[[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]]])
         >>> scene = render_scene(triangle, torch.tensor([[0, 1, 2]]), ahead, lens, (4, 4))
