@@ -28,6 +28,10 @@ LawOption = Annotated[
     str | None,
     typer.Option(help="kernel, geodesic, gaussian or paper (default: the config's)."),
 ]
+CheckpointOption = Annotated[
+    str,
+    typer.Option(help="final, or best: what generated best while training (samples.every)."),
+]
 
 
 def _show_version(wanted: bool | None) -> None:
@@ -71,10 +75,14 @@ def fit(
     settings = load_config(config, tuple(set_ or ()))
     folder = run or Path("runs") / Path(config).stem
     from sceneprior.stages.train import fit as run_fit
+    from sceneprior.tasks.watch import SampleJudge
 
     options = {"devices": devices, "accelerator": accelerator, "precision": precision}
     try:
-        run_fit(settings, folder, resume, tuple(logger or ("csv", "tensorboard")), options)
+        run_fit(
+            settings, folder, resume, tuple(logger or ("csv", "tensorboard")), options,
+            SampleJudge(settings),
+        )  # fmt: skip
     except KeyboardInterrupt:
         typer.echo(
             "Stopped and saved. Go on with: sceneprior fit "
@@ -92,6 +100,7 @@ def synthesize(
     count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many rooms.")] = 16,
     seed: Annotated[int, typer.Option(help="Same seed, same rooms.")] = 0,
     law: LawOption = None,
+    checkpoint: CheckpointOption = "final",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
     renderer: RendererOption = "auto",
 ) -> None:
@@ -101,7 +110,7 @@ def synthesize(
     from sceneprior.tasks.decode import synthesize as generate
     from sceneprior.tasks.export import write_scenes
 
-    scenes = generate(load_run(run), count, seed, law)
+    scenes = generate(load_run(run, checkpoint), count, seed, law)
     write_scenes(scenes, out, open_renderer(renderer), overwrite)
     typer.echo(f"Wrote {count} rooms to {out}")
 
@@ -119,6 +128,7 @@ def eval_fid(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="JSON file (default: RUN/scores.json).")] = None,
     law: LawOption = None,
+    checkpoint: CheckpointOption = "final",
     renderer: RendererOption = "auto",
 ) -> None:
     """Judge generated rooms against test rooms, with the whole protocol beside the figures."""
@@ -126,7 +136,7 @@ def eval_fid(
     from sceneprior.tasks.judge import judge_run
 
     target = out or run / "scores.json"
-    print_scores(judge_run(run, count, seed, inception, shards, target, law, renderer))
+    print_scores(judge_run(run, count, seed, inception, shards, target, law, renderer, checkpoint))
     typer.echo(f"Wrote {target}")
 
 
@@ -139,13 +149,16 @@ def report(
     command: Annotated[
         list[str] | None, typer.Option(help="A command to list on the page. Repeatable.")
     ] = None,
+    checkpoint: CheckpointOption = "final",
     renderer: RendererOption = "auto",
 ) -> None:
     """Write one self-contained page: inputs, curves, rooms, scores."""
     from sceneprior.tasks.judge import report_run
 
     target = out or run / "report.html"
-    report_run(run, scores or run / "scores.json", target, seed, tuple(command or ()), renderer)
+    report_run(
+        run, scores or run / "scores.json", target, seed, tuple(command or ()), renderer, checkpoint
+    )
     typer.echo(f"Wrote {target}")
 
 

@@ -61,6 +61,23 @@ class ModelConfig(_Section):
     hidden: int = Field(1024, ge=8)
     """Inner width of the feed-forward layers."""
     dropout: float = Field(0.1, ge=0, lt=1)
+    latent: Literal["sphere", "uniform"] = "sphere"
+    """Where latents live: `sphere` (paper), or `uniform`, a cube with one logit a coordinate, in
+    which `sampling.law: paper` draws uniformly (ablation c1; `anchors` has no say)."""
+    decoder: Literal["transformer", "lstm"] = "transformer"
+    """What emits object features: the `transformer` (paper), or an `lstm` that takes z first and
+    then its own last output (ablation c2; `heads`, `hidden` and `dropout` have no say)."""
+    final_norm: bool = False
+    """Normalise once more after the encoder layer and after the decoder layer, as the released
+    code and the default of the library that it builds on."""
+    query_self_attention: bool = False
+    """Give the decoder layer self attention over its one query, z, as the released code."""
+    step_mlps: bool = False
+    """End step k in a two-layer MLP of its own, as the released code: 0.5 million weights a step
+    at width 512, and the k-th object knows that it is the k-th."""
+    layout_heads: Literal["joint", "separate"] = "joint"
+    """MLP2 is one MLP for all (`joint`), or a linear layer for the classes and an MLP of its own
+    for each of x, y, z, width, height and depth (`separate`, released code)."""
     shape_width: int = Field(256, ge=8)
     shape_level: int = Field(4, ge=0, le=6)
     """Icosphere subdivisions of the template: 20 * 4**level faces."""
@@ -75,6 +92,21 @@ class ModelConfig(_Section):
             raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
         return self
 
+    @model_validator(mode="after")
+    def _transformer_parts(self) -> "ModelConfig":
+        for part in ("final_norm", "query_self_attention", "step_mlps"):
+            if self.decoder != "transformer" and getattr(self, part):
+                raise ValueError(
+                    f"{part} is a part of the transformer, but decoder is '{self.decoder}'; "
+                    "set it to false"
+                )
+        return self
+
+    @property
+    def logits_per_room(self) -> int:
+        """How many numbers a room's latent is learnt as."""
+        return self.width if self.latent == "uniform" else self.anchors
+
 
 class LossConfig(_Section):
     """Weights of the terms (section 4)."""
@@ -82,6 +114,10 @@ class LossConfig(_Section):
     class_: float = Field(1.0, ge=0, alias="class")
     box: float = Field(5.0, ge=0)
     completeness: float = Field(1.0, ge=0)
+    completeness_target: Literal["first_n", "stop"] = "first_n"
+    """Of n objects, `first_n` wants ones for the first n predictions and zeros after (supplement
+    B); `stop` wants ones from the last object on and ends a generated scene with the first object
+    that has one (main text, released code). Decoding follows the same convention."""
     frustum: float = Field(1.0, ge=0)
     mask: float = Field(2.0, ge=0)
     """lambda_S."""
@@ -96,10 +132,13 @@ class LossConfig(_Section):
 
 
 class StageConfig(_Section):
-    """How one stage is trained."""
+    """How one stage is trained. The optimiser is Adam; released, AdamW without decay: the same."""
 
     epochs: int = Field(ge=1)
     batch_size: int = Field(16, ge=1)
+    """Rooms a batch and process."""
+    accumulate: int = Field(1, ge=1)
+    """Batches whose gradients are averaged before each update."""
     learning_rate: float = Field(1e-4, gt=0)
     latent_learning_rate: float = Field(1e-4, gt=0)
     """For the latent weights, which see one gradient an epoch; the paper uses one rate for all."""
@@ -149,17 +188,39 @@ class SamplingConfig(_Section):
     to their logits; `paper`: logits from N(0, 1)."""
 
 
+class SamplesConfig(_Section):
+    """What a stage generates while it trains; the checkpoint that generates best is kept."""
+
+    every: int = Field(0, ge=0)
+    """Epochs from one look to the next, and one at the stage's end; 0 never looks."""
+    count: int = Field(200, ge=2)
+    """Rooms generated at each look, always from the same seed and by the run's sampling law."""
+    seed: int = Field(0, ge=0)
+    metric: Literal["category_kl", "objects_off", "overlaps", "type_share", "mask_iou"] = (
+        "category_kl"
+    )
+    """What `best.ckpt` is best in; the first three are better low, the others high."""
+    against: Literal["test", "train"] = "test"
+    """Rooms that `category_kl` and `objects_off` compare with; training rooms where there are no
+    others. A checkpoint chosen by its test score is no longer blind to the test rooms: take
+    `train` where `best.ckpt` is to be reported."""
+
+
 class RunConfig(_Section):
     """Everything a run is; saved with it as `config.yaml`."""
 
     label_set: str
     seed: int = Field(0, ge=0)
+    stages: Literal["two", "one"] = "two"
+    """`two`: layout, then layout and shape together (paper); `one`: the second from scratch, so
+    that boxes and shapes are learnt together (ablation c3; the section `layout` has no say)."""
     data: DataConfig
     model: ModelConfig
     loss: LossConfig = LossConfig()
     layout: StageConfig
     shape: ShapeConfig
     sampling: SamplingConfig = SamplingConfig()
+    samples: SamplesConfig = SamplesConfig()
 
     @model_validator(mode="after")
     def _known_label_set(self) -> "RunConfig":

@@ -77,6 +77,24 @@ def test_bad_shards_are_sentences_and_leave_no_run(command, toy_shards, tmp_path
     assert "the nearest valid key is 'epochs'" in fit(toy_shards, "--set", "layout.epoch=3")
 
 
+def test_fit_keeps_the_best_sampler_and_other_verbs_take_it(command, toy_shards, tmp_path):
+    config = write_tiny_config(
+        tmp_path / "tiny.yaml", toy_shards, layout__epochs=2, shape__epochs=1,
+        samples={"every": 1, "count": 6},
+    )  # fmt: skip
+    status, _, errors = command("fit", "--config", config, "--run", "run", "--accelerator", "cpu")
+    assert status == 0, errors
+    draw = ["--run", "run", "-n", 2, "--renderer", "software"]
+    status, _, errors = command("synthesize", *draw, "--out", "rooms", "--checkpoint", "best")
+    assert status == 0 and (tmp_path / "rooms" / "overview.png").is_file(), errors
+    status, _, errors = command("eval-fid", *draw, "--checkpoint", "best")
+    assert status == 0, errors
+    protocol = json.loads((tmp_path / "run" / "scores.json").read_text())["protocol"]
+    assert protocol["checkpoint"] == "best"
+    said = one_sentence(command("synthesize", *draw, "--out", "b", "--checkpoint", "worst"))
+    assert "No checkpoint 'worst'; choose from final, best." in said
+
+
 def test_a_config_typo_names_key_file_and_nearest_key(command, toy_shards, tmp_path):
     config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards)
     config.write_text(config.read_text().replace("  dropout:", "  droput:"))

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from tiny_runs import write_tiny_config
 
+from sceneprior.classes import label_set
 from sceneprior.config import dump_config, find_config, load_config
 from sceneprior.errors import ConfigError, InputError
 
@@ -33,7 +34,8 @@ def replaced(path: Path, old: str, new: str) -> Path:
 
 
 def test_the_demo_and_the_papers_settings_are_there():
-    assert {"demo.yaml", "bedroom.yaml", "living.yaml"} <= {path.name for path in SHIPPED}
+    wanted = {"demo.yaml", "bedroom.yaml", "living.yaml", "scannet.yaml"}
+    assert wanted <= {path.name for path in SHIPPED}
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
@@ -56,16 +58,69 @@ def test_shipped_configs_are_complete(path):
     assert set(keys(yaml.safe_load(path.read_text()))) == set(keys(everything))
 
 
-@pytest.mark.parametrize(("name", "objects"), [("bedroom", 13), ("living", 28)])
-def test_the_papers_numbers(name, objects):
+@pytest.mark.parametrize(
+    ("name", "objects", "classes", "mask_step"),
+    # ScanNet's shards are written at a quarter of the images' size.
+    [("bedroom", 13, 22, 4), ("living", 28, 15, 4), ("scannet", 53, 19, 1)],
+)
+def test_the_papers_numbers(name, objects, classes, mask_step):
     config = load_config(f"{name}.yaml")
+    assert len(label_set(config.label_set)) == classes
     model = config.model
     assert (model.max_objects, model.width, model.heads, model.hidden) == (objects, 512, 4, 1024)
-    assert (config.data.views_per_room, config.data.mask_step) == (20, 4)
+    assert (config.data.views_per_room, config.data.mask_step) == (20, mask_step)
+    assert config.data.augment_rotations and config.data.view_fraction == 1
+    for stage, epochs in ((config.layout, 800), (config.shape, 500)):
+        assert (stage.epochs, stage.batch_size, stage.accumulate) == (epochs, 16, 1)
+        assert stage.learning_rate == stage.latent_learning_rate == 1e-4
+        assert (stage.schedule, stage.milestones, stage.decay) == ("steps", (300,), 0.1)
+        assert stage.latent_noise == stage.clip_gradient == 0
     loss = config.loss
+    assert (loss.class_, loss.completeness, loss.frustum, loss.box, loss.mask) == (1, 1, 1, 5, 2)
     assert (loss.match_box, loss.iou_gate, loss.hidden_overshoot) == (5.0, 0.5, 1.0)
     assert config.layout.proxy == "ellipsoid" and config.shape.compositing == "paper"
     assert (model.template, model.fit_box, model.shape_level) == ("sphere", False, 4)
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+def test_no_shipped_config_is_a_variant_or_an_ablation(path):
+    config = load_config(str(path))
+    model = config.model
+    assert (config.stages, config.loss.completeness_target) == ("two", "first_n")
+    assert (model.latent, model.decoder, model.layout_heads) == ("sphere", "transformer", "joint")
+    assert not (model.final_norm or model.query_self_attention or model.step_mlps)
+
+
+def test_the_released_codes_settings_are_one_command_away():
+    """The keys that docs/paper_map.md lists, as it lists them."""
+    text = (FOLDER.parent / "docs" / "paper_map.md").read_text()
+    _, command = text.split("```bash\n", 1)
+    words = command.split("```", 1)[0].replace("\\\n", " ").split()
+    assert words[:4] == ["sceneprior", "fit", "--config", "bedroom.yaml"]
+    config = load_config(words[3], tuple(words[i + 1] for i, w in enumerate(words) if w == "--set"))
+    model = config.model
+    assert (model.hidden, model.layout_heads, config.loss.completeness_target) == (
+        512, "separate", "stop",
+    )  # fmt: skip
+    assert model.final_norm and model.query_self_attention and model.step_mlps
+    assert (config.layout.batch_size, config.layout.milestones) == (128, (400,))
+    assert (config.shape.batch_size, config.shape.milestones) == (16, (300,))
+    assert config.layout.proxy == "ellipsoid_points" and config.sampling.law == "paper"
+
+
+@pytest.mark.parametrize("part", ["final_norm", "query_self_attention", "step_mlps"])
+def test_a_part_of_the_transformer_without_a_transformer_is_a_sentence(config, part):
+    message = refusal(config, "model.decoder=lstm", f"model.{part}=true")
+    assert message.startswith(
+        f"{config}: 'model': {part} is a part of the transformer, but decoder is 'lstm'; "
+        "set it to false"
+    )
+    load_config(str(config), ("model.decoder=lstm",))
+
+
+def test_a_room_has_as_many_logits_as_its_latent_space_asks_for(config):
+    assert load_config(str(config)).model.logits_per_room == 10
+    assert load_config(str(config), ("model.latent=uniform",)).model.logits_per_room == 16
 
 
 def test_a_shipped_config_is_found_by_name_from_any_folder(tmp_path, monkeypatch):

@@ -7,11 +7,15 @@ import numpy as np
 from torch.utils.data import DataLoader, Sampler
 
 from sceneprior.batches import SceneViews
-from sceneprior.data.dataset import ViewDataset
+from sceneprior.data.dataset import BLANK, ViewDataset
 
 
 class DrawSampler(Sampler[list[tuple[int, int]]]):
     """Batches of (row, epoch): a fresh order each epoch, split over processes.
+
+    Several processes together draw the batches that one process would draw with a `batch_size`
+    as many times as large. A last batch with fewer rows than processes is filled up with draws
+    of an epoch `BLANK`, which the data set answers with a room in which there is nothing.
 
     Args:
         rows: Size of the data set.
@@ -32,18 +36,17 @@ class DrawSampler(Sampler[list[tuple[int, int]]]):
         """Lightning calls this before each epoch."""
         self.epoch = epoch
 
-    def _mine(self) -> int:
-        # Every process gets the same number, so that none waits for another: the first wrap.
-        return -(-self.rows // self.world)
-
     def __len__(self) -> int:
-        return -(-self._mine() // self.batch_size)
+        return -(-self.rows // (self.batch_size * self.world))
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
         order = np.random.default_rng([self.seed, self.epoch]).permutation(self.rows)
-        order = np.resize(order, self._mine() * self.world)[self.rank :: self.world]
-        for start in range(0, len(order), self.batch_size):
-            yield [(int(row), self.epoch) for row in order[start : start + self.batch_size]]
+        step = self.batch_size * self.world
+        for start in range(0, self.rows, step):
+            batch = order[start : start + step]
+            mine = batch[self.rank :: self.world]
+            # A process without a batch would leave the others waiting for it.
+            yield [(int(row), self.epoch) for row in mine] or [(int(batch[0]), BLANK)]
 
 
 def _as_it_is(batch: Any) -> SceneViews:

@@ -10,6 +10,9 @@ from sceneprior.batches import SceneViews
 from sceneprior.errors import ShardError
 from sceneprior.shards import RoomViews, Shard, list_shards
 
+BLANK = -1
+"""An epoch no one draws in: the room comes without objects, and teaches nothing."""
+
 
 class ViewDataset(Dataset):
     """Rooms of a split with their views; images are read only where masks are wanted.
@@ -22,6 +25,7 @@ class ViewDataset(Dataset):
         view_fraction: Share of each room's views that may be drawn, chosen once by `seed`.
         mask_step: Every how many pixels the instance ids are kept; None reads no images.
         seed: Decides which views are drawn.
+        limit: Only the first so many rooms; None takes all.
 
     Raises:
         ShardError: a shard is missing, damaged, or of another label set than the first.
@@ -36,6 +40,7 @@ class ViewDataset(Dataset):
         view_fraction: float = 1.0,
         mask_step: int | None = None,
         seed: int = 0,
+        limit: int | None = None,
     ):
         self.views_per_room = views_per_room
         self.rotations = rotations
@@ -46,6 +51,8 @@ class ViewDataset(Dataset):
         self._images: dict[int, np.ndarray] = {}
         self.label_set = ""
         for path in list_shards(folder, split):
+            if limit is not None and len(self.rooms) >= limit:
+                break
             with Shard(path) as shard:
                 if self.label_set and shard.label_set != self.label_set:
                     raise ShardError(
@@ -53,7 +60,8 @@ class ViewDataset(Dataset):
                         f"'{self.label_set}'; keep one label set a folder."
                     )
                 self.label_set = shard.label_set
-                for room_id in shard.room_ids:
+                left = None if limit is None else limit - len(self.rooms)
+                for room_id in shard.room_ids[:left]:
                     self.rooms.append(shard.read_room(room_id))
                     self._paths.append(path)
         if not self.rooms:
@@ -92,12 +100,12 @@ class ViewDataset(Dataset):
         poses = np.empty((*shape, 4, 4), dtype=np.float32)
         lenses = np.empty((*shape, 3, 3), dtype=np.float32)
         for slot, (row, room, views) in enumerate(zip(rows, rooms, chosen, strict=True)):
-            count = len(room.object_class)
-            classes[slot, :count] = room.object_class
+            count = len(room.object_class) if draws[slot][1] != BLANK else 0
+            classes[slot, :count] = room.object_class[:count]
             real[slot, :count] = True
-            boxes[slot, :, :count] = room.boxes[views]
-            visible[slot, :, :count] = room.visible[views]
-            clear[slot, :, :count] = room.sides_clear[views]
+            boxes[slot, :, :count] = room.boxes[views, :count]
+            visible[slot, :, :count] = room.visible[views, :count]
+            clear[slot, :, :count] = room.sides_clear[views, :count]
             # The room turns by +a, so a camera sees the turned room as it saw the plain one.
             poses[slot] = room.world_to_camera[views] @ self._turns[row % self.rotations].T
             lenses[slot] = room.intrinsics[views]
@@ -123,7 +131,7 @@ class ViewDataset(Dataset):
     def _draw(self, row: int, epoch: int) -> np.ndarray:
         # A pure function of seed, row and epoch: a resumed run draws what it would have drawn.
         allowed = self._allowed[row // self.rotations]
-        generator = np.random.default_rng([self.seed, row, epoch])
+        generator = np.random.default_rng([self.seed, row, max(epoch, 0)])
         if len(allowed) >= self.views_per_room:
             return generator.choice(allowed, self.views_per_room, replace=False)
         # A room with few views shows each of them about equally often.

@@ -73,7 +73,11 @@ def category_kl(generated: Sequence[Scene], test: Sequence[Scene]) -> float:
         training rooms: the training split flatters.
     """
     common_label_set(generated, test)
-    p, q = class_frequencies(test), class_frequencies(generated)
+    return frequency_kl(class_frequencies(test), class_frequencies(generated))
+
+
+def frequency_kl(p: Float[np.ndarray, " classes"], q: Float[np.ndarray, " classes"]) -> float:
+    """`category_kl` of class frequencies: of q, the generated rooms', from p."""
     return float((p * (np.log(p + KL_EPSILON) - np.log(q + KL_EPSILON))).sum())
 
 

@@ -7,7 +7,9 @@ from torch.nn import functional as F
 
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.geometry.cameras import Boxes2D, camera_centers, pixel_rays
+from sceneprior.losses.completeness import completeness_targets
 from sceneprior.losses.matching import Matches, side_distance
+from sceneprior.losses.processes import share_of_batch
 
 
 def take(values: Tensor, index: Int[Tensor, "rooms objects"], dim: int) -> Tensor:
@@ -25,8 +27,11 @@ def layout_losses(
     views: SceneViews,
     matches: Matches,
     hidden_overshoot: float = 1.0,
+    completeness_target: str = "first_n",
 ) -> dict[str, Float[Tensor, ""]]:
     """The four terms of L_layout, each averaged over the objects it applies to.
+
+    Where several processes train, over those of all processes: see `share_of_batch`.
 
     Args:
         scenes: Predictions.
@@ -34,6 +39,7 @@ def layout_losses(
         views: What the cameras saw.
         matches: Which prediction answers for which object.
         hidden_overshoot: See `side_distance`.
+        completeness_target: `first_n` or `stop`; see `losses/completeness.py`.
 
     Returns:
         `class`, `box`, `completeness` and `frustum`; weights are the caller's.
@@ -45,7 +51,7 @@ def layout_losses(
     return {
         "class": class_loss(scenes, views, matches),
         "box": box_loss(predicted, views.boxes, views.sides_clear, seen & inside, hidden_overshoot),
-        "completeness": completeness_loss(scenes, views),
+        "completeness": completeness_loss(scenes, views, completeness_target),
         "frustum": frustum_loss(centers, views, seen & ~inside),
     }
 
@@ -75,12 +81,20 @@ def box_loss(
     return _mean_of_objects(torch.stack(apart).sum(dim=0), counted)
 
 
-def completeness_loss(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""]:
-    """Binary cross entropy of the completeness scores: ones for the first n, zeros after."""
+def completeness_loss(
+    scenes: DecodedScenes, views: SceneViews, target: str = "first_n"
+) -> Float[Tensor, ""]:
+    """Binary cross entropy of the completeness scores of all predictions.
+
+    Args:
+        scenes: Predictions.
+        views: Whose rooms have how many objects.
+        target: What the scores should be; see `losses/completeness.py`.
+    """
     logits = scenes.completeness_logits
-    counts = views.is_object.sum(dim=-1, keepdim=True)
-    position = torch.arange(logits.shape[1], device=logits.device)
-    return F.binary_cross_entropy_with_logits(logits, (position < counts).to(logits.dtype))
+    wanted = completeness_targets(views.is_object.sum(dim=-1), logits.shape[1], target)
+    mean = F.binary_cross_entropy_with_logits(logits, wanted.to(logits.dtype))
+    return mean * share_of_batch(views.is_object.any(dim=-1).sum())
 
 
 def frustum_loss(
@@ -110,4 +124,5 @@ def _mean_of_objects(
 
 def _mean(values: Float[Tensor, " n"], counted: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
     weights = counted.to(values.dtype)
-    return (values * weights).sum() / weights.sum().clamp(min=1)
+    count = weights.sum()
+    return (values * weights).sum() / count.clamp(min=1) * share_of_batch(count)

@@ -6,6 +6,7 @@ from torch.nn import functional as F
 
 from sceneprior.batches import SceneViews
 from sceneprior.losses.matching import Matches
+from sceneprior.losses.processes import share_of_batch
 
 CERTAIN = 1e-6
 """Pixels of a mask this near to 0 or 1 carry no gradient."""
@@ -44,8 +45,8 @@ def mask_loss(
     each = F.binary_cross_entropy(certain, observed, reduction="none").mean(dim=(1, 2))
     count = seen.sum(dim=1)
     share = 1 / count[room, item].to(mine.dtype)
-    objects = (count > 0).sum().clamp(min=1)
-    loss = (each * use * share).sum() / objects
+    objects = (count > 0).sum()
+    loss = (each * use * share).sum() / objects.clamp(min=1) * share_of_batch(objects)
     pairs = max(len(room), 1)
     return loss, {"mask_iou": iou.sum() / pairs, "mask_used": use.sum() / pairs}
 

@@ -1,4 +1,11 @@
-"""Weights in, points on the latent hypersphere out (section 3.1, equation 2)."""
+"""Logits in, latents out: points on the hypersphere (section 3.1, equation 2), or in a cube.
+
+A latent space turns the logits of rooms, which are learnt, into latents, which are decoded. Logits
+drawn from N(0, 1) are where training rooms start and what the `paper` law samples. Beside that a
+space knows how near two latents are, what lies between them and what a small step is.
+"""
+
+import math
 
 import torch
 from jaxtyping import Float
@@ -9,11 +16,15 @@ from torch.nn import functional as F
 class LatentSphere(nn.Module):
     """Map weights of M fixed unit vectors to a point on the unit hypersphere.
 
+    A constant added to all logits of a room changes nothing: `shift_free`.
+
     Args:
         anchors: M, the number of fixed vectors phi_i.
         dimension: D_z.
         seed: Draws the anchors; they are stored with the model.
     """
+
+    shift_free = True
 
     def __init__(self, anchors: int, dimension: int, seed: int = 0):
         super().__init__()
@@ -27,14 +38,87 @@ class LatentSphere(nn.Module):
         """z = normalise(sum_i w_i phi_i), w = softmax(logits): positive weights that sum to 1."""
         return F.normalize(logits.softmax(dim=-1) @ self.anchors, dim=-1)
 
+    def nearness(
+        self, some: Float[Tensor, "some dimension"], others: Float[Tensor, "others dimension"]
+    ) -> Float[Tensor, "some others"]:
+        """Larger for nearer pairs: the cosine of the angle between them."""
+        return some @ others.T
+
+    def between(
+        self,
+        start: Float[Tensor, "pairs dimension"],
+        end: Float[Tensor, "pairs dimension"],
+        along: Float[Tensor, " pairs"],
+    ) -> Float[Tensor, "pairs dimension"]:
+        """One point a pair, on the geodesic; see `slerp_pairs`."""
+        return slerp_pairs(start, end, along)
+
+    def step(
+        self, z: Float[Tensor, "rooms dimension"], length: float, seed: int
+    ) -> Float[Tensor, "rooms dimension"]:
+        """Move each point at random; see `jitter`."""
+        return jitter(z, length, seed)
+
+
+class LatentCube(nn.Module):
+    """Map one logit a coordinate to a point of a cube around the origin: ablation c1.
+
+    z_i = a * (2 * Phi(logit_i) - 1), Phi the normal distribution function, so that logits from
+    N(0, 1) are points spread uniformly over the cube. Its half edge a = sqrt(3 / D_z) makes the
+    mean square length of such points 1: what follows sees numbers as large as the sphere's.
+
+    The paper says 'uniform latent space parameterization' and no more; this is our reading.
+
+    Args:
+        dimension: D_z, which is also the number of logits a room has.
+    """
+
+    shift_free = False
+
+    def __init__(self, dimension: int):
+        super().__init__()
+        self.half_edge = math.sqrt(3 / dimension)
+
+    def forward(self, logits: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
+        """2 * Phi(x) - 1 is erf(x / sqrt(2))."""
+        return self.half_edge * torch.erf(logits / math.sqrt(2))
+
+    def nearness(
+        self, some: Float[Tensor, "some dimension"], others: Float[Tensor, "others dimension"]
+    ) -> Float[Tensor, "some others"]:
+        """Larger for nearer pairs: minus their distance."""
+        return -torch.cdist(some, others)
+
+    def between(
+        self,
+        start: Float[Tensor, "pairs dimension"],
+        end: Float[Tensor, "pairs dimension"],
+        along: Float[Tensor, " pairs"],
+    ) -> Float[Tensor, "pairs dimension"]:
+        """One point a pair, on the straight line."""
+        return torch.lerp(start, end, along.unsqueeze(-1))
+
+    def step(
+        self, z: Float[Tensor, "rooms dimension"], length: float, seed: int
+    ) -> Float[Tensor, "rooms dimension"]:
+        """Move each point a random step of about `length`, and no further than the cube's faces."""
+        moved = z + _random_steps(z, length, seed)
+        return moved.clamp(-self.half_edge, self.half_edge)
+
+
+LatentSpace = LatentSphere | LatentCube
+
 
 def jitter(
     z: Float[Tensor, "rooms dimension"], length: float, seed: int
 ) -> Float[Tensor, "rooms dimension"]:
     """Move points a random step of about `length` on the sphere; the same seed, the same steps."""
+    return F.normalize(z + _random_steps(z, length, seed), dim=-1)
+
+
+def _random_steps(z: Tensor, length: float, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
-    step = torch.randn(z.shape, generator=generator).to(z) * (length / z.shape[-1] ** 0.5)
-    return F.normalize(z + step, dim=-1)
+    return torch.randn(z.shape, generator=generator).to(z) * (length / z.shape[-1] ** 0.5)
 
 
 def slerp(

@@ -7,6 +7,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sceneprior.models.released import SeparateHeads
+
 
 class Layout(NamedTuple):
     """What the layout decoder says of each object; metres in the room frame."""
@@ -17,6 +19,20 @@ class Layout(NamedTuple):
     completeness_logits: Float[Tensor, "rooms objects"]
 
 
+class JointHead(nn.Sequential):
+    """MLP2: class logits, x, y, z, width, height, depth and completeness from one MLP."""
+
+    def __init__(self, hidden: int, classes: int):
+        super().__init__(
+            nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, classes + 7)
+        )
+
+    def box_rows(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights and bias of the last layer of x, y, z, width, height, depth, completeness."""
+        last: nn.Linear = self[-1]  # type: ignore[assignment]
+        return [(last.weight[row], last.bias[row]) for row in range(-7, 0)]
+
+
 class LayoutDecoder(nn.Module):
     """MLP1 (shared with the shape decoder), then MLP2.
 
@@ -24,29 +40,28 @@ class LayoutDecoder(nn.Module):
         width: Size of an object feature.
         classes: Size of the label set.
         initial_size_m: Edge of every box before training.
+        heads: `joint` (paper) or `separate`: see `SeparateHeads`.
     """
 
-    def __init__(self, width: int, classes: int, initial_size_m: float = 0.7):
+    def __init__(self, width: int, classes: int, initial_size_m: float = 0.7, heads: str = "joint"):
         super().__init__()
         hidden = 2 * width
         self.classes = classes
         self.mlp1 = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, hidden))
-        self.mlp2 = nn.Sequential(
-            nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, classes + 7)
+        self.mlp2 = (
+            SeparateHeads(hidden, classes) if heads == "separate" else JointHead(hidden, classes)
         )
         self._start_at_floor_center(initial_size_m)
 
     def _start_at_floor_center(self, size_m: float) -> None:
         # Section 3.4: every object starts at the floor centre. Weights are small rather than
         # zero, so that objects can part; y starts a little above 0, where ReLU has a slope.
-        last: nn.Linear = self.mlp2[-1]  # type: ignore[assignment]
+        size = float(torch.log(torch.expm1(torch.tensor(size_m))))
+        starts = (0.0, 0.1, 0.0, size, size, size, 0.0)
         with torch.no_grad():
-            last.weight[self.classes :] *= 0.1
-            last.bias[self.classes :] = 0
-            last.bias[self.classes + 1] = 0.1
-            last.bias[self.classes + 3 : self.classes + 6] = float(
-                torch.log(torch.expm1(torch.tensor(size_m)))
-            )
+            for (weight, bias), start in zip(self.mlp2.box_rows(), starts, strict=True):
+                weight *= 0.1
+                bias.fill_(start)
 
     def forward(
         self, features: Float[Tensor, "rooms objects width"]

@@ -5,6 +5,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sceneprior.models.released import QuerySelfAttention, SharedOutput, StepOutputs
+
 
 class FeedForward(nn.Module):
     """MLP[hidden, width] with GELU, the residual and the norm around it (supplement A)."""
@@ -39,9 +41,21 @@ class SceneDecoder(nn.Module):
         heads: Attention heads; must divide `width`.
         hidden: Inner width of the feed-forward layers (paper: 1,024 for a width of 512).
         dropout: Applied where the library applies it; 0.1 is its default.
+        final_norm: Normalise once more after each of the two layers (the library's default).
+        query_self_attention: Let z attend to itself before it asks (released code).
+        step_outputs: N gives each of N steps an MLP of its own (released code); 0 gives none.
     """
 
-    def __init__(self, width: int, heads: int, hidden: int, dropout: float):
+    def __init__(
+        self,
+        width: int,
+        heads: int,
+        hidden: int,
+        dropout: float,
+        final_norm: bool = False,
+        query_self_attention: bool = False,
+        step_outputs: int = 0,
+    ):
         super().__init__()
         self.heads = heads
         self.dropout = dropout
@@ -56,23 +70,24 @@ class SceneDecoder(nn.Module):
         self.decoder_out = nn.Linear(width, width)
         self.decoder_norm = nn.LayerNorm(width)
         self.decoder_ff = FeedForward(width, hidden, dropout)
+        self.encoder_end = nn.LayerNorm(width) if final_norm else nn.Identity()
+        self.decoder_end = nn.LayerNorm(width) if final_norm else nn.Identity()
+        self.query = (
+            QuerySelfAttention(width, heads, dropout) if query_self_attention else nn.Identity()
+        )
+        self.output = StepOutputs(step_outputs, width) if step_outputs else SharedOutput()
 
     def forward(
         self, z: Float[Tensor, "rooms width"], objects: int
     ) -> Float[Tensor, "rooms objects width"]:
-        """Unroll `objects` steps from the start token (the empty room).
-
-        Coordinates of a unit vector are about 1 / sqrt(width), far below the normalised
-        features they are added to; scaled to about 1 they are heard. Without it the
-        class loss falls far more slowly (docs/results.md).
-        """
-        z = z * z.shape[-1] ** 0.5
+        """Unroll `objects` steps from the start token (the empty room)."""
+        wish = self._wish(z)
         tokens = self.start.expand(len(z), 1, -1)
         qkv = self._split(self.encoder_qkv(tokens))
-        question = self._question(z)
+        question = self._question(wish)
         features: list[Tensor] = []
         for step in range(objects):
-            features.append(self._next(z, question, tokens, qkv))
+            features.append(self._next(wish, question, tokens, qkv))
             if step + 1 < objects:
                 newest = features[-1].unsqueeze(1)
                 tokens = torch.cat([tokens, newest], dim=1)
@@ -86,27 +101,37 @@ class SceneDecoder(nn.Module):
         previous: Float[Tensor, "rooms objects width"],
     ) -> Float[Tensor, "rooms width"]:
         """The feature that follows a set of objects, in whatever order they are given."""
-        z = z * z.shape[-1] ** 0.5
+        wish = self._wish(z)
         tokens = torch.cat([self.start.expand(len(z), 1, -1), previous], dim=1)
         qkv = self._split(self.encoder_qkv(tokens))
-        return self._next(z, self._question(z), tokens, qkv)
+        return self._next(wish, self._question(wish), tokens, qkv)
 
-    def _next(self, z: Tensor, question: Tensor, tokens: Tensor, qkv: list[Tensor]) -> Tensor:
+    def _wish(self, z: Tensor) -> Tensor:
+        """(rooms, width): z as the query of every step.
+
+        Coordinates of a unit vector are about 1 / sqrt(width), far below the normalised
+        features they are added to; scaled to about 1 they are heard. Without it the
+        class loss falls far more slowly (docs/results.md).
+        """
+        return self.query(z * z.shape[-1] ** 0.5)
+
+    def _next(self, wish: Tensor, question: Tensor, tokens: Tensor, qkv: list[Tensor]) -> Tensor:
         query, key, value = qkv
         # Written out: on a dozen tokens torch's fused CPU attention is slower.
         scores = query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5
         mixed = (self._drop(scores.softmax(dim=-1)) @ value).transpose(1, 2).flatten(2)
         context = self.encoder_norm(tokens + self._drop(self.encoder_out(mixed)))
-        context = self.encoder_ff(context)
-        answer = z + self._drop(self.decoder_out(self._ask(question, context)))
-        return self.decoder_ff(self.decoder_norm(answer))
+        context = self.encoder_end(self.encoder_ff(context))
+        answer = wish + self._drop(self.decoder_out(self._ask(question, context)))
+        answer = self.decoder_end(self.decoder_ff(self.decoder_norm(answer)))
+        return self.output(answer, step=tokens.shape[1] - 1)
 
-    def _question(self, z: Tensor) -> Tensor:
+    def _question(self, wish: Tensor) -> Tensor:
         """(rooms, heads, width): z's query of each head, carried through the key projection.
 
         The key's bias would add the same to every token's score, which a softmax does not see.
         """
-        query = self.decoder_query(z).unflatten(-1, (self.heads, -1))
+        query = self.decoder_query(wish).unflatten(-1, (self.heads, -1))
         key = self.decoder_key.unflatten(0, (self.heads, -1))
         return torch.einsum("rhd,hdw->rhw", query, key) / query.shape[-1] ** 0.5
 

@@ -16,7 +16,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from sceneprior.stages.view_loss import step_seed
+from sceneprior.stages.view_loss import batch_number, step_seed
 
 
 class RunProgress(Callback):
@@ -60,13 +60,14 @@ class RunProgress(Callback):
 
 
 class StepSeed(Callback):
-    """Seed each step anew, so that a resumed run drops out what it would have dropped out."""
+    """Seed each batch anew, so that a resumed run drops out what it would have dropped out."""
 
     def __init__(self, seed: int):
         self.seed = seed
 
     def on_train_batch_start(self, trainer: lightning.Trainer, pl_module, batch, batch_idx) -> None:
-        torch.manual_seed(step_seed(self.seed, trainer.global_step, trainer.global_rank))
+        batch = batch_number(trainer, batch_idx)
+        torch.manual_seed(step_seed(self.seed, batch, trainer.global_rank))
 
 
 class RollingCheckpoint(Callback):
@@ -87,15 +88,18 @@ class RollingCheckpoint(Callback):
         checkpoint.update(self.extra)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
-        self.write(trainer, "last.ckpt")
+        write_checkpoint(trainer, self.folder, "last.ckpt")
 
-    def write(self, trainer: lightning.Trainer, name: str) -> None:
-        """Write to a temporary name and move into place."""
-        part = self.folder / f"{name}.part"
-        try:
-            trainer.save_checkpoint(part)
-            if trainer.is_global_zero:
-                part.replace(self.folder / name)
-        finally:
-            if trainer.is_global_zero:
-                part.unlink(missing_ok=True)
+
+def write_checkpoint(trainer: lightning.Trainer, folder: Path, name: str) -> None:
+    """Write to a temporary name and move into place; all processes call, the first writes."""
+    part = folder / f"{name}.part"
+    try:
+        trainer.save_checkpoint(part)
+        if trainer.is_global_zero:
+            part.replace(folder / name)
+    finally:
+        if trainer.is_global_zero:
+            part.unlink(missing_ok=True)
+    # Others may be about to read it.
+    trainer.strategy.barrier()

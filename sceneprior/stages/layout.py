@@ -8,8 +8,10 @@ from sceneprior.batches import SceneViews
 from sceneprior.config import RunConfig
 from sceneprior.models.scene_prior import ScenePrior
 from sceneprior.stages.view_loss import (
+    batch_number,
     build_optimizer,
     check_finite,
+    full_precision,
     match_and_score,
     proxy_boxes,
     step_seed,
@@ -37,7 +39,8 @@ class LayoutStage(lightning.LightningModule):
 
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
         settings = self.config.layout
-        seed = step_seed(self.config.seed, self.global_step, self.global_rank)
+        batch = batch_number(self.trainer, batch_idx)
+        seed = step_seed(self.config.seed, batch, self.global_rank)
         z = training_latents(
             self.prior,
             self.latents,
@@ -47,9 +50,10 @@ class LayoutStage(lightning.LightningModule):
             seed,
         )
         scenes = self.prior.decode(z, with_shape=False)
-        boxes = proxy_boxes(scenes, views, settings.proxy)
-        losses, _ = match_and_score(scenes, boxes, views, self.config.loss)
-        total = weighted_sum(losses, self.config.loss)
+        with full_precision(self.device):
+            boxes = proxy_boxes(scenes, views, settings.proxy)
+            losses, _ = match_and_score(scenes, boxes, views, self.config.loss)
+            total = weighted_sum(losses, self.config.loss)
         check_finite(total, views)
         named = {f"train/{name}": loss.detach() for name, loss in losses.items()}
         named["train/loss"] = total.detach()

@@ -2,7 +2,9 @@
 
 RUN/config.yaml            every setting, defaults included
 RUN/<stage>/last.ckpt      newest checkpoint of the stage: what `--resume` continues from
-RUN/<stage>/final.ckpt     the stage is done
+RUN/<stage>/final.ckpt     the stage is done: what tasks take unless asked for `best`
+RUN/<stage>/best.ckpt      where `samples.every` is set: what generated best (stages/samples.py)
+RUN/<stage>/samples.json   the newest look's scores and the best so far; pictures in samples/
 RUN/<stage>/metrics.csv    one line an epoch; TensorBoard's files lie beside it
 """
 
@@ -21,6 +23,8 @@ from sceneprior.models.scene_prior import ScenePrior
 from sceneprior.stages.view_loss import build_latents, build_prior
 
 STAGES = ("layout", "shape")
+STAGES_OF = {"two": STAGES, "one": ("shape",)}
+"""What a run of `config.stages` trains, in order."""
 
 
 @dataclass(frozen=True)
@@ -39,21 +43,37 @@ def checkpoint_extra(config: RunConfig, room_ids: tuple[str, ...]) -> dict[str, 
     return {"sceneprior": {"room_ids": list(room_ids), "label_set": config.label_set}}
 
 
-def find_checkpoint(run: Path) -> tuple[str, Path]:
-    """The furthest finished stage's checkpoint, else the furthest begun one's.
+CHECKPOINTS = ("final", "best")
+
+
+def find_checkpoint(run: Path, checkpoint: str = "final") -> tuple[str, Path]:
+    """The checkpoint that tasks use.
+
+    Args:
+        run: A run's folder.
+        checkpoint: `final`: the furthest finished stage's, else the furthest begun one's. `best`:
+            the one that generated best in the furthest stage that has one.
 
     Raises:
-        InputError: the folder is no run, or nothing was saved in it yet.
+        InputError: the folder is no run, or what was asked for was not saved in it yet.
     """
+    if checkpoint not in CHECKPOINTS:
+        raise InputError(f"No checkpoint '{checkpoint}'; choose from {', '.join(CHECKPOINTS)}.")
     if not (run / "config.yaml").is_file():
         raise InputError(
             f"{run} is not a run folder (no config.yaml in it); train one with "
             "`sceneprior fit --config demo.yaml --run RUN`."
         )
-    for name in ("final.ckpt", "last.ckpt"):
+    names = ("best.ckpt",) if checkpoint == "best" else ("final.ckpt", "last.ckpt")
+    for name in names:
         for stage in reversed(STAGES):
             if (run / stage / name).is_file():
                 return stage, run / stage / name
+    if checkpoint == "best":
+        raise InputError(
+            f"{run} holds no best.ckpt: its config has samples.every at 0, or no look was taken "
+            "yet. Use the final checkpoint, or train with `--set samples.every=25`."
+        )
     raise InputError(
         f"{run} holds no checkpoint yet; let `sceneprior fit --config {run / 'config.yaml'} "
         f"--run {run} --resume` get further."
@@ -97,14 +117,14 @@ def restore(config: RunConfig, path: Path) -> tuple[ScenePrior, nn.Embedding, tu
     return prior, latents, room_ids
 
 
-def load_run(run: Path) -> TrainedPrior:
-    """The trained prior of a run, in evaluation mode.
+def load_run(run: Path, checkpoint: str = "final") -> TrainedPrior:
+    """The trained prior of a run, in evaluation mode; `checkpoint` as in `find_checkpoint`.
 
     Raises:
         InputError: the folder is no run, or its checkpoint is missing or damaged.
     """
     run = Path(run)
-    stage, path = find_checkpoint(run)
+    stage, path = find_checkpoint(run, checkpoint)
     config = load_config(str(run / "config.yaml"))
     prior, latents, room_ids = restore(config, path)
     return TrainedPrior(

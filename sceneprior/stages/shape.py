@@ -12,8 +12,10 @@ from sceneprior.losses.shape import mask_loss, observed_ids
 from sceneprior.models.scene_prior import ScenePrior
 from sceneprior.silhouettes.render import render_silhouettes
 from sceneprior.stages.view_loss import (
+    batch_number,
     build_optimizer,
     check_finite,
+    full_precision,
     match_and_score,
     proxy_boxes,
     step_seed,
@@ -26,7 +28,7 @@ class ShapeStage(lightning.LightningModule):
     """The layout loss, now of deformed meshes, plus the mask loss (equation 8).
 
     Args:
-        prior: The network as the layout stage left it.
+        prior: The network as the layout stage left it; a fresh one where there is one stage alone.
         latents: Its latents.
         config: The run.
     """
@@ -40,16 +42,18 @@ class ShapeStage(lightning.LightningModule):
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
         settings = self.config.shape
         progress = self.current_epoch / settings.epochs
-        seed = step_seed(self.config.seed, self.global_step, self.global_rank)
+        batch = batch_number(self.trainer, batch_idx)
+        seed = step_seed(self.config.seed, batch, self.global_rank)
         z = training_latents(self.prior, self.latents, views.room_index, settings, progress, seed)
         scenes = self.prior.decode(z)
-        boxes = self._boxes(scenes, views)
-        losses, matches = match_and_score(scenes, boxes, views, self.config.loss)
-        # Before rendering, too, which refuses vertices that are not finite and knows no rooms.
-        check_finite(weighted_sum(losses, self.config.loss), views)
-        masks = self._render(scenes, views)
-        losses["mask"], overlap = mask_loss(masks, views, matches, self.config.loss.iou_gate)
-        total = weighted_sum(losses, self.config.loss)
+        with full_precision(self.device):
+            boxes = self._boxes(scenes, views)
+            losses, matches = match_and_score(scenes, boxes, views, self.config.loss)
+            # Before rendering, too, which refuses vertices that are not finite and knows no rooms.
+            check_finite(weighted_sum(losses, self.config.loss), views)
+            masks = self._render(scenes, views)
+            losses["mask"], overlap = mask_loss(masks, views, matches, self.config.loss.iou_gate)
+            total = weighted_sum(losses, self.config.loss)
         check_finite(total, views)
         named = {f"train/{name}": value.detach() for name, value in (losses | overlap).items()}
         named["train/loss"] = total.detach()

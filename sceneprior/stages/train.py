@@ -19,9 +19,11 @@ from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.models.scene_prior import ScenePrior
-from sceneprior.stages.callbacks import RollingCheckpoint, RunProgress, StepSeed
+from sceneprior.stages.callbacks import RollingCheckpoint, RunProgress, StepSeed, write_checkpoint
+from sceneprior.stages.cluster import first_process, requeue_on_signal, slurm_plugins
 from sceneprior.stages.layout import LayoutStage
-from sceneprior.stages.runs import STAGES, checkpoint_extra, restore
+from sceneprior.stages.runs import STAGES_OF, checkpoint_extra, restore
+from sceneprior.stages.samples import Judge, SampleWatch
 from sceneprior.stages.shape import ShapeStage
 from sceneprior.stages.view_loss import build_latents, build_prior
 
@@ -34,8 +36,9 @@ def fit(
     resume: bool = False,
     loggers: tuple[str, ...] = ("csv", "tensorboard"),
     trainer_options: dict[str, Any] | None = None,
+    judge: Judge | None = None,
 ) -> None:
-    """Train the layout stage, then the shape stage.
+    """Train the layout stage, then the shape stage; with `stages: one`, the latter from scratch.
 
     Args:
         config: The run's settings.
@@ -43,26 +46,35 @@ def fit(
         resume: Continue an interrupted run: finished stages are not trained again.
         loggers: Of `csv`, `tensorboard`, `wandb`.
         trainer_options: Passed on to Lightning's Trainer (devices, accelerator, precision).
+        judge: Looks at the prior every `samples.every` epochs; `tasks.watch.SampleJudge(config)`.
 
     Raises:
         InputError: the run exists and is not resumed, its settings differ from `config`, or the
             shards do not fit it; a run refused at its start leaves nothing behind.
     """
     run = Path(run)
+    if config.samples.every and judge is None:
+        raise InputError(
+            f"samples.every is {config.samples.every}, but nobody was given to judge what is "
+            "generated; pass judge=sceneprior.tasks.watch.SampleJudge(config), or set it to 0."
+        )
     _check_run(config, run, resume)
     for name in loggers:
         if name not in LOGGERS:
             raise InputError(f"No logger '{name}'; choose from {', '.join(LOGGERS)}.")
     previous = None
-    for stage in STAGES:
-        final = run / stage / "final.ckpt"
-        if not final.is_file():
-            _fit_stage(stage, config, run, previous, resume, loggers, trainer_options or {})
-        previous = final
+    with requeue_on_signal():
+        for stage in STAGES_OF[config.stages]:
+            final = run / stage / "final.ckpt"
+            if not final.is_file():
+                _fit_stage(
+                    stage, config, run, previous, resume, loggers, trainer_options or {}, judge
+                )
+            previous = final
 
 
 def _check_run(config: RunConfig, run: Path, resume: bool) -> None:
-    if os.environ.get("LOCAL_RANK", "0") != "0":
+    if not first_process():
         return  # one of several processes: the first has checked, and the run is its own
     saved = run / "config.yaml"
     if saved.is_file():
@@ -85,6 +97,7 @@ def _fit_stage(
     resume: bool,
     loggers: tuple[str, ...],
     trainer_options: dict[str, Any],
+    judge: Judge | None,
 ) -> None:
     settings = getattr(config, stage)
     dataset = _open_data(stage, config)
@@ -92,6 +105,10 @@ def _fit_stage(
     module = {"layout": LayoutStage, "shape": ShapeStage}[stage](prior, latents, config)
     folder = run / stage
     rolling = RollingCheckpoint(folder, checkpoint_extra(config, dataset.room_ids))
+    callbacks = [RunProgress(f"fit {stage} (epochs)"), StepSeed(config.seed)]
+    if judge is not None and config.samples.every:
+        # Before the rolling checkpoint, which holds the best so far.
+        callbacks.append(SampleWatch(folder, config, stage, dataset.room_ids, judge))
     _quiet_lightning()
     lightning.seed_everything(config.seed, verbose=False)
     if settings.cpu_threads is not None:
@@ -101,7 +118,10 @@ def _fit_stage(
         max_epochs=settings.epochs,
         gradient_clip_val=settings.clip_gradient or None,
         logger=[_logger(name, folder) for name in loggers],
-        callbacks=[RunProgress(f"fit {stage} (epochs)"), StepSeed(config.seed), rolling],
+        accumulate_grad_batches=settings.accumulate,
+        callbacks=[*callbacks, rolling],
+        plugins=slurm_plugins(),
+        default_root_dir=folder,
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -109,8 +129,9 @@ def _fit_stage(
         log_every_n_steps=1,
     )
     # Only now: a run that is refused leaves nothing behind.
-    folder.mkdir(parents=True, exist_ok=True)
-    dump_config(config, run / "config.yaml")
+    if trainer.is_global_zero:
+        folder.mkdir(parents=True, exist_ok=True)
+        dump_config(config, run / "config.yaml")
     loader = make_loader(
         dataset, settings.batch_size, config.seed, config.data.workers,
         trainer.global_rank, trainer.world_size,
@@ -126,7 +147,7 @@ def _fit_stage(
             raise
         signal.signal(signal.SIGINT, before)  # which Lightning left ignored
         raise KeyboardInterrupt from None
-    rolling.write(trainer, "final.ckpt")
+    write_checkpoint(trainer, folder, "final.ckpt")
 
 
 def _trainer(options: dict[str, Any], **settings: Any) -> lightning.Trainer:
@@ -196,7 +217,7 @@ def _csv_logger(folder: Path) -> CSVLogger:
     path = folder / "metrics.csv"
     before = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
     logger = CSVLogger(folder, name="", version="")
-    if before:
+    if before and first_process():
         logger.experiment.metrics.extend(before)
         logger.save()
     return logger

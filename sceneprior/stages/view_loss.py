@@ -1,10 +1,12 @@
 """Decoded scenes and what cameras saw in, weighted losses out: the part both stages share."""
 
+import lightning
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
+from torch import distributed as dist
 
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.config import LossConfig, RunConfig, StageConfig
@@ -14,7 +16,6 @@ from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.losses.layout import layout_losses
 from sceneprior.losses.matching import Matches, match_objects
-from sceneprior.models.latents import jitter
 from sceneprior.models.scene_prior import ScenePrior
 
 POINTS_LEVEL = 2
@@ -40,7 +41,10 @@ def match_and_score(
 ) -> tuple[dict[str, Float[Tensor, ""]], Matches]:
     """Match predictions to tracked objects by their 2D boxes and take the layout losses."""
     matches = match_objects(scenes, boxes, views, weights.match_box, weights.hidden_overshoot)
-    return layout_losses(scenes, boxes, views, matches, weights.hidden_overshoot), matches
+    losses = layout_losses(
+        scenes, boxes, views, matches, weights.hidden_overshoot, weights.completeness_target
+    )
+    return losses, matches
 
 
 def weighted_sum(losses: dict[str, Tensor], weights: LossConfig) -> Float[Tensor, ""]:
@@ -52,14 +56,36 @@ def weighted_sum(losses: dict[str, Tensor], weights: LossConfig) -> Float[Tensor
 def check_finite(total: Tensor, views: SceneViews) -> None:
     """Stop at the first loss that is not a number, and name the rooms that made it.
 
+    Several processes stop together: one that stopped alone would leave the others waiting.
+
     Raises:
-        FloatingPointError: the loss is NaN or infinite.
+        FloatingPointError: the loss is NaN or infinite, here or in another process.
     """
-    if not torch.isfinite(total):
-        raise FloatingPointError(
-            f"The loss is {total.item()} on rooms {', '.join(views.room_ids)}; lower the learning "
-            "rate, or look at these rooms with `sceneprior inspect`."
-        )
+    finite = torch.isfinite(total.detach())
+    several = dist.is_available() and dist.is_initialized()
+    if several:
+        worst = finite.to(torch.int32)
+        dist.all_reduce(worst, dist.ReduceOp.MIN)
+        all_finite = bool(worst)
+    else:
+        all_finite = bool(finite)
+    if all_finite:
+        return
+    told = [(total.item(), () if finite else views.room_ids)]
+    if several:
+        told = [told[0]] * dist.get_world_size()
+        dist.all_gather_object(told, (total.item(), () if finite else views.room_ids))
+    value = next(value for value, rooms in told if rooms)
+    raise FloatingPointError(
+        f"The loss is {value} on rooms {', '.join(room for _, rooms in told for room in rooms)}; "
+        "lower the learning rate, or look at these rooms with `sceneprior inspect`."
+    )
+
+
+def full_precision(device: torch.device) -> torch.autocast:
+    """Where mixed precision ends: networks may run in half the bits; latents, projections,
+    matching, silhouettes and losses may not."""
+    return torch.autocast(device.type, enabled=False)
 
 
 def build_prior(config: RunConfig, classes: int) -> ScenePrior:
@@ -71,13 +97,18 @@ def build_prior(config: RunConfig, classes: int) -> ScenePrior:
 def build_latents(config: RunConfig, rooms: int) -> nn.Embedding:
     """One row of latent logits a training room, drawn from N(0, 1)."""
     generator = torch.Generator().manual_seed(config.seed + 1)
-    logits = torch.randn(rooms, config.model.anchors, generator=generator)
+    logits = torch.randn(rooms, config.model.logits_per_room, generator=generator)
     return nn.Embedding.from_pretrained(logits, freeze=False)
 
 
-def step_seed(seed: int, step: int, rank: int) -> int:
-    """A seed of its own for each step and process, the same when a run is resumed."""
-    return int(np.random.SeedSequence([seed, step, rank]).generate_state(1, np.uint64)[0] >> 1)
+def batch_number(trainer: lightning.Trainer, batch_idx: int) -> int:
+    """How many batches came before this one; `accumulate` makes several of them one step."""
+    return trainer.current_epoch * int(trainer.num_training_batches) + batch_idx
+
+
+def step_seed(seed: int, batch: int, rank: int) -> int:
+    """A seed of its own for each batch and process, the same when a run is resumed."""
+    return int(np.random.SeedSequence([seed, batch, rank]).generate_state(1, np.uint64)[0] >> 1)
 
 
 def training_latents(
@@ -88,7 +119,7 @@ def training_latents(
     progress: float,
     seed: int,
 ) -> Float[Tensor, "rooms width"]:
-    """The rooms' points on the sphere, moved a little where the stage asks for it.
+    """The rooms' points of the latent space, moved a little where the stage asks for it.
 
     Args:
         prior, latents: Of the run.
@@ -97,10 +128,11 @@ def training_latents(
         progress: Share of the stage that is done, 0 to 1.
         seed: Of this step's noise.
     """
-    z = prior.sphere(latents(rows))
     end = stage.latent_noise if stage.latent_noise_end is None else stage.latent_noise_end
     noise = stage.latent_noise + progress * (end - stage.latent_noise)
-    return jitter(z, noise, seed) if noise else z
+    with full_precision(rows.device):
+        z = prior.sphere(latents(rows))
+        return prior.sphere.step(z, noise, seed) if noise else z
 
 
 def build_optimizer(

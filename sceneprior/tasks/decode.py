@@ -6,6 +6,7 @@ from torch import Tensor
 
 from sceneprior.batches import DecodedScenes
 from sceneprior.classes import label_set
+from sceneprior.losses.completeness import kept_objects
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.stages.runs import TrainedPrior
 from sceneprior.tasks.sampling import sample_latents
@@ -14,14 +15,18 @@ BATCH = 64
 
 
 def to_scenes(
-    decoded: DecodedScenes, faces: Tensor, label_set_name: str, names: list[str]
+    decoded: DecodedScenes,
+    faces: Tensor,
+    label_set_name: str,
+    names: list[str],
+    completeness_target: str = "first_n",
 ) -> list[Scene]:
-    """Objects up to the first whose completeness falls to 0.5; their likeliest classes.
+    """Objects up to where completeness says that the scene ends; their likeliest classes.
 
     `void` is a class like any other to the network, but no furniture: such objects are left out.
     """
     classes = label_set(label_set_name)
-    kept = (decoded.completeness_logits > 0).long().cumprod(dim=1).bool()
+    kept = kept_objects(decoded.completeness_logits, completeness_target)
     labels = decoded.class_logits.argmax(dim=-1)
     corners = faces.cpu().numpy()
     scenes = []
@@ -45,13 +50,17 @@ def to_scenes(
 def decode_latents(
     trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: list[str]
 ) -> list[Scene]:
-    """Scenes of points on the hypersphere; meshes once the shape stage has finished."""
+    """Scenes of latents; meshes once the shape stage has finished."""
     scenes: list[Scene] = []
     for start in range(0, len(z), BATCH):
         part = slice(start, start + BATCH)
         decoded = trained.prior.decode(z[part], with_shape=trained.stage == "shape")
         scenes += to_scenes(
-            decoded, trained.prior.shape.faces, trained.config.label_set, names[part]
+            decoded,
+            trained.prior.shape.faces,
+            trained.config.label_set,
+            names[part],
+            trained.config.loss.completeness_target,
         )
     return scenes
 
@@ -63,7 +72,7 @@ def decode_training_rooms(trained: TrainedPrior) -> list[Scene]:
 
 
 def synthesize(trained: TrainedPrior, count: int, seed: int, law: str | None = None) -> list[Scene]:
-    """New scenes: latents sampled from the hypersphere, decoded."""
+    """New scenes: latents sampled by a law, decoded."""
     law = law or trained.config.sampling.law
     z = sample_latents(trained.prior.sphere, trained.logits, count, seed, law)
     names = [f"seed{seed}_{index:04d}" for index in range(count)]

@@ -5,12 +5,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from sceneprior.errors import InputError
 from sceneprior.evaluation.layout_metrics import reconstruction_scores
 from sceneprior.evaluation.protocol import evaluate_synthesis, write_scores
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.report import write_report
-from sceneprior.models.latents import slerp
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene
 from sceneprior.stages.runs import STAGES, TrainedPrior, load_run
@@ -29,6 +30,7 @@ def judge_run(
     out: Path,
     law: str | None,
     renderer: str,
+    checkpoint: str = "final",
 ) -> dict[str, Any]:
     """Score generated rooms against test rooms, and decoded training rooms against the truth.
 
@@ -41,11 +43,12 @@ def judge_run(
         out: JSON file to write.
         law: Sampling law; None takes the config's.
         renderer: Kind of renderer.
+        checkpoint: `final` or `best`.
 
     Raises:
         InputError: the run, the shards or the Inception file cannot be used.
     """
-    trained = load_run(run)
+    trained = load_run(run, checkpoint)
     folder = shards or Path(trained.config.data.shards)
     generated = synthesize(trained, count, seed, law)
     scores = evaluate_synthesis(
@@ -55,6 +58,7 @@ def judge_run(
     scores |= reconstruction_scores(pairs)
     scores["protocol"]["run"] = Path(run).resolve().name
     scores["protocol"]["stage"] = trained.stage
+    scores["protocol"]["checkpoint"] = checkpoint
     scores["protocol"]["sampling_law"] = law or trained.config.sampling.law
     write_scores(scores, out)
     return scores
@@ -78,14 +82,20 @@ def decoded_and_true(trained: TrainedPrior, shards: Path) -> list[tuple[Scene, S
 
 
 def report_run(
-    run: Path, scores: Path, out: Path, seed: int, commands: tuple[str, ...], renderer: str
+    run: Path,
+    scores: Path,
+    out: Path,
+    seed: int,
+    commands: tuple[str, ...],
+    renderer: str,
+    checkpoint: str = "final",
 ) -> None:
     """Write the page of a run.
 
     Raises:
         InputError: the run or its scores cannot be read.
     """
-    trained = load_run(run)
+    trained = load_run(run, checkpoint)
     try:
         figures = json.loads(scores.read_text())
     except (OSError, ValueError) as error:
@@ -110,11 +120,14 @@ def report_run(
 
 
 def unfold(trained: TrainedPrior) -> list[Scene]:
-    """Rooms along the geodesic between two training rooms that lie far apart."""
-    z = trained.prior.sphere(trained.logits)
-    end = int((z @ z[0]).argmin())
+    """Rooms between two training rooms that lie far apart: on the sphere, along the geodesic."""
+    space = trained.prior.sphere
+    z = space(trained.logits)
+    end = int(space.nearness(z[:1], z).argmin())
+    start, far = z[:1].expand(UNFOLDING_STEPS, -1), z[end].expand(UNFOLDING_STEPS, -1)
     names = [f"step_{step}" for step in range(UNFOLDING_STEPS)]
-    return decode_latents(trained, slerp(z[0], z[end], UNFOLDING_STEPS), names)
+    along = torch.linspace(0, 1, UNFOLDING_STEPS)
+    return decode_latents(trained, space.between(start, far, along), names)
 
 
 def read_curves(run: Path) -> dict[str, list[tuple[int, float]]]:

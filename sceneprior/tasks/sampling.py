@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.errors import InputError
-from sceneprior.models.latents import LatentSphere, slerp_pairs
+from sceneprior.models.latents import LatentSpace
 
 NEIGHBOURS = 20
 """Rooms that a geodesic may lead to; more reach further from the training rooms."""
@@ -18,21 +18,22 @@ LAWS = ("kernel", "geodesic", "gaussian", "paper")
 
 
 def sample_latents(
-    sphere: LatentSphere,
+    sphere: LatentSpace,
     trained: Float[Tensor, "rooms anchors"],
     count: int,
     seed: int,
     law: str = "kernel",
 ) -> Float[Tensor, "count dimension"]:
-    """Draw points of the hypersphere.
+    """Draw points of the latent space.
 
     Args:
         sphere: Turns logits into points.
         trained: The training rooms' logits.
         count: How many to draw.
         seed: Same seed, same rooms.
-        law: `geodesic`: a point anywhere on the geodesic between a training room drawn at
-            random and one of its `NEIGHBOURS` nearest. The others: see `sample_logits`.
+        law: `geodesic`: a point anywhere on the geodesic (in a cube: the straight line) between a
+            training room drawn at random and one of its `NEIGHBOURS` nearest. The others: see
+            `sample_logits`.
 
     Raises:
         InputError: an unknown law, or fewer than two training rooms to draw between.
@@ -42,21 +43,25 @@ def sample_latents(
     if law != "paper" and len(trained) < 2:
         raise InputError(f"The {law} law needs at least 2 training rooms; use --law paper.")
     if law != "geodesic":
-        return sphere(sample_logits(trained, count, seed, law))
+        return sphere(sample_logits(trained, count, seed, law, sphere.shift_free))
     generator = torch.Generator().manual_seed(seed)
     start = _rooms_in_turn(len(trained), count, generator)
     z = sphere(trained)
-    closeness = z[start] @ z.T
+    closeness = sphere.nearness(z[start], z)
     closeness[torch.arange(count), start] = -torch.inf  # nobody is their own neighbour
     nearest = closeness.topk(min(NEIGHBOURS, len(trained) - 1), dim=1).indices
     pick = torch.randint(nearest.shape[1], (count, 1), generator=generator)
     end = nearest.gather(1, pick)[:, 0]
     along = torch.rand(count, generator=generator).to(trained.dtype)
-    return slerp_pairs(z[start], z[end], along)
+    return sphere.between(z[start], z[end], along)
 
 
 def sample_logits(
-    trained: Float[Tensor, "rooms anchors"], count: int, seed: int, law: str
+    trained: Float[Tensor, "rooms anchors"],
+    count: int,
+    seed: int,
+    law: str,
+    shift_free: bool = True,
 ) -> Float[Tensor, "count anchors"]:
     """Draw logits of latent weights.
 
@@ -68,13 +73,16 @@ def sample_logits(
             ended. `gaussian`: the mean and covariance of the training rooms' logits. `kernel`:
             the same mean and covariance, as a mixture of Gaussians around the training rooms
             (a smoothed bootstrap of width `BANDWIDTH`).
+        shift_free: Whether a constant added to all logits of a room changes nothing, as where a
+            softmax turns them into weights; that freedom is taken out first.
     """
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(count, trained.shape[1], generator=generator, dtype=torch.float64)
     if law == "paper":
         return noise.to(trained.dtype)
-    # A softmax does not see what is added to all its logits: take that freedom out first.
-    logits = trained.double() - trained.double().mean(dim=1, keepdim=True)
+    logits = trained.double()
+    if shift_free:
+        logits = logits - logits.mean(dim=1, keepdim=True)
     mean = logits.mean(dim=0)
     centred = logits - mean
     # centred^T centred is the covariance; its square root needs no positive definiteness.

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from toy_rooms import make_toy_room
 
 from sceneprior.data.datamodule import DrawSampler, make_loader
-from sceneprior.data.dataset import ViewDataset
+from sceneprior.data.dataset import BLANK, ViewDataset
 from sceneprior.errors import ShardError
 from sceneprior.geometry.boxes import box_corners
 from sceneprior.geometry.cameras import boxes_of_points
@@ -135,32 +135,52 @@ def test_a_turned_room_under_turned_cameras_looks_the_same(toy_shards):
 
 
 @pytest.mark.parametrize(
-    ("rows", "batch", "world"), [(12, 4, 1), (12, 5, 1), (13, 4, 2), (3, 2, 4)]
+    ("rows", "batch", "world"), [(12, 4, 1), (12, 5, 1), (13, 4, 2), (13, 3, 2), (3, 2, 4)]
 )
 def test_each_epoch_visits_every_room_once_split_over_processes(rows, batch, world):
     samplers = [DrawSampler(rows, batch, 7, rank, world) for rank in range(world)]
+    alone = DrawSampler(rows, batch * world, 7)
     orders = []
     for epoch in range(3):
-        visited = []
-        lengths = set()
-        for sampler in samplers:
+        for sampler in [*samplers, alone]:
             sampler.set_epoch(epoch)
-            batches = list(sampler)
-            assert len(batches) == len(sampler)
-            assert {e for part in batches for _, e in part} == {epoch}
-            assert all(len(part) == batch for part in batches[:-1]) and len(batches[-1]) <= batch
-            visited += [row for part in batches for row, _ in part]
-            lengths.add(sum(map(len, batches)))
-        assert set(visited) == set(range(rows))
-        # All processes get the same number: the fewest possible rows come twice.
-        assert len(lengths) == 1 and len(visited) == -(-rows // world) * world
-        assert max(map(visited.count, range(rows))) <= 2
+        shared = [list(sampler) for sampler in samplers]
+        whole = list(alone)
+        # Nobody waits for a process that has no batch left.
+        assert {len(batches) for batches in shared} == {len(whole)} == {len(alone)}
+        assert {len(sampler) for sampler in samplers} == {len(whole)}
+        for parts, together in zip(zip(*shared, strict=True), whole, strict=True):
+            drawn = [draw for part in parts for draw in part if draw[1] != BLANK]
+            assert sorted(drawn) == sorted(together)
+            assert all(1 <= len(part) <= batch for part in parts)
+            # Blank draws only fill up for those who got none.
+            assert all(len(part) == 1 for part in parts if part[0][1] == BLANK)
+        visited = [row for part in whole for row, _ in part]
+        assert sorted(visited) == list(range(rows))
+        assert {e for part in whole for _, e in part} == {epoch}
         orders.append(visited)
         again = DrawSampler(rows, batch, 7, 0, world)
         again.set_epoch(epoch)
-        samplers[0].set_epoch(epoch)
-        assert list(again) == list(samplers[0])
+        assert list(again) == shared[0]
     assert orders[0] != orders[1] or rows < 4
+
+
+def test_a_blank_draw_is_a_room_in_which_there_is_nothing(toy_shards):
+    data = dataset(toy_shards, mask_step=4)
+    views = data.__getitems__([(3, BLANK)])
+    assert views.room_index.tolist() == [3] and views.instance_ids is not None
+    assert not views.is_object.any() and not views.visible.any()
+    mixed, plain = data.__getitems__([(3, BLANK), (4, 2)]), data.__getitems__([(4, 2)])
+    count = int(plain.is_object.sum())
+    assert torch.equal(mixed.visible[1, :, :count], plain.visible[0])
+
+
+def test_a_limit_takes_the_first_rooms_across_shards(toy_shards):
+    every = dataset(toy_shards, rotations=4)
+    for limit in (1, 6, 8, 50):
+        some = dataset(toy_shards, rotations=4, limit=limit)
+        assert some.room_ids == every.room_ids[: 4 * limit]
+        assert torch.equal(some.__getitems__([(2, 5)]).boxes, every.__getitems__([(2, 5)]).boxes)
 
 
 def test_the_loader_gives_whole_batches_and_learns_of_epochs(toy_shards):

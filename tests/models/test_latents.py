@@ -1,4 +1,4 @@
-"""The hypersphere: unit vectors in, geodesics along it."""
+"""The latent spaces: the hypersphere with its geodesics, and the cube of ablation c1."""
 
 import math
 
@@ -7,7 +7,7 @@ import torch
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.models.latents import LatentSphere, slerp
+from sceneprior.models.latents import LatentCube, LatentSphere, jitter, slerp, slerp_pairs
 
 
 def test_latents_are_positive_mixtures_of_unit_anchors_on_the_unit_sphere(torch_rng):
@@ -69,3 +69,56 @@ def test_opposite_points_have_no_shortest_path():
     start = F.normalize(torch.ones(4), dim=-1)
     with pytest.raises(ValueError, match="opposite points; any great circle joins them"):
         slerp(start, -start, 3)
+
+
+def test_what_the_sphere_knows_of_near_between_and_steps(torch_rng):
+    sphere = LatentSphere(7, 12).double()
+    z = sphere(torch.randn(5, 7, generator=torch_rng, dtype=torch.float64))
+    near = sphere.nearness(z[:2], z)
+    assert near.shape == (2, 5) and near.argmax(dim=1).tolist() == [0, 1]
+    angles = torch.acos(near.clamp(-1, 1))
+    assert_close((z[:2, None] - z).norm(dim=-1), 2 * torch.sin(angles / 2), rtol=0, atol=1e-7)
+    along = torch.tensor([0.2, 0.9], dtype=torch.float64)
+    assert torch.equal(sphere.between(z[:2], z[2:4], along), slerp_pairs(z[:2], z[2:4], along))
+    assert torch.equal(sphere.step(z, 0.3, 4), jitter(z, 0.3, 4))
+
+
+def test_standard_normal_logits_are_spread_uniformly_over_the_cube(torch_rng):
+    cube = LatentCube(12)
+    z = cube(torch.randn(20_000, 12, generator=torch_rng))
+    edge = 2 * cube.half_edge
+    assert z.abs().max() <= cube.half_edge
+    # 240,000 numbers in ten bins: a standard error is 0.0006.
+    shares = torch.histc(z, 10, -cube.half_edge, cube.half_edge) / z.numel()
+    assert (shares - 0.1).abs().max() < 0.003
+    # As long as the sphere's, in the mean square; the decoder scales both alike.
+    assert float(z.square().sum(dim=-1).mean()) == pytest.approx(1, abs=0.01)
+    assert edge == pytest.approx(1.0)  # 2 * sqrt(3 / 12)
+
+
+def test_a_coordinate_of_the_cube_is_the_normal_distribution_function(torch_rng):
+    from scipy.stats import norm
+
+    cube = LatentCube(3)
+    logits = torch.randn(4, 3, generator=torch_rng, dtype=torch.float64)
+    wanted = 2 * torch.from_numpy(norm.cdf(logits.numpy())) - 1
+    assert_close(cube(logits), wanted, rtol=0, atol=1e-12)  # half its edge is sqrt(3 / 3)
+    assert torch.autograd.gradcheck(cube, (logits.requires_grad_(),))
+    assert not cube.state_dict()
+
+
+def test_what_the_cube_knows_of_near_between_and_steps(torch_rng):
+    cube = LatentCube(12)
+    z = cube(torch.randn(50, 12, generator=torch_rng, dtype=torch.float64))
+    near = cube.nearness(z[:2], z)
+    # cdist takes differences of squares for many points: half the digits.
+    assert_close(-near, (z[:2, None] - z).norm(dim=-1), rtol=0, atol=1e-6)
+    along = torch.tensor([0.0, 0.25], dtype=torch.float64)
+    points = cube.between(z[:2], z[2:4], along)
+    assert torch.equal(points[0], z[0])
+    assert_close(points[1], 0.75 * z[1] + 0.25 * z[3])
+    moved = cube.step(z, 0.3, 4)
+    assert torch.equal(moved, cube.step(z, 0.3, 4)) and not torch.equal(moved, cube.step(z, 0.3, 5))
+    assert moved.abs().max() <= cube.half_edge
+    length = (moved - z).norm(dim=-1)
+    assert 0.2 < length.mean() < 0.3  # about 0.3, less what the faces hold back

@@ -2,15 +2,17 @@
 
 import math
 
+import pytest
 import torch
 from torch.testing import assert_close
 
 from sceneprior.models.layout_decoder import LayoutDecoder
 
 
-def test_before_training_all_objects_stand_near_the_floor_centre(torch_rng):
+@pytest.mark.parametrize("heads", ["joint", "separate"])
+def test_before_training_all_objects_stand_near_the_floor_centre(torch_rng, heads):
     torch.manual_seed(0)
-    model = LayoutDecoder(64, 22, initial_size_m=0.7)
+    model = LayoutDecoder(64, 22, initial_size_m=0.7, heads=heads)
     # Features leave a LayerNorm: about N(0, 1).
     layout, shared = model(torch.randn(8, 13, 64, generator=torch_rng))
     assert layout.class_logits.shape == (8, 13, 22)
@@ -25,9 +27,10 @@ def test_before_training_all_objects_stand_near_the_floor_centre(torch_rng):
     assert layout.centers_m.std(dim=1).min() > 1e-3
 
 
-def test_no_box_reaches_below_the_floor_whatever_the_weights(torch_rng):
+@pytest.mark.parametrize("heads", ["joint", "separate"])
+def test_no_box_reaches_below_the_floor_whatever_the_weights(torch_rng, heads):
     torch.manual_seed(0)
-    model = LayoutDecoder(16, 5).double()
+    model = LayoutDecoder(16, 5, heads=heads).double()
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.normal_(0, 2, generator=torch_rng)

@@ -50,6 +50,16 @@ def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded):
         np.testing.assert_array_equal(item.mesh.faces, faces)
 
 
+def test_a_stop_flag_ends_a_scene_after_the_object_that_has_it(decoded):
+    faces = torch.tensor([[0, 1, 2], [3, 4, 5]])
+    stops = replace(
+        decoded, completeness_logits=torch.tensor([[-2.0, 0.1, -5, 3], [-1, -1, -1, -1]])
+    )
+    first, second = to_scenes(stops, faces, "front3d_bedroom", ["a", "b"], "stop")
+    assert labels(first) == ["double_bed", "nightstand"]
+    assert labels(second) == ["double_bed", "nightstand", "wardrobe"]
+
+
 def test_nothing_complete_is_an_empty_room_and_no_vertices_are_boxes(decoded):
     none = replace(decoded, completeness_logits=-torch.ones(2, 4), vertices_m=None)
     faces = torch.tensor([[0, 1, 2]])

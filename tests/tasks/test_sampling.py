@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from sceneprior.errors import InputError
-from sceneprior.models.latents import LatentSphere
+from sceneprior.models.latents import LatentCube, LatentSphere
 from sceneprior.tasks import sampling
 from sceneprior.tasks.sampling import LAWS, sample_latents, sample_logits
 
@@ -119,3 +119,33 @@ def test_kernel_keeps_mean_and_covariance():
     drawn = sample_logits(trained, 200_000, seed=0, law="kernel")
     torch.testing.assert_close(drawn.mean(0), centred.mean(0), rtol=0, atol=0.01)
     torch.testing.assert_close(torch.cov(drawn.T), torch.cov(centred.T), rtol=0.05, atol=0.02)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_every_law_stays_in_the_cube_and_goes_by_its_seed(trained, law):
+    cube = LatentCube(7)
+    one = sample_latents(cube, trained, 9, 3, law)
+    assert one.shape == (9, 7) and one.abs().max() <= cube.half_edge
+    assert torch.equal(one, sample_latents(cube, trained, 9, 3, law))
+    assert not torch.equal(one, sample_latents(cube, trained, 9, 4, law))
+
+
+def test_in_the_cube_a_constant_added_to_the_logits_is_no_freedom(trained):
+    drawn = sample_logits(trained, MANY, 0, "gaussian", LatentCube.shift_free).double()
+    wanted = trained.double()
+    spread = wanted.std(dim=0)
+    assert ((drawn.mean(dim=0) - wanted.mean(dim=0)) / spread).abs().max() < 0.04
+    assert ((drawn.T.cov() - wanted.T.cov()) / spread[:, None] / spread).abs().max() < 0.05
+
+
+def test_in_the_cube_neighbours_are_joined_by_straight_lines(trained, monkeypatch):
+    monkeypatch.setattr(sampling, "NEIGHBOURS", 3)
+    cube = LatentCube(7)
+    z = cube(trained.double())
+    apart = torch.cdist(z, z).fill_diagonal_(torch.inf)
+    nearest = apart.topk(3, largest=False).indices
+    pairs = [(a, int(b)) for a in range(40) for b in nearest[a]]
+    for point in sample_latents(cube, trained.double(), 60, 0, "geodesic"):
+        to_all = (z - point).norm(dim=-1)
+        detour = torch.stack([to_all[a] + to_all[b] - apart[a, b] for a, b in pairs])
+        assert detour.min() < 1e-6

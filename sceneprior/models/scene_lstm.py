@@ -1,0 +1,32 @@
+"""A latent in, a sequence of object features out: the LSTM of ablation c2 and Table 1."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class SceneLstm(nn.Module):
+    """Stands where the transformer stands: x_k is the LSTM's output on x_(k-1), and x_0 is z.
+
+    One layer whose state begins at zero. Unlike the transformer's, its answer depends on the order
+    of the objects before, and z is heard at the first step alone.
+
+    Args:
+        width: D_z, the size of z, of the state and of every object feature.
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.cell = nn.LSTMCell(width, width)
+
+    def forward(
+        self, z: Float[Tensor, "rooms width"], objects: int
+    ) -> Float[Tensor, "rooms objects width"]:
+        """Unroll `objects` steps; z is scaled as it is for the transformer."""
+        feature, state = z * z.shape[-1] ** 0.5, None
+        features: list[Tensor] = []
+        for _ in range(objects):
+            state = self.cell(feature, state)
+            feature = state[0]
+            features.append(feature)
+        return torch.stack(features, dim=1)
