@@ -19,7 +19,6 @@ import numpy as np
 
 from sceneprior.errors import InputError
 from sceneprior.scene import Mesh
-from sceneprior.silhouettes.zbuffer import NEAR_M, rasterize
 
 KINDS = ("auto", "pyrender", "software")
 ENVIRONMENT_VARIABLE = "SCENEPRIOR_RENDERER"
@@ -28,6 +27,8 @@ APT_LINE = "apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mes
 _NO_GL_VARIABLE = "SCENEPRIOR_NO_GL"
 """Set by tests: behave as on a machine without GL."""
 _FAR_M = 200.0
+# The z-buffer is imported where it draws: Numba takes 60 MB and half a second, which a command
+# that draws nothing (prep-scannet) should not pay.
 
 
 @dataclass(frozen=True)
@@ -83,19 +84,32 @@ class Renderer(abc.ABC):
         colors: np.ndarray,
         camera: Camera,
         image_size: tuple[int, int],
-        background: tuple[int, int, int] = (255, 255, 255),
+        background: tuple[int, int, int] | np.ndarray = (255, 255, 255),
     ) -> np.ndarray:
         """A picture for people: mesh k in `colors[k]` (uint8), lit from the camera: (H, W, 3).
 
-        Our z-buffer draws it for both kinds, so that pictures look the same everywhere.
+        Behind the meshes is a colour, or another picture of this size. Our z-buffer draws it for
+        both kinds, so that pictures look the same everywhere.
         """
+        from sceneprior.silhouettes.zbuffer import rasterize
+
         height, width = image_size
         soup = _join(meshes)
-        face_index, _ = _rasterize(soup, camera, (2 * height, 2 * width), supersampling=2)
+        fine_size = (2 * height, 2 * width)
+        face_index, _ = rasterize(
+            soup.vertices,
+            soup.faces,
+            camera.world_to_camera,
+            _projection(camera, fine_size, supersampling=2),
+            fine_size,
+            perspective=isinstance(camera, Pinhole),
+        )
         light = _face_light(soup, camera)
         palette = np.asarray(colors, dtype=np.float64).reshape(-1, 3)[soup.mesh_of_face]
-        palette = np.concatenate([palette * light[:, None], [background]])  # -1 is the last row
+        palette = np.concatenate([palette * light[:, None], [(0, 0, 0)]])  # -1 is the last row
         fine = palette[face_index].reshape(height, 2, width, 2, 3)
+        behind = np.broadcast_to(np.asarray(background), (height, width, 3))[:, None, :, None]
+        fine = np.where((face_index < 0).reshape(height, 2, width, 2, 1), behind, fine)
         return np.rint(fine.mean(axis=(1, 3))).astype(np.uint8)
 
 
@@ -146,11 +160,21 @@ class SoftwareRenderer(Renderer):
     def instance_ids_of_views(
         self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
     ) -> np.ndarray:
+        from sceneprior.silhouettes.zbuffer import draw_labels
+
         soup = _join(meshes)
-        id_of_face = np.concatenate([soup.mesh_of_face + 1, [0]]).astype(np.uint16)
+        id_of_face = (soup.mesh_of_face + 1).astype(np.int32)
         images = np.empty((len(cameras), *image_size), dtype=np.uint16)
         for image, camera in zip(images, cameras, strict=True):
-            image[...] = id_of_face[_rasterize(soup, camera, image_size)[0]]
+            image[...] = draw_labels(
+                soup.vertices,
+                soup.faces,
+                id_of_face,
+                camera.world_to_camera,
+                _projection(camera, image_size),
+                image_size,
+                perspective=isinstance(camera, Pinhole),
+            )
         return images
 
 
@@ -179,23 +203,15 @@ def _join(meshes: Sequence[Mesh]) -> _Soup:
     )
 
 
-def _rasterize(
-    soup: _Soup, camera: Camera, image_size: tuple[int, int], supersampling: int = 1
-) -> tuple[np.ndarray, np.ndarray]:
+def _projection(
+    camera: Camera, image_size: tuple[int, int], supersampling: int = 1
+) -> tuple[float, float, float, float]:
+    """What the z-buffer asks for; `image_size` is the supersampled one."""
     if isinstance(camera, Pinhole):
         K = np.asarray(camera.intrinsics, dtype=np.float64) * supersampling
-        projection = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    else:
-        scale = supersampling / camera.metres_per_pixel
-        projection = (scale, scale, image_size[1] / 2, image_size[0] / 2)
-    return rasterize(
-        soup.vertices,
-        soup.faces,
-        camera.world_to_camera,
-        projection,
-        image_size,
-        perspective=isinstance(camera, Pinhole),
-    )
+        return K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    scale = supersampling / camera.metres_per_pixel
+    return scale, scale, image_size[1] / 2, image_size[0] / 2
 
 
 def _face_light(soup: _Soup, camera: Camera) -> np.ndarray:
@@ -319,16 +335,15 @@ class _PyrenderRenderer(Renderer):
         self._offscreen.viewport_height, self._offscreen.viewport_width = image_size
         for image, camera in zip(images, cameras, strict=True):
             node = self._add_camera(scene, camera, image_size)
-            color, _ = self._offscreen.render(
+            image[...], _ = self._offscreen.render(
                 scene, self._pyrender.RenderFlags.SEG, seg_node_map=color_of_node
             )
-            image[...] = color[..., 0]
-            if len(meshes) > 255:
-                image |= color[..., 1].astype(np.uint16) << 8
             scene.remove_node(node)
         return images
 
     def _add_camera(self, scene: Any, camera: Camera, image_size: tuple[int, int]) -> Any:
+        from sceneprior.silhouettes.zbuffer import NEAR_M
+
         if isinstance(camera, Pinhole):
             K = np.asarray(camera.intrinsics, dtype=np.float64)
             lens = self._pyrender.IntrinsicsCamera(
@@ -360,33 +375,82 @@ def _open_context(pyrender: Any) -> Any:
     raise first_error or RuntimeError("EGL lists no device")
 
 
+_VERTEX_SHADER = """#version 330 core
+layout(location = 0) in vec3 position;
+uniform mat4 world_to_clip;
+void main() { gl_Position = world_to_clip * vec4(position, 1.0); }
+"""
+_FRAGMENT_SHADER = """#version 330 core
+uniform vec3 color;
+out vec4 shown;
+void main() { shown = vec4(color, 1.0); }
+"""
+
+
 @functools.cache
 def _id_renderer_class() -> type:
     """pyrender's renderer, changed where exact ids need it (built once pyrender is imported)."""
     from OpenGL import GL as gl  # noqa: N811
+    from OpenGL.raw.GL.VERSION import GL_1_0 as raw_gl  # noqa: N811
+    from pyrender.constants import RenderFlags
     from pyrender.renderer import Renderer as PyrenderRenderer
 
     class IdRenderer(PyrenderRenderer):
         """No multisampling, no culling, a fixed drawing order, and no depth read back."""
 
         _main_fb_dims: tuple[Any, Any]
+        _ids: Any = None
 
         def _sorted_mesh_nodes(self, scene: Any) -> list[Any]:
             # pyrender walks a set: where two faces are equally near, its order would decide.
             return sorted(scene.mesh_nodes, key=lambda node: node.mesh.name)
 
-        def _bind_and_draw_primitive(
-            self, primitive: Any, pose: Any, program: Any, flags: int
-        ) -> None:
-            program.set_uniform("M", pose)
-            primitive._bind()
-            gl.glDisable(gl.GL_CULL_FACE)  # furniture has faces of either winding
-            gl.glDisable(gl.GL_BLEND)
+        def _forward_pass(
+            self, scene: Any, flags: int, seg_node_map: Any = None
+        ) -> tuple[np.ndarray, None] | None:
+            # pyrender's own pass binds, looks up and multiplies again for every mesh and vertex.
+            self._configure_forward_pass_viewport(flags)
+            gl.glClearColor(0, 0, 0, 1)
+            gl.glClear(gl.GL_COLOR_BUFFER_BIT | gl.GL_DEPTH_BUFFER_BIT)
+            for switch in (gl.GL_MULTISAMPLE, gl.GL_BLEND, gl.GL_CULL_FACE):
+                gl.glDisable(switch)  # no culling: furniture has faces of either winding
             gl.glPolygonMode(gl.GL_FRONT_AND_BACK, gl.GL_FILL)
-            gl.glDrawElementsInstanced(
-                primitive.mode, primitive.indices.size, gl.GL_UNSIGNED_INT, None, 1
+            program = self._ids_program()
+            gl.glUseProgram(program)
+            world_to_camera, projection = self._get_camera_matrices(scene)
+            world_to_clip = (projection @ world_to_camera).astype(np.float32)
+            gl.glUniformMatrix4fv(
+                gl.glGetUniformLocation(program, "world_to_clip"), 1, gl.GL_TRUE, world_to_clip
             )
-            primitive._unbind()
+            color_place = gl.glGetUniformLocation(program, "color")
+            for node in self._sorted_mesh_nodes(scene):
+                red, green, blue = seg_node_map[node]
+                gl.glUniform3f(color_place, red / 255, green / 255, blue / 255)
+                for primitive in node.mesh.primitives:
+                    gl.glBindVertexArray(primitive._vaid)
+                    gl.glDrawElements(
+                        primitive.mode, primitive.indices.size, gl.GL_UNSIGNED_INT, None
+                    )
+            gl.glBindVertexArray(0)
+            gl.glUseProgram(0)
+            offscreen = flags & RenderFlags.OFFSCREEN
+            return self._read_main_framebuffer(scene, flags) if offscreen else None
+
+        def _ids_program(self) -> int:
+            if self._ids is None:
+                self._ids = gl.glCreateProgram()
+                for kind, source in (
+                    (gl.GL_VERTEX_SHADER, _VERTEX_SHADER),
+                    (gl.GL_FRAGMENT_SHADER, _FRAGMENT_SHADER),
+                ):
+                    shader = gl.glCreateShader(kind)
+                    gl.glShaderSource(shader, source)
+                    gl.glCompileShader(shader)
+                    gl.glAttachShader(self._ids, shader)
+                gl.glLinkProgram(self._ids)
+                if not gl.glGetProgramiv(self._ids, gl.GL_LINK_STATUS):
+                    raise RuntimeError(f"shaders do not link: {gl.glGetProgramInfoLog(self._ids)}")
+            return self._ids
 
         def _configure_main_framebuffer(self) -> None:
             size = (self.viewport_width, self.viewport_height)
@@ -397,7 +461,7 @@ def _id_renderer_class() -> type:
             gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, self._main_fb)
             self._main_cb, self._main_db = gl.glGenRenderbuffers(2)
             for buffer, form, role in (
-                (self._main_cb, gl.GL_RGBA8, gl.GL_COLOR_ATTACHMENT0),
+                (self._main_cb, gl.GL_RG8, gl.GL_COLOR_ATTACHMENT0),
                 (self._main_db, gl.GL_DEPTH_COMPONENT24, gl.GL_DEPTH_ATTACHMENT),
             ):
                 gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, buffer)
@@ -415,11 +479,25 @@ def _id_renderer_class() -> type:
             self._main_fb_dims = (None, None)
 
         def _read_main_framebuffer(self, scene: Any, flags: int) -> tuple[np.ndarray, None]:
-            width, height = self._main_fb_dims
             gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._main_fb)
+            return self._read_ids(), None
+
+        # OSMesa draws into the window's buffer, and asks for it in two parts.
+        def read_color_buf(self) -> np.ndarray:
+            return self._read_ids()
+
+        def read_depth_buf(self) -> None:
+            return None
+
+        def _read_ids(self) -> np.ndarray:
+            """(height, width) uint16: the red and the green byte of each pixel."""
+            ids = np.empty((self.viewport_height, self.viewport_width), dtype="<u2")
             gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
-            pixels = gl.glReadPixels(0, 0, width, height, gl.GL_RGBA, gl.GL_UNSIGNED_BYTE)
-            image = np.frombuffer(pixels, dtype=np.uint8).reshape(height, width, 4)
-            return image[::-1], None  # GL's first row is the lowest
+            # The raw call: PyOpenGL's own does not know this format.
+            raw_gl.glReadPixels(
+                0, 0, self.viewport_width, self.viewport_height, gl.GL_RG, gl.GL_UNSIGNED_BYTE,
+                ctypes.c_void_p(ids.ctypes.data),
+            )  # fmt: skip
+            return ids[::-1]  # GL's first row is the lowest
 
     return IdRenderer

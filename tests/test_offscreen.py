@@ -231,6 +231,18 @@ def test_one_pyrender_a_process_and_none_after_a_fork():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_who_draws_nothing_does_not_pay_for_numba():
+    code = (
+        "import sys, data_prep.build, sceneprior.offscreen as o\n"
+        "o.open_renderer('software')\n"
+        "print('numba' in sys.modules)"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=os.environ
+    )
+    assert answer.stdout.strip() == "False"
+
+
 def test_drawing_needs_neither_torch_nor_a_window():
     code = (
         "import sys, data_prep.build, sceneprior.offscreen as o\n"

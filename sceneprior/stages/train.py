@@ -111,6 +111,8 @@ def _fit_stage(
     # Only now: a run that is refused leaves nothing behind.
     folder.mkdir(parents=True, exist_ok=True)
     dump_config(config, run / "config.yaml")
+    if dataset.masks is None:  # else worker processes may make the batches
+        dataset.to(trainer.strategy.root_device)
     loader = make_loader(
         dataset, settings.batch_size, config.seed, config.data.workers,
         trainer.global_rank, trainer.world_size,
