@@ -119,8 +119,10 @@ class StageConfig(_Section):
     cpu_threads: int | None = Field(None, ge=1)
     """Torch threads where a CPU trains; None leaves torch's choice. A small network gains little
     from a second thread and loses much when another program takes that core."""
-    proxy: Literal["ellipsoid", "box"] = "ellipsoid"
-    """What an object's 2D box is taken from where its mesh is not (see `box_from`)."""
+    proxy: Literal["ellipsoid", "ellipsoid_points", "box"] = "ellipsoid"
+    """What an object's 2D box is taken from where its mesh is not (see `box_from`): the smooth
+    ellipsoid that fills the 3D box, exactly; 162 of its points, which is slower and moves what is
+    behind the camera in front of it, as the authors do with 2,562; or the 3D box's corners."""
 
 
 class ShapeConfig(StageConfig):
@@ -132,6 +134,8 @@ class ShapeConfig(StageConfig):
     """Views drawn per room and step; None takes data.views_per_room."""
     sigma_px2: float | None = Field(None, gt=0)
     """Softness of silhouettes in squared pixels; None takes the paper's 1e-4 squared NDC."""
+    silhouettes: Literal["exact", "fast"] = "exact"
+    """`exact`: every face near a pixel has its say (paper); `fast`: the outline alone."""
     compositing: Literal["layered", "paper"] = "paper"
     box_from: Literal["mesh", "proxy"] = "mesh"
     """Whether 2D boxes come from the deformed mesh (paper) or still from the proxy."""

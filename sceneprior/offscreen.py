@@ -5,9 +5,11 @@ The one front door to pyrender. Where the machine has no GL library, a z-buffer 
 """
 
 import abc
+import contextlib
 import ctypes
 import ctypes.util
 import functools
+import importlib.util
 import os
 import sys
 import types
@@ -272,6 +274,7 @@ def _open_pyrender() -> "_PyrenderRenderer":
     if _pyrender is None:
         if _failure is None:
             try:
+                _load_triton_before_mesa()
                 platform = _probe_gl()
                 if "OpenGL" not in sys.modules:  # PyOpenGL chooses at its first import
                     platform = os.environ.setdefault("PYOPENGL_PLATFORM", platform)
@@ -284,6 +287,14 @@ def _open_pyrender() -> "_PyrenderRenderer":
                 _failure = " ".join(_failure.split())[:200]
         raise _NoGLError(_failure)
     return _pyrender
+
+
+def _load_triton_before_mesa() -> None:
+    # Mesa's software GL and Triton each bring an LLVM. A process that loads Triton second, as
+    # Lightning does where torch's CUDA build has installed it, dies of a segmentation fault.
+    if importlib.util.find_spec("triton") is not None:
+        with contextlib.suppress(Exception):  # a broken Triton is its user's to meet
+            importlib.import_module("triton")
 
 
 class _PyrenderRenderer(Renderer):

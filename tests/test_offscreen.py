@@ -1,5 +1,6 @@
 """Both renderers: ids by hand, agreement, and what happens where there is no GL."""
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -241,6 +242,14 @@ def test_who_draws_nothing_does_not_pay_for_numba():
         [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=os.environ
     )
     assert answer.stdout.strip() == "False"
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
+def test_triton_can_be_loaded_after_software_gl():
+    """Lightning imports it where it is installed; after Mesa's LLVM that was a segfault."""
+    code = "from sceneprior.offscreen import open_renderer\nopen_renderer('auto')\nimport triton\n"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
 
 
 def test_drawing_needs_neither_torch_nor_a_window():

@@ -1,69 +1,207 @@
-"""Projected triangles in, soft coverage out, in plain torch: the readable definition.
+"""Projected meshes in, visible soft masks out, in plain torch: the readable definition.
 
-Slow and differentiable by autograd, in any precision and on any device. The fast backends are
+Slow, differentiable by autograd, in any precision and on any device. The fast backends are
 tested against it.
 """
+
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from sceneprior.silhouettes.topology import topology_of
 
-def soft_coverage(
-    pixels: Float[Tensor, "meshes vertices 2"],
-    depths: Float[Tensor, "meshes vertices"],
+MIN_AREA_PX2 = 1e-12
+"""Doubled area under which a projected face is not drawn: it has no inside."""
+
+PIECE_PX = 4.0
+"""An edge of an outline is cut into equal pieces of at most this length: outline or not."""
+
+ASIDE_PX = 1e-3
+"""How far beside the middle of a piece it is asked whether a face lies there."""
+
+
+SLACK = 1e-6
+"""Share of its size by which a face is wider for ids and depths, where rounding must not open a
+crack at a pixel centre on the edge of two faces."""
+
+
+class Settings(NamedTuple):
+    """How to draw: see `sceneprior.silhouettes.render`."""
+
+    image_size: tuple[int, int]
+    sigma_px2: float
+    blur_px2: float
+    near_m: float
+    mode: str
+    compositing: str
+
+
+class Alone(NamedTuple):
+    """One mesh, drawn alone: coverage, depth where it is felt, depth where a face contains
+    the pixel centre (else infinite)."""
+
+    coverage: Float[Tensor, "*image"]
+    order_m: Float[Tensor, "*image"]
+    depth_m: Float[Tensor, "*image"]
+
+
+def draw(
+    pixels: Float[Tensor, "images objects vertices 2"],
+    depths: Float[Tensor, "images objects vertices"],
     faces: Int[Tensor, "faces 3"],
-    drawn: Bool[Tensor, " meshes"],
-    image_size: tuple[int, int],
-    sigma_px2: float,
-    blur_px2: float,
-    near_m: float,
-) -> tuple[Float[Tensor, "meshes height width"], Float[Tensor, "meshes height width"]]:
-    """Coverage and depth of each mesh, alone: see `sceneprior.silhouettes.render`."""
-    height, width = image_size
+    drawn: Bool[Tensor, "images objects"],
+    settings: Settings,
+) -> tuple[
+    Float[Tensor, "images objects height width"],
+    Int[Tensor, "images height width"],
+    Float[Tensor, "images height width"],
+]:
+    """Masks, front-most object and its depth: see `sceneprior.silhouettes.render`."""
+    images, objects = pixels.shape[:2]
+    flat = zip(pixels.flatten(0, 1), depths.flatten(0, 1), drawn.flatten(), strict=True)
+    alone = [draw_alone(*mesh[:2], faces, mesh[2], settings) for mesh in flat]
+    shape = (images, objects, *settings.image_size)
+    if not alone:
+        coverage = order = depth = pixels.new_zeros(shape) + pixels.sum()
+    else:
+        coverage, order, depth = (torch.stack(x).reshape(shape) for x in zip(*alone, strict=True))
+    masks = composite(coverage, order, settings.compositing)
+    if objects == 0:
+        return masks, *_nothing(pixels, (images, *settings.image_size))
+    nearest, front = depth.detach().min(dim=1)
+    return masks, torch.where(nearest < float("inf"), front, -1).int(), nearest
+
+
+def _nothing(like: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    front = torch.full(shape, -1, dtype=torch.int32, device=like.device)
+    return front, like.new_full(shape, float("inf"))
+
+
+def draw_alone(
+    pixels: Float[Tensor, "vertices 2"],
+    depths: Float[Tensor, " vertices"],
+    faces: Int[Tensor, "faces 3"],
+    drawn: Bool[Tensor, ""],
+    settings: Settings,
+) -> Alone:
+    """One mesh in one view, without anything before it."""
+    height, width = settings.image_size
     rows = torch.arange(height, dtype=pixels.dtype, device=pixels.device) + 0.5
     columns = torch.arange(width, dtype=pixels.dtype, device=pixels.device) + 0.5
     grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1).reshape(-1, 1, 2)
-    coverage, depth = [], []
-    for mesh in range(len(pixels)):
-        corners, z = pixels[mesh][faces], depths[mesh][faces]
-        keep = (z > near_m).all(dim=-1) & (_twice_area(corners).abs() > 1e-12) & drawn[mesh]
-        soft, nearest = _one_mesh(grid, corners[keep], z[keep], sigma_px2, blur_px2)
-        coverage.append(soft.reshape(height, width))
-        depth.append(nearest.reshape(height, width))
-    return torch.stack(coverage), torch.stack(depth)
-
-
-def _one_mesh(
-    grid: Tensor, corners: Tensor, z: Tensor, sigma: float, blur: float
-) -> tuple[Tensor, Tensor]:
-    if len(corners) == 0:
+    corners, z = pixels[faces], depths[faces]
+    keep = (z > settings.near_m).all(-1) & (_twice_area(corners).abs() > MIN_AREA_PX2) & drawn
+    if not keep.any():
         # The sum over no corners is 0, and carries a gradient of 0 instead of none.
-        empty = torch.zeros_like(grid[:, 0, 0]) + corners.sum()
-        return empty, torch.full_like(empty, float("inf"))
+        empty = torch.zeros_like(grid[:, 0, 0]) + corners[:0].sum()
+        nowhere = torch.full_like(empty, float("inf"))
+        alone: tuple[Tensor, ...] = (empty, nowhere, nowhere)
+    elif settings.mode == "exact":
+        alone = _faces(grid, corners[keep], z[keep], settings)
+    else:
+        alone = _outline(grid, pixels, depths, faces, keep, settings)
+    return Alone(*(x.reshape(height, width) for x in alone))
+
+
+def _faces(grid: Tensor, corners: Tensor, z: Tensor, settings: Settings) -> tuple[Tensor, ...]:
+    """The exact formula: every face has its say."""
     a, b, c = corners.unbind(dim=1)
     squared = torch.stack(
-        [_segment_distance2(grid, *edge) for edge in ((a, b), (b, c), (c, a))]
+        [_segment_distance2(grid, *edge)[0] for edge in ((a, b), (b, c), (c, a))]
     ).amin(dim=0)
-    weights = torch.stack([_cross(grid, b, c), _cross(grid, c, a), _cross(grid, a, b)], dim=-1)
-    weights = weights / _twice_area(corners).unsqueeze(-1)
+    weights = _weights(grid, corners)
     inside = (weights > 0).all(dim=-1)
-    touched = inside | (squared < blur)
-    x = torch.where(inside, squared, -squared) / sigma
+    touched = inside | (squared < settings.blur_px2)
+    x = torch.where(inside, squared, -squared) / settings.sigma_px2
     log_missed = torch.where(touched, -F.softplus(x), 0.0).sum(dim=-1)
+    clipped = weights.detach().clamp(min=0)
+    face_depth = clipped.sum(dim=-1) / (clipped / z.detach()).sum(dim=-1)
+    contained = (weights > -SLACK).all(dim=-1)
+    depth = torch.where(contained, face_depth, float("inf")).amin(dim=-1)
+    felt = torch.where(touched, face_depth, float("inf")).amin(dim=-1)
+    return -torch.expm1(log_missed), torch.where(depth < float("inf"), depth, felt), depth
+
+
+def _outline(
+    grid: Tensor, pixels: Tensor, depths: Tensor, faces: Tensor, keep: Tensor, settings: Settings
+) -> tuple[Tensor, ...]:
+    """The fast mode: the mesh as one shape with one outline."""
+    corners, z = pixels[faces[keep]], depths[faces[keep]].detach()
+    weights = _weights(grid, corners.detach())
+    contained = (weights > -SLACK).all(dim=-1)
     clipped = weights.clamp(min=0)
-    clipped = clipped / clipped.sum(dim=-1, keepdim=True)
-    face_depth = 1 / (clipped / z).sum(dim=-1)
-    nearest = torch.where(touched, face_depth, float("inf")).amin(dim=-1)
-    return -torch.expm1(log_missed), nearest.detach()
+    face_depth = clipped.sum(dim=-1) / (clipped / z).sum(dim=-1)
+    depth = torch.where(contained, face_depth, float("inf")).amin(dim=-1)
+    inside = contained.any(dim=-1)
+    ends, spans = _outline_pieces(pixels.detach(), faces, keep, settings)
+    if len(ends) == 0:
+        covered = inside.to(pixels.dtype) + corners[:0].sum()
+        return covered, depth, depth
+    start, end = pixels[ends[:, 0]], pixels[ends[:, 1]]
+    squared, share = _segment_distance2(grid, start, end, spans)
+    squared, nearest = squared.min(dim=-1)
+    share = share.gather(-1, nearest.unsqueeze(-1)).squeeze(-1).detach()
+    on_outline = squared < settings.blur_px2
+    x = torch.where(inside, squared, -squared) / settings.sigma_px2
+    coverage = torch.where(on_outline, torch.sigmoid(x), inside.to(x.dtype))
+    z0, z1 = depths.detach()[ends[nearest]].unbind(dim=-1)
+    felt = 1 / ((1 - share) / z0 + share / z1)
+    felt = torch.where(on_outline, felt, float("inf"))
+    return coverage, torch.where(inside, depth, felt), depth
 
 
-def _segment_distance2(point: Tensor, start: Tensor, end: Tensor) -> Tensor:
+def _outline_pieces(
+    pixels: Tensor, faces: Tensor, keep: Tensor, settings: Settings
+) -> tuple[Int[Tensor, "pieces 2"], Float[Tensor, "2 pieces"]]:
+    """Vertices of each outline edge near the image and the part [t0, t1] of it, a row a piece."""
+    mesh = topology_of(faces.cpu().numpy())
+    corners = pixels[faces]
+    side = torch.sign(_twice_area(corners)).long() * keep
+    # How many faces more lie over the image to the left of an edge than to its right.
+    layers = torch.zeros(len(mesh.edges), dtype=torch.long, device=pixels.device)
+    way = torch.from_numpy(mesh.way).to(side)
+    edge_of = torch.from_numpy(mesh.edge_of).long().to(side.device)
+    layers = layers.index_add(0, edge_of.flatten(), (side[:, None] * way).flatten())
+    ends, spans = [torch.empty(0, 2).to(faces)], [torch.empty(0, 2).to(pixels)]
+    size = torch.tensor(settings.image_size[::-1]).to(pixels)
+    reach = settings.blur_px2**0.5 + PIECE_PX
+    for e in layers.nonzero().flatten().tolist():
+        a, b = mesh.edges[e].tolist()
+        along = pixels[b] - pixels[a]
+        length = float(along.norm())
+        away = torch.stack([along[1], -along[0]]) / length * (1 if layers[e] > 0 else -1)
+        count = max(int(-(-length // PIECE_PX)), 1)
+        t0, t1 = (torch.arange(count).to(pixels) + k for k in (0, 1))
+        middle = pixels[a] + ((t0 + t1) / (2 * count)).unsqueeze(-1) * along
+        near = ((middle > -reach) & (middle < size + reach)).all(dim=-1)
+        beside = (middle + ASIDE_PX * away)[near].unsqueeze(1)
+        free = ~(_weights(beside, corners[keep]) > 0).all(dim=-1).any(dim=-1)
+        spans.append(torch.stack([t0, t1], dim=-1)[near][free] / count)
+        ends.append(torch.tensor([[a, b]]).to(faces).expand(len(spans[-1]), -1))
+    return torch.cat(ends), torch.cat(spans).T
+
+
+def _segment_distance2(
+    point: Tensor, start: Tensor, end: Tensor, span: Tensor | tuple[int, int] = (0, 1)
+) -> tuple[Tensor, Tensor]:
+    """Squared distance to the part `span` of a segment, and where on it the nearest point is."""
     along = end - start
-    t = ((point - start) * along).sum(-1) / (along * along).sum(-1).clamp(min=1e-12)
-    nearest = start + t.clamp(0, 1).unsqueeze(-1) * along
-    return ((point - nearest) ** 2).sum(-1)
+    t = ((point - start) * along).sum(-1) / (along * along).sum(-1).clamp(min=MIN_AREA_PX2)
+    t = torch.minimum(
+        torch.maximum(t, torch.as_tensor(span[0]).to(t)), torch.as_tensor(span[1]).to(t)
+    )
+    nearest = start + t.unsqueeze(-1) * along
+    return ((point - nearest) ** 2).sum(-1), t
+
+
+def _weights(point: Tensor, corners: Tensor) -> Tensor:
+    """Barycentric weights of points in triangles, whichever way round."""
+    a, b, c = corners.unbind(dim=-2)
+    sides = [_cross(point, b, c), _cross(point, c, a), _cross(point, a, b)]
+    return torch.stack(sides, dim=-1) / _twice_area(corners).unsqueeze(-1)
 
 
 def _cross(point: Tensor, start: Tensor, end: Tensor) -> Tensor:
@@ -78,12 +216,14 @@ def _twice_area(corners: Tensor) -> Tensor:
 
 def composite(
     coverage: Float[Tensor, "images objects height width"],
-    depth: Float[Tensor, "images objects height width"],
+    order_m: Float[Tensor, "images objects height width"],
     compositing: str,
 ) -> Float[Tensor, "images objects height width"]:
     """Visible soft masks from coverages and depths: see `sceneprior.silhouettes.compositing`."""
-    order = depth.argsort(dim=1, stable=True)
-    alpha = coverage.gather(1, order)
+    if compositing == "alone" or coverage.shape[1] == 0:
+        return coverage
+    sequence = order_m.argsort(dim=1, stable=True)
+    alpha = coverage.gather(1, sequence)
     missed = 1 - alpha
     if compositing == "layered":
         ones = torch.ones_like(missed[:, :1])
@@ -91,6 +231,6 @@ def composite(
     else:
         whole = 1 - missed.prod(dim=1, keepdim=True)
         front = torch.zeros_like(alpha)
-        front[:, 0] = depth.amin(dim=1) < float("inf")
+        front[:, 0] = order_m.amin(dim=1) < float("inf")
         visible = whole * front
-    return torch.zeros_like(visible).scatter(1, order, visible)
+    return torch.zeros_like(visible).scatter(1, sequence, visible)

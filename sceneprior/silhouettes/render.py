@@ -1,14 +1,16 @@
 """Meshes and cameras in, soft masks out: the public door of the differentiable renderer."""
 
+import importlib
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.geometry.cameras import project
-from sceneprior.silhouettes import compositing as fast_compositing
-from sceneprior.silhouettes import cpu, reference
+from sceneprior.silhouettes.projection import project_in_threads
+from sceneprior.silhouettes.reference import Settings
 
 NEAR_M = 0.05
 """A face with a corner nearer than this, or behind the camera, is left out of that view."""
@@ -16,11 +18,26 @@ NEAR_M = 0.05
 SIGMA_NDC = 1e-4
 """The paper's blend sigma, in squared NDC (the shorter image side spans [-1, 1])."""
 
-COMPOSITING = (*fast_compositing.MODES, "alone")
+MODES = ("exact", "fast")
+COMPOSITING = ("layered", "paper", "alone")
+BACKENDS = ("auto", "cpu", "cuda", "reference")
+
+
+class RenderedScene(NamedTuple):
+    """What `render_scene` draws.
+
+    `masks` is what `render_silhouettes` returns. `front` is the index of the object whose surface
+    is nearest at the pixel centre, -1 where there is none, and `depth_m` how far away it is along
+    the optical axis, infinite where there is none; both are hard and carry no gradient.
+    """
+
+    masks: Float[Tensor, "rooms views objects height width"]
+    front: Int[Tensor, "rooms views height width"]
+    depth_m: Float[Tensor, "rooms views height width"]
 
 
 def sigma_from_ndc(sigma_ndc: float, image_size: tuple[int, int]) -> float:
-    """PyTorch3D's squared-NDC sigma in squared pixels."""
+    """PyTorch3D's squared-NDC units (the shorter image side spans [-1, 1]) in squared pixels."""
     return sigma_ndc * (min(image_size) / 2) ** 2
 
 
@@ -32,38 +49,51 @@ def render_silhouettes(
     image_size: tuple[int, int],
     *,
     sigma_px2: float | None = None,
+    sigma_ndc: float | None = None,
+    blur_ndc: float | None = None,
+    mode: str = "exact",
     compositing: str = "layered",
     drawn: Bool[Tensor, "rooms objects"] | None = None,
     backend: str = "auto",
 ) -> Float[Tensor, "rooms views objects height width"]:
     """Draw every object's soft mask in every view of its room.
 
-    A pixel is covered unless every face misses it:
+    In `exact` mode a pixel is covered unless every face misses it:
 
         coverage = 1 - prod_f (1 - sigmoid(s_f * d_f / sigma))
 
     d_f is the squared distance in pixels from the pixel centre to the nearest edge of the
     projected face f, s_f is +1 inside the face and -1 outside. Outside, faces farther than
-    the blur radius (where the sigmoid is 1e-4) do not count, as in the authors' code. There is
-    no limit on faces per pixel.
+    the blur radius do not count, as in the authors' code. There is no limit on faces per pixel.
+
+    In `fast` mode the mesh is one shape: coverage = sigmoid(s * d / sigma), d the squared distance
+    to its outline. Edges of faces inside the outline do not show, so masks are not fattened by
+    a fine mesh, and the cost does not grow with the blur (docs/silhouettes.md).
 
     Args:
         vertices_m: World positions in metres; all objects share one topology.
-        faces: Corners of each triangle.
+        faces: Corners of each triangle. Both sides are drawn; the mesh need not be closed.
         world_to_camera: One rigid transform a view, OpenCV axes.
         intrinsics: Pixels of an image of `image_size`.
         image_size: (height, width) of the masks.
-        sigma_px2: Softness of an edge in squared pixels; None takes the paper's 1e-4 squared
-            NDC. Larger pulls on more pixels and blurs more.
+        sigma_px2: Softness of an edge in squared pixels. Larger pulls on more pixels and
+            blurs more. None takes `sigma_ndc`.
+        sigma_ndc: The same in PyTorch3D's squared-NDC units; None takes the paper's 1e-4.
+        blur_ndc: Squared blur radius in the same units; None takes the authors', at which the
+            sigmoid is 1e-4: log(1 / 1e-4 - 1) sigma.
+        mode: `exact` or `fast`.
         compositing: `layered` or `paper` (visible masks, see `compositing.py`), or `alone`.
         drawn: Objects to draw; others are empty and hide nothing. None draws all.
-        backend: `cpu` (Numba), `reference` (plain torch), or `auto`: Numba where it can run.
+        backend: `cpu` (Numba), `cuda` (Triton), `reference` (plain torch), or `auto`: the fast
+            one of the tensors' device.
 
     Returns:
         Masks in [0, 1], differentiable in `vertices_m`.
 
     Raises:
-        ValueError: an unknown mode, a sigma that is not positive, or a vertex that is not finite.
+        ValueError: an unknown mode, a sigma that is not positive, a face without its vertex, or a
+            vertex or camera that is not finite.
+        ImportError: the backend is `cuda`, or `auto` with CUDA tensors, and Triton is missing.
 
     Source:
         Liu et al., "Soft Rasterizer", ICCV 2019; the paper's supplement A.
@@ -79,43 +109,111 @@ def render_silhouettes(
         >>> masks.shape, round(masks.sum().item(), 3)
         (torch.Size([1, 1, 1, 32, 32]), 128.0)
     """
-    if compositing not in COMPOSITING:
-        raise ValueError(f"compositing is '{compositing}'; expected one of {COMPOSITING}")
+    return render_scene(
+        vertices_m,
+        faces,
+        world_to_camera,
+        intrinsics,
+        image_size,
+        sigma_px2=sigma_px2,
+        sigma_ndc=sigma_ndc,
+        blur_ndc=blur_ndc,
+        mode=mode,
+        compositing=compositing,
+        drawn=drawn,
+        backend=backend,
+    ).masks
+
+
+def render_scene(
+    vertices_m: Float[Tensor, "rooms objects vertices 3"],
+    faces: Int[Tensor, "faces 3"],
+    world_to_camera: Float[Tensor, "rooms views 4 4"],
+    intrinsics: Float[Tensor, "rooms views 3 3"],
+    image_size: tuple[int, int],
+    *,
+    sigma_px2: float | None = None,
+    sigma_ndc: float | None = None,
+    blur_ndc: float | None = None,
+    mode: str = "exact",
+    compositing: str = "layered",
+    drawn: Bool[Tensor, "rooms objects"] | None = None,
+    backend: str = "auto",
+) -> RenderedScene:
+    """`render_silhouettes`, and which object is in front at each pixel, and how far away.
+
+    Arguments and errors are those of `render_silhouettes`.
+
+    Example: what a room's camera would label.
+
+        >>> triangle = torch.tensor([[[[0.0, 0, 2], [0.9, 0, 2], [0, 0.9, 2]]]])
+        >>> ahead = torch.eye(4)[None, None]
+        >>> lens = torch.tensor([[[[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]]])
+        >>> scene = render_scene(triangle, torch.tensor([[0, 1, 2]]), ahead, lens, (4, 4))
+        >>> scene.front[0, 0].tolist()
+        [[-1, -1, -1, -1], [-1, -1, -1, -1], [-1, -1, 0, -1], [-1, -1, -1, -1]]
+    """
+    _refuse_unknown("mode", mode, MODES)
+    _refuse_unknown("compositing", compositing, COMPOSITING)
+    _refuse_unknown("backend", backend, BACKENDS)
+    if min(image_size) < 1:
+        raise ValueError(f"image_size is {tuple(image_size)}; both sides must be at least 1")
+    if sigma_px2 is not None and sigma_ndc is not None:
+        raise ValueError("sigma_px2 and sigma_ndc are both given; they say the same in two units")
     if sigma_px2 is None:
-        sigma_px2 = sigma_from_ndc(SIGMA_NDC, image_size)
+        sigma_ndc = SIGMA_NDC if sigma_ndc is None else sigma_ndc
+        if not sigma_ndc > 0:
+            raise ValueError(f"sigma_ndc is {sigma_ndc}; it must be positive")
+        sigma_px2 = sigma_from_ndc(sigma_ndc, image_size)
     if not sigma_px2 > 0:
         raise ValueError(f"sigma_px2 is {sigma_px2}; it must be positive")
+    blur_px2 = math.log(1 / 1e-4 - 1) * sigma_px2
+    if blur_ndc is not None:
+        if not blur_ndc >= 0:
+            raise ValueError(f"blur_ndc is {blur_ndc}; it must not be negative")
+        blur_px2 = sigma_from_ndc(blur_ndc, image_size)
     finite = torch.isfinite(vertices_m).flatten(2).all(dim=-1)
     if not bool(finite.all()):
         room, item = (~finite).nonzero()[0].tolist()
         raise ValueError(f"object {item} of room {room} has a vertex that is not finite")
-    rooms, objects = vertices_m.shape[:2]
+    seen = torch.isfinite(world_to_camera).flatten(2).all(-1)
+    seen &= torch.isfinite(intrinsics).flatten(2).all(-1)
+    if not bool(seen.all()):
+        room, view = (~seen).nonzero()[0].tolist()
+        raise ValueError(f"view {view} of room {room} has a pose or lens that is not finite")
+    rooms, objects, vertices = vertices_m.shape[:3]
     views = world_to_camera.shape[1]
+    if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < vertices:
+        raise ValueError(
+            f"faces name vertices {int(faces.min())} to {int(faces.max())}, but each object has "
+            f"vertices 0 to {vertices - 1}"
+        )
     if drawn is None:
         drawn = torch.ones(rooms, objects, dtype=torch.bool, device=vertices_m.device)
-    projected = project(vertices_m, world_to_camera, intrinsics).flatten(0, 2)
-    engine, compose = _backend(backend, vertices_m)
-    coverage, depth = engine.soft_coverage(
-        projected[..., :2],
-        projected[..., 2],
+    if backend == "auto":
+        backend = vertices_m.device.type
+        backend = backend if backend in BACKENDS else "reference"
+    moving_cameras = world_to_camera.requires_grad or intrinsics.requires_grad
+    if backend == "cpu" and not moving_cameras:
+        pixels, depths = project_in_threads(vertices_m, world_to_camera, intrinsics)
+    else:
+        projected = project(vertices_m, world_to_camera, intrinsics).flatten(0, 1)
+        pixels, depths = projected[..., :2], projected[..., 2]
+    masks, front, depth_m = _engine(backend).draw(
+        pixels,
+        depths,
         faces,
-        drawn.unsqueeze(1).expand(-1, views, -1).flatten(),
-        image_size,
-        sigma_px2,
-        math.log(1 / 1e-4 - 1) * sigma_px2,
-        NEAR_M,
+        drawn.repeat_interleave(views, dim=0),
+        Settings((image_size[0], image_size[1]), sigma_px2, blur_px2, NEAR_M, mode, compositing),
     )
-    shape = (rooms * views, objects, *image_size)
-    if compositing != "alone":
-        coverage = compose(coverage.reshape(shape), depth.reshape(shape), compositing)
-    return coverage.reshape(rooms, views, objects, *image_size)
+    return RenderedScene(*(array.unflatten(0, (rooms, views)) for array in (masks, front, depth_m)))
 
 
-def _backend(name: str, like: Tensor):
-    if name == "auto":
-        name = "cpu" if like.device.type == "cpu" else "reference"
-    if name == "cpu":
-        return cpu, fast_compositing.composite
-    if name == "reference":
-        return reference, reference.composite
-    raise ValueError(f"backend is '{name}'; expected auto, cpu or reference")
+def _engine(backend: str):
+    # Loaded when asked for: the CPU backend compiles, and Triton may not be installed.
+    return importlib.import_module(f"sceneprior.silhouettes.{backend}")
+
+
+def _refuse_unknown(name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise ValueError(f"{name} is '{value}'; expected {', '.join(known[:-1])} or {known[-1]}")

@@ -11,7 +11,7 @@ from sceneprior.stages.view_loss import (
     build_optimizer,
     check_finite,
     match_and_score,
-    proxy_points,
+    proxy_boxes,
     step_seed,
     training_latents,
     weighted_sum,
@@ -47,8 +47,8 @@ class LayoutStage(lightning.LightningModule):
             seed,
         )
         scenes = self.prior.decode(z, with_shape=False)
-        points = proxy_points(scenes, settings.proxy)
-        losses, _ = match_and_score(scenes, points, views, self.config.loss)
+        boxes = proxy_boxes(scenes, views, settings.proxy)
+        losses, _ = match_and_score(scenes, boxes, views, self.config.loss)
         total = weighted_sum(losses, self.config.loss)
         check_finite(total, views)
         named = {f"train/{name}": loss.detach() for name, loss in losses.items()}

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.config import RunConfig
+from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.losses.shape import mask_loss, observed_ids
 from sceneprior.models.scene_prior import ScenePrior
 from sceneprior.silhouettes.render import render_silhouettes
@@ -14,7 +15,7 @@ from sceneprior.stages.view_loss import (
     build_optimizer,
     check_finite,
     match_and_score,
-    proxy_points,
+    proxy_boxes,
     step_seed,
     training_latents,
     weighted_sum,
@@ -42,7 +43,8 @@ class ShapeStage(lightning.LightningModule):
         seed = step_seed(self.config.seed, self.global_step, self.global_rank)
         z = training_latents(self.prior, self.latents, views.room_index, settings, progress, seed)
         scenes = self.prior.decode(z)
-        losses, matches = match_and_score(scenes, self._box_points(scenes), views, self.config.loss)
+        boxes = self._boxes(scenes, views)
+        losses, matches = match_and_score(scenes, boxes, views, self.config.loss)
         # Before rendering, too, which refuses vertices that are not finite and knows no rooms.
         check_finite(weighted_sum(losses, self.config.loss), views)
         masks = self._render(scenes, views)
@@ -56,10 +58,12 @@ class ShapeStage(lightning.LightningModule):
         )
         return total
 
-    def _box_points(self, scenes: DecodedScenes) -> Tensor:
-        if self.config.shape.box_from == "mesh" and scenes.vertices_m is not None:
-            return scenes.vertices_m
-        return proxy_points(scenes, self.config.shape.proxy)
+    def _boxes(self, scenes: DecodedScenes, views: SceneViews) -> Boxes2D:
+        if self.config.shape.box_from == "proxy" or scenes.vertices_m is None:
+            return proxy_boxes(scenes, views, self.config.shape.proxy)
+        return boxes_of_points(
+            scenes.vertices_m, views.world_to_camera, views.intrinsics, views.image_size
+        )
 
     def _render(self, scenes: DecodedScenes, views: SceneViews) -> Tensor:
         # Only the first n predictions of a room answer for objects; the rest would hide them.
@@ -77,6 +81,7 @@ class ShapeStage(lightning.LightningModule):
             views.intrinsics * scale[:, None],
             (height, width),
             sigma_px2=self.config.shape.sigma_px2,
+            mode=self.config.shape.silhouettes,
             compositing=self.config.shape.compositing,
             drawn=drawn,
         )

@@ -1,69 +1,176 @@
-"""Against PyTorch3D: silhouettes and gradients kept in shared/data/oracle_silhouettes.npz."""
+"""Against PyTorch3D: silhouettes, ids, depths and gradients kept in
+shared/data/oracle_silhouettes.npz."""
 
 import itertools
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from sceneprior.silhouettes.render import render_silhouettes, sigma_from_ndc
+from sceneprior.silhouettes.render import render_scene
 
 ORACLE = Path(__file__).resolve().parents[3] / "shared" / "data" / "oracle_silhouettes.npz"
 pytestmark = pytest.mark.skipif(
     not ORACLE.is_file(), reason=f"no {ORACLE.parent.name}/{ORACLE.name} beside the repository"
 )
 SIZES = ["90x120", "180x240"]
+AROUND_THE_CAMERA = (2, 3)
+"""Object and view: PyTorch3D drops other faces there than we do."""
 
 
-def seen_by_pytorch3d(data, view: int, item: int, tag: str) -> np.ndarray:
+@lru_cache
+def oracle() -> dict[str, np.ndarray]:
+    with np.load(ORACLE) as archive:
+        return dict(archive)
+
+
+def size_of(tag: str) -> tuple[int, int]:
+    height, width = map(int, tag.split("x"))
+    return height, width
+
+
+def camera_of(view: int, tag: str, dtype: torch.dtype) -> dict:
+    data = oracle()
+    pose = torch.eye(4, dtype=dtype)
+    pose[:3, :3] = torch.from_numpy(data["R"][view])
+    pose[:3, 3] = torch.from_numpy(data["t"][view])
+    return {
+        "world_to_camera": pose[None, None],
+        "intrinsics": torch.from_numpy(data[f"K_{tag}"]).to(dtype)[None, None],
+        "image_size": size_of(tag),
+    }
+
+
+def pixels_of(name: str, tag: str, *index: int) -> np.ndarray:
+    """A packed array of the oracle as booleans."""
+    return np.unpackbits(oracle()[f"{name}_{tag}"][index], axis=-1).astype(bool)
+
+
+def seen_by_pytorch3d(view: int, item: int, tag: str) -> torch.Tensor:
     """Faces that PyTorch3D draws: it skips those with less than 1e-8 of (doubled) area in NDC.
 
     We draw any sliver that has an area at all: its outline reaches as far as another's.
     """
-    height, width = map(int, tag.split("x"))
+    data = oracle()
     camera = data["verts"][item].astype(np.float64) @ data["R"][view].T + data["t"][view]
     pixels = camera @ data[f"K_{tag}"].T
-    a, b, c = (pixels[:, :2] / pixels[:, 2:] * 2 / min(height, width))[data["faces"].T]
+    a, b, c = (pixels[:, :2] / pixels[:, 2:] * 2 / min(size_of(tag)))[data["faces"].T]
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-    return data["faces"][np.abs(area) > 1e-8]
+    return torch.from_numpy(data["faces"][np.abs(area) > 1e-8]).long()
 
 
 @pytest.mark.parametrize("tag", SIZES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_silhouettes_and_gradients_are_pytorch3ds(tag, dtype):
-    height, width = map(int, tag.split("x"))
-    compared = slivers = 0
-    with np.load(ORACLE) as archive:
-        data = dict(archive)
+@pytest.mark.parametrize("blur", ["A", "B"])
+def test_silhouettes_and_gradients_are_pytorch3ds(tag, dtype, blur):
+    """A, the authors' blur, without a cap of faces per pixel; B, one of sigma, which at 50 faces
+    per pixel no pixel of the oracle fills."""
+    data = oracle()
+    compared = slivers = jumps = 0
+    cap = "nocap_" if blur == "A" else ""
     for view, item in itertools.product(range(4), range(3)):
-        if data["z_min"][item, view] < 0.06:
-            continue  # around the camera: PyTorch3D drops other faces than we do
-        faces = seen_by_pytorch3d(data, view, item, tag)
+        if (item, view) == AROUND_THE_CAMERA:
+            continue
+        faces = seen_by_pytorch3d(view, item, tag)
         slivers += len(data["faces"]) - len(faces)
-        pose = torch.eye(4, dtype=dtype)
-        pose[:3, :3] = torch.from_numpy(data["R"][view])
-        pose[:3, 3] = torch.from_numpy(data["t"][view])
         vertices = torch.from_numpy(data["verts"][item]).to(dtype).requires_grad_()
-        mask = render_silhouettes(
+        mask = render_scene(
             vertices[None, None],
-            torch.from_numpy(faces).long(),
-            pose[None, None],
-            torch.from_numpy(data[f"K_{tag}"]).to(dtype)[None, None],
-            (height, width),
-            sigma_px2=sigma_from_ndc(float(data["sigma"]), (height, width)),
+            faces,
+            **camera_of(view, tag, dtype),
+            sigma_ndc=float(data["sigma"]),
+            blur_ndc=float(data[f"blur_radius_{blur}"]),
             compositing="alone",
-        )[0, 0, 0]
+        ).masks[0, 0, 0]
         weights = torch.from_numpy(data[f"weights_int8_{tag}"][item, view]).to(dtype) / 64
         (mask * weights).sum().backward()
-        alpha = data[f"alpha_nocap_A_{tag}"][item, view]
+        alpha = data[f"alpha_{cap}{blur}_{tag}"][item, view]
         assert alpha.max() > 0.99
-        np.testing.assert_allclose(mask.detach().numpy(), alpha, rtol=0, atol=1e-4)
-        wanted = data[f"grad_nocap_A_{tag}"][item, view]
-        # Relative to the largest pull of this object in this view. A pixel as far from one edge
-        # as from another, or at the blur radius, may choose another side in float32 and move
-        # its share of 0.0015 (seen at 1 and 4 of 1,926 numbers).
-        error = np.abs(vertices.grad.numpy() - wanted) / np.abs(wanted).max()
-        assert np.sort(error.ravel())[-5] <= 1e-3 and error.max() <= 2e-3
+        assert blur == "A" or not pixels_of("k_full_B", tag, item, view).any()
+        # Where a face is as far as the blur radius, to float rounding, it reads 0.27 or nothing
+        # in B: the oracle's notes know one such pixel at 180 x 240.
+        jumps += (np.abs(mask.detach().numpy() - alpha) > 1e-4).sum()
+        pulls_agree(vertices.grad, data[f"grad_{cap}{blur}_{tag}"][item, view], blur)
         compared += 1
     assert (compared, slivers) == (11, 1)
+    assert jumps <= (1 if blur == "B" and tag == "180x240" else 0)
+
+
+def pulls_agree(gradient: torch.Tensor, wanted: np.ndarray, blur: str) -> None:
+    """Relative to the largest pull of this object in this view: 1e-3, seen 4e-5.
+
+    But a pixel as far from one edge as from another, or at the blur radius, may choose another
+    side in float32 and move its share of four vertices: in A at most 0.0015 (seen in 2 of 44
+    views), in B, where a face at the blur radius still reads 0.27, 0.032 (in 3).
+    """
+    error = np.abs(gradient.numpy() - wanted) / np.abs(wanted).max()
+    few, largest = (4, 2e-3) if blur == "A" else (12, 4e-2)
+    assert (error > 1e-3).sum() <= few and error.max() <= largest
+
+
+@pytest.mark.parametrize("mode", ["exact", "fast"])
+@pytest.mark.parametrize("tag", SIZES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_ids_and_depths_are_pytorch3ds_hard_rasters(tag, dtype, mode):
+    """Seen: no pixel differs in any view, the one with an object around the camera included."""
+    data = oracle()
+    vertices = torch.from_numpy(data["verts"]).to(dtype)
+    faces = torch.from_numpy(data["faces"]).long()
+    for view in range(4):
+        camera = camera_of(view, tag, dtype)
+        front, depth_m = (
+            x[0, 0].numpy() for x in render_scene(vertices[None], faces, **camera, mode=mode)[1:]
+        )
+        wanted = data[f"scene_id_hard_{tag}"][view]
+        np.testing.assert_array_equal(front, wanted)
+        assert len(np.unique(wanted)) == 4
+        depth = np.where(wanted >= 0, data[f"scene_depth_hard_{tag}"][view], np.inf)
+        # Theirs are float32: on a face seen nearly edge on, they are 4e-5 off at up to 3 pixels.
+        far = ~np.isclose(depth_m, depth, rtol=1e-5, atol=0)
+        assert far.sum() <= 3
+        np.testing.assert_allclose(depth_m, depth, rtol=5e-5)
+        for item in range(3):
+            alone = render_scene(vertices[None, item : item + 1], faces, **camera, mode=mode)
+            inside = pixels_of("mask_hard", tag, item, view)
+            np.testing.assert_array_equal(alone.front[0, 0].numpy() >= 0, inside)
+
+
+@pytest.mark.parametrize("tag", SIZES)
+def test_the_joined_scene_is_pytorch3ds(tag):
+    """One mesh of all three objects; B alone, for in A many pixels fill the 50 faces it keeps."""
+    data = oracle()
+    for view in range(3):
+        vertices = torch.from_numpy(data["verts"]).double().requires_grad_()
+        faces = [seen_by_pytorch3d(view, item, tag) + item * 642 for item in range(3)]
+        mask = render_scene(
+            vertices.reshape(1, 1, -1, 3),
+            torch.cat(faces),
+            **camera_of(view, tag, torch.float64),
+            sigma_ndc=float(data["sigma"]),
+            blur_ndc=float(data["blur_radius_B"]),
+        ).masks[0, 0, 0]
+        weights = torch.from_numpy(data[f"weights_int8_{tag}"][0, view]) / 64
+        (mask * weights).sum().backward()
+        alpha = data[f"scene_alpha_B_{tag}"][view]
+        np.testing.assert_allclose(mask.detach().numpy(), alpha, rtol=0, atol=1e-4)
+        pulls_agree(vertices.grad, data[f"scene_grad_B_{tag}"][view], "B")
+
+
+@pytest.mark.parametrize("mode", ["exact", "fast"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_object_around_the_camera_draws_and_pulls_without_a_nan(mode, dtype):
+    data = oracle()
+    item, view = AROUND_THE_CAMERA
+    assert data["z_min"][item, view] < 0
+    vertices = torch.from_numpy(data["verts"]).to(dtype).requires_grad_()
+    drawn = render_scene(
+        vertices[None],
+        torch.from_numpy(data["faces"]).long(),
+        **camera_of(view, "90x120", dtype),
+        mode=mode,
+    )
+    drawn.masks.sum().backward()
+    assert torch.isfinite(drawn.masks).all() and torch.isfinite(vertices.grad).all()
+    assert drawn.masks.min() >= 0 and drawn.masks.max() <= 1

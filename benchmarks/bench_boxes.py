@@ -1,0 +1,115 @@
+"""Time 2D boxes of ellipsoids: in closed form against the authors' 2,562 projected vertices.
+
+Run `python benchmarks/bench_boxes.py`. A step is forward and backward, on the CPU, of a batch of
+the layout stage: 128 rooms (32 with 2,562 vertices: more need 6 GB), 13 objects, 20 views. The two
+take turns, so that whatever else the machine does meets both; the figure is the median.
+"""
+
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from sceneprior.geometry.boxes import place
+from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
+from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
+from sceneprior.geometry.meshes import icosphere
+
+SIZE = (480, 640)
+
+
+def make_batch(rooms: int, views: int, objects: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Centres, sizes and cameras inside of 5 m rooms: some objects are behind, some are cut."""
+    generator = torch.Generator().manual_seed(0)
+    centers = torch.rand(rooms, objects, 3, generator=generator) * 5 - 2.5
+    sizes = torch.rand(rooms, objects, 3, generator=generator) * 1.5 + 0.2
+    turn = torch.linalg.qr(torch.randn(rooms, views, 3, 3, generator=generator))[0]
+    cameras = torch.eye(4).repeat(rooms, views, 1, 1)
+    cameras[..., :3, :3] = turn * torch.linalg.det(turn)[..., None, None]
+    cameras[..., :3, 3] = torch.randn(rooms, views, 3, generator=generator)
+    lens = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]).expand(rooms, views, 3, 3)
+    return centers.requires_grad_(), sizes.requires_grad_(), cameras, lens
+
+
+def boxes_ratio(
+    repeats: int = 7,
+    rooms: int = 128,
+    views: int = 20,
+    objects: int = 13,
+    level: int = 4,
+    threads: int | None = None,
+) -> dict[str, float]:
+    """Median seconds of a step in closed form and with an icosphere, and how many times as fast.
+
+    Args:
+        repeats: Steps of each; one more warms up.
+        rooms, views, objects: Of the batch.
+        level: Of the icosphere; 4 is the authors'.
+        threads: For torch; None leaves what it has.
+
+    Returns:
+        `closed_s`, `points_s` and `ratio` = points_s / closed_s.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads or before)
+    try:
+        return _boxes_ratio(repeats, rooms, views, objects, level)
+    finally:
+        torch.set_num_threads(before)
+
+
+def _boxes_ratio(
+    repeats: int, rooms: int, views: int, objects: int, level: int
+) -> dict[str, float]:
+    centers, sizes, cameras, lens = make_batch(rooms, views, objects)
+    sphere = icosphere(level)[0].expand(rooms, objects, -1, -1)
+
+    def closed() -> Boxes2D:
+        return boxes_of_ellipsoids(centers, sizes, cameras, lens, SIZE)
+
+    def points() -> Boxes2D:
+        return boxes_of_points(place(sphere, centers, sizes), cameras, lens, SIZE)
+
+    def seconds(boxes_of: Callable[[], Boxes2D]) -> float:
+        centers.grad = sizes.grad = None
+        start = time.perf_counter()
+        boxes_of().boxes.sum().backward()
+        return time.perf_counter() - start
+
+    times: dict[str, list[float]] = {"closed": [], "points": []}
+    for repeat in range(repeats + 1):
+        for name, boxes_of in (("closed", closed), ("points", points)):
+            spent = seconds(boxes_of)
+            if repeat:  # the first turn warms up
+                times[name].append(spent)
+    closed_s, points_s = (statistics.median(times[name]) for name in ("closed", "points"))
+    return {"closed_s": closed_s, "points_s": points_s, "ratio": points_s / closed_s}
+
+
+def processor() -> str:
+    """The CPU's own name where Linux tells it."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"{len(names)} x {names[0]}" if names else platform.processor()
+
+
+def main() -> None:
+    print(f"{processor()}, load {os.getloadavg()[0]:.1f}; torch {torch.__version__}")
+    for threads in sorted({1, torch.get_num_threads()}):
+        for name, level, rooms in (("162 vertices", 2, 128), ("2,562 (authors)", 4, 32)):
+            found = boxes_ratio(repeats=3, rooms=rooms, level=level, threads=threads)
+            print(
+                f"{threads} threads, {rooms} rooms: closed form {found['closed_s'] * 1e3:.1f} ms, "
+                f"{name} {found['points_s'] * 1e3:,.0f} ms: {found['ratio']:,.0f} times as fast",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

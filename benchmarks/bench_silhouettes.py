@@ -1,0 +1,296 @@
+"""How fast are the silhouettes? A room of 13 meshes in 20 views, forward and backward.
+
+    python benchmarks/bench_silhouettes.py [--json FILE]
+
+Measures the exact and the fast mode on the CPU (and on a GPU where there is one), the plain
+torch reference, the closed-form boxes, and PyTorch3D and nvdiffrast where they are importable.
+Figures are medians of runs that take turns, so that a noisy neighbour hits all alike; ratios are
+of medians of one run. Compiling is reported apart and never in a median.
+"""
+
+import argparse
+import importlib.util
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from bench_boxes import boxes_ratio
+
+from sceneprior.geometry.cameras import project
+from sceneprior.geometry.meshes import icosphere
+from sceneprior.silhouettes import render_scene
+
+SIZE = (90, 120)
+OBJECTS, VIEWS = 13, 20
+
+
+def furnished_room(level: int, device: str = "cpu", rooms: int = 1) -> dict[str, Any]:
+    """Ellipsoids the size of furniture in a room of 4 x 4 m, cameras on a circle looking in."""
+    generator = np.random.default_rng(0)
+    sphere, faces = icosphere(level)
+    place = generator.uniform((-2, 0.2, -2), (2, 1.2, 2), (rooms, OBJECTS, 3))
+    half = generator.uniform(0.15, 0.6, (rooms, OBJECTS, 3))
+    vertices = sphere * torch.from_numpy(half)[:, :, None] + torch.from_numpy(place)[:, :, None]
+    poses = [looking_in(2 * np.pi * view / VIEWS) for view in range(VIEWS)]
+    height, width = SIZE
+    lens = torch.tensor([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
+    room = {
+        "vertices_m": vertices.float(),
+        "faces": faces,
+        "world_to_camera": torch.from_numpy(np.array(poses)).float().expand(rooms, -1, -1, -1),
+        "intrinsics": lens.expand(rooms, VIEWS, 3, 3),
+    }
+    return {key: value.to(device) for key, value in room.items()} | {"image_size": SIZE}
+
+
+def looking_in(angle: float) -> np.ndarray:
+    """World to camera of a camera 2.6 m from the middle and 1.6 m up (OpenCV axes)."""
+    eye = np.array([2.6 * np.cos(angle), 1.6, 2.6 * np.sin(angle)])
+    forward = np.array([0, 0.6, 0]) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0, 1, 0))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, -np.cross(right, forward), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    return pose
+
+
+def forward_backward(room: dict[str, Any], **options: Any) -> Callable[[], None]:
+    """One training step's worth of drawing: masks, front-most ids, and the vertices' gradient."""
+    shape = (*room["world_to_camera"].shape[:2], room["vertices_m"].shape[1], *SIZE)
+    upstream = torch.rand(shape, device=room["vertices_m"].device)
+
+    def step() -> None:
+        vertices = room["vertices_m"].clone().requires_grad_()
+        scene = render_scene(**(room | {"vertices_m": vertices}), **options)
+        scene.masks.backward(upstream)
+        if vertices.is_cuda:
+            torch.cuda.synchronize()
+
+    return step
+
+
+def medians(steps: dict[str, Callable[[], None]], repeats: int) -> dict[str, float]:
+    """Median seconds of each step; they take turns."""
+    times: dict[str, list[float]] = {name: [] for name in steps}
+    for step in steps.values():
+        step()
+    for _ in range(repeats):
+        for name, step in steps.items():
+            start = time.perf_counter()
+            step()
+            times[name].append(time.perf_counter() - start)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def reference_seconds() -> float:
+    """The plain torch reference on one object in one view, times 13 x 20: it takes them in turn,
+    and holds every pair of face and pixel, so that a whole room needs tens of GiB."""
+    room = furnished_room(3)
+    part = room | {key: room[key][:, :1] for key in ("world_to_camera", "intrinsics", "vertices_m")}
+    step = forward_backward(part, backend="reference")
+    return medians({"reference": step}, 1)["reference"] * OBJECTS * VIEWS
+
+
+def first_call_seconds(mode: str) -> dict[str, float]:
+    """A new process's first forward and backward: compiling, and once more from the cache."""
+    code = (
+        "import time, sys; sys.path.insert(0, sys.argv[1]); import bench_silhouettes as b; "
+        "step = b.forward_backward(b.furnished_room(1), mode=sys.argv[2]); "
+        "start = time.perf_counter(); step(); print(time.perf_counter() - start)"
+    )
+    seconds = {}
+    cache = Path(os.environ.get("TMPDIR", "/tmp")) / f"sceneprior_bench_{os.getpid()}_{mode}"
+    for what in ("compiling", "cached"):
+        done = subprocess.run(
+            [sys.executable, "-c", code, str(Path(__file__).parent), mode],
+            env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        seconds[what] = float(done.stdout)
+    return seconds
+
+
+def peak_extra_mib(**options: Any) -> float:
+    """Peak memory of one forward and backward, dense masks and their gradient included."""
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import bench_silhouettes as b; "
+        f"print(b.memory_growth(**{options!r}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(Path(__file__).parent)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return float(done.stdout)
+
+
+def memory_growth(**options: Any) -> float:
+    """Peak resident MiB of one forward and backward above what is resident before it (Linux)."""
+    room = furnished_room(3)
+    one = room | {key: room[key][:, :1] for key in ("world_to_camera", "intrinsics")}
+    forward_backward(one, **options)()  # loads all code
+    step = forward_backward(room, **options)
+    Path("/proc/self/clear_refs").write_text("5")  # forgets the peak so far
+    before = status_mib("VmRSS")
+    step()
+    return status_mib("VmHWM") - before
+
+
+def status_mib(name: str) -> float:
+    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if name in x)
+    return int(line.split()[1]) / 1024
+
+
+def peers(repeats: int) -> dict[str, float | str]:
+    """PyTorch3D's soft silhouettes of the same room, one joined scene a view, as the authors draw;
+    nvdiffrast's antialiased masks on a GPU."""
+    found: dict[str, float | str] = {}
+    for name in ("pytorch3d", "nvdiffrast"):
+        if importlib.util.find_spec(name) is None:
+            found[name] = "not installed"
+    if "pytorch3d" not in found:
+        found["pytorch3d"] = medians({"it": pytorch3d_step()}, min(repeats, 2))["it"]
+    if "nvdiffrast" not in found:
+        if torch.cuda.is_available():
+            found["nvdiffrast"] = medians({"it": nvdiffrast_step()}, repeats)["it"]
+        else:
+            found["nvdiffrast"] = "installed, but needs a GPU"
+    return found
+
+
+def pytorch3d_step() -> Callable[[], None]:
+    from pytorch3d.renderer import (
+        BlendParams,
+        MeshRasterizer,
+        MeshRenderer,
+        RasterizationSettings,
+        SoftSilhouetteShader,
+    )
+    from pytorch3d.structures import Meshes
+    from pytorch3d.utils import cameras_from_opencv_projection
+
+    room = furnished_room(3)
+    poses, lenses = room["world_to_camera"][0], room["intrinsics"][0]
+    size = torch.tensor([SIZE]).expand(VIEWS, -1)
+    cameras = cameras_from_opencv_projection(poses[:, :3, :3], poses[:, :3, 3], lenses, size)
+    settings = RasterizationSettings(SIZE, np.log(1 / 1e-4 - 1) * 1e-4, 50, bin_size=0)
+    renderer = MeshRenderer(
+        MeshRasterizer(cameras, settings), SoftSilhouetteShader(BlendParams(sigma=1e-4))
+    )
+    per_object = room["vertices_m"].shape[2]
+    faces = torch.cat([room["faces"] + k * per_object for k in range(OBJECTS)])
+    upstream = torch.rand(VIEWS, *SIZE)
+
+    def step() -> None:
+        vertices = room["vertices_m"].clone().requires_grad_()
+        joined = vertices.reshape(1, -1, 3).expand(VIEWS, -1, -1)
+        masks = renderer(Meshes(joined, faces.expand(VIEWS, -1, -1)))[..., 3]
+        masks.backward(upstream)
+
+    return step
+
+
+def nvdiffrast_step() -> Callable[[], None]:
+    import nvdiffrast.torch as dr
+
+    room = furnished_room(3, "cuda")
+    context = dr.RasterizeCudaContext()
+    per_object = room["vertices_m"].shape[2]
+    faces = torch.cat([room["faces"] + k * per_object for k in range(OBJECTS)]).int()
+    ids = torch.eye(OBJECTS, device="cuda").repeat_interleave(per_object, 0)
+    upstream = torch.rand(VIEWS, *SIZE, OBJECTS, device="cuda")
+    half = torch.tensor([SIZE[1] / 2, SIZE[0] / 2], device="cuda")
+
+    def step() -> None:
+        vertices = room["vertices_m"].clone().requires_grad_()
+        seen = project(vertices, room["world_to_camera"], room["intrinsics"])[0].flatten(1, 2)
+        z = seen[..., 2:]
+        clip = torch.cat([(seen[..., :2] / half - 1) * z, z - 0.1, z], dim=-1).contiguous()
+        raster, _ = dr.rasterize(context, clip, faces, SIZE)
+        color, _ = dr.interpolate(ids[None], raster, faces)
+        dr.antialias(color.contiguous(), raster, clip, faces).backward(upstream)
+        torch.cuda.synchronize()
+
+    return step
+
+
+def gpu(repeats: int) -> dict[str, Any]:
+    """16 rooms on the GPU, both modes."""
+    if not torch.cuda.is_available():
+        return {"gpu": "none"}
+    room = furnished_room(3, "cuda", rooms=16)
+    steps = {mode: forward_backward(room, mode=mode) for mode in ("exact", "fast")}
+    times = medians(steps, repeats)
+    return {"gpu": torch.cuda.get_device_name()} | {
+        f"gpu_16_rooms_{mode}_fwd_bwd_s": seconds for mode, seconds in times.items()
+    }
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were taken on."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        names = [line for line in info.read_text().splitlines() if line.startswith("model name")]
+        model = names[0].split(":", 1)[1].strip() if names else model
+    return {
+        "cpu": model,
+        "cores": len(os.sched_getaffinity(0)),
+        "torch_threads": torch.get_num_threads(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--json", type=Path, help="write the figures to this file, too")
+    parser.add_argument("--repeats", type=int, default=15)
+    arguments = parser.parse_args()
+    figures: dict[str, Any] = {}
+
+    def note(**found: Any) -> None:
+        figures.update(found)
+        for name, value in found.items():
+            shown = f"{value:.4g}" if isinstance(value, float) else value
+            print(f"{name:32s} {shown}", flush=True)
+
+    note(machine=machine())
+    steps = {
+        f"{mode}{tag}": forward_backward(furnished_room(level), mode=mode)
+        for mode in ("exact", "fast")
+        for tag, level in (("", 3), ("_5120", 4))
+    }
+    times = medians(steps, arguments.repeats)
+    note(**{f"{name}_fwd_bwd_s": seconds for name, seconds in times.items()})
+    note(fast_ratio=times["exact"] / times["fast"])
+    for mode in ("exact", "fast"):
+        note(**{f"{mode}_5120_over_1280": times[f"{mode}_5120"] / times[mode]})
+    note(boxes_ratio=boxes_ratio()["ratio"])
+    for mode in ("exact", "fast"):
+        note(**{f"{mode}_alone_peak_extra_mib": peak_extra_mib(mode=mode, compositing="alone")})
+        note(**{f"{mode}_first_call_s": first_call_seconds(mode)})
+    reference = reference_seconds()
+    note(reference_fwd_bwd_s=reference, reference_ratio=reference / times["exact"])
+    note(**gpu(arguments.repeats))
+    note(**peers(arguments.repeats))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""Which silhouettes teach shapes best? The shape stage from one layout, at equal steps.
+
+    make demo                                            # once: makes the rooms and the layout
+    python benchmarks/silhouette_quality.py --run out/demo/run --epochs 10 --seed 0
+
+Every variant of renderer and compositing starts from the same layout checkpoint and sees the same
+batches. Afterwards all are judged alike: the decoded training rooms are drawn hard, and each
+object's visible mask is compared with what the camera saw (mask IoU, mean over objects and
+views), and its 3D box with the truth (mean over objects).
+"""
+
+import argparse
+import json
+import shutil
+import time
+from pathlib import Path
+
+import torch
+
+from sceneprior.config import load_config
+from sceneprior.data.datamodule import make_loader
+from sceneprior.data.dataset import ViewDataset
+from sceneprior.evaluation.layout_metrics import reconstruction_scores
+from sceneprior.geometry.cameras import boxes_of_points
+from sceneprior.losses.matching import match_objects
+from sceneprior.losses.shape import observed_ids
+from sceneprior.silhouettes import render_scene
+from sceneprior.stages.runs import TrainedPrior, load_run
+from sceneprior.stages.train import fit
+from sceneprior.tasks.judge import decoded_and_true
+
+VARIANTS = ("exact/layered", "exact/paper", "fast/layered", "fast/paper")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--run", type=Path, default=Path("out/demo/run"))
+    parser.add_argument("--out", type=Path, default=Path("out/silhouette_quality"))
+    parser.add_argument("--epochs", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--variants", nargs="+", default=VARIANTS)
+    parser.add_argument("--set", nargs="*", default=(), help="other settings, as for `fit`")
+    arguments = parser.parse_args()
+    rows = {}
+    for variant in arguments.variants:
+        mode, compositing = variant.split("/")
+        run = arguments.out / f"{mode}_{compositing}_{arguments.seed}"
+        shutil.rmtree(run, ignore_errors=True)
+        shutil.copytree(arguments.run / "layout", run / "layout")
+        settings = (
+            f"seed={arguments.seed}",
+            f"shape.epochs={arguments.epochs}",
+            f"shape.silhouettes={mode}",
+            f"shape.compositing={compositing}",
+            *arguments.set,
+        )
+        config = load_config(str(arguments.run / "config.yaml"), settings)
+        start = time.perf_counter()
+        fit(config, run, resume=False)
+        seconds = time.perf_counter() - start
+        trained = load_run(run)
+        truth = reconstruction_scores(decoded_and_true(trained, Path(config.data.shards)))
+        rows[variant] = {
+            "mask_iou": mask_iou(trained),
+            "box_iou_3d": truth["box_iou_3d"],
+            "class_accuracy": truth["class_accuracy"],
+            "seconds": seconds,
+        }
+        figures = "  ".join(f"{name} {value:.4f}" for name, value in rows[variant].items())
+        print(f"{variant:16s} {figures}", flush=True)
+    (arguments.out / f"figures_{arguments.seed}.json").write_text(json.dumps(rows, indent=2))
+
+
+@torch.no_grad()
+def mask_iou(trained: TrainedPrior) -> float:
+    """Mean IoU of visible hard masks over objects and views of all training rooms."""
+    data = trained.config.data
+    dataset = ViewDataset(
+        Path(data.shards), "train", views_per_room=8, mask_step=data.mask_step, seed=0
+    )
+    total = count = 0.0
+    for views in make_loader(dataset, 16, seed=0, workers=0):
+        scenes = trained.prior.decode(trained.prior.sphere(trained.logits[views.room_index]))
+        boxes = boxes_of_points(
+            scenes.vertices_m, views.world_to_camera, views.intrinsics, views.image_size
+        )
+        matches = match_objects(scenes, boxes, views)
+        ids = observed_ids(views)
+        height, width = ids.shape[-2:]
+        scale = torch.tensor([width / views.image_size[1], height / views.image_size[0], 1.0])
+        drawn = torch.arange(scenes.centers_m.shape[1]) < views.is_object.sum(-1, keepdim=True)
+        front = render_scene(
+            scenes.vertices_m,
+            trained.prior.shape.faces,
+            views.world_to_camera,
+            views.intrinsics * scale[:, None],
+            (height, width),
+            drawn=drawn,
+        ).front
+        room, view, item = (views.visible & matches.valid.unsqueeze(1)).nonzero(as_tuple=True)
+        mine = front[room, view] == matches.prediction[room, item][:, None, None]
+        seen = ids[room, view] == (item + 1)[:, None, None]
+        both, either = (mine & seen).sum(dim=(1, 2)), (mine | seen).sum(dim=(1, 2))
+        total += float((both / either.clamp(min=1)).sum())
+        count += len(room)
+    return total / count
+
+
+if __name__ == "__main__":
+    main()
