@@ -65,7 +65,7 @@ def test_a_disk_that_fills_up(tmp_path, monkeypatch, number, said, after):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_kernel_refuses_large_files(front, tmp_path, workers):
-    """A real limit in a real process: no file may grow beyond 60 kB, and shards do."""
+    """A real limit in a real process: no file may grow beyond 20 kB, and shards do."""
     three_houses(front)
     front.house("more", *(bedroom(f"Bedroom-{k}") for k in range(10)))
     out = tmp_path / "shards"
@@ -73,7 +73,7 @@ def test_the_kernel_refuses_large_files(front, tmp_path, workers):
         sys.executable, "-m", "sceneprior", "prep-front", "--front", front.front, "--out", out,
         "--future", front.future, "--workers", str(workers), "--renderer", "software",
     ]  # fmt: skip
-    limit = (60_000, 60_000)
+    limit = (20_000, 20_000)
     done = subprocess.run(
         command, capture_output=True, text=True, env=os.environ | {"NUMBA_CACHE_DIR": ""},
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit),
