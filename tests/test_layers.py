@@ -24,8 +24,8 @@ FOUNDATION = {name for name, row in ROWS.items() if row <= 1}
 
 OWNERS = {
     "h5py": ["sceneprior/shards.py"],
-    "pyrender": ["sceneprior/offscreen.py"],
-    "OpenGL": ["sceneprior/offscreen.py"],
+    "pyrender": ["sceneprior/offscreen/"],
+    "OpenGL": ["sceneprior/offscreen/"],
     "numba": ["sceneprior/silhouettes/"],
     "triton": ["sceneprior/silhouettes/"],
     "lightning": ["sceneprior/stages/"],

@@ -10,7 +10,7 @@ import pytest
 
 from sceneprior import offscreen
 from sceneprior.errors import InputError
-from sceneprior.offscreen import Orthographic, Pinhole, open_renderer
+from sceneprior.offscreen import Orthographic, Pinhole, gl, open_renderer
 from sceneprior.scene import Mesh
 
 INTRINSICS = np.array([[100.0, 0, 64], [0, 100, 48], [0, 0, 1]])
@@ -165,11 +165,11 @@ def test_shaded_pictures():
 
 def no_gl(monkeypatch):
     def missing():
-        raise offscreen._NoGLError("libEGL or libGL is not installed")
+        raise gl.NoGLError("libEGL or libGL is not installed")
 
-    monkeypatch.setattr(offscreen, "_probe_gl", missing)
-    monkeypatch.setattr(offscreen, "_pyrender", None)
-    monkeypatch.setattr(offscreen, "_failure", None)
+    monkeypatch.setattr(gl, "_probe_gl", missing)
+    monkeypatch.setattr(gl, "_pyrender", None)
+    monkeypatch.setattr(gl, "_failure", None)
     monkeypatch.delenv(offscreen.ENVIRONMENT_VARIABLE, raising=False)
     offscreen._notice.cache_clear()
 
@@ -191,12 +191,12 @@ def test_without_gl_pyrender_is_one_sentence_with_the_apt_line(monkeypatch):
 
 def test_a_context_that_cannot_be_made_is_no_traceback(monkeypatch):
     no_gl(monkeypatch)
-    monkeypatch.setattr(offscreen, "_probe_gl", lambda: "egl")
+    monkeypatch.setattr(gl, "_probe_gl", lambda: "egl")
 
     def broken():
         raise AttributeError("'NoneType' object has no attribute 'glGetError'")
 
-    monkeypatch.setattr(offscreen, "_PyrenderRenderer", broken)
+    monkeypatch.setattr(gl, "_PyrenderRenderer", broken)
     with pytest.raises(InputError, match="no GL context can be made"):
         open_renderer("pyrender")
 
