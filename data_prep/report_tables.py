@@ -30,7 +30,7 @@ def _outcome(report: dict[str, Any]) -> Table:
         table.add_row(f"filtered by {rule}", str(group["rooms"]))
     table.add_row("failed", str(report["statuses"].get("failed", 0)))
     if report["with_notes"]:
-        table.add_row("prepared without some pieces", str(report["with_notes"]))
+        table.add_row("prepared with notes", str(report["with_notes"]))
     return table
 
 

@@ -29,12 +29,13 @@ def write_whole(path: Path, data: bytes) -> None:
             # Without this a power cut may keep the new name and lose the bytes.
             os.fsync(file.fileno())
         temporary.replace(path)
-    except BaseException as error:
+    except OSError as error:
+        error.filename = str(path)
+        raise
+    finally:
+        # Gone already where all went well; whatever went wrong, nothing half-written stays.
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            error.filename = str(path)
-        raise
     _sync_folder(path.parent)
 
 

@@ -17,6 +17,8 @@ from sceneprior.files import write_whole
 FORMAT = "sceneprior-views"
 VERSION = 1
 INDEX_NAME = "index.json"
+PREPARE = "`sceneprior prep-front`, `prep-scannet` or `prep-posed`"
+"""What writes shards, for errors."""
 MODELS_FOLDER = "models"
 
 
@@ -208,7 +210,7 @@ class Shard:
     def __init__(self, path: Path):
         self.path = Path(path)
         if not self.path.is_file():
-            raise ShardError(f"No shard at {path}; `sceneprior prep-front` writes shards.")
+            raise ShardError(f"No shard at {path}; {PREPARE} writes shards.")
         try:
             self._file = h5py.File(self.path, "r")
             form, version = self._file.attrs.get("format"), self._file.attrs.get("version")
@@ -218,7 +220,7 @@ class Shard:
             self._file.close()
             raise ShardError(
                 f"{path} says format '{form}' version {version}, expected '{FORMAT}' version "
-                f"{VERSION}. Prepare the data again with this release's `sceneprior prep-front`."
+                f"{VERSION}. Prepare the data again with this release's {PREPARE}."
             )
         try:
             self.label_set = str(self._file.attrs["label_set"])
@@ -303,7 +305,7 @@ def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:
     where = f", room {room_id}" if room_id else ""
     return ShardError(
         f"{path}{where} cannot be read ({str(error).splitlines()[0]}): the file is damaged. "
-        f"Delete it and run the same `sceneprior prep-front` command again."
+        f"Delete it and run the same {PREPARE} command again."
     )
 
 
@@ -315,12 +317,12 @@ def list_shards(folder: Path, split: str) -> list[Path]:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ShardError(f"No folder of shards at {folder}; make one with `sceneprior prep-front`.")
+        raise ShardError(f"No folder of shards at {folder}; make one with {PREPARE}.")
     paths = sorted((folder / split).glob("*.h5"))
     if not paths:
         raise ShardError(
             f"The '{split}' split of {folder} holds no shards; check the split file given to "
-            "`sceneprior prep-front` and its report."
+            f"{PREPARE}, and its report."
         )
     return paths
 
@@ -341,7 +343,7 @@ def read_index(folder: Path) -> dict[str, Any]:
     except OSError:
         raise ShardError(
             f"{folder} has no {INDEX_NAME}; it is not a finished folder of shards. "
-            "Run `sceneprior prep-front` to its end."
+            f"Run {PREPARE} to its end."
         ) from None
     except ValueError as error:
         raise ShardError(f"{path} is not JSON ({error}); prepare the folder again.") from None

@@ -1,5 +1,6 @@
 """A zip of instance masks in, one frame's object ids out; nothing is unpacked to disk."""
 
+import contextlib
 import io
 import re
 import zipfile
@@ -43,13 +44,12 @@ class MaskArchive:
             raise InputError(
                 f"{self.path} cannot be opened as a zip ({error}); download it again."
             ) from None
-        try:
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.close)
             self._members = self._list()
             self.frames = tuple(sorted(self._members))
             self.image_size = self._size(self.frames[0])
-        except BaseException:
-            self.close()
-            raise
+            undo.pop_all()  # all went well: it stays open
 
     def __enter__(self) -> "MaskArchive":
         return self

@@ -1,5 +1,6 @@
 """A `.sens` recording in, its poses, lens and single colour frames out; the file stays on disk."""
 
+import contextlib
 import struct
 from array import array
 from pathlib import Path
@@ -56,12 +57,11 @@ class SensFile:
                 f"{self.path} cannot be opened ({error.strerror}); "
                 "a scan folder holds its recording as <scene>.sens."
             ) from None
-        try:
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.close)
             frames = self._read_header()
             self._read_index(frames)
-        except BaseException:
-            self.close()
-            raise
+            undo.pop_all()  # all went well: it stays open
 
     def __enter__(self) -> "SensFile":
         return self

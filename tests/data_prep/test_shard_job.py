@@ -21,7 +21,7 @@ FAILURES = {
     3: ("unreadable", "/nowhere/at/all cannot be read (No such file or directory)"),
     5: ("shapes", "box, room box_5: boxes has shape"),
     6: ("path", "its file '../evil' would lie outside the folder of shards"),
-    7: ("model path", "its file '/tmp/evil.ply' would lie outside the folder of shards"),
+    7: ("model path", "its file '/elsewhere/evil.ply' would lie outside the folder of shards"),
 }
 TROUBLE = {number: what for number, (what, _) in FAILURES.items()} | {8: "filtered"}
 

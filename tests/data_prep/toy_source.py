@@ -59,7 +59,7 @@ class ToySource:
             case "path":
                 return replace(made, files={"../evil": b""})
             case "model path":
-                return replace(made, models={"/tmp/evil": TRIANGLE})
+                return replace(made, models={"/elsewhere/evil": TRIANGLE})
         raise AssertionError
 
 
