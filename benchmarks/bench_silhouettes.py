@@ -99,7 +99,7 @@ def reference_seconds() -> float:
     room = furnished_room(3)
     part = room | {key: room[key][:, :1] for key in ("world_to_camera", "intrinsics", "vertices_m")}
     step = forward_backward(part, backend="reference")
-    return medians({"reference": step}, 3)["reference"] * OBJECTS * VIEWS
+    return medians({"reference": step}, 1)["reference"] * OBJECTS * VIEWS
 
 
 def first_call_seconds(mode: str) -> dict[str, float]:

@@ -1,25 +1,50 @@
 """The commands that prepare data; `sceneprior.cli` mounts them. Heavy imports wait inside."""
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from data_prep.homes.command import make_homes_command
+from data_prep.inspect_command import inspect_command
+
+if TYPE_CHECKING:
+    from data_prep.build import Job
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Mount prep-front, inspect and make-homes."""
+    """Mount the prep-* commands, inspect and make-homes."""
     app.command("make-homes")(make_homes_command)
     app.command("prep-front")(prep_front)
-    app.command("inspect")(inspect)
+    app.command("prep-scannet")(prep_scannet)
+    app.command("prep-posed")(prep_posed)
+    app.command("inspect")(inspect_command)
+
+
+OutOption = Annotated[Path, typer.Option(help="Folder for the shards.")]
+WorkersOption = Annotated[
+    int | None, typer.Option(min=1, help="Processes on this machine (default: all cores).")
+]
+SchedulerOption = Annotated[
+    str | None, typer.Option(help="Work on a Dask cluster instead: tcp://HOST:8786.")
+]
+OnlyOption = Annotated[
+    str | None, typer.Option(help="One house or room: HOUSE, HOUSE/ROOM or a room id.")
+]
+StrictOption = Annotated[bool, typer.Option("--strict", help="Stop at the first failed room.")]
+RetryOption = Annotated[
+    bool, typer.Option("--retry-failed", help="Try rooms again that failed in an earlier run.")
+]
 
 
 def prep_front(
     front: Annotated[Path, typer.Option(help="Folder of house JSONs (3D-FRONT).")],
     future: Annotated[Path, typer.Option(help="Folder of furniture models (3D-FUTURE-model).")],
-    out: Annotated[Path, typer.Option(help="Folder for the shards.")],
-    room_type: Annotated[str, typer.Option(help="bedroom or living.")] = "bedroom",
+    out: OutOption,
+    room_type: Annotated[
+        str, typer.Option(help="bedroom, living, dining, library or all.")
+    ] = "bedroom",
     splits: Annotated[
         Path | None, typer.Option(help="CSV of `room id,split`; without it, a seeded 9:1.")
     ] = None,
@@ -32,76 +57,158 @@ def prep_front(
         list[str] | None, typer.Option(help="Change a rule of the recipe: max_floor_m=8, or null.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
-    workers: Annotated[int | None, typer.Option(help="Processes (default: all cores).")] = None,
+    rgb: Annotated[
+        bool, typer.Option("--rgb", help="Also draw shaded pictures: OUT/rgb/ROOM/VIEW.png.")
+    ] = False,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
     renderer: Annotated[str, typer.Option(help="auto, pyrender or software.")] = "auto",
-    only: Annotated[
-        str | None, typer.Option(help="One house or room: HOUSE, HOUSE/ROOM or a room id.")
-    ] = None,
+    only: OnlyOption = None,
+    strict: StrictOption = False,
+    retry_failed: RetryOption = False,
 ) -> None:
-    """Turn houses in 3D-FRONT's format into view shards. Run again to go on after a stop."""
-    import os
+    """Turn houses in 3D-FRONT's format into view shards. Run again to go on after a stop.
 
-    from data_prep.build import FrontJob, build_shards
+    Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
+    """
+    from data_prep.build import Job
+    from data_prep.front.source import FrontSource
     from data_prep.recipe import load_recipe
 
     changes = list(rule or [])
     if views_per_m2 is not None:
         changes.append(f"views.per_m2={views_per_m2}")
-    job = FrontJob(
-        front=front,
-        future=future,
-        out=out,
-        recipe=load_recipe(f"front3d_{room_type}", tuple(changes)),
-        splits=splits,
-        seed=seed,
-        workers=workers or len(os.sched_getaffinity(0)),
-        renderer=renderer,
-        only=only,
-        val=val,
+    recipe = load_recipe(f"front3d_{room_type}", tuple(changes))
+    source = FrontSource(front, future, recipe, splits, seed, only, val, rgb)
+    run_job(
+        Job(
+            source,
+            out,
+            workers=workers or len(os.sched_getaffinity(0)),
+            scheduler=scheduler,
+            renderer=renderer,
+            strict=strict,
+            retry_failed=retry_failed,
+        )
     )
+
+
+def prep_scannet(
+    scans: Annotated[Path, typer.Option(help="ScanNet's folder of scans.")],
+    labels: Annotated[Path, typer.Option(help="scannetv2-labels.combined.tsv.")],
+    out: OutOption,
+    masks: Annotated[
+        str, typer.Option(help="filt (cleaned) or raw (the projected mesh).")
+    ] = "filt",
+    full_size: Annotated[
+        bool, typer.Option("--full-size", help="1296 x 968 rather than a quarter of it.")
+    ] = False,
+    frame_step: Annotated[int, typer.Option(help="Every so many frames is a candidate.")] = 15,
+    max_views: Annotated[int, typer.Option(help="Candidates are thinned to this many.")] = 100,
+    train_list: Annotated[Path | None, typer.Option(help="scannetv2_train.txt.")] = None,
+    val_list: Annotated[
+        Path | None,
+        typer.Option(help="scannetv2_val.txt: the test split. Without lists, a seeded 9:1."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the 9:1.")] = 0,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    only: Annotated[str | None, typer.Option(help="One scan, or the beginning of names.")] = None,
+    strict: StrictOption = False,
+    retry_failed: RetryOption = False,
+) -> None:
+    """Turn ScanNet's recordings into view shards, straight from .sens and the zips.
+
+    Exit status: 0, or 3 if scans failed (the others are prepared; report.csv says why).
+    """
+    from data_prep.build import Job
+    from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings
+    from data_prep.scannet.source import ScanNetSource
+
+    size = FULL_SIZE if full_size else QUARTER_SIZE
+    settings = ScanSettings(frame_step, max_views, masks, size)
+    source = ScanNetSource(scans, labels, settings, train_list, val_list, seed, only)
+    count = workers or len(os.sched_getaffinity(0))
+    run_job(Job(source, out, count, scheduler, strict=strict, retry_failed=retry_failed))
+
+
+def prep_posed(
+    rooms: Annotated[
+        Path, typer.Argument(help="A room's folder with transforms.json, or a folder of such.")
+    ],
+    out: OutOption,
+    label_set: Annotated[
+        str,
+        typer.Option(help="A file with a class a line, void,bed,chair or a known set's name."),
+    ],
+    up: Annotated[str, typer.Option(help="The poses' axis that points up: z or y.")] = "z",
+    floor_m: Annotated[
+        float | None, typer.Option(help="Height of the floor where a file gives no floor_m.")
+    ] = None,
+    camera_height_m: Annotated[
+        float, typer.Option(help="Without: the lowest camera stood this far above the floor.")
+    ] = 1.2,
+    metres_per_unit: Annotated[
+        float, typer.Option(help="Of the poses, where a file does not say.")
+    ] = 1.0,
+    max_side: Annotated[
+        int | None, typer.Option(help="Sample larger masks down to this (default: as they are).")
+    ] = None,
+    max_views: Annotated[int, typer.Option(help="Frames are thinned to this many.")] = 100,
+    val_share: Annotated[float, typer.Option(help="Share of rooms in the test split.")] = 0.1,
+    seed: Annotated[int, typer.Option(help="Of the split.")] = 0,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    only: Annotated[str | None, typer.Option(help="One room, or the beginning of names.")] = None,
+    strict: StrictOption = False,
+) -> None:
+    """Turn posed pictures with tracked instance masks into view shards (docs/posed_data.md).
+
+    Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
+    """
+    from data_prep.build import Job
+    from data_prep.posed.labels import read_label_set
+    from data_prep.posed.source import PosedSource
+    from data_prep.posed.views import PosedSettings
+
+    settings = PosedSettings(up, floor_m, camera_height_m, metres_per_unit, max_side, max_views)
+    classes = read_label_set(label_set)
+    source = PosedSource(rooms, classes, settings, val_share, seed, only)
+    for sentence in source.assumptions():
+        typer.echo(f"Note: {sentence}", err=True)
+    count = workers or len(os.sched_getaffinity(0))
+    run_job(Job(source, out, count, scheduler, strict=strict))
+    typer.echo(f"To train on them: sceneprior fit --set 'label_set={classes}' ...")
+
+
+def run_job(job: "Job") -> None:
+    """Carry out a `prep-*` job, print its report, and exit as every such command does.
+
+    Raises:
+        InputError: see `build_shards`; `main` prints it and exits with 2.
+        typer.Exit: 3 if rooms failed, 130 after Ctrl-C.
+    """
+    from rich.console import Console
+
+    from data_prep.build import build_shards
+    from data_prep.report_tables import report_tables
+    from data_prep.shard_job import RoomFailedError
+
     try:
         summary = build_shards(job)
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to go on.", err=True)
         raise typer.Exit(130) from None
-    made = f"{summary.shards_made} shards made, {summary.shards_kept} already there"
-    typer.echo(f"{out}: {summary} ({made}; {summary.renderer})")
-
-
-def inspect(
-    shards: Annotated[Path, typer.Argument(help="Folder of shards.")],
-    png: Annotated[Path | None, typer.Option(help="Also draw a sheet of views here.")] = None,
-    room: Annotated[str | None, typer.Option(help="Draw views of this room only.")] = None,
-    pictures: Annotated[int, typer.Option(help="Views on the sheet.")] = 24,
-    boxes_3d: Annotated[
-        bool, typer.Option("--boxes-3d", help="Draw the ground truth's 3D boxes, too.")
-    ] = False,
-) -> None:
-    """Say what a folder of shards holds, and draw some of it."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from data_prep.inspection import contact_sheet, count_shards
-
-    counts = count_shards(shards)
-    totals = Table("split", "rooms", "views", "objects", "objects a room", "objects a view")
-    for split, row in counts.items():
-        totals.add_row(
-            split,
-            str(row["rooms"]),
-            str(row["views"]),
-            str(row["objects"]),
-            f"{row['objects'] / max(row['rooms'], 1):.2f}",
-            f"{row['seen']:.2f}",
-        )
-    histogram = Table("class", *counts)
-    names = sorted({name for row in counts.values() for name in row["classes"]})
-    for name in names:
-        histogram.add_row(name, *(str(row["classes"].get(name, 0)) for row in counts.values()))
+    except RoomFailedError as error:
+        typer.echo(f"Error: {error}", err=True)
+        raise typer.Exit(3) from None
     console = Console()
-    console.print(totals)
-    console.print(histogram)
-    if png is not None:
-        png.parent.mkdir(parents=True, exist_ok=True)
-        contact_sheet(shards, room, pictures, boxes_3d).save(png)
-        typer.echo(f"Drew {png}.")
+    for table in report_tables(summary.report):
+        console.print(table)
+    made = f"{summary.shards_made} shards made, {summary.shards_kept} already there"
+    if summary.shards_open:
+        made += f", {summary.shards_open} still to make: run without --only"
+    drawn = f"; {summary.renderer}" if summary.renderer else ""
+    typer.echo(f"{job.out}: {summary} ({made}{drawn})")
+    if summary.statuses.get("failed"):
+        raise typer.Exit(3)

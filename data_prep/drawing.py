@@ -7,7 +7,7 @@ import numpy as np
 
 from data_prep.observations import Observations, observe, pixel_counts
 from data_prep.recipe import Recipe, ViewRules
-from data_prep.rooms import Room
+from data_prep.rooms import Furniture, Room
 from data_prep.viewpoints import Viewpoints, intrinsics, sees_enough
 from sceneprior.classes import label_set
 from sceneprior.offscreen import Renderer

@@ -2,9 +2,10 @@
 
 import csv
 import functools
+import math
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -48,6 +49,31 @@ class ViewRules:
     tries: int = 8
     """After so many tries the best view drawn stays."""
 
+    def __post_init__(self) -> None:
+        positive = ("per_m2", "at_least", "per_house_at_most", "tries")
+        for name in positive:
+            if getattr(self, name) <= 0:
+                raise InputError(f"views.{name} is {getattr(self, name)}; it must be above 0.")
+        if min(self.image_size) < 8 or max(self.image_size) > 8192:
+            raise InputError(f"views.image_size is {self.image_size}; sides are 8 to 8192 pixels.")
+        if not 1 <= self.fov_deg <= 170:
+            raise InputError(f"views.fov_deg is {self.fov_deg}; it lies between 1 and 170 degrees.")
+
+
+@dataclass(frozen=True)
+class Expected:
+    """The counts of a finished job on the real data set, where somebody knows them."""
+
+    of: str = ""
+    """Which data these counts are of, and who counted: "3D-FRONT, ATISS's index"."""
+    rooms: int | None = None
+    """Prepared rooms."""
+    train: int | None = None
+    test: int | None = None
+    """Prepared rooms of the split."""
+    views: int | None = None
+    objects: int | None = None
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -55,10 +81,10 @@ class Recipe:
 
     name: str
     label_set: str
-    class_column: str
-    """Column of front3d_categories.csv that holds the class of a category."""
-    room_types: tuple[str, ...]
-    """A room is of this recipe if its type contains one of these, whatever the case."""
+    class_columns: tuple[str, ...]
+    """Columns of front3d_categories.csv: the first of them that is not void counts."""
+    room_types: tuple[str, ...] | None
+    """A room is of this recipe if its type contains one of these, whatever the case; null: all."""
     min_objects: int | None = 2
     """Objects of the label set; void does not count."""
     max_objects: int | None = None
@@ -69,11 +95,22 @@ class Recipe:
     """One of these must be there."""
     scale_range: tuple[float, float] | None = (1e-5, 5.0)
     """A room with a piece scaled beyond this (absolute value, each axis) is left out."""
+    allow_mirrored: bool = True
+    """False leaves out a room with a piece of negative scale."""
     views: ViewRules = field(default_factory=ViewRules)
+    expected: Expected | None = None
+    """What the report compares with; it decides nothing."""
 
     def of_type(self, room_type: str) -> bool:
         """Whether a room of this type is what the recipe is about."""
+        if self.room_types is None:
+            return True
         return any(word.lower() in room_type.lower() for word in self.room_types)
+
+    @property
+    def classes(self) -> dict[str, str]:
+        """3D-FUTURE's category -> class; what is not listed is void."""
+        return category_classes(self.class_columns)
 
 
 def load_recipe(name: str, changes: tuple[str, ...] = ()) -> Recipe:
@@ -93,30 +130,80 @@ def load_recipe(name: str, changes: tuple[str, ...] = ()) -> Recipe:
         if not equals or section not in ("", "views"):
             raise InputError(f"'{change}' is not a rule; write it as max_floor_m=8.")
         target = data.setdefault("views", {}) if section else data
-        target[rule] = yaml.safe_load(value)
-    views = _build(ViewRules, data.pop("views", {}), path)
-    recipe = replace(_build(Recipe, {"name": name, **data}, path), views=views)
-    label_set(recipe.label_set)
+        try:
+            target[rule] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise InputError(f"The value of '{change}' is no YAML; quote it, or mend it.") from None
+    views = _build(ViewRules, data.pop("views", None) or {}, path)
+    counts = data.pop("expected", None)
+    expected = None if counts is None else _build(Expected, counts, path)
+    recipe = replace(_build(Recipe, {"name": name, **data}, path), views=views, expected=expected)
+    _check_classes(recipe)
     return recipe
 
 
 def _build(kind: type, values: dict[str, Any], path: Path) -> Any:
+    hints = get_type_hints(kind)
     known = [item.name for item in fields(kind)]
     for key in values:
         if key not in known:
             raise InputError(f"{path.name} has no rule '{key}'; there are {', '.join(known)}.")
     tidy = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
+    for key, value in tidy.items():
+        if not _fits(value, hints[key]):
+            wanted = str(getattr(hints[key], "__name__", hints[key])).replace("None", "null")
+            raise InputError(f"{path.name}: {key} is {values[key]!r}, but takes {wanted}.")
     try:
         return kind(**tidy)
     except TypeError as error:
         raise InputError(f"{path.name}: {error}.") from None
 
 
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value out of YAML is of the type that a rule has."""
+    parts = get_args(hint)
+    if get_origin(hint) is tuple:
+        if parts[-1] is Ellipsis:
+            parts = parts[:1] * len(value) if isinstance(value, tuple) else ()
+        right = isinstance(value, tuple) and len(value) == len(parts)
+        return right and all(_fits(item, part) for item, part in zip(value, parts, strict=True))
+    if parts:  # a union
+        return any(_fits(value, part) for part in parts)
+    if isinstance(value, bool) or hint is bool:
+        return isinstance(value, bool) and hint is bool
+    if hint is float:
+        return isinstance(value, int | float) and math.isfinite(value)
+    return isinstance(value, hint)
+
+
+def _check_classes(recipe: Recipe) -> None:
+    names = label_set(recipe.label_set)
+    for name in {*recipe.required_classes, *recipe.classes.values()}:
+        if name not in names:
+            raise InputError(
+                f"{recipe.name}: the label set {recipe.label_set} has no class '{name}'; "
+                f"it has {', '.join(names)}."
+            )
+
+
 @functools.cache
-def category_classes(column: str) -> dict[str, str]:
-    """3D-FUTURE's category strings -> class names, from recipes/front3d_categories.csv."""
+def category_classes(columns: tuple[str, ...]) -> dict[str, str]:
+    """3D-FUTURE's category strings -> class names, from recipes/front3d_categories.csv.
+
+    Args:
+        columns: `bedroom_class`, `living_room_class`: the first that is not void decides.
+
+    Raises:
+        InputError: there is no such column.
+    """
     with (FOLDER / "front3d_categories.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    if column not in rows[0]:
-        raise InputError(f"front3d_categories.csv has no column '{column}'.")
-    return {row["model_info_category"]: row[column] for row in rows}
+    for column in columns:
+        if column not in rows[0]:
+            raise InputError(f"front3d_categories.csv has no column '{column}'.")
+    return {
+        row["model_info_category"]: next(
+            (row[column] for column in columns if row[column] != "void"), "void"
+        )
+        for row in rows
+    }

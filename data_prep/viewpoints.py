@@ -11,13 +11,15 @@ from data_prep.rooms import Room
 from sceneprior.offscreen import Pinhole
 
 _PLACES = 200  # random places tried before a rule about the place is relaxed
+_DARTS = 10_000  # random points tried before one is taken that is known to lie inside
 
 
 def view_counts(floor_areas_m2: Sequence[float], rules: ViewRules) -> list[int]:
     """Views of each room of one house: in proportion to its floor, within the house's share.
 
-    A house whose rooms would get more than `per_house_at_most` shares that number by area; no room
-    gets fewer than `at_least`.
+    A house whose rooms would get more than `per_house_at_most` shares that number by area. No room
+    gets fewer than `at_least`, unless the house has so many rooms that an equal share is less; no
+    room gets none.
 
     Example:
 
@@ -26,7 +28,16 @@ def view_counts(floor_areas_m2: Sequence[float], rules: ViewRules) -> list[int]:
     """
     wanted = [rules.per_m2 * area for area in floor_areas_m2]
     share = min(1.0, rules.per_house_at_most / max(sum(wanted), 1e-9))
-    return [max(rules.at_least, round(views * share)) for views in wanted]
+    limit = max(rules.per_house_at_most, len(wanted))
+    least = min(rules.at_least, limit // max(len(wanted), 1))
+    counts = [max(least, round(views * share)) for views in wanted]
+    while sum(counts) > limit:  # rounding up, and small rooms that got the least
+        surplus = [
+            (count - views * share if count > least else -math.inf)
+            for count, views in zip(counts, wanted, strict=True)
+        ]
+        counts[surplus.index(max(surplus))] -= 1
+    return counts
 
 
 def intrinsics(rules: ViewRules) -> np.ndarray:
@@ -120,10 +131,13 @@ class Viewpoints:
 
     def _place(self) -> np.ndarray:
         x1, z1, x2, z2 = self._area.bounds
-        while True:
+        for _ in range(_DARTS):
             x, z = self._rng.uniform((x1, z1), (x2, z2))
             if shapely.contains_xy(self._area, x, z):
                 return np.array([x, self._rng.uniform(*self._rules.eye_height_m), z])
+        # Slivers of floor, far apart: from now on every camera stands at one place that is inside.
+        self._area = self._area.representative_point().buffer(1e-3)
+        return self._place()
 
     def _pitch(self, elevation_rad: float) -> float:
         """A slight look down, raised as far as it takes to keep a lamp on the ceiling in view."""

@@ -17,6 +17,9 @@ from sceneprior.errors import InputError
 
 Run = Callable[..., Iterator[Any]]
 
+# Spawned, never forked: a GL context does not survive a fork.
+_START_METHOD = "spawn"
+
 
 @contextlib.contextmanager
 def pool(workers: int) -> Iterator[Run]:
@@ -32,7 +35,7 @@ def pool(workers: int) -> Iterator[Run]:
         def in_process(
             function: Callable[..., Any], arguments: list[Any], title: str | None
         ) -> Iterator[Any]:
-            with _progress(title, len(arguments)) as advance:
+            with progress(title, len(arguments)) as advance:
                 for item in arguments:
                     result = function(*item)
                     advance()
@@ -40,15 +43,14 @@ def pool(workers: int) -> Iterator[Run]:
 
         yield in_process
         return
-    # Spawned, never forked: a GL context does not survive a fork.
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context(_START_METHOD)
     stop = context.Event()
     executor = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(stop,))
 
     def in_pool(
         function: Callable[..., Any], arguments: list[Any], title: str | None
     ) -> Iterator[Any]:
-        with _progress(title, len(arguments)) as advance:
+        with progress(title, len(arguments)) as advance:
             # Ctrl-C is for this process to answer; a worker is born with the signal blocked.
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             try:
@@ -98,7 +100,8 @@ def _start_worker(stop: Event) -> None:
 
 
 @contextlib.contextmanager
-def _progress(title: str | None, total: int) -> Iterator[Callable[[], None]]:
+def progress(title: str | None, total: int) -> Iterator[Callable[[], None]]:
+    """A bar on stderr; gives a function that moves it on by one. Without a title there is none."""
     if title is None or not total:
         yield lambda: None
         return

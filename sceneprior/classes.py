@@ -1,6 +1,7 @@
 """Label sets: the class names a prior distinguishes, in the paper's order, and their colours."""
 
 import colorsys
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -24,20 +25,75 @@ LABEL_SETS: dict[str, tuple[str, ...]] = {
     ),
 }  # fmt: skip
 """Supplement A of the paper; `refridgerator` is spelt as ScanNet spells it."""
+# Room types the paper does not have, under names of their own: a prior says what it was trained on.
+LABEL_SETS |= {
+    "front3d_dining": LABEL_SETS["front3d_living"],
+    "front3d_library": LABEL_SETS["front3d_living"],
+    "front3d_all": LABEL_SETS["front3d_bedroom"],  # it holds every name of the living rooms' list
+}
 
 VOID = 0
 """Index of `void` in every label set: furniture outside the list."""
 
 
+_OWN = "void,"
+_LONGEST_NAME = 60
+
+
 def label_set(name: str) -> tuple[str, ...]:
     """The class names of a label set, `void` first.
 
+    A list of one's own needs no entry in `LABEL_SETS`: its name is the list itself, so it goes
+    wherever names go (shards, configs, checkpoints, scene JSONs, workers) and is known there.
+
+        >>> label_set("void,bed,night stand")
+        ('void', 'bed', 'night stand')
+
     Raises:
-        InputError: no label set has this name.
+        InputError: no label set has this name, or the list is not one.
     """
+    if name.startswith(_OWN):
+        return own_label_set(name.split(",")[1:])
     if name not in LABEL_SETS:
-        raise InputError(f"No label set is called '{name}'; there are {', '.join(LABEL_SETS)}.")
+        raise InputError(
+            f"No label set is called '{name}'; there are {', '.join(LABEL_SETS)}, "
+            "or write your own as void,bed,chair."
+        )
     return LABEL_SETS[name]
+
+
+def own_label_set(names: Sequence[str]) -> tuple[str, ...]:
+    """Check a list of class names of one's own, given without `void`, and put `void` first.
+
+    Raises:
+        InputError: a name is empty, too long, repeated, or holds a comma or odd characters.
+    """
+    classes = ("void", *names)
+    for name in classes:
+        if name != name.strip() or not 0 < len(name) <= _LONGEST_NAME or not name.isprintable():
+            raise InputError(
+                f"'{name[:_LONGEST_NAME]}' is no class name: 1 to {_LONGEST_NAME} printable "
+                "characters, no space at either end."
+            )
+        if "," in name:
+            raise InputError(f"The class name '{name}' holds a comma, which parts class names.")
+        if classes.count(name) > 1:
+            raise InputError(f"The class '{name}' is twice in the label set; once is enough.")
+    if len(classes) < 2:
+        raise InputError("A label set needs a class beside void.")
+    return classes
+
+
+def label_set_name(names: Sequence[str]) -> str:
+    """The name of a label set of one's own: the list itself, as `label_set` reads it.
+
+    Args:
+        names: Class names, without `void`.
+
+    Raises:
+        InputError: see `own_label_set`.
+    """
+    return ",".join(own_label_set(names))
 
 
 def class_colors(count: int) -> np.ndarray:

@@ -9,8 +9,8 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from sceneprior.classes import LABEL_SETS
-from sceneprior.errors import ConfigError
+from sceneprior.classes import label_set
+from sceneprior.errors import ConfigError, InputError
 
 
 class _Loader(yaml.SafeLoader):
@@ -210,6 +210,7 @@ class RunConfig(_Section):
     """Everything a run is; saved with it as `config.yaml`."""
 
     label_set: str
+    """A name in `sceneprior/classes.py`, or a list of one's own: `void,bed,chair`."""
     seed: int = Field(0, ge=0)
     stages: Literal["two", "one"] = "two"
     """`two`: layout, then layout and shape together (paper); `one`: the second from scratch, so
@@ -224,8 +225,10 @@ class RunConfig(_Section):
 
     @model_validator(mode="after")
     def _known_label_set(self) -> "RunConfig":
-        if self.label_set not in LABEL_SETS:
-            raise ValueError(f"label_set '{self.label_set}' is none of {', '.join(LABEL_SETS)}")
+        try:
+            label_set(self.label_set)
+        except InputError as error:
+            raise ValueError(f"label_set: {str(error).removesuffix('.')}") from None
         return self
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from tiny_runs import write_tiny_config
 
-from sceneprior.classes import label_set
+from sceneprior.classes import LABEL_SETS, label_set
 from sceneprior.config import dump_config, find_config, load_config
 from sceneprior.errors import ConfigError, InputError
 
@@ -173,7 +173,10 @@ def test_a_typo_names_the_key_the_file_and_the_nearest_key(config, old, new, key
         ("  heads: 2", "  heads: 3", "'model': width 16 is not a multiple of heads 3."),
         ("  epochs: 6\n", "", "'layout.epochs' is missing and has no default; add it."),
         ("label_set: front3d_bedroom", "label_set: attic",
-         "label_set 'attic' is none of front3d_bedroom, front3d_living, scannet."),
+         f"label_set: No label set is called 'attic'; there are {', '.join(LABEL_SETS)}, or write "
+         "your own as void,bed,chair."),
+        ("label_set: front3d_bedroom", "label_set: 'void,bed,bed'",
+         "label_set: The class 'bed' is twice in the label set"),
         ("loss: {}", "loss: 3", "'loss': input should be a valid dictionary or instance of"),
     ],
 )  # fmt: skip

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 FILES = sorted(path for name in ("sceneprior", "data_prep") for path in (ROOT / name).rglob("*.py"))
 
 ROWS = {
-    "geometry": 0, "silhouettes": 0, "classes": 0, "errors": 0, "config": 0,
+    "geometry": 0, "silhouettes": 0, "classes": 0, "errors": 0, "files": 0, "config": 0,
     "scene": 1, "batches": 1, "offscreen": 1, "shards": 1,
     "data": 2, "models": 2, "losses": 2,
     "data_prep": 3, "stages": 3,
@@ -24,8 +24,8 @@ FOUNDATION = {name for name, row in ROWS.items() if row <= 1}
 
 OWNERS = {
     "h5py": ["sceneprior/shards.py"],
-    "pyrender": ["sceneprior/offscreen.py"],
-    "OpenGL": ["sceneprior/offscreen.py"],
+    "pyrender": ["sceneprior/offscreen/"],
+    "OpenGL": ["sceneprior/offscreen/"],
     "numba": ["sceneprior/silhouettes/"],
     "triton": ["sceneprior/silhouettes/"],
     "lightning": ["sceneprior/stages/"],
@@ -34,12 +34,14 @@ OWNERS = {
     "pydantic": ["sceneprior/config.py"],
     "typer": [
         "sceneprior/cli.py", "sceneprior/tasks/demo.py", "data_prep/cli.py",
-        "data_prep/homes/command.py",
+        "data_prep/homes/command.py", "data_prep/inspect_command.py",
     ],
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
     "scipy.optimize": ["sceneprior/losses/matching.py", "sceneprior/evaluation/"],
     "cv2": ["data_prep/"],
+    "distributed": ["data_prep/cluster.py"],
+    "dask": ["data_prep/cluster.py"],
 }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from sceneprior import offscreen
 from sceneprior.errors import InputError
-from sceneprior.offscreen import Orthographic, Pinhole, open_renderer
+from sceneprior.offscreen import Orthographic, Pinhole, gl, open_renderer
 from sceneprior.scene import Mesh
 
 INTRINSICS = np.array([[100.0, 0, 64], [0, 100, 48], [0, 0, 1]])
@@ -165,11 +165,11 @@ def test_shaded_pictures():
 
 def no_gl(monkeypatch):
     def missing():
-        raise offscreen._NoGLError("libEGL or libGL is not installed")
+        raise gl.NoGLError("libEGL or libGL is not installed")
 
-    monkeypatch.setattr(offscreen, "_probe_gl", missing)
-    monkeypatch.setattr(offscreen, "_pyrender", None)
-    monkeypatch.setattr(offscreen, "_failure", None)
+    monkeypatch.setattr(gl, "_probe_gl", missing)
+    monkeypatch.setattr(gl, "_pyrender", None)
+    monkeypatch.setattr(gl, "_failure", None)
     monkeypatch.delenv(offscreen.ENVIRONMENT_VARIABLE, raising=False)
     offscreen._notice.cache_clear()
 
@@ -191,12 +191,12 @@ def test_without_gl_pyrender_is_one_sentence_with_the_apt_line(monkeypatch):
 
 def test_a_context_that_cannot_be_made_is_no_traceback(monkeypatch):
     no_gl(monkeypatch)
-    monkeypatch.setattr(offscreen, "_probe_gl", lambda: "egl")
+    monkeypatch.setattr(gl, "_probe_gl", lambda: "egl")
 
     def broken():
         raise AttributeError("'NoneType' object has no attribute 'glGetError'")
 
-    monkeypatch.setattr(offscreen, "_PyrenderRenderer", broken)
+    monkeypatch.setattr(gl, "_PyrenderRenderer", broken)
     with pytest.raises(InputError, match="no GL context can be made"):
         open_renderer("pyrender")
 
@@ -230,6 +230,18 @@ def test_one_pyrender_a_process_and_none_after_a_fork():
         "raise SystemExit(os.waitstatus_to_exitcode(os.wait()[1]))\n"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_who_draws_nothing_does_not_pay_for_numba():
+    code = (
+        "import sys, data_prep.build, sceneprior.offscreen as o\n"
+        "o.open_renderer('software')\n"
+        "print('numba' in sys.modules)"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=os.environ
+    )
+    assert answer.stdout.strip() == "False"
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")

@@ -14,6 +14,7 @@ from sceneprior.shards import (
     iterate_rooms,
     list_shards,
     read_index,
+    room_checksum,
     write_shard,
 )
 
@@ -162,3 +163,39 @@ def test_folders(tmp_path):
     (tmp_path / "index.json").write_text('{"a"')
     with pytest.raises(ShardError, match="is not JSON"):
         read_index(tmp_path)
+
+
+def test_a_checksum_covers_everything_and_survives_the_file(tmp_path):
+    room, truth = make_room(), make_truth()
+    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, truth), (make_room("bare"), None)])
+    with Shard(tmp_path / "a.h5") as shard:
+        assert shard.has_ground_truth("house_A") and not shard.has_ground_truth("bare")
+        stored = shard.read_checksum("house_A")
+        read = shard.read_room("house_A", images=True), shard.read_ground_truth("house_A")
+        assert stored == room_checksum(*read) == room_checksum(room, truth)
+        bare = shard.read_room("bare", images=True)
+        assert shard.read_checksum("bare") == room_checksum(bare, None) != stored
+    for of, pair in ((room, 0), (truth, 1)):
+        for item in fields(of):
+            value = getattr(of, item.name)
+            if isinstance(value, np.ndarray):
+                other = value.copy()
+                other.flat[-1] = other.flat[-1] == 0
+            else:
+                other = {"room_id": "b", "image_size": (16, 12), "height_m": 3.0}.get(
+                    item.name, ("a", "b", "c")
+                )
+            both = [room, truth]
+            both[pair] = replace(of, **{item.name: other})
+            assert room_checksum(*both) != stored, item.name
+
+
+def test_shards_of_before_have_no_checksum(tmp_path):
+    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(make_room(), None)])
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        del file["rooms/house_A"].attrs["sha256"]
+    with Shard(tmp_path / "a.h5") as shard:
+        assert shard.read_checksum("house_A") is None
+        for read in (shard.read_checksum, shard.has_ground_truth):
+            with pytest.raises(ShardError, match="room nowhere cannot be read"):
+                read("nowhere")

@@ -56,7 +56,12 @@ def _as_it_is(batch: Any) -> SceneViews:
 def make_loader(
     dataset: ViewDataset, batch_size: int, seed: int, workers: int, rank: int = 0, world: int = 1
 ) -> DataLoader:
-    """A loader whose batches are whole `SceneViews`."""
+    """A loader whose batches are whole `SceneViews`.
+
+    `workers` read masks ahead. Without masks there is nothing to read: boxes and cameras are in
+    memory, on the GPU perhaps, and no worker process stands between them and the step.
+    """
+    workers = 0 if dataset.masks is None else workers
     return DataLoader(
         dataset,
         batch_sampler=DrawSampler(len(dataset), batch_size, seed, rank, world),

@@ -7,6 +7,8 @@ import torch
 from torch.utils.data import Dataset
 
 from sceneprior.batches import SceneViews
+from sceneprior.data.flat_views import FlatViews
+from sceneprior.data.masks import MaskStore
 from sceneprior.errors import ShardError
 from sceneprior.shards import RoomViews, Shard, list_shards
 
@@ -16,6 +18,9 @@ BLANK = -1
 
 class ViewDataset(Dataset):
     """Rooms of a split with their views; images are read only where masks are wanted.
+
+    Boxes and cameras of the whole split are in memory, flat: tens of MB for 100,000 views. `to`
+    moves them to a GPU, and batches are made there. Masks are read view by view.
 
     Args:
         folder: Shard folder.
@@ -44,14 +49,12 @@ class ViewDataset(Dataset):
     ):
         self.views_per_room = views_per_room
         self.rotations = rotations
-        self.mask_step = mask_step
         self.seed = seed
-        self.rooms: list[RoomViews] = []
-        self._paths: list[Path] = []
-        self._images: dict[int, np.ndarray] = {}
         self.label_set = ""
+        rooms: list[RoomViews] = []
+        places: list[tuple[Path, str]] = []
         for path in list_shards(folder, split):
-            if limit is not None and len(self.rooms) >= limit:
+            if limit is not None and len(rooms) >= limit:
                 break
             with Shard(path) as shard:
                 if self.label_set and shard.label_set != self.label_set:
@@ -60,72 +63,71 @@ class ViewDataset(Dataset):
                         f"'{self.label_set}'; keep one label set a folder."
                     )
                 self.label_set = shard.label_set
-                left = None if limit is None else limit - len(self.rooms)
+                left = None if limit is None else limit - len(rooms)
                 for room_id in shard.room_ids[:left]:
-                    self.rooms.append(shard.read_room(room_id))
-                    self._paths.append(path)
-        if not self.rooms:
+                    rooms.append(shard.read_room(room_id))
+                    places.append((path, room_id))
+        if not rooms:
             raise ShardError(f"The shards of {folder}/{split} hold no rooms; prepare them again.")
-        self._allowed = [self._choose(index, view_fraction) for index in range(len(self.rooms))]
-        self.max_objects = max(len(room.object_class) for room in self.rooms)
-        self._turns = [_turn_about_up(quarter) for quarter in range(4)]
+        self.flat = FlatViews.of(rooms)
+        self.masks = None if mask_step is None else MaskStore(places, mask_step)
+        self._plain_ids = tuple(room.room_id for room in rooms)
+        self._image_sizes = tuple(room.image_size for room in rooms)
+        self._object_counts = np.array([len(room.object_class) for room in rooms])
+        self._allowed = [
+            self._choose(index, len(room.visible), view_fraction)
+            for index, room in enumerate(rooms)
+        ]
 
-    def _choose(self, index: int, fraction: float) -> np.ndarray:
-        count = len(self.rooms[index].visible)
+    def _choose(self, index: int, count: int, fraction: float) -> np.ndarray:
         keep = max(1, round(fraction * count))
         order = np.random.default_rng([self.seed, index]).permutation(count)
         return np.sort(order[:keep])
 
     def __len__(self) -> int:
-        return len(self.rooms) * self.rotations
+        return len(self._plain_ids) * self.rotations
+
+    @property
+    def max_objects(self) -> int:
+        """Tracked objects of the fullest room."""
+        return int(self._object_counts.max())
 
     @property
     def room_ids(self) -> tuple[str, ...]:
         """One id a row: the room's, with `@90` and so on for its turned copies."""
         turns = ("", "@90", "@180", "@270")[: self.rotations]
-        return tuple(room.room_id + turn for room in self.rooms for turn in turns)
+        return tuple(room_id + turn for room_id in self._plain_ids for turn in turns)
+
+    def to(self, device: torch.device | str) -> "ViewDataset":
+        """Move boxes and cameras to `device`, where batches are then made."""
+        self.flat = self.flat.to(device)
+        return self
 
     def __getitems__(self, draws: list[tuple[int, int]]) -> SceneViews:
-        """A batch of rows; each draw is (row, epoch), which together decide its views."""
-        rows = [row for row, _ in draws]
-        rooms = [self.rooms[row // self.rotations] for row in rows]
-        chosen = [self._draw(row, epoch) for row, epoch in draws]
-        objects = max(len(room.object_class) for room in rooms)
-        shape = (len(rows), self.views_per_room)
-        classes = np.zeros((len(rows), objects), dtype=np.int64)
-        real = np.zeros((len(rows), objects), dtype=bool)
-        boxes = np.zeros((*shape, objects, 4), dtype=np.float32)
-        visible = np.zeros((*shape, objects), dtype=bool)
-        clear = np.zeros((*shape, objects, 4), dtype=bool)
-        poses = np.empty((*shape, 4, 4), dtype=np.float32)
-        lenses = np.empty((*shape, 3, 3), dtype=np.float32)
-        for slot, (row, room, views) in enumerate(zip(rows, rooms, chosen, strict=True)):
-            count = len(room.object_class) if draws[slot][1] != BLANK else 0
-            classes[slot, :count] = room.object_class[:count]
-            real[slot, :count] = True
-            boxes[slot, :, :count] = room.boxes[views, :count]
-            visible[slot, :, :count] = room.visible[views, :count]
-            clear[slot, :, :count] = room.sides_clear[views, :count]
-            # The room turns by +a, so a camera sees the turned room as it saw the plain one.
-            poses[slot] = room.world_to_camera[views] @ self._turns[row % self.rotations].T
-            lenses[slot] = room.intrinsics[views]
+        """A batch of rows; each draw is (row, epoch), which together decide its views.
+
+        The views of an epoch `BLANK` show nothing of a room in which there is nothing.
+        """
+        rows = np.array([row for row, _ in draws])
+        rooms, quarters = np.divmod(rows, self.rotations)
+        views = np.stack([self._draw(row, epoch) for row, epoch in draws])
+        device = self.flat.device
         ids = None
-        if self.mask_step is not None:
-            ids = torch.from_numpy(
-                np.stack([self._ids(row)[v] for row, v in zip(rows, chosen, strict=True)])
-            )
+        if self.masks is not None:
+            images = [self.masks.read(int(r), v) for r, v in zip(rooms, views, strict=True)]
+            ids = torch.from_numpy(np.stack(images)).to(device)
         return SceneViews(
-            room_index=torch.tensor(rows),
-            object_class=torch.from_numpy(classes),
-            is_object=torch.from_numpy(real),
-            world_to_camera=torch.from_numpy(poses),
-            intrinsics=torch.from_numpy(lenses),
-            boxes=torch.from_numpy(boxes),
-            visible=torch.from_numpy(visible),
-            sides_clear=torch.from_numpy(clear),
-            image_size=rooms[0].image_size,
+            room_index=torch.from_numpy(rows).to(device),
+            **self.flat.gather(
+                torch.from_numpy(rooms).to(device),
+                torch.from_numpy(views).to(device),
+                torch.from_numpy(quarters).to(device),
+                int(self._object_counts[rooms].max()),
+                torch.tensor([epoch == BLANK for _, epoch in draws], device=device),
+            ),
+            image_size=self._image_sizes[rooms[0]],
             instance_ids=ids,
-            room_ids=tuple(room.room_id for room in rooms),
+            room_ids=tuple(self._plain_ids[room] for room in rooms),
         )
 
     def _draw(self, row: int, epoch: int) -> np.ndarray:
@@ -136,22 +138,3 @@ class ViewDataset(Dataset):
             return generator.choice(allowed, self.views_per_room, replace=False)
         # A room with few views shows each of them about equally often.
         return np.resize(generator.permutation(allowed), self.views_per_room)
-
-    def _ids(self, row: int) -> np.ndarray:
-        index = row // self.rotations
-        if index not in self._images:
-            room = self.rooms[index]
-            with Shard(self._paths[index]) as shard:
-                self._images[index] = shard.read_instance_ids(
-                    room.room_id, range(len(room.visible)), self.mask_step or 1
-                )
-        return self._images[index]
-
-
-def _turn_about_up(quarter: int) -> np.ndarray:
-    """(4, 4) rotation by quarter * 90 degrees about +y, exact."""
-    cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
-    turn = np.eye(4, dtype=np.float32)
-    turn[0, 0] = turn[2, 2] = cosine
-    turn[0, 2], turn[2, 0] = sine, -sine
-    return turn

@@ -106,6 +106,15 @@ def inception_features(
     return _in_chunks(images, features, INCEPTION["dimensions"])
 
 
+def check_inception(torchscript_path: Path) -> None:
+    """Ask the file for the features of one grey picture, before hours of drawing lean on it.
+
+    Raises:
+        InputError: as `inception_features`.
+    """
+    inception_features(np.full((1, 32, 32, 3), 128, dtype=np.uint8), torchscript_path)
+
+
 def _not_inception(path: Path, reason: str) -> InputError:
     return InputError(
         f"{path} is not the Inception network of NVIDIA's StyleGAN metrics ({reason}); give the "

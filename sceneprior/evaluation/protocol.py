@@ -17,7 +17,12 @@ from rich.table import Table
 
 from sceneprior.classes import VOID, class_colors, label_set
 from sceneprior.errors import InputError
-from sceneprior.evaluation.image_metrics import EFFNET_LITE0, INCEPTION, frechet_distance
+from sceneprior.evaluation.image_metrics import (
+    EFFNET_LITE0,
+    INCEPTION,
+    check_inception,
+    frechet_distance,
+)
 from sceneprior.evaluation.layout_metrics import (
     KL_EPSILON,
     OVERLAP_SHARE,
@@ -79,6 +84,8 @@ def evaluate_synthesis(
         InputError: no rooms, fewer than two on a side, other label sets than the shards', or
             an Inception file that is none.
     """
+    if inception is not None:
+        check_inception(inception)
     test = [without_void(scene) for scene in reference_scenes(shards, "test")]
     train = [without_void(scene) for scene in reference_scenes(shards, "train")]
     generated = [without_void(scene) for scene in generated]

@@ -45,13 +45,13 @@ def topdown_protocol(label_set_name: str) -> TopDownProtocol:
     """The protocol of a label set: 12.5 mm a pixel for bedrooms, 25 mm for the other sets.
 
     The windows hold the largest rooms that ATISS's filter lets through (6 x 6 m bedrooms,
-    12 x 12 m living rooms).
+    12 x 12 m living rooms). A label set of one's own has the larger one.
 
     Raises:
         InputError: no label set has this name.
     """
     label_set(label_set_name)
-    return TopDownProtocol(window_m=_WINDOWS_M[label_set_name])
+    return TopDownProtocol(window_m=_WINDOWS_M.get(label_set_name, 12.8))
 
 
 def box_mesh(center_m: Sequence[float], size_m: Sequence[float]) -> Mesh:

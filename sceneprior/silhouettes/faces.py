@@ -35,6 +35,15 @@ def _region(ax, ay, bx, by, cx, cy, reach, bounds):
     return max(top, bounds[0]), bottom, max(left >> 3, bounds[2]), (right + 7) >> 3
 
 
+@njit(inline="always")
+@no_type_check
+def _from_edge(px, py, ax, ay, bx, by, over_length2, zero, one):
+    """From the nearest point of edge ab to p, how far along ab it lies, twice area (a, b, p)."""
+    ux, uy, x, y = bx - ax, by - ay, px - ax, py - ay
+    t = min(max((x * ux + y * uy) * over_length2, zero), one)
+    return x - t * ux, y - t * uy, t, ux * y - uy * x
+
+
 @njit(fastmath=_LOOSE, error_model="numpy", nogil=True)
 @no_type_check
 def _draw_strip(
@@ -43,27 +52,16 @@ def _draw_strip(
 ):  # fmt: skip
     T = odds.dtype.type
     zero, one, half, most, slack = T(0), T(1), T(0.5), T(80), T(-SLACK)
-    u1, v1, u2, v2, u3, v3 = bx - ax, by - ay, cx - bx, cy - by, ax - cx, ay - cy
     for k in range(count):
         j = np.uintp(start) + np.uintp(k)  # unsigned: Python's negative indices cost the vectors
         px = T(column + (np.int32(k) & 7)) + half
         py = T(row + (np.int32(k) >> 3)) + half
-        x, y = px - ax, py - ay
-        t = min(max((x * u1 + y * v1) * over1, zero), one)
-        dx, dy = x - t * u1, y - t * v1
-        d1 = dx * dx + dy * dy
-        wc = (u1 * y - v1 * x) * over_area
-        x, y = px - bx, py - by
-        t = min(max((x * u2 + y * v2) * over2, zero), one)
-        dx, dy = x - t * u2, y - t * v2
-        d2 = dx * dx + dy * dy
-        wa = (u2 * y - v2 * x) * over_area
-        x, y = px - cx, py - cy
-        t = min(max((x * u3 + y * v3) * over3, zero), one)
-        dx, dy = x - t * u3, y - t * v3
-        d3 = dx * dx + dy * dy
+        x1, y1, _, wc = _from_edge(px, py, ax, ay, bx, by, over1, zero, one)
+        x2, y2, _, wa = _from_edge(px, py, bx, by, cx, cy, over2, zero, one)
+        x3, y3, _, _ = _from_edge(px, py, cx, cy, ax, ay, over3, zero, one)
+        d = min(x1 * x1 + y1 * y1, min(x2 * x2 + y2 * y2, x3 * x3 + y3 * y3))
+        wa, wc = wa * over_area, wc * over_area
         wb = one - wa - wc
-        d = min(d1, min(d2, d3))
         inside = min(wa, min(wb, wc)) > zero
         touched = inside | (d < blur)
         x = min(d * over_sigma, most)
@@ -84,28 +82,18 @@ def _pull_strip(
     """The pull of a strip's pixels on a face's three corners."""
     T = force.dtype.type
     zero, one, half, most = T(0), T(1), T(0.5), T(80)
-    u1, v1, u2, v2, u3, v3 = bx - ax, by - ay, cx - bx, cy - by, ax - cx, ay - cy
     gax, gay, gbx, gby, gcx, gcy = zero, zero, zero, zero, zero, zero
     for k in range(count):
         j = np.uintp(start) + np.uintp(k)
         px = T(column + (np.int32(k) & 7)) + half
         py = T(row + (np.int32(k) >> 3)) + half
-        x, y = px - ax, py - ay
-        t1 = min(max((x * u1 + y * v1) * over1, zero), one)
-        x1, y1 = x - t1 * u1, y - t1 * v1
-        d1 = x1 * x1 + y1 * y1
-        wc = (u1 * y - v1 * x) * over_area
-        x, y = px - bx, py - by
-        t2 = min(max((x * u2 + y * v2) * over2, zero), one)
-        x2, y2 = x - t2 * u2, y - t2 * v2
-        d2 = x2 * x2 + y2 * y2
-        wa = (u2 * y - v2 * x) * over_area
-        x, y = px - cx, py - cy
-        t3 = min(max((x * u3 + y * v3) * over3, zero), one)
-        x3, y3 = x - t3 * u3, y - t3 * v3
-        d3 = x3 * x3 + y3 * y3
-        wb = one - wa - wc
+        x1, y1, t1, wc = _from_edge(px, py, ax, ay, bx, by, over1, zero, one)
+        x2, y2, t2, wa = _from_edge(px, py, bx, by, cx, cy, over2, zero, one)
+        x3, y3, t3, _ = _from_edge(px, py, cx, cy, ax, ay, over3, zero, one)
+        d1, d2, d3 = x1 * x1 + y1 * y1, x2 * x2 + y2 * y2, x3 * x3 + y3 * y3
         d = min(d1, min(d2, d3))
+        wa, wc = wa * over_area, wc * over_area
+        wb = one - wa - wc
         inside = min(wa, min(wb, wc)) > zero
         touched = inside | (d < blur)
         x = min(d * over_sigma, most)

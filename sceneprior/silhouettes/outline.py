@@ -8,7 +8,7 @@ The silhouette of a mesh is taken as one shape instead of many faces:
 faces over a point of the image changes (for a closed mesh: one face turned towards the camera,
 one away), as far as no other face lies on their far side. Faces are only rasterised hard, so the
 cost grows with pixels and outline length, not with faces times blur. docs/silhouettes.md draws
-how this differs from the exact formula. All arithmetic is in float64.
+how this differs from the exact formula.
 """
 
 from typing import no_type_check
@@ -23,58 +23,75 @@ from sceneprior.silhouettes.windows import pixel_range
 
 
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
+@njit(error_model="numpy", nogil=True)
+@no_type_check
+def _depth_strip(
+    order, start, count, column, row, ax, ay, over_area, bx, by, cx, cy, near_a, near_b, near_c
+):  # fmt: skip
+    """A face's 1 / z where it contains pixel centres of a strip; runs as vectors (faces.py)."""
+    T = order.dtype.type
+    half, least, most, nowhere = T(0.5), T(-SLACK), T(1 + SLACK), T(-np.inf)
+    for k in range(count):
+        j = np.uintp(start) + np.uintp(k)
+        x = T(column + (np.int32(k) & 7)) + half - ax
+        y = T(row + (np.int32(k) >> 3)) + half - ay
+        wb = (x * cy - y * cx) * over_area
+        wc = (y * bx - x * by) * over_area
+        here = near_a + wb * near_b + wc * near_c
+        contained = (wb > least) & (wc > least) & (wb + wc < most)
+        order[j] = max(order[j], here if contained else nowhere)
+
+
 @njit(nogil=True, error_model="numpy")
 @no_type_check
 def _rasterize(
-    points, depths, faces, edge_of, way, row0, row1, strip0, strip1, start, near, order, layers
+    points, nearness, faces, edge_of, way, row0, row1, strip0, strip1, start, most, order, layers
 ):  # fmt: skip
-    """Depths of faces at pixel centres, and for each edge how many faces more lie to its left."""
-    rows = row1 - row0
+    """Nearest 1 / depth at pixel centres; for each edge how many faces more lie to its left."""
+    T = points.dtype.type
+    one, least, inner, outer = T(1), T(MIN_AREA_PX2), T(0.499), T(0.501)
+    low_row, high_row = T(row0), T(row1)
+    low_column, high_column = T(strip0 * 8), T(strip1 * 8)
     for f in range(faces.shape[0]):
         ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
-        za, zb, zc = float(depths[ia]), float(depths[ib]), float(depths[ic])
-        if za <= near or zb <= near or zc <= near:
+        near_a, near_b, near_c = nearness[ia], nearness[ib], nearness[ic]
+        if not (0 < near_a < most and 0 < near_b < most and 0 < near_c < most):
             continue
-        ax, ay = float(points[ia, 0]), float(points[ia, 1])
-        bx, by = float(points[ib, 0]), float(points[ib, 1])
-        cx, cy = float(points[ic, 0]), float(points[ic, 1])
+        ax, ay = points[ia, 0], points[ia, 1]
+        bx, by = points[ib, 0], points[ib, 1]
+        cx, cy = points[ic, 0], points[ic, 1]
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if abs(area) <= MIN_AREA_PX2:
+        if abs(area) <= least:
             continue
-        side = 1 if area > 0.0 else -1
+        side = 1 if area > 0 else -1
         layers[edge_of[f, 0]] += side * way[f, 0]
         layers[edge_of[f, 1]] += side * way[f, 1]
         layers[edge_of[f, 2]] += side * way[f, 2]
-        top, bottom = pixel_range(min(ay, by, cy), max(ay, by, cy), row1)
-        left, right = pixel_range(min(ax, bx, cx), max(ax, bx, cx), strip1 * 8)
-        top, left = max(top, row0), max(left, strip0 * 8)
+        # First and one past the last pixel centre, a little outwards: most small faces have none.
+        top = int(max(min(ay, by, cy) + inner, low_row))
+        bottom = int(min(max(ay, by, cy) + outer, high_row))
+        left = int(max(min(ax, bx, cx) + inner, low_column))
+        right = int(min(max(ax, bx, cx) + outer, high_column))
         if top >= bottom or left >= right:
             continue
-        over = 1.0 / area
-        near_a, near_b, near_c = 1.0 / za, 1.0 / zb, 1.0 / zc
-        for row in range(top, bottom):
-            y = row + 0.5 - ay
-            for column in range(left, right):
-                x = column + 0.5 - ax
-                wb = (x * (cy - ay) - y * (cx - ax)) * over
-                wc = (y * (bx - ax) - x * (by - ay)) * over
-                if wb > -SLACK and wc > -SLACK and wb + wc < 1.0 + SLACK:
-                    nearness = near_a + wb * (near_b - near_a) + wc * (near_c - near_a)
-                    j = start + (((column >> 3) - strip0) * rows + row - row0) * 8 + (column & 7)
-                    if nearness > order[j]:
-                        order[j] = nearness
+        left, right = left >> 3, (right + 7) >> 3
+        for strip in range(left, right):
+            _depth_strip(
+                order, start + ((strip - strip0) * (row1 - row0) + top - row0) * 8,
+                (bottom - top) * 8, np.int32(strip * 8), np.int32(top), ax, ay, one / area,
+                bx - ax, by - ay, cx - ax, cy - ay, near_a, near_b - near_a, near_c - near_a,
+            )  # fmt: skip
 
 
 @njit(nogil=True, error_model="numpy")
 @no_type_check
-def _faces_over(x, y, ends, layers, count):
-    """Number of faces over a point: what the edges to its right add up to."""
+def _faces_over(x, y, ax, ay, by, slope, falls):
+    """Number of faces over a point: what the edges to its right add up to. Runs as vectors."""
     faces = 0
-    for i in range(count):
-        ax, ay, bx, by = ends[i, 0], ends[i, 1], ends[i, 2], ends[i, 3]
-        if (ay <= y) != (by <= y) and ax + (y - ay) * (bx - ax) / (by - ay) > x:
-            # Going right, an edge that runs down the image is crossed from its left side.
-            faces += layers[i] if by > ay else -layers[i]
+    for i in range(ax.size):
+        crossed = (ay[i] <= y) != (by[i] <= y)
+        right = ax[i] + (y - ay[i]) * slope[i] > x  # of a level edge not a number: never crossed
+        faces += falls[i] if crossed & right else 0
     return faces
 
 
@@ -90,18 +107,35 @@ def _cut(start, step, low, high, first, last):
 
 @njit(nogil=True, error_model="numpy")
 @no_type_check
+def _candidates(points, edges, layers):
+    """Edges at which the number of faces changes: which, ends, dx / dy, and by how many faces it
+    falls to the right where they are crossed along a row."""
+    which = np.flatnonzero(layers).astype(np.int32)
+    ax, ay, bx, by = np.empty((4, which.size))
+    for i in range(which.size):
+        a, b = edges[which[i], 0], edges[which[i], 1]
+        ax[i], ay[i], bx[i], by[i] = points[a, 0], points[a, 1], points[b, 0], points[b, 1]
+    # An edge that runs down the image has its left side to the left.
+    falls = np.where(by > ay, layers[which], -layers[which])
+    return which, ax, ay, bx, by, (bx - ax) / (by - ay), falls
+
+
+@njit(nogil=True, error_model="numpy")
+@no_type_check
 def _trace(
-    ends, layers, which, count, row0, row1, strip0, strip1, start, blur, distance, edge, share
+    candidates, layers, row0, row1, strip0, strip1, start, blur, distance, edge, share
 ):  # fmt: skip
     """Squared distance to the outline, its nearest edge, and where on it, near the outline."""
     rows = row1 - row0
     reach = np.sqrt(blur)
-    for i in range(count):
-        ax, ay = ends[i, 0], ends[i, 1]
-        ux, uy = ends[i, 2] - ax, ends[i, 3] - ay
-        length = np.hypot(ux, uy)
+    which, all_ax, all_ay, all_bx, all_by, slope, falls = candidates
+    for i in range(which.size):
+        ax, ay = all_ax[i], all_ay[i]
+        ux, uy = all_bx[i] - ax, all_by[i] - ay
+        length = np.sqrt(ux * ux + uy * uy)
+        over_length2 = 1.0 / (length * length)
         # The side with fewer faces: away from the left, (-uy, ux), where layers are positive.
-        away = -ASIDE_PX / length if layers[i] > 0 else ASIDE_PX / length
+        away = -ASIDE_PX / length if layers[which[i]] > 0 else ASIDE_PX / length
         t0, t1 = _cut(ax, ux, strip0 * 8 - reach, strip1 * 8 + reach, 0.0, 1.0)
         t0, t1 = _cut(ay, uy, row0 - reach, row1 + reach, t0, t1)
         if not (t0 < t1 and length < np.inf):
@@ -111,7 +145,7 @@ def _trace(
             t0, t1 = piece / pieces, (piece + 1) / pieces
             middle = (t0 + t1) / 2
             x, y = ax + middle * ux - away * uy, ay + middle * uy + away * ux
-            if _faces_over(x, y, ends, layers, count) > 0:
+            if _faces_over(x, y, all_ax, all_ay, all_by, slope, falls) > 0:
                 continue
             x0, x1, y0, y1 = ax + t0 * ux, ax + t1 * ux, ay + t0 * uy, ay + t1 * uy
             top, bottom = pixel_range(min(y0, y1) - reach, max(y0, y1) + reach, row1)
@@ -120,7 +154,7 @@ def _trace(
                 y = row + 0.5 - ay
                 for column in range(max(left, strip0 * 8), right):
                     x = column + 0.5 - ax
-                    t = min(max((x * ux + y * uy) / (length * length), t0), t1)
+                    t = min(max((x * ux + y * uy) * over_length2, t0), t1)
                     d = (x - t * ux) * (x - t * ux) + (y - t * uy) * (y - t * uy)
                     j = start + (((column >> 3) - strip0) * rows + row - row0) * 8 + (column & 7)
                     if d < distance[j]:
@@ -130,38 +164,24 @@ def _trace(
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _cover(
-    first, last, pixels, depths, faces, edges, edge_of, way, bounds, starts, sigma, blur, near,
+    first, last, pixels, nearness, faces, edges, edge_of, way, bounds, starts, sigma, blur, most,
     odds, order, edge, share,
 ):  # fmt: skip
     for mesh in range(first, last):
         row0, row1, strip0, strip1 = bounds[mesh]
         if row1 <= row0:
             continue
-        points, z, start = pixels[mesh], depths[mesh], starts[mesh]
-        all_layers = np.zeros(edges.shape[0], dtype=np.int32)
+        points, z, start = pixels[mesh], nearness[mesh], starts[mesh]
+        layers = np.zeros(edges.shape[0], dtype=np.int32)
         _rasterize(
-            points, z, faces, edge_of, way, row0, row1, strip0, strip1, start, near,
-            order, all_layers,
-        )  # fmt: skip
-        count = 0
-        for e in range(edges.shape[0]):
-            count += all_layers[e] != 0
-        which = np.empty(count, dtype=np.int32)
-        layers = np.empty(count, dtype=np.int32)
-        ends = np.empty((count, 4))
-        count = 0
-        for e in range(edges.shape[0]):
-            a, b = edges[e, 0], edges[e, 1]
-            if all_layers[e] != 0:
-                which[count], layers[count] = e, all_layers[e]
-                ends[count, 0], ends[count, 1] = points[a, 0], points[a, 1]
-                ends[count, 2], ends[count, 3] = points[b, 0], points[b, 1]
-                count += 1
+            points, z, faces, edge_of, way, row0, row1, strip0, strip1, start, most, order, layers
+        )
         for j in range(start, starts[mesh + 1]):
             odds[j] = blur  # holds squared distances for now
         _trace(
-            ends, layers, which, count, row0, row1, strip0, strip1, start, blur, odds, edge, share
-        )
+            _candidates(points, edges, layers), layers, row0, row1, strip0, strip1, start, blur,
+            odds, edge, share,
+        )  # fmt: skip
         for j in range(start, starts[mesh + 1]):
             inside = order[j] > 0.0
             if edge[j] < 0:
@@ -170,7 +190,7 @@ def _cover(
             odds[j] = 1.0 + np.exp((odds[j] if inside else -odds[j]) / sigma)
             if not inside:
                 a, b = edges[edge[j], 0], edges[edge[j], 1]
-                order[j] = -1.0 / ((1.0 - share[j]) / z[a] + share[j] / z[b])
+                order[j] = -1.0 / ((1.0 - share[j]) * z[a] + share[j] * z[b])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -207,10 +227,11 @@ def cover(pixels, depths, faces, windows, settings):
     order = np.full(size, -np.inf, dtype=pixels.dtype)
     edge = np.full(size, -1, dtype=np.int32)
     share = np.empty(size, dtype=pixels.dtype)
-    rest = (settings.sigma_px2, settings.blur_px2, settings.near_m)
-    in_threads(
-        _cover, len(pixels), pixels, depths, faces, *mesh, *windows, *rest, odds, order, edge, share
-    )
+    with np.errstate(divide="ignore"):
+        nearness = 1 / depths
+    rest = (settings.sigma_px2, settings.blur_px2, 1 / settings.near_m)
+    results = (odds, order, edge, share)
+    in_threads(_cover, len(pixels), pixels, nearness, faces, *mesh, *windows, *rest, *results)
     return odds, order, (mesh.edges, order, edge, share)
 
 

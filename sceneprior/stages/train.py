@@ -132,6 +132,8 @@ def _fit_stage(
     if trainer.is_global_zero:
         folder.mkdir(parents=True, exist_ok=True)
         dump_config(config, run / "config.yaml")
+    if dataset.masks is None:  # else worker processes may make the batches
+        dataset.to(trainer.strategy.root_device)
     loader = make_loader(
         dataset, settings.batch_size, config.seed, config.data.workers,
         trainer.global_rank, trainer.world_size,

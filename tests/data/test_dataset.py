@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from references.batches import batch_room_by_room, rooms_with_images, turn_about_up
 from torch.testing import assert_close
 from toy_rooms import make_toy_room
 
@@ -11,26 +12,30 @@ from sceneprior.data.dataset import BLANK, ViewDataset
 from sceneprior.errors import ShardError
 from sceneprior.geometry.boxes import box_corners
 from sceneprior.geometry.cameras import boxes_of_points
-from sceneprior.shards import Shard, list_shards, write_shard
+from sceneprior.shards import RoomViews, Shard, list_shards, write_shard
 
 
 def dataset(shards, **changes) -> ViewDataset:
     return ViewDataset(shards, "train", **{"views_per_room": 5, **changes})
 
 
-def drawn_views(data: ViewDataset, row: int, epoch: int) -> list[int]:
+@pytest.fixture(scope="module")
+def rooms(toy_shards) -> list[RoomViews]:
+    return rooms_with_images(toy_shards, "train")
+
+
+def drawn_views(data: ViewDataset, rooms: list[RoomViews], row: int, epoch: int) -> list[int]:
     """Which of the room's views a draw holds, told by their cameras."""
     views = data.__getitems__([(row, epoch)])
-    room = data.rooms[row // data.rotations]
-    turn = data._turns[row % data.rotations]
-    known = room.world_to_camera @ turn.T
+    room = rooms[row // data.rotations]
+    known = room.world_to_camera @ turn_about_up(row % data.rotations).T
     return [
         int(np.abs(known - pose).sum(axis=(1, 2)).argmin())
         for pose in views.world_to_camera[0].numpy()
     ]
 
 
-def test_a_batch_holds_what_the_shards_hold_and_pads_the_rest(toy_shards):
+def test_a_batch_holds_what_the_shards_hold_and_pads_the_rest(toy_shards, rooms):
     data = dataset(toy_shards)
     rows = list(range(12))
     views = data.__getitems__([(row, 3) for row in rows])
@@ -38,11 +43,11 @@ def test_a_batch_holds_what_the_shards_hold_and_pads_the_rest(toy_shards):
     assert views.room_ids == tuple(f"toy/train_{k:02d}" for k in rows)
     assert views.boxes.shape == (12, 5, data.max_objects, 4)
     assert views.image_size == (72, 96) and views.instance_ids is None
-    counts = {len(room.object_class) for room in data.rooms}
+    counts = {len(room.object_class) for room in rooms}
     assert len(counts) > 1  # or nothing would be padded
-    for slot, room in enumerate(data.rooms):
+    for slot, room in enumerate(rooms):
         n = len(room.object_class)
-        chosen = drawn_views(data, slot, 3)
+        chosen = drawn_views(data, rooms, slot, 3)
         assert views.object_class[slot].tolist() == [
             *room.object_class,
             *[0] * (len(views.is_object[slot]) - n),
@@ -56,23 +61,50 @@ def test_a_batch_holds_what_the_shards_hold_and_pads_the_rest(toy_shards):
         assert not views.sides_clear[slot, :, n:].any()
 
 
-def test_masks_are_every_fourth_pixel_of_the_same_views(toy_shards):
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"rotations": 4, "seed": 3},
+        {"views_per_room": 11, "mask_step": 4},
+        {"view_fraction": 0.4, "mask_step": 3, "rotations": 4},
+    ],
+    ids=str,
+)
+def test_batches_are_those_made_room_by_room(toy_shards, rooms, changes):
+    settings = {"views_per_room": 5, **changes}
+    data = dataset(toy_shards, **settings)
+    rng = np.random.default_rng(0)
+    for size in (1, 3, 8, 8):
+        draws = [
+            (int(row), int(epoch)) for row, epoch in rng.integers(0, (len(data), 9), (size, 2))
+        ]
+        views = data.__getitems__(draws)
+        by_hand = batch_room_by_room(rooms, draws, **settings)
+        for name, expected in by_hand.items():
+            found = getattr(views, name)
+            assert torch.equal(found, torch.from_numpy(expected)), name
+            assert found.dtype == torch.from_numpy(expected).dtype, name
+        assert views.instance_ids is None or "instance_ids" in by_hand
+
+
+def test_masks_are_every_fourth_pixel_of_the_same_views(toy_shards, rooms):
     data = dataset(toy_shards, mask_step=4)
     views = data.__getitems__([(2, 0), (7, 1)])
     assert views.instance_ids.shape == (2, 5, 18, 24)
     for slot, (row, epoch) in enumerate([(2, 0), (7, 1)]):
-        with Shard(data._paths[row]) as shard:
-            whole = shard.read_room(data.rooms[row].room_id, images=True).instance_ids
-        small = whole[drawn_views(data, row, epoch), 2::4, 2::4]
+        small = rooms[row].instance_ids[drawn_views(data, rooms, row, epoch), 2::4, 2::4]
         np.testing.assert_array_equal(views.instance_ids[slot], small)
 
 
-def test_draws_are_a_function_of_seed_row_and_epoch_alone(toy_shards):
+def test_draws_are_a_function_of_seed_row_and_epoch_alone(toy_shards, rooms):
     data = dataset(toy_shards, seed=4)
-    first = [drawn_views(data, row, epoch) for row in range(3) for epoch in range(4)]
+    first = [drawn_views(data, rooms, row, epoch) for row in range(3) for epoch in range(4)]
     again = dataset(toy_shards, seed=4)
     # In another order, in other batches, in another process: the same.
-    backwards = [drawn_views(again, row, epoch) for row in (2, 1, 0) for epoch in (3, 2, 1, 0)]
+    backwards = [
+        drawn_views(again, rooms, row, epoch) for row in (2, 1, 0) for epoch in (3, 2, 1, 0)
+    ]
     assert first == backwards[::-1]
     in_batch = again.__getitems__([(1, 2), (0, 0), (2, 3)])
     alone = again.__getitems__([(0, 0)])
@@ -80,35 +112,37 @@ def test_draws_are_a_function_of_seed_row_and_epoch_alone(toy_shards):
     assert all(len(set(draw)) == 5 for draw in first)  # without replacement
     assert len({tuple(draw) for draw in first}) > 8
     other = dataset(toy_shards, seed=5)
-    assert [drawn_views(other, row, epoch) for row in range(3) for epoch in range(4)] != first
+    assert [
+        drawn_views(other, rooms, row, epoch) for row in range(3) for epoch in range(4)
+    ] != first
 
 
-def test_few_views_are_shown_about_equally_often(toy_shards):
+def test_few_views_are_shown_about_equally_often(toy_shards, rooms):
     data = dataset(toy_shards, views_per_room=20)
-    draw = drawn_views(data, 0, 0)
+    draw = drawn_views(data, rooms, 0, 0)
     counts = np.bincount(draw, minlength=8)
     assert len(draw) == 20 and counts.min() == 2 and counts.max() == 3
 
 
 @pytest.mark.parametrize(("fraction", "kept"), [(1.0, 8), (0.5, 4), (0.25, 2), (0.01, 1)])
-def test_view_fraction_keeps_the_same_share_of_each_rooms_views(toy_shards, fraction, kept):
+def test_view_fraction_keeps_the_same_share_of_each_rooms_views(toy_shards, rooms, fraction, kept):
     data = dataset(toy_shards, view_fraction=fraction)
     for row in range(4):
-        seen = set().union(*(drawn_views(data, row, epoch) for epoch in range(30)))
+        seen = set().union(*(drawn_views(data, rooms, row, epoch) for epoch in range(30)))
         assert len(seen) == kept
     if fraction == 0.5:
         subsets = {tuple(allowed) for allowed in data._allowed}
         assert len(subsets) > 6
 
 
-def test_a_turned_room_under_turned_cameras_looks_the_same(toy_shards):
+def test_a_turned_room_under_turned_cameras_looks_the_same(toy_shards, rooms):
     """Rows 4k to 4k + 3 are room k turned by 0, 90, 180, 270 degrees about +y."""
     data = dataset(toy_shards, rotations=4)
     assert len(data) == 48
     assert data.room_ids[:4] == tuple("toy/train_00" + turn for turn in ("", "@90", "@180", "@270"))
-    with Shard(data._paths[0]) as shard:
-        truth = shard.read_ground_truth(data.rooms[0].room_id)
-    n = len(data.rooms[0].object_class)
+    with Shard(list_shards(toy_shards, "train")[0]) as shard:
+        truth = shard.read_ground_truth(rooms[0].room_id)
+    n = len(rooms[0].object_class)
     center = torch.from_numpy(truth.centers_m[:n])
     size = torch.from_numpy(truth.sizes_m[:n])
     for quarter in range(4):
@@ -121,11 +155,11 @@ def test_a_turned_room_under_turned_cameras_looks_the_same(toy_shards):
                 box_corners(
                     torch.from_numpy(truth.centers_m[:n]), torch.from_numpy(truth.sizes_m[:n])
                 )[None],
-                torch.from_numpy(data.rooms[0].world_to_camera[[view]])[None],
+                torch.from_numpy(rooms[0].world_to_camera[[view]])[None],
                 views.intrinsics[:, :1],
                 (72, 96),
             ).boxes[0, 0]
-            for view in drawn_views(data, quarter, 0)
+            for view in drawn_views(data, rooms, quarter, 0)
         ]
         # Quarter turns are exact in floats; what is left is the order of sums.
         assert_close(found.boxes[0], torch.stack(plain), rtol=0, atol=1e-5)
@@ -194,6 +228,20 @@ def test_the_loader_gives_whole_batches_and_learns_of_epochs(toy_shards):
     assert torch.equal(
         batches[0].world_to_camera[0], data.__getitems__([(row, 2)]).world_to_camera[0]
     )
+
+
+def test_workers_stand_between_only_where_masks_are_read(toy_shards):
+    assert make_loader(dataset(toy_shards), 5, 0, workers=2).num_workers == 0
+    assert make_loader(dataset(toy_shards, mask_step=4), 5, 0, workers=2).num_workers == 2
+
+
+def test_a_data_set_moved_to_a_device_makes_its_batches_there(toy_shards):
+    data = dataset(toy_shards, mask_step=4)
+    before = data.__getitems__([(3, 0), (1, 0)])
+    assert data.to("meta") is data  # a device that holds no numbers: nothing may be read from it
+    for name in ("boxes", "world_to_camera", "room_index", "instance_ids"):
+        found = getattr(data.__getitems__([(3, 0), (1, 0)]), name)
+        assert found.device.type == "meta" and found.shape == getattr(before, name).shape
 
 
 def test_folders_that_cannot_be_used_say_so(tmp_path, toy_shards):

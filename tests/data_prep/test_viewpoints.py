@@ -125,6 +125,30 @@ def test_views_follow_the_floor_area():
     assert view_counts([10.0], ViewRules(per_m2=0.5, at_least=3)) == [5]
 
 
+def test_a_house_never_gets_more_than_its_share():
+    counts = view_counts([1.0, 100.0], RULES)
+    assert counts == [8, 92]  # 8 at least, and the large room pays
+    assert view_counts([20.0] * 3 + [1.0] * 2, RULES) == [28, 28, 28, 8, 8]
+    assert view_counts([5.0] * 20, RULES) == [5] * 20  # where 8 each would be 160
+    assert view_counts([5.0] * 120, RULES) == [1] * 120  # no room gets none
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        areas = rng.uniform(0.5, 60.0, size=rng.integers(1, 25))
+        counts = view_counts(areas.tolist(), RULES)
+        assert sum(counts) <= 100 and min(counts) >= min(8, 100 // len(areas))
+        assert sorted(areas) == sorted(areas, key=lambda a: (counts[areas.tolist().index(a)], a))
+
+
+def test_slivers_of_floor_far_apart_take_no_time():
+    """Random darts would never hit them."""
+    floor = shapely.MultiPolygon([shapely.box(x, x, x + 1e-3, x + 900) for x in (0, 9e4)])
+    room = Room("house_A", "Bedroom", floor, 2.7, ())
+    spots = Viewpoints(room, np.zeros((0, 2, 3)), np.zeros((0, 3)), RULES, np.random.default_rng(0))
+    turns = np.stack([spots.draw().world_to_camera for _ in range(5)])
+    eyes = -np.einsum("nji,nj->ni", turns[:, :3, :3], turns[:, :3, 3])
+    assert shapely.distance(floor, shapely.points(eyes[:, [0, 2]])).max() < 2e-3
+
+
 def test_views_that_see_too_little_are_judged_so():
     whole = 360 * 480
     assert sees_enough(np.array([300, 300, 0]), RULES)[0]

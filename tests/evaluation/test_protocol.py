@@ -141,6 +141,8 @@ def test_what_cannot_be_scored_is_refused_before_anything_is_drawn(
         evaluate_synthesis([Scene("a", "scannet")] * 2, shards, renderer=renderer)
     with pytest.raises(ShardError, match="No folder of shards"):
         evaluate_synthesis(generated, tmp_path / "absent", renderer=renderer)
+    with pytest.raises(InputError, match=r"absent\.pt"):
+        evaluate_synthesis(generated, shards, renderer=renderer, inception=tmp_path / "absent.pt")
 
 
 def test_a_nan_never_reaches_a_result_file(tmp_path):

@@ -1,0 +1,218 @@
+"""How big are shards, and how fast do batches come out of them?
+
+    python benchmarks/bench_shards.py [--shards DIR] [--json FILE]
+
+Without `--shards` it prepares 48 bedrooms of this package's own homes first. Batches are 16 scenes
+x 20 views with masks at a quarter of the size, read and collated, one process. They are timed
+
+- cold: no view was read before (the file is in the operating system's cache, as below);
+- again: masks are in the loader's packed store, as in every epoch but the first;
+- layout: 16 and 128 scenes without masks, from memory;
+- per-view files: the same views from one HDF5 file each, read as the authors' released loader
+  reads theirs: every object's box, class, track and mask on its own, drawn into an image,
+  reduced, stacked view by view and room by room.
+
+All take turns; figures are medians, ratios are of one run.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import torch
+from torch.utils.data import default_collate
+
+from sceneprior.data.dataset import ViewDataset
+from sceneprior.data.flat_views import FlatViews
+from sceneprior.shards import RoomViews, iterate_rooms, list_shards
+
+SCENES, VIEWS, STEP = 16, 20, 4
+CLASSES = 22
+
+
+def prepare(folder: Path, rooms: int) -> Path:
+    """Shards of homes made by this package."""
+    homes, out = folder / "homes", folder / "shards"
+    commands = (
+        ["make-homes", str(homes), "--rooms", str(rooms)],
+        ["prep-front", "--front", str(homes / "3D-FRONT"), "--future",
+         str(homes / "3D-FUTURE-model"), "--out", str(out), "--renderer", "software"],
+    )  # fmt: skip
+    for command in commands:
+        subprocess.run([sys.executable, "-m", "sceneprior", *command], check=True, stdout=-1)
+    return out
+
+
+def sizes(shards: Path) -> dict[str, float]:
+    """Bytes of the shard files a view, and what of them the images take."""
+    paths = list_shards(shards, "train")
+    total, images, views = sum(path.stat().st_size for path in paths), 0, 0
+    for path in paths:
+        with h5py.File(path) as file:
+            for room in file["rooms"].values():
+                images += room["instance_ids"].id.get_storage_size()
+                views += len(room["instance_ids"])
+    return {
+        "views": views,
+        "bytes_per_view": total / views,
+        "image_bytes_per_view": images / views,
+        "views_per_room": views / sum(1 for _ in iterate_rooms(shards, "train")),
+    }
+
+
+def memory(shards: Path) -> dict[str, float]:
+    """What the loader holds of 100,000 views such as these."""
+    flat = FlatViews.of([shard.read_room(room) for shard, room in iterate_rooms(shards, "train")])
+    views = len(flat.world_to_camera)
+    data = ViewDataset(shards, "train", VIEWS, mask_step=STEP)
+    assert data.masks is not None
+    for room in range(len(data)):
+        data.masks.read(room, np.arange(len(data._allowed[room])))
+    return {
+        "boxes_and_cameras_mb_per_100k_views": flat.bytes / views / 10,
+        "masks_mb_per_100k_views": data.masks.bytes / views / 10,
+    }
+
+
+def write_view_files(folder: Path, room: RoomViews) -> list[Path]:
+    """One HDF5 file a view: pose, lens and, for each visible object, box, class, track and mask."""
+    assert room.instance_ids is not None
+    height, width = room.image_size
+    paths = []
+    for view, image in enumerate(room.instance_ids):
+        paths.append(folder / f"{room.room_id.replace('/', '_')}_{view:04d}.hdf5")
+        with h5py.File(paths[-1], "w") as file:
+            file["room_type"] = np.array([b"bedroom"])
+            file["cam_T"] = room.world_to_camera[view].astype(np.float64)
+            file["cam_K"] = room.intrinsics[view].astype(np.float64)
+            for k in np.flatnonzero(room.visible[view]):
+                corners = room.boxes[view, k] * [width, height, width, height]
+                left, top, right, bottom = corners.round().astype(int)
+                one = file.create_group(f"inst_info/{k}")
+                one["bbox2d"] = np.array([left, top, right - left, bottom - top])
+                one["category_id"] = np.array([int(room.object_class[k])])
+                one["inst_mark"] = np.array([str(k).encode()])
+                mask = image[top:bottom, left:right] == k + 1
+                one.create_dataset("mask", data=mask, compression="gzip")
+    return paths
+
+
+def read_view_file(path: Path, objects: int, image_size: tuple[int, int]) -> dict[str, Any]:
+    """One view as arrays, padded to the room's tracked objects."""
+    with h5py.File(path, "r") as file:
+        _ = file["room_type"][0].decode()
+        pose, lens = file["cam_T"][:], file["cam_K"][:]
+        found = [
+            (int(one["inst_mark"][0]), one["bbox2d"][:], one["category_id"][0], one["mask"][:])
+            for one in file.get("inst_info", {}).values()
+        ]
+    boxes = np.full((objects, 4 + CLASSES), -1.0)
+    boxes[:, 4:] = 0
+    seen = np.zeros(objects, dtype=bool)
+    ids = np.full(image_size, -1)
+    for k, (left, top, width, height), category, mask in found:
+        boxes[k, :4] = left, top, left + width - 1, top + height - 1
+        boxes[k, 4 + category] = 1
+        seen[k] = True
+        ids[top : top + height, left : left + width][mask] = k
+    size = (image_size[1] // STEP, image_size[0] // STEP)
+    small = cv2.resize(ids.astype(np.int32), size, interpolation=cv2.INTER_NEAREST_EXACT)
+    return {
+        "pose": pose.astype(np.float32),
+        "lens": lens.astype(np.float32),
+        "boxes": boxes.astype(np.float32),
+        "seen": seen,
+        "ids": small.astype(np.int64),
+    }
+
+
+def batch_from_view_files(
+    rooms: list[tuple[list[Path], int, tuple[int, int]]], seed: int
+) -> dict[str, torch.Tensor]:
+    """20 random views of each room, padded to the fullest and stacked."""
+    rng = np.random.default_rng(seed)
+    widest = max(objects for _, objects, _ in rooms)
+    scenes = []
+    for paths, objects, size in rooms:
+        chosen = rng.choice(len(paths), VIEWS, replace=len(paths) < VIEWS)
+        views = [read_view_file(paths[view], objects, size) for view in chosen]
+        for view in views:
+            for name in ("boxes", "seen"):
+                rest = np.zeros((widest - objects, *view[name].shape[1:]), view[name].dtype)
+                view[name] = np.concatenate([view[name], rest])
+        scenes.append(default_collate(views))
+    return default_collate(scenes)
+
+
+def speeds(shards: Path, folder: Path, repeats: int) -> dict[str, float]:
+    """Median milliseconds of a batch, each way."""
+    chosen = []
+    for shard, room_id in iterate_rooms(shards, "train"):
+        room = shard.read_room(room_id, images=True)
+        chosen.append((write_view_files(folder, room), len(room.object_class), room.image_size))
+        if len(chosen) == SCENES:
+            break
+    warm = ViewDataset(shards, "train", VIEWS, mask_step=STEP)
+    layout = ViewDataset(shards, "train", VIEWS, rotations=4)
+    rows = list(range(SCENES))
+    assert warm.masks is not None
+    for row in rows:
+        warm.masks.read(row, np.arange(len(warm._allowed[row])))
+    times: dict[str, list[float]] = {}
+
+    def timed(name: str, call: Callable[[], object]) -> None:
+        before = time.perf_counter()
+        call()
+        times.setdefault(name, []).append(1000 * (time.perf_counter() - before))
+
+    for epoch in range(repeats):
+        fresh = ViewDataset(shards, "train", VIEWS, mask_step=STEP)
+        draws = [(row, epoch) for row in rows]
+        many = [(row % len(layout), epoch) for row in range(128)]
+        timed("per_view_files_ms", lambda: batch_from_view_files(chosen, epoch))  # noqa: B023
+        timed("cold_ms", lambda: fresh.__getitems__(draws))  # noqa: B023
+        timed("again_ms", lambda: warm.__getitems__(draws))  # noqa: B023
+        timed("layout_16_ms", lambda: layout.__getitems__(draws))  # noqa: B023
+        timed("layout_128_ms", lambda: layout.__getitems__(many))  # noqa: B023
+    found = {name: statistics.median(values) for name, values in times.items()}
+    base = found["per_view_files_ms"]
+    found |= {
+        "files_over_cold": base / found["cold_ms"],
+        "files_over_again": base / found["again_ms"],
+        "files_over_layout": base / found["layout_16_ms"],
+    }
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--shards", type=Path, help="measure these instead of made homes")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--json", type=Path, help="write the figures to this file, too")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    figures: dict[str, Any] = {"cores": os.cpu_count(), "load_average": os.getloadavg()}
+    with tempfile.TemporaryDirectory() as name:
+        shards = arguments.shards or prepare(Path(name), rooms=48)
+        views = Path(name) / "views"
+        views.mkdir()
+        figures |= sizes(shards) | memory(shards) | speeds(shards, views, arguments.repeats)
+    for key, value in figures.items():
+        print(f"{key:38}", f"{value:.4g}" if isinstance(value, float) else value)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

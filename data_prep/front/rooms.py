@@ -1,0 +1,207 @@
+"""A parsed house in, its rooms out, whatever the quirks of the files."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from data_prep.front.files import MODEL_FILE, is_name, shown
+from data_prep.front.geometry import (
+    Surface,
+    floor_of,
+    height_of,
+    in_frame,
+    placement_of,
+    room_frame,
+    surface_of,
+)
+from data_prep.front.houses import House, is_valid, key_of, parse_house
+from data_prep.front.models import ModelBank, unit_of
+from data_prep.recipe import Recipe
+from data_prep.rooms import Furniture, Room
+from sceneprior.errors import InputError
+from sceneprior.scene import Mesh
+
+_NO_MESH = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+_FLAT = 1e-9
+
+
+@dataclass
+class HouseRooms:
+    """What one house file gave."""
+
+    rooms: list[Room] = field(default_factory=list)
+    failures: list[tuple[str, str]] = field(default_factory=list)
+    """(room id, why it cannot be used)."""
+    filtered: list[tuple[str, str, str]] = field(default_factory=list)
+    """(room id, the rule that leaves it out, a sentence)."""
+
+
+class _FilteredError(Exception):
+    """A rule leaves the room out: its name, and a sentence."""
+
+
+def read_house(
+    house: Path | House,
+    models: ModelBank,
+    recipe: Recipe,
+    wanted: Callable[[str, str], bool] = lambda room_id, room_type: True,
+    load_models: bool = True,
+) -> HouseRooms:
+    """Read the wanted rooms of one house.
+
+    Args:
+        house: `<house uid>.json`, or what `parse_house` made of it.
+        models: Where furniture meshes come from.
+        recipe: Its classes (a category that is not listed is `void`) and rules about scales.
+        wanted: Called with (room id, room type).
+        load_models: False leaves every mesh empty (a survey needs labels only).
+
+    Raises:
+        InputError: the file is not a house.
+    """
+    if not isinstance(house, House):
+        house = parse_house(house)
+    reader = _RoomReader(house, models, recipe, load_models)
+    result = HouseRooms()
+    seen: set[str] = set()
+    for number, entry in enumerate(house.rooms):
+        if not isinstance(entry, dict):
+            result.failures.append((f"{house.name}_room{number}", "its entry is no JSON object"))
+            continue
+        room_type = str(entry["type"]) if isinstance(entry.get("type"), str) else ""
+        name = entry.get("instanceid") or room_type or f"room{number}"
+        room_id = f"{house.name}_{name if is_name(name) else f'room{number}'}"
+        if not wanted(room_id, room_type):
+            continue
+        if not is_name(name):
+            why = f"its instanceid, {shown(name)}, can be no name"
+            result.failures.append((room_id, why))
+            continue
+        if room_id in seen:
+            result.failures.append((room_id, "another room of the house has the same instanceid"))
+            continue
+        seen.add(room_id)
+        try:
+            result.rooms.append(reader.read(entry, room_id, room_type))
+        except _FilteredError as rule:
+            result.filtered.append((room_id, *rule.args))
+        except InputError as error:
+            result.failures.append((room_id, str(error)))
+        except (
+            LookupError, TypeError, ValueError, AttributeError, ArithmeticError, OSError,
+            RecursionError, shapely.GEOSException,
+        ) as error:  # fmt: skip
+            text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+            result.failures.append((room_id, f"the room's entry cannot be read ({text})"))
+    return result
+
+
+@dataclass(frozen=True)
+class _RoomReader:
+    """Reads the rooms of one house."""
+
+    house: House
+    models: ModelBank
+    recipe: Recipe
+    load_models: bool
+
+    def read(self, room: dict[str, Any], room_id: str, room_type: str) -> Room:
+        children = room.get("children") or []
+        if not isinstance(children, list):
+            raise InputError("its children are no list")
+        children = [child for child in children if isinstance(child, dict)]
+        placed = [
+            (child, entry)
+            for child in children
+            # The others are surfaces, dangling references, and furniture 3D-FRONT itself rejects.
+            if (entry := self.house.furniture.get(key_of(child.get("ref")))) and is_valid(entry)
+        ]
+        if not placed:
+            raise _FilteredError("no_furniture", "no furniture stands in it")
+        notes: list[str] = []
+        surfaces = self._surfaces(children, notes)
+        floor, floor_y = floor_of(surfaces.get("Floor", []))
+        room_from_house = room_frame(floor, floor_y)
+        return Room(
+            room_id,
+            room_type,
+            in_frame(floor, room_from_house),
+            height_of(surfaces, floor_y),
+            tuple(self._furniture(placed, room_from_house, notes)),
+            tuple(notes),
+        )
+
+    def _surfaces(
+        self, children: list[dict[str, Any]], notes: list[str]
+    ) -> dict[str, list[Surface]]:
+        surfaces: dict[str, list[Surface]] = {}
+        for child in children:
+            mesh = self.house.meshes.get(key_of(child.get("ref")))
+            kind = mesh.get("type") if mesh else None
+            if mesh is None or kind not in ("Floor", "WallInner", "Ceiling"):
+                continue
+            try:
+                surface = surface_of(mesh, child)
+            except InputError as error:
+                notes.append(f"a {kind} mesh is left out: {error}")
+                continue
+            if surface.unusable:
+                notes.append(f"a {kind} mesh has {surface.unusable} triangles without places")
+            surfaces.setdefault(kind, []).append(surface)
+        return surfaces
+
+    def _furniture(
+        self,
+        placed: list[tuple[dict[str, Any], dict[str, Any]]],
+        room_from_house: np.ndarray,
+        notes: list[str],
+    ) -> list[Furniture]:
+        pieces: list[Furniture] = []
+        seen: set[bytes] = set()
+        for child, entry in placed:
+            model_id = str(entry.get("jid") or "")
+            try:
+                placement = placement_of(child, required=("pos", "rot"))
+                self._check_scale(model_id, placement.scale)
+                key = model_id.encode(errors="replace") + np.round(placement.matrix, 4).tobytes()
+                if key in seen:
+                    notes.append(f"{shown(model_id)} stands twice at the same place; one is kept")
+                    continue
+                seen.add(key)
+                model = self._model(model_id)
+            except InputError as error:
+                notes.append(f"{shown(model_id)} is left out: {error}")
+                continue
+            category = self.models.category(model_id)
+            unit = np.diag([*[unit_of(model, entry)] * 3, 1.0])
+            pieces.append(
+                Furniture(
+                    label=self.recipe.classes.get(category, "void"),
+                    category=category,
+                    model_id=model_id,
+                    model=model,
+                    model_to_room=room_from_house @ placement.matrix @ unit,
+                )
+            )
+        return pieces
+
+    def _check_scale(self, model_id: str, scale: np.ndarray) -> None:
+        """Two rules of the recipe; without them, only what is flat is left out."""
+        limits, text = self.recipe.scale_range, ", ".join(f"{value:g}" for value in scale)
+        if limits and not all(limits[0] <= abs(value) <= limits[1] for value in scale):
+            why = f"{shown(model_id)} is scaled by {text}, beyond scale_range"
+            raise _FilteredError("scale_range", why)
+        if not self.recipe.allow_mirrored and (scale < 0).any():
+            why = f"{shown(model_id)} is mirrored, scaled by {text}"
+            raise _FilteredError("allow_mirrored", why)
+        if (np.abs(scale) < _FLAT).any():
+            raise InputError(f"it is scaled by {text}, to nothing")
+
+    def _model(self, model_id: str) -> Mesh:
+        if not self.models.has(model_id):
+            raise InputError(f"the models folder has no {MODEL_FILE} for it")
+        return self.models.load(model_id) if self.load_models else _NO_MESH

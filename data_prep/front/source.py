@@ -1,0 +1,224 @@
+"""3D-FRONT (or homes in its format) as a source of rooms: surveyed by house, drawn by room."""
+
+import functools
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from data_prep.drawing import prepare_room
+from data_prep.filters import broken_rule
+from data_prep.front.files import file_stamp, house_files, model_info_path
+from data_prep.front.houses import House, parse_house
+from data_prep.front.models import ModelBank
+from data_prep.front.rooms import HouseRooms, read_house
+from data_prep.plan import digest, digest_of_files
+from data_prep.recipe import Expected, Recipe
+from data_prep.rgb import rgb_files
+from data_prep.rooms import Room
+from data_prep.selection import (
+    check_survey,
+    house_may_match,
+    is_asked_for,
+    read_splits,
+    seeded_split,
+)
+from data_prep.source import SPLITS, LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
+from data_prep.viewpoints import view_counts
+from data_prep.workers import Run
+from sceneprior.errors import InputError
+from sceneprior.offscreen import Renderer
+
+_HOUSES_PER_TASK = 8
+
+
+@dataclass(frozen=True)
+class FrontSource:
+    """What `prep-front` reads: a `Source` (data_prep/source.py)."""
+
+    front: Path
+    """Folder of house JSONs."""
+    future: Path
+    """Folder of furniture models."""
+    recipe: Recipe
+    splits: Path | None = None
+    """CSV of `room id,split`; None: a seeded 9:1."""
+    seed: int = 0
+    only: str | None = None
+    """HOUSE, HOUSE/ROOM or a room id; the beginning of a house's name is enough."""
+    val: str = "train"
+    """Which split the rows `val` of `splits` join: train, test or none."""
+    rgb: bool = False
+    """Also draw shaded pictures, `rgb/<room>/<view>.png` (rgb.py). The shards do not change."""
+
+    @property
+    def name(self) -> str:
+        return "3d-front"
+
+    @property
+    def label_set(self) -> str:
+        return self.recipe.label_set
+
+    @property
+    def room_type(self) -> str:
+        return self.recipe.name.removeprefix("front3d_")
+
+    @property
+    def draws(self) -> bool:
+        return True
+
+    @property
+    def expected(self) -> Expected | None:
+        return self.recipe.expected
+
+    def settings(self, only: str | None) -> dict[str, Any]:
+        """See `Source.settings`."""
+        info = model_info_path(Path(self.future))
+        if self.splits is not None:
+            read_splits(self.splits, self.val)
+        recipe = asdict(self.recipe)
+        del recipe["expected"]
+        return {
+            "recipe": recipe,
+            "seed": self.seed,
+            "val": self.val,
+            "rgb": self.rgb,
+            "splits": None if self.splits is None else digest(Path(self.splits).read_text()),
+            "houses": digest_of_files(self._houses(only)),
+            "models": digest_of_files([info]),
+        }
+
+    def survey(self, run: Run) -> Survey:
+        """Read every house once, without meshes, and decide which rooms are worth drawing."""
+        files = self._houses(self.only)
+        found: list[tuple[str, str, int]] = []
+        left_out: list[LeftOut] = []
+        chunks = [files[i : i + _HOUSES_PER_TASK] for i in range(0, len(files), _HOUSES_PER_TASK)]
+        arguments = [(self, chunk) for chunk in chunks]
+        for rooms, lost in run(_survey_houses, arguments, "reading houses"):
+            found += rooms
+            left_out += lost
+        if not found and not left_out:
+            kinds = " or ".join(self.recipe.room_types or ("any type",))
+            raise InputError(
+                f"No room of {self.front} is of a type that {self.recipe.name} is about ({kinds})."
+            )
+        if self.splits is None:
+            split_of_id = seeded_split([room_id for room_id, _, _ in found], self.seed)
+        else:
+            split_of_id = read_splits(self.splits, self.val)
+        tasks = []
+        for room_id, house, views in found:
+            bare = room_id.removeprefix(f"{house}_")
+            split = split_of_id.get(room_id, split_of_id.get(bare, ""))
+            if split in SPLITS:
+                tasks.append(RoomTask(room_id, house, split, views))
+            else:
+                why = "it is in no split"
+                left_out.append(LeftOut(room_id, house, "filtered", why, rule="split"))
+        survey = Survey(
+            tuple(task for task in tasks if is_asked_for(self.only, task.room_id, task.house)),
+            tuple(item for item in left_out if is_asked_for(self.only, item.room_id, item.house)),
+        )
+        where = f"{self.front} passes the recipe {self.recipe.name}"
+        hint = str(self.splits or "that the data set has more than one usable room")
+        check_survey(survey, where, self.only, hint)
+        return survey
+
+    def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
+        """Read one room with its meshes and draw its views."""
+        assert renderer is not None
+        path = Path(self.front) / f"{task.house}.json"
+        house = _parsed(path, file_stamp(path))
+        read = self.read(house, load_models=True, room_id=task.room_id)
+        if not read.rooms:
+            reasons = [why for _, why in read.failures] + [why for *_, why in read.filtered]
+            why = reasons[0] if reasons else "its house lost it meanwhile"
+            return LeftOut(task.room_id, task.house, "failed", why)
+        room = read.rooms[0]
+        # The survey saw no meshes: a model that turns out unreadable may leave too little.
+        broken = broken_rule(room, self.recipe)
+        made = None
+        if broken is None:
+            made = prepare_room(room, task.views, self.recipe, self.seed, renderer)
+            broken = "no_view", "no view shows any object"
+        if made is None:
+            return _filtered(room, task.house, *broken)
+        pieces = [piece for piece in room.furniture if piece.label != "void"]
+        models = {piece.model_id: piece.model for piece in pieces}
+        pictures = {}
+        if self.rgb:
+            colors = [self._bank.color(piece.model_id) for piece in room.furniture]
+            pictures = rgb_files(room, colors, made[0], self.label_set, renderer)
+        return PreparedRoom(*made, models=models, files=pictures, notes=room.notes)
+
+    def read(self, house: House, load_models: bool, room_id: str | None = None) -> HouseRooms:
+        """The rooms of a house that are of the recipe's type, or the one with this id."""
+        return read_house(
+            house,
+            self._bank,
+            self.recipe,
+            lambda its_id, its_type: (
+                self.recipe.of_type(its_type) if room_id is None else its_id == room_id
+            ),
+            load_models,
+        )
+
+    @property
+    def _bank(self) -> ModelBank:
+        folder = Path(self.future)
+        return _bank(folder, file_stamp(model_info_path(folder)))
+
+    def _houses(self, only: str | None) -> list[Path]:
+        chosen = [path for path in house_files(self.front) if house_may_match(only, path.stem)]
+        if not chosen:
+            house = (only or "").partition("/")[0]
+            raise InputError(
+                f"{self.front} has no house '{house}' (--only takes HOUSE, HOUSE/ROOM or ID)."
+            )
+        return chosen
+
+
+# Kept from room to room within a process. The stamps make a worker that outlives the job, as those
+# of a cluster do, read a mended file again.
+@functools.lru_cache(maxsize=1)
+def _bank(future: Path, stamp: tuple[int, int]) -> ModelBank:
+    return ModelBank(future)
+
+
+@functools.lru_cache(maxsize=1)
+def _parsed(path: Path, stamp: tuple[int, int]) -> House:
+    return parse_house(path)
+
+
+def _filtered(room: Room, house: str, rule: str, reason: str) -> LeftOut:
+    return LeftOut(room.room_id, house, "filtered", reason, rule, room.notes)
+
+
+def _survey_houses(
+    source: FrontSource, files: list[Path]
+) -> tuple[list[tuple[str, str, int]], list[LeftOut]]:
+    """(room id, house, views) of the rooms to draw, and the others with the reason."""
+    found: list[tuple[str, str, int]] = []
+    left_out: list[LeftOut] = []
+    for path in files:
+        house = path.stem
+        try:
+            read = source.read(parse_house(path), load_models=False)
+        except Exception as error:
+            left_out.append(LeftOut(house, house, "failed", sentence_of(error)))
+            continue
+        left_out += [LeftOut(room_id, house, "failed", why) for room_id, why in read.failures]
+        left_out += [
+            LeftOut(room_id, house, "filtered", why, rule=rule)
+            for room_id, rule, why in read.filtered
+        ]
+        good = []
+        for room in read.rooms:
+            broken = broken_rule(room, source.recipe)
+            if broken is None:
+                good.append(room)
+            else:
+                left_out.append(_filtered(room, house, *broken))
+        counts = view_counts([float(room.floor.area) for room in good], source.recipe.views)
+        found += [(room.room_id, house, views) for room, views in zip(good, counts, strict=True)]
+    return found, left_out

@@ -1,0 +1,1 @@
+"""Anybody's data: posed pictures with tracked instance masks (docs/posed_data.md)."""

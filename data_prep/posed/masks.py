@@ -1,0 +1,60 @@
+"""PNGs of tracked instance ids in, arrays out."""
+
+import zlib
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from sceneprior.errors import InputError
+
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+_HEADER_BYTES = 26
+_GREY, _PALETTE = 0, 3
+_KINDS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
+
+
+def mask_size(path: Path) -> tuple[int, int]:
+    """(height, width), without reading the pixels.
+
+    Raises:
+        InputError: it is missing, no PNG, or has more than one channel.
+    """
+    with _open(path) as picture:
+        return picture.height, picture.width
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """(height, width) uint16: the same value is the same object in all frames, 0 is nothing.
+
+    Raises:
+        InputError: it is missing, no PNG, has more than one channel, or is cut off.
+    """
+    try:
+        with _open(path) as picture:
+            return np.asarray(picture).astype(np.uint16)
+    except (OSError, ValueError, SyntaxError, EOFError, zlib.error) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} is damaged ({str(error)[:120]}).") from None
+
+
+def _open(path: Path) -> Image.Image:
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEADER_BYTES)
+        if len(head) < _HEADER_BYTES or not head.startswith(_PNG_START):
+            raise InputError(f"{path} is no PNG; ids are kept in PNGs, which lose nothing.")
+        depth, kind = head[24:26]
+        # A palette's indices are the ids, as DAVIS and most segmenters write them. Pillow stretches
+        # grey values of fewer than 8 bits, so those are refused.
+        if kind != _PALETTE and (kind != _GREY or depth not in (8, 16)):
+            raise InputError(
+                f"{path} is {depth}-bit {_KINDS.get(kind, 'of unknown colours')}; expected one "
+                "channel of 8 or 16 bits, or a palette, whose values are instance ids."
+            )
+        return Image.open(path, formats=("PNG",))
+    except FileNotFoundError:
+        raise InputError(f"{path} is missing.") from None
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path} is no PNG that can be read ({str(error)[:120]}).") from None

@@ -1,0 +1,200 @@
+"""Folders of posed pictures as a source of rooms: a folder with a transforms.json is a room."""
+
+import hashlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from data_prep.plan import digest_of_files
+from data_prep.posed.labels import TABLES
+from data_prep.posed.transforms import FILE_NAME, INSTANCES, read_transforms, room_name
+from data_prep.posed.views import (
+    PosedSettings,
+    prepare_posed,
+    seems_up,
+    stored_size,
+    usable_frames,
+)
+from data_prep.recipe import Expected
+from data_prep.selection import check_survey, house_may_match, is_asked_for
+from data_prep.source import LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
+from data_prep.workers import Run
+from sceneprior.classes import label_set
+from sceneprior.errors import InputError
+from sceneprior.offscreen import Renderer
+
+
+@dataclass(frozen=True)
+class PosedSource:
+    """What `prep-posed` reads: a `Source` (data_prep/source.py)."""
+
+    folder: Path
+    """One room, or a folder of rooms."""
+    label_set: str
+    """As `sceneprior.classes.label_set` takes it."""
+    posed_settings: PosedSettings = field(default_factory=PosedSettings)
+    val_share: float = 0.1
+    """Share of the rooms in the split `test`, at least one of several; 0: all rooms train."""
+    seed: int = 0
+    only: str | None = None
+    """A room; the beginning of its name is enough."""
+
+    @property
+    def name(self) -> str:
+        return "posed"
+
+    @property
+    def room_type(self) -> str:
+        return "posed"
+
+    @property
+    def draws(self) -> bool:
+        return False
+
+    @property
+    def expected(self) -> Expected | None:
+        return None
+
+    def settings(self, only: str | None) -> dict[str, Any]:
+        """See `Source.settings`. The files' names and sizes take part: whoever mends masks or
+        classes should not be handed the shards of before."""
+        label_set(self.label_set)
+        if not 0 <= self.val_share < 1:
+            raise InputError(f"val_share is {self.val_share}; expected a share from 0 to below 1.")
+        rooms = [path for path in find_rooms(self.folder) if house_may_match(only, room_name(path))]
+        if not rooms:
+            raise InputError(f"{self.folder} has no room '{only}' (--only takes a room's folder).")
+        files = {
+            room_name(room): digest_of_files(
+                [room / name for name in (FILE_NAME, *TABLES) if (room / name).is_file()]
+                + sorted((room / INSTANCES).glob("*.png"))
+            )
+            for room in rooms
+        }
+        return {
+            "recipe": {"label_set": self.label_set, **asdict(self.posed_settings)},
+            "seed": self.seed,
+            "val_share": self.val_share,
+            "rooms": hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:16],
+        }
+
+    def survey(self, run: Run) -> Survey:
+        """Read every room's transforms.json and the size of its masks."""
+        rooms = find_rooms(self.folder)
+        sizes: dict[str, tuple[int, int]] = {}
+        left_out: list[LeftOut] = []
+        for room, found in zip(
+            rooms, run(_look, [(self, room) for room in rooms], "reading rooms"), strict=True
+        ):
+            name = room_name(room)
+            if isinstance(found, str):
+                left_out.append(LeftOut(name, name, "failed", found))
+            else:
+                sizes[name] = found
+        # A batch holds several rooms, and images of one size.
+        usual = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
+        for name, size in sizes.items():
+            if size != usual:
+                why = (
+                    f"its views are {size[1]} x {size[0]} pixels, those of most rooms {usual[1]} x "
+                    f"{usual[0]}, and a folder of shards has one size; prepare its folder by itself"
+                )
+                left_out.append(LeftOut(name, name, "filtered", why, "image_size"))
+        names = [name for name, size in sizes.items() if size == usual]
+        split_of = shared_split(names, self.val_share, self.seed)
+        survey = Survey(
+            tuple(
+                RoomTask(name, name, split_of[name])
+                for name in names
+                if is_asked_for(self.only, name, name)
+            ),
+            tuple(item for item in left_out if is_asked_for(self.only, item.room_id, item.house)),
+        )
+        if not survey.rooms:
+            check_survey(survey, f"{self.folder} can be prepared", self.only, "the rooms")
+        return survey
+
+    def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
+        """Read one room and label its views."""
+        folders = {room_name(room): room for room in find_rooms(self.folder)}
+        if task.house not in folders:
+            raise InputError(f"{self.folder} has lost this room meanwhile; give it back.")
+        recording = read_transforms(folders[task.house])
+        made = prepare_posed(recording, self.label_set, self.posed_settings)
+        if made is None:
+            why = f"none of its {len(recording.frames)} frames shows any object"
+            return LeftOut(task.room_id, task.house, "filtered", why, "no_view")
+        return made
+
+    def assumptions(self) -> list[str]:
+        """Sentences about what the files do not say, for the user to read before the work."""
+        recordings = []
+        for room in find_rooms(self.folder):
+            try:
+                recordings.append(read_transforms(room))
+            except InputError:
+                continue  # the report will say it
+        settings, count = self.posed_settings, len(recordings)
+        sentences = []
+        unknown = sum(recording.floor_m is None for recording in recordings)
+        if unknown and settings.floor_m is None:
+            sentences.append(
+                f"{unknown} of {count} rooms give no floor_m: the floor is assumed "
+                f"{settings.camera_height_m:g} m below the lowest camera (--camera-height-m)."
+            )
+        unknown = sum(recording.metres_per_unit is None for recording in recordings)
+        if unknown and settings.metres_per_unit == 1:
+            sentences.append(
+                f"{unknown} of {count} rooms give no metres_per_unit: poses are taken as metres; "
+                "those of COLMAP are not."
+            )
+        other = sum(seems_up(recording) not in (None, settings.up) for recording in recordings)
+        if other:
+            axis = "y" if settings.up == "z" else "z"
+            sentences.append(
+                f"In {other} of {count} rooms the tops of the pictures point along {axis}, but "
+                f"{settings.up} is taken as up: is it --up {axis}?"
+            )
+        return sentences
+
+
+def find_rooms(folder: Path) -> list[Path]:
+    """The folder itself if it holds a transforms.json, else its sub-folders that hold one, or
+    that hold `instances/` without, for the report to name them; sorted.
+
+    Raises:
+        InputError: there is no room.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"No folder at {folder}; prep-posed reads a folder of rooms.")
+    if (folder / FILE_NAME).is_file():
+        return [folder]
+    found = [
+        path
+        for path in sorted(folder.iterdir())
+        if (path / FILE_NAME).is_file() or (path / INSTANCES).is_dir()
+    ]
+    if not found:
+        raise InputError(f"{folder} holds no {FILE_NAME}, and none of its sub-folders does.")
+    return found
+
+
+def shared_split(names: Sequence[str], val_share: float, seed: int) -> dict[str, str]:
+    """Room -> train or test; a name keeps its place in the order whatever else is there."""
+    order = sorted(names, key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).digest())
+    tests = 0
+    if val_share > 0 and len(order) > 1:
+        tests = min(max(1, round(val_share * len(order))), len(order) - 1)
+    return {name: "test" if i < tests else "train" for i, name in enumerate(order)}
+
+
+def _look(source: PosedSource, room: Path) -> tuple[int, int] | str:
+    """The size at which a room would be stored, or why it cannot be."""
+    try:
+        recording = read_transforms(room)
+        return stored_size(usable_frames(recording)[0], source.posed_settings)
+    except Exception as error:
+        return sentence_of(error)

@@ -1,0 +1,1 @@
+"""ScanNet's raw scan folders in (.sens, zips, JSON, PLY), labelled views of one room out."""

@@ -1,0 +1,191 @@
+"""A scan's `.txt`, JSONs and mesh in; its alignment, and each object's vertices, out."""
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sceneprior.errors import InputError
+
+_RIGID_SLACK = 1e-2
+
+
+@dataclass(frozen=True)
+class Group:
+    """One annotated object: `segGroups[]` of the aggregation."""
+
+    object_id: int
+    category: str
+    """The annotators' word for it."""
+    segments: frozenset[int]
+
+
+def read_properties(path: Path) -> dict[str, str]:
+    """The `key = value` lines of `<scene>.txt`.
+
+    Raises:
+        InputError: the file is missing or not text.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise _unreadable(path, error) from None
+    pairs = (line.partition("=") for line in lines)
+    return {key.strip(): value.strip() for key, equals, value in pairs if equals}
+
+
+def axis_alignment(path: Path, properties: dict[str, str]) -> np.ndarray:
+    """(4, 4) float64, from the scan's frame to one with its walls along the axes, z up.
+
+    The identity where the file has none: scans of version 1, and test scans.
+
+    Raises:
+        InputError: it is not 16 numbers, or does not move the scan rigidly.
+    """
+    if "axisAlignment" not in properties:
+        return np.eye(4)
+    words = properties["axisAlignment"].split()
+    try:
+        matrix = np.array([float(word) for word in words]).reshape(4, 4)
+    except ValueError:
+        raise InputError(
+            f"{path}: axisAlignment is {len(words)} words, expected 16 numbers. "
+            "Download the scan again."
+        ) from None
+    turn = matrix[:3, :3]
+    if (
+        not np.isfinite(matrix).all()
+        or np.abs(turn.T @ turn - np.eye(3)).max() > _RIGID_SLACK
+        or np.abs(matrix[3] - (0, 0, 0, 1)).max() > _RIGID_SLACK
+        or np.linalg.det(turn) < 0
+    ):
+        raise InputError(
+            f"{path}: axisAlignment does not turn and move the scan, it distorts it; "
+            "the file is damaged. Download the scan again."
+        )
+    return matrix
+
+
+def read_groups(path: Path) -> tuple[list[Group], list[str]]:
+    """The objects of `<scene>.aggregation.json`, by object id, and what was odd about them.
+
+    Raises:
+        InputError: the file is missing, truncated, or not an aggregation.
+    """
+    data = _read_json(path, "a scan without annotations (ScanNet's test scans) cannot be prepared")
+    found: dict[int, Group] = {}
+    notes = []
+    try:
+        for entry in data["segGroups"]:
+            number, category = entry["objectId"], entry["label"]
+            if not _is_index(number) or not isinstance(category, str):
+                raise TypeError(f"objectId {number!r} with label {category!r}")
+            segments = frozenset(entry["segments"])
+            if not all(_is_index(segment) for segment in segments):
+                raise TypeError(f"the segments of object {number} are not all whole numbers")
+            if number in found:
+                notes.append(f"object {number} is listed twice; its parts were joined")
+                category, segments = found[number].category, segments | found[number].segments
+            found[number] = Group(number, category, segments)
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"{path} is not an aggregation of objects ({type(error).__name__}: {error}); "
+            "expected segGroups with objectId, label and segments. Download the scan again."
+        ) from None
+    return [found[number] for number in sorted(found)], notes
+
+
+def read_segments(path: Path) -> np.ndarray:
+    """(vertices,) int64, the segment of each mesh vertex, from `<scene>_vh_clean_2...segs.json`.
+
+    Raises:
+        InputError: the file is missing, truncated, or not a segmentation.
+    """
+    data = _read_json(path, "it tells which part of the mesh is which object")
+    try:
+        segments = np.asarray(data["segIndices"])
+        if segments.ndim != 1 or segments.dtype.kind != "i":
+            raise TypeError("segIndices is not a list of whole numbers")
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} is not a segmentation ({type(error).__name__}: {error}); "
+            "expected segIndices, one whole number per vertex. Download the scan again."
+        ) from None
+    return segments.astype(np.int64)
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """(vertices, 3) float64 of `<scene>_vh_clean_2.ply`, metres, the scan's own frame, z up.
+
+    Raises:
+        InputError: the file is missing, truncated, or holds no finite vertices.
+    """
+    from trimesh.exchange.ply import load_ply
+
+    if not path.is_file():
+        raise _unreadable(path, FileNotFoundError("no such file"))
+    try:
+        # The arrays of the file, not a Trimesh: merged or dropped vertices would no longer be
+        # those of segs.json, and the triangles, which nobody needs, would double the memory.
+        with path.open("rb") as file:
+            loaded = load_ply(file, fix_texture=False, skip_materials=True)
+        vertices = np.array(loaded["vertices"], dtype=np.float64).reshape(-1, 3)
+    except Exception as error:  # a damaged PLY surprises trimesh in many ways
+        raise InputError(
+            f"{path} is not a mesh that can be read ({type(error).__name__}: {error}); "
+            "it is truncated or damaged. Download the scan again."
+        ) from None
+    if not len(vertices) or not np.isfinite(vertices).all():
+        raise InputError(f"{path} holds no vertices, or broken ones. Download the scan again.")
+    return vertices
+
+
+def object_bounds(
+    groups: list[Group], segments: np.ndarray, vertices_m: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray] | None]:
+    """Lowest and highest corner (3,) of each group's axis-aligned box; None without vertices.
+
+    Args:
+        groups: What `read_groups` gave.
+        segments: (V,) segment of each vertex.
+        vertices_m: (V, 3) in the frame whose axes the boxes follow.
+    """
+    order = np.argsort(segments, kind="stable")
+    numbers, starts = np.unique(segments[order], return_index=True)
+    parts = dict(zip(numbers.tolist(), np.split(order, starts[1:]), strict=True))
+    bounds: list[tuple[np.ndarray, np.ndarray] | None] = []
+    for group in groups:
+        mine = [parts[segment] for segment in sorted(group.segments) if segment in parts]
+        if not mine:
+            bounds.append(None)
+            continue
+        points = vertices_m[np.concatenate(mine)]
+        bounds.append((points.min(axis=0), points.max(axis=0)))
+    return bounds
+
+
+def _is_index(value: Any) -> bool:
+    # JSON's true is Python's 1; a float is no index even where it is whole.
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < math.inf
+
+
+def _read_json(path: Path, why: str) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise _unreadable(path, error, why) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"{path} is not JSON ({error}); it is truncated or damaged. Download the scan again."
+        ) from None
+
+
+def _unreadable(path: Path, error: Exception, why: str = "") -> InputError:
+    reason = getattr(error, "strerror", None) or error
+    return InputError(
+        f"{path} cannot be read ({reason}){'; ' if why else ''}{why}. "
+        f"Download it into the scan's folder, or leave {path.parent.name} out of the list of scans."
+    )

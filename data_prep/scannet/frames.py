@@ -1,0 +1,165 @@
+"""Poses, masks and lens of a recording in; which frames are views, and their cameras, out."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprior.errors import InputError
+
+_ROTATION_SLACK = 1e-2
+"""A pose whose axes are further than this from right angles and unit length is damage. Fused
+poses of the release, rounded to float32, are a thousand times better."""
+_ASPECT_SLACK = 0.02
+"""1296 x 968 and 640 x 480 differ by 0.4% in shape and still show the same picture."""
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """The frames that become views, and how many candidates could not."""
+
+    frames: tuple[int, ...]
+    candidates: int
+    """Every `step`-th frame of the recording."""
+    bad_poses: int
+    without_mask: int
+    """Candidates with a pose but no mask."""
+
+
+def choose_frames(
+    camera_to_world: np.ndarray, with_mask: Collection[int], step: int = 15, at_most: int = 100
+) -> FrameChoice:
+    """Every `step`-th frame, less those that cannot be used, then at most `at_most` of them.
+
+    What is left is thinned evenly, first and last frame kept. Frames are dropped before they are
+    thinned, so that a recording that lost its track keeps as many views as it can.
+
+    Args:
+        camera_to_world: (frames, 4, 4), as recorded.
+        with_mask: Frame numbers that have a mask.
+        step: As ScanNet's exports, 15.
+        at_most: The paper's 100.
+
+    Example: 7 candidates, one lost, thinned to 3.
+
+        >>> poses = np.repeat(np.eye(4)[None], 61, axis=0)
+        >>> poses[10] = -np.inf
+        >>> choose_frames(poses, range(61), step=10, at_most=3)
+        FrameChoice(frames=(0, 40, 60), candidates=7, bad_poses=1, without_mask=0)
+    """
+    candidates = np.arange(0, len(camera_to_world), step)
+    posed = candidates[is_pose(camera_to_world[candidates])].tolist()
+    masked = set(with_mask)
+    usable = [frame for frame in posed if frame in masked]
+    frames = usable
+    if len(usable) > at_most:
+        # Half up rather than to even, so that the steps are as equal as they can be.
+        places = np.floor(np.linspace(0, len(usable) - 1, at_most) + 0.5).astype(int)
+        frames = [usable[place] for place in places]
+    return FrameChoice(
+        tuple(frames), len(candidates), len(candidates) - len(posed), len(posed) - len(usable)
+    )
+
+
+def is_pose(camera_to_world: np.ndarray) -> np.ndarray:
+    """(frames,) bool: finite, and a rotation with a translation.
+
+    Args:
+        camera_to_world: (frames, 4, 4).
+    """
+    poses = np.asarray(camera_to_world, dtype=np.float64)
+    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    safe = np.where(finite[:, None, None], poses, 0.0)
+    turn = safe[:, :3, :3]
+    off = np.abs(turn.transpose(0, 2, 1) @ turn - np.eye(3)).max(axis=(1, 2))
+    bottom = np.abs(safe[:, 3] - (0, 0, 0, 1)).max(axis=1)
+    right_handed = np.linalg.det(turn) > 0
+    return finite & (off < _ROTATION_SLACK) & (bottom < _ROTATION_SLACK) & right_handed
+
+
+def room_cameras(camera_to_world: np.ndarray, room_from_scan: np.ndarray) -> np.ndarray:
+    """World-to-camera transforms in the room frame.
+
+    Args:
+        camera_to_world: (views, 4, 4) good poses in the scan's own frame, OpenCV axes.
+        room_from_scan: (4, 4) rigid.
+
+    Returns:
+        (views, 4, 4) float64. The rotation is the nearest exact one, so that a camera's centre
+        and its rays agree to rounding.
+    """
+    poses = np.asarray(room_from_scan, dtype=np.float64) @ camera_to_world.astype(np.float64)
+    u, _, v = np.linalg.svd(poses[:, :3, :3])
+    turn = (u @ v).transpose(0, 2, 1)
+    inverse = np.zeros_like(poses)
+    inverse[:, :3, :3] = turn
+    inverse[:, :3, 3:] = -turn @ poses[:, :3, 3:]
+    inverse[:, 3, 3] = 1
+    return inverse
+
+
+def sampled_lines(source: int, target: int) -> np.ndarray:
+    """(target,) which of `source` rows (or columns) stand for the `target` rows of a small image.
+
+    The nearest to where the small pixel's centre lies, the later one where two are equally near.
+
+        >>> sampled_lines(12, 3).tolist()
+        [2, 6, 10]
+    """
+    return np.floor((np.arange(target) + 0.5) * source / target).astype(np.int64)
+
+
+def mask_intrinsics(
+    intrinsic_color: np.ndarray,
+    color_size: tuple[int, int],
+    mask_size: tuple[int, int],
+    image_size: tuple[int, int],
+) -> np.ndarray:
+    """The lens of an image of `image_size` sampled (`sampled_lines`) from a mask of `mask_size`.
+
+    Colour frames, masks and what is stored may all differ in size; this is the one place that
+    minds it. Three steps, each exact:
+
+    - ScanNet counts pixel centres in whole numbers, docs/conventions.md puts them at i + 0.5:
+      half a pixel is added to the centre of projection.
+    - A mask shows what the colour frame shows: u scales with the widths, v with the heights.
+    - A sampled pixel is one of the mask's pixels, whose centre need not be the small pixel's own:
+      every fourth line from the third on is 0.5 full-size pixels late. The mean offset moves
+      the centre of projection, so that points fall on the pixels that show them.
+
+    Args:
+        intrinsic_color: (4, 4) of the `.sens`, pixels of the colour frame.
+        color_size, mask_size, image_size: (height, width).
+
+    Returns:
+        (3, 3) float64, pixels of the stored image.
+
+    Raises:
+        InputError: masks and colour frames are not of one shape.
+
+    Example: half size; the second of each two pixels stays, 0.25 small pixels right of the centre.
+
+        >>> K = np.diag([8.0, 8, 1, 1])
+        >>> K[:2, 2] = 3.5  # the middle of 8 pixels that are counted from centre to centre
+        >>> mask_intrinsics(K, (8, 8), (8, 8), (4, 4))[0].tolist()
+        [4.0, 0.0, 1.75]
+    """
+    shapes = mask_size[1] / mask_size[0], color_size[1] / color_size[0]
+    if abs(shapes[0] / shapes[1] - 1) > _ASPECT_SLACK:
+        raise InputError(
+            f"The masks are {mask_size[1]} x {mask_size[0]} pixels but the colour frames "
+            f"{color_size[1]} x {color_size[0]}, another shape: they do not show the same "
+            "picture. Use the masks that belong to this recording."
+        )
+    intrinsics = np.array(intrinsic_color[:3, :3], dtype=np.float64)
+    intrinsics[2] = 0, 0, 1
+    intrinsics[:2, 2] += 0.5
+    # Axis 0 is u, along the width; axis 1 is v.
+    for axis, line in enumerate((1, 0)):
+        intrinsics[axis] *= mask_size[line] / color_size[line]
+        step = mask_size[line] / image_size[line]
+        lines = sampled_lines(mask_size[line], image_size[line])
+        late = np.mean(lines + 0.5 - (np.arange(image_size[line]) + 0.5) * step)
+        intrinsics[axis, 2] -= late
+        intrinsics[axis] /= step
+    return intrinsics

@@ -1,0 +1,72 @@
+"""ScanNet's label table in, the class of every raw category out."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+from sceneprior.classes import label_set
+from sceneprior.errors import InputError
+
+LABEL_SET = "scannet"
+SHELL = frozenset(
+    ["wall", "floor", "ceiling", "door", "window", "blinds", "floor mat", "mirror", "picture"]
+)
+"""NYU40 classes of the room itself. Every piece of furniture stands against one of them in the
+image, and none of them hides it: they are drawn as nothing."""
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What the raw categories of the annotators mean."""
+
+    nyu40: dict[str, str]
+    """Raw category -> NYU40 class, both in lower case."""
+    source: str
+    """Name of the table, for messages."""
+
+    def knows(self, category: str) -> bool:
+        """Whether the table lists a raw category."""
+        return _tidy(category) in self.nyu40
+
+    def label(self, category: str) -> str:
+        """Class in the label set `scannet`; `void` for anything outside the 19."""
+        name = self.nyu40.get(_tidy(category), "")
+        return name if name in label_set(LABEL_SET) else "void"
+
+    def is_shell(self, category: str) -> bool:
+        """Whether this is a part of the room rather than a thing in it."""
+        return self.nyu40.get(_tidy(category), "") in SHELL
+
+
+def read_labels(path: Path) -> Labels:
+    """Read `scannetv2-labels.combined.tsv`. Where a category repeats, its last row wins.
+
+    Raises:
+        InputError: the file is missing or is not that table.
+    """
+    path = Path(path)
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            # Some categories hold a quotation mark (inches), which means nothing here.
+            rows = list(csv.reader(file, delimiter="\t", quoting=csv.QUOTE_NONE))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(
+            f"The label table {path} cannot be read ({error}); "
+            "--labels names ScanNet's scannetv2-labels.combined.tsv."
+        ) from None
+    columns = [name.strip().lower() for name in rows[0]] if rows else []
+    if "raw_category" not in columns or "nyu40class" not in columns:
+        raise InputError(
+            f"{path} has no columns raw_category and nyu40class (it begins with "
+            f"{', '.join(columns[:4]) or 'nothing'}); --labels names ScanNet's "
+            "scannetv2-labels.combined.tsv, which is tab separated."
+        )
+    raw, nyu = columns.index("raw_category"), columns.index("nyu40class")
+    meanings = {_tidy(row[raw]): _tidy(row[nyu]) for row in rows[1:] if len(row) > max(raw, nyu)}
+    if not meanings:
+        raise InputError(f"{path} lists no categories; download the label table again.")
+    return Labels(meanings, path.name)
+
+
+def _tidy(text: str) -> str:
+    return text.strip().lower()

@@ -1,0 +1,134 @@
+"""ScanNet as a source of rooms: a scan is a room, and its recording has its views."""
+
+import functools
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from data_prep.plan import digest
+from data_prep.recipe import Expected
+from data_prep.scannet.labels import LABEL_SET, Labels, read_labels
+from data_prep.scannet.scans import ScanSettings, read_scan
+from data_prep.scannet.splits import find_scans, space_of, split_scans
+from data_prep.scannet.views import prepare_scan
+from data_prep.selection import check_survey, house_may_match, is_asked_for, seeded_split
+from data_prep.source import LeftOut, PreparedRoom, RoomTask, Survey
+from data_prep.workers import Run
+from sceneprior.errors import InputError
+from sceneprior.offscreen import Renderer
+
+_OFFICIAL = Expected(
+    of="ScanNet v2 by its lists; views as the paper counts them (section 5)",
+    rooms=1513, train=1201, test=312, views=108_059,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ScanNetSource:
+    """What `prep-scannet` reads: a `Source` (data_prep/source.py)."""
+
+    scans: Path
+    """Folder of scan folders."""
+    labels: Path
+    """scannetv2-labels.combined.tsv."""
+    scan_settings: ScanSettings = field(default_factory=ScanSettings)
+    train: Path | None = None
+    """scannetv2_train.txt."""
+    val: Path | None = None
+    """scannetv2_val.txt, which becomes the split `test`. Without lists: a seeded 9:1 of spaces."""
+    seed: int = 0
+    only: str | None = None
+    """A scan; the beginning of its name is enough."""
+
+    @property
+    def name(self) -> str:
+        return "scannet"
+
+    @property
+    def label_set(self) -> str:
+        return LABEL_SET
+
+    @property
+    def room_type(self) -> str:
+        return "scannet"
+
+    @property
+    def draws(self) -> bool:
+        return False
+
+    @property
+    def expected(self) -> Expected | None:
+        return _OFFICIAL if self.train and self.val and self.only is None else None
+
+    def settings(self, only: str | None) -> dict[str, Any]:
+        """See `Source.settings`."""
+        read_labels(self.labels)
+        folders = self._folders(only)
+        lists = {"train": self.train, "val": self.val}
+        if self.train or self.val:
+            split_scans(find_scans(self.scans), self.train, self.val)
+        return {
+            "recipe": asdict(self.scan_settings),
+            "seed": self.seed,
+            "labels": digest(Path(self.labels).read_text(encoding="utf-8")),
+            **{
+                name: None if path is None else digest(Path(path).read_text(encoding="utf-8"))
+                for name, path in lists.items()
+            },
+            # Names alone: a scan that failed may be downloaded again, and tried with the others
+            # kept (`--retry-failed`), which sizes of files would forbid.
+            "scans": digest("\n".join(path.name for path in folders)),
+        }
+
+    def survey(self, run: Run) -> Survey:
+        """Which scans are there and in a split; no scan is opened."""
+        folders = find_scans(self.scans)
+        names = [path.name for path in folders]
+        left_out: list[LeftOut] = []
+        if self.train or self.val:
+            found = split_scans(folders, self.train, self.val)
+            split_of = found.split_of
+            for scan_ids, why in (
+                (found.skipped, "it is in no list"),
+                (found.missing, f"a list names it, but {self.scans} has no such folder"),
+            ):
+                left_out += [LeftOut(name, name, "filtered", why, "split") for name in scan_ids]
+        else:
+            # By space: the same room scanned again must not be in both halves.
+            half = seeded_split(list(dict.fromkeys(map(space_of, names))), self.seed)
+            split_of = {name: half[space_of(name)] for name in names}
+        survey = Survey(
+            tuple(
+                RoomTask(name, name, split)
+                for name, split in split_of.items()
+                if is_asked_for(self.only, name, name)
+            ),
+            tuple(item for item in left_out if is_asked_for(self.only, item.room_id, item.house)),
+        )
+        hint = "the lists" if self.train or self.val else "that there is more than one space"
+        check_survey(survey, f"{self.scans} is to be prepared", self.only, hint)
+        return survey
+
+    def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
+        """Read one scan and label its views."""
+        labels = _labels(Path(self.labels), Path(self.labels).stat().st_mtime_ns)
+        scan = read_scan(Path(self.scans) / task.house, labels, self.scan_settings)
+        made = prepare_scan(scan)
+        if made is None:
+            why = f"none of its {len(scan.frames)} views shows any object"
+            return LeftOut(task.room_id, task.house, "filtered", why, "no_view", scan.notes)
+        return made
+
+    def _folders(self, only: str | None) -> list[Path]:
+        chosen = [path for path in find_scans(self.scans) if house_may_match(only, path.name)]
+        if not chosen:
+            raise InputError(
+                f"{self.scans} has no scan '{only}' (--only takes a scan, such as scene0000_00)."
+            )
+        return chosen
+
+
+# Kept from room to room within a process; the stamp makes a long-lived worker see a mended table.
+@functools.lru_cache(maxsize=1)
+def _labels(path: Path, stamp: int) -> Labels:
+    return read_labels(path)

@@ -1,0 +1,103 @@
+"""A folder of scans and the official lists in; which scan is in which split, out."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sceneprior.errors import InputError
+
+
+@dataclass(frozen=True)
+class ScanSplits:
+    """Which scans are prepared, and under which split."""
+
+    split_of: dict[str, str]
+    """Scan id -> train or test, in the order of the folders."""
+    skipped: tuple[str, ...]
+    """Scans on disk that no list names."""
+    missing: tuple[str, ...]
+    """Scans that a list names and the disk has not."""
+
+
+def find_scans(folder: Path) -> list[Path]:
+    """The scan folders in ScanNet's `scans`, sorted: `scene0000_00` and whatever holds a `.sens`
+    of its own name. A folder that lost its `.sens` is listed, too, for the report to name it.
+
+    Raises:
+        InputError: the folder is missing, or holds no scans.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"No folder at {folder}; --scans names ScanNet's folder of scans.")
+    found = [path for path in sorted(folder.iterdir()) if path.is_dir() and _is_scan(path)]
+    if not found:
+        inside = folder / "scans"
+        hint = (
+            f"; did you mean {inside}?"
+            if inside.is_dir()
+            else f"; did you mean {folder.absolute().parent}?"
+            if _is_scan(folder.absolute())
+            else "."
+        )
+        raise InputError(f"{folder} holds no scans (scene0000_00/ and so on){hint}")
+    return found
+
+
+def _is_scan(path: Path) -> bool:
+    named = re.fullmatch(r"scene\d{4}_\d{2}", path.name)
+    return bool(named) or (path / f"{path.name}.sens").is_file()
+
+
+def space_of(scan_id: str) -> str:
+    """The place a scan was made in, `scene0000` of `scene0000_01`. A split that is drawn at
+    random should draw spaces, or a room is in both halves."""
+    return re.sub(r"_\d{2}$", "", scan_id)
+
+
+def split_scans(
+    folders: Sequence[Path], train: Path | None = None, val: Path | None = None
+) -> ScanSplits:
+    """Sort scans by the official lists; those of `val` are the split `test`.
+
+    Args:
+        folders: From `find_scans`.
+        train: `scannetv2_train.txt`: one scan id a line.
+        val: `scannetv2_val.txt`.
+
+    Raises:
+        InputError: a list cannot be read, both name one scan, or no scan is in a list.
+    """
+    listed: dict[str, str] = {}
+    for path, split in ((train, "train"), (val, "test")):
+        for scan_id in [] if path is None else _read_list(path):
+            if listed.setdefault(scan_id, split) != split:
+                raise InputError(f"{scan_id} is in both {train} and {val}; a scan has one split.")
+    names = [path.name for path in folders]
+    split_of = {name: listed[name] for name in names if name in listed}
+    if not split_of:
+        lists = " and ".join(str(path) for path in (train, val) if path is not None)
+        raise InputError(
+            f"None of the {len(names)} scans is in {lists or 'a list, as no list is given'}; "
+            "check that --train and --val are ScanNet's scannetv2_train.txt and scannetv2_val.txt."
+        )
+    here = set(names)
+    return ScanSplits(
+        split_of,
+        tuple(name for name in names if name not in listed),
+        tuple(name for name in listed if name not in here),
+    )
+
+
+def _read_list(path: Path) -> list[str]:
+    try:
+        lines = [line.strip() for line in Path(path).read_text(encoding="utf-8").splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"The list of scans {path} cannot be read ({error}).") from None
+    for number, line in enumerate(lines, 1):
+        if re.search(r"[\s,;]", line):
+            raise InputError(
+                f"{path}, line {number}: '{line[:60]}' is not a scan id; expected one "
+                "(scene0000_00) a line, as in scannetv2_train.txt."
+            )
+    return [line for line in lines if line]

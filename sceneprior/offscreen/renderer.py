@@ -1,0 +1,147 @@
+"""What a renderer is, what its cameras are, and pictures for people, alike from every renderer.
+
+The z-buffer is imported where it draws: Numba takes 60 MB and half a second, which a command that
+draws nothing (prep-scannet) should not pay.
+"""
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprior.scene import Mesh
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A perspective camera: `point_camera = world_to_camera @ point_world`, OpenCV axes."""
+
+    world_to_camera: np.ndarray
+    """(4, 4), metres."""
+    intrinsics: np.ndarray
+    """(3, 3), pixels; without skew."""
+
+
+@dataclass(frozen=True)
+class Orthographic:
+    """A parallel camera; the centre of the image lies on its optical axis."""
+
+    world_to_camera: np.ndarray
+    """(4, 4), metres. Only what lies in front of the camera is drawn."""
+    metres_per_pixel: float
+
+
+Camera = Pinhole | Orthographic
+
+
+class Renderer(abc.ABC):
+    """What draws meshes; `open_renderer` gives one."""
+
+    name: str
+    """What was chosen, for reports: "software" or "pyrender (EGL, <GL's own name>)"."""
+    kind: str
+    """"pyrender" or "software": what `open_renderer` takes to get the same again."""
+
+    @abc.abstractmethod
+    def instance_ids_of_views(
+        self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
+    ) -> np.ndarray:
+        """Which mesh each pixel's centre sees, for many views of one room.
+
+        Returns:
+            (views, height, width) uint16: 0 for nothing, k + 1 for `meshes[k]`. Both sides of a
+            face are seen.
+        """
+
+    def instance_ids(
+        self, meshes: Sequence[Mesh], camera: Camera, image_size: tuple[int, int]
+    ) -> np.ndarray:
+        """The same for one view: (height, width) uint16."""
+        return self.instance_ids_of_views(meshes, [camera], image_size)[0]
+
+    def shaded(
+        self,
+        meshes: Sequence[Mesh],
+        colors: np.ndarray,
+        camera: Camera,
+        image_size: tuple[int, int],
+        background: tuple[int, int, int] | np.ndarray = (255, 255, 255),
+    ) -> np.ndarray:
+        """A picture for people: mesh k in `colors[k]` (uint8), lit from the camera: (H, W, 3).
+
+        Behind the meshes is a colour, or another picture of this size. Our z-buffer draws it for
+        both kinds, so that pictures look the same everywhere.
+        """
+        from sceneprior.silhouettes.zbuffer import rasterize
+
+        height, width = image_size
+        soup = join(meshes)
+        fine_size = (2 * height, 2 * width)
+        face_index, _ = rasterize(
+            soup.vertices,
+            soup.faces,
+            camera.world_to_camera,
+            projection(camera, fine_size, supersampling=2),
+            fine_size,
+            perspective=isinstance(camera, Pinhole),
+        )
+        light = _face_light(soup, camera)
+        palette = np.asarray(colors, dtype=np.float64).reshape(-1, 3)[soup.mesh_of_face]
+        palette = np.concatenate([palette * light[:, None], [(0, 0, 0)]])  # -1 is the last row
+        fine = palette[face_index].reshape(height, 2, width, 2, 3)
+        behind = np.broadcast_to(np.asarray(background), (height, width, 3))[:, None, :, None]
+        fine = np.where((face_index < 0).reshape(height, 2, width, 2, 1), behind, fine)
+        return np.rint(fine.mean(axis=(1, 3))).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Soup:
+    """All meshes of a room as one."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    mesh_of_face: np.ndarray
+
+
+def join(meshes: Sequence[Mesh]) -> Soup:
+    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+    counts = [len(mesh.faces) for mesh in meshes]
+    return Soup(
+        np.concatenate([np.zeros((0, 3)), *(mesh.vertices_m for mesh in meshes)]),
+        np.concatenate(
+            [np.zeros((0, 3), np.int32)]
+            + [
+                np.asarray(mesh.faces, np.int32).reshape(-1, 3) + np.int32(start)
+                for mesh, start in zip(meshes, starts, strict=False)
+            ]
+        ),
+        np.repeat(np.arange(len(meshes)), counts),
+    )
+
+
+def projection(
+    camera: Camera, image_size: tuple[int, int], supersampling: int = 1
+) -> tuple[float, float, float, float]:
+    """What the z-buffer asks for; `image_size` is the supersampled one."""
+    if isinstance(camera, Pinhole):
+        K = np.asarray(camera.intrinsics, dtype=np.float64) * supersampling
+        return K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    scale = supersampling / camera.metres_per_pixel
+    return scale, scale, image_size[1] / 2, image_size[0] / 2
+
+
+def _face_light(soup: Soup, camera: Camera) -> np.ndarray:
+    """Brightness of each face in [0.4, 1]: ambient, and a lamp a little above the camera."""
+    to_camera = np.asarray(camera.world_to_camera, dtype=np.float64)
+    corners = (soup.vertices @ to_camera[:3, :3].T + to_camera[:3, 3])[soup.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    if isinstance(camera, Pinhole):
+        towards_eye = -corners.mean(axis=1)
+    else:
+        towards_eye = np.broadcast_to([0.0, 0.0, -1.0], normals.shape)
+    normals *= np.where((normals * towards_eye).sum(axis=1, keepdims=True) < 0, -1, 1)
+    lamp = np.array([-0.25, -0.55, -0.8])
+    lamp /= np.linalg.norm(lamp)
+    return 0.4 + 0.6 * np.clip(normals @ lamp, 0, 1)

@@ -1,0 +1,52 @@
+"""Small jobs on small data sets, and what lies on disk after them."""
+
+import hashlib
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from front_files import FrontFolder, bedroom
+
+from data_prep.build import Job
+from data_prep.front.source import FrontSource
+from data_prep.recipe import load_recipe
+from sceneprior.shards import Shard
+
+SMALL = ("views.image_size=[90, 120]", "views.per_m2=0.5", "views.min_object_pixels=20")
+
+
+def front_job(front: FrontFolder, out: Path, **changes: Any) -> Job:
+    """A job on small images; `changes` are fields of FrontSource or Job, or more `rules`."""
+    recipe = load_recipe("front3d_bedroom", (*SMALL, *changes.pop("rules", ())))
+    names = {item.name for item in fields(FrontSource)}
+    of_source = {name: changes.pop(name) for name in list(changes) if name in names}
+    source = FrontSource(front.front, front.future, **{"recipe": recipe, **of_source})
+    return Job(source, out, **{"renderer": "software", **changes})
+
+
+def three_houses(front: FrontFolder) -> None:
+    """Six bedrooms."""
+    for k in range(3):
+        front.house(f"house{k}", bedroom(f"Bedroom-{k}"), bedroom(f"MasterBedroom-{k}"))
+
+
+def digests(folder: Path, *patterns: str) -> dict[str, str]:
+    """Path -> SHA-256 of every file (that matches)."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for pattern in patterns or ("**/*",)
+        for path in sorted(folder.glob(pattern))
+        if path.is_file()
+    }
+
+
+def rooms_of(folder: Path) -> dict[str, Any]:
+    """Room id -> (views with images, ground truth)."""
+    found = {}
+    for split in ("train", "test"):
+        for path in sorted((folder / split).glob("*.h5")):
+            with Shard(path) as shard:
+                for room_id in shard.room_ids:
+                    truth = shard.read_ground_truth(room_id)
+                    found[room_id] = (shard.read_room(room_id, images=True), truth)
+    return found

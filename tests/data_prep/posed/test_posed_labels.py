@@ -1,0 +1,88 @@
+"""Tables of classes and label sets of one's own."""
+
+import pytest
+
+from data_prep.posed.labels import read_classes, read_label_set
+from sceneprior.classes import label_set
+from sceneprior.errors import InputError
+
+
+def table(folder, text, name="classes.json"):
+    (folder / name).write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("classes.json", '{"1": "bed", " 300 ": "night stand"}'),
+        ("classes.csv", "id,class\n1,bed\n\n300,night stand\n"),
+        ("classes.csv", "\ufeff1,bed,note\n 300 ,night stand"),
+    ],
+)
+def test_tables(tmp_path, name, text):
+    assert read_classes(table(tmp_path, text, name)) == {1: "bed", 300: "night stand"}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("classes.json", "{", "classes.json cannot be read (Expecting property name"),
+        ("classes.json", "{}", "classes.json is empty; expected a class for each instance id."),
+        ("classes.json", "[[1]]", 'is not an object of ids and class names, as {"1": "bed", "2"'),
+        ("classes.json", '{"1": 2}', 'is not an object of ids and class names, as {"1": "bed", "'),
+        ("classes.json", '"bed"', "is not an object of ids and class names"),
+        ("classes.json", '{"0": "bed"}', "'0' is no instance id; expected a number from 1 to 655"),
+        ("classes.json", '{"70000": "bed"}', "'70000' is no instance id"),
+        ("classes.json", '{"1e3": "bed"}', "'1e3' is no instance id"),
+        ("classes.json", '{"1": "bed", "1": "sofa"}', "instance id 1 is there twice."),
+        ("classes.csv", "1,bed\n1,sofa", "instance id 1 is there twice."),
+        ("classes.csv", "1\n", "classes.csv cannot be read (a row '1' has no class)."),
+        ("classes.csv", "", "classes.csv is empty; expected a class"),
+    ],
+)  # fmt: skip
+def test_bad_tables(tmp_path, name, text, said):
+    with pytest.raises(InputError) as error:
+        read_classes(table(tmp_path, text, name))
+    assert said in str(error.value)
+
+
+def test_one_table_a_room(tmp_path):
+    with pytest.raises(InputError, match=r"has no classes\.json or classes\.csv; one table says"):
+        read_classes(tmp_path)
+    table(table(tmp_path, "{}"), "", "classes.csv")
+    with pytest.raises(InputError, match="has two tables of classes"):
+        read_classes(tmp_path)
+
+
+def test_label_sets(tmp_path):
+    assert read_label_set("scannet") == "scannet"
+    assert read_label_set("void, bed,night stand") == "void,bed,night stand"
+    path = tmp_path / "classes.txt"
+    path.write_text("# mine\nvoid\nbed\n\n night stand \n")
+    assert read_label_set(str(path)) == "void,bed,night stand"
+    (tmp_path / "a.json").write_text('["bed", "chair"]')
+    assert label_set(read_label_set(str(tmp_path / "a.json"))) == ("void", "bed", "chair")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        (
+            "a.txt",
+            "bed\nbed\n",
+            "a.txt: The class 'bed' is twice in the label set; once is enough.",
+        ),
+        ("a.txt", "# nothing\n", "a.txt: A label set needs a class beside void."),
+        ("a.json", "{", "a.json holds no class names (Expecting"),
+        ("a.json", '{"1": "bed"}', "a.json holds no list of class names."),
+        ("a.json", '["bed, large"]', "a.json: The class name 'bed, large' holds a comma, which"),
+    ],
+)
+def test_bad_label_sets(tmp_path, name, text, said):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError) as error:
+        read_label_set(str(tmp_path / name))
+    assert said in str(error.value)
+    with pytest.raises(InputError, match=r"nowhere is neither a file with a class a line, nor one"):
+        read_label_set("nowhere")

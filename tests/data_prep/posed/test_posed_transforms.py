@@ -1,0 +1,132 @@
+"""transforms.json: what is read of it, and one sentence for whatever it may hold instead."""
+
+import json
+
+import numpy as np
+import pytest
+from posed_files import PosedRoom
+
+from data_prep.posed.transforms import lens_matrix, read_transforms, room_name
+from sceneprior.errors import InputError
+
+
+@pytest.fixture
+def room(tmp_path):
+    return PosedRoom(tmp_path / "room")
+
+
+def refusal(folder):
+    with pytest.raises(InputError) as error:
+        recording = read_transforms(folder)
+        for frame in recording.frames:
+            lens_matrix(frame, (96, 128))
+    return str(error.value)
+
+
+def test_frames_poses_and_their_files(room):
+    data = room.data
+    data["frames"][1] |= {"file_path": "./train/r_1", "mask_path": "known.png"}
+    data["frames"][2] |= {"file_path": "video/frame.0002.PNG"}
+    data["frames"][3] |= {"instance_path": "elsewhere/3.png"}
+    room.folder.mkdir()
+    room.write_transforms(data | {"floor_m": -1, "floor_center_m": [1, 2.5]})
+    recording = read_transforms(room.folder)
+    inside = [str(frame.instances.relative_to(room.folder)) for frame in recording.frames]
+    assert inside == [
+        "instances/frame_00000.png", "instances/r_1.png", "instances/frame.0002.png",
+        "elsewhere/3.png", "instances/frame_00004.png",
+    ]  # fmt: skip
+    assert recording.frames[1].known == room.folder / "known.png"
+    assert recording.frames[0].known is None
+    np.testing.assert_array_equal(recording.frames[4].camera_to_world, room.poses[4])
+    assert (recording.floor_m, recording.floor_center_m) == (-1.0, (1.0, 2.5))
+    assert recording.metres_per_unit is None
+    K, size = lens_matrix(recording.frames[0], (1, 1))
+    assert K.tolist() == [[80, 0, 64], [0, 80, 48], [0, 0, 1]] and size == (96, 128)
+
+
+def test_room_names(tmp_path, monkeypatch):
+    assert room_name(tmp_path / "a") == "a"
+    monkeypatch.chdir(tmp_path)
+    assert room_name(".") == tmp_path.name
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"frames": None}, "has no list `frames` with a frame in it."),
+        ({"frames": []}, "has no list `frames` with a frame in it."),
+        ({"frames": [3]}, "frame 0: it has no `file_path`."),
+        ({"frames": [{"file_path": 3}]}, "frame 0: it has no `file_path`."),
+        ({"frames": [{"file_path": "a"}]}, "frame 'a': `transform_matrix` is not a list of 4 rows"),
+        ({"fl_x": "wide"}, "fl_x is 'wide'; expected a number."),
+        ({"fl_x": 10**400}, "fl_x is '1000"),
+        ({"cx": True}, "cx is 'True'; expected a number."),
+        ({"cy": float("nan")}, "cy is 'nan'; expected a number."),
+        ({"w": 12.5}, "frame 'images/frame_00000.jpg': w, h are 12.5, 96.0; expected pixel counts"),
+        ({"fl_x": None}, "has no fl_x and no camera_angle_x, here or for the whole file"),
+        ({"fl_x": -1}, "fl_x, fl_y are -1.0, 80.0; expected above 0"),
+        ({"k2": 0.03}, "its lens is distorted (k2 = 0.03); undistort the pictures first"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "its camera_model is OPENCV_FISHEYE, not a pinhole;"),
+        ({"is_fisheye": True}, "its camera_model is fisheye, not a pinhole; undistort the pict"),
+        ({"metres_per_unit": 0}, "metres_per_unit is 0.0; it must be above 0."),
+        ({"floor_center_m": [1]}, "floor_center_m is '[1]'; expected two numbers."),
+        ({"floor_center_m": [1, None]}, "floor_center_m holds null; expected two numbers."),
+        ({"floor_center_m": [1, "x"]}, "floor_center_m is 'x'; expected a number."),
+    ],
+)
+def test_a_wrong_key_is_a_sentence(room, changes, said):
+    room.write(**changes)
+    message = refusal(room.folder)
+    assert said in message
+    assert message.startswith(str(room.folder / "transforms.json")) or "frame 'images" in message
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"transform_matrix": [[1, 2], [3, 4]]}, "`transform_matrix` is not a list of 4 rows of 4"),
+        ({"transform_matrix": [[1, 2], [3]]}, "`transform_matrix` is not a list of 4 rows of 4"),
+        ({"transform_matrix": "eye"}, "`transform_matrix` is not a list of 4 rows of 4 numbers."),
+        ({"instance_path": 3}, "instance_path is '3'; expected a path."),
+        ({"instance_path": "a\0b"}, "instance_path is "),
+        ({"mask_path": ""}, "mask_path is ''; expected a path."),
+        ({"file_path": "other/frame_00000.png"}, "would share the ids in "),
+        ({"k1": 1e-3}, "its lens is distorted (k1 = 0.001)"),
+    ],
+)
+def test_a_wrong_frame_is_named(room, changes, said):
+    room.write()
+    data = room.data
+    data["frames"][1] |= changes
+    room.write_transforms(data)
+    message = refusal(room.folder)
+    assert said in message and data["frames"][1]["file_path"] in message
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", '{"frames": 3}', "[" * 100_000, "\udcff"])
+def test_what_is_no_transforms_json(room, text):
+    room.folder.mkdir()
+    (room.folder / "transforms.json").write_bytes(text.encode("utf-8", "surrogateescape"))
+    message = refusal(room.folder)
+    assert "is not JSON" in message or "has no list `frames`" in message
+
+
+def test_a_missing_file(tmp_path):
+    assert "transforms.json cannot be read (No such file" in refusal(tmp_path)
+
+
+def test_nothing_random_is_a_traceback(room, numbers):
+    """Any value anywhere: the room is read or named."""
+    room.write()
+    values = [None, 0, -1, 1e300, "x", [], {}, [[]], True, float("inf"), float("nan"), 10**30]
+    for _ in range(300):
+        data = json.loads(json.dumps(room.data))
+        target = data if numbers.random() < 0.5 else data["frames"][numbers.integers(5)]
+        target[str(numbers.choice(list(target)))] = values[numbers.integers(len(values))]
+        room.write_transforms(data)
+        try:
+            for frame in read_transforms(room.folder).frames:
+                lens_matrix(frame, (96, 128))
+        except InputError as error:
+            assert len(str(error)) > 30

@@ -1,0 +1,196 @@
+"""The text, JSON and mesh files of a scan, whole and damaged."""
+
+import json
+
+import numpy as np
+import pytest
+from scan_files import BOX_FACES, Box, write_ply
+
+from data_prep.scannet.annotations import (
+    Group,
+    axis_alignment,
+    object_bounds,
+    read_groups,
+    read_properties,
+    read_segments,
+    read_vertices,
+)
+from sceneprior.errors import InputError
+
+
+@pytest.fixture
+def write(tmp_path):
+    def at(name, content):
+        path = tmp_path / name
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
+        return path
+
+    return at
+
+
+def group(number, label="chair", segments=(1, 2)):
+    return {"id": 9, "objectId": number, "segments": list(segments), "label": label}
+
+
+def test_properties_are_lines_of_key_and_value(write):
+    path = write("a.txt", "axisAlignment = 1 0 \nsceneType = Bedroom / Hotel\n\nno pair\n")
+    assert read_properties(path) == {"axisAlignment": "1 0", "sceneType": "Bedroom / Hotel"}
+
+
+def test_alignment_is_row_major_and_may_be_absent(tmp_path):
+    numbers = "0 -1 0 2 1 0 0 3 0 0 1 4 0 0 0 1"
+    matrix = axis_alignment(tmp_path, {"axisAlignment": numbers})
+    assert matrix.tolist() == [[0, -1, 0, 2], [1, 0, 0, 3], [0, 0, 1, 4], [0, 0, 0, 1]]
+    np.testing.assert_array_equal(axis_alignment(tmp_path, {}), np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ("1 0 0", "axisAlignment is 3 words, expected 16 numbers"),
+        ("x " * 16, "axisAlignment is 16 words, expected 16 numbers"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 nan", "it distorts it; the file is damaged"),
+        ("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", "it distorts it"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1", "it distorts it"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0 1 0 0 1", "it distorts it"),
+        ("inf 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "it distorts it"),
+    ],
+)
+def test_alignments_that_are_none(tmp_path, numbers, words):
+    with pytest.raises(InputError, match=r"a\.txt: .*" + words):
+        axis_alignment(tmp_path / "a.txt", {"axisAlignment": numbers})
+
+
+def test_groups_come_by_object_id(write):
+    path = write("a.json", {"segGroups": [group(5, "bed"), group(2)]})
+    found, notes = read_groups(path)
+    assert found == [Group(2, "chair", frozenset({1, 2})), Group(5, "bed", frozenset({1, 2}))]
+    assert notes == []
+
+
+def test_an_object_listed_twice_is_joined_and_told(write):
+    path = write("a.json", {"segGroups": [group(2, "bed", [1]), group(2, "sofa", [7])]})
+    found, notes = read_groups(path)
+    assert found == [Group(2, "bed", frozenset({1, 7}))]
+    assert notes == ["object 2 is listed twice; its parts were joined"]
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ({}, "KeyError: 'segGroups'"),
+        ([1], "TypeError"),
+        (None, "TypeError"),
+        ({"segGroups": None}, "TypeError"),
+        ({"segGroups": [{"objectId": 1}]}, "KeyError: 'label'"),
+        ({"segGroups": [group(-1)]}, "objectId -1 with label 'chair'"),
+        ({"segGroups": [group(1.5)]}, "objectId 1.5 with"),
+        ({"segGroups": [group(True)]}, "objectId True with"),
+        ({"segGroups": [group(1, None)]}, "objectId 1 with label None"),
+        ({"segGroups": [group(1, segments=["x"])]}, "segments of object 1 are not all whole"),
+        ({"segGroups": [group(1, segments=[[3]])]}, "TypeError"),
+    ],
+)
+def test_aggregations_that_are_none(write, data, words):
+    with pytest.raises(InputError, match=rf"a\.json is not an aggregation of objects .*{words}"):
+        read_groups(write("a.json", data))
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ({}, "KeyError: 'segIndices'"),
+        ([], "TypeError"),
+        ({"segIndices": [1.5, 2]}, "segIndices is not a list of whole numbers"),
+        ({"segIndices": [10**30]}, "segIndices is not a list of whole numbers"),
+        ({"segIndices": [[1], [2, 3]]}, "ValueError"),
+        ({"segIndices": 4}, "segIndices is not a list"),
+        ({"segIndices": []}, "segIndices is not a list of whole numbers"),
+    ],
+)
+def test_segmentations_that_are_none(write, data, words):
+    with pytest.raises(InputError, match=rf"a\.json is not a segmentation .*{words}"):
+        read_segments(write("a.json", data))
+
+
+@pytest.mark.parametrize("read", [read_groups, read_segments])
+def test_json_that_is_missing_or_cut(write, read, tmp_path):
+    text = json.dumps({"segGroups": [group(1)], "segIndices": [1, 2, 3]})
+    for cut in range(len(text)):
+        with pytest.raises(InputError, match=r"a\.json is not JSON .*truncated or damaged"):
+            read(write("a.json", text[:cut]))
+    with pytest.raises(InputError, match="is not JSON"):
+        read(write("a.json", "[" * 100_000))
+    (tmp_path / "a.json").write_bytes(b"\xff\xfe{}")
+    with pytest.raises(InputError, match=r"is not JSON .*utf-8"):
+        read(tmp_path / "a.json")
+    with pytest.raises(InputError, match=r"none\.json cannot be read .No such file.*; .* leave"):
+        read(tmp_path / "none.json")
+
+
+def test_a_scan_without_annotations_says_so(tmp_path):
+    with pytest.raises(InputError, match=r"a scan without annotations .* cannot be prepared"):
+        read_groups(tmp_path / "a.json")
+
+
+def test_properties_that_cannot_be_read(tmp_path):
+    with pytest.raises(InputError, match=r"a\.txt cannot be read .No such file"):
+        read_properties(tmp_path / "a.txt")
+    (tmp_path / "a.txt").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match=r"a\.txt cannot be read .*utf-8"):
+        read_properties(tmp_path / "a.txt")
+
+
+def test_vertices_keep_their_number_and_order(tmp_path, rng):
+    """Also those that lie on each other, and those of no triangle."""
+    vertices = rng.normal(size=(20, 3)).astype(np.float32)
+    vertices[7] = vertices[3]
+    faces = np.array([(3, 4, 5), (7, 8, 9)])
+    np.testing.assert_array_equal(
+        read_vertices(write_ply(tmp_path / "a.ply", vertices, faces)), vertices
+    )
+
+
+def test_a_mesh_that_is_missing_damaged_or_cut(tmp_path, rng):
+    path = write_ply(tmp_path / "a.ply", rng.normal(size=(8, 3)), BOX_FACES)
+    data = path.read_bytes()
+    begin = data.index(b"end_header\n") + 11
+    for cut in range(0, len(data), 3):
+        path.write_bytes(data[:cut])
+        try:
+            count = len(read_vertices(path))
+        except InputError as error:
+            assert "a.ply is not a mesh" in str(error) or "a.ply holds no vertices" in str(error)
+        else:
+            # Triangles are not needed; half the vertices would be noticed beside segs.json.
+            assert count == 8 and cut >= begin + 8 * 16
+    for _ in range(200):
+        damaged = bytearray(data)
+        for at in rng.integers(0, len(data), 4):
+            damaged[at] = rng.integers(256)
+        path.write_bytes(damaged)
+        try:
+            read_vertices(path)
+        except InputError as error:
+            assert "a.ply" in str(error)
+    with pytest.raises(InputError, match=r"none\.ply cannot be read .no such file"):
+        read_vertices(tmp_path / "none.ply")
+    broken = np.full((8, 3), np.nan)
+    with pytest.raises(InputError, match="holds no vertices, or broken ones"):
+        read_vertices(write_ply(path, broken, BOX_FACES))
+
+
+def test_bounds_are_those_of_each_objects_segments():
+    box = Box("chair", (0, 1, 2), (3, 4, 5))
+    vertices = np.concatenate([box.corners, box.corners + 10, [[99.0, 99, 99]]])
+    segments = np.array([7] * 4 + [9] * 4 + [3] * 8 + [1])
+    groups = [
+        Group(0, "chair", frozenset({9, 7, 1000})),
+        Group(1, "bed", frozenset({1000})),
+        Group(2, "bed", frozenset({3, 9})),
+        Group(3, "bed", frozenset()),
+    ]
+    whole, none, joined, empty = object_bounds(groups, segments, vertices)
+    np.testing.assert_array_equal(whole, [(0, 1, 2), (3, 4, 5)])
+    assert none is None and empty is None
+    np.testing.assert_array_equal(joined, [(0, 1, 5), (13, 14, 15)])

@@ -1,0 +1,69 @@
+"""`prep-scannet` and what `inspect` makes of its shards."""
+
+import pytest
+import typer
+from scan_files import ScanFolder, write_table
+from typer.testing import CliRunner
+
+from data_prep.cli import add_commands
+from sceneprior.errors import InputError
+from sceneprior.shards import Shard
+
+
+@pytest.fixture
+def prep(scan, tmp_path):
+    for k in range(3):
+        folder = tmp_path / "scans" / f"scene000{k}_00"
+        ScanFolder(folder, scan.boxes, scan.alignment, scan.poses).write(mask_size=(242, 324))
+    table = write_table(tmp_path / "labels.tsv")
+    app = typer.Typer()
+    add_commands(app)
+
+    def run(*words):
+        arguments = [
+            "prep-scannet", "--scans", tmp_path / "scans", "--labels", table,
+            "--out", tmp_path / "shards", "--workers", 1, "--frame-step", 1, *words,
+        ]  # fmt: skip
+        return CliRunner().invoke(app, [str(word) for word in arguments])
+
+    run.inspect = lambda *words: CliRunner().invoke(
+        app, ["inspect", str(tmp_path / "shards"), *words]
+    )
+    return run
+
+
+def test_scans_become_shards_whose_boxes_project_onto_their_masks(prep, tmp_path):
+    (tmp_path / "train.txt").write_text("scene0000_00\nscene0001_00\n")
+    (tmp_path / "val.txt").write_text("scene0002_00\n")
+    made = prep("--train-list", tmp_path / "train.txt", "--val-list", tmp_path / "val.txt")
+    assert made.exit_code == 0, made.output
+    assert "train 2 rooms, 10 views, 4 objects; test 1 rooms, 5 views, 2 objects" in made.stdout
+    checked = prep.inspect("--verify")
+    said = " ".join(checked.stdout.split())
+    assert checked.exit_code == 0 and "mean 2D IoU of 0.9" in said and "(3D boxes)" in said
+    assert prep.inspect("--room", "scene0000_00").exit_code == 0
+
+
+def test_options(prep, tmp_path):
+    assert prep("--full-size", "--max-views", 2, "--only", "scene0001").exit_code == 0
+    (path,) = (tmp_path / "shards").glob("*/*.h5")
+    with Shard(path) as shard:
+        room = shard.read_room("scene0001_00")
+    assert room.image_size == (968, 1296) and len(room.visible) == 2
+    other = prep("--masks", "soft")
+    assert isinstance(other.exception, InputError)
+    assert str(other.exception) == "masks is 'soft'; choose filt or raw."
+
+
+def test_a_damaged_scan_gives_status_3(prep, tmp_path):
+    path = tmp_path / "scans/scene0001_00/scene0001_00.sens"
+    path.write_bytes(path.read_bytes()[:-60])
+    lists = []
+    for name, scans in (("train", (0, 1)), ("val", (2,))):
+        path = tmp_path / f"{name}.txt"
+        path.write_text("".join(f"scene000{k}_00\n" for k in scans))
+        lists += [f"--{name}-list", path]
+    stopped = prep("--strict", *lists)
+    assert stopped.exit_code == 3 and "Error: Room scene0001_00 failed" in stopped.stderr
+    made = prep(*lists)
+    assert made.exit_code == 3 and "1 failed (report.csv says why)" in made.stdout

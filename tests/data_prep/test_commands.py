@@ -1,0 +1,104 @@
+"""The commands as a user meets them: what they print, and their exit status."""
+
+import pytest
+import typer
+from front_files import bedroom
+from front_jobs import SMALL, three_houses
+from typer.testing import CliRunner
+
+from data_prep.cli import add_commands
+
+
+@pytest.fixture
+def cli():
+    app = typer.Typer()
+    add_commands(app)
+    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
+
+
+def test_commands(front, tmp_path, cli):
+    three_houses(front)
+    out, png = tmp_path / "shards", tmp_path / "pictures" / "sheet.png"
+    rules = [word for rule in SMALL for word in ("--rule", rule)]
+    made = cli(
+        "prep-front", "--front", front.front, "--future", front.future, "--out", out,
+        "--workers", 1, "--renderer", "software", "--views-per-m2", 0.7, *rules[:2], *rules[4:],
+    )  # fmt: skip
+    assert made.exit_code == 0, made.output
+    assert "train 5 rooms, 55 views, 15 objects; test 1 rooms, 11 views, 3 objects" in made.stdout
+    looked = cli("inspect", out, "--png", png, "--boxes-3d", "--pictures", 6)
+    assert looked.exit_code == 0, looked.output
+    assert "nightstand" in looked.stdout and "train" in looked.stdout
+    assert png.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.fixture
+def prep(front, tmp_path, cli):
+    def run(*words):
+        rules = [word for rule in SMALL for word in ("--rule", rule)]
+        return cli(
+            "prep-front", "--front", front.front, "--future", front.future,
+            "--out", tmp_path / "shards", "--workers", 1, "--renderer", "software", *rules, *words,
+        )  # fmt: skip
+
+    return run
+
+
+def test_failed_rooms_give_status_3_and_filtered_ones_do_not(front, tmp_path, prep):
+    front.house("house", bedroom("Bedroom-1"), bedroom("Bedroom-2"), bedroom("Bedroom-3"))
+    (front.front / "broken.json").write_text('{"scene": {"room": [')
+    stopped = prep("--strict")
+    assert stopped.exit_code == 3
+    assert "Error: Room broken failed: broken.json is not JSON" in stopped.stderr
+    assert not (tmp_path / "shards").exists()
+    made = prep()
+    assert made.exit_code == 3, made.output
+    assert "failed" in made.stdout and "broken" in made.stdout and "not JSON" in made.stdout
+    assert "1 failed (report.csv says why)" in made.stdout
+    assert (tmp_path / "shards" / "index.json").is_file()
+    assert prep("--strict").exit_code == 3  # in a finished folder, too
+    (tmp_path / "shards" / "test" / "bedroom_0000.h5").unlink()
+    part = prep("--only", "house/Bedroom-2")  # the failure is no business of this room's
+    assert part.exit_code == 0 and "1 failed" not in part.stdout, part.output
+    assert '"broken"' in (tmp_path / "shards" / "report.json").read_text()
+
+
+def test_only_in_a_whole_folder_says_what_is_still_to_make(front, tmp_path, prep):
+    front.house("house", *(bedroom(f"Bedroom-{k}") for k in range(12)))
+    assert prep().exit_code == 0
+    for path in (tmp_path / "shards").glob("*/*.h5"):
+        path.unlink()
+    made = prep("--only", "house/Bedroom-2")
+    assert made.exit_code == 0, made.output
+    said = " ".join(made.stdout.split())
+    assert "1 shards made, 0 already there, 2 still to make: run without --only" in said
+
+
+def test_a_rule_that_filters_is_in_the_table(front, prep):
+    front.house("house", bedroom("Bedroom-1"), bedroom("Bedroom-2"))
+    front.house("large", bedroom("Bedroom-3", bounds=(-4.0, -4.0, 4.0, 4.0)))
+    made = prep()
+    assert made.exit_code == 0, made.output
+    assert "filtered by max_floor_m" in made.stdout and "objects a room" not in made.stderr
+
+
+def test_pictures_and_wrong_words(front, tmp_path, prep, cli):
+    three_houses(front)
+    odd = bedroom("Bedroom-9")
+    odd["instanceid"] = "[/] [bold]"  # rich must not take it for markup
+    odd["children"] = {"a": 1}
+    front.house("odd", odd)
+    made = prep("--rgb")
+    assert made.exit_code == 3 and "its instanceid, '[/] [bold]'" in made.stdout, made.output
+    assert len(list((tmp_path / "shards" / "rgb").glob("*/0000.png"))) == 6
+    for words, said in (
+        (("--room-type", "attic"), "No recipe is called 'front3d_attic'; there are front3d_all,"),
+        (("--rule", "max_floor_m=wide"), "max_floor_m is 'wide', but takes float | null"),
+        (("--room-type", "library"), "is of a type that front3d_library is about (library)"),
+    ):
+        result = cli(
+            "prep-front", "--front", front.front, "--future", front.future,
+            "--out", tmp_path / "other", "--workers", 1, "--renderer", "software", *words,
+        )  # fmt: skip
+        assert result.exit_code and said in str(result.exception)
+        assert not (tmp_path / "other").exists()

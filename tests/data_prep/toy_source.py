@@ -1,0 +1,67 @@
+"""A source of boxes that draws nothing: what a new data set has to bring, and what may go wrong."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from toy_rooms import LABEL_SET, make_toy_room
+
+from data_prep.recipe import Expected
+from data_prep.source import LeftOut, PreparedRoom, RoomTask, Survey
+from sceneprior.errors import InputError
+from sceneprior.scene import Mesh
+
+TRIANGLE = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], dtype=np.int32))
+
+
+@dataclass(frozen=True)
+class ToySource:
+    """`rooms` rooms, one in five for testing; `trouble` says which of them misbehave, and how."""
+
+    rooms: int = 10
+    trouble: dict[int, str] = field(default_factory=dict)
+    name: str = "toy"
+    label_set: str = LABEL_SET
+    room_type: str = "toys"
+    draws: bool = False
+    only: str | None = None
+    expected: Expected | None = None
+
+    def settings(self, only: str | None) -> dict[str, Any]:
+        return {"rooms": self.rooms}
+
+    def survey(self, run: Any) -> Survey:
+        ids = [room_id for part in run(_list, [(0, 5), (5, self.rooms)], None) for room_id in part]
+        tasks = (
+            RoomTask(room_id, "box", "test" if k % 5 == 4 else "train", extra={"number": k})
+            for k, room_id in enumerate(ids)
+        )
+        return Survey(tuple(tasks), (LeftOut("box_x", "box", "filtered", "it is odd", "odd"),))
+
+    def prepare(self, task: RoomTask, renderer: Any) -> PreparedRoom | LeftOut:
+        assert renderer is None
+        number = task.extra["number"]
+        views, truth = make_toy_room(task.room_id, np.random.default_rng(number))
+        made = PreparedRoom(views, truth, {"toy": TRIANGLE}, {f"rgb/{number}.txt": b"red"})
+        match self.trouble.get(number):
+            case None:
+                return made
+            case "filtered":
+                return LeftOut(task.room_id, task.house, "filtered", "it is dark", "light")
+            case "sentence":
+                raise InputError("its file is truncated")
+            case "unforeseen":
+                return {}["surprise"]
+            case "unreadable":
+                return open("/nowhere/at/all")  # noqa: PTH123
+            case "shapes":
+                return replace(made, views=replace(views, boxes=views.boxes[:1]))
+            case "path":
+                return replace(made, files={"../evil": b""})
+            case "model path":
+                return replace(made, models={"/elsewhere/evil": TRIANGLE})
+        raise AssertionError
+
+
+def _list(start: int, end: int) -> list[str]:
+    return [f"box_{k}" for k in range(start, end)]
