@@ -23,19 +23,18 @@ def write_whole(path: Path, data: bytes) -> None:
     temporary = path.with_name(f"{path.name}.{secrets.token_hex(4)}{PART}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("xb") as file:
-            file.write(data)
-            file.flush()
-            # Without this a power cut may keep the new name and lose the bytes.
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        with contextlib.ExitStack() as undo:
+            undo.callback(_remove, temporary)
+            with temporary.open("xb") as file:
+                file.write(data)
+                file.flush()
+                # Without this a power cut may keep the new name and lose the bytes.
+                os.fsync(file.fileno())
+            temporary.replace(path)
+            undo.pop_all()
     except OSError as error:
         error.filename = str(path)
         raise
-    finally:
-        # Gone already where all went well; whatever went wrong, nothing half-written stays.
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
     _sync_folder(path.parent)
 
 
@@ -46,6 +45,11 @@ def remove_parts(folder: Path) -> None:
         OSError: the folder cannot be changed.
     """
     for path in sorted(Path(folder).rglob(f"*{PART}")):
+        path.unlink(missing_ok=True)
+
+
+def _remove(path: Path) -> None:
+    with contextlib.suppress(OSError):
         path.unlink(missing_ok=True)
 
 
