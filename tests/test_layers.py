@@ -17,7 +17,7 @@ ROWS = {
     "data_prep": 3, "stages": 3,
     "evaluation": 4,
     "tasks": 5,
-    "cli": 6, "__main__": 6,
+    "commands": 6, "cli": 6, "__main__": 6,
 }  # fmt: skip
 FOUNDATION = {name for name, row in ROWS.items() if row <= 1}
 """Rows 0 and 1: all that preparing and judging may stand on, beside themselves."""
@@ -33,7 +33,7 @@ OWNERS = {
     "yaml": ["sceneprior/config.py", "data_prep/recipe.py"],
     "pydantic": ["sceneprior/config.py"],
     "typer": [
-        "sceneprior/cli.py", "sceneprior/tasks/demo.py", "data_prep/cli.py",
+        "sceneprior/cli.py", "sceneprior/commands/", "sceneprior/tasks/demo.py", "data_prep/cli.py",
         "data_prep/homes/command.py", "data_prep/inspect_command.py",
     ],
     "jinja2": ["sceneprior/evaluation/"],
@@ -86,9 +86,9 @@ def allowed(layer: str) -> set[str]:
     below -= {"data_prep"}
     if layer == "stages":
         return below
-    if layer == "tasks":
+    if layer in ("tasks", "commands"):
         return below
-    # `config` is known to stages, tasks and cli alone.
+    # `config` is known to stages, tasks, commands and cli alone.
     return below - ({"config"} if layer != "config" else set())
 
 

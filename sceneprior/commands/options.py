@@ -1,0 +1,20 @@
+"""Options that several verbs share."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+RendererOption = Annotated[
+    str, typer.Option(help="auto, pyrender or software (needs no GL library).")
+]
+RunOption = Annotated[Path, typer.Option(help="Folder of a run that `fit` made.")]
+LawOption = Annotated[
+    str | None,
+    typer.Option(help="kernel, geodesic, gaussian or paper (default: the config's)."),
+]
+CheckpointOption = Annotated[
+    str,
+    typer.Option(help="final, or best: what generated best while training (samples.every)."),
+]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
