@@ -1,0 +1,171 @@
+"""A comparison in; trained and judged runs, one table and a figure for each kind of room out.
+
+Each run is two commands of `sceneprior`, `fit` and `eval-fid`, in processes of their own: whoever
+doubts a figure types them again. What a run cost is noted beside it; finished runs are kept.
+"""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from sceneprior.errors import InputError
+from sceneprior.evaluation.comparison_table import Row, write_tables
+from sceneprior.files import write_whole
+from sceneprior.offscreen import open_renderer
+from sceneprior.stages.runs import STAGES, load_any_run, read_checkpoint
+from sceneprior.tasks.comparison import Comparison, Run, runs_of
+from sceneprior.tasks.comparison_figure import write_figure
+
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What training a run took."""
+
+    cpu_s: float
+    steps: int
+    parameters: int
+
+
+def compare(comparison: Comparison, out: Path, jobs: int, renderer: str) -> list[str]:
+    """Train and judge every run that is not done yet, then write `table.*` and the figures.
+
+    Args:
+        comparison: From `load_comparison`.
+        out: `<rooms>/<method>/seed<k>/` in it holds a run; the tables lie beside them.
+        jobs: Runs at a time.
+        renderer: A renderer's name, or `auto`.
+
+    Returns:
+        A sentence for each run that failed; the table is written without it.
+
+    Raises:
+        typer.Exit: stopped by Ctrl-C; the same command goes on.
+    """
+    runs = runs_of(comparison, out)
+    stop = threading.Event()
+    pool = ThreadPoolExecutor(max_workers=jobs)
+    try:
+        failures = list(pool.map(lambda run: _do(run, comparison, renderer, stop), runs))
+    except KeyboardInterrupt:
+        stop.set()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)  # waits for those that the same Ctrl-C has told
+        if stop.is_set():
+            typer.echo("Stopped. The same command goes on from here.", err=True)
+    done = [run for run in runs if (run.folder / "scores.json").is_file()]
+    if done:
+        write_tables(_rows(comparison, done), out)
+        drawing = open_renderer(renderer)
+        for key in comparison.rooms:
+            own = [run for run in done if run.rooms == key and run.seed == comparison.seeds[0]]
+            if own:
+                write_figure(comparison, own, out / f"{key}.png", drawing)
+    return [failure for failure in failures if failure]
+
+
+def _do(run: Run, comparison: Comparison, renderer: str, stop: threading.Event) -> str | None:
+    """Both commands of a run, unless they are done; a sentence if one failed."""
+    journal = run.folder / "steps.json"
+    done: dict[str, Any] = json.loads(journal.read_text()) if journal.is_file() else {}
+    for name, arguments in _steps(run, comparison, renderer).items():
+        before = done.get(name, {})
+        if before.get("finished") and before["arguments"] == arguments:
+            continue
+        if stop.is_set():
+            return None
+        typer.echo(f"$ sceneprior {shlex.join(arguments)}", err=True)
+        run.folder.mkdir(parents=True, exist_ok=True)
+        status, cpu_s, wall_s = _call(arguments, run.folder / f"{name}.log")
+        earlier = {} if before.get("finished") else before  # a stopped step goes on
+        done[name] = {
+            "arguments": arguments,
+            "cpu_s": cpu_s + earlier.get("cpu_s", 0.0),
+            "wall_s": wall_s + earlier.get("wall_s", 0.0),
+            "finished": status == 0,
+        }
+        write_whole(journal, (json.dumps(done, indent=1) + "\n").encode())
+        if status == INTERRUPTED:
+            stop.set()
+            return None
+        if status:
+            return f"{run.rooms}, {run.method}, seed {run.seed}: {_last_line(run.folder / f'{name}.log')}"
+    return None
+
+
+def _steps(run: Run, comparison: Comparison, renderer: str) -> dict[str, list[str]]:
+    settings = [word for setting in run.settings for word in ("--set", setting)]
+    return {
+        "fit": [
+            "fit", "--config", run.config, "--run", str(run.folder / "run"), *settings,
+            "--logger", "csv", "--resume",
+        ],
+        "scores": [
+            "eval-fid", "--run", str(run.folder / "run"), "-n", str(comparison.count),
+            "--seed", str(comparison.sampling_seed), "--out", str(run.folder / "scores.json"),
+            "--renderer", renderer,
+        ],
+    }  # fmt: skip
+
+
+def _call(arguments: Sequence[str], log: Path) -> tuple[int, float, float]:
+    """Exit status, CPU seconds and wall seconds of a command, whose words go to `log`."""
+    start = time.monotonic()
+    with log.open("wb") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "sceneprior", *arguments], stdout=file, stderr=file
+        )
+        # wait4 knows what this child alone has used, with all that it waited for itself.
+        _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    return process.returncode, used.ru_utime + used.ru_stime, time.monotonic() - start
+
+
+def _last_line(log: Path) -> str:
+    """The sentence a command ended with."""
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
+    told = [line for line in lines if line]
+    return told[-1].removeprefix("Error: ") if told else f"it said nothing in {log}"
+
+
+def _rows(comparison: Comparison, done: Sequence[Run]) -> list[Row]:
+    rows = []
+    for run in done:
+        scores = json.loads((run.folder / "scores.json").read_text())
+        method = comparison.methods[run.method]
+        rows.append(
+            Row(
+                rooms=comparison.rooms[run.rooms].title,
+                group=method.group,
+                title=method.title,
+                seed=run.seed,
+                scores=scores,
+                costs=vars(costs_of(run.folder)),
+            )
+        )
+    return rows
+
+
+def costs_of(folder: Path) -> Costs:
+    """What training took, from what `compare` noted and the checkpoints hold."""
+    run = folder / "run"
+    finals = [path for stage in STAGES if (path := run / stage / "final.ckpt").is_file()]
+    noted = json.loads((folder / "steps.json").read_text())
+    return Costs(
+        cpu_s=noted["fit"]["cpu_s"],
+        steps=sum(int(read_checkpoint(path)["global_step"]) for path in finals),
+        parameters=sum(item.numel() for item in load_any_run(run).prior.parameters()),
+    )
