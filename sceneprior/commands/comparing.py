@@ -32,10 +32,7 @@ def compare(
     from sceneprior.tasks.comparison import load_comparison, part_of
 
     comparison = part_of(load_comparison(config), methods, rooms, seeds)
-    try:
-        failures = run_comparison(comparison, out, jobs, renderer)
-    except KeyboardInterrupt:
-        raise typer.Exit(130) from None
+    failures = run_comparison(comparison, out, jobs, renderer)
     typer.echo(f"Wrote {out / 'table.md'}")
     if failures:
         raise InputError(

@@ -7,6 +7,7 @@ doubts a figure types them again. What a run cost is noted beside it; finished r
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
 import threading
@@ -27,7 +28,7 @@ from sceneprior.stages.runs import STAGES, load_any_run, read_checkpoint
 from sceneprior.tasks.comparison import Comparison, Run, runs_of
 from sceneprior.tasks.comparison_figure import write_figure
 
-INTERRUPTED = 130
+INTERRUPTED = (130, -signal.SIGINT)
 
 
 @dataclass(frozen=True)
@@ -57,15 +58,16 @@ def compare(comparison: Comparison, out: Path, jobs: int, renderer: str) -> list
     runs = runs_of(comparison, out)
     stop = threading.Event()
     pool = ThreadPoolExecutor(max_workers=jobs)
+    failures: list[str | None] = []
     try:
         failures = list(pool.map(lambda run: _do(run, comparison, renderer, stop), runs))
     except KeyboardInterrupt:
         stop.set()
-        raise
     finally:
         pool.shutdown(cancel_futures=True)  # waits for those that the same Ctrl-C has told
-        if stop.is_set():
-            typer.echo("Stopped. The same command goes on from here.", err=True)
+    if stop.is_set():
+        typer.echo("Stopped. The same command goes on from here.", err=True)
+        raise typer.Exit(130)
     done = [run for run in runs if (run.folder / "scores.json").is_file()]
     if done:
         write_tables(_rows(comparison, done), out)
@@ -98,7 +100,7 @@ def _do(run: Run, comparison: Comparison, renderer: str, stop: threading.Event) 
             "finished": status == 0,
         }
         write_whole(journal, (json.dumps(done, indent=1) + "\n").encode())
-        if status == INTERRUPTED:
+        if status in INTERRUPTED:
             stop.set()
             return None
         if status:
