@@ -13,8 +13,9 @@ rest is hidden. Rows of the table:
 
 `overlaps` are intersecting pairs of boxes a room, `beds` the share of rooms with what their type
 stands for (a bed in bedrooms), `found` the share of given objects that the room had by itself, in
-class, and `off_m` how far from where they are (mean over centre and sides); `differ` is the mean over
-pairs of answers to one room of 1 - matched IoU of what they add over the larger number; 0 is alike.
+class, and `off_m` how far from where they are (mean over centre and sides); `differ` is the mean
+over pairs of answers to one room of 1 - matched IoU of what they add over the larger number; 0 is
+alike.
 """
 
 import argparse
@@ -37,7 +38,7 @@ from sceneprior.evaluation.layout_metrics import (
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.scene import Scene
 from sceneprior.stages.runs import load_run
-from sceneprior.tasks import complete as completion
+from sceneprior.tasks.complete import STEPS, complete
 from sceneprior.tasks.put_into import put_into
 
 
@@ -61,13 +62,11 @@ def main() -> None:
     given = [half(room, rng) for room in tests]
 
     def completed(steps: int) -> list[list[Scene]]:
-        completion.STEPS = steps
-        answers = completion.complete(trained, given, arguments.answers, arguments.seed)
+        answers = complete(trained, given, arguments.answers, arguments.seed, steps=steps)
         return [scenes for _, scenes in answers]
 
-    steps = completion.STEPS
     rows = {
-        "completed": completed(steps),
+        "completed": completed(STEPS),
         "untouched start": completed(0),
         "nearest training room": [[put_into(nearest(training, one), one)] for one in given],
         "test rooms": [[room] for room in tests],

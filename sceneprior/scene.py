@@ -95,6 +95,11 @@ def read_scene(path: Path) -> Scene:
     """
     try:
         data = json.loads(Path(path).read_text())
+        if not isinstance(data, dict):
+            raise InputError(
+                f"{path} is not a scene JSON: expected an object with 'format' and 'objects', got "
+                f"a {type(data).__name__}; docs/conventions.md describes the format."
+            )
         if data["format"] != FORMAT or data["version"] != VERSION:
             raise InputError(
                 f"{path} says format '{data['format']}' version {data['version']}; "

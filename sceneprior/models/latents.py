@@ -151,7 +151,9 @@ def slerp_pairs(
     Raises:
         ValueError: two vectors are opposite, so that no geodesic is the shortest.
     """
-    angle = torch.acos((start * end).sum(dim=-1).clamp(-1, 1)).unsqueeze(-1)
+    # Not acos of the dot product, which in float32 knows no angle between pi - 3e-4 and pi.
+    apart, together = (start - end).norm(dim=-1), (start + end).norm(dim=-1)
+    angle = 2 * torch.atan2(apart, together).unsqueeze(-1)
     if bool((angle > torch.pi - 1e-4).any()):
         raise ValueError("The two latents are opposite points; any great circle joins them.")
     t = along.unsqueeze(-1)

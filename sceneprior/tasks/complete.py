@@ -67,6 +67,7 @@ def complete(
     count: int = 4,
     seed: int = 0,
     law: str | None = None,
+    steps: int = STEPS,
 ) -> list[tuple[Float[Tensor, "count dimension"], list[Scene]]]:
     """Furnish the rest of rooms; all rooms and all answers in one batch.
 
@@ -77,6 +78,7 @@ def complete(
         count: Answers a room.
         seed: Of the latents that answers start from.
         law: Of drawing them; None takes the config's.
+        steps: Of the fit; 0 leaves the drawn latents as they are.
 
     Returns:
         Of each room the answers' latents and the answers: see `put_into`.
@@ -86,7 +88,7 @@ def complete(
     """
     given = gather_given(trained, scenes)
     starts = _starts(trained, given, count * RESTARTS, seed, law)
-    z, loss = fit_latents(trained, starts, given.repeated(count * RESTARTS))
+    z, loss = fit_latents(trained, starts, given.repeated(count * RESTARTS), steps)
     # Starts are in order of promise; dealt out in turn, every answer has good ones.
     best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
     z = take_along(z.view(len(scenes), RESTARTS, count, -1), best)
@@ -157,20 +159,23 @@ def _starts(
 
 
 def fit_latents(
-    trained: TrainedPrior, starts: Float[Tensor, "rooms dimension"], given: Given
+    trained: TrainedPrior,
+    starts: Float[Tensor, "rooms dimension"],
+    given: Given,
+    steps: int = STEPS,
 ) -> tuple[Float[Tensor, "rooms dimension"], Float[Tensor, " rooms"]]:
     """Move latents until their rooms hold what is given; the latents, and what is left to win."""
     space, target = trained.prior.sphere, trained.config.loss.completeness_target
     free = starts.clone().requires_grad_()
     # Adam moves every coordinate by about its rate.
     optimizer = torch.optim.Adam([free], lr=RATE / math.sqrt(starts.shape[1]))
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
 
     def loss_of(z: Tensor) -> Float[Tensor, " rooms"]:
         loss = given_loss(trained.prior.decode(z, with_shape=False), given, target)
         return loss + START_WEIGHT / 2 * (z - starts).square().sum(dim=-1)
 
-    for _ in range(STEPS):
+    for _ in range(steps):
         optimizer.zero_grad()
         # Summed, not averaged: a room's steps do not depend on who else is in the batch.
         loss_of(space.onto(free)).sum().backward()

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import nn
 
 from sceneprior.batches import DecodedScenes
 from sceneprior.classes import class_colors
 from sceneprior.errors import InputError
 from sceneprior.evaluation.topdown import corner_view
 from sceneprior.models.latents import LatentCube
+from sceneprior.models.scene_prior import ScenePrior
 from sceneprior.offscreen import open_renderer
 from sceneprior.stages.runs import load_run
 from sceneprior.tasks.decode import decode_latents
@@ -67,18 +69,24 @@ def test_opposite_ends_are_a_sentence_and_in_a_cube_no_trouble(trained):
         "the other; choose another end, or go by way of a third room."
     )
 
-    class Prior:
-        sphere = LatentCube(16)
-
-    cubic = replace(trained, prior=Prior())
+    cubic = replace(trained, prior=Cubic())
     z = path_latents(cubic, start, -start, 5)
     torch.testing.assert_close(z[2], torch.zeros(16), rtol=0, atol=1e-7)
 
 
-class Decoder:
+class Cubic(ScenePrior):
+    """A prior that has its latent space and nothing else."""
+
+    def __init__(self):
+        nn.Module.__init__(self)
+        self.sphere = LatentCube(16)
+
+
+class Decoder(ScenePrior):
     """Three predictions: a bed, one that turns from a table into void, and one past the end."""
 
     def __init__(self, classes: int):
+        nn.Module.__init__(self)
         self.classes = classes
         self.shape = type("Shape", (), {"faces": torch.tensor([[0, 1, 2]])})
 
