@@ -130,12 +130,11 @@ def read_scene(path: Path) -> Scene:
             f"{path} is not a scene JSON ({type(error).__name__}: {error}); "
             "docs/conventions.md describes the format."
         ) from None
-    floor = data.get("floor_m")
     return Scene(
         name=str(data.get("name", Path(path).stem)),
         label_set=data["label_set"],
         objects=objects,
-        floor_m=None if floor is None else np.asarray(floor, dtype=np.float64),
+        floor_m=floor,
         extra=data.get("extra", {}),
     )
 

@@ -25,8 +25,9 @@ def put_into(room: Scene, given: Scene, extra: dict[str, object] | None = None) 
         room: Generated, or any other room.
         given: Objects, and perhaps a floor, which the result has too.
         extra: For the JSON, beside `given` (the rows of the given objects), `replaced` and
-            `removed` (how many of the room's own objects went for which reason) and `replaced_off_m`
-            (how far the first were from what they stand for, mean over centre and sides; null if none).
+            `removed` (how many of the room's own objects went for which reason), and
+            `replaced_off_m` (how far the first were from what they stand for, mean over centre
+            and sides; null if none).
     """
     given = replace(given, label_set=room.label_set)
     partners = _partners(room, given)
