@@ -95,6 +95,11 @@ def read_scene(path: Path) -> Scene:
     """
     try:
         data = json.loads(Path(path).read_text())
+        if not isinstance(data, dict):
+            raise InputError(
+                f"{path} is not a scene JSON: expected an object with 'format' and 'objects', got "
+                f"a {type(data).__name__}; docs/conventions.md describes the format."
+            )
         if data["format"] != FORMAT or data["version"] != VERSION:
             raise InputError(
                 f"{path} says format '{data['format']}' version {data['version']}; "
@@ -112,19 +117,24 @@ def read_scene(path: Path) -> Scene:
             SceneObject(item["class"], _triple(item["center_m"]), _triple(item["size_m"]))
             for item in data["objects"]
         )
+        floor = data.get("floor_m")
+        floor = None if floor is None else np.array(floor, dtype=np.float64)
+        if floor is not None and (floor.ndim != 2 or floor.shape[1] != 2):
+            raise ValueError(f"floor_m has shape {floor.shape}, not (corners, 2)")
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}).") from None
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{path} is not a scene JSON ({type(error).__name__}: {error}); "
             "docs/conventions.md describes the format."
         ) from None
-    floor = data.get("floor_m")
     return Scene(
         name=str(data.get("name", Path(path).stem)),
         label_set=data["label_set"],
         objects=objects,
-        floor_m=None if floor is None else np.asarray(floor, dtype=np.float64),
+        floor_m=floor,
         extra=data.get("extra", {}),
     )
 

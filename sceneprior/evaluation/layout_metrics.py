@@ -130,6 +130,21 @@ def overlap_pairs(scenes: Sequence[Scene]) -> Overlaps:
     return Overlaps(per_room=hits / max(len(scenes), 1), share=hits / max(pairs, 1))
 
 
+def shared_of_smaller(
+    centers_a: Float[np.ndarray, "n 3"],
+    sizes_a: Float[np.ndarray, "n 3"],
+    centers_b: Float[np.ndarray, "m 3"],
+    sizes_b: Float[np.ndarray, "m 3"],
+) -> Float[np.ndarray, "n m"]:
+    """The part of the smaller box's volume that each box a shares with each box b, in [0, 1].
+
+    0 where a box has no volume.
+    """
+    shared = _intersections(centers_a, sizes_a, centers_b, sizes_b)
+    smaller = np.minimum(sizes_a.prod(1)[:, None], sizes_b.prod(1)[None])
+    return np.divide(shared, smaller, out=np.zeros_like(shared), where=smaller > 0)
+
+
 def _intersections(
     centers_a: np.ndarray, sizes_a: np.ndarray, centers_b: np.ndarray, sizes_b: np.ndarray
 ) -> np.ndarray:

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneprior.batches import DecodedScenes
-from sceneprior.classes import label_set
+from sceneprior.classes import VOID, label_set
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.stages.runs import TrainedPrior
@@ -26,16 +26,14 @@ def to_scenes(
     `void` is a class like any other to the network, but no furniture: such objects are left out.
     """
     classes = label_set(label_set_name)
-    kept = kept_objects(decoded.completeness_logits, completeness_target)
+    slots = furnished_slots(decoded, completeness_target)
     labels = decoded.class_logits.argmax(dim=-1)
     corners = faces.cpu().numpy()
     scenes = []
     for room, name in enumerate(names):
         objects = []
-        for item in kept[room].nonzero()[:, 0].tolist():
+        for item in slots[room]:
             label = classes[int(labels[room, item])]
-            if label == "void":
-                continue
             mesh = None
             if decoded.vertices_m is not None:
                 mesh = Mesh(decoded.vertices_m[room, item].cpu().numpy(), corners)
@@ -44,6 +42,15 @@ def to_scenes(
             objects.append(SceneObject(label, center, size, mesh))
         scenes.append(Scene(name, label_set_name, tuple(objects)))
     return scenes
+
+
+def furnished_slots(
+    decoded: DecodedScenes, completeness_target: str = "first_n"
+) -> list[list[int]]:
+    """Which of the N predictions of each room `to_scenes` makes objects of, in its order."""
+    kept = kept_objects(decoded.completeness_logits, completeness_target)
+    kept = kept & (decoded.class_logits.argmax(dim=-1) != VOID)
+    return [row.nonzero()[:, 0].tolist() for row in kept]
 
 
 @torch.no_grad()
@@ -71,9 +78,15 @@ def decode_training_rooms(trained: TrainedPrior) -> list[Scene]:
     return decode_latents(trained, z, list(trained.room_ids))
 
 
-def synthesize(trained: TrainedPrior, count: int, seed: int, law: str | None = None) -> list[Scene]:
-    """New scenes: latents sampled by a law, decoded."""
+def draw_latents(
+    trained: TrainedPrior, count: int, seed: int, law: str | None = None
+) -> tuple[Float[Tensor, "count width"], list[str]]:
+    """Latents sampled by a law (None: the run's own), and the names of their rooms."""
     law = law or trained.config.sampling.law
     z = sample_latents(trained.prior.sphere, trained.logits, count, seed, law)
-    names = [f"seed{seed}_{index:04d}" for index in range(count)]
-    return decode_latents(trained, z, names)
+    return z, [f"seed{seed}_{index:04d}" for index in range(count)]
+
+
+def synthesize(trained: TrainedPrior, count: int, seed: int, law: str | None = None) -> list[Scene]:
+    """New scenes: latents sampled by a law, decoded."""
+    return decode_latents(trained, *draw_latents(trained, count, seed, law))
