@@ -158,10 +158,11 @@ class StageConfig(_Section):
     cpu_threads: int | None = Field(None, ge=1)
     """Torch threads where a CPU trains; None leaves torch's choice. A small network gains little
     from a second thread and loses much when another program takes that core."""
-    proxy: Literal["ellipsoid", "ellipsoid_points", "box"] = "ellipsoid"
+    proxy: Literal["ellipsoid", "ellipsoid_points", "box", "bulge"] = "ellipsoid"
     """What an object's 2D box is taken from where its mesh is not (see `box_from`): the smooth
     ellipsoid that fills the 3D box, exactly; 162 of its points, which is slower and moves what is
-    behind the camera in front of it, as the authors do with 2,562; or the 3D box's corners."""
+    behind the camera in front of it, as the authors do with 2,562; the 3D box's corners; or
+    `bulge`, the box with its edges cut off as far as its class has learnt to."""
 
 
 class ShapeConfig(StageConfig):

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from sceneprior.batches import DecodedScenes
 from sceneprior.geometry.boxes import place
+from sceneprior.models.chamfers import ClassChamfers
 from sceneprior.models.latents import LatentCube, LatentSpace, LatentSphere
 from sceneprior.models.layout_decoder import LayoutDecoder
 from sceneprior.models.scene_decoder import SceneDecoder
@@ -69,6 +70,7 @@ class ScenePrior(nn.Module):
                 width, heads, hidden, dropout, final_norm, query_self_attention, steps
             )
         self.layout = LayoutDecoder(width, classes, heads=layout_heads)
+        self.chamfers = ClassChamfers(classes)
         self.shape = ShapeDecoder(2 * width, shape_width, shape_level, template, fit_box)
 
     def forward(
@@ -94,5 +96,6 @@ class ScenePrior(nn.Module):
             centers_m=layout.centers_m,
             sizes_m=layout.sizes_m,
             completeness_logits=layout.completeness_logits,
+            chamfers=self.chamfers(layout.class_logits),
             vertices_m=vertices,
         )

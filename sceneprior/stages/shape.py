@@ -36,6 +36,9 @@ class ShapeStage(lightning.LightningModule):
     def __init__(self, prior: ScenePrior, latents: nn.Embedding, config: RunConfig):
         super().__init__()
         self.prior = prior.requires_grad_(True)
+        shape = config.shape
+        # Several processes agree on gradients only of what takes part.
+        prior.chamfers.requires_grad_((shape.box_from, shape.proxy) == ("proxy", "bulge"))
         self.latents = latents
         self.config = config
 

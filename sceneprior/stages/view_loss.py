@@ -10,7 +10,7 @@ from torch import distributed as dist
 
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.config import LossConfig, RunConfig, StageConfig
-from sceneprior.geometry.boxes import box_corners, place
+from sceneprior.geometry.boxes import box_corners, chamfered_cube, place
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
 from sceneprior.geometry.meshes import icosphere
@@ -30,6 +30,8 @@ def proxy_boxes(scenes: DecodedScenes, views: SceneViews, proxy: str) -> Boxes2D
         return boxes_of_ellipsoids(centers_m, sizes_m, cameras, lenses, views.image_size)
     if proxy == "box":
         points_m = box_corners(centers_m, sizes_m)
+    elif proxy == "bulge":
+        points_m = place(chamfered_cube(scenes.chamfers), centers_m, sizes_m)
     else:
         sphere = icosphere(POINTS_LEVEL)[0].to(centers_m)
         points_m = place(sphere.expand(*centers_m.shape[:2], -1, -1), centers_m, sizes_m)
@@ -140,12 +142,14 @@ def build_optimizer(
 ) -> OptimizerLRSchedulerConfig:
     """Adam with the stage's schedule over `steps` updates, in the shape Lightning takes."""
     fresh = list(prior.shape.parameters())
-    trained = [item for name, item in prior.named_parameters() if not name.startswith("shape.")]
+    tables = [*latents.parameters(), *prior.chamfers.parameters()]
+    others = ("shape.", "chamfers.")
+    trained = [item for name, item in prior.named_parameters() if not name.startswith(others)]
     fresh_rate = getattr(stage, "decoder_learning_rate", None) or stage.learning_rate
     groups = [
         {"params": trained, "lr": stage.learning_rate},
         {"params": fresh, "lr": fresh_rate},
-        {"params": list(latents.parameters()), "lr": stage.latent_learning_rate},
+        {"params": tables, "lr": stage.latent_learning_rate},
     ]
     optimizer = torch.optim.Adam(groups, fused=True)
     if stage.schedule == "cosine":

@@ -35,6 +35,7 @@ VARIANTS = {
     "c1_uniform": {"model__latent": "uniform", "layout__latent_noise": 0.1},
     "c2_lstm": {"model__decoder": "lstm"},
     "c3_one_stage": {"stages": "one", "shape__epochs": 5},
+    "bulge": {"layout__proxy": "bulge", "shape__box_from": "proxy", "shape__proxy": "bulge"},
     "released": RELEASED,
 }
 
@@ -67,6 +68,12 @@ def test_a_variant_learns(variant):
     ]
     assert losses[-1] < losses[0]
     assert all(torch.isfinite(torch.tensor(value)) for _, value in curves["shape/mask"])
+
+
+def test_chamfers_are_learnt_by_the_bulge_alone(variant):
+    name, _, run = variant
+    moved = (load_run(run).prior.chamfers.logits != -2).any(dim=1)
+    assert moved.any() if name == "bulge" else not moved.any()
 
 
 def test_a_variant_is_decoded_sampled_and_interpolated(variant):

@@ -28,6 +28,7 @@ def seen() -> tuple[DecodedScenes, SceneViews]:
         centers_m=torch.rand(rooms, objects, 3, generator=generator) * 2 - 1,
         sizes_m=torch.rand(rooms, objects, 3, generator=generator) + 0.2,
         completeness_logits=torch.zeros(rooms, objects),
+        chamfers=torch.full((rooms, objects, 2), 0.3),
     )
     return scenes, SceneViews(
         room_index=torch.arange(rooms),
@@ -58,7 +59,7 @@ def test_a_box_holds_the_ellipsoid_and_that_its_points(seen):
 def test_every_proxy_of_the_config_has_boxes_of_its_own(seen):
     proxies = StageConfig.model_fields["proxy"].annotation.__args__
     boxes = [proxy_boxes(*seen, proxy).boxes for proxy in proxies]
-    assert len(proxies) == 3
+    assert len(proxies) == 4
     for i, one in enumerate(boxes):
         assert all(not torch.equal(one, other) for other in boxes[:i])
 
