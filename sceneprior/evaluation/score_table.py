@@ -1,0 +1,97 @@
+"""Scores as tables: a result in; rows of text, and a table in the terminal, out."""
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+COLUMNS: tuple[tuple[str, str, str], ...] = (
+    ("generated", "generated", "n_generated"),
+    ("train_rooms", "real training", "n_train_rooms"),
+    ("test", "real test", "n_test"),
+)
+"""(name of the column's intervals, heading, where the protocol counts its rooms)."""
+
+SCORE_ROWS: tuple[tuple[str, str, str], ...] = (
+    ("fid", "FID (Inception)", "lower is closer"),
+    ("kid", "KID (Inception)", "lower is closer"),
+    ("precision_inception", "Precision, Inception", "share of rooms"),
+    ("recall_inception", "Recall, Inception", "share of test rooms"),
+    ("sca", "SCA (AlexNet)", "0.5 is best"),
+    ("fd_effnet_lite0", "Frechet distance, EfficientNet-Lite0 (not FID)", "lower is closer"),
+    ("kid_effnet_lite0", "Kernel distance, EfficientNet-Lite0 (not KID)", "lower is closer"),
+    ("precision_effnet_lite0", "Precision, EfficientNet-Lite0", "share of rooms"),
+    ("recall_effnet_lite0", "Recall, EfficientNet-Lite0", "share of test rooms"),
+    ("sca_effnet_lite0", "Classifier accuracy, EfficientNet-Lite0", "0.5 is best"),
+    ("category_kl", "Category KL to test rooms", "nats, lower is closer"),
+    ("type_share", "Rooms that hold their type's furniture", "share"),
+    ("mean_objects", "Objects in a room", "mean"),
+    ("overlap_pairs", "Intersecting pairs in a room", "mean"),
+    ("overlap_pair_share", "Intersecting pairs among all pairs", "share"),
+    ("overlap_volume_m3", "Volume shared by pairs in a room", "mean, cubic metres"),
+    ("out_of_bounds_share", "Pieces out of the floor's bounds", "share; known floors alone"),
+    ("walkable_share", "Walkable in one piece, between furniture", "share of free floor"),
+    (
+        "walkable_share_floor",
+        "Walkable in one piece, within the floor",
+        "share; known floors alone",
+    ),
+    ("nearest_training_m", "Distance to the nearest training room", "mean, metres"),
+    ("near_copy_share", "Near copies of a training room", "share of rooms"),
+)
+"""(key, title, unit) in the order of the printed tables."""
+
+
+def score_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
+    """The table of a result: (title, unit, a cell per column of `COLUMNS`).
+
+    A cell is the figure and, on a line of its own, its interval. A figure that a column does not
+    have is a dash; a key that the result lacks is no row.
+    """
+    rows = []
+    for key, title, unit in SCORE_ROWS:
+        if key not in scores:
+            continue
+        cells = []
+        for column, _, _ in COLUMNS:
+            interval = scores.get("intervals", {}).get(column, {}).get(key)
+            cells.append(_cell(score_of(scores, column, key), interval))
+        rows.append((title, unit, *cells))
+    return rows
+
+
+def score_of(scores: dict[str, Any], column: str, key: str) -> float | None:
+    """Where a result keeps the figure of a column."""
+    if column == "generated":
+        return scores.get(key)
+    if column == "test":
+        return scores.get(f"{key}_test")
+    found: float | None = scores.get(column, {}).get(key)
+    return found
+
+
+def headings(scores: dict[str, Any]) -> list[tuple[str, str]]:
+    """(what a column holds, how many rooms stand behind it) of each of `COLUMNS`."""
+    protocol = scores.get("protocol", {})
+    return [(title, f"{protocol.get(count, '?')} rooms") for _, title, count in COLUMNS]
+
+
+def _cell(value: float | None, interval: list[float] | None) -> str:
+    if value is None:
+        return "–"
+    digits = 4 if abs(value) < 0.01 else 3 if abs(value) < 10 else 1
+    if interval is None or value == interval[0] == interval[1]:
+        return f"{value:.{digits}f}"
+    return f"{value:.{digits}f}\n{interval[0]:.{digits}f} to {interval[1]:.{digits}f}"
+
+
+def print_scores(scores: dict[str, Any], console: Console | None = None) -> None:
+    """Print the table of a result to stdout, with how many rooms stand behind each column."""
+    table = Table(title="Synthesis against test rooms", caption=scores.get("note"))
+    table.add_column("")
+    table.add_column("unit")
+    for heading, rooms in headings(scores):
+        table.add_column(f"{heading}\n{rooms}", justify="right")
+    for row in score_rows(scores):
+        table.add_row(*row)
+    (console or Console()).print(table)
