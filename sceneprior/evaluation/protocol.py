@@ -79,8 +79,9 @@ def evaluate_synthesis(
 
     Returns:
         The figures of the generated rooms, `<key>_test` for those that the test rooms have by
-        themselves, under `train_rooms` the figures of real training rooms, `intervals` by column
-        (`generated`, `train_rooms`, `test`), and under `protocol` all that they depend on.
+        themselves, under `train_rooms` the figures of real training rooms, under `independent`
+        those of rooms of independent objects (and what their pictures say with real meshes under
+        `independent_meshes`), `intervals` by column, and under `protocol` all they depend on.
         docs/evaluation.md defines each.
 
     Raises:
@@ -178,10 +179,8 @@ def _columns(
         columns[column] = pictures(rooms) | layout
     columns["independent_meshes"] = pictures(replace(sets["independent"], features=meshes))
     # Frechet distances compare at equal numbers of rooms alone.
-    fair = sets["generated"].of(
-        seeded_rows(len(sets["generated"].scenes), len(sets["train"].scenes), seed),
-        (seed, len(sets)),
-    )
+    rows = seeded_rows(len(sets["generated"].scenes), len(sets["train"].scenes), seed)
+    fair = sets["generated"].of(rows, (seed, len(sets)))
     for column, suffix in (("independent", ""), ("independent_meshes", "_meshes")):
         gaps = gap_figures(fair, test, columns[column], columns["train_rooms"])
         columns["generated"] |= {f"{key}{suffix}": figure for key, figure in gaps.items()}

@@ -149,6 +149,10 @@ def _tiles(scores: dict[str, Any]) -> list[tuple[str, str, str]]:
     if "category_kl" in known:
         beside = f"nats; real training rooms {train['category_kl']:.3f}"
         tiles.append((f"{known['category_kl']:.3f}", "category KL to test rooms", beside))
+    if "gap_closed_effnet_lite0" in known:
+        beside = "independent objects, drawn as boxes: 0; real training rooms: 1"
+        share = f"{known['gap_closed_effnet_lite0']:.0%}"
+        tiles.append((share, "of the Frechet gap to real rooms closed", beside))
     if "mean_objects" in known:
         beside = f"real test rooms {known['mean_objects_test']:.2f}"
         tiles.append((f"{known['mean_objects']:.2f}", "objects in a generated room", beside))

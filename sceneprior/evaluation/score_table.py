@@ -20,22 +20,30 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
 
 SCORE_ROWS: tuple[tuple[str, str, str], ...] = (
     ("fid", "FID (Inception)", "lower is closer"),
-    ("gap_closed_inception", "Gap closed from independent boxes, Inception", "1: as near as real"),
+    (
+        "gap_closed_inception",
+        "Gap closed of independent boxes, Inception",
+        "0: theirs, 1: as near as real",
+    ),
     (
         "gap_closed_inception_meshes",
-        "Gap closed from independent furniture, Inception",
-        "1: as near as real",
+        "Gap closed of independent furniture, Inception",
+        "0: theirs, 1: as near as real",
     ),
     ("kid", "KID (Inception)", "lower is closer"),
     ("precision_inception", "Precision, Inception", "share of rooms"),
     ("recall_inception", "Recall, Inception", "share of test rooms"),
     ("sca", "SCA (AlexNet)", "0.5 is best"),
     ("fd_effnet_lite0", "Frechet distance, EfficientNet-Lite0 (not FID)", "lower is closer"),
-    ("gap_closed_effnet_lite0", "Gap closed from independent boxes, Lite0", "1: as near as real"),
+    (
+        "gap_closed_effnet_lite0",
+        "Gap closed of independent boxes, Lite0",
+        "0: theirs, 1: as near as real",
+    ),
     (
         "gap_closed_effnet_lite0_meshes",
-        "Gap closed from independent furniture, Lite0",
-        "1: as near as real",
+        "Gap closed of independent furniture, Lite0",
+        "0: theirs, 1: as near as real",
     ),
     ("kid_effnet_lite0", "Kernel distance, EfficientNet-Lite0 (not KID)", "lower is closer"),
     ("precision_effnet_lite0", "Precision, EfficientNet-Lite0", "share of rooms"),
@@ -97,7 +105,7 @@ def headings(scores: dict[str, Any]) -> list[tuple[str, str]]:
 def _cell(value: float | None, interval: list[float] | None) -> str:
     if value is None:
         return "–"
-    digits = 4 if abs(value) < 0.01 else 3 if abs(value) < 10 else 1
+    digits = 3 if abs(value) < 10 else 1
     if interval is None or value == interval[0] == interval[1]:
         return f"{value:.{digits}f}"
     return f"{value:.{digits}f}\n{interval[0]:.{digits}f} to {interval[1]:.{digits}f}"
@@ -116,7 +124,7 @@ def print_scores(scores: dict[str, Any], console: Console | None = None) -> None
     table = Table(
         title="Synthesis against test rooms", box=box.SIMPLE_HEAD, caption=_caption(scores)
     )
-    table.add_column("", min_width=26)
+    table.add_column("", overflow="fold")
     for heading, rooms in headings(scores):
         table.add_column(f"{heading}\n{rooms}", justify="right")
     for title, unit, *cells in score_rows(scores):

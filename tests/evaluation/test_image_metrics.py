@@ -10,7 +10,9 @@ from sceneprior.evaluation.image_metrics import (
     inception_features,
     single_threaded,
 )
+from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.set_metrics import frechet_distance
+from sceneprior.evaluation.topdown import topdown
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +40,15 @@ def test_frechet_distance_of_two_halves_is_that_of_batches_of_one_and_of_64():
     apart = frechet_distance(one_by_one[:12], one_by_one[12:])
     assert together > 1
     assert abs(together - apart) <= 1e-6
+
+
+def test_halves_of_test_renders_are_as_far_apart_one_by_one_as_64_at_once(shards, renderer):
+    rooms = [*reference_scenes(shards, "test"), *reference_scenes(shards, "train", limit=5)]
+    renders = np.stack([topdown(room, renderer) for room in rooms])
+    one_by_one = np.concatenate([efficientnet_lite0_features(image[None]) for image in renders])
+    at_once = efficientnet_lite0_features(np.tile(renders, (7, 1, 1, 1))[:64])[:10]
+    distances = [frechet_distance(found[::2], found[1::2]) for found in (one_by_one, at_once)]
+    assert distances[0] > 1 and abs(distances[0] - distances[1]) <= 1e-6
 
 
 def test_threads_of_torch_are_given_back(images):

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from sceneprior.errors import InputError, ShardError
 from sceneprior.evaluation import figures, protocol
+from sceneprior.evaluation.independent import independent_rooms
 from sceneprior.evaluation.layout_metrics import category_kl
 from sceneprior.evaluation.protocol import (
     evaluate_synthesis,
@@ -21,6 +22,7 @@ from sceneprior.evaluation.protocol import (
 )
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.score_table import SCORE_ROWS, print_scores, score_rows
+from sceneprior.evaluation.set_metrics import gap_closed
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene, SceneObject
@@ -60,6 +62,9 @@ def test_every_figure_stands_beside_that_of_real_rooms(result, generated, shards
     assert "fid" not in scores  # a distance in another network's features is never called FID
     beside = set(scores["train_rooms"])
     assert beside == ALONE | AGAINST and beside < set(scores)
+    assert set(scores["independent"]) == beside
+    # The same layouts: only their pictures differ.
+    assert set(scores["independent_meshes"]) == AGAINST - {"category_kl"}
     assert {key for key in scores if key.endswith("_test")} == {f"{key}_test" for key in ALONE}
     assert beside < {key for key, *_ in SCORE_ROWS}
     assert scores["train_rooms"]["category_kl"] == pytest.approx(0, abs=1e-12)
@@ -68,9 +73,12 @@ def test_every_figure_stands_beside_that_of_real_rooms(result, generated, shards
 def test_the_protocol_says_all_that_the_figures_depend_on(result, shards, renderer):
     scores, out = result
     said = scores["protocol"]
-    counts = {key: said[key] for key in ("n_generated", "n_test", "n_train_rooms")}
-    assert counts == {"n_generated": 3, "n_test": 5, "n_train_rooms": 3}
-    assert said["n_train_rooms_available"] == 8 and said["seed"] == 1
+    counts = {key: said[key] for key in said if key.startswith("n_")}
+    assert counts == {
+        "n_generated": 3, "n_test": 5, "n_train_rooms": 3, "n_train_rooms_available": 8,
+        "n_independent": 3, "n_gap": 3,
+    }  # fmt: skip
+    assert said["seed"] == 1
     assert said["render"]["image_size"] == (512, 512)
     assert said["render"]["metres_per_pixel"] == 0.0125
     assert said["render"]["renderer"] == renderer.name
@@ -128,7 +136,7 @@ def test_void_is_left_out_and_subsets_are_seeded(generated):
     assert seeded_rows(20, 50, 0) == list(range(20))
 
 
-def test_the_printed_table_holds_three_columns_of_rooms(result):
+def test_the_printed_table_holds_four_columns_of_rooms(result):
     scores, _ = result
     page = Console(file=io.StringIO(), width=140)
     print_scores(scores, page)
@@ -136,12 +144,39 @@ def test_the_printed_table_holds_three_columns_of_rooms(result):
     assert "3 rooms" in text and "5 rooms" in text and "not FID" in text
     assert "nan" not in text.lower()
     rows = {row[0]: row[2:] for row in score_rows(scores)}
-    assert rows["Objects in a room"] == ("2.000", "3.000", "3.000")
-    assert rows["Pieces out of the floor's bounds"] == ("0.0000", "0.0000", "0.0000")
+    assert rows["Objects in a room"] == ("2.000", "3.000", "3.000", "3.000")
+    assert rows["Pieces out of the floor's bounds"] == ("0.000", "0.000", "–", "0.000")
     value, interval = rows["Frechet distance, EfficientNet-Lite0 (not FID)"][0].split("\n")
     low, high = map(float, interval.split(" to "))
     assert low <= float(value) <= high
     assert "FID (Inception)" not in rows
+
+
+def test_the_gap_closed_compares_equal_numbers_of_rooms(shards, renderer):
+    train = reference_scenes(shards, "train")
+    independent = independent_rooms(train, len(train), 0)
+    for rooms, share in ((train, 1), (independent, 0)):
+        scores = evaluate_synthesis(rooms, shards, renderer=renderer, resamples=5)
+        assert scores["gap_closed_effnet_lite0"] == pytest.approx(share, abs=1e-12)
+        low, high = scores["intervals"]["generated"]["gap_closed_effnet_lite0"]
+        assert low <= share <= high
+        distances = [
+            scores[group]["fd_effnet_lite0"] for group in ("independent", "independent_meshes")
+        ]
+        real, ours = scores["train_rooms"]["fd_effnet_lite0"], scores["fd_effnet_lite0"]
+        for key, distance in zip(("", "_meshes"), distances, strict=True):
+            by_hand = gap_closed(ours, distance, real)
+            assert scores[f"gap_closed_effnet_lite0{key}"] == pytest.approx(by_hand, abs=1e-12)
+    # Twice as many rooms have a smaller distance, but enter the gap with as many as the others.
+    twice = [replace(room, name=f"{room.name}_{k}") for room in train for k in range(2)]
+    scores = evaluate_synthesis(twice, shards, renderer=renderer, resamples=0)
+    assert scores["protocol"]["n_gap"] == 8
+    rows = seeded_rows(16, 8, 0)
+    chosen = evaluate_synthesis(
+        [twice[row] for row in rows], shards, renderer=renderer, resamples=0
+    )
+    key = "gap_closed_effnet_lite0"
+    assert scores[key] == pytest.approx(chosen[key], abs=1e-9)
 
 
 def test_what_cannot_be_scored_is_refused_before_anything_is_drawn(

@@ -12,6 +12,7 @@ from torchmetrics.image.kid import KernelInceptionDistance
 from sceneprior.errors import InputError
 from sceneprior.evaluation.set_metrics import (
     frechet_distance,
+    gap_closed,
     kernel_distance,
     kernels,
     precision_recall,
@@ -68,6 +69,16 @@ def test_distances_refuse_too_few_images_and_broken_numbers():
         frechet_distance(np.zeros((1, 4)), np.zeros((3, 4)))
     with pytest.raises(InputError, match="not finite"):
         frechet_distance(np.zeros((2, 4)), np.full((3, 4), math.nan))
+
+
+def test_the_gap_closed_has_a_value_where_there_is_no_gap():
+    assert gap_closed(40, 60, 40) == 1 and gap_closed(60, 60, 40) == 0
+    assert gap_closed(55, 60, 40) == 0.25
+    assert gap_closed(70, 60, 40) == -0.5 and gap_closed(30, 60, 40) == 1.5
+    # Independent rooms as near as real ones, or nearer.
+    for independent in (40, 30):
+        assert gap_closed(40, independent, 40) == gap_closed(0, independent, 40) == 1
+        assert gap_closed(41, independent, 40) == 0
 
 
 class Plain(torch.nn.Module):
