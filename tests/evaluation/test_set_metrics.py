@@ -72,13 +72,13 @@ def test_distances_refuse_too_few_images_and_broken_numbers():
 
 
 def test_the_gap_closed_has_a_value_where_there_is_no_gap():
-    assert gap_closed(40, 60, 40) == 1 and gap_closed(60, 60, 40) == 0
-    assert gap_closed(55, 60, 40) == 0.25
-    assert gap_closed(70, 60, 40) == -0.5 and gap_closed(30, 60, 40) == 1.5
+    assert gap_closed(40.0, 60.0, 40.0) == 1 and gap_closed(60.0, 60.0, 40.0) == 0
+    assert gap_closed(55.0, 60.0, 40.0) == 0.25
+    assert gap_closed(70.0, 60.0, 40.0) == -0.5 and gap_closed(30.0, 60.0, 40.0) == 1.5
     # Independent rooms as near as real ones, or nearer.
-    for independent in (40, 30):
-        assert gap_closed(40, independent, 40) == gap_closed(0, independent, 40) == 1
-        assert gap_closed(41, independent, 40) == 0
+    for independent in (40.0, 30.0):
+        assert gap_closed(40.0, independent, 40.0) == gap_closed(0.0, independent, 40.0) == 1
+        assert gap_closed(41.0, independent, 40.0) == 0
 
 
 class Plain(torch.nn.Module):
