@@ -22,12 +22,12 @@ SCORE_ROWS: tuple[tuple[str, str, str], ...] = (
     ("fid", "FID (Inception)", "lower is closer"),
     (
         "gap_closed_inception",
-        "Gap closed of independent boxes, Inception",
+        "Gap closed, from independent boxes, Inception",
         "0: theirs, 1: as near as real",
     ),
     (
         "gap_closed_inception_meshes",
-        "Gap closed of independent furniture, Inception",
+        "Gap closed, from independent furniture, Inception",
         "0: theirs, 1: as near as real",
     ),
     ("kid", "KID (Inception)", "lower is closer"),
@@ -37,12 +37,12 @@ SCORE_ROWS: tuple[tuple[str, str, str], ...] = (
     ("fd_effnet_lite0", "Frechet distance, EfficientNet-Lite0 (not FID)", "lower is closer"),
     (
         "gap_closed_effnet_lite0",
-        "Gap closed of independent boxes, Lite0",
+        "Gap closed, from independent boxes, Lite0",
         "0: theirs, 1: as near as real",
     ),
     (
         "gap_closed_effnet_lite0_meshes",
-        "Gap closed of independent furniture, Lite0",
+        "Gap closed, from independent furniture, Lite0",
         "0: theirs, 1: as near as real",
     ),
     ("kid_effnet_lite0", "Kernel distance, EfficientNet-Lite0 (not KID)", "lower is closer"),
