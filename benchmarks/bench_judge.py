@@ -38,24 +38,30 @@ def judge_seconds(run: Path, shards: Path | None, count: int, renderer: str) -> 
 
     Returns:
         `synthesize`, `score`, `write_reference` (its first use), `score_with_reference` and
-        `without_intervals`, each with `cpu_s` and `wall_s`.
+        `without_intervals`, each with `cpu_s` and `wall_s`; printed as they come, too.
     """
-    trained, load = measure(lambda: load_run(run))
-    folder = shards or Path(trained.config.data.shards)
-    scenes, drawn = measure(lambda: synthesize(trained, count, seed=0))
-    screen = open_renderer(renderer)
-    seconds: dict[str, Any] = {"load": load, "synthesize": drawn}
+    seconds: dict[str, Any] = {}
 
-    def score(**options: Any) -> dict[str, float]:
-        return measure(lambda: evaluate_synthesis(scenes, folder, renderer=screen, **options))[1]
+    def timed(name: str, work: Callable[[], T]) -> T:
+        result, seconds[name] = measure(work)
+        print(name, seconds[name], flush=True)
+        return result
+
+    trained = timed("load", lambda: load_run(run))
+    folder = shards or Path(trained.config.data.shards)
+    scenes = timed("synthesize", lambda: synthesize(trained, count, seed=0))
+    screen = open_renderer(renderer)
+
+    def score(name: str, **options: Any) -> None:
+        timed(name, lambda: evaluate_synthesis(scenes, folder, renderer=screen, **options))
 
     evaluate_synthesis(scenes[:2], folder, renderer=screen, resamples=0)  # compiles, loads, warms
-    seconds["score"] = score()
+    score("score")
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "reference.npz"
-        seconds["write_reference"] = score(reference=path)
-        seconds["score_with_reference"] = score(reference=path)
-        seconds["without_intervals"] = score(reference=path, resamples=0)
+        score("write_reference", reference=path)
+        score("score_with_reference", reference=path)
+        score("without_intervals", reference=path, resamples=0)
     return seconds
 
 
