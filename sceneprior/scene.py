@@ -91,7 +91,8 @@ def read_scene(path: Path) -> Scene:
     """Read a scene's JSON.
 
     Raises:
-        InputError: the file is missing, not JSON, not this format, or names unknown classes.
+        InputError: the file is missing, not JSON, not this format, names unknown classes, or
+            holds numbers that no room has.
     """
     try:
         data = json.loads(Path(path).read_text())
@@ -118,9 +119,7 @@ def read_scene(path: Path) -> Scene:
             for item in data["objects"]
         )
         floor = data.get("floor_m")
-        floor = None if floor is None else np.array(floor, dtype=np.float64)
-        if floor is not None and (floor.ndim != 2 or floor.shape[1] != 2):
-            raise ValueError(f"floor_m has shape {floor.shape}, not (corners, 2)")
+        floor_m = None if floor is None else np.asarray(floor, dtype=np.float64)
     except InputError:
         raise
     except OSError as error:
@@ -130,13 +129,32 @@ def read_scene(path: Path) -> Scene:
             f"{path} is not a scene JSON ({type(error).__name__}: {error}); "
             "docs/conventions.md describes the format."
         ) from None
-    return Scene(
+    scene = Scene(
         name=str(data.get("name", Path(path).stem)),
         label_set=data["label_set"],
         objects=objects,
-        floor_m=floor,
+        floor_m=floor_m,
         extra=data.get("extra", {}),
     )
+    _check_numbers(path, scene)
+    return scene
+
+
+def _check_numbers(path: Path, scene: Scene) -> None:
+    for item in scene.objects:
+        if not np.isfinite([*item.center_m, *item.size_m]).all() or min(item.size_m) < 0:
+            raise InputError(
+                f"{path}: a {item.label} has centre {list(item.center_m)} and size "
+                f"{list(item.size_m)}; expected finite metres, and sizes not below 0."
+            )
+    floor = scene.floor_m
+    if floor is not None and (
+        floor.ndim != 2 or floor.shape[1] != 2 or len(floor) < 3 or not np.isfinite(floor).all()
+    ):
+        raise InputError(
+            f"{path}: floor_m has shape {floor.shape}; expected at least 3 corners [x, z] in "
+            "finite metres, or no floor_m."
+        )
 
 
 def _triple(values: Any) -> tuple[float, float, float]:

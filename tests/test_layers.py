@@ -38,6 +38,7 @@ OWNERS = {
     ],
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
+    "sklearn": ["sceneprior/evaluation/"],
     "scipy.optimize": ["sceneprior/losses/matching.py", "sceneprior/evaluation/"],
     "cv2": ["data_prep/"],
     "distributed": ["data_prep/cluster.py"],

@@ -12,7 +12,6 @@ from jinja2 import Environment, StrictUndefined
 
 from sceneprior import __version__
 from sceneprior.evaluation.layout_metrics import match_scenes
-from sceneprior.evaluation.protocol import score_rows
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.report_pictures import (
     RoomPictures,
@@ -21,6 +20,7 @@ from sceneprior.evaluation.report_pictures import (
     legend,
     room_pictures,
 )
+from sceneprior.evaluation.score_table import headings, score_rows
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Scene
 
@@ -94,6 +94,7 @@ def write_report(
         test=[room_pictures(scene, renderer) for scene in test],
         unfolding=[room_pictures(scene, renderer) for scene in along],
         legend=legend(shown),
+        headings=headings(scores),
         rows=score_rows(scores),
         protocol=protocol,
         protocol_text=json.dumps(protocol, indent=1),
@@ -148,6 +149,10 @@ def _tiles(scores: dict[str, Any]) -> list[tuple[str, str, str]]:
     if "category_kl" in known:
         beside = f"nats; real training rooms {train['category_kl']:.3f}"
         tiles.append((f"{known['category_kl']:.3f}", "category KL to test rooms", beside))
+    if "gap_closed_effnet_lite0" in known:
+        beside = "independent objects, drawn as boxes: 0; real training rooms: 1"
+        share = f"{known['gap_closed_effnet_lite0']:.0%}"
+        tiles.append((share, "of the Frechet gap to real rooms closed", beside))
     if "mean_objects" in known:
         beside = f"real test rooms {known['mean_objects_test']:.2f}"
         tiles.append((f"{known['mean_objects']:.2f}", "objects in a generated room", beside))
