@@ -27,6 +27,7 @@ def match_objects(
     views: SceneViews,
     box_weight: float = 5.0,
     hidden_overshoot: float = 1.0,
+    first_n: bool = True,
 ) -> Matches:
     """Find the cheapest one-to-one assignment of predictions to tracked objects.
 
@@ -41,6 +42,7 @@ def match_objects(
         views: What the cameras saw.
         box_weight: lambda_B.
         hidden_overshoot: See `side_distance`.
+        first_n: False lets all predictions take part: those that have no order.
 
     Raises:
         ValueError: a room holds more objects than the prior can generate.
@@ -57,7 +59,8 @@ def match_objects(
     # SciPy refuses what is not a number; the loss will be none either, and its check names rooms.
     matrices = cost.nan_to_num().cpu().numpy()
     for room, count in enumerate(counts.tolist()):
-        rows, columns = linear_sum_assignment(matrices[room, :count, :count])
+        candidates = count if first_n else slots
+        rows, columns = linear_sum_assignment(matrices[room, :candidates, :count])
         prediction[room, torch.from_numpy(columns)] = torch.from_numpy(rows)
     return Matches(prediction.to(cost.device), views.is_object & views.visible.any(dim=1))
 

@@ -53,6 +53,10 @@ class LatentSphere(nn.Module):
         """One point a pair, on the geodesic; see `slerp_pairs`."""
         return slerp_pairs(start, end, along)
 
+    def onto(self, points: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
+        """The nearest point of the sphere, for who moves through the space around it."""
+        return F.normalize(points, dim=-1)
+
     def step(
         self, z: Float[Tensor, "rooms dimension"], length: float, seed: int
     ) -> Float[Tensor, "rooms dimension"]:
@@ -97,6 +101,10 @@ class LatentCube(nn.Module):
     ) -> Float[Tensor, "pairs dimension"]:
         """One point a pair, on the straight line."""
         return torch.lerp(start, end, along.unsqueeze(-1))
+
+    def onto(self, points: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
+        """The nearest point of the cube, for who moves through the space around it."""
+        return points.clamp(-self.half_edge, self.half_edge)
 
     def step(
         self, z: Float[Tensor, "rooms dimension"], length: float, seed: int

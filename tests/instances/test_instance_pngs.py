@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_prep.posed.masks import mask_size, read_mask
 from sceneprior.errors import InputError
+from sceneprior.instances.pngs import mask_size, read_mask
 
 IDS = np.array([[0, 1, 2], [7, 200, 255]])
 
