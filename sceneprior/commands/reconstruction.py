@@ -111,11 +111,16 @@ def _own(
 
 
 def eval_svr(
-    run: RunOption,
     shards: Annotated[Path, typer.Option(help="Shards with 3D ground truth.")],
+    run: Annotated[Path | None, typer.Option(help="A run: its fits are judged.")] = None,
+    scenes: Annotated[
+        Path | None, typer.Option(help="Instead: what reconstruct, or retrieve after it, wrote.")
+    ] = None,
     split: Annotated[str, typer.Option(help="train or test.")] = "test",
     limit: Annotated[int | None, typer.Option(min=1, help="Only the first rooms.")] = None,
-    out: Annotated[Path | None, typer.Option(help="JSON file (default: RUN/svr.json).")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="JSON file (default: svr.json in RUN or SCENES).")
+    ] = None,
     schedule: ScheduleOption = "paper",
     restarts: RestartsOption = 1,
     start: StartOption = "nearest",
@@ -125,10 +130,18 @@ def eval_svr(
     renderer: RendererOption = "auto",
 ) -> None:
     """Judge single-view reconstruction against the true rooms, and against known ones."""
-    from sceneprior.tasks.judge_views import judge_views, print_view_scores
+    from sceneprior.errors import InputError
+    from sceneprior.tasks.judge_views import judge_scenes, judge_views, print_view_scores
     from sceneprior.tasks.reconstruct import FitOptions
 
-    target = out or run / "svr.json"
-    options = FitOptions(schedule, restarts, start, refine, seed=seed)
-    print_view_scores(judge_views(run, shards, split, limit, options, target, renderer, checkpoint))
+    if run is not None and scenes is None:
+        target = out or run / "svr.json"
+        options = FitOptions(schedule, restarts, start, refine, seed=seed)
+        scores = judge_views(run, shards, split, limit, options, target, renderer, checkpoint)
+    elif scenes is not None and run is None:
+        target = out or scenes / "svr.json"
+        scores = judge_scenes(scenes, shards, split, target, seed, renderer)
+    else:
+        raise InputError("Say what to judge: either --run, or --scenes with reconstructions.")
+    print_view_scores(scores)
     typer.echo(f"Wrote {target}")

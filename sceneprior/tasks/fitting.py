@@ -183,7 +183,8 @@ def fit_latents(
                 break
             if not going.all():
                 active, seen = active[going], rows_of(seen, going)
-                matches = Matches(*(part[going] for part in matches))
+                most = seen.is_object.shape[1]
+                matches = Matches(*(part[going, :most] for part in matches))
     with torch.no_grad():
         scenes = decode_images(trained, found, views)
         loss = view_loss(trained, scenes, views, masks)

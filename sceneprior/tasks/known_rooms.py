@@ -11,6 +11,7 @@ from torch import Tensor
 from sceneprior.batches import DecodedScenes
 from sceneprior.classes import label_set
 from sceneprior.config import LossConfig
+from sceneprior.errors import InputError
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.topdown import scene_meshes
 from sceneprior.geometry.boxes import box_corners
@@ -94,11 +95,12 @@ def turn_scene(scene: Scene, quarter: int) -> Scene:
 def random_answers(
     rooms: KnownRooms, images: Sequence[ObservedImage], weights: LossConfig, seed: int
 ) -> list[KnownAnswer]:
-    """A room drawn at random for each image, matched to its masks."""
-    draws = np.random.default_rng(seed).integers(len(rooms.scenes), size=len(images))
+    """A room drawn at random for each image, not its own, matched to its masks."""
+    rng = np.random.default_rng(seed)
     answers = []
-    for image, row in zip(images, draws, strict=True):
-        objects, _ = _matched(rooms, torch.tensor([int(row)]), image, weights)
+    for image in images:
+        row = int(rng.choice(_others(rooms, image)))
+        objects, _ = _matched(rooms, torch.tensor([row]), image, weights)
         answers.append(KnownAnswer(rooms.scenes[row], objects[0]))
     return answers
 
@@ -109,15 +111,15 @@ def nearest_answers(
     weights: LossConfig,
     renderer: Renderer,
 ) -> list[KnownAnswer]:
-    """For each image the room whose masks agree best: mean IoU over the image's masks.
+    """For each image the room, not its own, whose masks agree best: mean IoU over its masks.
 
     Only the `SHORTLIST` best by classes and 2D boxes are drawn.
     """
-    every = torch.arange(len(rooms.scenes))
     answers = []
     for image in images:
-        _, costs = _matched(rooms, every, image, weights)
-        best = costs.argsort()[:SHORTLIST]
+        others = _others(rooms, image)
+        _, costs = _matched(rooms, others, image, weights)
+        best = others[costs.argsort()[:SHORTLIST]]
         objects, _ = _matched(rooms, best, image, weights)
         overlaps = [
             mask_overlap(rooms.scenes[row], matched, image, renderer)
@@ -126,6 +128,16 @@ def nearest_answers(
         first = int(np.argmax(overlaps))
         answers.append(KnownAnswer(rooms.scenes[int(best[first])], objects[first]))
     return answers
+
+
+def _others(rooms: KnownRooms, image: ObservedImage) -> Tensor:
+    rows = [row for row, scene in enumerate(rooms.scenes) if scene.name != image.room_id]
+    if not rows:
+        raise InputError(
+            f"The shards' only training room is {image.room_id} itself, so there is no other to "
+            "compare its reconstruction with; judge with more training rooms."
+        )
+    return torch.tensor(rows)
 
 
 def _matched(

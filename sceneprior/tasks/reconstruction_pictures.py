@@ -28,13 +28,7 @@ def picture(found: Reconstruction, renderer: Renderer) -> UInt8[np.ndarray, "hei
         "found, same camera": same_camera(found.scene, found.image, renderer),
         "found, from above": from_above(found.scene, found.image, renderer),
     }
-    tiles = [
-        Image.fromarray(panel).resize(
-            (round(panel.shape[1] * HEIGHT_PX / panel.shape[0]), HEIGHT_PX),
-            Image.Resampling.NEAREST,
-        )
-        for panel in panels.values()
-    ]
+    tiles = [_as_tile(panel) for panel in panels.values()]
     width = sum(tile.width for tile in tiles) + GAP_PX * (len(tiles) - 1)
     rows = _legend_rows(found, width)
     sheet = Image.new("RGB", (width, LINE_PX * (1 + len(rows)) + HEIGHT_PX), PAPER)
@@ -52,9 +46,9 @@ def picture(found: Reconstruction, renderer: Renderer) -> UInt8[np.ndarray, "hei
     return np.asarray(sheet)
 
 
-def _of_height(panel: Image.Image) -> Image.Image:
-    width = max(round(panel.width * HEIGHT_PX / panel.height), 1)
-    return panel.resize((width, HEIGHT_PX), Image.Resampling.NEAREST)
+def _as_tile(panel: UInt8[np.ndarray, "height width 3"]) -> Image.Image:
+    width = max(round(panel.shape[1] * HEIGHT_PX / panel.shape[0]), 1)
+    return Image.fromarray(panel).resize((width, HEIGHT_PX), Image.Resampling.NEAREST)
 
 
 def _legend_rows(

@@ -7,9 +7,8 @@ from torch import Tensor
 
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.geometry.boxes import place
-from sceneprior.losses.matching import Matches
 from sceneprior.stages.runs import TrainedPrior
-from sceneprior.tasks.fitting import Fit, view_loss
+from sceneprior.tasks.fitting import Fit, ViewLoss, view_loss
 
 STEPS = 100
 RATE = 0.01
@@ -51,16 +50,12 @@ def refine(trained: TrainedPrior, views: SceneViews, fit: Fit, steps: int = STEP
         scenes = _move(start, canonical, moved, stretched)
         loss = view_loss(trained, scenes, views, matches=fit.loss.matches)
     better = loss.score < fit.loss.score
+    kept = {
+        name: torch.where(better, getattr(loss, name), getattr(fit.loss, name))
+        for name in ("total", "score", "mask_iou")
+    }
     return replace(
-        fit,
-        scenes=_choose(better, scenes, start),
-        loss=loss._replace(
-            **{
-                name: torch.where(better, getattr(loss, name), getattr(fit.loss, name))
-                for name in ("total", "score", "mask_iou")
-            },
-            matches=Matches(*fit.loss.matches),
-        ),
+        fit, scenes=_where(better, scenes, start), loss=ViewLoss(**kept, matches=fit.loss.matches)
     )
 
 
@@ -83,15 +78,16 @@ def _move(
     return replace(start, centers_m=centers, sizes_m=sizes, vertices_m=vertices)
 
 
-def _choose(first: Tensor, a: DecodedScenes, b: DecodedScenes) -> DecodedScenes:
+def _where(better: Tensor, moved: DecodedScenes, start: DecodedScenes) -> DecodedScenes:
     def choose(one: Tensor, other: Tensor) -> Tensor:
-        return torch.where(first.reshape(-1, *[1] * (one.dim() - 1)), one, other)
+        return torch.where(better.reshape(-1, *[1] * (one.dim() - 1)), one, other)
 
+    vertices = None
+    if moved.vertices_m is not None and start.vertices_m is not None:
+        vertices = choose(moved.vertices_m, start.vertices_m)
     return replace(
-        a,
-        centers_m=choose(a.centers_m, b.centers_m),
-        sizes_m=choose(a.sizes_m, b.sizes_m),
-        vertices_m=None
-        if a.vertices_m is None or b.vertices_m is None
-        else choose(a.vertices_m, b.vertices_m),
+        start,
+        centers_m=choose(moved.centers_m, start.centers_m),
+        sizes_m=choose(moved.sizes_m, start.sizes_m),
+        vertices_m=vertices,
     )

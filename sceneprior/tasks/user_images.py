@@ -150,8 +150,14 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
         except ValueError:
             raise InputError(f"--intrinsics {text} is no lens; expected {expected}.") from None
         lens = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    plain = lens.shape == (3, 3) and np.isfinite(lens).all()
-    if not plain or min(lens[0, 0], lens[1, 1]) <= 0 or lens[0, 1] != 0:
+    plain = (
+        lens.shape == (3, 3)
+        and np.isfinite(lens).all()
+        and min(lens[0, 0], lens[1, 1]) > 0
+        and lens[0, 1] == 0
+        and np.allclose(lens[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1])
+    )
+    if not plain:
         raise InputError(
             f"--intrinsics {text} is no pinhole lens (fx and fy above 0, no skew); "
             f"expected {expected}."
@@ -168,8 +174,9 @@ def read_pose(path: Path) -> np.ndarray:
         InputError: there is no such matrix, or it is no rotation with a translation.
     """
     data = _read_json(path)
-    found = [key for key in ("world_to_camera", "camera_to_world") if key in data]
+    found: list[str] = []
     try:
+        found = [key for key in ("world_to_camera", "camera_to_world") if key in data]
         matrix = np.array(data[found[0]], dtype=np.float64)
         turn = matrix[:3, :3]
         rigid = (

@@ -35,9 +35,12 @@ def test_a_box_found_half_aside():
 def test_the_same_object_is_found_perfectly_but_for_the_points():
     score = score_pair(ObjectPair(BED, BED), POINTS)
     assert score.box_iou_3d == pytest.approx(1) and score.oriented_box_iou_3d == pytest.approx(1)
-    assert score.class_right and score.f_score == pytest.approx(1, abs=0.05)
-    # 4,000 points on 16 square metres: the nearest is about sqrt(16 / 4000) / 2 away, each way.
-    assert score.chamfer_l2_m == pytest.approx(0.063, rel=0.1)
+    # Points as dense as 4,000 on 16 square metres lie half of sqrt(1 / density) from the nearest of
+    # another draw, each way; a circle of 5 cm holds density * pi * 0.05**2 of them on average.
+    density = POINTS / 16
+    assert score.chamfer_l2_m == pytest.approx(density**-0.5, rel=0.05)
+    assert score.class_right
+    assert score.f_score == pytest.approx(1 - np.exp(-density * np.pi * 0.05**2), abs=0.02)
 
 
 def test_a_mesh_counts_and_its_turn_shows_in_the_oriented_box():

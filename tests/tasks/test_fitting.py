@@ -112,6 +112,17 @@ def test_the_released_schedule_waits_for_masks_and_keeps_its_matching(trained, v
     assert (SCHEDULES["paper"].steps, SCHEDULES["paper"].drop_at) == (1000, 500)
 
 
+def test_a_kept_matching_goes_with_the_images_that_go_on(trained, views, start):
+    counts = views.is_object.sum(dim=1)
+    assert counts.min() < counts.max()  # so that those that go on are padded to fewer objects
+    fullest = int(counts.argmax())
+    schedule = FitSchedule(
+        steps=120, drop_at=20, masks_from=2, freeze_matching=True, patience=20, least_gain=0.02
+    )
+    fit = fit_latents(trained, views, start, schedule)
+    assert len(set(fit.steps.tolist())) > 1 and fit.steps[fullest] < fit.steps.max()
+
+
 def test_without_masks_only_the_layout_counts(trained, views, start):
     fit = fit_latents(trained, views, start, SHORT, masks=False)
     assert (fit.loss.mask_iou == 0).all()
@@ -119,11 +130,14 @@ def test_without_masks_only_the_layout_counts(trained, views, start):
 
 
 def test_more_objects_than_the_prior_generates(trained, views, start):
-    many = 7
+    many = torch.arange(7) % views.is_object.shape[1]
     crowded = replace(
         views,
-        object_class=torch.ones(4, many, dtype=torch.int64),
-        is_object=torch.ones(4, many, dtype=torch.bool),
+        object_class=views.object_class[:, many],
+        is_object=torch.ones(4, 7, dtype=torch.bool),
+        boxes=views.boxes[:, :, many],
+        visible=views.visible[:, :, many],
+        sides_clear=views.sides_clear[:, :, many],
     )
     with pytest.raises(InputError, match=r"toy_test_00_view\d shows 7 objects, but .* at most 6"):
         fit_latents(trained, crowded, start)
