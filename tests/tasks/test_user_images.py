@@ -1,4 +1,4 @@
-"""A user's own image: the same observation as from shards, and sentences for what cannot be read."""
+"""A user's own image: the same observation as from shards, and sentences for bad files."""
 
 import json
 
