@@ -9,6 +9,7 @@ from sceneprior.commands.options import CheckpointOption, OverwriteOption, Rende
 
 if TYPE_CHECKING:
     from sceneprior.stages.runs import TrainedPrior
+    from sceneprior.tasks.observed import ObservedImage
     from sceneprior.tasks.reconstruct import FitOptions, Reconstruction
 
 ScheduleOption = Annotated[
@@ -76,13 +77,15 @@ def reconstruct(
     options = FitOptions(schedule, restarts, start, refine, seed=seed)
     if mask is not None:
         found = [_own(trained, options, mask, classes, intrinsics, pose, camera_height)]
-    elif room is not None and shards is not None:
-        found = reconstruct(trained, [image_from_shards(shards, room, view)], options)
     else:
-        assert shards is not None and split is not None
-        images, blank = images_of_split(shards, split, seed, limit)
+        assert shards is not None
+        if room is not None:
+            images, blank = [image_from_shards(shards, room, view)], []
+        else:
+            images, blank = images_of_split(shards, split or "test", seed, limit)
         for name in blank:
             typer.echo(f"Note: no view of room {name} shows an object; it is left out.", err=True)
+        _tell_strange_classes(trained, images)
         found = reconstruct(trained, images, options)
     write_reconstructions(found, out, open_renderer(renderer))
     typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
@@ -106,8 +109,20 @@ def _own(
     own = read_own_image(mask, classes, intrinsics, trained.config.label_set, pose, camera_height)
     for note in own.notes:
         typer.echo(f"Note: {note}.", err=True)
+    _tell_strange_classes(trained, [own.image])
     sides = reconstruct(trained, sides_of_room(own, camera_height), options)
     return min(sides, key=lambda found: found.score)
+
+
+def _tell_strange_classes(trained: "TrainedPrior", images: "list[ObservedImage]") -> None:
+    from sceneprior.tasks.reconstruct import strange_classes
+
+    if strange := strange_classes(trained, images):
+        typer.echo(
+            f"Note: no training room of the run has these classes, so expect little of them: "
+            f"{', '.join(strange)}.",
+            err=True,
+        )
 
 
 def eval_svr(

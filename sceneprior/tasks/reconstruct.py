@@ -94,6 +94,16 @@ def check_options(options: FitOptions) -> None:
         raise InputError(f"restarts is {options.restarts}; an image needs at least one.")
 
 
+@torch.no_grad()
+def strange_classes(trained: TrainedPrior, images: Sequence[ObservedImage]) -> list[str]:
+    """Classes of the images that no training room has, as the run decodes them."""
+    names = label_set(trained.config.label_set)
+    rooms = trained.prior(trained.logits, with_shape=False)
+    known = set(rooms.class_logits.argmax(dim=-1).unique().tolist())
+    asked = {int(index) for image in images for index in image.object_class}
+    return [names[index] for index in sorted(asked - known)]
+
+
 def _batches(images: Sequence[ObservedImage], most: int) -> Iterator[list[int]]:
     """Images of one size together, and such of about as many objects: padding costs time."""
     by_size: dict[tuple[int, ...], list[int]] = {}

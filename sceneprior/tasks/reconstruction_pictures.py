@@ -16,7 +16,7 @@ from sceneprior.tasks.reconstruct import Reconstruction
 HEIGHT_PX = 360
 """Of each panel; masks are drawn larger or smaller to fit."""
 GAP_PX, LINE_PX = 8, 24
-PAPER, INK = (255, 255, 255), (40, 40, 40)
+PAPER, INK, FRAME = (255, 255, 255), (40, 40, 40), (200, 200, 200)
 SIGHT_M = 0.8
 """How far the camera's sides are drawn in the plan."""
 
@@ -37,6 +37,7 @@ def picture(found: Reconstruction, renderer: Renderer) -> UInt8[np.ndarray, "hei
     for title, tile in zip(panels, tiles, strict=True):
         draw.text((x + 2, 3), title, INK, font)
         sheet.paste(tile, (x, LINE_PX))
+        draw.rectangle((x, LINE_PX, x + tile.width - 1, LINE_PX + HEIGHT_PX - 1), outline=FRAME)
         x += tile.width + GAP_PX
     for line, row in enumerate(rows):
         y = LINE_PX * (1 + line) + HEIGHT_PX

@@ -7,12 +7,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.stages.runs import load_run
 from sceneprior.tasks import reconstruct as reconstruct_module
 from sceneprior.tasks.fitting import SCHEDULES, FitSchedule, decode_images, fit_latents, view_loss
 from sceneprior.tasks.observed import as_views, images_of_split
-from sceneprior.tasks.reconstruct import FitOptions, reconstruct
+from sceneprior.tasks.reconstruct import FitOptions, reconstruct, strange_classes
 from sceneprior.tasks.refinement import refine
 
 
@@ -77,6 +78,14 @@ def test_options_and_images_that_cannot_be(trained, images):
     other = replace(images[0], label_set="scannet")
     with pytest.raises(InputError, match="label set 'scannet', but the run was trained on 'front3"):
         reconstruct(trained, [other], FitOptions("short"))
+
+
+def test_classes_that_no_training_room_has(trained, images):
+    assert strange_classes(trained, images) == []
+    names = label_set(images[0].label_set)
+    classes = images[0].object_class.copy()
+    classes[0] = names.index("sofa")
+    assert strange_classes(trained, [replace(images[0], object_class=classes)]) == ["sofa"]
 
 
 def displaced(trained, views, by_m: float):
