@@ -128,7 +128,10 @@ def test_a_kept_matching_goes_with_the_images_that_go_on(trained, views, start, 
 
     monkeypatch.setattr(fitting, "view_loss", staged)
     fit = fit_latents(
-        trained, views, start, FitSchedule(50, 20, freeze_matching=True, patience=20, least_gain=0)
+        trained,
+        views,
+        start,
+        FitSchedule(50, 20, freeze_matching=True, patience=20, least_gain=0.0),
     )
     assert fit.steps.tolist() == [40 if name in full else 50 for name in views.room_ids]
 
