@@ -85,7 +85,7 @@ def reconstruct(
             images, blank = images_of_split(shards, split or "test", seed, limit)
         for name in blank:
             typer.echo(f"Note: no view of room {name} shows an object; it is left out.", err=True)
-        _tell_strange_classes(trained, images)
+        _tell_unlearnt_classes(trained, images)
         found = reconstruct(trained, images, options)
     write_reconstructions(found, out, open_renderer(renderer))
     typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
@@ -109,18 +109,18 @@ def _own(
     own = read_own_image(mask, classes, intrinsics, trained.config.label_set, pose, camera_height)
     for note in own.notes:
         typer.echo(f"Note: {note}.", err=True)
-    _tell_strange_classes(trained, [own.image])
+    _tell_unlearnt_classes(trained, [own.image])
     sides = reconstruct(trained, sides_of_room(own, camera_height), options)
     return min(sides, key=lambda found: found.score)
 
 
-def _tell_strange_classes(trained: "TrainedPrior", images: "list[ObservedImage]") -> None:
-    from sceneprior.tasks.reconstruct import strange_classes
+def _tell_unlearnt_classes(trained: "TrainedPrior", images: "list[ObservedImage]") -> None:
+    from sceneprior.tasks.reconstruct import unlearnt_classes
 
-    if strange := strange_classes(trained, images):
+    if unlearnt := unlearnt_classes(trained, images):
         typer.echo(
-            f"Note: no training room of the run has these classes, so expect little of them: "
-            f"{', '.join(strange)}.",
+            f"Note: the run never generates these classes, so expect little of them: "
+            f"{', '.join(unlearnt)}.",
             err=True,
         )
 

@@ -131,7 +131,8 @@ def fit_latents(
     What moves is z itself, put back onto the sphere before it is decoded, rather than the logits
     that training moves: those reach only what is between the anchors, and reach it slowly.
 
-    Images do not know of each other: alone or among others, the same comes out (to rounding).
+    Images do not know of each other: alone or among others, one takes the same steps, but for
+    rounding, which grows over a thousand of them.
 
     Args:
         trained: The prior.

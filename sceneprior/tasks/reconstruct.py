@@ -95,8 +95,8 @@ def check_options(options: FitOptions) -> None:
 
 
 @torch.no_grad()
-def strange_classes(trained: TrainedPrior, images: Sequence[ObservedImage]) -> list[str]:
-    """Classes of the images that no training room has, as the run decodes them."""
+def unlearnt_classes(trained: TrainedPrior, images: Sequence[ObservedImage]) -> list[str]:
+    """Classes of the images that the run gives to no object of any training room it decodes."""
     names = label_set(trained.config.label_set)
     rooms = trained.prior(trained.logits, with_shape=False)
     known = set(rooms.class_logits.argmax(dim=-1).unique().tolist())
