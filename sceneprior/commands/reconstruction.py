@@ -80,11 +80,13 @@ def reconstruct(
     else:
         assert shards is not None
         if room is not None:
-            images, blank = [image_from_shards(shards, room, view)], []
+            images = [image_from_shards(shards, room, view)]
         else:
             images, blank = images_of_split(shards, split or "test", seed, limit)
-        for name in blank:
-            typer.echo(f"Note: no view of room {name} shows an object; it is left out.", err=True)
+            for name in blank:
+                typer.echo(
+                    f"Note: no view of room {name} shows an object; it is left out.", err=True
+                )
         _tell_unlearnt_classes(trained, images)
         found = reconstruct(trained, images, options)
     write_reconstructions(found, out, open_renderer(renderer))
