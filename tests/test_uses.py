@@ -91,7 +91,9 @@ def test_complete(command, toy_run, rooms, tmp_path):  # noqa: F811
         command(*call, "--out", "many")
     )
     given.write_text(json.dumps({**scene, "floor_m": [1, 2, 3]}))
-    assert "floor_m has shape (3,), not (corners, 2)" in command(*call, "--out", "many")[2]
+    assert (
+        "floor_m has shape (3,); expected at least 3 corners" in command(*call, "--out", "many")[2]
+    )
     said = one_sentence(command(*call[:3], "--given", "gone.json", *SOFT, "--out", "many"))
     assert "gone.json cannot be read (No such file or directory)" in said
     assert not (tmp_path / "many").exists()

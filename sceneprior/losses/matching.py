@@ -27,6 +27,7 @@ def match_objects(
     views: SceneViews,
     box_weight: float = 5.0,
     hidden_overshoot: float = 1.0,
+    first_n: bool = True,
 ) -> Matches:
     """Find the cheapest one-to-one assignment of predictions to tracked objects.
 
@@ -41,6 +42,7 @@ def match_objects(
         views: What the cameras saw.
         box_weight: lambda_B.
         hidden_overshoot: See `side_distance`.
+        first_n: False lets all predictions take part: those that have no order.
 
     Raises:
         ValueError: a room holds more objects than the prior can generate.
@@ -53,7 +55,9 @@ def match_objects(
             f"A room holds {int(counts.max())} tracked objects but the prior generates "
             f"{slots}; set model.max_objects to at least {int(counts.max())}."
         )
-    prediction = assign(cost, counts.tolist(), counts.tolist())
+    objects = counts.tolist()
+    predictions = objects if first_n else [slots] * len(objects)
+    prediction = assign(cost, predictions, objects)
     return Matches(prediction, views.is_object & views.visible.any(dim=1))
 
 

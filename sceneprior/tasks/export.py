@@ -59,9 +59,11 @@ def check_free(folder: Path, overwrite: bool = False) -> None:
     """See that nothing would be written over unasked.
 
     Raises:
-        InputError: the folder holds something and `overwrite` is false.
+        InputError: it is a file, or holds something and `overwrite` is false.
     """
     folder = Path(folder)
+    if folder.is_file():
+        raise InputError(f"{folder} is a file; name a folder.")
     if not overwrite and folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder} is not empty; add --overwrite or name another folder.")
 

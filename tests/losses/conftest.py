@@ -55,7 +55,6 @@ def make_batch(seed: int = 0) -> Batch:
     centers = (uniform(rooms, SLOTS, 3) - 0.5) * torch.tensor([6.0, 1.5, 6.0]) + 1
     scenes = DecodedScenes(
         class_logits=torch.randn(rooms, SLOTS, CLASSES, generator=generator, dtype=torch.float64),
-        chamfers=torch.zeros(rooms, SLOTS, 2, dtype=torch.float64),
         centers_m=centers,
         sizes_m=uniform(rooms, SLOTS, 3) + 0.2,
         completeness_logits=torch.randn(rooms, SLOTS, generator=generator, dtype=torch.float64),

@@ -95,7 +95,6 @@ def test_more_objects_than_slots_says_what_to_set(batch):
         centers_m=scenes.centers_m[:, :3],
         sizes_m=scenes.sizes_m[:, :3],
         completeness_logits=scenes.completeness_logits[:, :3],
-        chamfers=scenes.chamfers[:, :3],
     )
     boxes = type(batch.boxes)(batch.boxes.boxes[:, :, :3], batch.boxes.in_frustum[:, :, :3])
     message = (

@@ -24,7 +24,6 @@ def decoded(torch_rng) -> DecodedScenes:
         logits[:, item, label] = 3
     return DecodedScenes(
         class_logits=logits,
-        chamfers=torch.zeros(*logits.shape[:2], 2),
         centers_m=torch.rand(2, 4, 3, generator=torch_rng),
         sizes_m=torch.rand(2, 4, 3, generator=torch_rng) + 0.1,
         completeness_logits=torch.tensor([[2.0, 0.1, 5.0, 0.3], [1.0, -0.01, 5.0, 5.0]]),
