@@ -31,10 +31,10 @@ def synthesize(
 ) -> None:
     """Generate rooms: JSON, GLB and a top-down PNG each."""
     from sceneprior.offscreen import open_renderer
-    from sceneprior.stages.runs import load_run
+    from sceneprior.stages.runs import load_any_run
     from sceneprior.tasks.decode import synthesize as generate
     from sceneprior.tasks.export import write_scenes
 
-    scenes = generate(load_run(run, checkpoint), count, seed, law)
+    scenes = generate(load_any_run(run, checkpoint), count, seed, law)
     write_scenes(scenes, out, open_renderer(renderer), overwrite)
     typer.echo(f"Wrote {count} rooms to {out}")
