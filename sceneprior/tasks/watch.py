@@ -105,7 +105,7 @@ class SampleJudge:
         scores = {
             "category_kl": frequency_kl(frequencies, class_frequencies(generated)),
             "objects": float(counts.mean()),
-            "objects_off": abs(float(counts.mean()) / mean_objects - 1),
+            "objects_off": float(abs(counts.mean() / mean_objects - 1)),
             "empty_share": float((counts == 0).mean()),
             "overlaps": overlap_pairs(generated).per_room,
         }
