@@ -181,6 +181,73 @@ class ShapeConfig(StageConfig):
     """Whether 2D boxes come from the deformed mesh (paper) or still from the proxy."""
 
 
+class BoxStageConfig(_Section):
+    """What the baselines that learn from boxes in 3D have in common. The optimiser is Adam."""
+
+    epochs: int = Field(ge=1)
+    batch_size: int = Field(ge=1)
+    """Rooms a batch and process."""
+    accumulate: int = Field(1, ge=1)
+    """Batches whose gradients are averaged before each update."""
+    learning_rate: float = Field(gt=0)
+    schedule: Literal["constant", "cosine"] = "constant"
+    """`constant` (published, both), or a short rise and a `cosine` down to zero."""
+    clip_gradient: float = Field(0.0, ge=0)
+    """Largest gradient norm; 0 does not clip."""
+    cpu_threads: int | None = Field(None, ge=1)
+    """As in `layout`."""
+    width: int = Field(512, ge=8)
+    """Of the hidden layers."""
+
+
+class Atiss3dConfig(BoxStageConfig):
+    """ATISS with 3D supervision (`stages: atiss3d`); the defaults are the published settings."""
+
+    epochs: int = Field(500, ge=1)
+    """With turned copies of 6,300 rooms these are the published 100,000 steps."""
+    batch_size: int = Field(128, ge=1)
+    learning_rate: float = Field(1e-4, gt=0)
+    layers: int = Field(4, ge=1)
+    """Of the transformer encoder."""
+    heads: int = Field(8, ge=1)
+    hidden: int = Field(1024, ge=8)
+    """Inner width of its feed-forward layers."""
+    mixtures: int = Field(10, ge=1)
+    """K, logistics a coordinate."""
+    dropout: float = Field(0.1, ge=0, lt=1)
+
+    @model_validator(mode="after")
+    def _heads_divide_width(self) -> "Atiss3dConfig":
+        if self.width % self.heads:
+            raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
+        return self
+
+
+class Sync2genConfig(BoxStageConfig):
+    """The Sync2Gen-style VAE (`stages: sync2gen`); epochs, batch, rate and latent as released."""
+
+    epochs: int = Field(800, ge=1)
+    batch_size: int = Field(64, ge=1)
+    learning_rate: float = Field(1e-3, gt=0)
+    latent: int = Field(20, ge=1)
+    """Numbers a room is boiled down to."""
+    slots: int = Field(8, ge=1)
+    """Objects of one class that a room can hold (released: 4); further ones are left out, and
+    their share is logged as `train/left_out`."""
+    kl_weight: float = Field(0.1, ge=0)
+    """Of the KL divergence from N(0, 1). Larger: new rooms are more like each other and better
+    formed; smaller: training rooms are remembered better, and what lies between is worse."""
+    refine_steps: int = Field(100, ge=0)
+    """Gradient steps on each new room's positions, towards offsets between classes as training
+    rooms have them; 0 takes rooms as decoded (the paper's Sync2Gen*). Acts on sampling alone."""
+
+    @model_validator(mode="after")
+    def _width_in_groups(self) -> "Sync2genConfig":
+        if self.width % 8:
+            raise ValueError(f"width {self.width} is not a multiple of 8")
+        return self
+
+
 class SamplingConfig(_Section):
     """Where new latents come from."""
 
@@ -213,14 +280,18 @@ class RunConfig(_Section):
     label_set: str
     """A name in `sceneprior/classes.py`, or a list of one's own: `void,bed,chair`."""
     seed: int = Field(0, ge=0)
-    stages: Literal["two", "one"] = "two"
+    stages: Literal["two", "one", "atiss3d", "sync2gen"] = "two"
     """`two`: layout, then layout and shape together (paper); `one`: the second from scratch, so
-    that boxes and shapes are learnt together (ablation c3; the section `layout` has no say)."""
+    that boxes and shapes are learnt together (ablation c3; the section `layout` has no say).
+    Baselines that learn from true boxes in 3D, by the section of their name: `atiss3d`,
+    `sync2gen`; of the others only `data` and `model.max_objects` concern them."""
     data: DataConfig
     model: ModelConfig
     loss: LossConfig = LossConfig()
     layout: StageConfig
     shape: ShapeConfig
+    atiss3d: Atiss3dConfig = Atiss3dConfig()
+    sync2gen: Sync2genConfig = Sync2genConfig()
     sampling: SamplingConfig = SamplingConfig()
     samples: SamplesConfig = SamplesConfig()
 

@@ -30,17 +30,23 @@ def synthesize(
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "auto",
 ) -> None:
-    """Generate rooms: JSON, GLB and a top-down PNG each, and their latents."""
+    """Generate rooms: JSON, GLB and a top-down PNG each, and latents where the method has them."""
     from sceneprior.offscreen import open_renderer
-    from sceneprior.stages.runs import load_run
+    from sceneprior.stages.runs import TrainedPrior, load_any_run
     from sceneprior.tasks.decode import decode_latents, draw_latents
-    from sceneprior.tasks.export import write_scenes
+    from sceneprior.tasks.decode import synthesize as generate
+    from sceneprior.tasks.export import check_free, write_scenes
     from sceneprior.tasks.latents import write_latents
 
-    trained = load_run(run, checkpoint)
-    z, names = draw_latents(trained, count, seed, law)
-    write_scenes(decode_latents(trained, z, names), out, open_renderer(renderer), overwrite)
-    write_latents(out, z, names)
+    check_free(out, overwrite)
+    trained = load_any_run(run, checkpoint)
+    artist = open_renderer(renderer)
+    if isinstance(trained, TrainedPrior):
+        z, names = draw_latents(trained, count, seed, law)
+        write_scenes(decode_latents(trained, z, names), out, artist, overwrite)
+        write_latents(out, z, names)
+    else:
+        write_scenes(generate(trained, count, seed, law), out, artist, overwrite)
     typer.echo(f"Wrote {count} rooms to {out}")
 
 

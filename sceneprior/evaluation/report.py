@@ -51,6 +51,7 @@ def write_report(
     decoded: Sequence[tuple[Scene, Scene]],
     unfolding: Sequence[Scene],
     renderer: Renderer,
+    from_boxes: bool = False,
 ) -> None:
     """Write one HTML file without scripts and without anything outside itself.
 
@@ -70,6 +71,8 @@ def write_report(
         decoded: (decoded, true) training rooms; the first 5 are shown.
         unfolding: Rooms along a geodesic of the hypersphere, from one room to another.
         renderer: From `sceneprior.offscreen.open_renderer`.
+        from_boxes: Rooms come from a baseline that learnt from true boxes: it has no latent sphere,
+            and saw no views.
 
     Raises:
         InputError: the shards cannot be read.
@@ -87,7 +90,8 @@ def write_report(
         shards=Path(shards).resolve().name,
         label_set=test[0].label_set.replace("_", " "),
         tiles=_tiles(scores),
-        views=input_views(shards, rooms=3, views_per_room=2),
+        views=[] if from_boxes else input_views(shards, rooms=3, views_per_room=2),
+        from_boxes=from_boxes,
         curves=curves_svg(curves) if curves else None,
         decoded=[_pair(*pair, renderer) for pair in pairs],
         generated=[room_pictures(scene, renderer) for scene in generated],

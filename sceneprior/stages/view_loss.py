@@ -8,7 +8,7 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 from torch import distributed as dist
 
-from sceneprior.batches import DecodedScenes, SceneViews
+from sceneprior.batches import DecodedScenes, RoomBoxes, SceneViews
 from sceneprior.config import LossConfig, RunConfig, ShapeConfig, StageConfig
 from sceneprior.geometry.boxes import box_corners, chamfered_cube, place
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
@@ -113,7 +113,7 @@ def weighted_sum(
     return torch.stack([by_name[name] * loss for name, loss in losses.items()]).sum(dim=0)
 
 
-def check_finite(total: Tensor, views: SceneViews) -> None:
+def check_finite(total: Tensor, views: SceneViews | RoomBoxes) -> None:
     """Stop at the first loss that is not a number, and name the rooms that made it.
 
     Several processes stop together: one that stopped alone would leave the others waiting.

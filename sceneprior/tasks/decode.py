@@ -1,14 +1,15 @@
-"""Decoded batches in, single `Scene`s out; latents of training rooms and new ones."""
+"""Decoded batches or boxes in, single `Scene`s out; latents of training rooms and new ones."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneprior.batches import DecodedScenes
+from sceneprior.batches import DecodedScenes, RoomBoxes
 from sceneprior.classes import VOID, label_set
+from sceneprior.errors import InputError
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.stages.runs import TrainedPrior
+from sceneprior.stages.runs import TrainedPrior, TrainedSampler
 from sceneprior.tasks.sampling import sample_latents
 
 BATCH = 64
@@ -53,6 +54,24 @@ def furnished_slots(
     return [row.nonzero()[:, 0].tolist() for row in kept]
 
 
+def boxes_to_scenes(rooms: RoomBoxes, label_set_name: str, names: list[str]) -> list[Scene]:
+    """Objects that have no mesh; they are drawn as boxes."""
+    classes = label_set(label_set_name)
+    scenes = []
+    for room, name in enumerate(names):
+        there = rooms.is_object[room]
+        objects = tuple(
+            SceneObject(classes[label], tuple(box[:3]), tuple(box[3:]))
+            for label, box in zip(
+                rooms.object_class[room, there].tolist(),
+                rooms.boxes_m[room, there].tolist(),
+                strict=True,
+            )
+        )
+        scenes.append(Scene(name, label_set_name, objects))
+    return scenes
+
+
 @torch.no_grad()
 def decode_latents(
     trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: list[str]
@@ -72,8 +91,17 @@ def decode_latents(
     return scenes
 
 
-def decode_training_rooms(trained: TrainedPrior) -> list[Scene]:
-    """The training rooms as the prior remembers them, named by their ids."""
+def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]:
+    """The training rooms as the prior remembers them, named by their ids.
+
+    Raises:
+        InputError: training rooms have no latents in runs of this kind.
+    """
+    if isinstance(trained, TrainedSampler) or not trained.remembers_rooms:
+        raise InputError(
+            f"A run of `stages: {trained.config.stages}` keeps no latents of training rooms, so "
+            "none can be decoded; take a run of `stages: two`."
+        )
     z = trained.prior.sphere(trained.logits)
     return decode_latents(trained, z, list(trained.room_ids))
 
@@ -84,9 +112,34 @@ def draw_latents(
     """Latents sampled by a law (None: the run's own), and the names of their rooms."""
     law = law or trained.config.sampling.law
     z = sample_latents(trained.prior.sphere, trained.logits, count, seed, law)
-    return z, [f"seed{seed}_{index:04d}" for index in range(count)]
+    return z, scene_names(count, seed)
 
 
-def synthesize(trained: TrainedPrior, count: int, seed: int, law: str | None = None) -> list[Scene]:
-    """New scenes: latents sampled by a law, decoded."""
+def synthesize(
+    trained: TrainedPrior | TrainedSampler, count: int, seed: int, law: str | None = None
+) -> list[Scene]:
+    """New scenes, of a run of any kind.
+
+    Args:
+        trained: From `load_any_run`.
+        count: How many.
+        seed: Same seed, same rooms.
+        law: Where latents come from; None takes the config's.
+
+    Raises:
+        InputError: a law for a method without latents, or one that does not exist.
+    """
+    if isinstance(trained, TrainedSampler):
+        if law is not None:
+            raise InputError(
+                f"A law says where latents of rooms come from, but `stages: "
+                f"{trained.config.stages}` has none; leave out --law {law}."
+            )
+        rooms = trained.prior.sample(count, seed)
+        return boxes_to_scenes(rooms, trained.config.label_set, scene_names(count, seed))
     return decode_latents(trained, *draw_latents(trained, count, seed, law))
+
+
+def scene_names(count: int, seed: int) -> list[str]:
+    """What new rooms are called."""
+    return [f"seed{seed}_{index:04d}" for index in range(count)]

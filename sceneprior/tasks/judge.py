@@ -16,12 +16,15 @@ from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.report import write_report
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene
-from sceneprior.stages.runs import STAGES, TrainedPrior, load_run
+from sceneprior.stages.runs import STAGES, TrainedPrior, TrainedSampler, load_any_run
 from sceneprior.tasks.decode import decode_latents, decode_training_rooms, synthesize
 from sceneprior.tasks.export import load_scene_folder
 
 UNFOLDING_STEPS = 7
-CURVES = ("loss", "class", "box", "completeness", "frustum", "mask", "mask_iou")
+CURVES = (
+    "loss", "class", "box", "completeness", "frustum", "mask", "mask_iou",
+    "existence", "position", "size", "kl",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -45,10 +48,11 @@ def judge_run(
     judging: Judging,
     checkpoint: str = "final",
 ) -> dict[str, Any]:
-    """Score generated rooms against test rooms, and decoded training rooms against the truth.
+    """Score generated rooms against test rooms, and decoded training rooms, in runs that remember
+    them, against the truth.
 
     Args:
-        run: A run's folder.
+        run: A run's folder, of any kind.
         count: Rooms to generate.
         seed: Of their latents, and of everything random in judging.
         shards: Folder with the test rooms; None takes the run's own.
@@ -60,16 +64,17 @@ def judge_run(
     Raises:
         InputError: the run, the shards or a file of weights cannot be used.
     """
-    trained = load_run(run, checkpoint)
+    trained = load_any_run(run, checkpoint)
     folder = shards or Path(trained.config.data.shards)
     generated = synthesize(trained, count, seed, law)
     scores = _judge(generated, folder, seed, judging)
-    pairs = decoded_and_true(trained, folder)
-    scores |= reconstruction_scores(pairs)
+    if trained.remembers_rooms:
+        scores |= reconstruction_scores(decoded_and_true(trained, folder))
     scores["protocol"]["run"] = Path(run).resolve().name
     scores["protocol"]["stage"] = trained.stage
     scores["protocol"]["checkpoint"] = checkpoint
-    scores["protocol"]["sampling_law"] = law or trained.config.sampling.law
+    if isinstance(trained, TrainedPrior):
+        scores["protocol"]["sampling_law"] = law or trained.config.sampling.law
     write_scores(scores, out)
     return scores
 
@@ -113,7 +118,7 @@ def _judge(scenes: list[Scene], shards: Path, seed: int, judging: Judging) -> di
 
 
 def decoded_and_true(
-    trained: TrainedPrior, shards: Path, meshes: bool = False
+    trained: TrainedPrior | TrainedSampler, shards: Path, meshes: bool = False
 ) -> list[tuple[Scene, Scene]]:
     """Training rooms as decoded, each with what training never saw: the room in 3D.
 
@@ -146,7 +151,7 @@ def report_run(
     Raises:
         InputError: the run or its scores cannot be read.
     """
-    trained = load_run(run, checkpoint)
+    trained = load_any_run(run, checkpoint)
     try:
         figures = json.loads(scores.read_text())
     except (OSError, ValueError) as error:
@@ -155,18 +160,25 @@ def report_run(
             f"`sceneprior eval-fid --run {run}`."
         ) from None
     shards = Path(trained.config.data.shards)
+    decoded: list[tuple[Scene, Scene]] = []
+    unfolding: list[Scene] = []
+    if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
+        decoded = decoded_and_true(trained, shards, meshes=True)
+        unfolding = unfold(trained)
+    from_boxes = isinstance(trained, TrainedSampler)
     write_report(
         out,
-        title="New rooms from a prior learnt from masks",
+        title=f"New rooms from a prior learnt from {'boxes in 3D' if from_boxes else 'masks'}",
         shards=shards,
         run=run,
         generated=synthesize(trained, 8, seed),
         scores=figures,
         commands=commands,
         curves=read_curves(run),
-        decoded=decoded_and_true(trained, shards, meshes=True),
-        unfolding=unfold(trained),
+        decoded=decoded,
+        unfolding=unfolding,
         renderer=open_renderer(renderer),
+        from_boxes=from_boxes,
     )
 
 

@@ -32,9 +32,9 @@ from sceneprior.offscreen import SoftwareRenderer
 from sceneprior.scene import Scene
 from sceneprior.shards import iterate_rooms, list_shards
 from sceneprior.silhouettes.render import render_scene
-from sceneprior.stages.runs import TrainedPrior
+from sceneprior.stages.runs import TrainedPrior, TrainedSampler
 from sceneprior.stages.samples import Verdict
-from sceneprior.tasks.decode import decode_latents
+from sceneprior.tasks.decode import decode_latents, synthesize
 from sceneprior.tasks.sampling import sample_latents
 
 PICTURED = 16
@@ -60,6 +60,7 @@ class SampleJudge:
     - `mask_iou`: of a few decoded training rooms, mean over the objects that their views see;
       hard masks of what is in front, in the layout stage of the undeformed template
 
+    A baseline without latents of training rooms has neither `overlaps_decoded` nor `mask_iou`.
     Compared rooms count what cameras saw of them: a look never reads ground truth in 3D.
 
     Args:
@@ -77,8 +78,11 @@ class SampleJudge:
                 "category_kl, objects_off, overlaps or mask_iou."
             )
 
-    def __call__(self, trained: TrainedPrior) -> Verdict:
+    def __call__(self, trained: TrainedPrior | TrainedSampler) -> Verdict:
         settings = self.config.samples
+        if isinstance(trained, TrainedSampler):
+            generated = synthesize(trained, settings.count, settings.seed)
+            return Verdict(self._scores(generated), tile(generated[:PICTURED]), self._compared[0])
         z = sample_latents(
             trained.prior.sphere, trained.logits, settings.count, settings.seed,
             self.config.sampling.law,
@@ -86,24 +90,27 @@ class SampleJudge:
         generated = _decode(trained, z, with_shape=False)
         plain = [row for row, name in enumerate(trained.room_ids) if "@" not in name]
         remembered = trained.prior.sphere(trained.logits[plain[: settings.count]])
-        split, frequencies, mean_objects = self._compared
-        counts = object_counts(generated)
-        scores = {
-            "category_kl": frequency_kl(frequencies, class_frequencies(generated)),
-            "objects": float(counts.mean()),
-            "objects_off": abs(float(counts.mean()) / mean_objects - 1),
-            "empty_share": float((counts == 0).mean()),
-            "overlaps": overlap_pairs(generated).per_room,
+        scores = self._scores(generated) | {
             "overlaps_decoded": overlap_pairs(
                 _decode(trained, remembered, with_shape=False)
             ).per_room,
             "mask_iou": mask_iou_of_rooms(trained, self._views),
         }
-        share = type_share(generated)
-        if share is not None:
-            scores["type_share"] = share
         pictured = _decode(trained, z[:PICTURED], with_shape=trained.stage == "shape")
-        return Verdict(scores, tile(pictured), split)
+        return Verdict(scores, tile(pictured), self._compared[0])
+
+    def _scores(self, generated: list[Scene]) -> dict[str, float]:
+        _, frequencies, mean_objects = self._compared
+        counts = object_counts(generated)
+        scores = {
+            "category_kl": frequency_kl(frequencies, class_frequencies(generated)),
+            "objects": float(counts.mean()),
+            "objects_off": float(abs(counts.mean() / mean_objects - 1)),
+            "empty_share": float((counts == 0).mean()),
+            "overlaps": overlap_pairs(generated).per_room,
+        }
+        share = type_share(generated)
+        return scores if share is None else scores | {"type_share": share}
 
     @cached_property
     def _compared(self) -> tuple[str, Float[np.ndarray, " classes"], float]:

@@ -17,7 +17,14 @@ from sceneprior.stages.runs import load_run, read_checkpoint
 from sceneprior.stages.train import fit
 from sceneprior.stages.view_loss import build_prior
 from sceneprior.tasks.decode import decode_training_rooms, synthesize
-from sceneprior.tasks.judge import UNFOLDING_STEPS, decoded_and_true, judge_run, read_curves, unfold
+from sceneprior.tasks.judge import (
+    UNFOLDING_STEPS,
+    Judging,
+    decoded_and_true,
+    judge_run,
+    read_curves,
+    unfold,
+)
 from sceneprior.tasks.sampling import LAWS
 
 CPU = {"accelerator": "cpu", "devices": 1}
@@ -124,7 +131,7 @@ def test_a_variant_is_judged(toy_shards, tmp_path, name):
     changes = {**FAST, **VARIANTS[name], "layout__epochs": 1, "shape__epochs": 1}
     run = tmp_path / "run"
     fit(tiny_config(toy_shards, **changes), run, trainer_options=CPU)
-    scores = judge_run(run, 4, 0, None, None, run / "scores.json", None, "software")
+    scores = judge_run(run, 4, 0, None, run / "scores.json", None, Judging(renderer="software"))
     assert scores["protocol"]["stage"] == "shape"
     assert 0 <= scores["box_iou_3d"] <= 1
 
