@@ -64,9 +64,11 @@ class ModelConfig(_Section):
     latent: Literal["sphere", "uniform"] = "sphere"
     """Where latents live: `sphere` (paper), or `uniform`, a cube with one logit a coordinate, in
     which `sampling.law: paper` draws uniformly (ablation c1; `anchors` has no say)."""
-    decoder: Literal["transformer", "lstm"] = "transformer"
-    """What emits object features: the `transformer` (paper), or an `lstm` that takes z first and
-    then its own last output (ablation c2; `heads`, `hidden` and `dropout` have no say)."""
+    decoder: Literal["transformer", "lstm", "atiss"] = "transformer"
+    """What emits object features: the `transformer` (paper); an `lstm` that takes z first and
+    then its own last output (ablation c2; `heads`, `hidden` and `dropout` have no say); or the
+    encoder of `atiss`, four layers in which z takes the empty embedding's place (ATISS-2D; as
+    published it has `heads` 8, `hidden` 1024)."""
     final_norm: bool = False
     """Normalise once more after the encoder layer and after the decoder layer, as the released
     code and the default of the library that it builds on."""
@@ -180,6 +182,20 @@ class ShapeConfig(StageConfig):
     """Whether 2D boxes come from the deformed mesh (paper) or still from the proxy."""
 
 
+class GanConfig(_Section):
+    """How the GAN is trained (`stages: gan`); renders take `shape.sigma_px2` and its
+    `silhouettes`."""
+
+    epochs: int = Field(400, ge=1)
+    batch_size: int = Field(16, ge=1)
+    views_per_room: int = Field(4, ge=1)
+    learning_rate: float = Field(2e-4, gt=0)
+    discriminator_learning_rate: float = Field(4e-4, gt=0)
+    noise: float = Field(0.1, ge=0)
+    clip_gradient: float = Field(1.0, ge=0)
+    cpu_threads: int | None = Field(None, ge=1)
+
+
 class SamplingConfig(_Section):
     """Where new latents come from."""
 
@@ -212,7 +228,7 @@ class RunConfig(_Section):
     label_set: str
     """A name in `sceneprior/classes.py`, or a list of one's own: `void,bed,chair`."""
     seed: int = Field(0, ge=0)
-    stages: Literal["two", "one"] = "two"
+    stages: Literal["two", "one", "gan"] = "two"
     """`two`: layout, then layout and shape together (paper); `one`: the second from scratch, so
     that boxes and shapes are learnt together (ablation c3; the section `layout` has no say)."""
     data: DataConfig
@@ -220,6 +236,7 @@ class RunConfig(_Section):
     loss: LossConfig = LossConfig()
     layout: StageConfig
     shape: ShapeConfig
+    gan: GanConfig = GanConfig()
     sampling: SamplingConfig = SamplingConfig()
     samples: SamplesConfig = SamplesConfig()
 

@@ -22,20 +22,29 @@ from sceneprior.errors import InputError
 from sceneprior.models.scene_prior import ScenePrior
 from sceneprior.stages.view_loss import build_latents, build_prior
 
-STAGES = ("layout", "shape")
-STAGES_OF = {"two": STAGES, "one": ("shape",)}
+STAGES = ("layout", "shape", "gan")
+STAGES_OF = {"two": ("layout", "shape"), "one": ("shape",), "gan": ("gan",)}
 """What a run of `config.stages` trains, in order."""
 
 
 @dataclass(frozen=True)
 class TrainedPrior:
-    """A prior with the latents of the rooms it was trained on, ready for use."""
+    """A prior with the latents of the rooms it was trained on, ready for use.
+
+    A GAN knows latents of no room: it has no rows of logits and no room ids.
+    """
 
     prior: ScenePrior
     logits: Float[Tensor, "rooms anchors"]
     room_ids: tuple[str, ...]
     config: RunConfig
     stage: str
+
+    @property
+    def law(self) -> str:
+        """Where new latents come from unless a task says otherwise: the config's law, but where
+        there are no rooms to draw from, the law that the prior was trained under."""
+        return self.config.sampling.law if len(self.logits) else "paper"
 
 
 def checkpoint_extra(config: RunConfig, room_ids: tuple[str, ...]) -> dict[str, Any]:
@@ -107,7 +116,9 @@ def restore(config: RunConfig, path: Path) -> tuple[ScenePrior, nn.Embedding, tu
         prior = build_prior(config, len(label_set(config.label_set)))
         latents = build_latents(config, len(room_ids))
         holder = nn.ModuleDict({"prior": prior, "latents": latents})
-        holder.load_state_dict(saved["state_dict"])
+        # A discriminator has done its work.
+        weights = {k: v for k, v in saved["state_dict"].items() if k.split(".")[0] in holder}
+        holder.load_state_dict(weights)
     except (KeyError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(

@@ -14,13 +14,14 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from torch import nn
 
 from sceneprior.classes import label_set
-from sceneprior.config import RunConfig, dump_config, load_config
+from sceneprior.config import GanConfig, RunConfig, StageConfig, dump_config, load_config
 from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.models.scene_prior import ScenePrior
 from sceneprior.stages.callbacks import RollingCheckpoint, RunProgress, StepSeed, write_checkpoint
 from sceneprior.stages.cluster import first_process, requeue_on_signal, slurm_plugins
+from sceneprior.stages.gan import GanStage
 from sceneprior.stages.layout import LayoutStage
 from sceneprior.stages.runs import STAGES_OF, checkpoint_extra, restore
 from sceneprior.stages.samples import Judge, SampleWatch
@@ -38,7 +39,7 @@ def fit(
     trainer_options: dict[str, Any] | None = None,
     judge: Judge | None = None,
 ) -> None:
-    """Train the layout stage, then the shape stage; with `stages: one`, the latter from scratch.
+    """Train the layout stage, then the shape stage, or what else `config.stages` names.
 
     Args:
         config: The run's settings.
@@ -102,13 +103,15 @@ def _fit_stage(
     settings = getattr(config, stage)
     dataset = _open_data(stage, config)
     prior, latents = _start(config, dataset, previous)
-    module = {"layout": LayoutStage, "shape": ShapeStage}[stage](prior, latents, config)
+    kind = {"layout": LayoutStage, "shape": ShapeStage, "gan": GanStage}[stage]
+    module = kind(prior, latents, config)
     folder = run / stage
-    rolling = RollingCheckpoint(folder, checkpoint_extra(config, dataset.room_ids))
+    room_ids = dataset.room_ids if len(latents.weight) else ()
+    rolling = RollingCheckpoint(folder, checkpoint_extra(config, room_ids))
     callbacks = [RunProgress(f"fit {stage} (epochs)"), StepSeed(config.seed)]
     if judge is not None and config.samples.every:
         # Before the rolling checkpoint, which holds the best so far.
-        callbacks.append(SampleWatch(folder, config, stage, dataset.room_ids, judge))
+        callbacks.append(SampleWatch(folder, config, stage, room_ids, judge))
     _quiet_lightning()
     lightning.seed_everything(config.seed, verbose=False)
     if settings.cpu_threads is not None:
@@ -116,9 +119,8 @@ def _fit_stage(
     trainer = _trainer(
         trainer_options,
         max_epochs=settings.epochs,
-        gradient_clip_val=settings.clip_gradient or None,
         logger=[_logger(name, folder) for name in loggers],
-        accumulate_grad_batches=settings.accumulate,
+        **_updates(settings),
         callbacks=[*callbacks, rolling],
         plugins=slurm_plugins(),
         default_root_dir=folder,
@@ -128,6 +130,11 @@ def _fit_stage(
         use_distributed_sampler=False,
         log_every_n_steps=1,
     )
+    if stage == "gan" and trainer.world_size > 1:
+        raise InputError(
+            f"stages: gan trains in one process, but {trainer.world_size} were asked for; "
+            "use --devices 1."
+        )
     # Only now: a run that is refused leaves nothing behind.
     if trainer.is_global_zero:
         folder.mkdir(parents=True, exist_ok=True)
@@ -152,6 +159,15 @@ def _fit_stage(
     write_checkpoint(trainer, folder, "final.ckpt")
 
 
+def _updates(settings: StageConfig | GanConfig) -> dict[str, Any]:
+    if isinstance(settings, GanConfig):
+        return {}  # two optimisers, which the module steps by itself
+    return {
+        "gradient_clip_val": settings.clip_gradient or None,
+        "accumulate_grad_batches": settings.accumulate,
+    }
+
+
 def _trainer(options: dict[str, Any], **settings: Any) -> lightning.Trainer:
     try:
         return lightning.Trainer(**settings, **options)
@@ -166,13 +182,15 @@ def _open_data(stage: str, config: RunConfig) -> ViewDataset:
     views = data.views_per_room
     if stage == "shape" and config.shape.views_per_room:
         views = config.shape.views_per_room
+    elif stage == "gan":
+        views = config.gan.views_per_room
     dataset = ViewDataset(
         Path(data.shards),
         "train",
         views_per_room=views,
         rotations=4 if data.augment_rotations else 1,
         view_fraction=data.view_fraction,
-        mask_step=data.mask_step if stage == "shape" else None,
+        mask_step=None if stage == "layout" else data.mask_step,
         seed=config.seed,
     )
     if dataset.label_set != config.label_set:
@@ -193,7 +211,8 @@ def _start(
 ) -> tuple[ScenePrior, nn.Embedding]:
     if previous is None:
         prior = build_prior(config, len(label_set(config.label_set)))
-        return prior, build_latents(config, len(dataset))
+        # A GAN pairs no point of the latent space with a room.
+        return prior, build_latents(config, 0 if config.stages == "gan" else len(dataset))
     prior, latents, room_ids = restore(config, previous)
     if room_ids != dataset.room_ids:
         raise InputError(

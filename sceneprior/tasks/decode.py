@@ -54,7 +54,7 @@ def decode_latents(
     scenes: list[Scene] = []
     for start in range(0, len(z), BATCH):
         part = slice(start, start + BATCH)
-        decoded = trained.prior.decode(z[part], with_shape=trained.stage == "shape")
+        decoded = trained.prior.decode(z[part], with_shape=trained.stage != "layout")
         scenes += to_scenes(
             decoded,
             trained.prior.shape.faces,
@@ -73,7 +73,6 @@ def decode_training_rooms(trained: TrainedPrior) -> list[Scene]:
 
 def synthesize(trained: TrainedPrior, count: int, seed: int, law: str | None = None) -> list[Scene]:
     """New scenes: latents sampled by a law, decoded."""
-    law = law or trained.config.sampling.law
-    z = sample_latents(trained.prior.sphere, trained.logits, count, seed, law)
+    z = sample_latents(trained.prior.sphere, trained.logits, count, seed, law or trained.law)
     names = [f"seed{seed}_{index:04d}" for index in range(count)]
     return decode_latents(trained, z, names)

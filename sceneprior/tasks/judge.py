@@ -18,7 +18,9 @@ from sceneprior.stages.runs import STAGES, TrainedPrior, load_run
 from sceneprior.tasks.decode import decode_latents, decode_training_rooms, synthesize
 
 UNFOLDING_STEPS = 7
-CURVES = ("loss", "class", "box", "completeness", "frustum", "mask", "mask_iou")
+CURVES = (
+    "loss", "class", "box", "completeness", "frustum", "mask", "mask_iou", "discriminator", "kept"
+)  # fmt: skip
 
 
 def judge_run(
@@ -55,11 +57,12 @@ def judge_run(
         generated, folder, inception=inception, seed=seed, renderer=open_renderer(renderer)
     )
     pairs = decoded_and_true(trained, folder)
-    scores |= reconstruction_scores(pairs)
+    if pairs:
+        scores |= reconstruction_scores(pairs)
     scores["protocol"]["run"] = Path(run).resolve().name
     scores["protocol"]["stage"] = trained.stage
     scores["protocol"]["checkpoint"] = checkpoint
-    scores["protocol"]["sampling_law"] = law or trained.config.sampling.law
+    scores["protocol"]["sampling_law"] = law or trained.law
     write_scores(scores, out)
     return scores
 
@@ -120,7 +123,12 @@ def report_run(
 
 
 def unfold(trained: TrainedPrior) -> list[Scene]:
-    """Rooms between two training rooms that lie far apart: on the sphere, along the geodesic."""
+    """Rooms between two training rooms that lie far apart: on the sphere, along the geodesic.
+
+    None where the prior knows latents of no rooms.
+    """
+    if not len(trained.logits):
+        return []
     space = trained.prior.sphere
     z = space(trained.logits)
     end = int(space.nearness(z[:1], z).argmin())
