@@ -183,17 +183,27 @@ class ShapeConfig(StageConfig):
 
 
 class GanConfig(_Section):
-    """How the GAN is trained (`stages: gan`); renders take `shape.sigma_px2` and its
-    `silhouettes`."""
+    """The GAN (`stages: gan`); docs/baselines_2d.md says what each is for. Maps are half as large
+    as the instance ids that `data.mask_step` keeps; renders take `shape.silhouettes`."""
 
     epochs: int = Field(400, ge=1)
     batch_size: int = Field(16, ge=1)
+    """Real rooms a step, and as many generated ones."""
     views_per_room: int = Field(4, ge=1)
-    learning_rate: float = Field(2e-4, gt=0)
-    discriminator_learning_rate: float = Field(4e-4, gt=0)
-    noise: float = Field(0.1, ge=0)
+    learning_rate: float = Field(1e-3, gt=0)
+    """Of the generator's Adam."""
+    discriminator_learning_rate: float = Field(2e-3, gt=0)
+    """Of the discriminator's. Too large: it is soon always right, and teaches nothing; too small:
+    the generator runs ahead to whatever it finds unusual."""
+    averaging: float = Field(0.99, ge=0, lt=1)
+    """Share of the averaged generator that is kept at each step; 0 keeps the newest alone."""
+    noise: float = Field(0.3, ge=0)
+    """Spread of the noise on all maps at the start; it falls to 0 over the epochs. Larger hides
+    for longer what only gives a render away."""
     clip_gradient: float = Field(1.0, ge=0)
+    """Largest gradient norm of each of the two; 0 does not clip."""
     cpu_threads: int | None = Field(None, ge=1)
+    """As in `layout`."""
 
 
 class SamplingConfig(_Section):
@@ -230,7 +240,8 @@ class RunConfig(_Section):
     seed: int = Field(0, ge=0)
     stages: Literal["two", "one", "gan"] = "two"
     """`two`: layout, then layout and shape together (paper); `one`: the second from scratch, so
-    that boxes and shapes are learnt together (ablation c3; the section `layout` has no say)."""
+    that boxes and shapes are learnt together (ablation c3; the section `layout` has no say); `gan`:
+    the baseline that learns from a discriminator instead of the view loss (section `gan`)."""
     data: DataConfig
     model: ModelConfig
     loss: LossConfig = LossConfig()

@@ -42,7 +42,8 @@ def rendered_maps(
     """What the views would show of other scenes: theirs, drawn into the views' cameras.
 
     Classes and existence are those that `tasks.decode` reads, hard, so that what is drawn is what
-    will be generated; their gradients are those of softmax and sigmoid (straight through). What does not exist hides nothing, and still learns what its appearance would change.
+    will be generated; their gradients are those of softmax and sigmoid (straight through). What
+    does not exist hides nothing, and still learns what its appearance would change.
 
     Args:
         scenes: Of as many rooms as `views`, with meshes.

@@ -1,5 +1,6 @@
 """The GAN baseline: our network against a discriminator of semantic maps, with no view loss."""
 
+import copy
 from collections.abc import Sequence
 
 import lightning
@@ -12,6 +13,7 @@ from torch.nn import functional as F
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.classes import label_set
 from sceneprior.config import RunConfig
+from sceneprior.losses.completeness import kept_objects
 from sceneprior.losses.semantic_maps import observed_maps, rendered_maps
 from sceneprior.models.layout_decoder import LayoutDecoder
 from sceneprior.models.map_discriminator import MapDiscriminator
@@ -39,8 +41,11 @@ class GanStage(lightning.LightningModule):
     maps into that room's own cameras. There are no latents of rooms: nothing pairs a generated
     room with a real one. What keeps it stable is listed in docs/baselines_2d.md.
 
+    `generator` is what plays; `prior`, which tasks take out of checkpoints, is a running average of
+    its weights, in which the two opponents' circling cancels.
+
     Args:
-        prior: The network, freshly initialised; it becomes the generator.
+        prior: The network, freshly initialised.
         latents: No rows; they make the run's checkpoints alike.
         config: The run.
     """
@@ -48,16 +53,17 @@ class GanStage(lightning.LightningModule):
     def __init__(self, prior: ScenePrior, latents: nn.Embedding, config: RunConfig):
         super().__init__()
         self.automatic_optimization = False
-        self.prior = prior
-        self.latents = latents
         self.config = config
         self.classes = len(label_set(config.label_set))
-        self.discriminator = MapDiscriminator(self.classes)
+        self.generator = prior
         spread_out(prior.layout, prior.decoder(self._latents(START_ROOMS), prior.max_objects))
+        self.prior = copy.deepcopy(prior).requires_grad_(False)
+        self.latents = latents
+        self.discriminator = MapDiscriminator(self.classes)
 
     def training_step(self, views: SceneViews, batch_idx: int) -> None:
-        generator, discriminator = self._optimizers()
-        scenes = self.prior.decode(self._latents(len(views.room_index)))
+        generator_optimizer, discriminator_optimizer = self._optimizers()
+        scenes = self.generator.decode(self._latents(len(views.room_index)))
         with full_precision(self.device):
             # Before rendering, too, which refuses vertices that are not finite.
             undecided = certainty(scenes)
@@ -66,27 +72,27 @@ class GanStage(lightning.LightningModule):
             fake = self._through_noise(self._draw(scenes, views))
 
         real_scores, fake_scores = self.discriminator(real), self.discriminator(fake.detach())
-        told_apart = hinge(real_scores, 1) + hinge(fake_scores, -1)
+        told_apart = mistaken(real_scores, real=True) + mistaken(fake_scores, real=False)
         check_finite(told_apart, views)
-        self._update(discriminator, told_apart)
+        self._update(discriminator_optimizer, told_apart)
 
         self.discriminator.requires_grad_(False)
-        unbelieved = -sum_of_means(self.discriminator(fake))
-        loss = unbelieved + SOFT * undecided
+        loss = mistaken(self.discriminator(fake), real=True) + SOFT * undecided
         check_finite(loss, views)
-        self._update(generator, loss)
+        self._update(generator_optimizer, loss)
         self.discriminator.requires_grad_(True)
+        self._average()
         self._log(scenes, loss, told_apart, real_scores, fake_scores)
 
     def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:
         shape = (rooms, self.config.model.logits_per_room)
         with full_precision(self.device):
-            return self.prior.sphere(torch.randn(shape, device=self.device))
+            return self.generator.sphere(torch.randn(shape, device=self.device))
 
     def _draw(self, scenes: DecodedScenes, views: SceneViews) -> Tensor:
         return rendered_maps(
             scenes,
-            self.prior.shape.faces,
+            self.generator.shape.faces,
             views,
             mode=self.config.shape.silhouettes,
             completeness_target=self.config.loss.completeness_target,
@@ -108,6 +114,14 @@ class GanStage(lightning.LightningModule):
             self.clip_gradients(optimizer, self.config.gan.clip_gradient, "norm")  # type: ignore[arg-type]
         optimizer.step()
 
+    @torch.no_grad()
+    def _average(self) -> None:
+        # The first steps are averaged over less: else they would stay as they started for long.
+        done = self.current_epoch * int(self.trainer.num_training_batches)
+        keep = min(self.config.gan.averaging, (1 + done) / (10 + done))
+        for mean, newest in zip(self.prior.parameters(), self.generator.parameters(), strict=True):
+            mean.lerp_(newest, 1 - keep)
+
     def _log(
         self,
         scenes: DecodedScenes,
@@ -116,11 +130,13 @@ class GanStage(lightning.LightningModule):
         real: Sequence[Tensor],
         fake: Sequence[Tensor],
     ) -> None:
+        target = self.config.loss.completeness_target
         said = {
             "loss": loss,
             "discriminator": told_apart,
-            "real_score": sum_of_means(real) / 2,
-            "fake_score": sum_of_means(fake) / 2,
+            "real_score": torch.stack([score.mean() for score in real]).mean(),
+            "fake_score": torch.stack([score.mean() for score in fake]).mean(),
+            "objects": kept_objects(scenes.completeness_logits, target).sum(dim=1).float().mean(),
         }
         named = {f"train/{name}": value.detach() for name, value in said.items()}
         self.log_dict(named, on_step=False, on_epoch=True, batch_size=len(scenes.centers_m))
@@ -128,21 +144,22 @@ class GanStage(lightning.LightningModule):
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         rates = self.config.gan
         return [
-            torch.optim.Adam(self.prior.parameters(), rates.learning_rate, BETAS),
+            torch.optim.Adam(self.generator.parameters(), rates.learning_rate, BETAS),
             torch.optim.Adam(
                 self.discriminator.parameters(), rates.discriminator_learning_rate, BETAS
             ),
         ]
 
 
-def hinge(scores: Sequence[Tensor], wanted: int) -> Float[Tensor, ""]:
-    """Nothing more is won by a score beyond `wanted` (1 or -1); patches and rooms count alike."""
-    return torch.stack([F.relu(1 - wanted * score).mean() for score in scores]).sum()
+def mistaken(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
+    """Cross entropy of scores, as logits of being real, with what is wanted of them.
 
-
-def sum_of_means(scores: Sequence[Tensor]) -> Float[Tensor, ""]:
-    """What the generator wants large: the mean score of patches plus that of rooms."""
-    return torch.stack([score.mean() for score in scores]).sum()
+    Patches and rooms count alike. The generator minimises it for its own maps as if these were
+    real (Goodfellow et al., "Generative adversarial nets", NeurIPS 2014: the loss that does not
+    saturate).
+    """
+    sign = -1 if real else 1
+    return torch.stack([F.softplus(sign * score).mean() for score in scores]).sum()
 
 
 def certainty(scenes: DecodedScenes) -> Float[Tensor, ""]:

@@ -29,10 +29,7 @@ STAGES_OF = {"two": ("layout", "shape"), "one": ("shape",), "gan": ("gan",)}
 
 @dataclass(frozen=True)
 class TrainedPrior:
-    """A prior with the latents of the rooms it was trained on, ready for use.
-
-    A GAN knows latents of no room: it has no rows of logits and no room ids.
-    """
+    """A prior with the latents of the rooms it was trained on, ready for use."""
 
     prior: ScenePrior
     logits: Float[Tensor, "rooms anchors"]
@@ -41,10 +38,15 @@ class TrainedPrior:
     stage: str
 
     @property
+    def remembers_rooms(self) -> bool:
+        """Whether training rooms have latents of their own; a GAN's have none."""
+        return len(self.logits) > 0
+
+    @property
     def law(self) -> str:
         """Where new latents come from unless a task says otherwise: the config's law, but where
         there are no rooms to draw from, the law that the prior was trained under."""
-        return self.config.sampling.law if len(self.logits) else "paper"
+        return self.config.sampling.law if self.remembers_rooms else "paper"
 
 
 def checkpoint_extra(config: RunConfig, room_ids: tuple[str, ...]) -> dict[str, Any]:
@@ -116,7 +118,7 @@ def restore(config: RunConfig, path: Path) -> tuple[ScenePrior, nn.Embedding, tu
         prior = build_prior(config, len(label_set(config.label_set)))
         latents = build_latents(config, len(room_ids))
         holder = nn.ModuleDict({"prior": prior, "latents": latents})
-        # A discriminator has done its work.
+        # What helped in training alone, such as a discriminator, has done its work.
         weights = {k: v for k, v in saved["state_dict"].items() if k.split(".")[0] in holder}
         holder.load_state_dict(weights)
     except (KeyError, RuntimeError) as error:

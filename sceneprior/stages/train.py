@@ -1,20 +1,15 @@
 """A config and a run folder in, trained stages out."""
 
-import csv
-import logging
-import os
 import signal
-import warnings
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from torch import nn
 
 from sceneprior.classes import label_set
-from sceneprior.config import GanConfig, RunConfig, StageConfig, dump_config, load_config
+from sceneprior.config import RunConfig, dump_config, load_config
 from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
@@ -23,12 +18,14 @@ from sceneprior.stages.callbacks import RollingCheckpoint, RunProgress, StepSeed
 from sceneprior.stages.cluster import first_process, requeue_on_signal, slurm_plugins
 from sceneprior.stages.gan import GanStage
 from sceneprior.stages.layout import LayoutStage
+from sceneprior.stages.loggers import LOGGERS, make_logger, quiet_lightning
 from sceneprior.stages.runs import STAGES_OF, checkpoint_extra, restore
 from sceneprior.stages.samples import Judge, SampleWatch
 from sceneprior.stages.shape import ShapeStage
 from sceneprior.stages.view_loss import build_latents, build_prior
 
-LOGGERS = ("csv", "tensorboard", "wandb")
+FROM_VIEWS = {"layout": LayoutStage, "shape": ShapeStage, "gan": GanStage}
+"""Stages that learn a prior from what cameras saw, and all but the GAN latents beside it."""
 
 
 def fit(
@@ -39,7 +36,7 @@ def fit(
     trainer_options: dict[str, Any] | None = None,
     judge: Judge | None = None,
 ) -> None:
-    """Train the layout stage, then the shape stage, or what else `config.stages` names.
+    """Train the stages of `config.stages`, one after the other (`runs.STAGES_OF`).
 
     Args:
         config: The run's settings.
@@ -103,8 +100,7 @@ def _fit_stage(
     settings = getattr(config, stage)
     dataset = _open_data(stage, config)
     prior, latents = _start(config, dataset, previous)
-    kind = {"layout": LayoutStage, "shape": ShapeStage, "gan": GanStage}[stage]
-    module = kind(prior, latents, config)
+    module = FROM_VIEWS[stage](prior, latents, config)
     folder = run / stage
     room_ids = dataset.room_ids if len(latents.weight) else ()
     rolling = RollingCheckpoint(folder, checkpoint_extra(config, room_ids))
@@ -112,15 +108,15 @@ def _fit_stage(
     if judge is not None and config.samples.every:
         # Before the rolling checkpoint, which holds the best so far.
         callbacks.append(SampleWatch(folder, config, stage, room_ids, judge))
-    _quiet_lightning()
+    quiet_lightning()
     lightning.seed_everything(config.seed, verbose=False)
     if settings.cpu_threads is not None:
         torch.set_num_threads(settings.cpu_threads)
     trainer = _trainer(
         trainer_options,
         max_epochs=settings.epochs,
-        logger=[_logger(name, folder) for name in loggers],
-        **_updates(settings),
+        logger=[make_logger(name, folder) for name in loggers],
+        **_updates(stage, settings),
         callbacks=[*callbacks, rolling],
         plugins=slurm_plugins(),
         default_root_dir=folder,
@@ -159,8 +155,8 @@ def _fit_stage(
     write_checkpoint(trainer, folder, "final.ckpt")
 
 
-def _updates(settings: StageConfig | GanConfig) -> dict[str, Any]:
-    if isinstance(settings, GanConfig):
+def _updates(stage: str, settings: Any) -> dict[str, Any]:
+    if stage == "gan":
         return {}  # two optimisers, which the module steps by itself
     return {
         "gradient_clip_val": settings.clip_gradient or None,
@@ -220,33 +216,3 @@ def _start(
             "needs the shards that the layout stage was trained on."
         )
     return prior, latents
-
-
-def _logger(name: str, folder: Path) -> Logger:
-    if name == "csv":
-        return _csv_logger(folder)
-    if name == "tensorboard":
-        return TensorBoardLogger(folder, name="", version="")
-    from lightning.pytorch.loggers import WandbLogger
-
-    key = os.environ.get("WANDB_API_KEY") or Path("~/.netrc").expanduser().is_file()
-    return WandbLogger(project="sceneprior", save_dir=folder, name=folder.name, offline=not key)
-
-
-def _csv_logger(folder: Path) -> CSVLogger:
-    # Lightning's deletes what it finds: hand it the rows of the epochs before the stop.
-    path = folder / "metrics.csv"
-    before = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
-    logger = CSVLogger(folder, name="", version="")
-    if before and first_process():
-        logger.experiment.metrics.extend(before)
-        logger.save()
-    return logger
-
-
-def _quiet_lightning() -> None:
-    # Its hints (loader workers, litlogger, cores) are for other set-ups than this one.
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", module="lightning")
-    torch.set_float32_matmul_precision("high")

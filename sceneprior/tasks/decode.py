@@ -6,6 +6,7 @@ from torch import Tensor
 
 from sceneprior.batches import DecodedScenes
 from sceneprior.classes import label_set
+from sceneprior.errors import InputError
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.stages.runs import TrainedPrior
@@ -66,13 +67,22 @@ def decode_latents(
 
 
 def decode_training_rooms(trained: TrainedPrior) -> list[Scene]:
-    """The training rooms as the prior remembers them, named by their ids."""
+    """The training rooms as the prior remembers them, named by their ids.
+
+    Raises:
+        InputError: training rooms have no latents in runs of this kind.
+    """
+    if not trained.remembers_rooms:
+        raise InputError(
+            f"A run of `stages: {trained.config.stages}` keeps no latents of training rooms, so "
+            "none can be decoded; take a run of `stages: two`."
+        )
     z = trained.prior.sphere(trained.logits)
     return decode_latents(trained, z, list(trained.room_ids))
 
 
 def synthesize(trained: TrainedPrior, count: int, seed: int, law: str | None = None) -> list[Scene]:
-    """New scenes: latents sampled by a law, decoded."""
+    """New scenes: latents sampled by a law (None: `trained.law`), decoded."""
     z = sample_latents(trained.prior.sphere, trained.logits, count, seed, law or trained.law)
     names = [f"seed{seed}_{index:04d}" for index in range(count)]
     return decode_latents(trained, z, names)

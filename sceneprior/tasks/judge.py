@@ -19,7 +19,8 @@ from sceneprior.tasks.decode import decode_latents, decode_training_rooms, synth
 
 UNFOLDING_STEPS = 7
 CURVES = (
-    "loss", "class", "box", "completeness", "frustum", "mask", "mask_iou", "discriminator", "kept"
+    "loss", "class", "box", "completeness", "frustum", "mask", "mask_iou", "discriminator",
+    "objects",
 )  # fmt: skip
 
 
@@ -34,7 +35,8 @@ def judge_run(
     renderer: str,
     checkpoint: str = "final",
 ) -> dict[str, Any]:
-    """Score generated rooms against test rooms, and decoded training rooms against the truth.
+    """Score generated rooms against test rooms, and decoded training rooms, in runs that remember
+    them, against the truth.
 
     Args:
         run: A run's folder.
@@ -56,9 +58,8 @@ def judge_run(
     scores = evaluate_synthesis(
         generated, folder, inception=inception, seed=seed, renderer=open_renderer(renderer)
     )
-    pairs = decoded_and_true(trained, folder)
-    if pairs:
-        scores |= reconstruction_scores(pairs)
+    if trained.remembers_rooms:
+        scores |= reconstruction_scores(decoded_and_true(trained, folder))
     scores["protocol"]["run"] = Path(run).resolve().name
     scores["protocol"]["stage"] = trained.stage
     scores["protocol"]["checkpoint"] = checkpoint
@@ -107,6 +108,10 @@ def report_run(
             f"`sceneprior eval-fid --run {run}`."
         ) from None
     shards = Path(trained.config.data.shards)
+    decoded: list[tuple[Scene, Scene]] = []
+    unfolding: list[Scene] = []
+    if trained.remembers_rooms:
+        decoded, unfolding = decoded_and_true(trained, shards), unfold(trained)
     write_report(
         out,
         title="New rooms from a prior learnt from masks",
@@ -116,19 +121,14 @@ def report_run(
         scores=figures,
         commands=commands,
         curves=read_curves(run),
-        decoded=decoded_and_true(trained, shards),
-        unfolding=unfold(trained),
+        decoded=decoded,
+        unfolding=unfolding,
         renderer=open_renderer(renderer),
     )
 
 
 def unfold(trained: TrainedPrior) -> list[Scene]:
-    """Rooms between two training rooms that lie far apart: on the sphere, along the geodesic.
-
-    None where the prior knows latents of no rooms.
-    """
-    if not len(trained.logits):
-        return []
+    """Rooms between two training rooms that lie far apart: on the sphere, along the geodesic."""
     space = trained.prior.sphere
     z = space(trained.logits)
     end = int(space.nearness(z[:1], z).argmin())

@@ -102,7 +102,7 @@ class SampleJudge:
             "empty_share": float((counts == 0).mean()),
             "overlaps": overlap_pairs(generated).per_room,
         }
-        if trained.room_ids:
+        if trained.remembers_rooms:
             plain = [row for row, name in enumerate(trained.room_ids) if "@" not in name]
             remembered = trained.prior.sphere(trained.logits[plain[: settings.count]])
             decoded = _decode(trained, remembered, with_shape=False)
