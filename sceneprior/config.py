@@ -190,14 +190,14 @@ class GanConfig(_Section):
     batch_size: int = Field(16, ge=1)
     """Real rooms a step, and as many generated ones."""
     views_per_room: int = Field(4, ge=1)
-    learning_rate: float = Field(1e-3, gt=0)
+    learning_rate: float = Field(5e-4, gt=0)
     """Of the generator's Adam."""
-    discriminator_learning_rate: float = Field(2e-3, gt=0)
+    discriminator_learning_rate: float = Field(4e-3, gt=0)
     """Of the discriminator's. Too large: it is soon always right, and teaches nothing; too small:
     the generator runs ahead to whatever it finds unusual."""
-    averaging: float = Field(0.99, ge=0, lt=1)
+    averaging: float = Field(0.97, ge=0, lt=1)
     """Share of the averaged generator that is kept at each step; 0 keeps the newest alone."""
-    noise: float = Field(0.3, ge=0)
+    noise: float = Field(0.1, ge=0)
     """Spread of the noise on all maps at the start; it falls to 0 over the epochs. Larger hides
     for longer what only gives a render away."""
     clip_gradient: float = Field(1.0, ge=0)

@@ -8,8 +8,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.parametrizations import spectral_norm
 
-STEPS = 3
-"""Halvings of a map's sides."""
+STEPS = 2
+"""Halvings of a map's sides; a patch is then 18 x 18 pixels of it."""
 
 
 class MapDiscriminator(nn.Module):

@@ -77,7 +77,7 @@ def test_the_true_room_looks_as_it_was_seen(views, toy_shards):
     assert_close(drawn.sum(dim=2), torch.ones_like(drawn[:, :, 0]), rtol=0, atol=1e-5)
     # They part at edges alone: of the pixels that show one class alone, nearly all agree.
     plain = (seen.amax(dim=2) == 1) & whole(scenes, views)[..., None, None]
-    assert plain.sum() > 3000
+    assert plain.float().mean() > 0.1
     agree = (drawn.argmax(dim=2) == seen.argmax(dim=2))[plain].float().mean()
     assert agree > 0.995
     assert (drawn - seen).abs().mean() < 0.01
