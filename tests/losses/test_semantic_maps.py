@@ -112,28 +112,24 @@ def test_objects_behind_void_or_after_the_end_are_seen(views, toy_shards):
     assert (rendered_maps(bed, FACES, views)[:, :, 9] > plain[:, :, 9]).any()
 
 
-def test_with_everything_there_the_maps_are_the_renderers_layers(views, toy_shards):
+def test_the_maps_are_the_renderers_layers(views, toy_shards):
     """Independent of our own laying over: `compositing='layered'`, where no edge is soft."""
     scenes = true_scenes(toy_shards, 4)
-    everything = replace(scenes, completeness_logits=scenes.completeness_logits.abs())
-    classes = everything.class_logits.clone()
-    classes[..., VOID] = -SURE
-    everything = replace(everything, class_logits=classes)
     size = (views.instance_ids.shape[-2] // LENS, views.instance_ids.shape[-1] // LENS)
     scale = torch.tensor([size[1] / views.image_size[1], size[0] / views.image_size[0], 1])
     layers = render_silhouettes(
-        everything.vertices_m, FACES, views.world_to_camera, views.intrinsics * scale[:, None],
-        size, sigma_px2=0.25, mode="fast",
+        scenes.vertices_m, FACES, views.world_to_camera, views.intrinsics * scale[:, None],
+        size, sigma_px2=0.25, mode="fast", drawn=scenes.completeness_logits > 0,
     )  # fmt: skip
-    maps = rendered_maps(everything, FACES, views)
+    maps = rendered_maps(scenes, FACES, views)
     assert_close(maps[:, :, VOID], 1 - layers.sum(dim=2), rtol=0, atol=1e-5)
-    one_hot = straight_through(everything.class_logits.softmax(dim=-1))
+    one_hot = straight_through(scenes.class_logits.softmax(dim=-1))
     wanted = torch.einsum("rvkhw,rkc->rvchw", layers, one_hot)
-    hard = (layers.amax(dim=2) > 0.999) & whole(everything, views)[..., None, None]
+    hard = (layers.amax(dim=2) > 0.999) & whole(scenes, views)[..., None, None]
     assert_close(
         maps.movedim(2, -1)[hard][:, 1:], wanted.movedim(2, -1)[hard][:, 1:], rtol=0, atol=2e-3
     )
-    assert hard.float().mean() > 0.05
+    assert hard.sum() > 300
 
 
 def test_laying_over_is_the_product_of_what_nearer_objects_leave(torch_rng):
