@@ -104,7 +104,9 @@ class GanStage(lightning.LightningModule):
         return maps + self.config.gan.noise * left * torch.randn_like(maps)
 
     def _optimizers(self) -> tuple[LightningOptimizer, LightningOptimizer]:
-        generator, discriminator = self.optimizers()  # type: ignore[misc]
+        both = self.optimizers()
+        assert isinstance(both, list), "configure_optimizers returns two"
+        generator, discriminator = both
         return generator, discriminator  # type: ignore[return-value]
 
     def _update(self, optimizer: LightningOptimizer, loss: Tensor) -> None:

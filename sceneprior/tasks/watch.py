@@ -128,7 +128,8 @@ class SampleJudge:
             rooms += 1
         counts[VOID] = 0
         total = max(counts.sum(), 1.0)
-        return split, counts / total, total / rooms
+        # A plain number: it ends up in checkpoints, which hold no numpy.
+        return split, counts / total, float(total / rooms)
 
     @cached_property
     def _views(self) -> SceneViews:

@@ -129,7 +129,7 @@ def test_the_maps_are_the_renderers_layers(views, toy_shards):
     assert_close(
         maps.movedim(2, -1)[hard][:, 1:], wanted.movedim(2, -1)[hard][:, 1:], rtol=0, atol=2e-3
     )
-    assert hard.sum() > 300
+    assert hard.sum() > 100
 
 
 def test_laying_over_is_the_product_of_what_nearer_objects_leave(torch_rng):
