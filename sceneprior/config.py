@@ -64,9 +64,11 @@ class ModelConfig(_Section):
     latent: Literal["sphere", "uniform"] = "sphere"
     """Where latents live: `sphere` (paper), or `uniform`, a cube with one logit a coordinate, in
     which `sampling.law: paper` draws uniformly (ablation c1; `anchors` has no say)."""
-    decoder: Literal["transformer", "lstm"] = "transformer"
-    """What emits object features: the `transformer` (paper), or an `lstm` that takes z first and
-    then its own last output (ablation c2; `heads`, `hidden` and `dropout` have no say)."""
+    decoder: Literal["transformer", "lstm", "atiss"] = "transformer"
+    """What emits object features: the `transformer` (paper); an `lstm` that takes z first and
+    then its own last output (ablation c2; `heads`, `hidden` and `dropout` have no say); or the
+    encoder of `atiss`, four layers in which z takes the empty embedding's place (ATISS-2D; as
+    published it has `heads` 8, `hidden` 1024)."""
     final_norm: bool = False
     """Normalise once more after the encoder layer and after the decoder layer, as the released
     code and the default of the library that it builds on."""
@@ -181,6 +183,30 @@ class ShapeConfig(StageConfig):
     """Whether 2D boxes come from the deformed mesh (paper) or still from the proxy."""
 
 
+class GanConfig(_Section):
+    """The GAN (`stages: gan`); docs/baselines_2d.md says what each is for. Maps are half as large
+    as the instance ids that `data.mask_step` keeps; renders take `shape.silhouettes`."""
+
+    epochs: int = Field(400, ge=1)
+    batch_size: int = Field(16, ge=1)
+    """Real rooms a step, and as many generated ones."""
+    views_per_room: int = Field(4, ge=1)
+    learning_rate: float = Field(5e-4, gt=0)
+    """Of the generator's Adam."""
+    discriminator_learning_rate: float = Field(4e-3, gt=0)
+    """Of the discriminator's. Too large: it is soon always right, and teaches nothing; too small:
+    the generator runs ahead to whatever it finds unusual."""
+    averaging: float = Field(0.97, ge=0, lt=1)
+    """Share of the averaged generator that is kept at each step; 0 keeps the newest alone."""
+    noise: float = Field(0.1, ge=0)
+    """Spread of the noise on all maps at the start; it falls to 0 over the epochs. Larger hides
+    for longer what only gives a render away."""
+    clip_gradient: float = Field(1.0, ge=0)
+    """Largest gradient norm of each of the two; 0 does not clip."""
+    cpu_threads: int | None = Field(None, ge=1)
+    """As in `layout`."""
+
+
 class BoxStageConfig(_Section):
     """What the baselines that learn from boxes in 3D have in common. The optimiser is Adam."""
 
@@ -280,16 +306,18 @@ class RunConfig(_Section):
     label_set: str
     """A name in `sceneprior/classes.py`, or a list of one's own: `void,bed,chair`."""
     seed: int = Field(0, ge=0)
-    stages: Literal["two", "one", "atiss3d", "sync2gen"] = "two"
+    stages: Literal["two", "one", "gan", "atiss3d", "sync2gen"] = "two"
     """`two`: layout, then layout and shape together (paper); `one`: the second from scratch, so
     that boxes and shapes are learnt together (ablation c3; the section `layout` has no say).
-    Baselines that learn from true boxes in 3D, by the section of their name: `atiss3d`,
-    `sync2gen`; of the others only `data` and `model.max_objects` concern them."""
+    Baselines, by the section of their name: `gan` learns from a discriminator instead of the view
+    loss; `atiss3d` and `sync2gen` learn from true boxes in 3D, and of the other sections only
+    `data` and `model.max_objects` concern them."""
     data: DataConfig
     model: ModelConfig
     loss: LossConfig = LossConfig()
     layout: StageConfig
     shape: ShapeConfig
+    gan: GanConfig = GanConfig()
     atiss3d: Atiss3dConfig = Atiss3dConfig()
     sync2gen: Sync2genConfig = Sync2genConfig()
     sampling: SamplingConfig = SamplingConfig()

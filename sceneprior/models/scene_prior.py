@@ -9,6 +9,7 @@ from sceneprior.geometry.boxes import place
 from sceneprior.models.chamfers import ClassChamfers
 from sceneprior.models.latents import LatentCube, LatentSpace, LatentSphere
 from sceneprior.models.layout_decoder import LayoutDecoder
+from sceneprior.models.scene_atiss import SceneAtiss
 from sceneprior.models.scene_decoder import SceneDecoder
 from sceneprior.models.scene_lstm import SceneLstm
 from sceneprior.models.shape_decoder import ShapeDecoder
@@ -25,8 +26,9 @@ class ScenePrior(nn.Module):
         width: D_z.
         anchors: M fixed vectors of the latent hypersphere.
         latent: `sphere`, or `uniform` for a cube of logits (ablation c1).
-        decoder: `transformer`, or `lstm` (ablation c2).
-        heads, hidden, dropout, final_norm, query_self_attention: Of the transformer.
+        decoder: `transformer`, `lstm` (ablation c2), or `atiss` (baseline ATISS-2D).
+        heads, hidden, dropout: Of the transformer, and of the encoder of `atiss`.
+        final_norm, query_self_attention: Of the transformer.
         step_mlps: Whether each of the transformer's N steps ends in an MLP of its own.
         layout_heads: Of the layout decoder.
         shape_width, shape_level, template, fit_box: Of the shape decoder.
@@ -61,9 +63,11 @@ class ScenePrior(nn.Module):
             self.sphere = LatentCube(width)
         else:
             self.sphere = LatentSphere(anchors, width, seed)
-        self.decoder: SceneDecoder | SceneLstm
+        self.decoder: SceneDecoder | SceneLstm | SceneAtiss
         if decoder == "lstm":
             self.decoder = SceneLstm(width)
+        elif decoder == "atiss":
+            self.decoder = SceneAtiss(width, heads, hidden, dropout)
         else:
             steps = max_objects if step_mlps else 0
             self.decoder = SceneDecoder(

@@ -31,6 +31,7 @@ from sceneprior.stages.view_loss import build_latents, build_prior
 STAGES_OF = {
     "two": ("layout", "shape"),
     "one": ("shape",),
+    "gan": ("gan",),
     "atiss3d": ("atiss3d",),
     "sync2gen": ("sync2gen",),
 }
@@ -58,6 +59,12 @@ class TrainedPrior:
     def remembers_rooms(self) -> bool:
         """Whether training rooms have latents of their own; a GAN's have none."""
         return len(self.logits) > 0
+
+    @property
+    def law(self) -> str:
+        """Where new latents come from unless a task says otherwise: the config's law, but where
+        there are no rooms to draw from, the law that the prior was trained under."""
+        return self.config.sampling.law if self.remembers_rooms else "paper"
 
 
 @dataclass(frozen=True)
@@ -142,7 +149,9 @@ def restore(config: RunConfig, path: Path) -> tuple[ScenePrior, nn.Embedding, tu
         prior = build_prior(config, len(label_set(config.label_set)))
         latents = build_latents(config, len(room_ids))
         holder = nn.ModuleDict({"prior": prior, "latents": latents})
-        holder.load_state_dict(saved["state_dict"])
+        # What helped in training alone, such as a discriminator, has done its work.
+        weights = {k: v for k, v in saved["state_dict"].items() if k.split(".")[0] in holder}
+        holder.load_state_dict(weights)
     except (KeyError, RuntimeError) as error:
         raise _misfit(path, error) from None
     return prior, latents, room_ids

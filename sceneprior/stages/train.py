@@ -18,6 +18,7 @@ from sceneprior.models.scene_prior import ScenePrior
 from sceneprior.stages import atiss3d, sync2gen
 from sceneprior.stages.callbacks import RollingCheckpoint, RunProgress, StepSeed, write_checkpoint
 from sceneprior.stages.cluster import first_process, requeue_on_signal, slurm_plugins
+from sceneprior.stages.gan import GanStage
 from sceneprior.stages.layout import LayoutStage
 from sceneprior.stages.loggers import LOGGERS, make_logger, quiet_lightning
 from sceneprior.stages.runs import STAGES_OF, checkpoint_extra, restore
@@ -25,8 +26,8 @@ from sceneprior.stages.samples import Judge, SampleWatch
 from sceneprior.stages.shape import ShapeStage
 from sceneprior.stages.view_loss import build_latents, build_prior
 
-FROM_VIEWS = {"layout": LayoutStage, "shape": ShapeStage}
-"""Stages that learn a prior and latents from what cameras saw."""
+FROM_VIEWS = {"layout": LayoutStage, "shape": ShapeStage, "gan": GanStage}
+"""Stages that learn a prior from what cameras saw, and all but the GAN latents beside it."""
 FROM_BOXES = {"atiss3d": atiss3d.build, "sync2gen": sync2gen.build}
 """Baselines that learn from true boxes in 3D; the only ones to open the ground truth."""
 
@@ -103,19 +104,23 @@ def _fit_stage(
     settings = getattr(config, stage)
     dataset: ViewDataset | TruthDataset
     module: lightning.LightningModule
+    room_ids: tuple[str, ...] = ()
     if stage in FROM_BOXES:
         dataset = _open_truth(config)
         module = FROM_BOXES[stage](config, dataset)
+        room_ids = dataset.room_ids
     else:
         dataset = _open_data(stage, config)
         prior, latents = _start(config, dataset, previous)
         module = FROM_VIEWS[stage](prior, latents, config)
+        if len(latents.weight):
+            room_ids = dataset.room_ids
     folder = run / stage
-    rolling = RollingCheckpoint(folder, checkpoint_extra(config, dataset.room_ids))
+    rolling = RollingCheckpoint(folder, checkpoint_extra(config, room_ids))
     callbacks = [RunProgress(f"fit {stage} (epochs)"), StepSeed(config.seed)]
     if judge is not None and config.samples.every:
         # Before the rolling checkpoint, which holds the best so far.
-        callbacks.append(SampleWatch(folder, config, stage, dataset.room_ids, judge))
+        callbacks.append(SampleWatch(folder, config, stage, room_ids, judge))
     quiet_lightning()
     lightning.seed_everything(config.seed, verbose=False)
     if settings.cpu_threads is not None:
@@ -123,9 +128,8 @@ def _fit_stage(
     trainer = _trainer(
         trainer_options,
         max_epochs=settings.epochs,
-        gradient_clip_val=settings.clip_gradient or None,
         logger=[make_logger(name, folder) for name in loggers],
-        accumulate_grad_batches=settings.accumulate,
+        **_updates(stage, settings),
         callbacks=[*callbacks, rolling],
         plugins=slurm_plugins(),
         default_root_dir=folder,
@@ -135,6 +139,11 @@ def _fit_stage(
         use_distributed_sampler=False,
         log_every_n_steps=1,
     )
+    if stage == "gan" and trainer.world_size > 1:
+        raise InputError(
+            f"stages: gan trains in one process, but {trainer.world_size} were asked for; "
+            "use --devices 1."
+        )
     # Only now: a run that is refused leaves nothing behind.
     if trainer.is_global_zero:
         folder.mkdir(parents=True, exist_ok=True)
@@ -159,6 +168,15 @@ def _fit_stage(
     write_checkpoint(trainer, folder, "final.ckpt")
 
 
+def _updates(stage: str, settings: Any) -> dict[str, Any]:
+    if stage == "gan":
+        return {}  # two optimisers, which the module steps by itself
+    return {
+        "gradient_clip_val": settings.clip_gradient or None,
+        "accumulate_grad_batches": settings.accumulate,
+    }
+
+
 def _trainer(options: dict[str, Any], **settings: Any) -> lightning.Trainer:
     try:
         return lightning.Trainer(**settings, **options)
@@ -173,13 +191,15 @@ def _open_data(stage: str, config: RunConfig) -> ViewDataset:
     views = data.views_per_room
     if stage == "shape" and config.shape.views_per_room:
         views = config.shape.views_per_room
+    elif stage == "gan":
+        views = config.gan.views_per_room
     dataset = ViewDataset(
         Path(data.shards),
         "train",
         views_per_room=views,
         rotations=4 if data.augment_rotations else 1,
         view_fraction=data.view_fraction,
-        mask_step=data.mask_step if stage == "shape" else None,
+        mask_step=None if stage == "layout" else data.mask_step,
         seed=config.seed,
     )
     _check_data(dataset, config)
@@ -213,7 +233,8 @@ def _start(
 ) -> tuple[ScenePrior, nn.Embedding]:
     if previous is None:
         prior = build_prior(config, len(label_set(config.label_set)))
-        return prior, build_latents(config, len(dataset))
+        # A GAN pairs no point of the latent space with a room.
+        return prior, build_latents(config, 0 if config.stages == "gan" else len(dataset))
     prior, latents, room_ids = restore(config, previous)
     if room_ids != dataset.room_ids:
         raise InputError(

@@ -80,7 +80,7 @@ def decode_latents(
     scenes: list[Scene] = []
     for start in range(0, len(z), BATCH):
         part = slice(start, start + BATCH)
-        decoded = trained.prior.decode(z[part], with_shape=trained.stage == "shape")
+        decoded = trained.prior.decode(z[part], with_shape=trained.stage != "layout")
         scenes += to_scenes(
             decoded,
             trained.prior.shape.faces,
@@ -110,8 +110,7 @@ def draw_latents(
     trained: TrainedPrior, count: int, seed: int, law: str | None = None
 ) -> tuple[Float[Tensor, "count width"], list[str]]:
     """Latents sampled by a law (None: the run's own), and the names of their rooms."""
-    law = law or trained.config.sampling.law
-    z = sample_latents(trained.prior.sphere, trained.logits, count, seed, law)
+    z = sample_latents(trained.prior.sphere, trained.logits, count, seed, law or trained.law)
     return z, scene_names(count, seed)
 
 
@@ -124,7 +123,7 @@ def synthesize(
         trained: From `load_any_run`.
         count: How many.
         seed: Same seed, same rooms.
-        law: Where latents come from; None takes the config's.
+        law: Where latents come from; None takes the run's own.
 
     Raises:
         InputError: a law for a method without latents, or one that does not exist.

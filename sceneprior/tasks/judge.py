@@ -23,7 +23,7 @@ from sceneprior.tasks.export import load_scene_folder
 UNFOLDING_STEPS = 7
 CURVES = (
     "loss", "class", "box", "completeness", "frustum", "mask", "mask_iou",
-    "existence", "position", "size", "kl",
+    "discriminator", "objects", "existence", "position", "size", "kl",
 )  # fmt: skip
 
 
@@ -74,7 +74,7 @@ def judge_run(
     scores["protocol"]["stage"] = trained.stage
     scores["protocol"]["checkpoint"] = checkpoint
     if isinstance(trained, TrainedPrior):
-        scores["protocol"]["sampling_law"] = law or trained.config.sampling.law
+        scores["protocol"]["sampling_law"] = law or trained.law
     write_scores(scores, out)
     return scores
 
