@@ -33,8 +33,6 @@ class SceneViews:
     """Height and width in pixels that `intrinsics` refer to."""
     instance_ids: Integer[Tensor, "rooms views height width"] | None = None
     """0 for nothing, k + 1 for object k; its own, smaller size. Only the shape stage has it."""
-    view_index: Int[Tensor, "rooms views"] | None = None
-    """Which view of the data set each one is: a row of the learned camera corrections."""
     room_ids: tuple[str, ...] = ()
 
     def to(self, device: torch.device | str) -> "SceneViews":

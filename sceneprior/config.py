@@ -130,7 +130,6 @@ class LossConfig(_Section):
     trim_views: float = Field(0.0, ge=0, lt=1)
     """Share of an object's views, those whose 2D boxes are furthest off, that the box loss leaves
     out of each step, so that a few wrong masks do not count; 0 is the paper."""
-    overlap: float = Field(0.0, ge=0)
     iou_gate: float = Field(0.5, ge=0, lt=1)
     """Masks that overlap less than this teach no shape."""
 
@@ -162,7 +161,6 @@ class StageConfig(_Section):
     cpu_threads: int | None = Field(None, ge=1)
     """Torch threads where a CPU trains; None leaves torch's choice. A small network gains little
     from a second thread and loses much when another program takes that core."""
-    camera_correction: float = Field(0.0, ge=0)
     proxy: Literal["ellipsoid", "ellipsoid_points", "box"] = "ellipsoid"
     """What an object's 2D box is taken from where its mesh is not (see `box_from`): the smooth
     ellipsoid that fills the 3D box, exactly; 162 of its points, which is slower and moves what is

@@ -116,7 +116,6 @@ class FlatViews:
             # a matrix product, which a GPU may round.
             "world_to_camera": poses.gather(-1, columns.expand_as(poses)) * signs,
             "intrinsics": self.intrinsics[at_view],
-            "view_index": at_view,
             "boxes": self.boxes[at_sighting],
             "visible": self.visible[at_sighting],
             "sides_clear": self.sides_clear[at_sighting],

@@ -42,8 +42,8 @@ def match_and_score(
     """Match predictions to tracked objects by their 2D boxes and take the layout losses."""
     matches = match_objects(scenes, boxes, views, weights.match_box, weights.hidden_overshoot)
     losses = layout_losses(
-        scenes, boxes, views, matches, weights.hidden_overshoot, weights.completeness_target,
-        weights.trim_views,
+        scenes, boxes, views, matches,
+        weights.hidden_overshoot, weights.completeness_target, weights.trim_views,
     )  # fmt: skip
     return losses, matches
 
@@ -137,7 +137,7 @@ def training_latents(
 
 
 def build_optimizer(
-    prior: ScenePrior, latents: nn.Embedding, stage: StageConfig, steps: int, cameras: nn.Module | None = None
+    prior: ScenePrior, latents: nn.Embedding, stage: StageConfig, steps: int
 ) -> OptimizerLRSchedulerConfig:
     """Adam with the stage's schedule over `steps` updates, in the shape Lightning takes."""
     fresh = list(prior.shape.parameters())
@@ -148,8 +148,6 @@ def build_optimizer(
         {"params": fresh, "lr": fresh_rate},
         {"params": list(latents.parameters()), "lr": stage.latent_learning_rate},
     ]
-    if cameras is not None:
-        groups.append({"params": list(cameras.parameters()), "lr": stage.latent_learning_rate})
     optimizer = torch.optim.Adam(groups, fused=True)
     if stage.schedule == "cosine":
         rates = [group["lr"] for group in optimizer.param_groups]
