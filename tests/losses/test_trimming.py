@@ -34,7 +34,7 @@ def test_the_loop_that_drops_the_furthest_views(batch, trim):
     for room in range(3):
         for item in range(4):
             seen = [view for view in range(6) if counted[room, view, item]]
-            seen.sort(key=lambda view: float(distance[room, view, item]))  # noqa: B023
+            seen.sort(key=lambda view: float(distance[room, view, item]))
             left = len(seen) - math.floor(trim * len(seen))
             wanted = set(seen[:left])
             assert {view for view in range(6) if kept[room, view, item]} == wanted
