@@ -127,9 +127,6 @@ class LossConfig(_Section):
     """Where another object touches a mask, the side of its 2D box there may be an occluder's. The
     part of a prediction that reaches further counts this much: 1 is the paper, which takes every
     side at its word; 0 lets objects go on behind others without end."""
-    trim_views: float = Field(0.0, ge=0, lt=1)
-    """Share of an object's views, those whose 2D boxes are furthest off, that the box loss leaves
-    out of each step, so that a few wrong masks do not count; 0 is the paper."""
     iou_gate: float = Field(0.5, ge=0, lt=1)
     """Masks that overlap less than this teach no shape."""
 

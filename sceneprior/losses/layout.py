@@ -28,7 +28,6 @@ def layout_losses(
     matches: Matches,
     hidden_overshoot: float = 1.0,
     completeness_target: str = "first_n",
-    trim_views: float = 0.0,
 ) -> dict[str, Float[Tensor, ""]]:
     """The four terms of L_layout, each averaged over the objects it applies to.
 
@@ -41,7 +40,6 @@ def layout_losses(
         matches: Which prediction answers for which object.
         hidden_overshoot: See `side_distance`.
         completeness_target: `first_n` or `stop`; see `losses/completeness.py`.
-        trim_views: See `agreeing_views`.
 
     Returns:
         `class`, `box`, `completeness` and `frustum`; weights are the caller's.
@@ -52,9 +50,7 @@ def layout_losses(
     seen = views.visible & matches.valid.unsqueeze(1)
     return {
         "class": class_loss(scenes, views, matches),
-        "box": box_loss(
-            predicted, views.boxes, views.sides_clear, seen & inside, hidden_overshoot, trim_views
-        ),
+        "box": box_loss(predicted, views.boxes, views.sides_clear, seen & inside, hidden_overshoot),
         "completeness": completeness_loss(scenes, views, completeness_target),
         "frustum": frustum_loss(centers, views, seen & ~inside),
     }
@@ -73,7 +69,6 @@ def box_loss(
     clear: Bool[Tensor, "rooms views objects 4"],
     counted: Bool[Tensor, "rooms views objects"],
     hidden_overshoot: float = 1.0,
-    trim_views: float = 0.0,
 ) -> Float[Tensor, ""]:
     """L1 distance of 2D boxes (summed over x1, y1, x2, y2): mean over visible views, then objects.
 
@@ -83,29 +78,7 @@ def box_loss(
         side_distance(predicted[..., i], target[..., i], clear[..., i], i, hidden_overshoot)
         for i in range(4)
     ]
-    distance = torch.stack(apart).sum(dim=0)
-    if trim_views:
-        counted = agreeing_views(distance, counted, trim_views)
-    return _mean_of_objects(distance, counted)
-
-
-def agreeing_views(
-    distance: Float[Tensor, "rooms views objects"],
-    counted: Bool[Tensor, "rooms views objects"],
-    trim: float,
-) -> Bool[Tensor, "rooms views objects"]:
-    """Of each object's counted views, all but the share `trim` that is furthest off.
-
-    The share is rounded down: an object in few views keeps them all. What is left is the objective
-    of least trimmed squares with distances for squares: a few wrong masks (cut, moved, or another
-    object's) do not move its minimum, however wrong they are.
-
-    Source:
-        Rousseeuw, "Least Median of Squares Regression", JASA 1984.
-    """
-    count = counted.sum(dim=1, keepdim=True)
-    worst_last = distance.detach().masked_fill(~counted, torch.inf).argsort(dim=1)
-    return worst_last.argsort(dim=1) < count - (trim * count).floor()
+    return _mean_of_objects(torch.stack(apart).sum(dim=0), counted)
 
 
 def completeness_loss(

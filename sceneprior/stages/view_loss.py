@@ -42,9 +42,8 @@ def match_and_score(
     """Match predictions to tracked objects by their 2D boxes and take the layout losses."""
     matches = match_objects(scenes, boxes, views, weights.match_box, weights.hidden_overshoot)
     losses = layout_losses(
-        scenes, boxes, views, matches,
-        weights.hidden_overshoot, weights.completeness_target, weights.trim_views,
-    )  # fmt: skip
+        scenes, boxes, views, matches, weights.hidden_overshoot, weights.completeness_target
+    )
     return losses, matches
 
 

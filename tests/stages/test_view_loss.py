@@ -10,8 +10,6 @@ from toy_rooms import look_at
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.config import ShapeConfig, StageConfig
 from sceneprior.geometry.cameras import boxes_of_points
-from sceneprior.stages import train
-from sceneprior.stages.runs import read_checkpoint
 from sceneprior.stages.shape import ShapeStage
 from sceneprior.stages.view_loss import build_latents, build_prior, proxy_boxes
 
@@ -85,17 +83,3 @@ def test_the_shape_stage_takes_boxes_from_where_it_is_told(seen, tmp_path, box_f
         )
     assert_close(found.boxes, expected.boxes, rtol=0, atol=0)
     assert torch.equal(found.in_frustum, expected.in_frustum)
-
-
-def test_trimming_no_view_trains_bit_for_bit_as_the_paper(toy_shards, tmp_path):
-    """Rooms of at most 4 drawn views: a share below a quarter is no view, a half is two of them."""
-    weights = {}
-    for trim in (0.0, 0.2, 0.5):
-        run = tmp_path / str(trim)
-        settings = {"loss__trim_views": trim} if trim else {}
-        config = tiny_config(toy_shards, layout__epochs=2, **settings)
-        train._fit_stage("layout", config, run, None, False, (), {"accelerator": "cpu"}, None)
-        weights[trim] = read_checkpoint(run / "layout" / "final.ckpt")["state_dict"]
-    paper, none, some = weights.values()
-    assert all(torch.equal(paper[name], none[name]) for name in paper)
-    assert not all(torch.equal(paper[name], some[name]) for name in paper)
