@@ -22,7 +22,7 @@ from sceneprior.stages.runs import find_checkpoint, load_run, read_checkpoint
 from sceneprior.stages.train import fit
 from sceneprior.stages.view_loss import build_latents, build_prior
 from sceneprior.tasks.decode import decode_training_rooms, synthesize
-from sceneprior.tasks.judge import judge_run, read_curves, report_run
+from sceneprior.tasks.judge import Judging, judge_run, read_curves, report_run
 from sceneprior.tasks.watch import SampleJudge
 
 CPU = {"accelerator": "cpu", "devices": 1}
@@ -141,7 +141,9 @@ def test_what_needs_latents_of_rooms_says_that_a_gan_has_none(gan_run):
 
 
 def test_a_gan_is_judged_and_reported_by_its_new_rooms_alone(gan_run, tmp_path):
-    scores = judge_run(gan_run, 4, 0, None, None, tmp_path / "scores.json", None, "software")
+    scores = judge_run(
+        gan_run, 4, 0, None, tmp_path / "scores.json", None, Judging(renderer="software")
+    )
     assert scores["protocol"]["stage"] == "gan" and scores["protocol"]["sampling_law"] == "paper"
     assert "box_iou_3d" not in scores and scores["mean_objects"] >= 0
     report_run(gan_run, tmp_path / "scores.json", tmp_path / "page.html", 0, (), "software")
