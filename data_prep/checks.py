@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import ndimage
 
-from data_prep.observations import MIN_BOX_SIDE_PX, clear_sides, pixel_counts
+from sceneprior.instances.observations import MIN_BOX_SIDE_PX, clear_sides, pixel_counts
 from sceneprior.shards import RoomGroundTruth, RoomViews
 
 

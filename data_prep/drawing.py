@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from data_prep.observations import Observations, observe, pixel_counts
 from data_prep.recipe import Recipe, ViewRules
 from data_prep.rooms import Furniture, Room
 from data_prep.viewpoints import Viewpoints, intrinsics, sees_enough
 from sceneprior.classes import label_set
+from sceneprior.instances.observations import Observations, observe, pixel_counts
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Mesh
 from sceneprior.shards import RoomGroundTruth, RoomViews

@@ -1,7 +1,5 @@
 """Recipes: which rooms of a source are kept, under which classes, and how cameras stand in them."""
 
-import csv
-import functools
 import math
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -11,6 +9,7 @@ import yaml
 
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
+from sceneprior.furniture import category_classes
 
 FOLDER = Path(__file__).parent / "recipes"
 
@@ -184,26 +183,3 @@ def _check_classes(recipe: Recipe) -> None:
                 f"{recipe.name}: the label set {recipe.label_set} has no class '{name}'; "
                 f"it has {', '.join(names)}."
             )
-
-
-@functools.cache
-def category_classes(columns: tuple[str, ...]) -> dict[str, str]:
-    """3D-FUTURE's category strings -> class names, from recipes/front3d_categories.csv.
-
-    Args:
-        columns: `bedroom_class`, `living_room_class`: the first that is not void decides.
-
-    Raises:
-        InputError: there is no such column.
-    """
-    with (FOLDER / "front3d_categories.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    for column in columns:
-        if column not in rows[0]:
-            raise InputError(f"front3d_categories.csv has no column '{column}'.")
-    return {
-        row["model_info_category"]: next(
-            (row[column] for column in columns if row[column] != "void"), "void"
-        )
-        for row in rows
-    }

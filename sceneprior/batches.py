@@ -1,4 +1,4 @@
-"""Two nouns that learning meets at: `SceneViews` (what cameras saw) and `DecodedScenes`."""
+"""Nouns that learning meets at: `SceneViews` (what cameras saw), `DecodedScenes`, `RoomBoxes`."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -37,11 +37,7 @@ class SceneViews:
 
     def to(self, device: torch.device | str) -> "SceneViews":
         """The same views with every tensor on `device` (Lightning calls this)."""
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        moved: dict[str, Any] = {
-            key: v.to(device) for key, v in values.items() if isinstance(v, Tensor)
-        }
-        return replace(self, **moved)
+        return replace(self, **_moved(self, device))
 
 
 @dataclass(frozen=True)
@@ -55,5 +51,32 @@ class DecodedScenes:
     """Full extents of the axis-aligned boxes."""
     completeness_logits: Float[Tensor, "rooms objects"]
     """Above 0 while the scene is still being filled (the paper's supplement B)."""
+    chamfers: Float[Tensor, "rooms objects 2"] | None = None
+    """How far the edges of the proxy `bulge` are cut off (`geometry.boxes.chamfered_cube`); None
+    for rooms that no prior decoded."""
     vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
     """Mesh vertices in the room frame; None until the shape decoder ran."""
+
+
+@dataclass(frozen=True)
+class RoomBoxes:
+    """A batch of rooms as labelled boxes in 3D: what supervision in 3D shows, and what methods that
+    learn from it make. Objects are padded to the fullest room's count; their order means nothing.
+    """
+
+    object_class: Int[Tensor, "rooms objects"]
+    """Index into the label set; 0 where `is_object` is false."""
+    is_object: Bool[Tensor, "rooms objects"]
+    """False for padding; the first n entries of a room with n objects are true."""
+    boxes_m: Float[Tensor, "rooms objects 6"]
+    """Centre x, y, z, then full extents along x, y, z; axis-aligned, in the room frame."""
+    room_ids: tuple[str, ...] = ()
+
+    def to(self, device: torch.device | str) -> "RoomBoxes":
+        """The same boxes with every tensor on `device` (Lightning calls this)."""
+        return replace(self, **_moved(self, device))
+
+
+def _moved(noun: SceneViews | RoomBoxes, device: torch.device | str) -> dict[str, Any]:
+    values = {item.name: getattr(noun, item.name) for item in fields(noun)}
+    return {key: v.to(device) for key, v in values.items() if isinstance(v, Tensor)}

@@ -64,9 +64,11 @@ class ModelConfig(_Section):
     latent: Literal["sphere", "uniform"] = "sphere"
     """Where latents live: `sphere` (paper), or `uniform`, a cube with one logit a coordinate, in
     which `sampling.law: paper` draws uniformly (ablation c1; `anchors` has no say)."""
-    decoder: Literal["transformer", "lstm"] = "transformer"
-    """What emits object features: the `transformer` (paper), or an `lstm` that takes z first and
-    then its own last output (ablation c2; `heads`, `hidden` and `dropout` have no say)."""
+    decoder: Literal["transformer", "lstm", "atiss"] = "transformer"
+    """What emits object features: the `transformer` (paper); an `lstm` that takes z first and
+    then its own last output (ablation c2; `heads`, `hidden` and `dropout` have no say); or the
+    encoder of `atiss`, four layers in which z takes the empty embedding's place (ATISS-2D; as
+    published it has `heads` 8, `hidden` 1024)."""
     final_norm: bool = False
     """Normalise once more after the encoder layer and after the decoder layer, as the released
     code and the default of the library that it builds on."""
@@ -158,10 +160,11 @@ class StageConfig(_Section):
     cpu_threads: int | None = Field(None, ge=1)
     """Torch threads where a CPU trains; None leaves torch's choice. A small network gains little
     from a second thread and loses much when another program takes that core."""
-    proxy: Literal["ellipsoid", "ellipsoid_points", "box"] = "ellipsoid"
+    proxy: Literal["ellipsoid", "ellipsoid_points", "box", "bulge"] = "ellipsoid"
     """What an object's 2D box is taken from where its mesh is not (see `box_from`): the smooth
     ellipsoid that fills the 3D box, exactly; 162 of its points, which is slower and moves what is
-    behind the camera in front of it, as the authors do with 2,562; or the 3D box's corners."""
+    behind the camera in front of it, as the authors do with 2,562; the 3D box's corners; or
+    `bulge`, the box with its edges cut off as far as its class has learnt to."""
 
 
 class ShapeConfig(StageConfig):
@@ -178,6 +181,97 @@ class ShapeConfig(StageConfig):
     compositing: Literal["layered", "paper"] = "paper"
     box_from: Literal["mesh", "proxy"] = "mesh"
     """Whether 2D boxes come from the deformed mesh (paper) or still from the proxy."""
+
+
+class GanConfig(_Section):
+    """The GAN (`stages: gan`); docs/baselines_2d.md says what each is for. Maps are half as large
+    as the instance ids that `data.mask_step` keeps; renders take `shape.silhouettes`."""
+
+    epochs: int = Field(400, ge=1)
+    batch_size: int = Field(16, ge=1)
+    """Real rooms a step, and as many generated ones."""
+    views_per_room: int = Field(4, ge=1)
+    learning_rate: float = Field(5e-4, gt=0)
+    """Of the generator's Adam."""
+    discriminator_learning_rate: float = Field(4e-3, gt=0)
+    """Of the discriminator's. Too large: it is soon always right, and teaches nothing; too small:
+    the generator runs ahead to whatever it finds unusual."""
+    averaging: float = Field(0.97, ge=0, lt=1)
+    """Share of the averaged generator that is kept at each step; 0 keeps the newest alone."""
+    noise: float = Field(0.1, ge=0)
+    """Spread of the noise on all maps at the start; it falls to 0 over the epochs. Larger hides
+    for longer what only gives a render away."""
+    clip_gradient: float = Field(1.0, ge=0)
+    """Largest gradient norm of each of the two; 0 does not clip."""
+    cpu_threads: int | None = Field(None, ge=1)
+    """As in `layout`."""
+
+
+class BoxStageConfig(_Section):
+    """What the baselines that learn from boxes in 3D have in common. The optimiser is Adam."""
+
+    epochs: int = Field(ge=1)
+    batch_size: int = Field(ge=1)
+    """Rooms a batch and process."""
+    accumulate: int = Field(1, ge=1)
+    """Batches whose gradients are averaged before each update."""
+    learning_rate: float = Field(gt=0)
+    schedule: Literal["constant", "cosine"] = "constant"
+    """`constant` (published, both), or a short rise and a `cosine` down to zero."""
+    clip_gradient: float = Field(0.0, ge=0)
+    """Largest gradient norm; 0 does not clip."""
+    cpu_threads: int | None = Field(None, ge=1)
+    """As in `layout`."""
+    width: int = Field(512, ge=8)
+    """Of the hidden layers."""
+
+
+class Atiss3dConfig(BoxStageConfig):
+    """ATISS with 3D supervision (`stages: atiss3d`); the defaults are the published settings."""
+
+    epochs: int = Field(500, ge=1)
+    """With turned copies of 6,300 rooms these are the published 100,000 steps."""
+    batch_size: int = Field(128, ge=1)
+    learning_rate: float = Field(1e-4, gt=0)
+    layers: int = Field(4, ge=1)
+    """Of the transformer encoder."""
+    heads: int = Field(8, ge=1)
+    hidden: int = Field(1024, ge=8)
+    """Inner width of its feed-forward layers."""
+    mixtures: int = Field(10, ge=1)
+    """K, logistics a coordinate."""
+    dropout: float = Field(0.1, ge=0, lt=1)
+
+    @model_validator(mode="after")
+    def _heads_divide_width(self) -> "Atiss3dConfig":
+        if self.width % self.heads:
+            raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
+        return self
+
+
+class Sync2genConfig(BoxStageConfig):
+    """The Sync2Gen-style VAE (`stages: sync2gen`); epochs, batch, rate and latent as released."""
+
+    epochs: int = Field(800, ge=1)
+    batch_size: int = Field(64, ge=1)
+    learning_rate: float = Field(1e-3, gt=0)
+    latent: int = Field(20, ge=1)
+    """Numbers a room is boiled down to."""
+    slots: int = Field(8, ge=1)
+    """Objects of one class that a room can hold (released: 4); further ones are left out, and
+    their share is logged as `train/left_out`."""
+    kl_weight: float = Field(0.1, ge=0)
+    """Of the KL divergence from N(0, 1). Larger: new rooms are more like each other and better
+    formed; smaller: training rooms are remembered better, and what lies between is worse."""
+    refine_steps: int = Field(100, ge=0)
+    """Gradient steps on each new room's positions, towards offsets between classes as training
+    rooms have them; 0 takes rooms as decoded (the paper's Sync2Gen*). Acts on sampling alone."""
+
+    @model_validator(mode="after")
+    def _width_in_groups(self) -> "Sync2genConfig":
+        if self.width % 8:
+            raise ValueError(f"width {self.width} is not a multiple of 8")
+        return self
 
 
 class SamplingConfig(_Section):
@@ -212,14 +306,20 @@ class RunConfig(_Section):
     label_set: str
     """A name in `sceneprior/classes.py`, or a list of one's own: `void,bed,chair`."""
     seed: int = Field(0, ge=0)
-    stages: Literal["two", "one"] = "two"
+    stages: Literal["two", "one", "gan", "atiss3d", "sync2gen"] = "two"
     """`two`: layout, then layout and shape together (paper); `one`: the second from scratch, so
-    that boxes and shapes are learnt together (ablation c3; the section `layout` has no say)."""
+    that boxes and shapes are learnt together (ablation c3; the section `layout` has no say).
+    Baselines, by the section of their name: `gan` learns from a discriminator instead of the view
+    loss; `atiss3d` and `sync2gen` learn from true boxes in 3D, and of the other sections only
+    `data` and `model.max_objects` concern them."""
     data: DataConfig
     model: ModelConfig
     loss: LossConfig = LossConfig()
     layout: StageConfig
     shape: ShapeConfig
+    gan: GanConfig = GanConfig()
+    atiss3d: Atiss3dConfig = Atiss3dConfig()
+    sync2gen: Sync2genConfig = Sync2genConfig()
     sampling: SamplingConfig = SamplingConfig()
     samples: SamplesConfig = SamplesConfig()
 

@@ -1,12 +1,17 @@
-"""Files that are whole or absent: bytes in, one atomic rename out."""
+"""Files that are whole or absent (bytes in, one atomic rename out), JSON files, file names."""
 
 import contextlib
+import json
 import os
 import secrets
 from pathlib import Path
+from typing import Any
+
+from sceneprior.errors import InputError
 
 PART = ".part"
 """How the name of a file ends that is still being written."""
+_LONGEST_NAME = 120
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -38,6 +43,16 @@ def write_whole(path: Path, data: bytes) -> None:
     _sync_folder(path.parent)
 
 
+def write_json(path: Path, data: Any) -> None:
+    """Write plain data as JSON, whole or not at all.
+
+    Raises:
+        ValueError: a number is NaN or infinite, which JSON does not know.
+        OSError: see `write_whole`.
+    """
+    write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
+
+
 def remove_parts(folder: Path) -> None:
     """Delete what killed writers left anywhere under a folder; nobody may be writing there.
 
@@ -46,6 +61,44 @@ def remove_parts(folder: Path) -> None:
     """
     for path in sorted(Path(folder).rglob(f"*{PART}")):
         path.unlink(missing_ok=True)
+
+
+def file_stamp(path: Path) -> tuple[int, int]:
+    """Time of change and size: what tells a changed file from the one that was read.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}).") from None
+    return status.st_mtime_ns, status.st_size
+
+
+def read_json(path: Path) -> Any:
+    """The JSON of a file.
+
+    Raises:
+        InputError: it cannot be read, or is none.
+    """
+    try:
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}).") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path.name} is not JSON ({error}); it may be truncated.") from None
+
+
+def is_name(text: Any) -> bool:
+    """Whether a text out of a file can be part of a path and of a report: short and printable."""
+    return (
+        isinstance(text, str)
+        and 0 < len(text) <= _LONGEST_NAME
+        and text.isprintable()
+        and text not in (".", "..")
+        and "/" not in text
+    )
 
 
 def _remove(path: Path) -> None:

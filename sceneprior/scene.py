@@ -91,10 +91,16 @@ def read_scene(path: Path) -> Scene:
     """Read a scene's JSON.
 
     Raises:
-        InputError: the file is missing, not JSON, not this format, or names unknown classes.
+        InputError: the file is missing, not JSON, not this format, names unknown classes, or
+            holds numbers that no room has.
     """
     try:
         data = json.loads(Path(path).read_text())
+        if not isinstance(data, dict):
+            raise InputError(
+                f"{path} is not a scene JSON: expected an object with 'format' and 'objects', got "
+                f"a {type(data).__name__}; docs/conventions.md describes the format."
+            )
         if data["format"] != FORMAT or data["version"] != VERSION:
             raise InputError(
                 f"{path} says format '{data['format']}' version {data['version']}; "
@@ -112,21 +118,43 @@ def read_scene(path: Path) -> Scene:
             SceneObject(item["class"], _triple(item["center_m"]), _triple(item["size_m"]))
             for item in data["objects"]
         )
+        floor = data.get("floor_m")
+        floor_m = None if floor is None else np.asarray(floor, dtype=np.float64)
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}).") from None
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{path} is not a scene JSON ({type(error).__name__}: {error}); "
             "docs/conventions.md describes the format."
         ) from None
-    floor = data.get("floor_m")
-    return Scene(
+    scene = Scene(
         name=str(data.get("name", Path(path).stem)),
         label_set=data["label_set"],
         objects=objects,
-        floor_m=None if floor is None else np.asarray(floor, dtype=np.float64),
+        floor_m=floor_m,
         extra=data.get("extra", {}),
     )
+    _check_numbers(path, scene)
+    return scene
+
+
+def _check_numbers(path: Path, scene: Scene) -> None:
+    for item in scene.objects:
+        if not np.isfinite([*item.center_m, *item.size_m]).all() or min(item.size_m) < 0:
+            raise InputError(
+                f"{path}: a {item.label} has centre {list(item.center_m)} and size "
+                f"{list(item.size_m)}; expected finite metres, and sizes not below 0."
+            )
+    floor = scene.floor_m
+    if floor is not None and (
+        floor.ndim != 2 or floor.shape[1] != 2 or len(floor) < 3 or not np.isfinite(floor).all()
+    ):
+        raise InputError(
+            f"{path}: floor_m has shape {floor.shape}; expected at least 3 corners [x, z] in "
+            "finite metres, or no floor_m."
+        )
 
 
 def _triple(values: Any) -> tuple[float, float, float]:

@@ -174,7 +174,8 @@ def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
     status, out, _ = command(*call, "--out", "made")
     assert (status, out) == (0, "Wrote 3 rooms to made\n")
     names = {f"seed5_000{k}.{kind}" for k in range(3) for kind in ("json", "glb", "png")}
-    assert {path.name for path in (tmp_path / "made").iterdir()} == names | {"overview.png"}
+    names |= {"overview.png", "latents.npz"}
+    assert {path.name for path in (tmp_path / "made").iterdir()} == names
     scene = json.loads((tmp_path / "made" / "seed5_0000.json").read_text())
     assert scene["label_set"] == "front3d_bedroom" and scene["units"] == "metres"
     command(*call, "--out", "again")

@@ -12,7 +12,7 @@ FILES = sorted(path for name in ("sceneprior", "data_prep") for path in (ROOT / 
 
 ROWS = {
     "geometry": 0, "silhouettes": 0, "classes": 0, "errors": 0, "files": 0, "config": 0,
-    "scene": 1, "batches": 1, "offscreen": 1, "shards": 1,
+    "scene": 1, "batches": 1, "offscreen": 1, "shards": 1, "furniture": 1, "instances": 1,
     "data": 2, "models": 2, "losses": 2,
     "data_prep": 3, "stages": 3,
     "evaluation": 4,
@@ -38,6 +38,7 @@ OWNERS = {
     ],
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
+    "sklearn": ["sceneprior/evaluation/"],
     "scipy.optimize": ["sceneprior/losses/matching.py", "sceneprior/evaluation/"],
     "cv2": ["data_prep/"],
     "distributed": ["data_prep/cluster.py"],

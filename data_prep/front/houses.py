@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data_prep.front.files import read_json
 from sceneprior.errors import InputError
+from sceneprior.files import read_json
 
 
 @dataclass(frozen=True)

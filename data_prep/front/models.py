@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from data_prep.cache import ByteCache
-from data_prep.front.files import MODEL_FILE, file_stamp, is_name, model_info_path, read_json
-from sceneprior.errors import InputError
+from sceneprior.files import file_stamp, is_name
+from sceneprior.furniture import MODEL_FILE, model_categories, read_obj
 from sceneprior.scene import Mesh
 
 _NO_FURNITURE_M = 10.0
@@ -32,7 +32,7 @@ class ModelBank:
 
     def __init__(self, folder: Path, cache_bytes: int = _CACHE_BYTES):
         self.folder = Path(folder)
-        self._categories = _read_model_info(self.folder)
+        self._categories = model_categories(self.folder)
         self._meshes = ByteCache[Mesh](
             cache_bytes, lambda mesh: mesh.vertices_m.nbytes + mesh.faces.nbytes
         )
@@ -90,59 +90,11 @@ def _longest(size: Any) -> float | None:
     return max(sides) if len(sides) == 3 and all(1e-3 < side < 1e3 for side in sides) else None
 
 
-def _read_model_info(folder: Path) -> dict[str, str]:
-    path = model_info_path(folder)
-    data = read_json(path)
-    try:
-        return {str(row["model_id"]): _category(row.get("category")) for row in data}
-    except (TypeError, KeyError, AttributeError) as error:
-        raise InputError(
-            f"{path} is not 3D-FUTURE's list of models ({type(error).__name__}: {error})."
-        ) from None
-
-
-def _category(text: Any) -> str:
-    return "others" if text is None else str(text).strip().lower().replace(" / ", "/")
-
-
 def _read_model(path: Path) -> Mesh:
     mesh = read_obj(path)
     if float(np.ptp(mesh.vertices_m, axis=0).max()) > _NO_FURNITURE_M:
         return Mesh(mesh.vertices_m / np.float32(100), mesh.faces)
     return mesh
-
-
-def read_obj(path: Path) -> Mesh:
-    """Vertices and triangles of a Wavefront OBJ, without materials, normals and unused vertices.
-
-    Raises:
-        InputError: the file cannot be read, or holds no triangle.
-    """
-    vertices: list[list[str]] = []
-    polygons: list[list[str]] = []
-    try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            for line in file:
-                if line.startswith("v "):
-                    vertices.append(line.split()[1:4])
-                elif line.startswith("f "):
-                    polygons.append([corner.split("/", 1)[0] for corner in line.split()[1:]])
-        points = np.array(vertices, dtype=np.float32).reshape(-1, 3)
-        corners = [
-            (polygon[0], polygon[i - 1], polygon[i])
-            for polygon in polygons
-            for i in range(2, len(polygon))
-        ]
-        faces = np.array(corners, dtype=np.int64).reshape(-1, 3)
-        # OBJ counts from 1, and from the end where negative (right for models of one group).
-        faces = np.where(faces < 0, faces + len(points), faces - 1)
-        used, faces = np.unique(faces, return_inverse=True)
-        points = points[used]
-    except (OSError, ValueError, IndexError, OverflowError) as error:
-        raise InputError(f"{path.parent.name}/{path.name} cannot be read ({error})") from None
-    if not len(used) or used[0] < 0 or not np.isfinite(points).all():
-        raise InputError(f"{path.parent.name}/{path.name} holds no usable triangles")
-    return Mesh(points, faces.reshape(-1, 3).astype(np.int32))
 
 
 def _mean_of_texture(folder: Path) -> tuple[int, int, int] | None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from data_prep.front.files import MODEL_FILE, is_name, shown
+from data_prep.front.files import shown
 from data_prep.front.geometry import (
     Surface,
     floor_of,
@@ -23,6 +23,8 @@ from data_prep.front.models import ModelBank, unit_of
 from data_prep.recipe import Recipe
 from data_prep.rooms import Furniture, Room
 from sceneprior.errors import InputError
+from sceneprior.files import is_name
+from sceneprior.furniture import MODEL_FILE
 from sceneprior.scene import Mesh
 
 _NO_MESH = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))

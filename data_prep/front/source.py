@@ -7,7 +7,7 @@ from typing import Any
 
 from data_prep.drawing import prepare_room
 from data_prep.filters import broken_rule
-from data_prep.front.files import file_stamp, house_files, model_info_path
+from data_prep.front.files import house_files
 from data_prep.front.houses import House, parse_house
 from data_prep.front.models import ModelBank
 from data_prep.front.rooms import HouseRooms, read_house
@@ -26,6 +26,8 @@ from data_prep.source import SPLITS, LeftOut, PreparedRoom, RoomTask, Survey, se
 from data_prep.viewpoints import view_counts
 from data_prep.workers import Run
 from sceneprior.errors import InputError
+from sceneprior.files import file_stamp
+from sceneprior.furniture import model_info_path
 from sceneprior.offscreen import Renderer
 
 _HOUSES_PER_TASK = 8

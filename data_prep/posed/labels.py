@@ -1,21 +1,13 @@
 """A table of instance ids and a label set in; the class of every id out."""
 
-import csv
-import io
 import json
-from collections.abc import Iterable
 from pathlib import Path
 
 from sceneprior.classes import LABEL_SETS, label_set_name
 from sceneprior.errors import InputError
+from sceneprior.instances.tables import read_class_table
 
 TABLES = ("classes.json", "classes.csv")
-SHELL = frozenset(
-    ["background", "wall", "floor", "ceiling", "door", "window", "blinds", "mirror", "picture"]
-)
-"""Classes of the room itself: nothing, unless the label set has them. Furniture stands against
-them in the image, and none of them hides it."""
-LARGEST_ID = 65_535
 
 
 def read_label_set(text: str) -> str:
@@ -63,67 +55,11 @@ def read_label_set(text: str) -> str:
 def read_classes(folder: Path) -> dict[int, str]:
     """Instance id -> class name, from a room's `classes.json` or `classes.csv`.
 
-    JSON is an object `{"1": "bed", "2": "chair"}`; CSV has rows `id,class` under a header or none.
-
     Raises:
-        InputError: there is no table, or two; it cannot be read; an id is no number from 1 to
-            65,535, or is there twice.
+        InputError: there is no table, or two; or see `read_class_table`.
     """
     found = [Path(folder) / name for name in TABLES if (Path(folder) / name).is_file()]
     if len(found) != 1:
         why = "has no classes.json or classes.csv" if not found else "has two tables of classes"
         raise InputError(f"{folder} {why}; one table says which class each instance id is.")
-    path = found[0]
-    try:
-        content = path.read_text(encoding="utf-8-sig")
-        pairs = _json_rows(path, content) if path.suffix == ".json" else _csv_rows(content)
-    except (OSError, ValueError, RecursionError, csv.Error) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path} cannot be read ({str(error)[:120]}).") from None
-    classes: dict[int, str] = {}
-    for key, name in pairs:
-        if not (key.isascii() and key.isdigit()) or not 0 < int(key[:9]) <= LARGEST_ID:
-            raise InputError(
-                f"{path}: '{key[:40]}' is no instance id; expected a number from 1 to {LARGEST_ID} "
-                "(0 is nothing)."
-            )
-        if int(key) in classes:
-            raise InputError(f"{path}: instance id {int(key)} is there twice.")
-        classes[int(key)] = name
-    if not classes:
-        raise InputError(f"{path} is empty; expected a class for each instance id.")
-    return classes
-
-
-def _json_rows(path: Path, content: str) -> Iterable[tuple[str, str]]:
-    # As pairs, so that a repeated key is seen.
-    data = json.loads(content, object_pairs_hook=list)
-    if (
-        not isinstance(data, list)
-        or not all(isinstance(row, tuple) for row in data)
-        or not all(isinstance(name, str) for _, name in data)
-    ):
-        raise InputError(
-            f'{path} is not an object of ids and class names, as {{"1": "bed", "2": "chair"}} is.'
-        )
-    return [(key.strip(), name) for key, name in data]
-
-
-def _csv_rows(content: str) -> Iterable[tuple[str, str]]:
-    rows = [row for row in csv.reader(io.StringIO(content)) if any(cell.strip() for cell in row)]
-    if rows and not rows[0][0].strip().isdigit():
-        rows = rows[1:]
-    for row in rows:
-        if len(row) < 2:
-            raise ValueError(f"a row '{row[0][:40]}' has no class")
-    return [(row[0].strip(), row[1]) for row in rows]
-
-
-def tidy(name: str) -> str:
-    """How names are compared: `Night_Stand` and `night stand` are one.
-
-    >>> tidy(" Night_Stand ")
-    'night stand'
-    """
-    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+    return read_class_table(found[0])

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_prep.observations import observe
-from data_prep.posed.ids import IdTable
-from data_prep.posed.masks import mask_size, read_mask
+from data_prep.posed.labels import read_classes
 from data_prep.posed.transforms import PosedFrame, Recording, lens_matrix, room_name
 from data_prep.scannet.frames import (
     choose_frames,
@@ -18,6 +16,9 @@ from data_prep.scannet.frames import (
 )
 from data_prep.source import PreparedRoom
 from sceneprior.errors import InputError
+from sceneprior.instances.observations import observe
+from sceneprior.instances.pngs import mask_size, read_mask
+from sceneprior.instances.tables import IdTable
 from sceneprior.shards import RoomViews
 
 UP_AXES = ("z", "y")
@@ -111,7 +112,7 @@ def prepare_posed(
         for count, what in ((choice.bad_poses, "no usable pose"), (choice.without_mask, "no PNG"))
         if count
     ]
-    table = IdTable(folder, label_set_name)
+    table = IdTable(read_classes(folder), label_set_name, str(folder))
     notes += table.notes
     images, lenses = [], []
     for frame in chosen:

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from torch.utils.data import DataLoader, Sampler
 
-from sceneprior.batches import SceneViews
 from sceneprior.data.dataset import BLANK, ViewDataset
+from sceneprior.data.truth import TruthDataset
 
 
 class DrawSampler(Sampler[list[tuple[int, int]]]):
@@ -49,14 +49,19 @@ class DrawSampler(Sampler[list[tuple[int, int]]]):
             yield [(int(row), self.epoch) for row in mine] or [(int(batch[0]), BLANK)]
 
 
-def _as_it_is(batch: Any) -> SceneViews:
+def _as_it_is(batch: Any) -> Any:
     return batch
 
 
 def make_loader(
-    dataset: ViewDataset, batch_size: int, seed: int, workers: int, rank: int = 0, world: int = 1
+    dataset: ViewDataset | TruthDataset,
+    batch_size: int,
+    seed: int,
+    workers: int,
+    rank: int = 0,
+    world: int = 1,
 ) -> DataLoader:
-    """A loader whose batches are whole `SceneViews`.
+    """A loader whose batches are whole `SceneViews`, or whole `RoomBoxes` of true boxes.
 
     `workers` read masks ahead. Without masks there is nothing to read: boxes and cameras are in
     memory, on the GPU perhaps, and no worker process stands between them and the step.

@@ -14,6 +14,8 @@ from sceneprior.shards import RoomViews, Shard, list_shards
 
 BLANK = -1
 """An epoch no one draws in: the room comes without objects, and teaches nothing."""
+TURNS = ("", "@90", "@180", "@270")
+"""What marks the id of a room that was turned about +y by so many quarters."""
 
 
 class ViewDataset(Dataset):
@@ -95,7 +97,7 @@ class ViewDataset(Dataset):
     @property
     def room_ids(self) -> tuple[str, ...]:
         """One id a row: the room's, with `@90` and so on for its turned copies."""
-        turns = ("", "@90", "@180", "@270")[: self.rotations]
+        turns = TURNS[: self.rotations]
         return tuple(room_id + turn for room_id in self._plain_ids for turn in turns)
 
     def to(self, device: torch.device | str) -> "ViewDataset":

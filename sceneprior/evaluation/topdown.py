@@ -142,22 +142,31 @@ def look_at(
     return matrix
 
 
-def perspective(
-    scene: Scene, renderer: Renderer, image_size: tuple[int, int] = (360, 480)
-) -> UInt8[np.ndarray, "height width 3"]:
-    """A shaded picture from above a corner, outside the room: for pages, not for scores.
+@dataclass(frozen=True)
+class CornerView:
+    """Where `perspective` looks from, and the floor it draws."""
 
-    The camera stands two room diagonals away; its lens is set so that the room just fits. The
-    floor is drawn as the rectangle around the known outline, or, where nobody knows it, around
-    the objects.
+    camera: Pinhole
+    image_size: tuple[int, int]
+    floor: Mesh
+
+
+def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480)) -> CornerView:
+    """From above a corner, outside: one view into which all these rooms just fit.
+
+    The camera stands two diagonals away. The floor is the rectangle around the known outlines,
+    or, where nobody knows them, around the objects.
 
     Args:
+        scenes: At least one room.
         image_size: (height, width) in pixels.
     """
-    meshes, (low, high) = scene_meshes(scene), _floor_rectangle(scene)
+    floors = np.array([_floor_rectangle(scene) for scene in scenes])
+    low, high = floors[:, 0].min(axis=0), floors[:, 1].max(axis=0)
     # 2 cm below y = 0, so that feet that stand on the floor do not flicker into it.
     center = ((low[0] + high[0]) / 2, -0.03, (low[1] + high[1]) / 2)
-    meshes.append(box_mesh(center, (high[0] - low[0], 0.02, high[1] - low[1])))
+    floor = box_mesh(center, (high[0] - low[0], 0.02, high[1] - low[1]))
+    meshes = [floor, *(mesh for scene in scenes for mesh in scene_meshes(scene))]
     points = np.concatenate([mesh.vertices_m for mesh in meshes])
     target, diagonal = (points.min(0) + points.max(0)) / 2, np.linalg.norm(np.ptp(points, axis=0))
     direction = np.array([0.42, 0.62, 0.66])  # of length 1.0
@@ -173,9 +182,30 @@ def perspective(
             [0, 0, 1],
         ]
     )
-    colors = np.concatenate([object_colors(scene), [[232, 228, 220]]]).astype(np.uint8)
-    camera = Pinhole(world_to_camera, intrinsics)
-    return renderer.shaded(meshes, colors, camera, image_size, BACKGROUND)
+    return CornerView(Pinhole(world_to_camera, intrinsics), image_size, floor)
+
+
+def perspective(
+    scene: Scene,
+    renderer: Renderer,
+    image_size: tuple[int, int] = (360, 480),
+    view: CornerView | None = None,
+    colors: UInt8[np.ndarray, "objects 3"] | None = None,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """A shaded picture from above a corner, outside the room: for pages, not for scores.
+
+    Args:
+        scene: The room.
+        renderer: From `sceneprior.offscreen.open_renderer`.
+        image_size: (height, width) in pixels, where no view is given.
+        view: None takes the room's own; one view for several rooms lets them be compared.
+        colors: Of the objects; None takes those of their classes.
+    """
+    view = view or corner_view([scene], image_size)
+    colors = object_colors(scene) if colors is None else colors
+    colors = np.concatenate([colors, [[232, 228, 220]]]).astype(np.uint8)
+    meshes = [*scene_meshes(scene), view.floor]
+    return renderer.shaded(meshes, colors, view.camera, view.image_size, BACKGROUND)
 
 
 def _floor_rectangle(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

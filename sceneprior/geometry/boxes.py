@@ -19,6 +19,23 @@ def unit_corners(like: Tensor) -> Float[Tensor, "8 3"]:
     return torch.cartesian_prod(side, side, side)
 
 
+def chamfered_cube(chamfers: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 32 3"]:
+    """The vertices of the cube [-1, 1]^3 with its edges cut off; they still touch all six sides.
+
+    Args:
+        chamfers: How far the upright and the level edges are cut, in [0, 1] of half a side:
+            (0, 0) is the cube, (1, 0) a prism over a diamond, (1, 1) an octahedron.
+    """
+    upright, level = (1 - chamfers).unsqueeze(-2).unbind(dim=-1)
+    x, y, z = unit_corners(chamfers).unbind(dim=-1)
+    rings = []
+    for across, along in ((x, upright * z), (upright * x, z)):
+        across, along = torch.broadcast_tensors(across, along)
+        rings.append(torch.stack([across, level * y, along], dim=-1))
+        rings.append(torch.stack([level * across, y.expand_as(across), level * along], dim=-1))
+    return torch.cat(rings, dim=-2)
+
+
 def place(
     canonical: Float[Tensor, "rooms objects vertices 3"],
     centers_m: Float[Tensor, "rooms objects 3"],

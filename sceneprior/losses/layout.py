@@ -9,6 +9,7 @@ from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.geometry.cameras import Boxes2D, camera_centers, pixel_rays
 from sceneprior.losses.completeness import completeness_targets
 from sceneprior.losses.matching import Matches, side_distance
+from sceneprior.losses.means import mean_of_objects
 from sceneprior.losses.processes import share_of_batch
 
 
@@ -28,7 +29,8 @@ def layout_losses(
     matches: Matches,
     hidden_overshoot: float = 1.0,
     completeness_target: str = "first_n",
-) -> dict[str, Float[Tensor, ""]]:
+    per_room: bool = False,
+) -> dict[str, Float[Tensor, "*rooms"]]:
     """The four terms of L_layout, each averaged over the objects it applies to.
 
     Where several processes train, over those of all processes: see `share_of_batch`.
@@ -40,6 +42,7 @@ def layout_losses(
         matches: Which prediction answers for which object.
         hidden_overshoot: See `side_distance`.
         completeness_target: `first_n` or `stop`; see `losses/completeness.py`.
+        per_room: Average over each room's objects alone: rooms that are fitted, not learnt from.
 
     Returns:
         `class`, `box`, `completeness` and `frustum`; weights are the caller's.
@@ -49,18 +52,22 @@ def layout_losses(
     centers = take(scenes.centers_m, matches.prediction, dim=1)
     seen = views.visible & matches.valid.unsqueeze(1)
     return {
-        "class": class_loss(scenes, views, matches),
-        "box": box_loss(predicted, views.boxes, views.sides_clear, seen & inside, hidden_overshoot),
-        "completeness": completeness_loss(scenes, views, completeness_target),
-        "frustum": frustum_loss(centers, views, seen & ~inside),
+        "class": class_loss(scenes, views, matches, per_room),
+        "box": box_loss(
+            predicted, views.boxes, views.sides_clear, seen & inside, hidden_overshoot, per_room
+        ),
+        "completeness": completeness_loss(scenes, views, completeness_target, per_room),
+        "frustum": frustum_loss(centers, views, seen & ~inside, per_room),
     }
 
 
-def class_loss(scenes: DecodedScenes, views: SceneViews, matches: Matches) -> Float[Tensor, ""]:
+def class_loss(
+    scenes: DecodedScenes, views: SceneViews, matches: Matches, per_room: bool = False
+) -> Float[Tensor, "*rooms"]:
     """Cross entropy between each object's class and the prediction that answers for it."""
     logits = take(scenes.class_logits, matches.prediction, dim=1)
     each = F.cross_entropy(logits.flatten(0, 1), views.object_class.flatten(), reduction="none")
-    return _mean(each, matches.valid.flatten())
+    return mean_of_objects(each.unflatten(0, logits.shape[:2]), matches.valid, per_room)
 
 
 def box_loss(
@@ -69,7 +76,8 @@ def box_loss(
     clear: Bool[Tensor, "rooms views objects 4"],
     counted: Bool[Tensor, "rooms views objects"],
     hidden_overshoot: float = 1.0,
-) -> Float[Tensor, ""]:
+    per_room: bool = False,
+) -> Float[Tensor, "*rooms"]:
     """L1 distance of 2D boxes (summed over x1, y1, x2, y2): mean over visible views, then objects.
 
     The same distance as in the matching cost (`side_distance`).
@@ -78,21 +86,27 @@ def box_loss(
         side_distance(predicted[..., i], target[..., i], clear[..., i], i, hidden_overshoot)
         for i in range(4)
     ]
-    return _mean_of_objects(torch.stack(apart).sum(dim=0), counted)
+    return _mean_of_views(torch.stack(apart).sum(dim=0), counted, per_room)
 
 
 def completeness_loss(
-    scenes: DecodedScenes, views: SceneViews, target: str = "first_n"
-) -> Float[Tensor, ""]:
+    scenes: DecodedScenes, views: SceneViews, target: str = "first_n", per_room: bool = False
+) -> Float[Tensor, "*rooms"]:
     """Binary cross entropy of the completeness scores of all predictions.
 
     Args:
         scenes: Predictions.
         views: Whose rooms have how many objects.
         target: What the scores should be; see `losses/completeness.py`.
+        per_room: One mean a room.
     """
     logits = scenes.completeness_logits
     wanted = completeness_targets(views.is_object.sum(dim=-1), logits.shape[1], target)
+    if per_room:
+        every = F.binary_cross_entropy_with_logits(
+            logits, wanted.to(logits.dtype), reduction="none"
+        )
+        return every.mean(dim=1)
     mean = F.binary_cross_entropy_with_logits(logits, wanted.to(logits.dtype))
     return mean * share_of_batch(views.is_object.any(dim=-1).sum())
 
@@ -101,7 +115,8 @@ def frustum_loss(
     centers_m: Float[Tensor, "rooms objects 3"],
     views: SceneViews,
     counted: Bool[Tensor, "rooms views objects"],
-) -> Float[Tensor, ""]:
+    per_room: bool = False,
+) -> Float[Tensor, "*rooms"]:
     """1 - cosine between the ray to a prediction and the ray through its object's 2D centre.
 
     Only views that see the object but not its prediction count (supplement B).
@@ -111,18 +126,14 @@ def frustum_loss(
     middle = (views.boxes[..., :2] + views.boxes[..., 2:]) / 2 * size
     target = pixel_rays(middle, views.world_to_camera, views.intrinsics)
     ray = centers_m.unsqueeze(1) - camera_centers(views.world_to_camera).unsqueeze(2)
-    return _mean_of_objects(1 - F.cosine_similarity(ray, target, dim=-1), counted)
+    return _mean_of_views(1 - F.cosine_similarity(ray, target, dim=-1), counted, per_room)
 
 
-def _mean_of_objects(
-    values: Float[Tensor, "rooms views objects"], counted: Bool[Tensor, "rooms views objects"]
-) -> Float[Tensor, ""]:
+def _mean_of_views(
+    values: Float[Tensor, "rooms views objects"],
+    counted: Bool[Tensor, "rooms views objects"],
+    per_room: bool,
+) -> Float[Tensor, "*rooms"]:
     weights = counted.to(values.dtype)
     per_object = (values * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
-    return _mean(per_object.flatten(), counted.any(dim=1).flatten())
-
-
-def _mean(values: Float[Tensor, " n"], counted: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-    weights = counted.to(values.dtype)
-    count = weights.sum()
-    return (values * weights).sum() / count.clamp(min=1) * share_of_batch(count)
+    return mean_of_objects(per_object, counted.any(dim=1), per_room)

@@ -27,6 +27,7 @@ def match_objects(
     views: SceneViews,
     box_weight: float = 5.0,
     hidden_overshoot: float = 1.0,
+    first_n: bool = True,
 ) -> Matches:
     """Find the cheapest one-to-one assignment of predictions to tracked objects.
 
@@ -41,25 +42,42 @@ def match_objects(
         views: What the cameras saw.
         box_weight: lambda_B.
         hidden_overshoot: See `side_distance`.
+        first_n: False lets all predictions take part: those that have no order.
 
     Raises:
         ValueError: a room holds more objects than the prior can generate.
     """
     cost = matching_cost(scenes, boxes_2d, views, box_weight, hidden_overshoot)
     counts = views.is_object.sum(dim=-1)
-    rooms, slots, objects = cost.shape
+    slots = cost.shape[1]
     if int(counts.max()) > slots:
         raise ValueError(
             f"A room holds {int(counts.max())} tracked objects but the prior generates "
             f"{slots}; set model.max_objects to at least {int(counts.max())}."
         )
-    prediction = torch.zeros(rooms, objects, dtype=torch.int64)
+    objects = counts.tolist()
+    predictions = objects if first_n else [slots] * len(objects)
+    prediction = assign(cost, predictions, objects)
+    return Matches(prediction, views.is_object & views.visible.any(dim=1))
+
+
+def assign(
+    cost: Float[Tensor, "rooms predictions objects"], predictions: list[int], objects: list[int]
+) -> Int[Tensor, "rooms objects"]:
+    """The prediction of each object, one to one, at the least total cost of each room.
+
+    Args:
+        cost: Of every pair; on any device.
+        predictions: How many predictions of each room take part, from the first on.
+        objects: How many objects each room has, no more than predictions; 0 stands for the rest.
+    """
+    prediction = torch.zeros(len(cost), cost.shape[2], dtype=torch.int64)
     # SciPy refuses what is not a number; the loss will be none either, and its check names rooms.
-    matrices = cost.nan_to_num().cpu().numpy()
-    for room, count in enumerate(counts.tolist()):
-        rows, columns = linear_sum_assignment(matrices[room, :count, :count])
+    matrices = cost.detach().nan_to_num().cpu().numpy()
+    for room, (count, many) in enumerate(zip(predictions, objects, strict=True)):
+        rows, columns = linear_sum_assignment(matrices[room, :count, :many])
         prediction[room, torch.from_numpy(columns)] = torch.from_numpy(rows)
-    return Matches(prediction.to(cost.device), views.is_object & views.visible.any(dim=1))
+    return prediction.to(cost.device)
 
 
 def side_distance(

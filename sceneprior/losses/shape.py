@@ -6,7 +6,7 @@ from torch.nn import functional as F
 
 from sceneprior.batches import SceneViews
 from sceneprior.losses.matching import Matches
-from sceneprior.losses.processes import share_of_batch
+from sceneprior.losses.means import mean_of_objects
 
 CERTAIN = 1e-6
 """Pixels of a mask this near to 0 or 1 carry no gradient."""
@@ -17,7 +17,8 @@ def mask_loss(
     views: SceneViews,
     matches: Matches,
     iou_gate: float = 0.5,
-) -> tuple[Float[Tensor, ""], dict[str, Float[Tensor, ""]]]:
+    per_room: bool = False,
+) -> tuple[Float[Tensor, "*rooms"], dict[str, Float[Tensor, "*rooms"]]]:
     """Binary cross entropy of visible masks, where prediction and observation overlap enough.
 
     Averaged over pixels, then over an object's views, then over objects; a mask whose IoU with
@@ -27,11 +28,12 @@ def mask_loss(
         rendered: Visible soft masks of all predictions.
         views: What the cameras saw, with `instance_ids` of the same height and width.
         matches: Which prediction answers for which object.
-        iou_gate: The paper's 0.5.
+        iou_gate: The paper's 0.5. Below 0 every mask counts.
+        per_room: Average over each room's objects alone; see `mean_of_objects`.
 
     Returns:
         The loss, and `mask_iou` (mean over all visible pairs) and `mask_used` (share gated in)
-        to log.
+        to log; with `per_room`, one of each a room.
     """
     seen = views.visible & matches.valid.unsqueeze(1)
     room, view, item = seen.nonzero(as_tuple=True)
@@ -45,10 +47,15 @@ def mask_loss(
     each = F.binary_cross_entropy(certain, observed, reduction="none").mean(dim=(1, 2))
     count = seen.sum(dim=1)
     share = 1 / count[room, item].to(mine.dtype)
-    objects = (count > 0).sum()
-    loss = (each * use * share).sum() / objects.clamp(min=1) * share_of_batch(objects)
-    pairs = max(len(room), 1)
-    return loss, {"mask_iou": iou.sum() / pairs, "mask_used": use.sum() / pairs}
+    per_object = mine.new_zeros(count.shape)
+    per_object = per_object.index_put((room, item), each * use * share, accumulate=True)
+    loss = mean_of_objects(per_object, count > 0, per_room)
+    if per_room:
+        pairs = count.sum(dim=1).clamp(min=1)
+        ious, used = (mine.new_zeros(len(count)).index_add(0, room, v) / pairs for v in (iou, use))
+    else:
+        ious, used = iou.sum() / max(len(room), 1), use.sum() / max(len(room), 1)
+    return loss, {"mask_iou": ious, "mask_used": used}
 
 
 def soft_iou(

@@ -38,6 +38,10 @@ class LatentSphere(nn.Module):
         """z = normalise(sum_i w_i phi_i), w = softmax(logits): positive weights that sum to 1."""
         return F.normalize(logits.softmax(dim=-1) @ self.anchors, dim=-1)
 
+    def onto(self, points: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
+        """The point of the sphere nearest to each point of space."""
+        return F.normalize(points, dim=-1)
+
     def nearness(
         self, some: Float[Tensor, "some dimension"], others: Float[Tensor, "others dimension"]
     ) -> Float[Tensor, "some others"]:
@@ -82,6 +86,10 @@ class LatentCube(nn.Module):
     def forward(self, logits: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
         """2 * Phi(x) - 1 is erf(x / sqrt(2))."""
         return self.half_edge * torch.erf(logits / math.sqrt(2))
+
+    def onto(self, points: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
+        """The point of the cube nearest to each point of space."""
+        return points.clamp(-self.half_edge, self.half_edge)
 
     def nearness(
         self, some: Float[Tensor, "some dimension"], others: Float[Tensor, "others dimension"]
@@ -143,7 +151,9 @@ def slerp_pairs(
     Raises:
         ValueError: two vectors are opposite, so that no geodesic is the shortest.
     """
-    angle = torch.acos((start * end).sum(dim=-1).clamp(-1, 1)).unsqueeze(-1)
+    # Not acos of the dot product, which in float32 knows no angle between pi - 3e-4 and pi.
+    apart, together = (start - end).norm(dim=-1), (start + end).norm(dim=-1)
+    angle = 2 * torch.atan2(apart, together).unsqueeze(-1)
     if bool((angle > torch.pi - 1e-4).any()):
         raise ValueError("The two latents are opposite points; any great circle joins them.")
     t = along.unsqueeze(-1)

@@ -1,5 +1,7 @@
 """A run's folder: what `fit` leaves in it, and the trained prior that tasks take out.
 
+`load_run` opens a run of our own kind, which has a latent space; `load_any_run` opens every kind.
+
 RUN/config.yaml            every setting, defaults included
 RUN/<stage>/last.ckpt      newest checkpoint of the stage: what `--resume` continues from
 RUN/<stage>/final.ckpt     the stage is done: what tasks take unless asked for `best`
@@ -8,6 +10,7 @@ RUN/<stage>/samples.json   the newest look's scores and the best so far; picture
 RUN/<stage>/metrics.csv    one line an epoch; TensorBoard's files lie beside it
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +22,27 @@ from torch import Tensor, nn
 from sceneprior.classes import label_set
 from sceneprior.config import RunConfig, load_config
 from sceneprior.errors import InputError
+from sceneprior.models.atiss import Atiss
 from sceneprior.models.scene_prior import ScenePrior
+from sceneprior.models.sync2gen import Sync2Gen
+from sceneprior.stages import atiss3d, sync2gen
 from sceneprior.stages.view_loss import build_latents, build_prior
 
-STAGES = ("layout", "shape")
-STAGES_OF = {"two": STAGES, "one": ("shape",)}
+STAGES_OF = {
+    "two": ("layout", "shape"),
+    "one": ("shape",),
+    "gan": ("gan",),
+    "atiss3d": ("atiss3d",),
+    "sync2gen": ("sync2gen",),
+}
 """What a run of `config.stages` trains, in order."""
+STAGES = tuple(dict.fromkeys(stage for stages in STAGES_OF.values() for stage in stages))
+"""Every stage there is; of two that a run has both, the later one last."""
+SAMPLERS: dict[str, Callable[[RunConfig], Atiss | Sync2Gen]] = {
+    "atiss3d": atiss3d.build_network,
+    "sync2gen": sync2gen.build_network,
+}
+"""The network of each stage whose runs are a `TrainedSampler`."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +54,30 @@ class TrainedPrior:
     room_ids: tuple[str, ...]
     config: RunConfig
     stage: str
+
+    @property
+    def remembers_rooms(self) -> bool:
+        """Whether training rooms have latents of their own; a GAN's have none."""
+        return len(self.logits) > 0
+
+    @property
+    def law(self) -> str:
+        """Where new latents come from unless a task says otherwise: the config's law, but where
+        there are no rooms to draw from, the law that the prior was trained under."""
+        return self.config.sampling.law if self.remembers_rooms else "paper"
+
+
+@dataclass(frozen=True)
+class TrainedSampler:
+    """A trained method that makes rooms of boxes from a seed alone: no room has a latent, and no
+    object a mesh."""
+
+    prior: Atiss | Sync2Gen
+    room_ids: tuple[str, ...]
+    config: RunConfig
+    stage: str
+
+    remembers_rooms = False
 
 
 def checkpoint_extra(config: RunConfig, room_ids: tuple[str, ...]) -> dict[str, Any]:
@@ -107,18 +149,42 @@ def restore(config: RunConfig, path: Path) -> tuple[ScenePrior, nn.Embedding, tu
         prior = build_prior(config, len(label_set(config.label_set)))
         latents = build_latents(config, len(room_ids))
         holder = nn.ModuleDict({"prior": prior, "latents": latents})
-        holder.load_state_dict(saved["state_dict"])
+        # What helped in training alone, such as a discriminator, has done its work.
+        weights = {k: v for k, v in saved["state_dict"].items() if k.split(".")[0] in holder}
+        holder.load_state_dict(weights)
     except (KeyError, RuntimeError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(
-            f"{path} does not fit the run's config.yaml ({reason}); use the config it was "
-            "trained with."
-        ) from None
+        raise _misfit(path, error) from None
     return prior, latents, room_ids
 
 
-def load_run(run: Path, checkpoint: str = "final") -> TrainedPrior:
-    """The trained prior of a run, in evaluation mode; `checkpoint` as in `find_checkpoint`.
+def restore_sampler(
+    config: RunConfig, stage: str, path: Path
+) -> tuple[Atiss | Sync2Gen, tuple[str, ...]]:
+    """Network and room ids of a checkpoint of a stage of `SAMPLERS`.
+
+    Raises:
+        InputError: the checkpoint is of another network.
+    """
+    saved = read_checkpoint(path)
+    try:
+        prior: Atiss | Sync2Gen = SAMPLERS[stage](config)
+        nn.ModuleDict({"prior": prior}).load_state_dict(saved["state_dict"])
+        return prior, tuple(saved["sceneprior"]["room_ids"])
+    except (KeyError, RuntimeError) as error:
+        raise _misfit(path, error) from None
+
+
+def _misfit(path: Path, error: Exception) -> InputError:
+    reason = " ".join(str(error).split())[:200]
+    return InputError(
+        f"{path} does not fit the run's config.yaml ({reason}); use the config it was trained with."
+    )
+
+
+def load_any_run(run: Path, checkpoint: str = "final") -> TrainedPrior | TrainedSampler:
+    """What a run of any kind trained, in evaluation mode; `checkpoint` as in `find_checkpoint`.
+
+    For tasks that only want new rooms (`tasks.decode.synthesize`).
 
     Raises:
         InputError: the folder is no run, or its checkpoint is missing or damaged.
@@ -126,7 +192,27 @@ def load_run(run: Path, checkpoint: str = "final") -> TrainedPrior:
     run = Path(run)
     stage, path = find_checkpoint(run, checkpoint)
     config = load_config(str(run / "config.yaml"))
+    if stage in SAMPLERS:
+        sampler, room_ids = restore_sampler(config, stage, path)
+        return TrainedSampler(sampler.eval().requires_grad_(False), room_ids, config, stage)
     prior, latents, room_ids = restore(config, path)
     return TrainedPrior(
         prior.eval().requires_grad_(False), latents.weight.detach(), room_ids, config, stage
     )
+
+
+def load_run(run: Path, checkpoint: str = "final") -> TrainedPrior:
+    """The trained prior of a run, in evaluation mode: for tasks that need its latent space.
+
+    Raises:
+        InputError: the folder is no run, its checkpoint is missing or damaged, or it is the run of
+            a baseline without a latent space.
+    """
+    trained = load_any_run(run, checkpoint)
+    if isinstance(trained, TrainedSampler):
+        raise InputError(
+            f"{run} is a run of `stages: {trained.config.stages}`, which has no latent space of "
+            "rooms, and this needs one. Take a run of `stages: two`; with this one, `sceneprior "
+            "synthesize`, `eval-fid` and `report` work."
+        )
+    return trained

@@ -22,7 +22,7 @@ from PIL import Image
 from sceneprior.config import RunConfig
 from sceneprior.errors import InputError
 from sceneprior.stages.callbacks import write_checkpoint
-from sceneprior.stages.runs import TrainedPrior
+from sceneprior.stages.runs import SAMPLERS, TrainedPrior, TrainedSampler
 
 LOW_IS_BETTER = ("category_kl", "objects_off", "overlaps")
 """Of the metrics that `samples.metric` may name; of the others high is better."""
@@ -39,7 +39,7 @@ class Verdict:
     """The split that the scores compare with."""
 
 
-Judge = Callable[[TrainedPrior], Verdict]
+Judge = Callable[[TrainedPrior | TrainedSampler], Verdict]
 
 
 class SampleWatch(Callback):
@@ -103,8 +103,10 @@ class SampleWatch(Callback):
         if trainer.is_global_zero:
             self._note(verdict, done)
 
-    def _prior_of(self, module: Any) -> TrainedPrior:
+    def _prior_of(self, module: Any) -> TrainedPrior | TrainedSampler:
         prior = copy.deepcopy(module.prior).cpu().eval().requires_grad_(False)
+        if self.stage in SAMPLERS:
+            return TrainedSampler(prior, self.room_ids, self.config, self.stage)
         logits = module.latents.weight.detach().cpu().clone()
         return TrainedPrior(prior, logits, self.room_ids, self.config, self.stage)
 

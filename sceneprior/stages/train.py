@@ -1,33 +1,35 @@
 """A config and a run folder in, trained stages out."""
 
-import csv
-import logging
-import os
 import signal
-import warnings
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from torch import nn
 
 from sceneprior.classes import label_set
 from sceneprior.config import RunConfig, dump_config, load_config
 from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
+from sceneprior.data.truth import TruthDataset
 from sceneprior.errors import InputError
 from sceneprior.models.scene_prior import ScenePrior
+from sceneprior.stages import atiss3d, sync2gen
 from sceneprior.stages.callbacks import RollingCheckpoint, RunProgress, StepSeed, write_checkpoint
 from sceneprior.stages.cluster import first_process, requeue_on_signal, slurm_plugins
+from sceneprior.stages.gan import GanStage
 from sceneprior.stages.layout import LayoutStage
+from sceneprior.stages.loggers import LOGGERS, make_logger, quiet_lightning
 from sceneprior.stages.runs import STAGES_OF, checkpoint_extra, restore
 from sceneprior.stages.samples import Judge, SampleWatch
 from sceneprior.stages.shape import ShapeStage
 from sceneprior.stages.view_loss import build_latents, build_prior
 
-LOGGERS = ("csv", "tensorboard", "wandb")
+FROM_VIEWS = {"layout": LayoutStage, "shape": ShapeStage, "gan": GanStage}
+"""Stages that learn a prior from what cameras saw, and all but the GAN latents beside it."""
+FROM_BOXES = {"atiss3d": atiss3d.build, "sync2gen": sync2gen.build}
+"""Baselines that learn from true boxes in 3D; the only ones to open the ground truth."""
 
 
 def fit(
@@ -38,7 +40,7 @@ def fit(
     trainer_options: dict[str, Any] | None = None,
     judge: Judge | None = None,
 ) -> None:
-    """Train the layout stage, then the shape stage; with `stages: one`, the latter from scratch.
+    """Train the stages of `config.stages`, one after the other (`runs.STAGES_OF`).
 
     Args:
         config: The run's settings.
@@ -100,25 +102,34 @@ def _fit_stage(
     judge: Judge | None,
 ) -> None:
     settings = getattr(config, stage)
-    dataset = _open_data(stage, config)
-    prior, latents = _start(config, dataset, previous)
-    module = {"layout": LayoutStage, "shape": ShapeStage}[stage](prior, latents, config)
+    dataset: ViewDataset | TruthDataset
+    module: lightning.LightningModule
+    room_ids: tuple[str, ...] = ()
+    if stage in FROM_BOXES:
+        dataset = _open_truth(config)
+        module = FROM_BOXES[stage](config, dataset)
+        room_ids = dataset.room_ids
+    else:
+        dataset = _open_data(stage, config)
+        prior, latents = _start(config, dataset, previous)
+        module = FROM_VIEWS[stage](prior, latents, config)
+        if len(latents.weight):
+            room_ids = dataset.room_ids
     folder = run / stage
-    rolling = RollingCheckpoint(folder, checkpoint_extra(config, dataset.room_ids))
+    rolling = RollingCheckpoint(folder, checkpoint_extra(config, room_ids))
     callbacks = [RunProgress(f"fit {stage} (epochs)"), StepSeed(config.seed)]
     if judge is not None and config.samples.every:
         # Before the rolling checkpoint, which holds the best so far.
-        callbacks.append(SampleWatch(folder, config, stage, dataset.room_ids, judge))
-    _quiet_lightning()
+        callbacks.append(SampleWatch(folder, config, stage, room_ids, judge))
+    quiet_lightning()
     lightning.seed_everything(config.seed, verbose=False)
     if settings.cpu_threads is not None:
         torch.set_num_threads(settings.cpu_threads)
     trainer = _trainer(
         trainer_options,
         max_epochs=settings.epochs,
-        gradient_clip_val=settings.clip_gradient or None,
-        logger=[_logger(name, folder) for name in loggers],
-        accumulate_grad_batches=settings.accumulate,
+        logger=[make_logger(name, folder) for name in loggers],
+        **_updates(stage, settings),
         callbacks=[*callbacks, rolling],
         plugins=slurm_plugins(),
         default_root_dir=folder,
@@ -128,6 +139,11 @@ def _fit_stage(
         use_distributed_sampler=False,
         log_every_n_steps=1,
     )
+    if stage == "gan" and trainer.world_size > 1:
+        raise InputError(
+            f"stages: gan trains in one process, but {trainer.world_size} were asked for; "
+            "use --devices 1."
+        )
     # Only now: a run that is refused leaves nothing behind.
     if trainer.is_global_zero:
         folder.mkdir(parents=True, exist_ok=True)
@@ -152,6 +168,15 @@ def _fit_stage(
     write_checkpoint(trainer, folder, "final.ckpt")
 
 
+def _updates(stage: str, settings: Any) -> dict[str, Any]:
+    if stage == "gan":
+        return {}  # two optimisers, which the module steps by itself
+    return {
+        "gradient_clip_val": settings.clip_gradient or None,
+        "accumulate_grad_batches": settings.accumulate,
+    }
+
+
 def _trainer(options: dict[str, Any], **settings: Any) -> lightning.Trainer:
     try:
         return lightning.Trainer(**settings, **options)
@@ -166,26 +191,41 @@ def _open_data(stage: str, config: RunConfig) -> ViewDataset:
     views = data.views_per_room
     if stage == "shape" and config.shape.views_per_room:
         views = config.shape.views_per_room
+    elif stage == "gan":
+        views = config.gan.views_per_room
     dataset = ViewDataset(
         Path(data.shards),
         "train",
         views_per_room=views,
         rotations=4 if data.augment_rotations else 1,
         view_fraction=data.view_fraction,
-        mask_step=data.mask_step if stage == "shape" else None,
+        mask_step=None if stage == "layout" else data.mask_step,
         seed=config.seed,
     )
+    _check_data(dataset, config)
+    return dataset
+
+
+def _open_truth(config: RunConfig) -> TruthDataset:
+    data = config.data
+    dataset = TruthDataset(Path(data.shards), "train", 4 if data.augment_rotations else 1)
+    _check_data(dataset, config)
+    return dataset
+
+
+def _check_data(dataset: ViewDataset | TruthDataset, config: RunConfig) -> None:
+    data = config.data
     if dataset.label_set != config.label_set:
         raise InputError(
             f"{data.shards} is labelled '{dataset.label_set}' but the config says "
             f"'{config.label_set}'; set label_set or point data.shards elsewhere."
         )
     if dataset.max_objects > config.model.max_objects:
+        what = "tracked objects" if isinstance(dataset, ViewDataset) else "objects"
         raise InputError(
-            f"A room of {data.shards} has {dataset.max_objects} tracked objects but "
+            f"A room of {data.shards} has {dataset.max_objects} {what} but "
             f"model.max_objects is {config.model.max_objects}; raise it."
         )
-    return dataset
 
 
 def _start(
@@ -193,7 +233,8 @@ def _start(
 ) -> tuple[ScenePrior, nn.Embedding]:
     if previous is None:
         prior = build_prior(config, len(label_set(config.label_set)))
-        return prior, build_latents(config, len(dataset))
+        # A GAN pairs no point of the latent space with a room.
+        return prior, build_latents(config, 0 if config.stages == "gan" else len(dataset))
     prior, latents, room_ids = restore(config, previous)
     if room_ids != dataset.room_ids:
         raise InputError(
@@ -201,33 +242,3 @@ def _start(
             "needs the shards that the layout stage was trained on."
         )
     return prior, latents
-
-
-def _logger(name: str, folder: Path) -> Logger:
-    if name == "csv":
-        return _csv_logger(folder)
-    if name == "tensorboard":
-        return TensorBoardLogger(folder, name="", version="")
-    from lightning.pytorch.loggers import WandbLogger
-
-    key = os.environ.get("WANDB_API_KEY") or Path("~/.netrc").expanduser().is_file()
-    return WandbLogger(project="sceneprior", save_dir=folder, name=folder.name, offline=not key)
-
-
-def _csv_logger(folder: Path) -> CSVLogger:
-    # Lightning's deletes what it finds: hand it the rows of the epochs before the stop.
-    path = folder / "metrics.csv"
-    before = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
-    logger = CSVLogger(folder, name="", version="")
-    if before and first_process():
-        logger.experiment.metrics.extend(before)
-        logger.save()
-    return logger
-
-
-def _quiet_lightning() -> None:
-    # Its hints (loader workers, litlogger, cores) are for other set-ups than this one.
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", module="lightning")
-    torch.set_float32_matmul_precision("high")

@@ -8,15 +8,17 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 from torch import distributed as dist
 
-from sceneprior.batches import DecodedScenes, SceneViews
-from sceneprior.config import LossConfig, RunConfig, StageConfig
-from sceneprior.geometry.boxes import box_corners, place
+from sceneprior.batches import DecodedScenes, RoomBoxes, SceneViews
+from sceneprior.config import LossConfig, RunConfig, ShapeConfig, StageConfig
+from sceneprior.geometry.boxes import box_corners, chamfered_cube, place
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.losses.layout import layout_losses
 from sceneprior.losses.matching import Matches, match_objects
+from sceneprior.losses.shape import observed_ids
 from sceneprior.models.scene_prior import ScenePrior
+from sceneprior.silhouettes.render import render_silhouettes
 
 POINTS_LEVEL = 2
 """`ellipsoid_points` are 162: spheres 0.6% too small, 1.7% in the worst direction."""
@@ -30,6 +32,9 @@ def proxy_boxes(scenes: DecodedScenes, views: SceneViews, proxy: str) -> Boxes2D
         return boxes_of_ellipsoids(centers_m, sizes_m, cameras, lenses, views.image_size)
     if proxy == "box":
         points_m = box_corners(centers_m, sizes_m)
+    elif proxy == "bulge":
+        assert scenes.chamfers is not None, "decode() gives every object chamfers"
+        points_m = place(chamfered_cube(scenes.chamfers), centers_m, sizes_m)
     else:
         sphere = icosphere(POINTS_LEVEL)[0].to(centers_m)
         points_m = place(sphere.expand(*centers_m.shape[:2], -1, -1), centers_m, sizes_m)
@@ -37,23 +42,78 @@ def proxy_boxes(scenes: DecodedScenes, views: SceneViews, proxy: str) -> Boxes2D
 
 
 def match_and_score(
-    scenes: DecodedScenes, boxes: Boxes2D, views: SceneViews, weights: LossConfig
-) -> tuple[dict[str, Float[Tensor, ""]], Matches]:
-    """Match predictions to tracked objects by their 2D boxes and take the layout losses."""
-    matches = match_objects(scenes, boxes, views, weights.match_box, weights.hidden_overshoot)
+    scenes: DecodedScenes,
+    boxes: Boxes2D,
+    views: SceneViews,
+    weights: LossConfig,
+    per_room: bool = False,
+    matches: Matches | None = None,
+) -> tuple[dict[str, Float[Tensor, "*rooms"]], Matches]:
+    """Match predictions to tracked objects by their 2D boxes and take the layout losses.
+
+    Args:
+        scenes, boxes: Predictions, and where the views would see them.
+        views: What the cameras saw.
+        weights: Of the run.
+        per_room: Losses of each room alone.
+        matches: To keep; None matches anew.
+    """
+    if matches is None:
+        matches = match_objects(scenes, boxes, views, weights.match_box, weights.hidden_overshoot)
     losses = layout_losses(
-        scenes, boxes, views, matches, weights.hidden_overshoot, weights.completeness_target
-    )
+        scenes, boxes, views, matches, weights.hidden_overshoot, weights.completeness_target,
+        per_room,
+    )  # fmt: skip
     return losses, matches
 
 
-def weighted_sum(losses: dict[str, Tensor], weights: LossConfig) -> Float[Tensor, ""]:
-    """The total that is minimised."""
+def seen_boxes(scenes: DecodedScenes, views: SceneViews, settings: ShapeConfig) -> Boxes2D:
+    """2D boxes of decoded objects: of their meshes where there are any (`ShapeConfig.box_from`)."""
+    if settings.box_from == "proxy" or scenes.vertices_m is None:
+        return proxy_boxes(scenes, views, settings.proxy)
+    return boxes_of_points(
+        scenes.vertices_m, views.world_to_camera, views.intrinsics, views.image_size
+    )
+
+
+def seen_masks(
+    vertices_m: Float[Tensor, "rooms objects vertices 3"],
+    faces: Int[Tensor, "faces 3"],
+    views: SceneViews,
+    settings: ShapeConfig,
+) -> Float[Tensor, "rooms views objects height width"]:
+    """Soft visible masks of decoded objects, at the size of the views' instance ids.
+
+    Only the first n predictions of a room of n objects are drawn: they answer for objects, and
+    the rest would hide them.
+    """
+    slots = torch.arange(vertices_m.shape[1], device=vertices_m.device)
+    height, width = observed_ids(views).shape[-2:]
+    scale = views.intrinsics.new_tensor(
+        [width / views.image_size[1], height / views.image_size[0], 1]
+    )
+    return render_silhouettes(
+        vertices_m,
+        faces,
+        views.world_to_camera,
+        views.intrinsics * scale[:, None],
+        (height, width),
+        sigma_px2=settings.sigma_px2,
+        mode=settings.silhouettes,
+        compositing=settings.compositing,
+        drawn=slots < views.is_object.sum(dim=-1, keepdim=True),
+    )
+
+
+def weighted_sum(
+    losses: dict[str, Float[Tensor, "*rooms"]], weights: LossConfig
+) -> Float[Tensor, "*rooms"]:
+    """The total that is minimised: one number, or one a room."""
     by_name = weights.model_dump(by_alias=True)
-    return torch.stack([by_name[name] * loss for name, loss in losses.items()]).sum()
+    return torch.stack([by_name[name] * loss for name, loss in losses.items()]).sum(dim=0)
 
 
-def check_finite(total: Tensor, views: SceneViews) -> None:
+def check_finite(total: Tensor, views: SceneViews | RoomBoxes) -> None:
     """Stop at the first loss that is not a number, and name the rooms that made it.
 
     Several processes stop together: one that stopped alone would leave the others waiting.
@@ -140,12 +200,14 @@ def build_optimizer(
 ) -> OptimizerLRSchedulerConfig:
     """Adam with the stage's schedule over `steps` updates, in the shape Lightning takes."""
     fresh = list(prior.shape.parameters())
-    trained = [item for name, item in prior.named_parameters() if not name.startswith("shape.")]
+    tables = [*latents.parameters(), *prior.chamfers.parameters()]
+    others = ("shape.", "chamfers.")
+    trained = [item for name, item in prior.named_parameters() if not name.startswith(others)]
     fresh_rate = getattr(stage, "decoder_learning_rate", None) or stage.learning_rate
     groups = [
         {"params": trained, "lr": stage.learning_rate},
         {"params": fresh, "lr": fresh_rate},
-        {"params": list(latents.parameters()), "lr": stage.latent_learning_rate},
+        {"params": tables, "lr": stage.latent_learning_rate},
     ]
     optimizer = torch.optim.Adam(groups, fused=True)
     if stage.schedule == "cosine":

@@ -55,6 +55,19 @@ def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> No
     _write_whole(folder / f"{name}.json", lambda path: path.write_text(text))
 
 
+def check_free(folder: Path, overwrite: bool = False) -> None:
+    """See that nothing would be written over unasked.
+
+    Raises:
+        InputError: it is a file, or holds something and `overwrite` is false.
+    """
+    folder = Path(folder)
+    if folder.is_file():
+        raise InputError(f"{folder} is a file; name a folder.")
+    if not overwrite and folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder} is not empty; add --overwrite or name another folder.")
+
+
 def write_scenes(
     scenes: Sequence[Scene], folder: Path, renderer: Renderer, overwrite: bool = False
 ) -> None:
@@ -63,14 +76,12 @@ def write_scenes(
     Raises:
         InputError: the folder holds something and `overwrite` is false.
     """
-    folder = Path(folder)
-    if not overwrite and folder.is_dir() and any(folder.iterdir()):
-        raise InputError(f"{folder} is not empty; add --overwrite or name another folder.")
+    check_free(folder, overwrite)
     with Progress(console=Console(stderr=True)) as progress:
         for scene in progress.track(scenes, description="Writing scenes"):
             write_scene(scene, folder, scene.name, renderer)
     sheet = Image.fromarray(overview(scenes[:OVERVIEW_ROOMS], renderer))
-    _write_whole(folder / "overview.png", lambda path: sheet.save(path, format="PNG"))
+    _write_whole(Path(folder) / "overview.png", lambda path: sheet.save(path, format="PNG"))
 
 
 def overview(scenes: Sequence[Scene], renderer: Renderer) -> UInt8[np.ndarray, "height width 3"]:

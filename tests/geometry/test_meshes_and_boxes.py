@@ -4,9 +4,10 @@ import itertools
 
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 from torch.testing import assert_close
 
-from sceneprior.geometry.boxes import box_corners, place, unit_corners
+from sceneprior.geometry.boxes import box_corners, chamfered_cube, place, unit_corners
 from sceneprior.geometry.meshes import icosphere, to_cube
 
 
@@ -49,6 +50,35 @@ def test_box_corners_are_center_plus_minus_half_a_size():
     ]
     assert_close(box_corners(center, size), torch.tensor(by_hand))
     assert box_corners(torch.zeros(2, 5, 3), torch.ones(2, 5, 3)).shape == (2, 5, 8, 3)
+
+
+def test_a_chamfered_cube_without_chamfers_is_the_cube():
+    vertices = chamfered_cube(torch.zeros(2, 5, 2))
+    assert vertices.shape == (2, 5, 32, 3)
+    assert {tuple(v) for v in vertices[1, 3].tolist()} == set(itertools.product((-1, 1), repeat=3))
+
+
+@pytest.mark.parametrize(
+    "upright, level, volume",
+    [
+        (0.0, 0.0, 8.0),
+        (1.0, 0.0, 4.0),  # a prism over the diamond of area 2
+        (1.0, 1.0, 4 / 3),  # an octahedron
+        # Below |y| = 1 - b the octagon of area 4 - 2 a^2; above it shrinks evenly to 1 - b of it.
+        (0.4, 0.5, (4 - 2 * 0.4**2) * 2 * (0.5 + 0.5 * (1 + 0.5 + 0.25) / 3)),
+    ],
+)
+def test_a_chamfered_cube_touches_all_six_sides_and_has_its_volume(upright, level, volume):
+    vertices = chamfered_cube(torch.tensor([upright, level], dtype=torch.float64))
+    one = torch.ones(3, dtype=torch.float64)
+    assert_close(vertices.amax(dim=0), one)
+    assert_close(vertices.amin(dim=0), -one)
+    assert ConvexHull(vertices.numpy()).volume == pytest.approx(volume)
+
+
+def test_gradients_of_chamfers_in_double_precision():
+    chamfers = torch.tensor([[0.2, 0.7], [0.5, 0.1]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(chamfered_cube, chamfers)
 
 
 def test_place_puts_the_unit_cube_into_the_box():

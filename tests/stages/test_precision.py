@@ -30,7 +30,7 @@ def watched(monkeypatch) -> list[tuple]:
 
     watch(layout, "match_and_score", predicted)
     watch(shape, "match_and_score", predicted)
-    watch(shape, "render_silhouettes", lambda args: args[:1])
+    watch(shape, "seen_masks", lambda args: args[:1])
     return seen
 
 
@@ -39,7 +39,7 @@ def test_bfloat16_stops_at_the_network(toy_shards, tmp_path, watched):
     full = record(config, tmp_path / "full", 1)
     watched.clear()
     mixed = record(config, tmp_path / "mixed", 1, precision="bf16-mixed")
-    assert {name for name, _, _ in watched} == {"match_and_score", "render_silhouettes"}
+    assert {name for name, _, _ in watched} == {"match_and_score", "seen_masks"}
     for _, types, autocast in watched:
         assert set(types) == {torch.float32} and not autocast
     one, other = (

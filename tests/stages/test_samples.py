@@ -160,8 +160,8 @@ def test_every_logger_gets_scores_and_pictures(toy_shards, tmp_path, monkeypatch
             return fakes.setdefault(folder.name, FakeWandb())
         return usual(name, folder)
 
-    usual = train._logger
-    monkeypatch.setattr(train, "_logger", logger)
+    usual = train.make_logger
+    monkeypatch.setattr(train, "make_logger", logger)
     monkeypatch.setattr(samples, "WandbLogger", FakeWandb)
     judge = Told(category_kl=[0.5, 0.2, 0.9, 0.3], objects=[4, 5, 6, 7])
     loggers = ("csv", "tensorboard", "wandb")

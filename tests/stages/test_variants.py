@@ -17,7 +17,14 @@ from sceneprior.stages.runs import load_run, read_checkpoint
 from sceneprior.stages.train import fit
 from sceneprior.stages.view_loss import build_prior
 from sceneprior.tasks.decode import decode_training_rooms, synthesize
-from sceneprior.tasks.judge import UNFOLDING_STEPS, decoded_and_true, judge_run, read_curves, unfold
+from sceneprior.tasks.judge import (
+    UNFOLDING_STEPS,
+    Judging,
+    decoded_and_true,
+    judge_run,
+    read_curves,
+    unfold,
+)
 from sceneprior.tasks.sampling import LAWS
 
 CPU = {"accelerator": "cpu", "devices": 1}
@@ -35,6 +42,7 @@ VARIANTS = {
     "c1_uniform": {"model__latent": "uniform", "layout__latent_noise": 0.1},
     "c2_lstm": {"model__decoder": "lstm"},
     "c3_one_stage": {"stages": "one", "shape__epochs": 5},
+    "bulge": {"layout__proxy": "bulge", "shape__box_from": "proxy", "shape__proxy": "bulge"},
     "released": RELEASED,
 }
 
@@ -67,6 +75,12 @@ def test_a_variant_learns(variant):
     ]
     assert losses[-1] < losses[0]
     assert all(torch.isfinite(torch.tensor(value)) for _, value in curves["shape/mask"])
+
+
+def test_chamfers_are_learnt_by_the_bulge_alone(variant):
+    name, _, run = variant
+    moved = (load_run(run).prior.chamfers.logits != -2).any(dim=1)
+    assert moved.any() if name == "bulge" else not moved.any()
 
 
 def test_a_variant_is_decoded_sampled_and_interpolated(variant):
@@ -117,7 +131,7 @@ def test_a_variant_is_judged(toy_shards, tmp_path, name):
     changes = {**FAST, **VARIANTS[name], "layout__epochs": 1, "shape__epochs": 1}
     run = tmp_path / "run"
     fit(tiny_config(toy_shards, **changes), run, trainer_options=CPU)
-    scores = judge_run(run, 4, 0, None, None, run / "scores.json", None, "software")
+    scores = judge_run(run, 4, 0, None, run / "scores.json", None, Judging(renderer="software"))
     assert scores["protocol"]["stage"] == "shape"
     assert 0 <= scores["box_iou_3d"] <= 1
 

@@ -10,8 +10,7 @@ from toy_rooms import look_at
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.config import ShapeConfig, StageConfig
 from sceneprior.geometry.cameras import boxes_of_points
-from sceneprior.stages.shape import ShapeStage
-from sceneprior.stages.view_loss import build_latents, build_prior, proxy_boxes
+from sceneprior.stages.view_loss import build_latents, build_prior, proxy_boxes, seen_boxes
 
 
 @pytest.fixture
@@ -28,6 +27,7 @@ def seen() -> tuple[DecodedScenes, SceneViews]:
         centers_m=torch.rand(rooms, objects, 3, generator=generator) * 2 - 1,
         sizes_m=torch.rand(rooms, objects, 3, generator=generator) + 0.2,
         completeness_logits=torch.zeros(rooms, objects),
+        chamfers=torch.full((rooms, objects, 2), 0.3),
     )
     return scenes, SceneViews(
         room_index=torch.arange(rooms),
@@ -58,7 +58,7 @@ def test_a_box_holds_the_ellipsoid_and_that_its_points(seen):
 def test_every_proxy_of_the_config_has_boxes_of_its_own(seen):
     proxies = StageConfig.model_fields["proxy"].annotation.__args__
     boxes = [proxy_boxes(*seen, proxy).boxes for proxy in proxies]
-    assert len(proxies) == 3
+    assert len(proxies) == 4
     for i, one in enumerate(boxes):
         assert all(not torch.equal(one, other) for other in boxes[:i])
 
@@ -71,9 +71,9 @@ def test_the_papers_proxy_is_the_smooth_ellipsoid():
 @pytest.mark.parametrize("box_from", ["mesh", "proxy"])
 def test_the_shape_stage_takes_boxes_from_where_it_is_told(seen, tmp_path, box_from):
     config = tiny_config(tmp_path, shape__box_from=box_from, shape__proxy="ellipsoid")
-    stage = ShapeStage(build_prior(config, classes=5), build_latents(config, rooms=2), config)
-    scenes = stage.prior.decode(stage.prior.sphere(stage.latents.weight))
-    found = stage._boxes(scenes, seen[1])
+    prior = build_prior(config, classes=5)
+    scenes = prior(build_latents(config, rooms=2).weight)
+    found = seen_boxes(scenes, seen[1], config.shape)
     if box_from == "proxy":
         expected = proxy_boxes(scenes, seen[1], "ellipsoid")
     else:

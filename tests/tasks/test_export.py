@@ -12,7 +12,7 @@ from sceneprior.classes import class_colors
 from sceneprior.errors import InputError
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.offscreen import open_renderer
-from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.scene import Mesh, Scene, SceneObject, scene_to_json
 from sceneprior.tasks.export import (
     OVERVIEW_TILE,
     load_scene,
@@ -157,3 +157,28 @@ def test_an_overview_holds_each_room_in_its_place(renderer):
     tiles = sheet.reshape(2, height, 4, width, 3).swapaxes(1, 2).reshape(8, -1, 3)
     colourful = (np.ptp(tiles.astype(int), axis=-1) > 60).sum(axis=1)
     assert colourful[4] > 1000 and not np.delete(colourful, 4).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"center_m": [0.0, float("nan"), 0.0]}, r"a desk has centre \[0\.0, nan, 0\.0\]"),
+        ({"size_m": [1.0, -1.0, 1.0]}, "sizes not below 0"),
+        ({"center_m": [0.0, 1.0]}, "is not a scene JSON"),
+    ],
+)
+def test_numbers_that_no_room_has_are_refused(tmp_path, change, sentence):
+    desk = SceneObject("desk", (0.0, 0.4, 0.0), (1.0, 0.8, 0.5))
+    data = scene_to_json(Scene("a", "front3d_bedroom", (desk,)))
+    data["objects"][0] |= change
+    (tmp_path / "a.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=sentence):
+        load_scene(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("floor", [[[0, 0], [1, 0]], [1, 2, 3], "here", [[0, 0], [1], [2, 2]]])
+def test_floors_that_are_no_outline_are_refused(tmp_path, floor):
+    data = scene_to_json(Scene("a", "front3d_bedroom")) | {"floor_m": floor}
+    (tmp_path / "a.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=r"a\.json(: floor_m has shape| is not a scene JSON)"):
+        load_scene(tmp_path / "a.json")

@@ -78,7 +78,7 @@ def test_rooms_decoded_as_they_are_have_the_masks_that_were_seen(toy_run, toy_sh
         def decode(logits_, with_shape):
             template = shape.template.expand(rooms, slots, -1, -1)
             vertices = place(template, centers, sizes) if with_shape else None
-            return DecodedScenes(logits, centers, sizes, torch.ones(rooms, slots), vertices)
+            return DecodedScenes(logits, centers, sizes, torch.ones(rooms, slots), None, vertices)
 
         monkeypatch.setattr(trained.prior, "forward", decode)
         return mask_iou_of_rooms(replace(trained, stage=stage), views)

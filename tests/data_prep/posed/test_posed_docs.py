@@ -47,12 +47,13 @@ def test_the_example_runs_as_printed(tmp_path, monkeypatch):
 
 
 def test_every_key_that_is_read_is_in_the_document():
-    from data_prep.posed import labels, transforms
+    from data_prep.posed import transforms
+    from sceneprior.instances import tables
 
     text = DOCUMENT.read_text()
     for key in re.findall(r"`([^`]+)`", transforms.__doc__):
         for word in key.split():
             spelt = word if not re.fullmatch(r"k[23]", word) else "`k1` to `k4`"
             assert spelt in text, word
-    for name in labels.SHELL:
+    for name in tables.SHELL:
         assert f"`{name}`" in text

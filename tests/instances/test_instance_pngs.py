@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_prep.posed.masks import mask_size, read_mask
 from sceneprior.errors import InputError
+from sceneprior.instances.pngs import mask_size, read_mask
 
 IDS = np.array([[0, 1, 2], [7, 200, 255]])
 
@@ -52,8 +52,8 @@ def test_what_is_no_png(path):
         mask_size(path)
 
 
-def test_damage_is_a_sentence(path, numbers):
-    ids = numbers.integers(0, 256, (60, 80)).astype(np.uint8)
+def test_damage_is_a_sentence(path, rng):
+    ids = rng.integers(0, 256, (60, 80)).astype(np.uint8)
     Image.fromarray(ids).save(path)
     whole = path.read_bytes()
     for end in (30, 60, len(whole) // 2, len(whole) - 30):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from data_prep.observations import observe, pixel_counts
+from sceneprior.instances.observations import observe, pixel_counts
 
 
 def paint(height, width, *rectangles):

@@ -1,5 +1,6 @@
 """Label what each camera saw: instance-id images in, 2D boxes, visibility and tracks out."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +37,7 @@ def pixel_counts(image: np.ndarray, count: int) -> np.ndarray:
     return np.bincount(image.ravel(), minlength=count + 1)[1 : count + 1]
 
 
-def observe(images: np.ndarray, is_object: np.ndarray) -> Observations:
+def observe(images: np.ndarray, is_object: np.ndarray | Sequence[bool]) -> Observations:
     """Measure every mask, and number anew the objects that are ever visible.
 
     Args:

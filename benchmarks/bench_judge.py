@@ -1,0 +1,89 @@
+"""Time the judging of rooms: synthesize, draw, read, score; where the seconds go.
+
+Run `python benchmarks/bench_judge.py --run RUN [--shards SHARDS] [-n 1000]`. CPU seconds of all
+threads are stated beside wall-clock seconds: on a busy machine only the former mean something.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.console import Console
+from rich.table import Table
+
+from sceneprior.evaluation.protocol import evaluate_synthesis
+from sceneprior.offscreen import open_renderer
+from sceneprior.stages.runs import load_run
+from sceneprior.tasks.decode import synthesize
+
+T = TypeVar("T")
+
+
+def measure(work: Callable[[], T]) -> tuple[T, dict[str, float]]:
+    """The result, and seconds of this process's threads and of the clock."""
+    cpu, wall = time.process_time(), time.perf_counter()
+    result = work()
+    return result, {
+        "cpu_s": round(time.process_time() - cpu, 2),
+        "wall_s": round(time.perf_counter() - wall, 2),
+    }
+
+
+def judge_seconds(run: Path, shards: Path | None, count: int, renderer: str) -> dict[str, Any]:
+    """Seconds of synthesis and of scoring, without and with a reference file.
+
+    Returns:
+        `synthesize`, `score`, `write_reference` (its first use), `score_with_reference` and
+        `without_intervals`, each with `cpu_s` and `wall_s`; printed as they come, too.
+    """
+    seconds: dict[str, Any] = {}
+
+    def timed(name: str, work: Callable[[], T]) -> T:
+        result, seconds[name] = measure(work)
+        print(name, seconds[name], flush=True)
+        return result
+
+    trained = timed("load", lambda: load_run(run))
+    folder = shards or Path(trained.config.data.shards)
+    scenes = timed("synthesize", lambda: synthesize(trained, count, seed=0))
+    screen = open_renderer(renderer)
+
+    def score(name: str, **options: Any) -> None:
+        timed(name, lambda: evaluate_synthesis(scenes, folder, renderer=screen, **options))
+
+    evaluate_synthesis(scenes[:2], folder, renderer=screen, resamples=0)  # compiles, loads, warms
+    score("score")
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "reference.npz"
+        score("write_reference", reference=path)
+        score("score_with_reference", reference=path)
+        score("without_intervals", reference=path, resamples=0)
+    return seconds
+
+
+def main() -> None:
+    """Print the table, and write it as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--run", type=Path, required=True)
+    parser.add_argument("--shards", type=Path)
+    parser.add_argument("-n", "--count", type=int, default=1000)
+    parser.add_argument("--renderer", default="auto")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    seconds = judge_seconds(arguments.run, arguments.shards, arguments.count, arguments.renderer)
+    table = Table(title=f"Judging {arguments.count} rooms")
+    for heading in ("", "CPU s", "wall s"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for name, taken in seconds.items():
+        table.add_row(name.replace("_", " "), f"{taken['cpu_s']:.1f}", f"{taken['wall_s']:.1f}")
+    Console().print(table)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(seconds, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

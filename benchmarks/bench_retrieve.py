@@ -1,0 +1,144 @@
+"""How long do 1,000 scenes of 6 objects against 5,000 CAD models take, and is the winner right?
+
+    python benchmarks/bench_retrieve.py [--scenes 1000] [--models 5000] [--checked 40] [--json FILE]
+
+Made in memory by --seed: models are pieces of two to seven blocks, objects are spheres of 2,562
+vertices drawn onto other such pieces, much as the shape decoder's meshes lie on furniture. Models
+fall to the classes as 3D-FUTURE's do (the table that ships with the package), and so do objects, so
+that large shelves are asked most. Timed is the search alone, meshes in, meshes out: `retrieve_all`,
+a thread a core. --checked objects are searched again the slow way, all models by all points.
+"""
+
+import argparse
+import csv
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sceneprior.furniture import CATEGORY_TABLE
+from sceneprior.geometry.meshes import icosphere
+from sceneprior.geometry.surfaces import surface_points
+from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.tasks.cad_bank import POINTS, CadBank, Shelf, unit_mesh
+from sceneprior.tasks.retrieve import extruded, most_similar, retrieve_all
+
+OBJECTS = 6
+LABEL_SET = "front3d_bedroom"
+_CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
+_FACES = np.array(
+    [
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ]
+)  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--scenes", type=int, default=1000)
+    parser.add_argument("--models", type=int, default=5000)
+    parser.add_argument("--checked", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    rng = np.random.default_rng(arguments.seed)
+    shares = class_shares()
+    start = time.perf_counter()
+    bank = make_bank(arguments.models, shares, rng)
+    made = time.perf_counter() - start
+    scenes = [make_scene(f"scene_{k:04d}", shares, rng) for k in range(arguments.scenes)]
+    wall, cpu = time.perf_counter(), time.process_time()
+    for _ in retrieve_all(scenes, bank):
+        pass
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    objects = arguments.scenes * OBJECTS
+    figures = {
+        "scenes": arguments.scenes,
+        "objects": objects,
+        "models": arguments.models,
+        "largest_shelf": max(len(shelf.model_ids) for shelf in bank.shelves.values()),
+        "points": POINTS,
+        "cores": os.cpu_count(),
+        "bank_s": round(made, 1),
+        "wall_s": round(wall, 1),
+        "cpu_s": round(cpu, 1),
+        "cpu_ms_per_object": round(1000 * cpu / objects, 1),
+        **check(scenes, bank, arguments.checked),
+    }
+    print(json.dumps(figures, indent=1))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+def class_shares() -> dict[str, float]:
+    """How 3D-FUTURE's models fall to the classes of bedrooms."""
+    counts: dict[str, int] = {}
+    with CATEGORY_TABLE.open(newline="") as file:
+        for row in csv.DictReader(file):
+            if row["bedroom_class"] != "void":
+                label = row["bedroom_class"]
+                counts[label] = counts.get(label, 0) + int(row["models_in_3d_future"])
+    total = sum(counts.values())
+    return {label: count / total for label, count in counts.items()}
+
+
+def make_bank(models: int, shares: dict[str, float], rng: np.random.Generator) -> CadBank:
+    labels = rng.choice(list(shares), models, p=list(shares.values()))
+    meshes = {f"model_{k:05d}": piece(rng) for k in range(models)}
+    points = np.stack(
+        [surface_points(mesh.vertices_m, mesh.faces, POINTS) for mesh in meshes.values()]
+    ).astype(np.float32)
+    names = np.array(list(meshes))
+    shelves = {
+        label: Shelf(tuple(names[labels == label]), points[labels == label])
+        for label in sorted(set(labels))
+    }
+    return CadBank(shelves, meshes.__getitem__)
+
+
+def piece(rng: np.random.Generator) -> Mesh:
+    """Two to seven blocks, filling the unit box."""
+    count = rng.integers(2, 8)
+    middles, sides = rng.uniform(-0.5, 0.5, (count, 1, 3)), rng.uniform(0.05, 1.0, (count, 1, 3))
+    vertices = (middles + sides * _CUBE).reshape(-1, 3)
+    faces = (_FACES + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
+    return unit_mesh(Mesh(vertices, faces))
+
+
+def make_scene(name: str, shares: dict[str, float], rng: np.random.Generator) -> Scene:
+    vertices, faces = (part.numpy() for part in icosphere(4))
+    cube = vertices / np.abs(vertices).max(axis=1, keepdims=True) / 2
+    objects = []
+    for label in rng.choice(list(shares), OBJECTS, p=list(shares.values())):
+        like = piece(rng)
+        surface = surface_points(like.vertices_m, like.faces, 2048)
+        near = 0.8 * surface[cKDTree(surface).query(cube)[1]] + 0.2 * cube
+        size = rng.uniform(0.4, 2.2, 3)
+        center = np.array([rng.uniform(-2, 2), size[1] / 2, rng.uniform(-2, 2)])
+        mesh = Mesh(near * size + center, faces)
+        objects.append(SceneObject(str(label), tuple(center.tolist()), tuple(size.tolist()), mesh))
+    return Scene(name, LABEL_SET, tuple(objects))
+
+
+def check(scenes: list[Scene], bank: CadBank, count: int) -> dict[str, float]:
+    """How often the fast search finds the winner of the slow one, and by how much it is off."""
+    items = [extruded(item) for scene in scenes for item in scene.objects][:count]
+    pairs = []
+    for item in items:
+        shelf = bank.shelves[item.label]
+        pairs.append((most_similar(item, shelf), most_similar(item, shelf, keep=None)))
+    return {
+        "checked": len(pairs),
+        "same_winner": sum(fast == slow for fast, slow in pairs),
+        "worst_excess_mm": round(
+            1000 * max((fast.distance_m - slow.distance_m for fast, slow in pairs), default=0), 3
+        ),
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""Are completed rooms better than the nearest training room with the given objects put in?
+
+    python benchmarks/complete_rooms.py --run RUN --shards SHARDS [--answers 4] [--seed 0]
+
+Of each test room half of the objects are given, rounded down and at least one, drawn by --seed; the
+rest is hidden. Rows of the table:
+
+- completed: `complete`, --answers a room;
+- untouched start: the same without the fit (0 steps): the best drawn rooms with the given put in;
+- nearest training room: the real training room (its 3D ground truth, which the prior never saw)
+  whose objects are nearest to the given ones of their class; one answer a room;
+- test rooms: themselves.
+
+`overlaps` are intersecting pairs of boxes a room, `beds` the share of rooms with what their type
+stands for (a bed in bedrooms), `found` the share of given objects that the room had by itself, in
+class, and `off_m` how far from where they are (mean over centre and sides); `differ` is the mean
+over pairs of answers to one room of 1 - matched IoU of what they add over the larger number; 0 is
+alike.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sceneprior.evaluation.layout_metrics import (
+    category_kl,
+    match_scenes,
+    object_counts,
+    overlap_pairs,
+    type_share,
+)
+from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.scene import Scene
+from sceneprior.stages.runs import load_run
+from sceneprior.tasks.complete import STEPS, complete
+from sceneprior.tasks.put_into import put_into
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--run", type=Path, required=True)
+    parser.add_argument("--shards", type=Path, required=True)
+    parser.add_argument("--answers", type=int, default=4)
+    parser.add_argument("--rooms", type=int, help="only so many test rooms")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    trained = load_run(arguments.run)
+    trained = replace(trained, stage="layout")  # boxes are judged; meshes would take time
+    most = trained.config.model.max_objects
+    rooms = reference_scenes(arguments.shards, "test", arguments.rooms)
+    tests = [without_meshes(room) for room in rooms if 2 <= len(room.objects) <= most]
+    training = [without_meshes(room) for room in reference_scenes(arguments.shards, "train")]
+    rng = np.random.default_rng(arguments.seed)
+    given = [half(room, rng) for room in tests]
+
+    def completed(steps: int) -> list[list[Scene]]:
+        answers = complete(trained, given, arguments.answers, arguments.seed, steps=steps)
+        return [scenes for _, scenes in answers]
+
+    rows = {
+        "completed": completed(STEPS),
+        "untouched start": completed(0),
+        "nearest training room": [[put_into(nearest(training, one), one)] for one in given],
+        "test rooms": [[room] for room in tests],
+    }
+    figures = {name: judge(answers, tests, given) for name, answers in rows.items()}
+    columns = list(next(iter(figures.values())))
+    print(f"{len(tests)} test rooms, {arguments.answers} answers each, seed {arguments.seed}")
+    print("| rooms | " + " | ".join(columns) + " |\n|" + " --- |" * (len(columns) + 1))
+    for name, row in figures.items():
+        print(f"| {name} | " + " | ".join(str(value) for value in row.values()) + " |")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+def without_meshes(room: Scene) -> Scene:
+    return replace(room.without_meshes(), extra={})
+
+
+def half(room: Scene, rng: np.random.Generator) -> Scene:
+    """Half of the objects, rounded down, at least one."""
+    count = max(1, len(room.objects) // 2)
+    rows = sorted(rng.permutation(len(room.objects))[:count])
+    return replace(room, objects=tuple(room.objects[row] for row in rows))
+
+
+def nearest(training: Sequence[Scene], given: Scene) -> Scene:
+    """By the mean distance of centres and sides; a missing object costs as much as 2 m."""
+
+    def cost(room: Scene) -> float:
+        total = 0.0
+        for label in {item.label for item in given.objects}:
+            ours, theirs = (of_class(scene, label) for scene in (room, given))
+            match = match_scenes(ours, theirs)
+            boxes, wanted = (np.hstack([s.centers_m, s.sizes_m]) for s in (ours, theirs))
+            apart = np.abs(boxes[match.decoded] - wanted[match.truth]).mean(axis=1)
+            total += float(apart.sum()) + 2.0 * (len(theirs.objects) - len(apart))
+        return total
+
+    return min(training, key=cost)
+
+
+def of_class(scene: Scene, label: str) -> Scene:
+    return replace(scene, objects=tuple(item for item in scene.objects if item.label == label))
+
+
+def judge(
+    answers: list[list[Scene]], tests: list[Scene], given: Sequence[Scene]
+) -> dict[str, float | str]:
+    every = [scene for scenes in answers for scene in scenes]
+    marked = [scene.extra for scene in every if scene.extra]
+    asked = sum(len(extra["given"]) for extra in marked)
+    off = [extra["replaced_off_m"] for extra in marked if extra["replaced"]]
+    apart = [
+        difference(*(replace(s, objects=s.objects[len(one.objects) :]) for s in pair))
+        for scenes, one in zip(answers, given, strict=True)
+        for pair in combinations(scenes, 2)
+    ]
+    return {
+        "category_kl": round(category_kl(every, tests), 3),
+        "overlaps": round(overlap_pairs(every).per_room, 2),
+        "beds": round(type_share(every) or 0.0, 3),
+        "objects": round(float(object_counts(every).mean()), 2),
+        "found": round(sum(extra["replaced"] for extra in marked) / asked, 2) if marked else "-",
+        "off_m": round(float(np.mean(off)), 2) if off else "-",
+        "differ": round(float(np.mean(apart)), 2) if apart else "-",
+    }
+
+
+def difference(a: Scene, b: Scene) -> float:
+    match = match_scenes(a, b)
+    most = max(len(a.objects), len(b.objects))
+    return 1 - float((match.iou * match.correct).sum()) / most if most else 0.0
+
+
+if __name__ == "__main__":
+    main()

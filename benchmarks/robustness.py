@@ -1,0 +1,171 @@
+"""Train on spoilt masks and poses; print what was learnt beside what clean ones teach.
+
+Run `python benchmarks/robustness.py --shards DIR [--seeds 0 1]`. Observations of the training split
+are spoilt in memory, the same way in every row of a seed; the truth in 3D, which the scores are
+taken from, stays as it is. Each row trains the layout stage alone, from the same start and for as
+many steps, on rooms of at most four objects: a short decoder makes short steps.
+"""
+
+import argparse
+import logging
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import lightning
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from sceneprior.batches import SceneViews
+from sceneprior.classes import label_set
+from sceneprior.config import RunConfig, load_config
+from sceneprior.data.datamodule import make_loader
+from sceneprior.data.dataset import ViewDataset
+from sceneprior.data.flat_views import FlatViews
+from sceneprior.evaluation.layout_metrics import reconstruction_scores
+from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.stages.layout import LayoutStage
+from sceneprior.stages.runs import TrainedPrior
+from sceneprior.stages.view_loss import build_latents, build_prior
+from sceneprior.tasks.decode import decode_training_rooms
+
+BASE = Path(__file__).parents[1] / "configs" / "demo.yaml"
+SETTINGS = (
+    "data.views_per_room=12",
+    "model.max_objects=4",
+    "model.width=64",
+    "model.hidden=64",
+    "layout.batch_size=48",
+    "layout.learning_rate=3e-3",
+    "layout.latent_noise=0.04",
+)
+WRONG = 0.2
+"""Share of the sightings whose mask is wrong; as many more are not seen at all."""
+DEGREES, METRES = 2.0, 0.05
+"""Root mean square of how far cameras are turned and moved."""
+
+
+def spoil_masks(flat: FlatViews, seed: int) -> FlatViews:
+    """Jitter every 2D box by 1% of the image, make `WRONG` of them wrong, and lose as many.
+
+    A third of the wrong ones are moved by up to a quarter of the image, a third lose half their
+    width or height, as masks that fall apart, and a third take the next sighting's box, which is
+    another object's, as where ids are swapped.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    count = len(flat.boxes)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    boxes = flat.boxes + 0.01 * torch.randn(count, 4, generator=generator)
+    fate = uniform(count)
+    moved = boxes + (uniform(count, 2) - 0.5).mul(0.5).repeat(1, 2)
+    lower, upright = uniform(count) < 0.5, uniform(count) < 0.5
+    row, side = torch.arange(count), upright.logical_not().long()
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+    cut = boxes.clone()
+    cut[row, side + 2 * (~lower).long()] = middle[row, side]
+    beside = row.roll(-1)
+    swapped = torch.where(flat.visible[beside, None], boxes[beside], boxes)
+    for third, wrong in enumerate((moved, cut, swapped)):
+        chosen = (fate >= third * WRONG / 3) & (fate < (third + 1) * WRONG / 3)
+        boxes = torch.where(chosen[:, None], wrong, boxes)
+    lost = (fate >= WRONG) & (fate < 2 * WRONG)
+    return replace(flat, boxes=boxes.clamp(0, 1), visible=flat.visible & ~lost)
+
+
+def spoil_poses(flat: FlatViews, seed: int) -> FlatViews:
+    """Turn each camera about a random axis and move it, by normally distributed amounts."""
+    generator = torch.Generator().manual_seed(seed)
+    count = len(flat.world_to_camera)
+    turn = torch.randn(count, 3, generator=generator) * (DEGREES * torch.pi / 180 / 3**0.5)
+    x, y, z = turn.unbind(1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
+    motion = torch.eye(4).repeat(count, 1, 1)
+    motion[:, :3, :3] = torch.linalg.matrix_exp(skew)
+    motion[:, :3, 3] = torch.randn(count, 3, generator=generator) * (METRES / 3**0.5)
+    return replace(flat, world_to_camera=motion @ flat.world_to_camera)
+
+
+class SmallRooms(Dataset):
+    """The first `count` training rooms of at most `objects` objects."""
+
+    masks = None
+
+    def __init__(self, views: ViewDataset, count: int, objects: int):
+        self.views = views
+        self.rows = (views.flat.object_count <= objects).nonzero()[:count, 0].tolist()
+        self.room_ids = tuple(views.room_ids[row] for row in self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitems__(self, draws: list[tuple[int, int]]) -> SceneViews:
+        batch = self.views.__getitems__([(self.rows[row], epoch) for row, epoch in draws])
+        return replace(batch, room_index=torch.tensor([row for row, _ in draws]))
+
+
+def train(config: RunConfig, rooms: SmallRooms) -> TrainedPrior:
+    """The layout stage alone, on what is in memory."""
+    lightning.seed_everything(config.seed, verbose=False)
+    prior = build_prior(config, len(label_set(config.label_set)))
+    latents = build_latents(config, len(rooms))
+    trainer = lightning.Trainer(
+        max_epochs=config.layout.epochs, logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False, accelerator="cpu",
+        gradient_clip_val=config.layout.clip_gradient or None,
+    )  # fmt: skip
+    loader = make_loader(rooms, config.layout.batch_size, config.seed, 0)  # type: ignore[arg-type]
+    trainer.fit(LayoutStage(prior, latents, config), loader)
+    prior = prior.eval().requires_grad_(False)
+    return TrainedPrior(prior, latents.weight.detach(), rooms.room_ids, config, "layout")
+
+
+def row(name: str, config: RunConfig, rooms: int, masks: bool, poses: bool) -> None:
+    """Train on some rooms, spoilt or not, and print how well they are remembered."""
+    folder = Path(config.data.shards)
+    data = ViewDataset(folder, "train", config.data.views_per_room, seed=config.seed)
+    if masks:
+        data.flat = spoil_masks(data.flat, config.seed + 10)
+    if poses:
+        data.flat = spoil_poses(data.flat, config.seed + 11)
+    chosen = SmallRooms(data, rooms, config.model.max_objects)
+    start = time.process_time()
+    trained = train(config, chosen)
+    seconds = time.process_time() - start
+    known = reference_scenes(folder, "train", max(chosen.rows) + 1, tracked_only=True)
+    truth = [known[index] for index in chosen.rows]
+    scores = reconstruction_scores(list(zip(decode_training_rooms(trained), truth, strict=True)))
+    print(
+        f"| {name} | {config.seed} | {scores['box_iou_3d']:.3f} | {scores['class_accuracy']:.3f} "
+        f"| {seconds:.0f} |",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--shards", type=Path, required=True)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--epochs", type=int, default=1000)
+    parser.add_argument("--rooms", type=int, default=48)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", module="lightning")
+    print("| observations | seed | box IoU 3D | class accuracy | CPU seconds |")
+    print("| --- | --- | --- | --- | --- |")
+    for seed in options.seeds:
+        for said, masks, poses in (
+            ("masks and poses spoilt", True, True),
+            ("masks spoilt", True, False),
+            ("clean", False, False),
+        ):
+            changes = (
+                f"data.shards={options.shards}", f"layout.epochs={options.epochs}", f"seed={seed}"
+            )  # fmt: skip
+            row(said, load_config(str(BASE), SETTINGS + changes), options.rooms, masks, poses)

@@ -1,0 +1,138 @@
+"""The paper's classifier: small pictures in, who AlexNet takes for generated out."""
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int, UInt8
+
+from sceneprior.errors import InputError
+
+SIZE_PX = 224
+EPOCHS = 10
+LEARNING_RATE = 1e-4
+BATCH = 256
+ALEXNET: dict[str, Any] = {
+    "name": "AlexNet, ImageNet weights of the user's file, convolutions and one new linear layer, "
+    "all fine-tuned",
+    "input": f"{SIZE_PX} x {SIZE_PX} RGB, bilinear with antialiasing, ImageNet mean and deviation",
+    "epochs": EPOCHS,
+    "learning_rate": LEARNING_RATE,
+    "batch": BATCH,
+}
+"""How SCA is measured with AlexNet, for the result file."""
+
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+_LAYERS = ((0, 3, 64, 11, 4, 2), (3, 64, 192, 5, 1, 2), (6, 192, 384, 3, 1, 1),
+           (8, 384, 256, 3, 1, 1), (10, 256, 256, 3, 1, 1))  # fmt: skip
+"""Number in the file, channels in and out, kernel, stride, padding of each convolution."""
+_POOLED_AFTER = (0, 3, 10)
+
+
+def check_alexnet(path: Path) -> None:
+    """Read the file, before hours of drawing lean on it.
+
+    Raises:
+        InputError: it is missing or holds something else.
+    """
+    _weights(Path(path))
+
+
+def classify_pictures(
+    path: Path,
+    pictures: UInt8[np.ndarray, "rooms 224 224 3"],
+    labels: Int[np.ndarray, " rooms"],
+    judged: UInt8[np.ndarray, "others 224 224 3"],
+    seed: int,
+) -> Int[np.ndarray, " others"]:
+    """Fine-tune AlexNet on labelled pictures and judge others, on a GPU where there is one.
+
+    Args:
+        path: `alexnet-owt-*.pth`, the state dict of torchvision's AlexNet.
+        pictures: RGB in 0..255.
+        labels: 1 generated, 0 real.
+        judged: Pictures to judge.
+        seed: Of the new layer and of the order of the pictures.
+
+    Source:
+        The paper's classifier is ATISS's: ImageNet AlexNet, 10 epochs, Adam at 1e-4, batches of
+        256. Training changes with the processor in the last digits, and so may a close call.
+    """
+    import torch
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    # Whoever draws random numbers after us draws the same as before.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = _network(_weights(Path(path))).to(device)
+    order = np.random.default_rng(seed)
+    optimizer = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE)
+    for _ in range(EPOCHS):
+        rows = order.permutation(len(pictures))
+        for start in range(0, len(rows), BATCH):
+            batch = rows[start : start + BATCH]
+            target = torch.as_tensor(labels[batch], dtype=torch.float32, device=device)
+            logits = network(_input(pictures[batch], device))[:, 0]
+            loss = torch.nn.functional.binary_cross_entropy_with_logits(logits, target)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    with torch.no_grad():
+        answers = [
+            network(_input(judged[start : start + BATCH], device))[:, 0].cpu().numpy() > 0
+            for start in range(0, len(judged), BATCH)
+        ]
+    return np.concatenate(answers).astype(int)
+
+
+def _input(pictures: np.ndarray, device: Any) -> Any:
+    import torch
+
+    images = torch.from_numpy(pictures).to(device).permute(0, 3, 1, 2).float() / 255
+    mean, deviation = (
+        torch.tensor(rgb, device=device)[:, None, None] for rgb in (_MEAN, _DEVIATION)
+    )
+    return (images - mean) / deviation
+
+
+def _network(weights: dict[str, Any]) -> Any:
+    from torch import nn
+
+    layers: list[Any] = []
+    for number, inside, outside, kernel, stride, padding in _LAYERS:
+        convolution = nn.Conv2d(inside, outside, kernel, stride, padding)
+        convolution.load_state_dict(
+            {part: weights[f"features.{number}.{part}"] for part in ("weight", "bias")}
+        )
+        layers += [convolution, nn.ReLU()]
+        if number in _POOLED_AFTER:
+            layers.append(nn.MaxPool2d(3, 2))
+    return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(6), nn.Flatten(), nn.Linear(256 * 36, 1))
+
+
+@lru_cache(maxsize=1)
+def _weights(path: Path) -> dict[str, Any]:
+    import torch
+
+    if not path.is_file():
+        raise InputError(
+            f"No AlexNet at {path}. The paper's SCA needs torchvision's file "
+            "`alexnet-owt-7be5be79.pth`; without it leave the option out: sca_effnet_lite0 needs "
+            "no download."
+        )
+    try:
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+        for number, inside, outside, kernel, _, _ in _LAYERS:
+            came = tuple(weights[f"features.{number}.weight"].shape)
+            if came != (outside, inside, kernel, kernel):
+                raise ValueError(f"features.{number}.weight has shape {came}")
+            if tuple(weights[f"features.{number}.bias"].shape) != (outside,):
+                raise ValueError(f"features.{number}.bias has another shape")
+    except Exception as error:  # what torch raises depends on which byte is odd
+        reason = str(error).strip().splitlines()[0][:200] if str(error) else type(error).__name__
+        raise InputError(
+            f"{path} is not the state dict of torchvision's AlexNet ({reason}); give "
+            "`alexnet-owt-7be5be79.pth`, or leave the option out."
+        ) from None
+    return {name: weights[name] for name in weights if name.startswith("features.")}

@@ -1,0 +1,100 @@
+"""Judge the floor between furniture: a `Scene` in, what stands outside and what can be walked out.
+
+Furniture is its axis-aligned box on the floor (x, z). All areas are exact (shapely), but for round
+corners, which are polygons of `ARC_SEGMENTS` sides a quarter turn.
+"""
+
+import numpy as np
+import shapely
+
+from sceneprior.classes import VOID
+from sceneprior.errors import InputError
+from sceneprior.scene import Scene
+
+AGENT_RADIUS_M = 0.2
+AGENT_HEIGHT_M = 1.5
+"""Who walks: a cylinder. What hangs higher, such as a lamp, is not in the way."""
+OUTSIDE_SHARE = 0.05
+"""A piece is out of bounds with more than this part of its box beyond the floor's outline."""
+ARC_SEGMENTS = 8
+
+
+def footprints(scene: Scene, below_m: float = np.inf) -> np.ndarray:
+    """The boxes of named furniture whose lower face is lower than `below_m`, as polygons."""
+    centers, halves = scene.centers_m, scene.sizes_m / 2
+    kept = (scene.class_indices != VOID) & (centers[:, 1] - halves[:, 1] < below_m)
+    low, high = (centers - halves)[kept], (centers + halves)[kept]
+    return np.asarray(shapely.box(low[:, 0], low[:, 2], high[:, 0], high[:, 2]))
+
+
+def floor_polygon(scene: Scene) -> shapely.Geometry | None:
+    """The floor inside the scene's outline; None where it has none.
+
+    Raises:
+        InputError: the outline has no area.
+    """
+    if scene.floor_m is None:
+        return None
+    outline = np.asarray(scene.floor_m, dtype=np.float64)
+    if outline.ndim == 2 and len(outline) >= 3 and outline.shape[1] == 2:
+        floor = shapely.make_valid(shapely.Polygon(outline))
+        if floor.area > 0:
+            return floor
+    raise InputError(
+        f"The floor of scene '{scene.name}' has no area; `floor_m` lists at least 3 corners "
+        "[x, z] in metres, or is left out."
+    )
+
+
+def outside_count(scene: Scene) -> tuple[int, int]:
+    """(pieces out of bounds, pieces judged); (0, 0) for a room whose floor nobody knows.
+
+    A piece is out of bounds with more than 5% of its box beyond the outline.
+
+    Example: a floor of 4 x 4 m, and a desk that pokes out by half its width.
+
+        >>> from sceneprior.scene import SceneObject
+        >>> desk = SceneObject("desk", (2.0, 0.4, 0.0), (1.0, 0.8, 0.5))
+        >>> floor = np.array([[-2, -2], [2, -2], [2, 2], [-2, 2]])
+        >>> outside_count(Scene("a", "front3d_bedroom", (desk,), floor))
+        (1, 1)
+    """
+    floor = floor_polygon(scene)
+    if floor is None:
+        return 0, 0
+    boxes = footprints(scene)
+    beyond = shapely.area(shapely.difference(boxes, floor))
+    return int((beyond > OUTSIDE_SHARE * shapely.area(boxes)).sum()), len(boxes)
+
+
+def walkable_share(scene: Scene, within: str = "furniture") -> float | None:
+    """The largest area that can be walked in one piece, as a share of all that can be stood on.
+
+    The agent, a disc of 0.2 m, stands where it meets neither a wall nor furniture lower than its
+    1.5 m. 1 means that all free floor hangs together, 0 that the agent fits nowhere.
+
+    Args:
+        scene: The room.
+        within: Where the walls are. `furniture`: the rectangle around all furniture, which every
+            scene has, so that rooms with and without a floor compare. `floor`: the outline.
+
+    Returns:
+        In [0, 1]; None for a room without a floor (`floor`), or with fewer than two pieces, which
+        leave no room in a rectangle around themselves (`furniture`).
+
+    Source:
+        The measure of Yang et al., "PhyScene", CVPR 2024, in exact areas.
+    """
+    if within == "floor":
+        walls = floor_polygon(scene)
+    else:
+        boxes = footprints(scene)
+        walls = shapely.envelope(shapely.union_all(boxes)) if len(boxes) > 1 else None
+    if walls is None:
+        return None
+    stand = shapely.buffer(walls, -AGENT_RADIUS_M, quad_segs=ARC_SEGMENTS)
+    blocked = shapely.union_all(
+        shapely.buffer(footprints(scene, AGENT_HEIGHT_M), AGENT_RADIUS_M, quad_segs=ARC_SEGMENTS)
+    )
+    pieces = shapely.area(shapely.get_parts(shapely.difference(stand, blocked)))
+    return float(pieces.max() / pieces.sum()) if pieces.sum() > 0 else 0.0

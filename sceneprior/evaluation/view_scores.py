@@ -1,0 +1,141 @@
+"""Score reconstructions from single images: pairs of true and found objects in, figures out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sceneprior.errors import InputError
+from sceneprior.evaluation.layout_metrics import box_iou_3d
+from sceneprior.evaluation.mesh_metrics import (
+    F_THRESHOLD_M,
+    POINTS,
+    chamfer,
+    f_score,
+    oriented_box_iou_3d,
+    oriented_boxes,
+    sample_surface,
+)
+from sceneprior.evaluation.topdown import box_mesh
+from sceneprior.scene import Mesh, SceneObject
+
+
+@dataclass(frozen=True)
+class ObjectPair:
+    """A true object that an image shows, and what was found for its mask."""
+
+    truth: SceneObject
+    found: SceneObject | None
+    """None where nothing was: its IoUs and F-score are 0, and it has no distance."""
+
+
+@dataclass(frozen=True)
+class PairScore:
+    """How well one true object was found."""
+
+    label: str
+    box_iou_3d: float
+    oriented_box_iou_3d: float
+    chamfer_l2_m: float | None
+    chamfer_squared_m2: float | None
+    f_score: float
+    class_right: bool
+
+
+def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairScore:
+    """Compare two objects where they stand; an object without a mesh is its box.
+
+    Args:
+        pair: True and found.
+        points: Drawn from each surface, uniformly by area.
+        seed: Of the points; the two surfaces have different ones.
+    """
+    truth, found = pair.truth, pair.found
+    if found is None:
+        return PairScore(truth.label, 0.0, 0.0, None, None, 0.0, False)
+    surfaces = [_mesh(truth), _mesh(found)]
+    a, b = (sample_surface(mesh, points, 2 * seed + i) for i, mesh in enumerate(surfaces))
+    distance = chamfer(a, b)
+    boxes = [
+        np.array([[item.center_m], [item.size_m]], dtype=np.float64) for item in (truth, found)
+    ]
+    turned = [oriented_boxes([mesh]) for mesh in surfaces]
+    return PairScore(
+        label=truth.label,
+        box_iou_3d=float(box_iou_3d(*boxes[0], *boxes[1])[0, 0]),
+        oriented_box_iou_3d=float(oriented_box_iou_3d(turned[0], turned[1])[0, 0]),
+        chamfer_l2_m=distance.l2_m,
+        chamfer_squared_m2=distance.squared_m2,
+        f_score=f_score(a, b, F_THRESHOLD_M),
+        class_right=found.label == truth.label,
+    )
+
+
+def _mesh(item: SceneObject) -> Mesh:
+    return item.mesh if item.mesh is not None else box_mesh(item.center_m, item.size_m)
+
+
+def score_views(
+    views: Sequence[Sequence[ObjectPair]], points: int = POINTS, seed: int = 0
+) -> dict[str, Any]:
+    """Scores of single-view reconstructions, every true object with the same weight.
+
+    Args:
+        views: The objects of each image.
+        points: Drawn from each surface.
+        seed: Of the points.
+
+    Returns:
+        `summary` of all objects, and `classes`: the same of each true class.
+
+    Raises:
+        InputError: there is no object.
+    """
+    scores = [
+        score_pair(pair, points, seed + row)
+        for row, pair in enumerate(pair for view in views for pair in view)
+    ]
+    if not scores:
+        raise InputError("No image shows an object, so there is nothing to score.")
+    labels = sorted({score.label for score in scores})
+    by_class = {name: [score for score in scores if score.label == name] for name in labels}
+    return {
+        "summary": {"images": len(views), **summary(scores)},
+        "classes": {name: summary(some) for name, some in by_class.items()},
+    }
+
+
+def summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
+    """Means over objects; the distances over those for which something was found, else None."""
+    near = [score for score in scores if score.chamfer_l2_m is not None]
+    count = len(scores)
+    return {
+        "objects": count,
+        "unmatched": count - len(near),
+        "box_iou_3d": sum(score.box_iou_3d for score in scores) / count,
+        "oriented_box_iou_3d": sum(score.oriented_box_iou_3d for score in scores) / count,
+        "chamfer_l2_m": _mean([score.chamfer_l2_m for score in near]),
+        "chamfer_squared_m2": _mean([score.chamfer_squared_m2 for score in near]),
+        "f_score": sum(score.f_score for score in scores) / count,
+        "class_accuracy": sum(score.class_right for score in scores) / count,
+    }
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+PROTOCOL = {
+    "objects": "those that the image shows, each matched to what was found for its mask by the "
+    "fit's own assignment (class and 2D box); every object weighs the same",
+    "box_iou_3d": "axis-aligned boxes in the room frame",
+    "oriented_box_iou_3d": "upright boxes around the meshes, over the footprint's rectangle of "
+    "least area",
+    "chamfer_l2_m": "mean distance to the nearest point of the other surface, both ways added, in "
+    "metres",
+    "chamfer_squared_m2": "the same of squared distances, in square metres",
+    "f_score": f"at {F_THRESHOLD_M} m",
+}
+"""What the figures are, as it stands in result files."""

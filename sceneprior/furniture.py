@@ -1,0 +1,151 @@
+"""Furniture models as 3D-FUTURE keeps them: a folder in; categories, classes and meshes out.
+
+    <folder>/model_info.json        or model_info_revised.json: the category of each model
+    <folder>/<model id>/raw_model.obj
+
+Preparing rooms and putting CAD models into generated ones read the same files; this is how.
+"""
+
+import csv
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sceneprior.errors import InputError
+from sceneprior.files import read_json
+from sceneprior.scene import Mesh
+
+MODEL_FILE = "raw_model.obj"
+CATEGORY_TABLE = Path(__file__).with_name("front3d_categories.csv")
+
+
+def model_info_path(folder: Path, option: str = "--future") -> Path:
+    """3D-FUTURE's list of models.
+
+    Args:
+        folder: 3D-FUTURE-model.
+        option: What the user named the folder with, for the sentence.
+
+    Raises:
+        InputError: the folder is missing, or has none.
+    """
+    if not folder.is_dir():
+        raise InputError(f"No folder at {folder}; {option} names the folder of 3D-FUTURE models.")
+    for name in ("model_info.json", "model_info_revised.json"):
+        if (folder / name).is_file():
+            return folder / name
+    raise InputError(
+        f"{folder} has no model_info.json (nor model_info_revised.json), so it is not a folder "
+        f"of 3D-FUTURE models; {option} usually ends in 3D-FUTURE-model."
+    )
+
+
+def model_categories(folder: Path, option: str = "--future") -> dict[str, str]:
+    """Model id -> category: lower case, "a / b" as "a/b"; "others" where the release says null.
+
+    Raises:
+        InputError: the folder is missing, or is not 3D-FUTURE's.
+    """
+    path = model_info_path(folder, option)
+    data = read_json(path)
+    try:
+        return {str(row["model_id"]): _category(row.get("category")) for row in data}
+    except (TypeError, KeyError, AttributeError) as error:
+        raise InputError(
+            f"{path} is not 3D-FUTURE's list of models ({type(error).__name__}: {error})."
+        ) from None
+
+
+def _category(text: Any) -> str:
+    return "others" if text is None else str(text).strip().lower().replace(" / ", "/")
+
+
+@functools.cache
+def category_classes(columns: tuple[str, ...]) -> dict[str, str]:
+    """3D-FUTURE's category strings -> class names, from front3d_categories.csv.
+
+    Args:
+        columns: `bedroom_class`, `living_room_class`: the first that is not void decides.
+
+    Raises:
+        InputError: there is no such column.
+    """
+    with CATEGORY_TABLE.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for column in columns:
+        if column not in rows[0]:
+            raise InputError(f"{CATEGORY_TABLE.name} has no column '{column}'.")
+    return {
+        row["model_info_category"]: next(
+            (row[column] for column in columns if row[column] != "void"), "void"
+        )
+        for row in rows
+    }
+
+
+_COLUMNS = {
+    "front3d_bedroom": ("bedroom_class",),
+    "front3d_living": ("living_room_class",),
+    "front3d_dining": ("living_room_class",),
+    "front3d_library": ("living_room_class",),
+}
+
+
+def class_of_category(category: str, label_set_name: str, names: tuple[str, ...]) -> str:
+    """The class that models of a category have in a label set; `void` where there is none.
+
+    The label sets of 3D-FRONT follow the paper's table. In any other the category itself is the
+    class where the set has that name, and then what it is in bedrooms or else in living rooms.
+
+        >>> class_of_category("king-size bed", "front3d_bedroom", ("void", "double_bed"))
+        'double_bed'
+        >>> class_of_category("dining table", "scannet", ("void", "table"))
+        'table'
+
+    Args:
+        category: As `model_categories` gives it.
+        label_set_name: Of `sceneprior.classes`.
+        names: The classes of that set.
+    """
+    if label_set_name not in _COLUMNS and category in names:
+        return category
+    for column in _COLUMNS.get(label_set_name, ("bedroom_class", "living_room_class")):
+        found = category_classes((column,)).get(category, "void")
+        if found != "void" and found in names:
+            return found
+    return "void"
+
+
+def read_obj(path: Path) -> Mesh:
+    """Vertices and triangles of a Wavefront OBJ, without materials, normals and unused vertices.
+
+    Raises:
+        InputError: the file cannot be read, or holds no triangle.
+    """
+    vertices: list[list[str]] = []
+    polygons: list[list[str]] = []
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            for line in file:
+                if line.startswith("v "):
+                    vertices.append(line.split()[1:4])
+                elif line.startswith("f "):
+                    polygons.append([corner.split("/", 1)[0] for corner in line.split()[1:]])
+        points = np.array(vertices, dtype=np.float32).reshape(-1, 3)
+        corners = [
+            (polygon[0], polygon[i - 1], polygon[i])
+            for polygon in polygons
+            for i in range(2, len(polygon))
+        ]
+        faces = np.array(corners, dtype=np.int64).reshape(-1, 3)
+        # OBJ counts from 1, and from the end where negative (right for models of one group).
+        faces = np.where(faces < 0, faces + len(points), faces - 1)
+        used, faces = np.unique(faces, return_inverse=True)
+        points = points[used]
+    except (OSError, ValueError, IndexError, OverflowError) as error:
+        raise InputError(f"{path.parent.name}/{path.name} cannot be read ({error})") from None
+    if not len(used) or used[0] < 0 or not np.isfinite(points).all():
+        raise InputError(f"{path.parent.name}/{path.name} holds no usable triangles")
+    return Mesh(points, faces.reshape(-1, 3).astype(np.int32))

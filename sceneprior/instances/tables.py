@@ -1,0 +1,130 @@
+"""Tables of instance ids in; the class of every id, and ids as `observe` takes them, out."""
+
+import csv
+import io
+import json
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from sceneprior.classes import label_set
+from sceneprior.errors import InputError
+
+SHELL = frozenset(
+    ["background", "wall", "floor", "ceiling", "door", "window", "blinds", "mirror", "picture"]
+)
+"""Classes of the room itself: nothing, unless the label set has them. Furniture stands against
+them in the image, and none of them hides it."""
+LARGEST_ID = 65_535
+
+
+def read_class_table(path: Path) -> dict[int, str]:
+    """Instance id -> class name, from a JSON or CSV file.
+
+    JSON is an object `{"1": "bed", "2": "chair"}`; CSV has rows `id,class` under a header or none.
+
+    Raises:
+        InputError: it cannot be read; an id is no number from 1 to 65,535, or is there twice.
+    """
+    try:
+        content = path.read_text(encoding="utf-8-sig")
+        pairs = _json_rows(path, content) if path.suffix.lower() == ".json" else _csv_rows(content)
+    except (OSError, ValueError, RecursionError, csv.Error) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} cannot be read ({str(error)[:120]}).") from None
+    classes: dict[int, str] = {}
+    for key, name in pairs:
+        if not (key.isascii() and key.isdigit()) or not 0 < int(key[:9]) <= LARGEST_ID:
+            raise InputError(
+                f"{path}: '{key[:40]}' is no instance id; expected a number from 1 to {LARGEST_ID} "
+                "(0 is nothing)."
+            )
+        if int(key) in classes:
+            raise InputError(f"{path}: instance id {int(key)} is there twice.")
+        classes[int(key)] = name
+    if not classes:
+        raise InputError(f"{path} is empty; expected a class for each instance id.")
+    return classes
+
+
+def _json_rows(path: Path, content: str) -> Iterable[tuple[str, str]]:
+    # As pairs, so that a repeated key is seen.
+    data = json.loads(content, object_pairs_hook=list)
+    if (
+        not isinstance(data, list)
+        or not all(isinstance(row, tuple) for row in data)
+        or not all(isinstance(name, str) for _, name in data)
+    ):
+        raise InputError(
+            f'{path} is not an object of ids and class names, as {{"1": "bed", "2": "chair"}} is.'
+        )
+    return [(key.strip(), name) for key, name in data]
+
+
+def _csv_rows(content: str) -> Iterable[tuple[str, str]]:
+    rows = [row for row in csv.reader(io.StringIO(content)) if any(cell.strip() for cell in row)]
+    if rows and not rows[0][0].strip().isdigit():
+        rows = rows[1:]
+    for row in rows:
+        if len(row) < 2:
+            raise ValueError(f"a row '{row[0][:40]}' has no class")
+    return [(row[0].strip(), row[1]) for row in rows]
+
+
+def tidy(name: str) -> str:
+    """How names are compared: `Night_Stand` and `night stand` are one.
+
+    >>> tidy(" Night_Stand ")
+    'night stand'
+    """
+    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+
+
+class IdTable:
+    """Values of masks -> consecutive ids: k + 1 for the k-th instance of the table, then one more
+    for what is not in it, which hides what is behind it as void furniture does.
+
+    Args:
+        of_id: Class name of each value, as `read_class_table` gives it.
+        label_set_name: The classes that count; others are void, and parts of the room nothing.
+        where: What errors begin with.
+
+    Raises:
+        InputError: none of the classes is in the label set.
+    """
+
+    def __init__(self, of_id: dict[int, str], label_set_name: str, where: str):
+        names = {tidy(name): i for i, name in enumerate(label_set(label_set_name))}
+        shell = [
+            key for key, name in of_id.items() if tidy(name) in SHELL and tidy(name) not in names
+        ]
+        objects = sorted(set(of_id) - set(shell))
+        indices = [names.get(tidy(of_id[key]), 0) for key in objects]
+        self.classes = np.array([*indices, 0], dtype=np.int16)
+        self.is_object = self.classes > 0
+        if not self.is_object.any():
+            came = ", ".join(sorted({of_id[key] for key in of_id})[:10])
+            raise InputError(
+                f"{where}: none of its classes ({came}) is in the label set "
+                f"({', '.join(list(names)[1:11])}{', ...' if len(names) > 11 else ''})."
+            )
+        others = Counter(of_id[key] for key in objects if tidy(of_id[key]) not in names)
+        self.notes = [
+            f"classes outside the label set are void: "
+            f"{', '.join(f'{name} ({count})' for name, count in sorted(others.items()))}"
+        ] * bool(others)
+        self.strange: set[int] = set()
+        self._unknown = len(objects) + 1
+        # The last entry is that of -1.
+        self._table = np.full(65_537, self._unknown, dtype=np.uint32)
+        self._table[[0, *shell]] = 0
+        self._table[objects] = np.arange(1, len(objects) + 1)
+        self._listed = np.array([-1, 0, *of_id])
+
+    def ids(self, values: np.ndarray) -> np.ndarray:
+        """(H, W) uint32 for `observe`; remembers values that the table does not have."""
+        self.strange |= set(np.setdiff1d(values, self._listed).tolist())
+        return self._table[values]

@@ -1,0 +1,124 @@
+"""Decoded scenes, or what cameras saw, in; semantic maps out: per pixel, how much of each class."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from sceneprior.batches import DecodedScenes, SceneViews
+from sceneprior.classes import VOID
+from sceneprior.losses.completeness import kept_share
+from sceneprior.losses.shape import observed_ids
+from sceneprior.silhouettes.render import render_scene
+
+LENS = 2
+"""Pixels of the instance ids on the side of one of a map. What is real has hard edges and what is
+rendered has soft ones, which would give it away; seen through this lens both are soft."""
+
+SIGMA_PX2 = 0.25
+"""Softness of rendered edges: about that of a hard edge under the lens, from 0.27 to 0.73 within
+half a pixel to either side."""
+
+
+def observed_maps(
+    views: SceneViews, classes: int
+) -> Float[Tensor, "rooms views classes height width"]:
+    """What the views show: the share of each class in a pixel, of `void` where no object is."""
+    ids = observed_ids(views).long()
+    of_id = F.pad(views.object_class, (1, 0), value=VOID)
+    pixels = of_id.gather(1, ids.flatten(1)).view_as(ids)
+    maps = F.one_hot(pixels, classes).movedim(-1, 2).to(views.intrinsics.dtype)
+    return F.avg_pool2d(maps.flatten(0, 1), LENS).unflatten(0, maps.shape[:2])
+
+
+def rendered_maps(
+    scenes: DecodedScenes,
+    faces: Int[Tensor, "faces 3"],
+    views: SceneViews,
+    *,
+    mode: str = "fast",
+    completeness_target: str = "first_n",
+) -> Float[Tensor, "rooms views classes height width"]:
+    """What the views would show of other scenes: theirs, drawn into the views' cameras.
+
+    Classes and existence are those that `tasks.decode` reads, hard, so that what is drawn is what
+    will be generated; their gradients are those of softmax and sigmoid (straight through). What
+    does not exist hides nothing, and still learns what its appearance would change.
+
+    Args:
+        scenes: Of as many rooms as `views`, with meshes.
+        faces: Of every mesh.
+        views: Cameras, and the size of the maps: that of `instance_ids`.
+        mode: Of `render_silhouettes`.
+        completeness_target: What completeness scores say (see `losses/completeness.py`).
+    """
+    assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
+    # As pooling does, which leaves out what does not fill a pixel.
+    ids = observed_ids(views)
+    height, width = ids.shape[-2] // LENS, ids.shape[-1] // LENS
+    scale = views.intrinsics.new_tensor(
+        [ids.shape[-1] / LENS / views.image_size[1], ids.shape[-2] / LENS / views.image_size[0], 1]
+    )
+    objects = scenes.vertices_m.shape[1]
+    # Each object is drawn as a room of its own: whole, with its own depth.
+    alone = render_scene(
+        scenes.vertices_m.flatten(0, 1).unsqueeze(1),
+        faces,
+        views.world_to_camera.repeat_interleave(objects, dim=0),
+        (views.intrinsics * scale[:, None]).repeat_interleave(objects, dim=0),
+        (height, width),
+        sigma_px2=SIGMA_PX2,
+        mode=mode,
+        compositing="alone",
+    )
+    coverage = alone.masks[:, :, 0].unflatten(0, (-1, objects)).transpose(1, 2)
+    depth_m = alone.depth_m.unflatten(0, (-1, objects)).transpose(1, 2)
+    # Where only the soft edge reaches, the object is as far away as its centre.
+    ahead = (views.world_to_camera[:, :, None, 2, :3] * scenes.centers_m[:, None]).sum(dim=-1)
+    ahead = (ahead + views.world_to_camera[:, :, None, 2, 3])[..., None, None].detach()
+    classes = straight_through(scenes.class_logits.softmax(dim=-1))
+    scores = scenes.completeness_logits.sigmoid()
+    scores = (scenes.completeness_logits > 0).to(scores) + scores - scores.detach()
+    kept = kept_share(scores, completeness_target)
+    return compose_maps(coverage, depth_m.where(depth_m.isfinite(), ahead), kept, classes)
+
+
+def straight_through(
+    shares: Float[Tensor, "*batch classes"],
+) -> Float[Tensor, "*batch classes"]:
+    """1 for the likeliest class, 0 for the others, with the gradient of the shares."""
+    hard = F.one_hot(shares.argmax(dim=-1), shares.shape[-1]).to(shares)
+    return hard + shares - shares.detach()
+
+
+def compose_maps(
+    coverage: Float[Tensor, "rooms views objects height width"],
+    depth_m: Float[Tensor, "rooms views objects height width"],
+    kept: Float[Tensor, "rooms objects"],
+    classes: Float[Tensor, "rooms objects classes"],
+) -> Float[Tensor, "rooms views classes height width"]:
+    """Lay objects over each other, pixel by pixel, nearest first.
+
+        visible_k = a_k * prod_{j nearer than k} (1 - a_j),    a_k = kept_k (1 - void_k) coverage_k
+
+    is what the pixel shows of object k, and what is left of it shows nothing: `void`.
+
+    Args:
+        coverage: Of each object alone, in [0, 1].
+        depth_m: Of each object at each pixel; orders them and carries no gradient.
+        kept: How far each object belongs to the scene, in [0, 1].
+        classes: What each object is; shares that sum to 1.
+
+    Returns:
+        Shares that sum to 1 over the classes.
+    """
+    there = kept * (1 - classes[..., VOID])
+    alpha = coverage * there[:, None, :, None, None]
+    order = depth_m.argsort(dim=2)
+    ordered = alpha.gather(2, order)
+    left = (1 - ordered).cumprod(dim=2)
+    before = torch.cat([torch.ones_like(left[:, :, :1]), left[:, :, :-1]], dim=2)
+    visible = torch.zeros_like(alpha).scatter(2, order, ordered * before)
+    maps = torch.einsum("rvkhw,rkc->rvchw", visible, classes)
+    nothing = F.one_hot(torch.tensor(VOID, device=maps.device), maps.shape[2]).to(maps)
+    return maps + left[:, :, -1:] * nothing[:, None, None]

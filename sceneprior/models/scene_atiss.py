@@ -1,0 +1,62 @@
+"""A latent in, a sequence of object features out: the ATISS encoder of the baseline ATISS-2D."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+LAYERS = 4
+"""Encoder layers of the published model, beside 8 heads, a width of 512 and an FFN of 1,024."""
+
+
+class SceneAtiss(nn.Module):
+    """Stands where the transformer stands: x_k is what the encoder makes of z among x_1 .. x_(k-1).
+
+    ATISS appends a learnt 'empty' embedding to the set of objects that are there, and reads the
+    next object off the place where it stood. Here z is that embedding (supplement, Baselines), so
+    there is nothing to learn for the empty room, and no floor plan, which 2D views do not show.
+    Nothing tells the tokens' order. Each layer normalises after its residuals and the last is
+    normalised once more, as in the library that ATISS builds on.
+
+    Every token sees every other, so that a new object changes what all layers say of the old ones:
+    each step encodes its set anew.
+
+    Args:
+        width: D_z, the size of z and of every object feature.
+        heads: Attention heads; must divide `width`.
+        hidden: Inner width of the feed-forward layers.
+        dropout: Applied where the library applies it; 0.1 is its default.
+        layers: How many.
+    """
+
+    def __init__(self, width: int, heads: int, hidden: int, dropout: float, layers: int = LAYERS):
+        super().__init__()
+        # Layers one by one: TransformerEncoder copies its layer, so that all would start alike.
+        self.layers = nn.ModuleList(
+            nn.TransformerEncoderLayer(width, heads, hidden, dropout, "gelu", batch_first=True)
+            for _ in range(layers)
+        )
+        self.end = nn.LayerNorm(width)
+
+    def forward(
+        self, z: Float[Tensor, "rooms width"], objects: int
+    ) -> Float[Tensor, "rooms objects width"]:
+        """Unroll `objects` steps from the empty set."""
+        features = z.new_zeros(len(z), 0, z.shape[-1])
+        for _ in range(objects):
+            newest = self.next_object(z, features)
+            features = torch.cat([features.to(newest.dtype), newest.unsqueeze(1)], dim=1)
+        return features
+
+    def next_object(
+        self,
+        z: Float[Tensor, "rooms width"],
+        previous: Float[Tensor, "rooms objects width"],
+    ) -> Float[Tensor, "rooms width"]:
+        """The feature that follows a set of objects, in whatever order they are given.
+
+        z is scaled as it is for the transformer: to about the size of the features beside it.
+        """
+        tokens = torch.cat([(z * z.shape[-1] ** 0.5).unsqueeze(1), previous.to(z.dtype)], dim=1)
+        for layer in self.layers:
+            tokens = layer(tokens)
+        return self.end(tokens[:, 0])

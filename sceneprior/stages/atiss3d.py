@@ -1,0 +1,105 @@
+"""Baseline with 3D supervision: ATISS learns the next object's class, position and size."""
+
+from dataclasses import dataclass
+
+import lightning
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sceneprior.batches import RoomBoxes
+from sceneprior.classes import label_set
+from sceneprior.config import RunConfig
+from sceneprior.data.truth import TruthDataset
+from sceneprior.models.atiss import END, Atiss
+from sceneprior.stages.box_loss import build_box_optimizer, total_of_rooms
+from sceneprior.stages.view_loss import batch_number, full_precision, step_seed
+
+
+class Atiss3dStage(lightning.LightningModule):
+    """Maximum likelihood of one object of each room, given some of the others.
+
+    Args:
+        prior: The network, which knows the range of the training rooms' boxes.
+        config: The run.
+    """
+
+    def __init__(self, prior: Atiss, config: RunConfig):
+        super().__init__()
+        self.prior = prior
+        self.config = config
+
+    def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
+        batch = batch_number(self.trainer, batch_idx)
+        part = part_of_rooms(rooms, step_seed(self.config.seed, batch, self.global_rank))
+        context = self.prior.context(
+            part.object_class, self.prior.to_unit(part.boxes_m), part.is_object
+        )
+        with full_precision(self.device):
+            log_probs = self.prior.log_prob(
+                context.float(), part.next_class, self.prior.to_unit(part.next_box_m)
+            )
+            losses = {name: -log_prob for name, log_prob in log_probs.items()}
+            return total_of_rooms(self, rooms, losses, weights={})
+
+    def configure_optimizers(self):
+        steps = int(self.trainer.estimated_stepping_batches)
+        return build_box_optimizer(self.prior, self.config.atiss3d, steps)
+
+
+@dataclass(frozen=True)
+class PartialRooms:
+    """Rooms of which some objects are there, and the one that is to come."""
+
+    object_class: Int[Tensor, "rooms objects"]
+    is_object: Bool[Tensor, "rooms objects"]
+    boxes_m: Float[Tensor, "rooms objects 6"]
+    next_class: Int[Tensor, " rooms"]
+    """`END` where all objects are there."""
+    next_box_m: Float[Tensor, "rooms 6"]
+
+
+def part_of_rooms(rooms: RoomBoxes, seed: int) -> PartialRooms:
+    """Put each room's n objects in a random order, and keep the first 0 to n, each as likely."""
+    generator = torch.Generator().manual_seed(seed)
+    count = rooms.is_object.sum(dim=1)
+    device = rooms.boxes_m.device
+    tickets = torch.rand(rooms.is_object.shape, generator=generator).to(device)
+    order = tickets.masked_fill(~rooms.is_object, 2.0).argsort(dim=1)
+    kept = (torch.rand(len(count), generator=generator).to(device) * (count + 1)).long()
+    # A column behind the last: what comes after a room's last object is its end.
+    labels = rooms.object_class.masked_fill(~rooms.is_object, END).gather(1, order)
+    labels = torch.nn.functional.pad(labels, (0, 1), value=END)
+    boxes_m = rooms.boxes_m.gather(1, order.unsqueeze(-1).expand(-1, -1, 6))
+    boxes_m = torch.nn.functional.pad(boxes_m, (0, 0, 0, 1))
+    placed = torch.arange(labels.shape[1] - 1, device=device) < kept[:, None]
+    return PartialRooms(
+        object_class=labels[:, :-1] * placed,
+        is_object=placed,
+        boxes_m=boxes_m[:, :-1],
+        next_class=labels.gather(1, kept[:, None])[:, 0],
+        next_box_m=boxes_m.gather(1, kept[:, None, None].expand(-1, 1, 6))[:, 0],
+    )
+
+
+def build_network(config: RunConfig) -> Atiss:
+    """The network a config describes, freshly initialised from its seed."""
+    torch.manual_seed(config.seed)
+    settings = config.atiss3d
+    return Atiss(
+        classes=len(label_set(config.label_set)),
+        max_objects=config.model.max_objects,
+        width=settings.width,
+        layers=settings.layers,
+        heads=settings.heads,
+        hidden=settings.hidden,
+        mixtures=settings.mixtures,
+        dropout=settings.dropout,
+    )
+
+
+def build(config: RunConfig, dataset: TruthDataset) -> Atiss3dStage:
+    """The stage at its start."""
+    prior = build_network(config)
+    prior.fit_bounds(dataset.everything())
+    return Atiss3dStage(prior, config)

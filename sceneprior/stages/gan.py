@@ -1,0 +1,200 @@
+"""The GAN baseline: our network against a discriminator of semantic maps, with no view loss."""
+
+import copy
+from collections.abc import Sequence
+
+import lightning
+import torch
+from jaxtyping import Float
+from lightning.pytorch.core.optimizer import LightningOptimizer
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sceneprior.batches import DecodedScenes, SceneViews
+from sceneprior.classes import label_set
+from sceneprior.config import RunConfig
+from sceneprior.losses.completeness import kept_objects
+from sceneprior.losses.semantic_maps import observed_maps, rendered_maps
+from sceneprior.models.layout_decoder import LayoutDecoder
+from sceneprior.models.map_discriminator import MapDiscriminator
+from sceneprior.models.scene_prior import ScenePrior
+from sceneprior.stages.view_loss import check_finite, full_precision
+
+BETAS = (0.0, 0.99)
+"""Of both Adams: momentum would push on after the opponent has moved."""
+
+STARTS = ((0.0, 1.2), (0.4, 0.4), (0.0, 1.2), (0.4, 0.5), (0.4, 0.5), (0.4, 0.5), (1.5, 1.0))
+"""Mean and spread, over rooms and objects, of what the layout decoder starts from: x, y, z, then
+width, height, depth before their SoftPlus, then completeness. Metres where they are metres."""
+
+START_ROOMS = 64
+
+SOFT = 0.01
+"""Weight of the mean square of class and completeness logits. A choice that is all but certain has
+no gradient: a generator whose objects had all become void would never come back."""
+
+
+class GanStage(lightning.LightningModule):
+    """Generator and discriminator in turn, once each a batch (supplement, Baselines).
+
+    A room is generated for each of the batch, from logits drawn from N(0, 1), and drawn as semantic
+    maps into that room's own cameras. There are no latents of rooms: nothing pairs a generated
+    room with a real one. What keeps it stable is listed in docs/baselines_2d.md.
+
+    `generator` is what plays; `prior`, which tasks take out of checkpoints, is a running average of
+    its weights, in which the two opponents' circling cancels.
+
+    Args:
+        prior: The network, freshly initialised.
+        latents: No rows; they make the run's checkpoints alike.
+        config: The run.
+    """
+
+    def __init__(self, prior: ScenePrior, latents: nn.Embedding, config: RunConfig):
+        super().__init__()
+        self.automatic_optimization = False
+        self.config = config
+        self.classes = len(label_set(config.label_set))
+        self.generator = prior
+        spread_out(prior.layout, prior.decoder(self._latents(START_ROOMS), prior.max_objects))
+        self.prior = copy.deepcopy(prior).requires_grad_(False)
+        self.latents = latents
+        self.discriminator = MapDiscriminator(self.classes)
+
+    def training_step(self, views: SceneViews, batch_idx: int) -> None:
+        generator_optimizer, discriminator_optimizer = self._optimizers()
+        scenes = self.generator.decode(self._latents(len(views.room_index)))
+        with full_precision(self.device):
+            # Before rendering, too, which refuses vertices that are not finite.
+            undecided = certainty(scenes)
+            check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views)
+            real = self._through_noise(observed_maps(views, self.classes))
+            fake = self._through_noise(self._draw(scenes, views))
+
+        real_scores, fake_scores = self.discriminator(real), self.discriminator(fake.detach())
+        told_apart = mistaken(real_scores, real=True) + mistaken(fake_scores, real=False)
+        check_finite(told_apart, views)
+        self._update(discriminator_optimizer, told_apart)
+
+        self.discriminator.requires_grad_(False)
+        loss = mistaken(self.discriminator(fake), real=True) + SOFT * undecided
+        check_finite(loss, views)
+        self._update(generator_optimizer, loss)
+        self.discriminator.requires_grad_(True)
+        self._average()
+        self._log(scenes, loss, told_apart, real_scores, fake_scores)
+
+    def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:
+        shape = (rooms, self.config.model.logits_per_room)
+        with full_precision(self.device):
+            return self.generator.sphere(torch.randn(shape, device=self.device))
+
+    def _draw(self, scenes: DecodedScenes, views: SceneViews) -> Tensor:
+        return rendered_maps(
+            scenes,
+            self.generator.shape.faces,
+            views,
+            mode=self.config.shape.silhouettes,
+            completeness_target=self.config.loss.completeness_target,
+        )
+
+    def _through_noise(self, maps: Tensor) -> Tensor:
+        """Maps as the discriminator sees them; real ones come in steps that rendered ones lack."""
+        left = 1 - self.current_epoch / self.config.gan.epochs
+        return maps + self.config.gan.noise * left * torch.randn_like(maps)
+
+    def _optimizers(self) -> tuple[LightningOptimizer, LightningOptimizer]:
+        both = self.optimizers()
+        assert isinstance(both, list), "configure_optimizers returns two"
+        generator, discriminator = both
+        return generator, discriminator  # type: ignore[return-value]
+
+    def _update(self, optimizer: LightningOptimizer, loss: Tensor) -> None:
+        optimizer.zero_grad()
+        self.manual_backward(loss)
+        if self.config.gan.clip_gradient:
+            self.clip_gradients(optimizer, self.config.gan.clip_gradient, "norm")  # type: ignore[arg-type]
+        optimizer.step()
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        # The first steps are averaged over less: else they would stay as they started for long.
+        done = self.current_epoch * int(self.trainer.num_training_batches)
+        keep = min(self.config.gan.averaging, (1 + done) / (10 + done))
+        for mean, newest in zip(self.prior.parameters(), self.generator.parameters(), strict=True):
+            mean.lerp_(newest, 1 - keep)
+
+    def _log(
+        self,
+        scenes: DecodedScenes,
+        loss: Tensor,
+        told_apart: Tensor,
+        real: Sequence[Tensor],
+        fake: Sequence[Tensor],
+    ) -> None:
+        target = self.config.loss.completeness_target
+        said = {
+            "loss": loss,
+            "discriminator": told_apart,
+            "real_score": torch.stack([score.mean() for score in real]).mean(),
+            "fake_score": torch.stack([score.mean() for score in fake]).mean(),
+            "objects": kept_objects(scenes.completeness_logits, target).sum(dim=1).float().mean(),
+        }
+        named = {f"train/{name}": value.detach() for name, value in said.items()}
+        self.log_dict(named, on_step=False, on_epoch=True, batch_size=len(scenes.centers_m))
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        rates = self.config.gan
+        return [
+            torch.optim.Adam(self.generator.parameters(), rates.learning_rate, BETAS),
+            torch.optim.Adam(
+                self.discriminator.parameters(), rates.discriminator_learning_rate, BETAS
+            ),
+        ]
+
+
+def mistaken(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
+    """Cross entropy of scores, as logits of being real, with what is wanted of them.
+
+    Patches and rooms count alike. The generator minimises it for its own maps as if these were
+    real (Goodfellow et al., "Generative adversarial nets", NeurIPS 2014: the loss that does not
+    saturate).
+    """
+    sign = -1 if real else 1
+    return torch.stack([F.softplus(sign * score).mean() for score in scores]).sum()
+
+
+def certainty(scenes: DecodedScenes) -> Float[Tensor, ""]:
+    """Mean squares of the logits that decide: 0 is undecided."""
+    return scenes.class_logits.square().mean() + scenes.completeness_logits.square().mean()
+
+
+@torch.no_grad()
+def spread_out(layout: LayoutDecoder, features: Float[Tensor, "rooms objects width"]) -> None:
+    """Start with objects all over the floor, of all sizes and classes.
+
+    A fresh layout decoder puts every object at the floor centre, and the discriminator would pull
+    all of them the same way: they would never part. So each layer is scaled and shifted until its
+    outputs have mean 0 and spread 1 over these rooms and objects (Salimans and Kingma, "Weight
+    normalization", NeurIPS 2016, section 3), and then those of boxes until they have `STARTS`.
+
+    Args:
+        layout: Changed in place.
+        features: Of random rooms.
+    """
+
+    def normalise(layer: nn.Linear, _: tuple[Tensor], output: Tensor) -> Tensor:
+        rows = output.flatten(0, -2)
+        mean, spread = rows.mean(dim=0), rows.std(dim=0).clamp(min=1e-8)
+        layer.weight /= spread[:, None]
+        layer.bias.copy_((layer.bias - mean) / spread)
+        return (output - mean) / spread
+
+    layers = [layer for layer in layout.modules() if isinstance(layer, nn.Linear)]
+    hooks = [layer.register_forward_hook(normalise) for layer in layers]
+    layout(features)
+    for hook in hooks:
+        hook.remove()
+    for (weight, bias), (mean, spread) in zip(layout.mlp2.box_rows(), STARTS, strict=True):
+        weight *= spread
+        bias.mul_(spread).add_(mean)

@@ -1,0 +1,195 @@
+"""CAD models to choose from: a folder of 3D-FUTURE in, points of every model in its unit box out.
+
+Points are drawn once a model and kept in one file; where the file of a model changes, its points
+are drawn again.
+"""
+
+import hashlib
+import io
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from sceneprior.classes import label_set
+from sceneprior.errors import InputError
+from sceneprior.files import file_stamp, is_name, write_whole
+from sceneprior.furniture import MODEL_FILE, class_of_category, model_categories, read_obj
+from sceneprior.geometry.surfaces import surface_points
+from sceneprior.scene import Mesh
+
+POINTS = 1024
+"""Points of a surface: at 2 m2 of it, one every 4 to 5 cm."""
+SEED = 0
+FORMAT = 1
+"""Of the file of points; raise it when points come out otherwise."""
+_FLAT = 1e-9
+"""A side shorter than this part of the longest has no thickness that scaling could bring out."""
+_MESHES_KEPT = 256
+
+
+def default_cache() -> Path:
+    """Where points are kept unless told otherwise: $XDG_CACHE_HOME/sceneprior, or ~/.cache/."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sceneprior"
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """The models of one class."""
+
+    model_ids: tuple[str, ...]
+    points: Float[np.ndarray, "models points 3"]
+    """On the surface of each model, which fills [-0.5, 0.5]^3."""
+
+
+@dataclass(frozen=True)
+class CadBank:
+    """Models by class, and where their meshes come from."""
+
+    shelves: Mapping[str, Shelf]
+    load: Callable[[str], Mesh]
+    """Model id -> its mesh, filling [-0.5, 0.5]^3."""
+    broken: Mapping[str, str] = field(default_factory=dict)
+    """Model id -> why it cannot be used."""
+
+
+def open_bank(
+    folder: Path,
+    label_set_name: str,
+    cache: Path,
+    points: int = POINTS,
+    track: Callable[[list[str]], Iterable[str]] = iter,
+) -> CadBank:
+    """Read the models of a 3D-FUTURE folder that have a class in a label set.
+
+    Args:
+        folder: 3D-FUTURE-model.
+        label_set_name: Whose classes count.
+        cache: Folder for the file of points. Deleting it costs time, nothing else.
+        points: Points a model.
+        track: Wraps the ids of the models whose points must be drawn, for a progress bar.
+
+    Raises:
+        InputError: the folder is not 3D-FUTURE's, or has no model of these classes.
+    """
+    folder = Path(folder)
+    names = label_set(label_set_name)
+    labels = {
+        model_id: class_of_category(category, label_set_name, names)
+        for model_id, category in sorted(model_categories(folder, "--models").items())
+    }
+    wanted = [model_id for model_id, label in labels.items() if label != "void"]
+    store = PointStore(folder, Path(cache), points)
+    broken = store.draw(wanted, track)
+    shelves = {}
+    for label in names:
+        of_class = [m for m in wanted if labels[m] == label and m not in broken]
+        if of_class:
+            shelves[label] = Shelf(tuple(of_class), np.stack([store.points[m] for m in of_class]))
+    if not shelves:
+        raise InputError(
+            f"{folder} holds no usable model of a class of {label_set_name} ({len(labels)} models "
+            f"listed, {len(broken)} of them broken); --models names a folder with the OBJ files."
+        )
+
+    def load(model_id: str) -> Mesh:
+        return unit_mesh(read_obj(folder / model_id / MODEL_FILE))
+
+    return CadBank(shelves, lru_cache(_MESHES_KEPT)(load), broken)
+
+
+def unit_mesh(mesh: Mesh) -> Mesh:
+    """Move and scale a mesh to fill [-0.5, 0.5]^3; a flat side stays flat, in the middle."""
+    vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
+    return Mesh(_into_unit_box(vertices, vertices), mesh.faces)
+
+
+def _into_unit_box(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    sides = high - low
+    scale = np.where(sides > _FLAT * sides.max(), 1 / np.maximum(sides, 1e-300), 0.0)
+    return (points - (low + high) / 2) * scale
+
+
+class PointStore:
+    """Points of models on disk: one npz a folder of models and settings, whole or absent.
+
+    Args:
+        folder: The models.
+        cache: Where the file lies.
+        count: Points a model.
+    """
+
+    def __init__(self, folder: Path, cache: Path, count: int):
+        self.folder, self.count = folder, count
+        settings = f"{folder.resolve()}|{count}|{SEED}|{FORMAT}"
+        name = f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
+        self.path = cache / name
+        self.points: dict[str, np.ndarray] = {}
+        self._stamps: dict[str, tuple[int, int]] = {}
+        self._read()
+
+    def draw(
+        self, model_ids: list[str], track: Callable[[list[str]], Iterable[str]]
+    ) -> dict[str, str]:
+        """Have points of these models; what was drawn is kept even if this is interrupted.
+
+        Returns:
+            Broken models, with the reason.
+        """
+        broken: dict[str, str] = {}
+        todo = []
+        for model_id in model_ids:
+            try:
+                if self._stamps.get(model_id) != self._stamp(model_id):
+                    todo.append(model_id)
+            except InputError as error:
+                broken[model_id] = str(error)
+        drawn = 0
+        try:
+            for model_id in track(todo):
+                try:
+                    self.points[model_id] = self._draw_one(model_id)
+                    self._stamps[model_id] = self._stamp(model_id)
+                    drawn += 1
+                except (InputError, ValueError) as error:
+                    broken[model_id] = str(error)
+        finally:
+            if drawn:
+                self._write()
+        return broken
+
+    def _stamp(self, model_id: str) -> tuple[int, int]:
+        if not is_name(model_id):
+            raise InputError(f"{ascii(model_id)[:60]} cannot be a folder's name")
+        return file_stamp(self.folder / model_id / MODEL_FILE)
+
+    def _draw_one(self, model_id: str) -> np.ndarray:
+        mesh = read_obj(self.folder / model_id / MODEL_FILE)
+        vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
+        # Drawn on the model as it is: in a unit box thin sides would count as wide ones.
+        points = surface_points(vertices, mesh.faces, self.count, SEED)
+        return _into_unit_box(points, vertices).astype(np.float32)
+
+    def _read(self) -> None:
+        try:
+            with np.load(self.path, allow_pickle=False) as file:
+                ids, stamps, points = file["ids"].tolist(), file["stamps"], file["points"]
+        except Exception:  # absent or damaged: drawn again, and written over
+            return
+        if points.shape == (len(ids), self.count, 3):
+            self.points = dict(zip(ids, points, strict=True))
+            self._stamps = {m: (int(a), int(b)) for m, (a, b) in zip(ids, stamps, strict=True)}
+
+    def _write(self) -> None:
+        ids = sorted(self._stamps)
+        buffer = io.BytesIO()
+        np.savez(
+            buffer, ids=np.array(ids), stamps=np.array([self._stamps[m] for m in ids], np.int64),
+            points=np.stack([self.points[m] for m in ids]),
+        )  # fmt: skip
+        write_whole(self.path, buffer.getvalue())

@@ -1,0 +1,63 @@
+"""Intervals: that they cover what they claim, and sit where the figure is."""
+
+import numpy as np
+import pytest
+
+from sceneprior.evaluation.bootstrap import COVERAGE, Figure, ratio, resample_counts
+from sceneprior.evaluation.set_metrics import frechet_distance
+
+
+def test_every_resample_has_as_many_rooms_and_seeds_repeat():
+    counts = resample_counts(7, 50, (3, 1))
+    assert counts.shape == (50, 7) and (counts.sum(1) == 7).all()
+    np.testing.assert_array_equal(counts, resample_counts(7, 50, (3, 1)))
+    assert (counts != resample_counts(7, 50, (3, 2))).any()
+    assert resample_counts(7, 0, 0).shape == (0, 7)
+
+
+def test_the_interval_of_a_mean_covers_it_as_often_as_it_says(rng):
+    covered = 0
+    for trial in range(300):
+        sample = rng.exponential(size=60)
+        low, high = ratio(sample, np.ones(60), resample_counts(60, 200, trial)).interval()
+        assert low < sample.mean() < high
+        covered += low <= 1 <= high
+    # 95% of 300, give or take three standard deviations; skewed samples of 60 lose 2%.
+    assert 0.89 < covered / 300 < 0.99 and COVERAGE == 0.95
+
+
+def test_the_interval_of_a_mean_is_as_wide_as_theory_says(rng):
+    sample = rng.normal(size=400)
+    low, high = ratio(np.abs(sample), np.ones(400), resample_counts(400, 4000, 0)).interval()
+    assert high - low == pytest.approx(2 * 1.96 * np.abs(sample).std() / 20, rel=0.05)
+
+
+def test_the_interval_of_a_distance_holds_the_distance_though_no_resample_does(rng):
+    a, b = rng.normal(size=(30, 50)), rng.normal(size=(30, 50))
+    draws = np.array(
+        [
+            frechet_distance(a, b, x, y)
+            for x, y in zip(resample_counts(30, 60, 1), resample_counts(30, 60, 2), strict=True)
+        ]
+    )
+    value = frechet_distance(a, b)
+    assert draws.min() > value  # repeated rooms: fewer different ones, farther apart
+    low, high = Figure(value, draws, 0.0).interval()
+    assert low < value < high
+    assert high - low == pytest.approx(np.diff(np.quantile(draws, [0.025, 0.975]))[0])
+
+
+def test_ratios_leave_out_what_weighs_nothing_and_stay_in_their_range():
+    counts = np.array([[2, 0, 0], [0, 0, 2], [1, 1, 0]])
+    figure = ratio(np.array([1.0, 0.0, 9.0]), np.array([1.0, 1.0, 0.0]), counts, 1.0)
+    assert figure.value == 5.0  # what weighs nothing should bring nothing
+    figure = ratio(np.array([1.0, 0.0, 0.0]), np.array([1.0, 1.0, 0.0]), counts, 1.0)
+    assert figure.value == 0.5 and figure.draws.tolist() == [1.0, 0.5]
+    assert figure.interval() == pytest.approx([0.2625, 0.7375])
+    assert Figure(0.9, np.array([0.0, 1.0]), 0.0, 1.0).interval() == pytest.approx([0.425, 1.0])
+
+
+def test_nothing_to_weigh_is_no_figure_and_no_nan():
+    nothing = ratio(np.zeros(3), np.zeros(3), resample_counts(3, 9, 0))
+    assert nothing.value is None and nothing.interval() is None
+    assert Figure(1.0, np.zeros(0)).interval() is None

@@ -1,0 +1,125 @@
+"""Who tells real from generated: chance on equal sets, certainty on unlike ones, never its own."""
+
+import numpy as np
+import pytest
+import torch
+
+from sceneprior.errors import InputError
+from sceneprior.evaluation.alexnet import _network, check_alexnet, classify_pictures
+from sceneprior.evaluation.bootstrap import resample_counts
+from sceneprior.evaluation.classifier import FOLDS, REPEATS, found_out, linear
+
+
+def accuracy(told, resamples: int = 50):
+    generated = resample_counts(len(told.judged_generated), resamples, 0)
+    return told.accuracy(generated, resample_counts(len(told.judged_real), resamples, 1))
+
+
+def test_sets_of_one_distribution_are_at_chance_and_far_ones_are_told_apart(rng):
+    a, b = rng.normal(size=(60, 8)), rng.normal(size=(45, 8))
+    figure = accuracy(found_out(a, b, seed=0))
+    low, high = figure.interval()
+    assert low < 0.5 < high and 0.3 < figure.value < 0.7
+    figure = accuracy(found_out(a, b + 10, seed=0))
+    assert figure.value == 1 and figure.interval() == [1, 1]
+
+
+def test_answers_are_those_of_folds_never_seen_with_equal_numbers_on_both_sides(rng):
+    calls = []
+
+    def remember(inputs, labels, judged, seed):
+        assert set(inputs[:, 0]).isdisjoint(judged[:, 0])
+        assert abs(2 * labels.sum() - len(labels)) <= 1
+        calls.append((len(inputs), len(judged), seed))
+        return np.ones(len(judged), dtype=int)  # all are generated, it says
+
+    told = found_out(np.arange(20.0)[:, None], 100 + np.arange(7.0)[:, None], 1, remember)
+    assert len(calls) == FOLDS * REPEATS and len({seed for *_, seed in calls}) == len(calls)
+    assert told.judged_real.tolist() == [REPEATS] * 7 and not told.right_real.any()
+    assert told.judged_generated.sum() == 7 * REPEATS
+    np.testing.assert_array_equal(told.right_generated, told.judged_generated)
+    assert accuracy(told).value == 0.5
+
+
+def test_seeds_repeat_and_two_rooms_a_side_are_enough(rng):
+    a, b = rng.normal(size=(9, 4)), rng.normal(size=(6, 4))
+    one, two = (found_out(a, b, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(one.right_generated, two.right_generated)
+    figure = accuracy(found_out(a[:2], b[:2], seed=0))
+    assert 0 <= figure.value <= 1
+    same = np.ones((4, 3))
+    assert accuracy(found_out(same, same, seed=0)).value == 0.5  # identical pictures
+
+
+def test_the_linear_classifier_is_a_penalised_fit_of_standardized_features(rng):
+    from scipy.optimize import minimize
+
+    x = rng.normal(size=(30, 3)) * [1, 20, 0.1] + 5
+    y = (x[:, 1] + 5 * rng.normal(size=30) > 5).astype(int)
+    z = (x - x.mean(0)) / x.std(0)
+
+    def loss(w):
+        margin = (2 * y - 1) * (z @ w[:3] + w[3])
+        return 0.5 * (w[:3] ** 2).sum() + 0.01 * np.logaddexp(0, -margin).sum()
+
+    w = minimize(loss, np.zeros(4), tol=1e-12).x
+    others = rng.normal(size=(50, 3)) * [1, 20, 0.1] + 5
+    expected = ((others - x.mean(0)) / x.std(0)) @ w[:3] + w[3] > 0
+    np.testing.assert_array_equal(linear(x, y, others, 0), expected)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A state dict of torchvision's names and shapes, with drawn numbers."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3)}
+    shapes[10] = (256, 256, 3)
+    state = {}
+    for number, (outside, inside, side) in shapes.items():
+        fan = (inside * side * side) ** -0.5
+        shape = (outside, inside, side, side)
+        state[f"features.{number}.weight"] = fan * torch.randn(shape, generator=generator)
+        state[f"features.{number}.bias"] = torch.zeros(outside)
+    path = tmp_path_factory.mktemp("alexnet") / "alexnet-owt-7be5be79.pth"
+    torch.save(state | {"classifier.1.bias": torch.zeros(4096)}, path)
+    return path
+
+
+def test_alexnets_layers_give_torchvisions_sizes(weights):
+    network = _network(torch.load(weights, weights_only=True))
+    image = torch.zeros(1, 3, 224, 224)
+    sizes = []
+    for layer in network:
+        image = layer(image)
+        if isinstance(layer, torch.nn.Conv2d | torch.nn.MaxPool2d):
+            sizes.append(tuple(image.shape[1:]))
+    # Krizhevsky's "one weird trick" network, as torchvision's page lists it.
+    assert sizes == [
+        (64, 55, 55), (64, 27, 27), (192, 27, 27), (192, 13, 13), (384, 13, 13), (256, 13, 13),
+        (256, 13, 13), (256, 6, 6),
+    ]  # fmt: skip
+    assert image.shape == (1, 1)
+
+
+def test_alexnet_tells_dark_pictures_from_light_ones_and_leaves_torchs_seed_alone(weights, rng):
+    level = np.repeat([40, 215], 4)
+    noise = rng.integers(-30, 30, (8, 224, 224, 3))
+    pictures = (level[:, None, None, None] + noise).astype(np.uint8)
+    labels = (level > 128).astype(int)
+    before = torch.get_rng_state()
+    answers = classify_pictures(weights, pictures[::2], labels[::2], pictures[1::2], seed=1)
+    assert torch.equal(before, torch.get_rng_state())
+    np.testing.assert_array_equal(answers, labels[1::2])
+
+
+def test_files_that_are_no_alexnet_are_named(weights, tmp_path):
+    check_alexnet(weights)
+    with pytest.raises(InputError, match="No AlexNet at"):
+        check_alexnet(tmp_path / "absent.pth")
+    (tmp_path / "text.pth").write_text("no network")
+    with pytest.raises(InputError, match="not the state dict of torchvision's AlexNet"):
+        check_alexnet(tmp_path / "text.pth")
+    state = torch.load(weights, weights_only=True)
+    torch.save(state | {"features.3.weight": torch.zeros(1)}, tmp_path / "other.pth")
+    with pytest.raises(InputError, match=r"features\.3\.weight has shape \(1,\)"):
+        check_alexnet(tmp_path / "other.pth")

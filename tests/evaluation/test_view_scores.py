@@ -1,0 +1,79 @@
+"""Scores of matched objects by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprior.errors import InputError
+from sceneprior.evaluation.topdown import box_mesh
+from sceneprior.evaluation.view_scores import ObjectPair, score_pair, score_views
+from sceneprior.scene import SceneObject
+
+POINTS = 4000
+DESK = SceneObject("desk", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
+BED = SceneObject("double_bed", (2.0, 0.5, 0.0), (2.0, 1.0, 2.0))
+
+
+def moved(item: SceneObject, x_m: float) -> SceneObject:
+    x, y, z = item.center_m
+    return replace(item, center_m=(x + x_m, y, z))
+
+
+def test_a_box_found_half_aside():
+    score = score_pair(ObjectPair(DESK, replace(moved(DESK, 0.5), label="sofa")), POINTS)
+    assert score.box_iou_3d == pytest.approx(1 / 3)
+    assert score.oriented_box_iou_3d == pytest.approx(1 / 3)
+    assert not score.class_right
+    # Two opposite sides are 0.5 m from the nearest side; of the other four, half of the area
+    # lies on the other box's sides, and the rest is up to 0.5 m, 0.25 m on average, away.
+    per_way = (0.5 * 1 + 4 * 0.5 * 0.25) / 6
+    inside = 0.5  # the side that lies within the other box sees a side half a metre away, too
+    assert 2 * per_way < score.chamfer_l2_m < 2 * (per_way + inside / 6) + 0.05
+
+
+def test_the_same_object_is_found_perfectly_but_for_the_points():
+    score = score_pair(ObjectPair(BED, BED), POINTS)
+    assert score.box_iou_3d == pytest.approx(1) and score.oriented_box_iou_3d == pytest.approx(1)
+    # Points as dense as 4,000 on 16 square metres lie half of sqrt(1 / density) from the nearest of
+    # another draw, each way; a circle of 5 cm holds density * pi * 0.05**2 of them on average.
+    density = POINTS / 16
+    assert score.chamfer_l2_m == pytest.approx(density**-0.5, rel=0.05)
+    assert score.class_right
+    assert score.f_score == pytest.approx(1 - np.exp(-density * np.pi * 0.05**2), abs=0.02)
+
+
+def test_a_mesh_counts_and_its_turn_shows_in_the_oriented_box():
+    turn = np.array([[1, 0, 1], [0, 2**0.5, 0], [-1, 0, 1]]) / 2**0.5
+    box = box_mesh((0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
+    turned = replace(box, vertices_m=box.vertices_m @ turn.T)
+    wide = 2**0.5
+    found = SceneObject("desk", (0.0, 0.5, 0.0), (wide, 1.0, wide), turned)
+    score = score_pair(ObjectPair(replace(DESK, mesh=box), found), POINTS)
+    assert score.box_iou_3d == pytest.approx(0.5)  # 1 of 2 square metres of floor
+    assert score.oriented_box_iou_3d == pytest.approx(2**0.5 / 2)  # a square and an octagon
+
+
+def test_every_object_weighs_the_same_and_nothing_found_is_no_number():
+    views = [[ObjectPair(DESK, DESK), ObjectPair(BED, None)], [ObjectPair(DESK, None)]]
+    scores = score_views(views, POINTS)
+    summary = scores["summary"]
+    assert (summary["images"], summary["objects"], summary["unmatched"]) == (2, 3, 2)
+    assert summary["box_iou_3d"] == pytest.approx(1 / 3)
+    assert summary["class_accuracy"] == pytest.approx(1 / 3)
+    assert summary["chamfer_l2_m"] < 0.1
+    bed = scores["classes"]["double_bed"]
+    assert bed["chamfer_l2_m"] is None and bed["chamfer_squared_m2"] is None
+    assert (bed["box_iou_3d"], bed["f_score"], bed["objects"]) == (0, 0, 1)
+    assert scores["classes"]["desk"]["box_iou_3d"] == pytest.approx(0.5)
+
+
+def test_the_same_seed_gives_the_same_figures():
+    views = [[ObjectPair(DESK, moved(DESK, 0.2))]]
+    assert score_views(views, 200, 3) == score_views(views, 200, 3)
+    assert score_views(views, 200, 3) != score_views(views, 200, 4)
+
+
+def test_no_object_is_a_sentence():
+    with pytest.raises(InputError, match="nothing to score"):
+        score_views([[]])

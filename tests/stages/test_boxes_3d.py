@@ -1,0 +1,289 @@
+"""The baselines with 3D supervision: they learn, stop, resume, and every verb takes their runs."""
+
+import csv
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_runs import tiny_config
+from torch.testing import assert_close
+from toy_rooms import write_toy_shards
+
+from sceneprior.batches import RoomBoxes
+from sceneprior.data.truth import TruthDataset
+from sceneprior.errors import ConfigError, InputError
+from sceneprior.models.atiss import END
+from sceneprior.stages import atiss3d, train
+from sceneprior.stages.atiss3d import Atiss3dStage, part_of_rooms
+from sceneprior.stages.callbacks import RollingCheckpoint
+from sceneprior.stages.runs import (
+    TrainedSampler,
+    find_checkpoint,
+    load_any_run,
+    load_run,
+    read_checkpoint,
+)
+from sceneprior.stages.sync2gen import Sync2genStage
+from sceneprior.stages.train import fit
+from sceneprior.tasks.decode import decode_training_rooms, synthesize
+from sceneprior.tasks.judge import Judging, judge_run, read_curves, report_run
+from sceneprior.tasks.watch import SampleJudge
+
+CPU = {"accelerator": "cpu", "devices": 1}
+ATISS = {
+    "epochs": 6, "batch_size": 5, "learning_rate": 2e-3, "width": 16, "layers": 1, "heads": 2,
+    "hidden": 16, "mixtures": 3, "dropout": 0.1, "schedule": "cosine",
+}  # fmt: skip
+SYNC = {
+    "epochs": 6, "batch_size": 5, "learning_rate": 3e-3, "width": 32, "latent": 8, "slots": 2,
+    "refine_steps": 5,
+}  # fmt: skip
+SECTIONS = {"atiss3d": ATISS, "sync2gen": SYNC}
+STAGES = {"atiss3d": Atiss3dStage, "sync2gen": Sync2genStage}
+
+
+def settings(shards: Path, stage: str, section: dict | None = None, **changes):
+    sections = {name: {**keys} for name, keys in SECTIONS.items()}
+    sections[stage] |= section or {}
+    return tiny_config(shards, stages=stage, **sections, **changes)
+
+
+@pytest.fixture(scope="module", params=["atiss3d", "sync2gen"])
+def stage(request) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def run(stage, toy_shards, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp(stage) / "run"
+    fit(settings(toy_shards, stage), folder, trainer_options=CPU)
+    return folder
+
+
+def curve(run: Path, stage: str, name: str) -> list[float]:
+    with (run / stage / "metrics.csv").open(newline="") as file:
+        return [float(row[f"train/{name}"]) for row in csv.DictReader(file)]
+
+
+def test_a_run_leaves_what_runs_py_promises(run, stage):
+    assert {path.name for path in run.iterdir()} == {"config.yaml", stage}
+    assert find_checkpoint(run) == (stage, run / stage / "final.ckpt")
+    terms = ("class", "position", "size") if stage == "atiss3d" else (
+        "existence", "position", "size", "kl", "left_out"
+    )  # fmt: skip
+    for name in (*terms, "loss"):
+        assert len(curve(run, stage, name)) == 6
+    assert curve(run, stage, "loss")[-1] < curve(run, stage, "loss")[0]
+    assert f"{stage}/size" in read_curves(run)
+
+
+class Stop(RollingCheckpoint):
+    """Presses Ctrl-C in the middle of the fourth epoch."""
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        if (trainer.current_epoch, batch_idx) == (3, 1):
+            raise KeyboardInterrupt
+
+
+def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
+    run, stage, toy_shards, tmp_path, monkeypatch
+):
+    config = settings(toy_shards, stage)
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "RollingCheckpoint", Stop)
+        with pytest.raises(KeyboardInterrupt):
+            fit(config, tmp_path / "run", trainer_options=CPU)
+    assert read_checkpoint(tmp_path / "run" / stage / "last.ckpt")["epoch"] == 2
+    fit(config, tmp_path / "run", resume=True, trainer_options=CPU)
+    wanted = read_checkpoint(run / stage / "final.ckpt")["state_dict"]
+    reached = read_checkpoint(tmp_path / "run" / stage / "final.ckpt")["state_dict"]
+    assert wanted.keys() == reached.keys()
+    for name, value in wanted.items():
+        assert torch.equal(reached[name], value), name
+
+
+def test_a_loss_that_is_no_number_names_its_rooms(stage, toy_shards, tmp_path, monkeypatch):
+    original = STAGES[stage].training_step
+
+    def poisoned(self, rooms, batch_idx):
+        bad = rooms.boxes_m.clone()
+        bad[0] = torch.nan
+        return original(
+            self, RoomBoxes(rooms.object_class, rooms.is_object, bad, rooms.room_ids), batch_idx
+        )
+
+    monkeypatch.setattr(STAGES[stage], "training_step", poisoned)
+    with pytest.raises(FloatingPointError, match=r"The loss is nan on rooms toy/train_\d\d, toy/"):
+        # One batch of all rooms: whatever is drawn of the first, some object's place is asked for.
+        fit(
+            settings(toy_shards, stage, {"batch_size": 12, "epochs": 5}),
+            tmp_path / "run",
+            trainer_options=CPU,
+        )
+    assert not list(tmp_path.rglob("final.ckpt"))
+
+
+def test_a_vae_learns_three_rooms_by_heart(tmp_path):
+    write_toy_shards(tmp_path / "shards", train=3, test=2, seed=5)
+    section = {
+        "batch_size": 3, "learning_rate": 5e-3, "schedule": "cosine", "epochs": 300, "width": 64,
+        "kl_weight": 1e-3, "refine_steps": 0,
+    }  # fmt: skip
+    config = settings(tmp_path / "shards", "sync2gen", section)
+    fit(config, tmp_path / "run", loggers=("csv",), trainer_options=CPU)
+    trained = load_any_run(tmp_path / "run")
+    truth = TruthDataset(tmp_path / "shards", "train").everything()
+    matrix = trained.prior.to_matrix(truth)
+    again = trained.prior.to_rooms(trained.prior.decode(trained.prior.encode(matrix)[0]))
+    assert_close(again.is_object.sum(dim=1), truth.is_object.sum(dim=1))
+    # Rooms are metres across and differ by tenths.
+    found, exists = trained.prior.to_matrix(again), matrix[..., :1]
+    off_m = (found - matrix)[..., 1:] * trained.prior.spread_m * exists
+    assert off_m.abs().max() < 0.1
+
+
+def test_what_comes_next_depends_on_what_is_there(toy_shards):
+    """The class of the next object is learnt from the set: without the set, the best that can be
+    said of it is how often each class comes next."""
+    config = settings(toy_shards, "atiss3d", {"width": 48, "hidden": 48, "dropout": 0.0})
+    dataset = TruthDataset(toy_shards, "train")
+    network = atiss3d.build(config, dataset).prior
+    rooms = dataset.__getitems__([(row, 0) for row in list(range(12)) * 8])
+    optimizer = torch.optim.Adam(network.parameters(), lr=2e-3)
+    drawn, terms = [], []
+    for step in range(200):
+        part = part_of_rooms(rooms, step)
+        placed = network.to_unit(part.boxes_m)
+        context = network.context(part.object_class, placed, part.is_object)
+        next_unit = network.to_unit(part.next_box_m)
+        term = -network.log_prob(context, part.next_class, next_unit)["class"].mean()
+        optimizer.zero_grad()
+        term.backward()
+        optimizer.step()
+        drawn.append(part.next_class)
+        terms.append(float(term.detach()))
+    share = torch.cat(drawn).bincount().float() / (200 * len(part.next_class))
+    blind = float(-(share * share.clamp(min=1e-9).log()).sum())
+    assert sum(terms[-20:]) / 20 < blind - 0.3
+
+
+def test_rooms_are_in_every_order_and_cut_anywhere(toy_shards):
+    rooms = TruthDataset(toy_shards, "train").everything()
+    counts = rooms.is_object.sum(dim=1)
+    seen, orders = set(), set()
+    for seed in range(80):
+        part = part_of_rooms(rooms, seed)
+        kept = part.is_object.sum(dim=1)
+        assert (kept <= counts).all()
+        for row in range(len(counts)):
+            there = part.is_object[row]
+            whole = {tuple(b) for b in rooms.boxes_m[row, rooms.is_object[row]].tolist()}
+            known = {tuple(b) for b in part.boxes_m[row, there].tolist()}
+            assert len(known) == int(kept[row]) and known <= whole
+            if kept[row] == counts[row]:
+                assert int(part.next_class[row]) == END
+            else:
+                box = tuple(part.next_box_m[row].tolist())
+                assert box in whole - known
+                at = [tuple(b) for b in rooms.boxes_m[row].tolist()].index(box)
+                assert part.next_class[row] == rooms.object_class[row, at]
+        seen.add(int(kept[0]))
+        orders.add(tuple(part.object_class[0].tolist()))
+    assert seen == set(range(int(counts[0]) + 1)) and len(orders) > 10
+
+
+def test_a_trained_run_makes_rooms_of_boxes(run, stage):
+    trained = load_any_run(run)
+    assert isinstance(trained, TrainedSampler) and trained.stage == stage
+    assert trained.room_ids == tuple(f"toy/train_{k:02d}" for k in range(12))
+    assert not trained.prior.training
+    scenes = synthesize(trained, 9, 2)
+    assert [scene.name for scene in scenes[:2]] == ["seed2_0000", "seed2_0001"]
+    again = synthesize(load_any_run(run), 9, 2)
+    for one, other in zip(scenes, again, strict=True):
+        assert one.objects == other.objects
+    assert [s.objects for s in scenes] != [s.objects for s in synthesize(trained, 9, 3)]
+    assert all(item.mesh is None and min(item.size_m) > 0 for s in scenes for item in s.objects)
+
+
+def test_what_needs_a_latent_space_says_that_there_is_none(run, stage):
+    with pytest.raises(InputError) as error:
+        load_run(run)
+    assert str(error.value) == (
+        f"{run} is a run of `stages: {stage}`, which has no latent space of rooms, and this needs "
+        "one. Take a run of `stages: two`; with this one, `sceneprior synthesize`, `eval-fid` and "
+        "`report` work."
+    )
+    with pytest.raises(
+        InputError, match=f"A run of `stages: {stage}` keeps no latents of training"
+    ):
+        decode_training_rooms(load_any_run(run))
+    with pytest.raises(InputError, match=f"but `stages: {stage}` has none; leave out --law kernel"):
+        synthesize(load_any_run(run), 2, 0, "kernel")
+
+
+def test_a_run_is_judged_and_reported(run, stage, tmp_path):
+    scores = judge_run(
+        run, 4, 0, None, tmp_path / "scores.json", None, Judging(renderer="software")
+    )
+    assert scores["protocol"]["stage"] == stage and "sampling_law" not in scores["protocol"]
+    assert "box_iou_3d" not in scores and scores["mean_objects"] >= 0
+    report_run(run, tmp_path / "scores.json", tmp_path / "page.html", 0, (), "software")
+    page = (tmp_path / "page.html").read_text()
+    assert "prior learnt from boxes in 3D" in page
+    assert "boxes sampled by a baseline that learnt from the true boxes" in " ".join(page.split())
+    assert "What training saw" not in page and "The sphere unfolding" not in page
+    assert "latent sphere" not in page
+
+
+def test_looks_choose_a_checkpoint(stage, toy_shards, tmp_path):
+    samples = {"every": 2, "count": 6, "metric": "objects_off"}
+    config = settings(toy_shards, stage, samples=samples)
+    fit(config, tmp_path / "run", trainer_options=CPU, judge=SampleJudge(config))
+    assert (tmp_path / "run" / stage / "samples" / "00004.png").is_file()
+    assert isinstance(load_any_run(tmp_path / "run", "best"), TrainedSampler)
+    config = settings(toy_shards, stage, samples=samples | {"metric": "mask_iou"})
+    with pytest.raises(
+        InputError, match=r"samples.metric is mask_iou, but a look gave only category"
+    ):
+        fit(config, tmp_path / "other", trainer_options=CPU, judge=SampleJudge(config))
+
+
+def test_what_does_not_fit_is_a_sentence(run, stage, toy_shards, tmp_path):
+    with pytest.raises(InputError, match=r"has 5 objects but model.max_objects is 3; raise"):
+        fit(settings(toy_shards, stage, model__max_objects=3), tmp_path / "a")
+    with pytest.raises(
+        InputError, match=r"is labelled 'front3d_bedroom' but the config says 'scan"
+    ):
+        fit(settings(toy_shards, stage, label_set="scannet"), tmp_path / "b")
+    assert not list(tmp_path.iterdir())
+    other = shutil.copytree(run, tmp_path / "run")
+    text = (other / "config.yaml").read_text()
+    at = text.index(f"\n{stage}:")
+    (other / "config.yaml").write_text(text[:at] + text[at:].replace("width: ", "width: 2", 1))
+    with pytest.raises(InputError, match=r"does not fit the run's config.yaml .*use the config it"):
+        load_any_run(other)
+    with pytest.raises(ConfigError, match="'atiss3d': width 16 is not a multiple of heads 3"):
+        settings(toy_shards, "atiss3d", {"heads": 3})
+    with pytest.raises(ConfigError, match="'sync2gen': width 36 is not a multiple of 8"):
+        settings(toy_shards, "sync2gen", {"width": 36})
+
+
+def test_refinement_acts_on_sampling_alone(toy_shards, tmp_path):
+    """One training serves both of the paper's rows, Sync2Gen and Sync2Gen*."""
+    fit(
+        settings(toy_shards, "sync2gen", {"refine_steps": 40}),
+        tmp_path / "run",
+        trainer_options=CPU,
+    )
+    plain = shutil.copytree(tmp_path / "run", tmp_path / "plain")
+    text = (plain / "config.yaml").read_text()
+    assert "refine_steps: 40" in text
+    (plain / "config.yaml").write_text(text.replace("refine_steps: 40", "refine_steps: 0"))
+    refined, decoded = (
+        load_any_run(tmp_path / name).prior.sample(20, 0) for name in ("run", "plain")
+    )
+    assert torch.equal(refined.object_class, decoded.object_class)
+    assert torch.equal(refined.boxes_m[..., 3:], decoded.boxes_m[..., 3:])
+    assert not torch.equal(refined.boxes_m, decoded.boxes_m)
