@@ -31,9 +31,15 @@ def compare(
     from sceneprior.tasks.compare import compare as run_comparison
     from sceneprior.tasks.comparison import load_comparison, part_of
 
-    comparison = part_of(load_comparison(config), methods, rooms, seeds)
-    failures = run_comparison(comparison, out, jobs, renderer)
-    typer.echo(f"Wrote {out / 'table.md'}")
+    comparison = load_comparison(config)
+    part = part_of(comparison, methods, rooms, seeds)
+    try:
+        failures = run_comparison(comparison, part, out, jobs, renderer)
+    except KeyboardInterrupt:
+        typer.echo("Stopped. The same command goes on from here.", err=True)
+        raise typer.Exit(130) from None
+    if (out / "table.md").is_file():
+        typer.echo(f"Wrote {out / 'table.md'}")
     if failures:
         raise InputError(
             f"{len(failures)} runs failed and are not in the table: {'; '.join(failures)}"

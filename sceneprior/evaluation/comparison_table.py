@@ -122,11 +122,7 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 
 def _columns(rows: Sequence[Row]) -> list[Column]:
-    return [
-        column
-        for column in COLUMNS
-        if any(_value(row, column) is not None for row in rows)
-    ]
+    return [column for column in COLUMNS if any(_value(row, column) is not None for row in rows)]
 
 
 def _body(rows: Sequence[Row], columns: Sequence[Column]) -> list[tuple[str, list[str]]]:

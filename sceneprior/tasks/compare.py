@@ -15,12 +15,12 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import typer
+from rich.console import Console
 
-from sceneprior.errors import InputError
 from sceneprior.evaluation.comparison_table import Row, write_tables
 from sceneprior.files import write_whole
 from sceneprior.offscreen import open_renderer
@@ -28,6 +28,8 @@ from sceneprior.stages.runs import STAGES, load_any_run, read_checkpoint
 from sceneprior.tasks.comparison import Comparison, Run, runs_of
 from sceneprior.tasks.comparison_figure import write_figure
 
+JOURNAL = "steps.json"
+SAY = Console(stderr=True, soft_wrap=True)
 INTERRUPTED = (130, -signal.SIGINT)
 
 
@@ -40,11 +42,14 @@ class Costs:
     parameters: int
 
 
-def compare(comparison: Comparison, out: Path, jobs: int, renderer: str) -> list[str]:
+def compare(
+    comparison: Comparison, part: Comparison, out: Path, jobs: int, renderer: str
+) -> list[str]:
     """Train and judge every run that is not done yet, then write `table.*` and the figures.
 
     Args:
-        comparison: From `load_comparison`.
+        comparison: From `load_comparison`; the tables show all of it that is done.
+        part: What to do now: from `part_of`, or the same.
         out: `<rooms>/<method>/seed<k>/` in it holds a run; the tables lie beside them.
         jobs: Runs at a time.
         renderer: A renderer's name, or `auto`.
@@ -53,45 +58,56 @@ def compare(comparison: Comparison, out: Path, jobs: int, renderer: str) -> list
         A sentence for each run that failed; the table is written without it.
 
     Raises:
-        typer.Exit: stopped by Ctrl-C; the same command goes on.
+        KeyboardInterrupt: stopped by Ctrl-C; the same call goes on.
     """
-    runs = runs_of(comparison, out)
     stop = threading.Event()
     pool = ThreadPoolExecutor(max_workers=jobs)
     failures: list[str | None] = []
     try:
-        failures = list(pool.map(lambda run: _do(run, comparison, renderer, stop), runs))
+        work = partial(_do, comparison=comparison, renderer=renderer, jobs=jobs, stop=stop)
+        failures = list(pool.map(work, runs_of(part, out)))
     except KeyboardInterrupt:
         stop.set()
     finally:
         pool.shutdown(cancel_futures=True)  # waits for those that the same Ctrl-C has told
     if stop.is_set():
-        typer.echo("Stopped. The same command goes on from here.", err=True)
-        raise typer.Exit(130)
-    done = [run for run in runs if (run.folder / "scores.json").is_file()]
+        raise KeyboardInterrupt
+    done = [run for run in runs_of(comparison, out) if _is_done(run)]
     if done:
         write_tables(_rows(comparison, done), out)
         drawing = open_renderer(renderer)
         for key in comparison.rooms:
-            own = [run for run in done if run.rooms == key and run.seed == comparison.seeds[0]]
-            if own:
+            first = {run.method: run for run in reversed(done) if run.rooms == key}
+            if own := [first[method] for method in comparison.methods if method in first]:
                 write_figure(comparison, own, out / f"{key}.png", drawing)
     return [failure for failure in failures if failure]
 
 
-def _do(run: Run, comparison: Comparison, renderer: str, stop: threading.Event) -> str | None:
+def _journal(run: Run) -> dict[str, Any]:
+    path = run.folder / JOURNAL
+    found: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    return found
+
+
+def _is_done(run: Run) -> bool:
+    noted = _journal(run)
+    return all(noted.get(name, {}).get("finished") for name in ("fit", "scores"))
+
+
+def _do(
+    run: Run, comparison: Comparison, renderer: str, jobs: int, stop: threading.Event
+) -> str | None:
     """Both commands of a run, unless they are done; a sentence if one failed."""
-    journal = run.folder / "steps.json"
-    done: dict[str, Any] = json.loads(journal.read_text()) if journal.is_file() else {}
+    done = _journal(run)
     for name, arguments in _steps(run, comparison, renderer).items():
         before = done.get(name, {})
         if before.get("finished") and before["arguments"] == arguments:
             continue
         if stop.is_set():
             return None
-        typer.echo(f"$ sceneprior {shlex.join(arguments)}", err=True)
+        SAY.print(f"$ sceneprior {shlex.join(arguments)}", markup=False, highlight=False)
         run.folder.mkdir(parents=True, exist_ok=True)
-        status, cpu_s, wall_s = _call(arguments, run.folder / f"{name}.log")
+        status, cpu_s, wall_s = _call(arguments, run.folder / f"{name}.log", jobs)
         earlier = {} if before.get("finished") else before  # a stopped step goes on
         done[name] = {
             "arguments": arguments,
@@ -99,12 +115,13 @@ def _do(run: Run, comparison: Comparison, renderer: str, stop: threading.Event) 
             "wall_s": wall_s + earlier.get("wall_s", 0.0),
             "finished": status == 0,
         }
-        write_whole(journal, (json.dumps(done, indent=1) + "\n").encode())
+        write_whole(run.folder / JOURNAL, (json.dumps(done, indent=1) + "\n").encode())
         if status in INTERRUPTED:
             stop.set()
             return None
         if status:
-            return f"{run.rooms}, {run.method}, seed {run.seed}: {_last_line(run.folder / f'{name}.log')}"
+            told = _last_line(run.folder / f"{name}.log")
+            return f"{run.rooms}, {run.method}, seed {run.seed}: {told}"
     return None
 
 
@@ -123,13 +140,17 @@ def _steps(run: Run, comparison: Comparison, renderer: str) -> dict[str, list[st
     }  # fmt: skip
 
 
-def _call(arguments: Sequence[str], log: Path) -> tuple[int, float, float]:
+def _call(arguments: Sequence[str], log: Path, jobs: int) -> tuple[int, float, float]:
     """Exit status, CPU seconds and wall seconds of a command, whose words go to `log`."""
+    # Threads of several jobs on one core wait for each other, spinning: each job has its share.
+    threads = str(max(1, (os.cpu_count() or 1) // jobs))
+    share = {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads} if jobs > 1 else {}
     start = time.monotonic()
     with log.open("wb") as file:
         process = subprocess.Popen(
-            [sys.executable, "-m", "sceneprior", *arguments], stdout=file, stderr=file
-        )
+            [sys.executable, "-m", "sceneprior", *arguments],
+            stdout=file, stderr=file, env={**os.environ, **share},
+        )  # fmt: skip
         # wait4 knows what this child alone has used, with all that it waited for itself.
         _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
@@ -165,7 +186,7 @@ def costs_of(folder: Path) -> Costs:
     """What training took, from what `compare` noted and the checkpoints hold."""
     run = folder / "run"
     finals = [path for stage in STAGES if (path := run / stage / "final.ckpt").is_file()]
-    noted = json.loads((folder / "steps.json").read_text())
+    noted = json.loads((folder / JOURNAL).read_text())
     return Costs(
         cpu_s=noted["fit"]["cpu_s"],
         steps=sum(int(read_checkpoint(path)["global_step"]) for path in finals),

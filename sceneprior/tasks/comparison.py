@@ -5,8 +5,9 @@ from pathlib import Path
 
 from pydantic import Field, field_validator
 
-from sceneprior.config import Section, check_section, load_config, read_settings
+from sceneprior.config import load_config
 from sceneprior.errors import InputError
+from sceneprior.settings import Section, check_settings, read_settings
 
 EVERY = "every"
 """In `Method.set`: settings for every kind of room."""
@@ -27,14 +28,14 @@ class Method(Section):
     title: str
     group: str
     """Methods of one group stand together, under this heading."""
-    set: dict[str, tuple[str, ...]] = {}
+    set: dict[str, list[str]] = Field(default_factory=dict)
     """Changes to the config as `section.key=value`, by kind of room; those for `every` first."""
 
 
 class Comparison(Section):
     """Methods by kinds of rooms by seeds."""
 
-    seeds: tuple[int, ...] = Field(min_length=1)
+    seeds: tuple[int, ...] = Field(min_length=1, strict=False)
     """A run each; the seed of training."""
     count: int = Field(ge=2)
     """Rooms that each run generates and is judged by."""
@@ -71,7 +72,7 @@ def load_comparison(name: str) -> Comparison:
         InputError: a method has settings for rooms that the comparison does not know.
     """
     path, data = read_settings(name)
-    comparison = check_section(Comparison, data, str(path))
+    comparison = check_settings(Comparison, data, str(path))
     for key, method in comparison.methods.items():
         strange = sorted(set(method.set) - {EVERY, *comparison.rooms})
         if strange:
