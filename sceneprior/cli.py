@@ -8,7 +8,7 @@ import typer
 
 from data_prep.cli import add_commands
 from sceneprior import __version__
-from sceneprior.commands import generating, judging, reconstruction, retrieval, training
+from sceneprior.commands import comparing, generating, judging, reconstruction, retrieval, training
 from sceneprior.errors import InputError
 
 app = typer.Typer(
@@ -19,7 +19,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 add_commands(app)
-for verbs in (training, generating, retrieval, judging, reconstruction):
+for verbs in (training, generating, retrieval, reconstruction, judging, comparing):
     verbs.add_commands(app)
 
 

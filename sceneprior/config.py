@@ -1,37 +1,17 @@
-"""A run's YAML in, one frozen, checked `RunConfig` out: the one module here that knows YAML."""
+"""What a run is: one frozen, checked `RunConfig`, read from a YAML and written beside the run."""
 
-import difflib
-import importlib.resources
-import re
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from sceneprior.classes import label_set
-from sceneprior.errors import ConfigError, InputError
+from sceneprior.errors import InputError
+from sceneprior.settings import Section, check_settings, read_settings
 
 
-class _Loader(yaml.SafeLoader):
-    """Safe YAML in which 3e-4 is a number, as people write it; YAML 1.1 asks for 3.0e-4."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"),
-    [*"-+0123456789"],
-)
-
-
-class _Section(BaseModel):
-    # Strict: "yes" is no number and 3.5 no count. Unknown keys are errors that name a neighbour.
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
-    )
-
-
-class DataConfig(_Section):
+class DataConfig(Section):
     """Which shards, and how much of each room a step sees."""
 
     shards: str
@@ -48,7 +28,7 @@ class DataConfig(_Section):
     """Loader processes; 0 loads in the training process, which is fastest for small sets."""
 
 
-class ModelConfig(_Section):
+class ModelConfig(Section):
     """The network (section 3 and supplement A)."""
 
     max_objects: int = Field(ge=1)
@@ -110,7 +90,7 @@ class ModelConfig(_Section):
         return self.width if self.latent == "uniform" else self.anchors
 
 
-class LossConfig(_Section):
+class LossConfig(Section):
     """Weights of the terms (section 4)."""
 
     class_: float = Field(1.0, ge=0, alias="class")
@@ -133,7 +113,7 @@ class LossConfig(_Section):
     """Masks that overlap less than this teach no shape."""
 
 
-class StageConfig(_Section):
+class StageConfig(Section):
     """How one stage is trained. The optimiser is Adam; released, AdamW without decay: the same."""
 
     epochs: int = Field(ge=1)
@@ -183,7 +163,7 @@ class ShapeConfig(StageConfig):
     """Whether 2D boxes come from the deformed mesh (paper) or still from the proxy."""
 
 
-class GanConfig(_Section):
+class GanConfig(Section):
     """The GAN (`stages: gan`); docs/baselines_2d.md says what each is for. Maps are half as large
     as the instance ids that `data.mask_step` keeps; renders take `shape.silhouettes`."""
 
@@ -207,7 +187,7 @@ class GanConfig(_Section):
     """As in `layout`."""
 
 
-class BoxStageConfig(_Section):
+class BoxStageConfig(Section):
     """What the baselines that learn from boxes in 3D have in common. The optimiser is Adam."""
 
     epochs: int = Field(ge=1)
@@ -274,7 +254,7 @@ class Sync2genConfig(BoxStageConfig):
         return self
 
 
-class SamplingConfig(_Section):
+class SamplingConfig(Section):
     """Where new latents come from."""
 
     law: Literal["kernel", "geodesic", "gaussian", "paper"] = "kernel"
@@ -282,7 +262,7 @@ class SamplingConfig(_Section):
     to their logits; `paper`: logits from N(0, 1)."""
 
 
-class SamplesConfig(_Section):
+class SamplesConfig(Section):
     """What a stage generates while it trains; the checkpoint that generates best is kept."""
 
     every: int = Field(0, ge=0)
@@ -300,7 +280,7 @@ class SamplesConfig(_Section):
     `train` where `best.ckpt` is to be reported."""
 
 
-class RunConfig(_Section):
+class RunConfig(Section):
     """Everything a run is; saved with it as `config.yaml`."""
 
     label_set: str
@@ -332,28 +312,6 @@ class RunConfig(_Section):
         return self
 
 
-def find_config(name: str) -> Path:
-    """A path to a YAML, or the name of a config that ships with the package.
-
-    Raises:
-        ConfigError: neither exists.
-    """
-    path = Path(name)
-    if path.is_file():
-        return path
-    folders = [
-        Path(str(importlib.resources.files("sceneprior"))) / "configs",
-        Path(__file__).resolve().parent.parent / "configs",
-    ]
-    for folder in folders:
-        if path.parent == Path() and (folder / name).is_file():
-            return folder / name
-    shipped = sorted({item.name for folder in folders for item in folder.glob("*.yaml")})
-    raise ConfigError(
-        f"No config '{name}': it is neither a file nor one of the shipped {', '.join(shipped)}."
-    )
-
-
 def load_config(name: str, overrides: tuple[str, ...] = ()) -> RunConfig:
     """Read a config and apply `section.key=value` overrides.
 
@@ -361,69 +319,16 @@ def load_config(name: str, overrides: tuple[str, ...] = ()) -> RunConfig:
         ConfigError: not found, not YAML, an unknown key or a wrong value; the message names the
             file, the key and, for a typo, the nearest key.
     """
-    path = find_config(name)
-    try:
-        data = yaml.load(path.read_text(), _Loader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from None
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path} holds no settings; expected `section:` and `key: value` lines.")
-    for override in overrides:
-        _apply(data, override)
+    path, data = read_settings(name, overrides)
     return check_config(data, str(path))
 
 
 def check_config(data: dict[str, Any], source: str) -> RunConfig:
     """Turn plain data into a `RunConfig`, or say in one sentence what is wrong with it."""
-    try:
-        return RunConfig.model_validate(data)
-    except ValidationError as error:
-        raise ConfigError(_explain(error, source)) from None
+    return check_settings(RunConfig, data, source)
 
 
 def dump_config(config: RunConfig, path: Path) -> None:
     """Write the resolved settings, every default included."""
     data = config.model_dump(mode="json", by_alias=True)
     path.write_text(yaml.safe_dump(data, sort_keys=False))
-
-
-def _apply(data: dict[str, Any], override: str) -> None:
-    key, equals, text = override.partition("=")
-    if not equals:
-        raise ConfigError(f"--set takes section.key=value, got '{override}'.")
-    *parents, last = key.strip().split(".")
-    node = data
-    for parent in parents:
-        node = node.setdefault(parent, {})
-        if not isinstance(node, dict):
-            raise ConfigError(f"--set {override}: '{parent}' is a value, not a section.")
-    try:
-        node[last] = yaml.load(text, _Loader)
-    except yaml.YAMLError:
-        raise ConfigError(f"--set {override}: '{text}' is not a YAML value.") from None
-
-
-def _explain(error: ValidationError, source: str) -> str:
-    first, *others = error.errors(include_url=False)
-    location = [str(part) for part in first["loc"]]
-    key = ".".join(location)
-    more = f" ({len(others)} more problem{'s' * (len(others) > 1)} after it)" if others else ""
-    if first["type"] == "extra_forbidden":
-        known = _keys_beside(location)
-        near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.0)
-        return f"{source}: unknown key '{key}'; the nearest valid key is '{near[0]}'.{more}"
-    if first["type"] == "missing":
-        return f"{source}: '{key}' is missing and has no default; add it.{more}"
-    got = f" (got {first['input']!r})" if not isinstance(first["input"], dict) else ""
-    reason = first["msg"].removeprefix("Value error, ")
-    reason = reason[:1].lower() + reason[1:]
-    return f"{source}: {f'{chr(39)}{key}{chr(39)}: ' if key else ''}{reason}{got}.{more}"
-
-
-def _keys_beside(location: list[str]) -> list[str]:
-    section: type[BaseModel] = RunConfig
-    for part in location[:-1]:
-        annotation = section.model_fields[part].annotation
-        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-            section = annotation
-    return [field.alias or name for name, field in section.model_fields.items()]

@@ -1,0 +1,131 @@
+"""A YAML in, checked settings out, or one sentence that names the file and the key."""
+
+import difflib
+import importlib.resources
+import re
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from sceneprior.errors import ConfigError
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML in which 3e-4 is a number, as people write it; YAML 1.1 asks for 3.0e-4."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"),
+    [*"-+0123456789"],
+)
+
+
+class Section(BaseModel):
+    # Strict: "yes" is no number and 3.5 no count. Unknown keys are errors that name a neighbour.
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
+    )
+
+
+_S = TypeVar("_S", bound=Section)
+
+
+def find_config(name: str) -> Path:
+    """A path to a YAML, or the name of a config that ships with the package.
+
+    Raises:
+        ConfigError: neither exists.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    folders = [
+        Path(str(importlib.resources.files("sceneprior"))) / "configs",
+        Path(__file__).resolve().parent.parent / "configs",
+    ]
+    for folder in folders:
+        if path.parent == Path() and (folder / name).is_file():
+            return folder / name
+    shipped = sorted({item.name for folder in folders for item in folder.glob("*.yaml")})
+    raise ConfigError(
+        f"No config '{name}': it is neither a file nor one of the shipped {', '.join(shipped)}."
+    )
+
+
+def read_settings(name: str, overrides: tuple[str, ...] = ()) -> tuple[Path, dict[str, Any]]:
+    """A YAML's path and what it holds, with `section.key=value` overrides applied.
+
+    Raises:
+        ConfigError: not found, not YAML, or an override that is none.
+    """
+    path = find_config(name)
+    try:
+        data = yaml.load(path.read_text(), _Loader)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from None
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path} holds no settings; expected `section:` and `key: value` lines.")
+    for override in overrides:
+        _apply(data, override)
+    return path, data
+
+
+def check_settings(model: type[_S], data: dict[str, Any], source: str) -> _S:
+    """Plain data as the model it should be.
+
+    Raises:
+        ConfigError: an unknown key or a wrong value; the message names the source, the key and,
+            for a typo, the nearest key.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(_explain(model, error, source)) from None
+
+
+def _apply(data: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    if not equals:
+        raise ConfigError(f"--set takes section.key=value, got '{override}'.")
+    *parents, last = key.strip().split(".")
+    node = data
+    for parent in parents:
+        node = node.setdefault(parent, {})
+        if not isinstance(node, dict):
+            raise ConfigError(f"--set {override}: '{parent}' is a value, not a section.")
+    try:
+        node[last] = yaml.load(text, _Loader)
+    except yaml.YAMLError:
+        raise ConfigError(f"--set {override}: '{text}' is not a YAML value.") from None
+
+
+def _explain(model: type[Section], error: ValidationError, source: str) -> str:
+    first, *others = error.errors(include_url=False)
+    location = [str(part) for part in first["loc"]]
+    key = ".".join(location)
+    more = f" ({len(others)} more problem{'s' * (len(others) > 1)} after it)" if others else ""
+    if first["type"] == "extra_forbidden":
+        known = _keys_beside(model, location)
+        near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.0)
+        return f"{source}: unknown key '{key}'; the nearest valid key is '{near[0]}'.{more}"
+    if first["type"] == "missing":
+        return f"{source}: '{key}' is missing and has no default; add it.{more}"
+    got = f" (got {first['input']!r})" if not isinstance(first["input"], dict) else ""
+    reason = first["msg"].removeprefix("Value error, ")
+    reason = reason[:1].lower() + reason[1:]
+    return f"{source}: {f'{chr(39)}{key}{chr(39)}: ' if key else ''}{reason}{got}.{more}"
+
+
+def _keys_beside(model: type[Section], location: list[str]) -> list[str]:
+    section: type[BaseModel] = model
+    for part in location[:-1]:
+        if part not in section.model_fields:
+            continue  # a name that the user chose, of a section that `dict[str, ...]` holds
+        annotation = section.model_fields[part].annotation
+        for inner in (annotation, *get_args(annotation)):
+            if isinstance(inner, type) and issubclass(inner, BaseModel):
+                section = inner
+    return [field.alias or name for name, field in section.model_fields.items()]

@@ -1,0 +1,135 @@
+"""What `sceneprior compare` compares: its YAML in, one `Comparison` and its runs out."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import Field, field_validator
+
+from sceneprior.config import load_config
+from sceneprior.errors import InputError
+from sceneprior.settings import Section, check_settings, read_settings
+
+EVERY = "every"
+"""In `Method.set`: settings for every kind of room."""
+
+
+class Rooms(Section):
+    """A kind of room to compare on."""
+
+    config: str
+    """The run config of our own method; every method's settings are changes to it."""
+    title: str
+    """Heading of its table."""
+
+
+class Method(Section):
+    """A row of the table."""
+
+    title: str
+    group: str
+    """Methods of one group stand together, under this heading."""
+    set: dict[str, list[str]] = Field(default_factory=dict)
+    """Changes to the config as `section.key=value`, by kind of room; those for `every` first."""
+
+
+class Comparison(Section):
+    """Methods by kinds of rooms by seeds."""
+
+    seeds: tuple[int, ...] = Field(min_length=1, strict=False)
+    """A run each; the seed of training."""
+    count: int = Field(ge=2)
+    """Rooms that each run generates and is judged by."""
+    sampling_seed: int = Field(0, ge=0)
+    """Of the generated rooms, the same for every run."""
+    rooms: dict[str, Rooms] = Field(min_length=1)
+    methods: dict[str, Method] = Field(min_length=1)
+
+    @field_validator("seeds")
+    @classmethod
+    def _each_once(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        if len(set(seeds)) < len(seeds) or min(seeds) < 0:
+            raise ValueError("seeds are numbers from 0 on, each once")
+        return seeds
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training with one seed, and where it goes."""
+
+    rooms: str
+    method: str
+    seed: int
+    config: str
+    settings: tuple[str, ...]
+    folder: Path
+
+
+def load_comparison(name: str) -> Comparison:
+    """Read a comparison and check the settings of each of its runs.
+
+    Raises:
+        ConfigError: not found, not YAML, an unknown key or a wrong value, in it or in a run.
+        InputError: a method has settings for rooms that the comparison does not know.
+    """
+    path, data = read_settings(name)
+    comparison = check_settings(Comparison, data, str(path))
+    for key, method in comparison.methods.items():
+        strange = sorted(set(method.set) - {EVERY, *comparison.rooms})
+        if strange:
+            raise InputError(
+                f"{path}: methods.{key}.set has '{strange[0]}'; expected {EVERY} or one of "
+                f"{', '.join(comparison.rooms)}."
+            )
+    for run in runs_of(comparison, Path()):
+        load_config(run.config, run.settings)
+    return comparison
+
+
+def part_of(
+    comparison: Comparison, methods: str | None, rooms: str | None, seeds: str | None
+) -> Comparison:
+    """Some methods, kinds of rooms and seeds of a comparison, each given as `a,b`; None is all.
+
+    Raises:
+        InputError: the comparison has no such entry.
+    """
+    kept_methods = _chosen("method", methods, tuple(comparison.methods))
+    kept_rooms = _chosen("kind of rooms", rooms, tuple(comparison.rooms))
+    kept_seeds = _chosen("seed", seeds, tuple(str(seed) for seed in comparison.seeds))
+    return comparison.model_copy(
+        update={
+            "methods": {key: comparison.methods[key] for key in kept_methods},
+            "rooms": {key: comparison.rooms[key] for key in kept_rooms},
+            "seeds": tuple(int(seed) for seed in kept_seeds),
+        }
+    )
+
+
+def _chosen(what: str, given: str | None, known: tuple[str, ...]) -> tuple[str, ...]:
+    if given is None:
+        return known
+    names = tuple(name.strip() for name in given.split(",") if name.strip())
+    for name in names:
+        if name not in known:
+            raise InputError(f"No {what} '{name}' in this comparison; it has {', '.join(known)}.")
+    if not names:
+        raise InputError(f"No {what} was named; the comparison has {', '.join(known)}.")
+    return tuple(name for name in known if name in names)
+
+
+def runs_of(comparison: Comparison, out: Path) -> list[Run]:
+    """Every run, seed by seed, so that a comparison that is stopped early is a whole one of fewer
+    seeds."""
+    return [
+        Run(
+            rooms=key,
+            method=name,
+            seed=seed,
+            config=rooms.config,
+            settings=(*method.set.get(EVERY, ()), *method.set.get(key, ()), f"seed={seed}"),
+            folder=out / key / name / f"seed{seed}",
+        )
+        for seed in comparison.seeds
+        for key, rooms in comparison.rooms.items()
+        for name, method in comparison.methods.items()
+    ]
