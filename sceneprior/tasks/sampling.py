@@ -10,7 +10,7 @@ from sceneprior.models.latents import LatentSpace
 NEIGHBOURS = 20
 """Rooms that a geodesic may lead to; more reach further from the training rooms."""
 
-BANDWIDTH = 0.2
+BANDWIDTH = 0.15
 """Of the kernel law, in standard deviations of the training rooms' logits: 0 copies training rooms,
 1 is the gaussian law. Larger is newer, and more often a room without a bed or with two."""
 
