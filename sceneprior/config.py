@@ -199,7 +199,7 @@ class BoxStageConfig(Section):
     schedule: Literal["constant", "cosine"] = "constant"
     """`constant` (published, both), or a short rise and a `cosine` down to zero."""
     clip_gradient: float = Field(0.0, ge=0)
-    """Largest gradient norm; 0 does not clip."""
+    """Largest gradient norm; 0 does not clip. Do not clip `atiss3d` (docs/baselines_3d.md)."""
     cpu_threads: int | None = Field(None, ge=1)
     """As in `layout`."""
     width: int = Field(512, ge=8)

@@ -59,10 +59,13 @@ class Atiss(nn.Module):
         self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
         self.object = nn.Linear(CLASS_WIDTH + 6 * 2 * OCTAVES, width)
         self.query = nn.Parameter(torch.randn(width))
-        layer = nn.TransformerEncoderLayer(
-            width, heads, hidden, dropout, activation="gelu", batch_first=True
+        self.encoder = nn.ModuleList(
+            nn.TransformerEncoderLayer(
+                width, heads, hidden, dropout, activation="gelu", batch_first=True
+            )
+            # Each drawn by itself; nn.TransformerEncoder would start with copies of one.
+            for _ in range(layers)
         )
-        self.encoder = nn.TransformerEncoder(layer, layers, enable_nested_tensor=False)
         of_three = 3 * 3 * mixtures
         self.class_head = _head(width, classes)
         self.position_head = _head(width + CLASS_WIDTH, of_three)
@@ -94,7 +97,9 @@ class Atiss(nn.Module):
         query = self.query.expand(len(unit), 1, -1)
         tokens = torch.cat([query, self.object(objects)], dim=1)
         padding = torch.cat([is_object.new_zeros(len(unit), 1), ~is_object], dim=1)
-        return self.encoder(tokens, src_key_padding_mask=padding)[:, 0]
+        for layer in self.encoder:
+            tokens = layer(tokens, src_key_padding_mask=padding)
+        return tokens[:, 0]
 
     def log_prob(
         self,
