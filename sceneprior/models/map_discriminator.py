@@ -36,13 +36,25 @@ class MapDiscriminator(nn.Module):
             nn.LeakyReLU(0.2),
             spectral_norm(nn.Linear(widths[-1], 1)),
         )
+        self.counts = nn.Sequential(
+            spectral_norm(nn.Linear(classes, widths[-1])),
+            nn.LeakyReLU(0.2),
+            spectral_norm(nn.Linear(widths[-1], widths[-1])),
+            nn.LeakyReLU(0.2),
+            spectral_norm(nn.Linear(widths[-1], 1)),
+        )
 
     def forward(
-        self, maps: Float[Tensor, "rooms views classes height width"]
-    ) -> tuple[Float[Tensor, "rooms views rows columns"], Float[Tensor, " rooms"]]:
-        """Scores of patches and of rooms; a higher score looks more real.
+        self,
+        maps: Float[Tensor, "rooms views classes height width"],
+        counts: Float[Tensor, "rooms classes"],
+    ) -> tuple[
+        Float[Tensor, "rooms views rows columns"], Float[Tensor, " rooms"], Float[Tensor, " rooms"]
+    ]:
+        """Scores of patches, of rooms, and of what is in them; a higher score looks more real.
 
         A room is what its views show on average and at most, whatever their order and number.
+        What is in it is the number of its objects of each class.
         """
         x = maps.flatten(0, 1)
         for layer in self.layers:
@@ -50,4 +62,4 @@ class MapDiscriminator(nn.Module):
         patches = self.patch(x)[:, 0].unflatten(0, maps.shape[:2])
         features = x.mean(dim=(2, 3)).unflatten(0, maps.shape[:2])
         room = torch.cat([features.mean(dim=1), features.amax(dim=1)], dim=-1)
-        return patches, self.room(room)[:, 0]
+        return patches, self.room(room)[:, 0], self.counts(counts)[:, 0]

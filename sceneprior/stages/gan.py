@@ -11,10 +11,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.batches import DecodedScenes, SceneViews
-from sceneprior.classes import label_set
+from sceneprior.classes import VOID, label_set
 from sceneprior.config import RunConfig
 from sceneprior.losses.completeness import kept_objects
-from sceneprior.losses.semantic_maps import observed_maps, rendered_maps
+from sceneprior.losses.semantic_maps import (
+    decoded_counts,
+    observed_counts,
+    observed_maps,
+    rendered_maps,
+)
 from sceneprior.models.layout_decoder import LayoutDecoder
 from sceneprior.models.map_discriminator import MapDiscriminator
 from sceneprior.models.scene_prior import ScenePrior
@@ -69,20 +74,37 @@ class GanStage(lightning.LightningModule):
             undecided = certainty(scenes)
             check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views)
             real = self._through_noise(observed_maps(views, self.classes))
+            real_counts = observed_counts(views, self.classes)
             fake = self._through_noise(self._draw(scenes, views))
+            fake_counts = decoded_counts(scenes, self.config.loss.completeness_target)
 
-        real_scores, fake_scores = self.discriminator(real), self.discriminator(fake.detach())
+        penalised = self.config.gan.gradient_penalty > 0
+        real_scores = self.discriminator(real.requires_grad_(penalised), real_counts)
+        fake_scores = self.discriminator(fake.detach(), fake_counts.detach())
         told_apart = mistaken(real_scores, real=True) + mistaken(fake_scores, real=False)
+        if penalised:
+            steepness = gradient_penalty(real_scores, real)
+            told_apart = told_apart + self.config.gan.gradient_penalty / 2 * steepness
         check_finite(told_apart, views)
         self._update(discriminator_optimizer, told_apart)
 
         self.discriminator.requires_grad_(False)
-        loss = mistaken(self.discriminator(fake), real=True) + SOFT * undecided
+        loss = mistaken(self.discriminator(fake, fake_counts), real=True) + SOFT * undecided
         check_finite(loss, views)
         self._update(generator_optimizer, loss)
         self.discriminator.requires_grad_(True)
         self._average()
         self._log(scenes, loss, told_apart, real_scores, fake_scores)
+
+    def on_train_epoch_start(self) -> None:
+        """Rates fall evenly to 0, so that the opponents' circling ends, too."""
+        for optimizer in self._optimizers():
+            for group in optimizer.param_groups:
+                group["lr"] = group["initial_lr"] * self._left()
+
+    def _left(self) -> float:
+        """Share of the training that is still to come."""
+        return 1 - self.current_epoch / self.config.gan.epochs
 
     def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:
         shape = (rooms, self.config.model.logits_per_room)
@@ -100,8 +122,7 @@ class GanStage(lightning.LightningModule):
 
     def _through_noise(self, maps: Tensor) -> Tensor:
         """Maps as the discriminator sees them; real ones come in steps that rendered ones lack."""
-        left = 1 - self.current_epoch / self.config.gan.epochs
-        return maps + self.config.gan.noise * left * torch.randn_like(maps)
+        return maps + self.config.gan.noise * self._left() * torch.randn_like(maps)
 
     def _optimizers(self) -> tuple[LightningOptimizer, LightningOptimizer]:
         both = self.optimizers()
@@ -145,11 +166,13 @@ class GanStage(lightning.LightningModule):
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         rates = self.config.gan
+        both = (
+            (self.generator, rates.learning_rate),
+            (self.discriminator, rates.discriminator_learning_rate),
+        )
         return [
-            torch.optim.Adam(self.generator.parameters(), rates.learning_rate, BETAS),
-            torch.optim.Adam(
-                self.discriminator.parameters(), rates.discriminator_learning_rate, BETAS
-            ),
+            torch.optim.Adam([{"params": part.parameters(), "initial_lr": rate}], rate, BETAS)
+            for part, rate in both
         ]
 
 
@@ -164,9 +187,25 @@ def mistaken(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
     return torch.stack([F.softplus(sign * score).mean() for score in scores]).sum()
 
 
+def gradient_penalty(
+    scores: Sequence[Tensor], maps: Float[Tensor, "rooms *map"]
+) -> Float[Tensor, ""]:
+    """Squared length of the gradient of the scores of real maps, the mean over rooms.
+
+    Source:
+        R1 of Mescheder et al., "Which training methods for GANs do actually converge?", ICML 2018.
+    """
+    total = len(maps) * torch.stack([score.mean() for score in scores]).sum()
+    (gradient,) = torch.autograd.grad(total, maps, create_graph=True)
+    return gradient.flatten(1).square().sum(dim=1).mean()
+
+
 def certainty(scenes: DecodedScenes) -> Float[Tensor, ""]:
-    """Mean squares of the logits that decide: 0 is undecided."""
-    return scenes.class_logits.square().mean() + scenes.completeness_logits.square().mean()
+    """Mean squares of the logits that decide: 0 is undecided. `void` is no choice."""
+    return (
+        scenes.class_logits[..., VOID + 1 :].square().mean()
+        + scenes.completeness_logits.square().mean()
+    )
 
 
 @torch.no_grad()

@@ -14,10 +14,12 @@ from sceneprior.cli import app
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.losses.completeness import kept_objects
+from sceneprior.losses.semantic_maps import observed_counts, observed_maps
+from sceneprior.models.map_discriminator import MapDiscriminator
 from sceneprior.models.scene_atiss import SceneAtiss
 from sceneprior.stages import train
 from sceneprior.stages.callbacks import RollingCheckpoint
-from sceneprior.stages.gan import GanStage, mistaken
+from sceneprior.stages.gan import GanStage, gradient_penalty, mistaken
 from sceneprior.stages.runs import find_checkpoint, load_run, read_checkpoint
 from sceneprior.stages.train import fit
 from sceneprior.stages.view_loss import build_latents, build_prior
@@ -243,21 +245,64 @@ def test_a_discriminator_told_to_tell_apart_does_and_its_views_have_no_order(toy
     views = ViewDataset(toy_shards, "train", views_per_room=3, mask_step=4).__getitems__(
         [(row, 0) for row in range(6)]
     )
-    from sceneprior.losses.semantic_maps import observed_maps
-
     real = observed_maps(views, 22)
     with torch.no_grad():
         fake = stage._draw(stage.generator(torch.randn(6, 10)), views)
-    judge = stage.discriminator
+    judge, counts = stage.discriminator, observed_counts(views, 22)
     optimizer = torch.optim.Adam(judge.parameters(), 2e-3, (0.0, 0.99))
     for _ in range(60):
         optimizer.zero_grad()
-        loss = mistaken(judge(real), real=True) + mistaken(judge(fake), real=False)
+        loss = mistaken(judge(real, counts), True) + mistaken(judge(fake, counts), False)
         loss.backward()
         optimizer.step()
     judge.eval()
-    (_, room_real), (_, room_fake) = judge(real), judge(fake)
+    (_, room_real, _), (_, room_fake, _) = judge(real, counts), judge(fake, counts)
     assert (room_real > room_fake.max()).all()
-    patches, room = judge(real.flip(1))
+    patches, room, _ = judge(real.flip(1), counts)
     assert_close(room, room_real, rtol=0, atol=1e-5)
-    assert_close(patches.flip(1), judge(real)[0], rtol=0, atol=1e-5)
+    assert_close(patches.flip(1), judge(real, counts)[0], rtol=0, atol=1e-5)
+
+
+def test_a_discriminator_tells_crowded_rooms_by_their_counts(torch_rng):
+    torch.manual_seed(0)
+    judge = MapDiscriminator(5)
+    maps = torch.rand(8, 2, 5, 8, 8, generator=torch_rng)
+    few, many = torch.eye(5)[[1] * 8], 6 * torch.eye(5)[[1] * 8]
+    optimizer = torch.optim.Adam(judge.parameters(), 5e-3, (0.0, 0.99))
+    for _ in range(100):
+        optimizer.zero_grad()
+        loss = mistaken(judge(maps, few), real=True) + mistaken(judge(maps, many), real=False)
+        loss.backward()
+        optimizer.step()
+    judge.eval()
+    assert (judge(maps, few)[2] > judge(maps, many)[2] + 1).all()
+    for mine, other in zip(judge(maps, few)[:2], judge(maps, many)[:2], strict=True):
+        assert torch.equal(mine, other)  # maps alone decide of patches and rooms
+
+
+def test_the_gradient_penalty_is_the_squared_slope_of_each_room(torch_rng):
+    maps = torch.randn(3, 2, 4, generator=torch_rng, dtype=torch.float64, requires_grad=True)
+    weights = torch.randn(2, 4, generator=torch_rng, dtype=torch.float64, requires_grad=True)
+    scores = (maps * weights, (maps**2).sum(dim=(1, 2)))  # two a room's patches, one a room
+    found = gradient_penalty(scores, maps)
+    assert_close(found, ((weights / 8 + 2 * maps) ** 2).sum(dim=(1, 2)).mean())
+    (slope,) = torch.autograd.grad(found, weights)
+    assert (slope != 0).all()
+
+
+def test_rates_fall_evenly_to_nothing(toy_shards, tmp_path, monkeypatch):
+    seen = []
+
+    def note(self, optimizer, loss):
+        seen.append(optimizer.param_groups[0]["lr"])
+        step(self, optimizer, loss)
+
+    step = GanStage._update
+    monkeypatch.setattr(GanStage, "_update", note)
+    config = settings(toy_shards, "gan", gan={**GAN, "gradient_penalty": 1.0})
+    fit(config, tmp_path / "run", trainer_options=CPU)
+    rates = [config.gan.discriminator_learning_rate, config.gan.learning_rate]
+    for epoch, kept in enumerate((1, 0.75, 0.5, 0.25)):
+        batches = len(seen) // 4
+        here = seen[epoch * batches : (epoch + 1) * batches]
+        assert here[:2] == pytest.approx([rate * kept for rate in rates])
