@@ -11,6 +11,9 @@ from torch.nn.utils.parametrizations import spectral_norm
 STEPS = 2
 """Halvings of a map's sides; a patch is then 18 x 18 pixels of it."""
 
+GAIN = 4
+"""Of the scores of rooms: at 1, one object more or less would move the odds by e at most."""
+
 
 class MapDiscriminator(nn.Module):
     """Judge maps patch by patch, and a room by all of its views together.
@@ -62,4 +65,4 @@ class MapDiscriminator(nn.Module):
         patches = self.patch(x)[:, 0].unflatten(0, maps.shape[:2])
         features = x.mean(dim=(2, 3)).unflatten(0, maps.shape[:2])
         room = torch.cat([features.mean(dim=1), features.amax(dim=1)], dim=-1)
-        return patches, self.room(room)[:, 0], self.counts(counts)[:, 0]
+        return patches, GAIN * self.room(room)[:, 0], GAIN * self.counts(counts)[:, 0]
