@@ -1,6 +1,7 @@
 """The baselines with 2D supervision: they train, stop, resume, and every verb takes their runs."""
 
 import csv
+import math
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from tiny_runs import tiny_config, write_tiny_config
 from torch.testing import assert_close
 from typer.testing import CliRunner
 
+from sceneprior.batches import DecodedScenes
 from sceneprior.cli import app
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
@@ -19,7 +21,7 @@ from sceneprior.models.map_discriminator import MapDiscriminator
 from sceneprior.models.scene_atiss import SceneAtiss
 from sceneprior.stages import train
 from sceneprior.stages.callbacks import RollingCheckpoint
-from sceneprior.stages.gan import GanStage, gradient_penalty, mistaken
+from sceneprior.stages.gan import MEMORY, GanStage, mistaken, sameness
 from sceneprior.stages.runs import find_checkpoint, load_run, read_checkpoint
 from sceneprior.stages.train import fit
 from sceneprior.stages.view_loss import build_latents, build_prior
@@ -280,14 +282,41 @@ def test_a_discriminator_tells_crowded_rooms_by_their_counts(torch_rng):
         assert torch.equal(mine, other)  # maps alone decide of patches and rooms
 
 
-def test_the_gradient_penalty_is_the_squared_slope_of_each_room(torch_rng):
-    maps = torch.randn(3, 2, 4, generator=torch_rng, dtype=torch.float64, requires_grad=True)
-    weights = torch.randn(2, 4, generator=torch_rng, dtype=torch.float64, requires_grad=True)
-    scores = (maps * weights, (maps**2).sum(dim=(1, 2)))  # two a room's patches, one a room
-    found = gradient_penalty(scores, maps)
-    assert_close(found, ((weights / 8 + 2 * maps) ** 2).sum(dim=(1, 2)).mean())
-    (slope,) = torch.autograd.grad(found, weights)
-    assert (slope != 0).all()
+def test_sameness_is_minus_the_mean_log_spread_and_never_without_a_slope(torch_rng):
+    numbers = torch.randn(400, 2, 6, generator=torch_rng, dtype=torch.float64)
+    numbers = (numbers - numbers.mean(dim=0)) / numbers.std(dim=0, correction=0)
+    spreads = torch.tensor([2.0, 9, 3, 1, 1, 1]).double()  # that of y has no say
+    boxes = (numbers * spreads).requires_grad_()
+
+    def scenes(boxes):
+        empty = boxes[..., 0]
+        return DecodedScenes(boxes, boxes[..., :3], boxes[..., 3:], empty, None, None)
+
+    assert_close(sameness(scenes(boxes)).item(), -math.log(2 * 3) / 5, rtol=0, atol=1e-5)
+    one = torch.ones(3, 2, 6, requires_grad=True)
+    assert sameness(scenes(one)).item() == pytest.approx(-math.log(1e-3), abs=1e-4)
+    sameness(scenes(one)).backward()
+    assert one.grad.isfinite().all()
+
+
+def test_the_excess_is_a_running_mean_that_pushes_down(toy_shards, tmp_path, monkeypatch):
+    """Always two more objects of class 9 than real rooms have, and one less of class 4."""
+    more = torch.eye(22)[9] * 2
+    less = torch.eye(22)[4]
+    said = []
+
+    def decoded(scenes, _):
+        said.append(more + scenes.completeness_logits.mean() * 0 + torch.zeros(5, 22))
+        said[-1].retain_grad()
+        return said[-1]
+
+    monkeypatch.setattr("sceneprior.stages.gan.observed_counts", lambda *_: less.expand(5, -1))
+    monkeypatch.setattr("sceneprior.stages.gan.decoded_counts", decoded)
+    big = {**GAN, "counts": 1e3, "epochs": 2}  # beside it the discriminator does not matter
+    fit(settings(toy_shards, "gan", gan=big), tmp_path / "run", trainer_options=CPU)
+    excess = read_checkpoint(tmp_path / "run" / "gan" / "final.ckpt")["state_dict"]["excess"]
+    assert_close(excess, (1 - MEMORY ** len(said)) * (more - less))
+    assert (said[-1].grad[:, 9] > 0).all() and (said[-1].grad[:, 4] < 0).all()
 
 
 def test_rates_fall_evenly_to_nothing(toy_shards, tmp_path, monkeypatch):
@@ -299,7 +328,7 @@ def test_rates_fall_evenly_to_nothing(toy_shards, tmp_path, monkeypatch):
 
     step = GanStage._update
     monkeypatch.setattr(GanStage, "_update", note)
-    config = settings(toy_shards, "gan", gan={**GAN, "gradient_penalty": 1.0})
+    config = settings(toy_shards, "gan", gan=GAN)
     fit(config, tmp_path / "run", trainer_options=CPU)
     rates = [config.gan.discriminator_learning_rate, config.gan.learning_rate]
     for epoch, kept in enumerate((1, 0.75, 0.5, 0.25)):
