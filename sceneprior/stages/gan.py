@@ -36,8 +36,7 @@ START_ROOMS = 64
 
 SOFT = 0.01
 """Weight of the mean square of class and completeness logits. A choice that is all but certain has
-no gradient: a generator whose objects had all become void would never come back."""
-
+no gradient: a generator whose objects had all gone would never come back."""
 
 MEMORY = 0.9
 """Share of `excess` that is kept at each step: a batch alone says little of rare classes."""
