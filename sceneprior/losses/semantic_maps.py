@@ -76,11 +76,32 @@ def rendered_maps(
     # Where only the soft edge reaches, the object is as far away as its centre.
     ahead = (views.world_to_camera[:, :, None, 2, :3] * scenes.centers_m[:, None]).sum(dim=-1)
     ahead = (ahead + views.world_to_camera[:, :, None, 2, 3])[..., None, None].detach()
+    kept, classes = choices(scenes, completeness_target)
+    return compose_maps(coverage, depth_m.where(depth_m.isfinite(), ahead), kept, classes)
+
+
+def observed_counts(views: SceneViews, classes: int) -> Float[Tensor, "rooms classes"]:
+    """How many objects of each class were tracked in each room."""
+    of_objects = F.one_hot(views.object_class.long(), classes) * views.is_object[..., None]
+    return of_objects.sum(dim=1).to(views.intrinsics.dtype)
+
+
+def decoded_counts(
+    scenes: DecodedScenes, completeness_target: str = "first_n"
+) -> Float[Tensor, "rooms classes"]:
+    """How many objects of each class the scenes have; whole numbers, with soft gradients."""
+    kept, classes = choices(scenes, completeness_target)
+    return torch.einsum("rk,rkc->rc", kept, classes)
+
+
+def choices(
+    scenes: DecodedScenes, completeness_target: str
+) -> tuple[Float[Tensor, "rooms objects"], Float[Tensor, "rooms objects classes"]]:
+    """Which objects exist, and which class each has: hard, with soft gradients."""
     classes = straight_through(scenes.class_logits.softmax(dim=-1))
     scores = scenes.completeness_logits.sigmoid()
     scores = (scenes.completeness_logits > 0).to(scores) + scores - scores.detach()
-    kept = kept_share(scores, completeness_target)
-    return compose_maps(coverage, depth_m.where(depth_m.isfinite(), ahead), kept, classes)
+    return kept_share(scores, completeness_target), classes
 
 
 def straight_through(

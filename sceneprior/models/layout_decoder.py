@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sceneprior.classes import VOID
 from sceneprior.models.released import SeparateHeads
 
 
@@ -41,12 +42,20 @@ class LayoutDecoder(nn.Module):
         classes: Size of the label set.
         initial_size_m: Edge of every box before training.
         heads: `joint` (paper) or `separate`: see `SeparateHeads`.
+        void: Whether an object may be `void`, a second way not to exist beside completeness.
     """
 
-    def __init__(self, width: int, classes: int, initial_size_m: float = 0.7, heads: str = "joint"):
+    def __init__(
+        self,
+        width: int,
+        classes: int,
+        initial_size_m: float = 0.7,
+        heads: str = "joint",
+        void: bool = True,
+    ):
         super().__init__()
         hidden = 2 * width
-        self.classes = classes
+        self.classes, self.void = classes, void
         self.mlp1 = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, hidden))
         self.mlp2 = (
             SeparateHeads(hidden, classes) if heads == "separate" else JointHead(hidden, classes)
@@ -74,6 +83,9 @@ class LayoutDecoder(nn.Module):
         shared = self.mlp1(features)
         out = self.mlp2(shared)
         logits, center, size, complete = out.split([self.classes, 3, 3, 1], dim=-1)
+        if not self.void:
+            is_void = torch.arange(self.classes, device=logits.device) == VOID
+            logits = logits.masked_fill(is_void, -torch.inf)
         sizes = F.softplus(size)
         x, y, z = center.unbind(-1)
         y = F.relu(y) + sizes[..., 1] / 2

@@ -30,7 +30,7 @@ class ScenePrior(nn.Module):
         heads, hidden, dropout: Of the transformer, and of the encoder of `atiss`.
         final_norm, query_self_attention: Of the transformer.
         step_mlps: Whether each of the transformer's N steps ends in an MLP of its own.
-        layout_heads: Of the layout decoder.
+        layout_heads, void: Of the layout decoder.
         shape_width, shape_level, template, fit_box: Of the shape decoder.
         seed: Draws the fixed latent anchors.
     """
@@ -50,6 +50,7 @@ class ScenePrior(nn.Module):
         query_self_attention: bool = False,
         step_mlps: bool = False,
         layout_heads: str = "joint",
+        void: bool = True,
         shape_width: int = 256,
         shape_level: int = 4,
         template: str = "sphere",
@@ -73,7 +74,7 @@ class ScenePrior(nn.Module):
             self.decoder = SceneDecoder(
                 width, heads, hidden, dropout, final_norm, query_self_attention, steps
             )
-        self.layout = LayoutDecoder(width, classes, heads=layout_heads)
+        self.layout = LayoutDecoder(width, classes, heads=layout_heads, void=void)
         self.chamfers = ClassChamfers(classes)
         self.shape = ShapeDecoder(2 * width, shape_width, shape_level, template, fit_box)
 

@@ -11,10 +11,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.batches import DecodedScenes, SceneViews
-from sceneprior.classes import label_set
+from sceneprior.classes import VOID, label_set
 from sceneprior.config import RunConfig
 from sceneprior.losses.completeness import kept_objects
-from sceneprior.losses.semantic_maps import observed_maps, rendered_maps
+from sceneprior.losses.semantic_maps import (
+    decoded_counts,
+    observed_counts,
+    observed_maps,
+    rendered_maps,
+)
 from sceneprior.models.layout_decoder import LayoutDecoder
 from sceneprior.models.map_discriminator import MapDiscriminator
 from sceneprior.models.scene_prior import ScenePrior
@@ -31,7 +36,10 @@ START_ROOMS = 64
 
 SOFT = 0.01
 """Weight of the mean square of class and completeness logits. A choice that is all but certain has
-no gradient: a generator whose objects had all become void would never come back."""
+no gradient: a generator whose objects had all gone would never come back."""
+
+MEMORY = 0.9
+"""Share of `excess` that is kept at each step: a batch alone says little of rare classes."""
 
 
 class GanStage(lightning.LightningModule):
@@ -42,7 +50,8 @@ class GanStage(lightning.LightningModule):
     room with a real one. What keeps it stable is listed in docs/baselines_2d.md.
 
     `generator` is what plays; `prior`, which tasks take out of checkpoints, is a running average of
-    its weights, in which the two opponents' circling cancels.
+    its weights, in which the two opponents' circling cancels. `excess` is how many objects of each
+    class a generated room has more than a real one, of late.
 
     Args:
         prior: The network, freshly initialised.
@@ -60,6 +69,8 @@ class GanStage(lightning.LightningModule):
         self.prior = copy.deepcopy(prior).requires_grad_(False)
         self.latents = latents
         self.discriminator = MapDiscriminator(self.classes)
+        self.excess: Tensor
+        self.register_buffer("excess", torch.zeros(self.classes))
 
     def training_step(self, views: SceneViews, batch_idx: int) -> None:
         generator_optimizer, discriminator_optimizer = self._optimizers()
@@ -69,20 +80,36 @@ class GanStage(lightning.LightningModule):
             undecided = certainty(scenes)
             check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views)
             real = self._through_noise(observed_maps(views, self.classes))
+            real_counts = observed_counts(views, self.classes)
             fake = self._through_noise(self._draw(scenes, views))
+            fake_counts = decoded_counts(scenes, self.config.loss.completeness_target)
 
-        real_scores, fake_scores = self.discriminator(real), self.discriminator(fake.detach())
+        real_scores = self.discriminator(real, real_counts)
+        fake_scores = self.discriminator(fake.detach(), fake_counts.detach())
         told_apart = mistaken(real_scores, real=True) + mistaken(fake_scores, real=False)
         check_finite(told_apart, views)
         self._update(discriminator_optimizer, told_apart)
 
         self.discriminator.requires_grad_(False)
-        loss = mistaken(self.discriminator(fake), real=True) + SOFT * undecided
+        self.excess.lerp_((fake_counts.detach() - real_counts).mean(dim=0), 1 - MEMORY)
+        loss = mistaken(self.discriminator(fake, fake_counts), real=True) + SOFT * undecided
+        loss = loss + self.config.gan.counts * (fake_counts @ self.excess).mean()
+        loss = loss + self.config.gan.variety * sameness(scenes)
         check_finite(loss, views)
         self._update(generator_optimizer, loss)
         self.discriminator.requires_grad_(True)
         self._average()
         self._log(scenes, loss, told_apart, real_scores, fake_scores)
+
+    def on_train_epoch_start(self) -> None:
+        """Rates fall evenly to 0, so that the opponents' circling ends, too."""
+        for optimizer in self._optimizers():
+            for group in optimizer.param_groups:
+                group["lr"] = group["initial_lr"] * self._left()
+
+    def _left(self) -> float:
+        """Share of the training that is still to come."""
+        return 1 - self.current_epoch / self.config.gan.epochs
 
     def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:
         shape = (rooms, self.config.model.logits_per_room)
@@ -100,8 +127,7 @@ class GanStage(lightning.LightningModule):
 
     def _through_noise(self, maps: Tensor) -> Tensor:
         """Maps as the discriminator sees them; real ones come in steps that rendered ones lack."""
-        left = 1 - self.current_epoch / self.config.gan.epochs
-        return maps + self.config.gan.noise * left * torch.randn_like(maps)
+        return maps + self.config.gan.noise * self._left() * torch.randn_like(maps)
 
     def _optimizers(self) -> tuple[LightningOptimizer, LightningOptimizer]:
         both = self.optimizers()
@@ -145,11 +171,13 @@ class GanStage(lightning.LightningModule):
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         rates = self.config.gan
+        both = (
+            (self.generator, rates.learning_rate),
+            (self.discriminator, rates.discriminator_learning_rate),
+        )
         return [
-            torch.optim.Adam(self.generator.parameters(), rates.learning_rate, BETAS),
-            torch.optim.Adam(
-                self.discriminator.parameters(), rates.discriminator_learning_rate, BETAS
-            ),
+            torch.optim.Adam([{"params": part.parameters(), "initial_lr": rate}], rate, BETAS)
+            for part, rate in both
         ]
 
 
@@ -165,8 +193,21 @@ def mistaken(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
 
 
 def certainty(scenes: DecodedScenes) -> Float[Tensor, ""]:
-    """Mean squares of the logits that decide: 0 is undecided."""
-    return scenes.class_logits.square().mean() + scenes.completeness_logits.square().mean()
+    """Mean squares of the logits that decide: 0 is undecided. `void` is no choice."""
+    return (
+        scenes.class_logits[..., VOID + 1 :].square().mean()
+        + scenes.completeness_logits.square().mean()
+    )
+
+
+def sameness(scenes: DecodedScenes) -> Float[Tensor, ""]:
+    """How alike a slot's objects are in all rooms: minus the mean log spread of place and size.
+
+    It is minus the entropy of normal distributions of their spread (after Kumar et al., "Maximum
+    entropy generators for energy-based models", 2019). Below 1 mm a spread counts as 1 mm.
+    """
+    boxes = torch.cat([scenes.centers_m[..., [0, 2]], scenes.sizes_m], dim=-1)
+    return -(boxes.var(dim=0, correction=0) + 1e-6).log().mean() / 2
 
 
 @torch.no_grad()

@@ -151,7 +151,9 @@ def full_precision(device: torch.device) -> torch.autocast:
 def build_prior(config: RunConfig, classes: int) -> ScenePrior:
     """The network a config describes, freshly initialised from its seed."""
     torch.manual_seed(config.seed)
-    return ScenePrior(classes=classes, seed=config.seed, **config.model.model_dump())
+    # A GAN's objects are never void: see docs/baselines_2d.md.
+    void = config.stages != "gan"
+    return ScenePrior(classes=classes, void=void, seed=config.seed, **config.model.model_dump())
 
 
 def build_latents(config: RunConfig, rooms: int) -> nn.Embedding:

@@ -15,6 +15,8 @@ from sceneprior.geometry.boxes import place
 from sceneprior.losses.semantic_maps import (
     LENS,
     compose_maps,
+    decoded_counts,
+    observed_counts,
     observed_maps,
     rendered_maps,
     straight_through,
@@ -171,6 +173,31 @@ def test_choices_are_hard_and_their_gradients_soft(torch_rng):
     (wanted,) = torch.autograd.grad((logits.softmax(dim=-1) * weights).sum(), logits)
     (got,) = torch.autograd.grad((chosen * weights).sum(), logits)
     assert_close(got, wanted, rtol=0, atol=1e-15)
+
+
+def test_counts_are_those_of_the_objects_that_exist(views, toy_shards):
+    scenes = true_scenes(toy_shards, 4)
+    assert torch.equal(decoded_counts(scenes), observed_counts(views, CLASSES))
+    for room, (shard, room_id) in zip(range(4), iterate_rooms(toy_shards, "train"), strict=False):
+        wanted = torch.zeros(CLASSES)
+        for label in shard.read_room(room_id).object_class:
+            wanted[int(label)] += 1
+        assert torch.equal(observed_counts(views, CLASSES)[room], wanted)
+
+
+def test_counts_pull_on_existence_and_classes(views, toy_shards):
+    scenes = true_scenes(toy_shards, 4, objects=2)
+    complete = torch.tensor([[0.5, -0.5]] * 4, requires_grad=True)
+    labels = (scenes.class_logits / SURE).requires_grad_()
+    counts = decoded_counts(replace(scenes, completeness_logits=complete, class_logits=labels))
+    assert_close(counts.detach().sum(dim=1), torch.ones(4))
+    counts[:, 9].sum().backward()
+    assert (labels.grad[:, 0, 9] > 0).all()  # of the object that exists
+    assert (labels.grad[:, 1] == 0).all()
+    (more,) = torch.autograd.grad(
+        decoded_counts(replace(scenes, completeness_logits=complete)).sum(), complete
+    )
+    assert (more > 0).all()
 
 
 def test_what_is_not_there_learns_what_its_appearance_would_change(views, toy_shards):

@@ -40,6 +40,20 @@ def test_no_box_reaches_below_the_floor_whatever_the_weights(torch_rng, heads):
     assert (layout.sizes_m >= 0).all()
 
 
+def test_without_void_it_is_never_likely_and_the_rest_is_as_it_was(torch_rng):
+    torch.manual_seed(0)
+    model = LayoutDecoder(16, 5)
+    x = torch.randn(3, 4, 16, generator=torch_rng)
+    plain, _ = model(x)
+    model.void = False
+    layout, _ = model(x)
+    assert (layout.class_logits[..., 0] == -torch.inf).all()
+    assert torch.equal(layout.class_logits[..., 1:], plain.class_logits[..., 1:])
+    layout.class_logits.softmax(dim=-1).square().sum().backward()
+    last = model.mlp2[-1].weight
+    assert (last.grad[0] == 0).all() and (last.grad[1:5] != 0).any() and last.grad.isfinite().all()
+
+
 def test_the_layout_is_what_supplement_a_says(torch_rng):
     """MLP2(MLP1(x)), then SoftPlus on sizes and ReLU on y, one object at a time."""
     torch.manual_seed(1)

@@ -1,6 +1,7 @@
 """The baselines with 2D supervision: they train, stop, resume, and every verb takes their runs."""
 
 import csv
+import math
 import shutil
 from pathlib import Path
 
@@ -10,14 +11,17 @@ from tiny_runs import tiny_config, write_tiny_config
 from torch.testing import assert_close
 from typer.testing import CliRunner
 
+from sceneprior.batches import DecodedScenes
 from sceneprior.cli import app
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.losses.completeness import kept_objects
+from sceneprior.losses.semantic_maps import observed_counts, observed_maps
+from sceneprior.models.map_discriminator import MapDiscriminator
 from sceneprior.models.scene_atiss import SceneAtiss
 from sceneprior.stages import train
 from sceneprior.stages.callbacks import RollingCheckpoint
-from sceneprior.stages.gan import GanStage, mistaken
+from sceneprior.stages.gan import MEMORY, GanStage, mistaken, sameness
 from sceneprior.stages.runs import find_checkpoint, load_run, read_checkpoint
 from sceneprior.stages.train import fit
 from sceneprior.stages.view_loss import build_latents, build_prior
@@ -245,21 +249,94 @@ def test_a_discriminator_told_to_tell_apart_does_and_its_views_have_no_order(toy
     views = ViewDataset(toy_shards, "train", views_per_room=3, mask_step=4).__getitems__(
         [(row, 0) for row in range(6)]
     )
-    from sceneprior.losses.semantic_maps import observed_maps
-
     real = observed_maps(views, 22)
     with torch.no_grad():
         fake = stage._draw(stage.generator(torch.randn(6, 10)), views)
-    judge = stage.discriminator
+    judge, counts = stage.discriminator, observed_counts(views, 22)
     optimizer = torch.optim.Adam(judge.parameters(), 2e-3, (0.0, 0.99))
     for _ in range(60):
         optimizer.zero_grad()
-        loss = mistaken(judge(real), real=True) + mistaken(judge(fake), real=False)
+        loss = mistaken(judge(real, counts), True) + mistaken(judge(fake, counts), False)
         loss.backward()
         optimizer.step()
     judge.eval()
-    (_, room_real), (_, room_fake) = judge(real), judge(fake)
+    (_, room_real, _), (_, room_fake, _) = judge(real, counts), judge(fake, counts)
     assert (room_real > room_fake.max()).all()
-    patches, room = judge(real.flip(1))
+    patches, room, _ = judge(real.flip(1), counts)
     assert_close(room, room_real, rtol=0, atol=1e-5)
-    assert_close(patches.flip(1), judge(real)[0], rtol=0, atol=1e-5)
+    assert_close(patches.flip(1), judge(real, counts)[0], rtol=0, atol=1e-5)
+
+
+def test_a_discriminator_tells_crowded_rooms_by_their_counts(torch_rng):
+    torch.manual_seed(0)
+    judge = MapDiscriminator(5)
+    maps = torch.rand(8, 2, 5, 8, 8, generator=torch_rng)
+    few, many = torch.eye(5)[[1] * 8], 6 * torch.eye(5)[[1] * 8]
+    optimizer = torch.optim.Adam(judge.parameters(), 5e-3, (0.0, 0.99))
+    for _ in range(100):
+        optimizer.zero_grad()
+        loss = mistaken(judge(maps, few), real=True) + mistaken(judge(maps, many), real=False)
+        loss.backward()
+        optimizer.step()
+    judge.eval()
+    assert (judge(maps, few)[2] > judge(maps, many)[2] + 1).all()
+    for mine, other in zip(judge(maps, few)[:2], judge(maps, many)[:2], strict=True):
+        assert torch.equal(mine, other)  # maps alone decide of patches and rooms
+
+
+def test_sameness_is_minus_the_mean_log_spread_and_never_without_a_slope(torch_rng):
+    numbers = torch.randn(400, 2, 6, generator=torch_rng, dtype=torch.float64)
+    numbers = (numbers - numbers.mean(dim=0)) / numbers.std(dim=0, correction=0)
+    spreads = torch.tensor([2.0, 9, 3, 1, 1, 1]).double()  # that of y has no say
+    boxes = (numbers * spreads).requires_grad_()
+
+    def scenes(boxes):
+        empty = boxes[..., 0]
+        return DecodedScenes(boxes, boxes[..., :3], boxes[..., 3:], empty, None, None)
+
+    assert_close(sameness(scenes(boxes)).item(), -math.log(2 * 3) / 5, rtol=0, atol=1e-5)
+    one = torch.ones(3, 2, 6, requires_grad=True)
+    assert sameness(scenes(one)).item() == pytest.approx(-math.log(1e-3), abs=1e-4)
+    sameness(scenes(one)).backward()
+    assert one.grad.isfinite().all()
+
+
+def test_the_excess_is_a_running_mean_that_pushes_down(toy_shards, tmp_path, monkeypatch):
+    """Always two more objects of class 9 than real rooms have, and one less of class 4."""
+    more = torch.eye(22)[9] * 2
+    less = torch.eye(22)[4]
+    said = []
+
+    def decoded(scenes, _):
+        said.append(more + 0 * scenes.completeness_logits.sum(dim=1, keepdim=True))
+        said[-1].retain_grad()
+        return said[-1]
+
+    def observed(views, _):
+        return less.expand(len(views.room_index), -1)
+
+    monkeypatch.setattr("sceneprior.stages.gan.observed_counts", observed)
+    monkeypatch.setattr("sceneprior.stages.gan.decoded_counts", decoded)
+    big = {**GAN, "counts": 1e3, "epochs": 2}  # beside it the discriminator does not matter
+    fit(settings(toy_shards, "gan", gan=big), tmp_path / "run", trainer_options=CPU)
+    excess = read_checkpoint(tmp_path / "run" / "gan" / "final.ckpt")["state_dict"]["excess"]
+    assert_close(excess, (1 - MEMORY ** len(said)) * (more - less), rtol=1e-4, atol=1e-5)
+    assert (said[-1].grad[:, 9] > 0).all() and (said[-1].grad[:, 4] < 0).all()
+
+
+def test_rates_fall_evenly_to_nothing(toy_shards, tmp_path, monkeypatch):
+    seen = []
+
+    def note(self, optimizer, loss):
+        seen.append(optimizer.param_groups[0]["lr"])
+        step(self, optimizer, loss)
+
+    step = GanStage._update
+    monkeypatch.setattr(GanStage, "_update", note)
+    config = settings(toy_shards, "gan", gan=GAN)
+    fit(config, tmp_path / "run", trainer_options=CPU)
+    rates = [config.gan.discriminator_learning_rate, config.gan.learning_rate]
+    for epoch, kept in enumerate((1, 0.75, 0.5, 0.25)):
+        batches = len(seen) // 4
+        here = seen[epoch * batches : (epoch + 1) * batches]
+        assert here[:2] == pytest.approx([rate * kept for rate in rates])
