@@ -34,6 +34,9 @@ width, height, depth before their SoftPlus, then completeness. Metres where they
 
 START_ROOMS = 64
 
+VARIED = (1.0, 1.0, 0.3, 0.3, 0.3)
+"""Spread over rooms, in metres, that a slot's x, z, width, height and depth are pushed towards."""
+
 SOFT = 0.01
 """Weight of the mean square of class and completeness logits. A choice that is all but certain has
 no gradient: a generator whose objects had all gone would never come back."""
@@ -201,13 +204,16 @@ def certainty(scenes: DecodedScenes) -> Float[Tensor, ""]:
 
 
 def sameness(scenes: DecodedScenes) -> Float[Tensor, ""]:
-    """How alike a slot's objects are in all rooms: minus the mean log spread of place and size.
+    """How alike a slot's objects are in all rooms: minus the mean log spread of place and size, as
+    a share of `VARIED`.
 
     It is minus the entropy of normal distributions of their spread (after Kumar et al., "Maximum
-    entropy generators for energy-based models", 2019). Below 1 mm a spread counts as 1 mm.
+    entropy generators for energy-based models", 2019). Below 1 mm a spread counts as 1 mm; above
+    `VARIED` there is nothing to gain, or objects would leave the room for the sake of it.
     """
     boxes = torch.cat([scenes.centers_m[..., [0, 2]], scenes.sizes_m], dim=-1)
-    return -(boxes.var(dim=0, correction=0) + 1e-6).log().mean() / 2
+    wanted = boxes.new_tensor(VARIED).square()
+    return -((boxes.var(dim=0, correction=0) + 1e-6) / wanted).clamp(max=1).log().mean() / 2
 
 
 @torch.no_grad()
