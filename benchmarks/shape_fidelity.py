@@ -1,0 +1,97 @@
+"""Chamfer distance of decoded training rooms to the true surfaces, after each stage.
+
+Run `python benchmarks/shape_fidelity.py RUN`. The layout stage has boxes alone, which stand here as
+the ellipsoids that fill them (the paper's proxy) and as boxes; the shape stage has meshes. All of
+them are held against the same true meshes, which training never saw. Pairs are chosen by boxes
+(`match_scenes`), each object counts once, and points are drawn with a fixed seed.
+"""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from statistics import mean
+
+import numpy as np
+
+from sceneprior.evaluation.layout_metrics import match_scenes
+from sceneprior.evaluation.mesh_metrics import chamfer, f_score, sample_surface
+from sceneprior.evaluation.topdown import box_mesh
+from sceneprior.geometry.meshes import icosphere
+from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.stages.runs import TrainedPrior, load_run, restore
+from sceneprior.tasks.judge import decoded_and_true
+
+SPHERE_LEVEL = 3
+
+
+def ellipsoid(item: SceneObject) -> Mesh:
+    """What fills the object's box smoothly."""
+    vertices, faces = icosphere(SPHERE_LEVEL)
+    placed = vertices.numpy() * np.array(item.size_m) / 2 + np.array(item.center_m)
+    return Mesh(placed, faces.numpy())
+
+
+def box(item: SceneObject) -> Mesh:
+    """The object's box."""
+    return box_mesh(item.center_m, item.size_m)
+
+
+def own(item: SceneObject) -> Mesh:
+    """The decoded mesh."""
+    assert item.mesh is not None, "a run of stages: two ends with meshes"
+    return item.mesh
+
+
+def distances(
+    pairs: list[tuple[Scene, Scene]], shape: Callable[[SceneObject], Mesh], points: int
+) -> list[tuple[float, float]]:
+    """Chamfer distance in metres (L2, both ways added) and F-score of every matched object."""
+    found = []
+    for decoded, truth in pairs:
+        match = match_scenes(decoded, truth)
+        for mine, true in zip(match.decoded, match.truth, strict=True):
+            target = truth.objects[true].mesh
+            assert target is not None, "asked for meshes"
+            a = sample_surface(shape(decoded.objects[mine]), points, 0)
+            b = sample_surface(target, points, 1)
+            found.append((chamfer(a, b).l2_m, f_score(a, b)))
+    return found
+
+
+def after_layout(trained: TrainedPrior, run: Path) -> TrainedPrior:
+    """The same run as its layout stage left it."""
+    prior, latents, room_ids = restore(trained.config, run / "layout" / "final.ckpt")
+    prior.eval().requires_grad_(False)
+    return replace(trained, prior=prior, logits=latents.weight.detach(), room_ids=room_ids)
+
+
+def main() -> None:
+    """Print a table in Markdown."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("run", type=Path)
+    options.add_argument("--points", type=int, default=2000, help="on each surface")
+    given = options.parse_args()
+    trained = load_run(given.run)
+    shards = Path(trained.config.data.shards)
+    layout = decoded_and_true(after_layout(trained, given.run), shards, meshes=True)
+    shaped = decoded_and_true(trained, shards, meshes=True)
+    rows = {
+        "layout stage, ellipsoids": distances(layout, ellipsoid, given.points),
+        "layout stage, boxes": distances(layout, box, given.points),
+        "shape stage, ellipsoids in its boxes": distances(shaped, ellipsoid, given.points),
+        "shape stage, its meshes": distances(shaped, own, given.points),
+    }
+    base = mean(value for value, _ in rows["layout stage, ellipsoids"])
+    objects = len(rows["layout stage, boxes"])
+    print(f"{given.run.resolve().name}: {len(layout)} training rooms, {objects} objects")
+    print("| shape | Chamfer distance L2, m | against the first row | F-score at 5 cm |")
+    print("| --- | ---: | ---: | ---: |")
+    for name, found in rows.items():
+        middle = mean(value for value, _ in found)
+        score = mean(value for _, value in found)
+        print(f"| {name} | {middle:.4f} | {middle / base - 1:+.0%} | {score:.3f} |")
+
+
+if __name__ == "__main__":
+    main()
