@@ -24,6 +24,9 @@ def compare(
     rooms: Annotated[str | None, typer.Option(help="Some kinds of rooms: bedroom.")] = None,
     seeds: Annotated[str | None, typer.Option(help="Some of the seeds: 0,1.")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 1,
+    inception: Annotated[
+        Path | None, typer.Option(help="inception-2015-12-05.pt (TorchScript), for FID proper.")
+    ] = None,
     renderer: RendererOption = "auto",
 ) -> None:
     """Train, judge and tabulate methods on the same rooms; run again to go on."""
@@ -34,7 +37,7 @@ def compare(
     comparison = load_comparison(config)
     part = part_of(comparison, methods, rooms, seeds)
     try:
-        failures = run_comparison(comparison, part, out, jobs, renderer)
+        failures = run_comparison(comparison, part, out, jobs, renderer, inception)
     except KeyboardInterrupt:
         typer.echo("Stopped. The same command goes on from here.", err=True)
         raise typer.Exit(130) from None

@@ -53,7 +53,7 @@ def reconstruct(
     restarts: RestartsOption = 1,
     start: StartOption = "nearest",
     refine: RefineOption = False,
-    seed: Annotated[int, typer.Option(help="Of drawn views and random starts.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of drawn views and random starts.")] = 0,
     checkpoint: CheckpointOption = "final",
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "auto",
@@ -73,6 +73,10 @@ def reconstruct(
             "Say what to reconstruct from, in one way: --shards with --room (and --view) or with "
             "--split; or --mask with --classes and --intrinsics."
         )
+    if mask is None and any(given is not None for given in (classes, intrinsics, pose)):
+        raise InputError("--classes, --intrinsics and --pose belong to --mask.")
+    if (limit is not None and split is None) or (view and room is None):
+        raise InputError("--limit belongs to --split, and --view to --room.")
     check_free(out, overwrite)
     options = FitOptions(schedule, restarts, start, refine, seed=seed)
     trained = load_run(run, checkpoint)
@@ -143,7 +147,7 @@ def eval_svr(
     restarts: RestartsOption = 1,
     start: StartOption = "nearest",
     refine: RefineOption = False,
-    seed: Annotated[int, typer.Option(help="Of the views, random starts and rooms.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the views, random starts and rooms.")] = 0,
     checkpoint: CheckpointOption = "final",
     renderer: RendererOption = "auto",
 ) -> None:
@@ -157,6 +161,12 @@ def eval_svr(
         options = FitOptions(schedule, restarts, start, refine, seed=seed)
         scores = judge_views(run, shards, split, limit, options, target, renderer, checkpoint)
     elif scenes is not None and run is None:
+        fitting = (schedule, restarts, start, refine, checkpoint)
+        if limit is not None or fitting != ("paper", 1, "nearest", False, "final"):
+            raise InputError(
+                "--limit, --checkpoint, --schedule, --restarts, --start and --refine belong to "
+                "--run; scenes are judged as they are."
+            )
         target = out or scenes / "svr.json"
         scores = judge_scenes(scenes, shards, split, target, seed, renderer)
     else:

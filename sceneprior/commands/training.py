@@ -33,7 +33,7 @@ def fit(
         "32-true"
     ),
 ) -> None:
-    """Train a prior: the layout stage, then the shape stage."""
+    """Train a run: the layout stage, then the shape stage; or a baseline (`stages`)."""
     from sceneprior.config import load_config
 
     settings = load_config(config, tuple(set_ or ()))
@@ -61,7 +61,7 @@ def report(
     run: RunOption,
     scores: Annotated[Path | None, typer.Option(help="From eval-fid (RUN/scores.json).")] = None,
     out: Annotated[Path | None, typer.Option(help="HTML file (default: RUN/report.html).")] = None,
-    seed: Annotated[int, typer.Option(help="Of the generated rooms shown.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the generated rooms shown.")] = 0,
     command: Annotated[
         list[str] | None, typer.Option(help="A command to list on the page. Repeatable.")
     ] = None,

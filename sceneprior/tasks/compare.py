@@ -22,6 +22,7 @@ from typing import Any
 from rich.console import Console
 
 from sceneprior.evaluation.comparison_table import Row, write_tables
+from sceneprior.evaluation.image_metrics import check_inception
 from sceneprior.files import write_whole
 from sceneprior.offscreen import open_renderer
 from sceneprior.stages.runs import STAGES, load_any_run, read_checkpoint
@@ -43,7 +44,12 @@ class Costs:
 
 
 def compare(
-    comparison: Comparison, part: Comparison, out: Path, jobs: int, renderer: str
+    comparison: Comparison,
+    part: Comparison,
+    out: Path,
+    jobs: int,
+    renderer: str,
+    inception: Path | None = None,
 ) -> list[str]:
     """Train and judge every run that is not done yet, then write `table.*` and the figures.
 
@@ -53,6 +59,7 @@ def compare(
         out: `<rooms>/<method>/seed<k>/` in it holds a run; the tables lie beside them.
         jobs: Runs at a time.
         renderer: A renderer's name, or `auto`.
+        inception: NVIDIA's `inception-2015-12-05.pt`; None leaves FID out.
 
     Returns:
         A sentence for each run that failed; the table is written without it.
@@ -60,11 +67,15 @@ def compare(
     Raises:
         KeyboardInterrupt: stopped by Ctrl-C; the same call goes on.
     """
+    judging: tuple[str, ...] = ("--renderer", renderer)
+    if inception is not None:
+        check_inception(inception)
+        judging = (*judging, "--inception", str(inception))
     stop = threading.Event()
     pool = ThreadPoolExecutor(max_workers=jobs)
     failures: list[str | None] = []
     try:
-        work = partial(_do, comparison=comparison, renderer=renderer, jobs=jobs, stop=stop)
+        work = partial(_do, comparison=comparison, judging=judging, jobs=jobs, stop=stop)
         failures = list(pool.map(work, runs_of(part, out)))
     except KeyboardInterrupt:
         stop.set()
@@ -72,7 +83,7 @@ def compare(
         pool.shutdown(cancel_futures=True)  # waits for those that the same Ctrl-C has told
     if stop.is_set():
         raise KeyboardInterrupt
-    done = [run for run in runs_of(comparison, out) if _is_done(run)]
+    done = [run for run in runs_of(comparison, out) if _is_done(run, comparison, judging)]
     if done:
         write_tables(_rows(comparison, done), out)
         drawing = open_renderer(renderer)
@@ -89,17 +100,24 @@ def _journal(run: Run) -> dict[str, Any]:
     return found
 
 
-def _is_done(run: Run) -> bool:
+def _is_done(run: Run, comparison: Comparison, judging: tuple[str, ...]) -> bool:
     noted = _journal(run)
-    return all(noted.get(name, {}).get("finished") for name in ("fit", "scores"))
+    return all(
+        noted.get(name, {}).get("finished") and noted[name]["arguments"] == arguments
+        for name, arguments in _steps(run, comparison, judging).items()
+    )
 
 
 def _do(
-    run: Run, comparison: Comparison, renderer: str, jobs: int, stop: threading.Event
+    run: Run,
+    comparison: Comparison,
+    judging: tuple[str, ...],
+    jobs: int,
+    stop: threading.Event,
 ) -> str | None:
     """Both commands of a run, unless they are done; a sentence if one failed."""
     done = _journal(run)
-    for name, arguments in _steps(run, comparison, renderer).items():
+    for name, arguments in _steps(run, comparison, judging).items():
         before = done.get(name, {})
         if before.get("finished") and before["arguments"] == arguments:
             continue
@@ -107,8 +125,12 @@ def _do(
             return None
         SAY.print(f"$ sceneprior {shlex.join(arguments)}", markup=False, highlight=False)
         run.folder.mkdir(parents=True, exist_ok=True)
+        goes_on = not before.get("finished")
+        if name == "fit":
+            done.pop("scores", None)  # which were of what lay here before
+            goes_on = (run.folder / "run" / "config.yaml").is_file()
+        earlier = before if goes_on else {}
         status, cpu_s, wall_s = _call(arguments, run.folder / f"{name}.log", jobs)
-        earlier = {} if before.get("finished") else before  # a stopped step goes on
         done[name] = {
             "arguments": arguments,
             "cpu_s": cpu_s + earlier.get("cpu_s", 0.0),
@@ -120,12 +142,12 @@ def _do(
             stop.set()
             return None
         if status:
-            told = _last_line(run.folder / f"{name}.log")
+            told = _reason(run.folder / f"{name}.log")
             return f"{run.rooms}, {run.method}, seed {run.seed}: {told}"
     return None
 
 
-def _steps(run: Run, comparison: Comparison, renderer: str) -> dict[str, list[str]]:
+def _steps(run: Run, comparison: Comparison, judging: tuple[str, ...]) -> dict[str, list[str]]:
     settings = [word for setting in run.settings for word in ("--set", setting)]
     return {
         "fit": [
@@ -135,7 +157,7 @@ def _steps(run: Run, comparison: Comparison, renderer: str) -> dict[str, list[st
         "scores": [
             "eval-fid", "--run", str(run.folder / "run"), "-n", str(comparison.count),
             "--seed", str(comparison.sampling_seed), "--out", str(run.folder / "scores.json"),
-            "--renderer", renderer,
+            *judging,
         ],
     }  # fmt: skip
 
@@ -157,11 +179,12 @@ def _call(arguments: Sequence[str], log: Path, jobs: int) -> tuple[int, float, f
     return process.returncode, used.ru_utime + used.ru_stime, time.monotonic() - start
 
 
-def _last_line(log: Path) -> str:
-    """The sentence a command ended with."""
+def _reason(log: Path) -> str:
+    """The sentence a command failed with, or its last words."""
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
-    told = [line for line in lines if line]
-    return told[-1].removeprefix("Error: ") if told else f"it said nothing in {log}"
+    errors = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
+    told = errors or [line for line in lines if line]
+    return told[-1] if told else f"it said nothing in {log}"
 
 
 def _rows(comparison: Comparison, done: Sequence[Run]) -> list[Row]:
@@ -189,6 +212,12 @@ def costs_of(folder: Path) -> Costs:
     noted = json.loads((folder / JOURNAL).read_text())
     return Costs(
         cpu_s=noted["fit"]["cpu_s"],
-        steps=sum(int(read_checkpoint(path)["global_step"]) for path in finals),
+        steps=sum(_steps_of(path) for path in finals),
         parameters=sum(item.numel() for item in load_any_run(run).prior.parameters()),
     )
+
+
+def _steps_of(final: Path) -> int:
+    steps = int(read_checkpoint(final)["global_step"])
+    # Lightning counts updates; a GAN makes two a batch.
+    return steps // 2 if final.parent.name == "gan" else steps

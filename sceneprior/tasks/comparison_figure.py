@@ -19,6 +19,8 @@ from sceneprior.tasks.comparison import Comparison, Run
 from sceneprior.tasks.decode import synthesize
 
 SHOWN = 8
+DRAWN_FROM = 256
+"""Training rooms that the independent row draws objects from: thousands of meshes are gigabytes."""
 TILE_PX = 160
 MARGIN_PX = 190
 
@@ -35,7 +37,7 @@ def write_figure(
         renderer: From `sceneprior.offscreen.open_renderer`.
     """
     trained = [load_any_run(run.folder / "run") for run in runs]
-    real = reference_scenes(Path(trained[0].config.data.shards), "train")
+    real = reference_scenes(Path(trained[0].config.data.shards), "train", limit=DRAWN_FROM)
     rows = {
         "Real training rooms": real[:SHOWN],
         "Independent objects": independent_rooms(real, SHOWN, comparison.sampling_seed, True),

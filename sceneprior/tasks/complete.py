@@ -210,8 +210,9 @@ def given_loss(
     each = F.cross_entropy(logits.flatten(0, 1), given.labels.flatten(), reduction="none")
     each = each.view(-1, objects) + take(kept, rows, dim=1)
     each = each + BOX_WEIGHT * (take(boxes, rows, dim=1) - given.boxes_m).abs().mean(dim=-1)
-    counted = given.is_object.to(each.dtype)
-    return (each * counted).sum(dim=1) / counted.sum(dim=1).clamp(min=1)
+    # Padding is no class: where void is ruled out, its cross entropy has no end.
+    each = each.where(given.is_object, 0.0)
+    return each.sum(dim=1) / given.is_object.sum(dim=1).clamp(min=1)
 
 
 def log_kept(

@@ -68,6 +68,16 @@ def check_free(folder: Path, overwrite: bool = False) -> None:
         raise InputError(f"{folder} is not empty; add --overwrite or name another folder.")
 
 
+def clear_scenes(folder: Path) -> None:
+    """Delete the scenes that a folder holds, with their GLBs, PNGs and latents, and nothing else:
+    whoever reads it next would take them for new ones."""
+    for path in Path(folder).glob("*.json"):
+        if _format_of(path) == FORMAT:
+            for ending in (".glb", ".png", ".json"):
+                path.with_suffix(ending).unlink(missing_ok=True)
+    (Path(folder) / "latents.npz").unlink(missing_ok=True)
+
+
 def write_scenes(
     scenes: Sequence[Scene], folder: Path, renderer: Renderer, overwrite: bool = False
 ) -> None:
@@ -77,6 +87,7 @@ def write_scenes(
         InputError: the folder holds something and `overwrite` is false.
     """
     check_free(folder, overwrite)
+    clear_scenes(folder)
     with Progress(console=Console(stderr=True)) as progress:
         for scene in progress.track(scenes, description="Writing scenes"):
             write_scene(scene, folder, scene.name, renderer)
@@ -224,7 +235,8 @@ def load_scene_folder(folder: Path) -> list[Scene]:
     if not folder.is_dir():
         raise InputError(f"No folder of scenes at {folder}; `sceneprior synthesize` writes one.")
     paths = sorted(folder.glob("*.json"), key=_counting_order)
-    scenes = [load_scene(path) for path in paths if _says_scene(path)]
+    # What cannot be read is not passed over: load_scene says what is wrong with it.
+    scenes = [load_scene(path) for path in paths if _format_of(path) in (FORMAT, None)]
     if not scenes:
         raise InputError(
             f"{folder} holds no scene JSON; `sceneprior synthesize` writes them, and "
@@ -239,9 +251,10 @@ def _counting_order(path: Path) -> list[str]:
     return [part.zfill(20) if part.isdigit() else part for part in parts]
 
 
-def _says_scene(path: Path) -> bool:
+def _format_of(path: Path) -> str | None:
+    """What a JSON says it is; None where it cannot be read."""
     try:
         data = json.loads(path.read_text())
-    except ValueError:
-        return True  # read_scene says what is wrong with it
-    return isinstance(data, dict) and data.get("format") == FORMAT
+    except (OSError, ValueError):
+        return None
+    return str(data.get("format", "")) if isinstance(data, dict) else ""

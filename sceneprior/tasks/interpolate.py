@@ -99,7 +99,7 @@ def decode_path(
     rooms: list[PathRoom] = []
     for start in range(0, len(z), BATCH):
         part = slice(start, start + BATCH)
-        decoded = trained.prior.decode(z[part], with_shape=trained.stage == "shape")
+        decoded = trained.prior.decode(z[part], with_shape=trained.stage != "layout")
         scenes = to_scenes(
             decoded, trained.prior.shape.faces, config.label_set, names[part], target
         )

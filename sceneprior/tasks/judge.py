@@ -66,10 +66,11 @@ def judge_run(
     """
     trained = load_any_run(run, checkpoint)
     folder = shards or Path(trained.config.data.shards)
-    generated = synthesize(trained, count, seed, law)
-    scores = _judge(generated, folder, seed, judging)
-    if trained.remembers_rooms:
-        scores |= reconstruction_scores(decoded_and_true(trained, folder))
+    # First, because other shards than the run's are refused here.
+    pairs = decoded_and_true(trained, folder) if trained.remembers_rooms else []
+    scores = _judge(synthesize(trained, count, seed, law), folder, seed, judging)
+    if pairs:
+        scores |= reconstruction_scores(pairs)
     scores["protocol"]["run"] = Path(run).resolve().name
     scores["protocol"]["stage"] = trained.stage
     scores["protocol"]["checkpoint"] = checkpoint

@@ -75,6 +75,7 @@ def judge_views(
         InputError: the run or the shards cannot be used.
     """
     trained = load_run(run, checkpoint)
+    reference_scenes(shards, split, limit=1, meshes=False)  # refuses before any fit
     images, blank = images_of_split(shards, split, options.seed, limit)
     fitted = reconstruct(trained, images, options)
     plain = reconstruct(trained, images, replace(options, masks=False, refine=False))

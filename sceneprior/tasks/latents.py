@@ -47,8 +47,9 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
         return draw_latents(trained, 1, int(text[5:]))[0][0]
     path, item = _split(text)
     if not path.is_file():
+        known = f"such as {trained.room_ids[0]}" if trained.room_ids else "which keeps none"
         raise InputError(
-            f"'{text}' is neither a training room of this run (such as {trained.room_ids[0]}), "
+            f"'{text}' is neither a training room of this run ({known}), "
             f"nor seed:NUMBER, nor a file of latents ({', '.join(_ENDINGS)})."
         )
     latents, names = _read(path)

@@ -64,9 +64,15 @@ def reconstruct(
         options: See there.
 
     Raises:
-        InputError: unknown options, another label set, or more objects than the prior generates.
+        InputError: unknown options, a run without latents of rooms, another label set, or more
+            objects than the prior generates.
     """
     check_options(options)
+    if not trained.remembers_rooms:
+        raise InputError(
+            f"Fitting starts from training rooms, and a run of `stages: {trained.config.stages}` "
+            "keeps no latents of them; take a run of `stages: two`."
+        )
     for image in images:
         if image.label_set != trained.config.label_set:
             raise InputError(

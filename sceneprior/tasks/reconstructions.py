@@ -9,7 +9,7 @@ from PIL import Image
 
 from sceneprior.files import write_whole
 from sceneprior.offscreen import Renderer
-from sceneprior.tasks.export import write_scene
+from sceneprior.tasks.export import clear_scenes, write_scene
 from sceneprior.tasks.reconstruct import Reconstruction
 from sceneprior.tasks.reconstruction_pictures import picture
 
@@ -21,6 +21,7 @@ def write_reconstructions(
 
     The JSON's `extra` says where the image is from, its camera, and how well its masks are met.
     """
+    clear_scenes(folder)
     for one in found:
         image = one.image
         extra = {

@@ -79,10 +79,10 @@ class SampleJudge:
                 f"samples.metric is type_share, but {config.label_set} mixes room types; choose "
                 "category_kl, objects_off, overlaps or mask_iou."
             )
-        if config.samples.metric == "mask_iou" and config.stages == "gan":
+        if config.samples.metric == "mask_iou" and config.stages not in ("two", "one"):
             raise InputError(
-                "samples.metric is mask_iou, but a GAN remembers no rooms; choose category_kl, "
-                "objects_off, overlaps or type_share."
+                f"samples.metric is mask_iou, but `stages: {config.stages}` remembers no rooms; "
+                "choose category_kl, objects_off, overlaps or type_share."
             )
 
     def __call__(self, trained: TrainedPrior | TrainedSampler) -> Verdict:
@@ -144,7 +144,8 @@ class SampleJudge:
             views_per_room=VIEWS,
             rotations=4 if data.augment_rotations else 1,
             mask_step=data.mask_step,
-            seed=self.config.samples.seed,
+            view_fraction=data.view_fraction,
+            seed=self.config.seed,  # which chose the share of the views, too
             limit=REMEMBERED,
         )
         return rooms.__getitems__([(row, 0) for row in range(0, len(rooms), rooms.rotations)])

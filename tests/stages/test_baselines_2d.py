@@ -27,6 +27,8 @@ from sceneprior.stages.train import fit
 from sceneprior.stages.view_loss import build_latents, build_prior
 from sceneprior.tasks.decode import decode_training_rooms, synthesize
 from sceneprior.tasks.judge import Judging, judge_run, read_curves, report_run
+from sceneprior.tasks.latents import read_latent
+from sceneprior.tasks.reconstruct import FitOptions, reconstruct
 from sceneprior.tasks.watch import SampleJudge
 
 CPU = {"accelerator": "cpu", "devices": 1}
@@ -139,6 +141,10 @@ def test_what_needs_latents_of_rooms_says_that_a_gan_has_none(gan_run):
         "A run of `stages: gan` keeps no latents of training rooms, so none can be decoded; take "
         "a run of `stages: two`."
     )
+    with pytest.raises(InputError, match="which keeps none"):
+        read_latent(trained, "typo")
+    with pytest.raises(InputError, match="Fitting starts from training rooms"):
+        reconstruct(trained, [], FitOptions())
     for law in ("kernel", "geodesic", "gaussian"):
         with pytest.raises(InputError, match=f"The {law} law needs at least 2 training rooms; use"):
             synthesize(trained, 2, 0, law)
@@ -165,7 +171,7 @@ def test_looks_choose_a_checkpoint_of_a_gan(toy_shards, tmp_path):
     with (tmp_path / "run" / "gan" / "metrics.csv").open(newline="") as file:
         header = next(csv.reader(file))
     assert "samples/overlaps" in header and "samples/mask_iou" not in header
-    with pytest.raises(InputError, match=r"samples.metric is mask_iou, but a GAN remembers no"):
+    with pytest.raises(InputError, match="but `stages: gan` remembers no rooms"):
         SampleJudge(settings(toy_shards, "gan", samples=samples | {"metric": "mask_iou"}))
 
 

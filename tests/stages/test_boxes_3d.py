@@ -255,10 +255,8 @@ def test_looks_choose_a_checkpoint(stage, toy_shards, tmp_path):
     assert (tmp_path / "run" / stage / "samples" / "00004.png").is_file()
     assert isinstance(load_any_run(tmp_path / "run", "best"), TrainedSampler)
     config = settings(toy_shards, stage, samples=samples | {"metric": "mask_iou"})
-    with pytest.raises(
-        InputError, match=r"samples.metric is mask_iou, but a look gave only category"
-    ):
-        fit(config, tmp_path / "other", trainer_options=CPU, judge=SampleJudge(config))
+    with pytest.raises(InputError, match=f"mask_iou, but `stages: {stage}` remembers no rooms"):
+        SampleJudge(config)
 
 
 def test_what_does_not_fit_is_a_sentence(run, stage, toy_shards, tmp_path):

@@ -128,9 +128,56 @@ def test_runs_are_trained_judged_tabulated_and_not_repeated(written, tmp_path, m
     assert "| Ours |" in (out / "table.md").read_text()
 
 
+def test_scores_of_a_run_that_was_there_before_are_not_taken_for_the_new_ones(
+    written, tmp_path, monkeypatch
+):
+    called = []
+
+    def working(arguments, log, jobs):
+        called.append(arguments[0])
+        run = Path(arguments[arguments.index("--run") + 1])
+        run.mkdir(exist_ok=True)
+        (run / "config.yaml").touch()
+        return 0, 2.0, 1.0
+
+    monkeypatch.setattr(module, "_call", working)
+    monkeypatch.setattr(module, "write_tables", lambda rows, out: None)
+    monkeypatch.setattr(module, "_rows", lambda comparison, done: [])
+    monkeypatch.setattr(module, "write_figure", lambda *given: None)
+    methods = {"ours": {"title": "Ours", "group": "2D"}}
+    before = load_comparison(written(methods=methods))
+    compare(before, before, tmp_path / "out", 1, "software")
+    compare(before, before, tmp_path / "out", 1, "software")
+    assert called == ["fit", "eval-fid"]
+    methods["ours"]["set"] = {"every": ["model.width=8"]}
+    after = load_comparison(written(methods=methods))
+    compare(after, after, tmp_path / "out", 1, "software")
+    assert called[2:] == ["fit", "eval-fid"]
+    more = load_comparison(written(methods=methods, count=5))
+    compare(more, more, tmp_path / "out", 1, "software")
+    assert called[4:] == ["eval-fid"]
+
+
+def test_a_command_that_failed_is_told_by_its_own_sentence(tmp_path):
+    log = tmp_path / "fit.log"
+    log.write_text("10%\nError: ValueError: odd.\nThis should not happen. Run again.\n")
+    assert module._reason(log) == "ValueError: odd."
+    log.write_text("\n 73% Killed\n")
+    assert module._reason(log) == "73% Killed"
+    log.write_text("")
+    assert module._reason(log) == f"it said nothing in {log}"
+
+
 def test_a_stopped_comparison_says_so_and_keeps_what_the_run_took(written, tmp_path, monkeypatch):
     comparison = load_comparison(written())
-    monkeypatch.setattr(module, "_call", lambda arguments, log, jobs: (130, 2.5, 3.0))
+
+    def stopped(arguments, log, jobs):
+        run = Path(arguments[arguments.index("--run") + 1])
+        run.mkdir(exist_ok=True)
+        (run / "config.yaml").touch()
+        return 130, 2.5, 3.0
+
+    monkeypatch.setattr(module, "_call", stopped)
     for times in (1, 2):
         with pytest.raises(KeyboardInterrupt):
             compare(comparison, comparison, tmp_path / "out", 1, "software")

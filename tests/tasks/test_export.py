@@ -21,6 +21,7 @@ from sceneprior.tasks.export import (
     read_glb_meshes,
     scene_to_glb,
     write_scene,
+    write_scenes,
 )
 
 
@@ -49,6 +50,20 @@ def scene() -> Scene:
 def glb_json(data: bytes) -> dict:
     length = struct.unpack("<I", data[12:16])[0]
     return json.loads(data[20 : 20 + length])
+
+
+def test_new_scenes_leave_none_of_the_old_ones_behind_and_everything_else_alone(
+    scene, renderer, tmp_path
+):
+    rooms = [replace(scene, name=name) for name in "abc"]
+    write_scenes(rooms, tmp_path, renderer)
+    (tmp_path / "latents.npz").write_bytes(b"of the old rooms")
+    (tmp_path / "scores.json").write_text('{"format": "sceneprior-scores"}')
+    (tmp_path / "notes.txt").write_text("mine")
+    write_scenes(rooms[1:2], tmp_path, renderer, overwrite=True)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "b.json", "b.glb", "b.png", "overview.png", "scores.json", "notes.txt",
+    }  # fmt: skip
 
 
 def test_the_glb_has_named_nodes_in_metres_and_class_colours(scene):

@@ -84,7 +84,7 @@ def test_rooms_decoded_as_they_are_have_the_masks_that_were_seen(toy_run, toy_sh
         return mask_iou_of_rooms(replace(trained, stage=stage), views)
 
     for stage in ("layout", "shape"):
-        assert iou(stage, centers) > 0.95
+        assert iou(stage, centers) > 0.93
         assert iou(stage, centers + 0.5) < 0.5
 
 
