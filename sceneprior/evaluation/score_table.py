@@ -111,16 +111,21 @@ def _cell(value: float | None, interval: list[float] | None) -> str:
     return f"{value:.{digits}f}\n{interval[0]:.{digits}f} to {interval[1]:.{digits}f}"
 
 
+def wide_console() -> Console:
+    """stdout; a file or a pipe has no width, for which rich would take 80."""
+    console = Console()
+    if not console.is_terminal:
+        console.width = max(console.width, WIDTH)
+    return console
+
+
 def print_scores(scores: dict[str, Any], console: Console | None = None) -> None:
     """Print the table of a result to stdout, with how many rooms stand behind each column.
 
     Below the table stand the protocol's main entries: where the rooms come from, seed, renderer,
     and the hash of the test rooms' pictures.
     """
-    console = console or Console()
-    if not console.is_terminal:
-        # A file or a pipe has no width, and rich would take 80.
-        console.width = max(console.width, WIDTH)
+    console = console or wide_console()
     table = Table(
         title="Synthesis against test rooms", box=box.SIMPLE_HEAD, caption=_caption(scores)
     )

@@ -14,6 +14,7 @@ from sceneprior.config import LossConfig
 from sceneprior.errors import InputError
 from sceneprior.evaluation.mesh_metrics import POINTS
 from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.score_table import wide_console
 from sceneprior.evaluation.view_scores import PROTOCOL, ObjectPair, score_views
 from sceneprior.files import write_whole
 from sceneprior.offscreen import open_renderer
@@ -231,7 +232,7 @@ def print_view_scores(scores: dict[str, Any], console: Console | None = None) ->
     judged = next(iter(scores["rows"].values()))
     summary = judged["summary"]
     title = f"{summary['objects']} objects in {summary['images']} single views"
-    console = console or Console()
+    console = console or wide_console()
     console.print(_table(title, rows))
     console.print(_table(f"{next(iter(rows)).capitalize()}, by class", judged["classes"]))
 
