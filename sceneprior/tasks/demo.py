@@ -34,12 +34,15 @@ def run_demo(out: Path, config: str, rooms: int, count: int, renderer: str) -> N
     out.mkdir(parents=True, exist_ok=True)
     journal = out / "steps.json"
     done = json.loads(journal.read_text()) if journal.is_file() else {}
-    for name, arguments in _steps(out, config, rooms, count, renderer).items():
+    steps = _steps(out, config, rooms, count, renderer)
+    for number, (name, arguments) in enumerate(steps.items()):
         before = done.get(name, {})
         same = before.get("arguments") == arguments and (out / RESULTS[name]).exists()
         if same and before["finished"]:
             typer.echo(f"{name}: done before, {done[name]['seconds']:.0f} s", err=True)
             continue
+        for later in list(steps)[number + 1 :]:
+            done.pop(later, None)  # what they left is of what lay here before
         typer.echo(f"$ sceneprior {shlex.join(arguments)}", err=True)
         told: list[str] = []
         if name == "report":
