@@ -60,7 +60,7 @@ def test_rooms_decoded_as_they_are_have_the_masks_that_were_seen(toy_run, toy_sh
     shape = trained.prior.shape
     shape.template = torch.from_numpy(cube.vertices_m).float()
     shape.faces = torch.from_numpy(cube.faces)
-    config = tiny_config(toy_shards, samples={"every": 1}, data__mask_step=1)
+    config = tiny_config(toy_shards, seed=0, samples={"every": 1}, data__mask_step=1)
     views = SampleJudge(config)._views
     truth = {scene.name: scene for scene in reference_scenes(toy_shards, "train", None, True)}
     rooms, slots = len(views.room_ids), 6
@@ -84,7 +84,7 @@ def test_rooms_decoded_as_they_are_have_the_masks_that_were_seen(toy_run, toy_sh
         return mask_iou_of_rooms(replace(trained, stage=stage), views)
 
     for stage in ("layout", "shape"):
-        assert iou(stage, centers) > 0.93
+        assert iou(stage, centers) > 0.95
         assert iou(stage, centers + 0.5) < 0.5
 
 
