@@ -12,13 +12,14 @@ from sceneprior.batches import DecodedScenes
 from sceneprior.classes import label_set
 from sceneprior.config import LossConfig
 from sceneprior.errors import InputError
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.reference import reference_scene
 from sceneprior.evaluation.topdown import scene_meshes
 from sceneprior.geometry.boxes import box_corners
 from sceneprior.geometry.cameras import boxes_of_points
 from sceneprior.losses.matching import match_objects, matching_cost
 from sceneprior.offscreen import Pinhole, Renderer
 from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.shards import Shard, iterate_rooms
 from sceneprior.tasks.fitting import rows_of
 from sceneprior.tasks.observed import ObservedImage, as_views
 
@@ -28,15 +29,33 @@ CERTAIN_LOGIT = 30.0
 """Of a class that is known: its probability rounds to 1."""
 ABSENT_M = 1e4
 """Where padding stands: no camera sees it."""
+TURNS = 4
 
 
 @dataclass(frozen=True)
 class KnownRooms:
-    """Rooms in 3D, each in four turns, as what a prior decodes."""
+    """Rooms in 3D, each in four turns, as what a prior decodes.
 
+    They are boxes: a data set's meshes in four turns are many gigabytes. `furnished` reads those of
+    a room that is wanted.
+    """
+
+    folder: Path
+    paths: tuple[Path, ...]
+    """The shard of each room, before turns."""
     scenes: tuple[Scene, ...]
     decoded: DecodedScenes
-    counts: Tensor
+
+    def furnished(self, row: int) -> Scene:
+        """`scenes[row]` with its meshes.
+
+        Raises:
+            ShardError: a model's file is missing or damaged.
+        """
+        scene = self.scenes[row]
+        with Shard(self.paths[row // TURNS]) as shard:
+            home = reference_scene(shard, scene.name, self.folder)
+        return turn_scene(home, row % TURNS)
 
 
 @dataclass(frozen=True)
@@ -49,13 +68,16 @@ class KnownAnswer:
 
 
 def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
-    """The rooms of a split with their meshes, turned by 0, 90, 180 and 270 degrees.
+    """The rooms of a split, turned by 0, 90, 180 and 270 degrees.
 
     Raises:
         ShardError: the shards or their ground truth cannot be read.
     """
-    rooms = reference_scenes(shards, split)
-    turned = tuple(turn_scene(scene, quarter) for scene in rooms for quarter in range(4))
+    rooms = [
+        (shard.path, reference_scene(shard, room_id, shards, meshes=False))
+        for shard, room_id in iterate_rooms(shards, split)
+    ]
+    turned = tuple(turn_scene(scene, quarter) for _, scene in rooms for quarter in range(TURNS))
     names = label_set(turned[0].label_set)
     counts = torch.tensor([len(scene.objects) for scene in turned])
     most = max(int(counts.max()), 1)
@@ -67,9 +89,8 @@ def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
         centers[row, :count] = torch.from_numpy(scene.centers_m).float()
         sizes[row, :count] = torch.from_numpy(scene.sizes_m).float()
         logits[row, range(count), scene.class_indices] = CERTAIN_LOGIT
-    return KnownRooms(
-        turned, DecodedScenes(logits, centers, sizes, torch.zeros(centers.shape[:2])), counts
-    )
+    decoded = DecodedScenes(logits, centers, sizes, torch.zeros(centers.shape[:2]))
+    return KnownRooms(Path(shards), tuple(path for path, _ in rooms), turned, decoded)
 
 
 def turn_scene(scene: Scene, quarter: int) -> Scene:
@@ -100,8 +121,8 @@ def random_answers(
     answers = []
     for image in images:
         row = int(rng.choice(_others(rooms, image)))
-        objects, _ = _matched(rooms, torch.tensor([row]), image, weights)
-        answers.append(KnownAnswer(rooms.scenes[row], objects[0]))
+        slots, _ = _matched(rooms, torch.tensor([row]), image, weights)
+        answers.append(_answer(rooms, row, slots[0]))
     return answers
 
 
@@ -120,14 +141,20 @@ def nearest_answers(
         others = _others(rooms, image)
         _, costs = _matched(rooms, others, image, weights)
         best = others[costs.argsort()[:SHORTLIST]]
-        objects, _ = _matched(rooms, best, image, weights)
-        overlaps = [
-            mask_overlap(rooms.scenes[row], matched, image, renderer)
-            for row, matched in zip(best.tolist(), objects, strict=True)
+        slots, _ = _matched(rooms, best, image, weights)
+        offered = [
+            _answer(rooms, row, matched) for row, matched in zip(best.tolist(), slots, strict=True)
         ]
-        first = int(np.argmax(overlaps))
-        answers.append(KnownAnswer(rooms.scenes[int(best[first])], objects[first]))
+        overlaps = [mask_overlap(one.scene, one.objects, image, renderer) for one in offered]
+        answers.append(offered[int(np.argmax(overlaps))])
     return answers
+
+
+def _answer(rooms: KnownRooms, row: int, slots: Sequence[int]) -> KnownAnswer:
+    scene = rooms.furnished(row)
+    count = len(scene.objects)
+    objects = tuple(scene.objects[slot] if slot < count else None for slot in slots)
+    return KnownAnswer(scene, objects)
 
 
 def _others(rooms: KnownRooms, image: ObservedImage) -> Tensor:
@@ -142,8 +169,8 @@ def _others(rooms: KnownRooms, image: ObservedImage) -> Tensor:
 
 def _matched(
     rooms: KnownRooms, rows: Tensor, image: ObservedImage, weights: LossConfig
-) -> tuple[list[tuple[SceneObject | None, ...]], Tensor]:
-    """What each room offers for each mask, and the mean cost of that."""
+) -> tuple[list[list[int]], Tensor]:
+    """Which object each room offers for each mask, past its last for none; and the mean cost."""
     view = rows_of(as_views([image], 1), torch.zeros(len(rows), dtype=torch.int64))
     # As many empty places beside a room's objects as there are masks, lest they run out.
     masks = view.is_object.shape[1]
@@ -166,14 +193,7 @@ def _matched(
     settings = (weights.match_box, weights.hidden_overshoot)
     chosen = match_objects(decoded, boxes, view, *settings, first_n=False).prediction
     costs = matching_cost(decoded, boxes, view, *settings).gather(1, chosen.unsqueeze(1))
-    objects = [
-        tuple(
-            rooms.scenes[row].objects[slot] if slot < len(rooms.scenes[row].objects) else None
-            for slot in slots
-        )
-        for row, slots in zip(rows.tolist(), chosen.tolist(), strict=True)
-    ]
-    return objects, costs[:, 0].mean(dim=1)
+    return chosen.tolist(), costs[:, 0].mean(dim=1)
 
 
 def mask_overlap(

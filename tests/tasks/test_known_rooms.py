@@ -31,9 +31,13 @@ def renderer():
 
 def test_every_room_is_there_in_four_turns(rooms):
     assert len(rooms.scenes) == 4 * 12
-    turned = turn_scene(rooms.scenes[0], 1)
-    for item, again in zip(turned.objects, rooms.scenes[1].objects, strict=True):
-        assert item.center_m == again.center_m and item.size_m == again.size_m
+    turned = turn_scene(rooms.furnished(0), 1)
+    for item, again, box in zip(
+        turned.objects, rooms.furnished(1).objects, rooms.scenes[1].objects, strict=True
+    ):
+        assert item.center_m == again.center_m == box.center_m
+        assert item.size_m == again.size_m == box.size_m and box.mesh is None
+        assert np.array_equal(item.mesh.vertices_m, again.mesh.vertices_m)
         assert np.ptp(item.mesh.vertices_m, axis=0) == pytest.approx(item.size_m, abs=1e-6)
     home = turn_scene(turned, 3)
     for item, again in zip(home.objects, rooms.scenes[0].objects, strict=True):
@@ -67,16 +71,20 @@ def test_overlap_is_one_for_the_room_itself_and_none_for_nothing(toy_shards, ren
     assert mask_overlap(truth, [None] * len(objects), image, renderer) == 0
 
 
+def names_of(answers) -> list[tuple[str, int]]:
+    return [(one.scene.name, one.scene.extra["turned_degrees"]) for one in answers]
+
+
 def test_random_rooms_come_from_the_seed_and_are_never_the_images_own(rooms, toy_shards):
     images = images_of_split(toy_shards, "train", 0)[0]
     drawn = [random_answers(rooms, images, LossConfig(), seed) for seed in range(3)]
     again = random_answers(rooms, images, LossConfig(), 0)
-    assert [one.scene for one in again] == [one.scene for one in drawn[0]]
-    assert [one.scene for one in drawn[1]] != [one.scene for one in drawn[0]]
+    assert names_of(again) == names_of(drawn[0]) != names_of(drawn[1])
     for answers in drawn:
         for image, answer in zip(images, answers, strict=True):
             assert answer.scene.name != image.room_id
             assert len(answer.objects) == len(image.rows)
+            assert all(item is None or item.mesh is not None for item in answer.objects)
 
 
 def test_a_room_that_is_the_only_one_is_no_baseline(rooms, toy_shards):
