@@ -51,6 +51,9 @@ def eval_fid(
             help="Keep what real rooms' pictures say in this .npz, or take it from there."
         ),
     ] = None,
+    boxes: Annotated[
+        bool, typer.Option("--boxes", help="Also compare all rooms as boxes: layouts alone.")
+    ] = False,
     resamples: Annotated[
         int, typer.Option(min=0, help="Of the bootstrap intervals; 0 leaves them out.")
     ] = 200,
@@ -70,7 +73,7 @@ def eval_fid(
             "Both --run and --scenes came; give --run to judge what a run generates, or --scenes "
             "to judge scenes that are there."
         )
-    judging = Judging(inception, alexnet, reference, resamples, renderer)
+    judging = Judging(inception, alexnet, reference, resamples, renderer, boxes)
     if run is not None:
         target = out or run / "scores.json"
         scores = judge_run(run, count or GENERATED, seed, shards, target, law, judging, checkpoint)

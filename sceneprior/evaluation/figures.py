@@ -160,6 +160,16 @@ def _frechet(rooms: Rooms, test: Rooms, a: np.ndarray, b: np.ndarray) -> Figure:
     )
 
 
+def frechet_figures(rooms: Rooms, test: Rooms) -> dict[str, Figure]:
+    """Frechet distances of a set's pictures to those of test rooms, by every network at hand."""
+    figures = {}
+    for network, key in FRECHET.items():
+        a, b = getattr(rooms.features, network), getattr(test.features, network)
+        if a is not None and b is not None:
+            figures[key] = _frechet(rooms, test, a, b)
+    return figures
+
+
 def gap_figures(
     rooms: Rooms, test: Rooms, independent: dict[str, Figure], real: dict[str, Figure]
 ) -> dict[str, Figure]:
@@ -172,16 +182,16 @@ def gap_figures(
         real: The same of real training rooms.
     """
     figures = {}
-    for network, key in FRECHET.items():
-        a, b = getattr(rooms.features, network), getattr(test.features, network)
-        if key not in real or a is None or b is None:
+    names = {key: network for network, key in FRECHET.items()}
+    for key, distance in frechet_figures(rooms, test).items():
+        if key not in real:
             continue
-        distances = (_frechet(rooms, test, a, b), independent[key], real[key])
+        distances = (distance, independent[key], real[key])
         value = gap_closed(*(distance.value or 0.0 for distance in distances))
         # A resample repeats rooms, which moves all distances up: each back to its own mean.
         moved = [(d.value or 0.0) + d.draws - d.draws.mean() for d in distances if len(d.draws)]
         draws = np.array([gap_closed(*draw) for draw in zip(*moved, strict=True)])
-        figures[f"gap_closed_{network}"] = Figure(value, draws)
+        figures[f"gap_closed_{names[key]}"] = Figure(value, draws)
     return figures
 
 

@@ -15,6 +15,7 @@ from rich.progress import Progress
 from sceneprior.classes import VOID
 from sceneprior.errors import InputError
 from sceneprior.evaluation.alexnet import check_alexnet
+from sceneprior.evaluation.as_boxes import box_figures
 from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES
 from sceneprior.evaluation.figures import (
     Figure,
@@ -57,6 +58,7 @@ def evaluate_synthesis(
     resamples: int = RESAMPLES,
     renderer: Renderer,
     reference: Path | None = None,
+    boxes: bool = False,
     out: Path | None = None,
 ) -> dict[str, Any]:
     """Compare generated rooms with the test rooms, and real and independent rooms with them too.
@@ -75,6 +77,7 @@ def evaluate_synthesis(
         resamples: Of the intervals; 0 leaves them out.
         renderer: From `sceneprior.offscreen.open_renderer`.
         reference: File that keeps what was read from the real rooms' pictures; None draws them.
+        boxes: Also compare pictures of all rooms drawn as boxes: their layouts alone.
         out: JSON file to write, whole or not at all; None writes nothing.
 
     Returns:
@@ -122,6 +125,11 @@ def evaluate_synthesis(
         furnished = independent_rooms(reference_scenes(shards, "train"), len(train), seed, True)
         drawn["independent_meshes"] = draw("independent, furnished", furnished)
         del furnished
+        as_boxes = {"independent": drawn["independent"]}
+        for group, scenes in {"test": test, "generated": generated, "train": train}.items():
+            if boxes:
+                plain = [scene.without_meshes() for scene in scenes]
+                as_boxes[group] = draw(f"boxed {group}", plain)
 
     own = {"train": train_rows}
     groups = {"test": test, "generated": generated, "train": train, "independent": independent}
@@ -129,7 +137,13 @@ def evaluate_synthesis(
     for number, (group, scenes) in enumerate(groups.items()):
         nearest = nearest_distances(scenes, every_train, own.get(group))
         sets[group] = rooms_of(scenes, drawn[group], nearest, resamples, (seed, number))
-    columns = _columns(sets, drawn["independent_meshes"], seed, inception is not None, alexnet)
+    # Frechet distances compare at equal numbers of rooms alone.
+    fair_rows = seeded_rows(len(generated), len(train), seed)
+    meshes = drawn["independent_meshes"]
+    columns = _columns(sets, meshes, fair_rows, seed, inception is not None, alexnet)
+    if boxes:
+        layouts = box_figures(sets, as_boxes, COLUMN_GROUPS, fair_rows, (seed, len(sets)))
+        columns = {name: own | layouts.get(name, {}) for name, own in columns.items()}
     scores: dict[str, Any] = {"format": FORMAT, "version": VERSION, "note": NOTE}
     scores |= {key: figure.value for key, figure in columns["generated"].items()}
     scores |= {f"{key}_test": figure.value for key, figure in columns["test"].items()}
@@ -164,7 +178,12 @@ def evaluate_synthesis(
 
 
 def _columns(
-    sets: dict[str, Rooms], meshes: SceneFeatures, seed: int, inception: bool, alexnet: Path | None
+    sets: dict[str, Rooms],
+    meshes: SceneFeatures,
+    fair_rows: Sequence[int],
+    seed: int,
+    inception: bool,
+    alexnet: Path | None,
 ) -> dict[str, dict[str, Figure]]:
     """The figures of every set of rooms; `meshes` are the independent rooms' with real meshes."""
     test = sets["test"]
@@ -178,9 +197,7 @@ def _columns(
         layout = {"category_kl": category_kl_figure(rooms, test), **figures_alone(rooms)}
         columns[column] = pictures(rooms) | layout
     columns["independent_meshes"] = pictures(replace(sets["independent"], features=meshes))
-    # Frechet distances compare at equal numbers of rooms alone.
-    rows = seeded_rows(len(sets["generated"].scenes), len(sets["train"].scenes), seed)
-    fair = sets["generated"].of(rows, (seed, len(sets)))
+    fair = sets["generated"].of(fair_rows, (seed, len(sets)))
     for column, suffix in (("independent", ""), ("independent_meshes", "_meshes")):
         gaps = gap_figures(fair, test, columns[column], columns["train_rooms"])
         columns["generated"] |= {f"{key}{suffix}": figure for key, figure in gaps.items()}

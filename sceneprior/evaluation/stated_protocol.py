@@ -58,6 +58,7 @@ def definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
         "many rooms as real training rooms; drawn as boxes, _meshes: with the real meshes",
         "gap_closed": "(independent - generated) / (independent - real training), Frechet "
         "distances to the test rooms, n_gap rooms each; 1 or 0 where independent <= real",
+        "_boxes": "the same figure, all rooms drawn as boxes, real ones too (--boxes)",
         "type_share": list(TYPE_CLASSES.get(names, ())),
     }
 

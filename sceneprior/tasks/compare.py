@@ -67,7 +67,8 @@ def compare(
     Raises:
         KeyboardInterrupt: stopped by Ctrl-C; the same call goes on.
     """
-    judging: tuple[str, ...] = ("--renderer", renderer)
+    # Some methods decode meshes and some have boxes alone: --boxes compares what all have.
+    judging: tuple[str, ...] = ("--boxes", "--renderer", renderer)
     if inception is not None:
         check_inception(inception)
         judging = (*judging, "--inception", str(inception))

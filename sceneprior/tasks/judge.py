@@ -36,6 +36,7 @@ class Judging:
     reference: Path | None = None
     resamples: int = RESAMPLES
     renderer: str = "auto"
+    boxes: bool = False
 
 
 def judge_run(
@@ -115,6 +116,7 @@ def _judge(scenes: list[Scene], shards: Path, seed: int, judging: Judging) -> di
         resamples=judging.resamples,
         renderer=open_renderer(judging.renderer),
         reference=judging.reference,
+        boxes=judging.boxes,
     )
 
 

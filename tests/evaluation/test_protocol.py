@@ -22,10 +22,11 @@ from sceneprior.evaluation.protocol import (
 )
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.score_table import SCORE_ROWS, print_scores, score_rows
-from sceneprior.evaluation.set_metrics import gap_closed
+from sceneprior.evaluation.set_metrics import frechet_distance, gap_closed
+from sceneprior.evaluation.stated_protocol import drawing_of
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.offscreen import open_renderer
-from sceneprior.scene import Scene, SceneObject
+from sceneprior.scene import Mesh, Scene, SceneObject
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +107,46 @@ def test_test_rooms_against_themselves_are_at_distance_zero(shards, renderer):
         scores["protocol"]["renders_sha256"]["test"]
         == (scores["protocol"]["renders_sha256"]["generated"])
     )
+
+
+def shrunk(scene: Scene) -> Scene:
+    """Every mesh at half its size round its box's centre."""
+    return replace(
+        scene,
+        objects=tuple(
+            replace(
+                item,
+                mesh=Mesh((item.mesh.vertices_m + item.center_m) / 2, item.mesh.faces),
+            )
+            for item in scene.objects
+        ),
+    )
+
+
+def test_as_boxes_only_layouts_count(generated, shards, renderer):
+    """Meshes do not show: here they are much smaller than their boxes."""
+    bare = [scene.without_meshes() for scene in generated]
+    scores = [
+        evaluate_synthesis(scenes, shards, seed=1, renderer=renderer, boxes=True, resamples=20)
+        for scenes in ([shrunk(scene) for scene in generated], bare)
+    ]
+    assert scores[0]["fd_effnet_lite0"] != scores[1]["fd_effnet_lite0"]
+    keys = {"fd_effnet_lite0_boxes", "gap_closed_effnet_lite0_boxes"}
+    assert {key for key in scores[0] if key.endswith("_boxes")} == keys
+    assert keys < {key for key, *_ in SCORE_ROWS}
+    for key in keys:
+        assert scores[0][key] == scores[1][key]
+        assert scores[0]["intervals"]["generated"][key] == scores[1]["intervals"]["generated"][key]
+    # By its definition, from pictures of boxes.
+    view = drawing_of(generated[0].label_set, renderer, None, None)
+    real = reference_scenes(shards, "test", meshes=False)
+    a, b = (view.features(scenes, lambda _: None).effnet_lite0 for scenes in (bare, real))
+    assert scores[0]["fd_effnet_lite0_boxes"] == frechet_distance(a, b)
+    for column in ("train_rooms", "independent"):
+        assert scores[0][column]["fd_effnet_lite0_boxes"] >= 0
+    small = [shrunk(scene) for scene in reference_scenes(shards, "test")]
+    truth = evaluate_synthesis(small, shards, renderer=renderer, boxes=True, resamples=0)
+    assert truth["fd_effnet_lite0_boxes"] < 1e-8 < truth["fd_effnet_lite0"]
 
 
 class StandIn(torch.nn.Module):
