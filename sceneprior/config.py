@@ -47,8 +47,13 @@ class ModelConfig(Section):
     decoder: Literal["transformer", "lstm", "atiss"] = "transformer"
     """What emits object features: the `transformer` (paper); an `lstm` that takes z first and
     then its own last output (ablation c2; `heads`, `hidden` and `dropout` have no say); or the
-    encoder of `atiss`, four layers in which z takes the empty embedding's place (ATISS-2D; as
-    published it has `heads` 8, `hidden` 1024)."""
+    encoder of `atiss`, in which z takes the empty embedding's place (ATISS-2D; as published it
+    has `heads` 8, `hidden` 1024)."""
+    encoder_layers: int = Field(4, ge=1)
+    """Of the encoder of `atiss` alone; 4 are published."""
+    norm_first: bool = False
+    """In the encoder of `atiss` alone: normalise before attention and feed-forward, not after
+    their residuals as published. Learns at higher rates (docs/baselines_2d.md)."""
     final_norm: bool = False
     """Normalise once more after the encoder layer and after the decoder layer, as the released
     code and the default of the library that it builds on."""

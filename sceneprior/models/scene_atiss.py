@@ -4,9 +4,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-LAYERS = 4
-"""Encoder layers of the published model, beside 8 heads, a width of 512 and an FFN of 1,024."""
-
 
 class SceneAtiss(nn.Module):
     """Stands where the transformer stands: x_k is what the encoder makes of z among x_1 .. x_(k-1).
@@ -14,8 +11,9 @@ class SceneAtiss(nn.Module):
     ATISS appends a learnt 'empty' embedding to the set of objects that are there, and reads the
     next object off the place where it stood. Here z is that embedding (supplement, Baselines), so
     there is nothing to learn for the empty room, and no floor plan, which 2D views do not show.
-    Nothing tells the tokens' order. Each layer normalises after its residuals and the last is
-    normalised once more, as in the library that ATISS builds on.
+    Nothing tells the tokens' order. Each layer normalises after its residuals, unless told
+    otherwise, and the last is normalised once more, as in the library that ATISS builds on. The
+    published model has 4 layers, 8 heads, a width of 512 and an FFN of 1,024.
 
     Every token sees every other, so that a new object changes what all layers say of the old ones:
     each step encodes its set anew.
@@ -26,13 +24,24 @@ class SceneAtiss(nn.Module):
         hidden: Inner width of the feed-forward layers.
         dropout: Applied where the library applies it; 0.1 is its default.
         layers: How many.
+        norm_first: Normalise what goes into attention and feed-forward instead.
     """
 
-    def __init__(self, width: int, heads: int, hidden: int, dropout: float, layers: int = LAYERS):
+    def __init__(
+        self,
+        width: int,
+        heads: int,
+        hidden: int,
+        dropout: float,
+        layers: int = 4,
+        norm_first: bool = False,
+    ):
         super().__init__()
         # Layers one by one: TransformerEncoder copies its layer, so that all would start alike.
         self.layers = nn.ModuleList(
-            nn.TransformerEncoderLayer(width, heads, hidden, dropout, "gelu", batch_first=True)
+            nn.TransformerEncoderLayer(
+                width, heads, hidden, dropout, "gelu", batch_first=True, norm_first=norm_first
+            )
             for _ in range(layers)
         )
         self.end = nn.LayerNorm(width)

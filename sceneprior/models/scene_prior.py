@@ -27,6 +27,7 @@ class ScenePrior(nn.Module):
         anchors: M fixed vectors of the latent hypersphere.
         latent: `sphere`, or `uniform` for a cube of logits (ablation c1).
         decoder: `transformer`, `lstm` (ablation c2), or `atiss` (baseline ATISS-2D).
+        encoder_layers, norm_first: Of the encoder of `atiss`.
         heads, hidden, dropout: Of the transformer, and of the encoder of `atiss`.
         final_norm, query_self_attention: Of the transformer.
         step_mlps: Whether each of the transformer's N steps ends in an MLP of its own.
@@ -46,6 +47,8 @@ class ScenePrior(nn.Module):
         dropout: float = 0.1,
         latent: str = "sphere",
         decoder: str = "transformer",
+        encoder_layers: int = 4,
+        norm_first: bool = False,
         final_norm: bool = False,
         query_self_attention: bool = False,
         step_mlps: bool = False,
@@ -68,7 +71,7 @@ class ScenePrior(nn.Module):
         if decoder == "lstm":
             self.decoder = SceneLstm(width)
         elif decoder == "atiss":
-            self.decoder = SceneAtiss(width, heads, hidden, dropout)
+            self.decoder = SceneAtiss(width, heads, hidden, dropout, encoder_layers, norm_first)
         else:
             steps = max_objects if step_mlps else 0
             self.decoder = SceneDecoder(

@@ -12,9 +12,9 @@ from sceneprior.models.scene_atiss import SceneAtiss
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
 
 
-def made(dtype=torch.float64, width=12, layers=4, dropout=0.0) -> SceneAtiss:
+def made(dtype=torch.float64, width=12, layers=4, dropout=0.0, norm_first=False) -> SceneAtiss:
     torch.manual_seed(0)
-    model = SceneAtiss(width, 3, 20, dropout, layers).to(dtype)
+    model = SceneAtiss(width, 3, 20, dropout, layers, norm_first).to(dtype)
     with torch.no_grad():  # biases and norms as different from their start as after training
         for parameter in model.parameters():
             parameter += 0.2 * torch.randn_like(parameter)
@@ -53,37 +53,43 @@ def test_unrolling_is_asking_step_by_step_and_rooms_do_not_see_each_other(torch_
     assert_close(model(z, 2), unrolled[:, :2], rtol=0, atol=1e-12)
 
 
-def test_the_slow_twin_says_the_same(torch_rng):
+@pytest.mark.parametrize("norm_first", [False, True])
+def test_the_slow_twin_says_the_same(torch_rng, norm_first):
     """Token by token and head by head: z is one of the tokens, and the answer is read off it."""
-    model = made(layers=2).eval()
+    model = made(layers=2, norm_first=norm_first).eval()
     z, previous = inputs(torch_rng, rooms=2, objects=3)
     with torch.no_grad():
         answers = model.next_object(z, previous)
         for room in range(2):
             tokens = [z[room] * 12**0.5, *previous[room]]
             for layer in model.layers:
-                tokens = encode(layer, tokens)
+                tokens = encode(layer, tokens, norm_first)
             assert_close(answers[room], normalise(tokens[0], model.end), rtol=0, atol=1e-12)
 
 
-def encode(layer, tokens):
+def encode(layer, tokens, norm_first):
     """One layer of the ATISS encoder over a list of tokens."""
+
+    def before(token, norm):
+        return normalise(token, norm) if norm_first else token
+
+    def after(token, norm):
+        return token if norm_first else normalise(token, norm)
+
     attention = layer.self_attn
     weights = attention.in_proj_weight.chunk(3)
     biases = attention.in_proj_bias.chunk(3)
     query, key, value = (
-        [weight @ token + bias for token in tokens]
+        [weight @ before(token, layer.norm1) + bias for token in tokens]
         for weight, bias in zip(weights, biases, strict=True)
     )
     out = []
     for token, asks in zip(tokens, query, strict=True):
         mixed = attend(asks, key, value, attention.num_heads)
-        x = normalise(
-            token + attention.out_proj.weight @ mixed + attention.out_proj.bias, layer.norm1
-        )
-        inner = layer.linear1.weight @ x + layer.linear1.bias
+        x = after(token + attention.out_proj.weight @ mixed + attention.out_proj.bias, layer.norm1)
+        inner = layer.linear1.weight @ before(x, layer.norm2) + layer.linear1.bias
         inner = inner * 0.5 * (1 + torch.erf(inner / 2**0.5))  # GELU
-        out.append(normalise(x + layer.linear2.weight @ inner + layer.linear2.bias, layer.norm2))
+        out.append(after(x + layer.linear2.weight @ inner + layer.linear2.bias, layer.norm2))
     return out
 
 
