@@ -176,15 +176,15 @@ class GanConfig(Section):
     batch_size: int = Field(16, ge=1)
     """Real rooms a step, and as many generated ones."""
     views_per_room: int = Field(4, ge=1)
-    learning_rate: float = Field(5e-4, gt=0)
-    """Of the generator's Adam."""
+    learning_rate: float = Field(1e-3, gt=0)
+    """Of the generator's Adam; its shape decoder has a tenth."""
     discriminator_learning_rate: float = Field(4e-3, gt=0)
     """Of the discriminator's. Too large: it is soon always right, and teaches nothing; too small:
     the generator runs ahead to whatever it finds unusual."""
     counts: float = Field(1.0, ge=0)
-    """Weight of the generator's second aim: as many objects of each class a room, on average, as
-    real rooms have. 0 leaves them to the discriminator, and classes drift."""
-    variety: float = Field(0.1, ge=0)
+    """Weight of the generator's second aim: as much of each class a room, on average, as real rooms
+    have, in objects and in pixels. 0 leaves that to the discriminator, and classes drift."""
+    variety: float = Field(1.0, ge=0)
     """Weight of the generator's third aim: that the k-th object of different rooms has different
     places and sizes. Too small: all rooms end up as one; too large: objects are anywhere."""
     averaging: float = Field(0.97, ge=0, lt=1)

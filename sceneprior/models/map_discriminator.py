@@ -11,8 +11,8 @@ from torch.nn.utils.parametrizations import spectral_norm
 STEPS = 2
 """Halvings of a map's sides; a patch is then 18 x 18 pixels of it."""
 
-GAIN = 4
-"""Of the scores of rooms: at 1, one object more or less would move the odds by e at most."""
+GAIN = 10
+"""Of all scores: at 1, one object more or less would move the odds by e at most."""
 
 
 class MapDiscriminator(nn.Module):
@@ -40,7 +40,7 @@ class MapDiscriminator(nn.Module):
             spectral_norm(nn.Linear(widths[-1], 1)),
         )
         self.counts = nn.Sequential(
-            spectral_norm(nn.Linear(classes, widths[-1])),
+            spectral_norm(nn.Linear(2 * classes, widths[-1])),
             nn.LeakyReLU(0.2),
             spectral_norm(nn.Linear(widths[-1], widths[-1])),
             nn.LeakyReLU(0.2),
@@ -50,14 +50,14 @@ class MapDiscriminator(nn.Module):
     def forward(
         self,
         maps: Float[Tensor, "rooms views classes height width"],
-        counts: Float[Tensor, "rooms classes"],
+        counts: Float[Tensor, "rooms both"],
     ) -> tuple[
         Float[Tensor, "rooms views rows columns"], Float[Tensor, " rooms"], Float[Tensor, " rooms"]
     ]:
         """Scores of patches, of rooms, and of what is in them; a higher score looks more real.
 
         A room is what its views show on average and at most, whatever their order and number.
-        What is in it is the number of its objects of each class.
+        What is in it is the number of objects of each class, and how much of its views they fill.
         """
         x = maps.flatten(0, 1)
         for layer in self.layers:
@@ -65,4 +65,4 @@ class MapDiscriminator(nn.Module):
         patches = self.patch(x)[:, 0].unflatten(0, maps.shape[:2])
         features = x.mean(dim=(2, 3)).unflatten(0, maps.shape[:2])
         room = torch.cat([features.mean(dim=1), features.amax(dim=1)], dim=-1)
-        return patches, GAIN * self.room(room)[:, 0], GAIN * self.counts(counts)[:, 0]
+        return GAIN * patches, GAIN * self.room(room)[:, 0], GAIN * self.counts(counts)[:, 0]

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from sceneprior.batches import DecodedScenes, SceneViews
-from sceneprior.classes import VOID, label_set
+from sceneprior.classes import label_set
 from sceneprior.config import RunConfig
+from sceneprior.losses.adversarial import certainty, contents, implausible, mistaken, sameness
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.losses.semantic_maps import (
     decoded_counts,
@@ -34,12 +34,15 @@ width, height, depth before their SoftPlus, then completeness. Metres where they
 
 START_ROOMS = 64
 
-VARIED = (1.0, 1.0, 0.3, 0.3, 0.3)
-"""Spread over rooms, in metres, that a slot's x, z, width, height and depth are pushed towards."""
+SHAPES = 0.1
+"""Of the generator's learning rate, for the shape decoder: maps are content with sheared boxes."""
 
 SOFT = 0.01
 """Weight of the mean square of class and completeness logits. A choice that is all but certain has
 no gradient: a generator whose objects had all gone would never come back."""
+
+PLAUSIBLE = 10.0
+"""Weight of what leaves where rooms are and how large furniture is."""
 
 MEMORY = 0.9
 """Share of `excess` that is kept at each step: a batch alone says little of rare classes."""
@@ -53,8 +56,8 @@ class GanStage(lightning.LightningModule):
     room with a real one. What keeps it stable is listed in docs/baselines_2d.md.
 
     `generator` is what plays; `prior`, which tasks take out of checkpoints, is a running average of
-    its weights, in which the two opponents' circling cancels. `excess` is how many objects of each
-    class a generated room has more than a real one, of late.
+    its weights, in which the two opponents' circling cancels. `excess` is how much more
+    of each class a generated room has than a real one, of late: objects, and pixels (`contents`).
 
     Args:
         prior: The network, freshly initialised.
@@ -73,7 +76,7 @@ class GanStage(lightning.LightningModule):
         self.latents = latents
         self.discriminator = MapDiscriminator(self.classes)
         self.excess: Tensor
-        self.register_buffer("excess", torch.zeros(self.classes))
+        self.register_buffer("excess", torch.zeros(2 * self.classes))
 
     def training_step(self, views: SceneViews, batch_idx: int) -> None:
         generator_optimizer, discriminator_optimizer = self._optimizers()
@@ -86,18 +89,20 @@ class GanStage(lightning.LightningModule):
             real_counts = observed_counts(views, self.classes)
             fake = self._through_noise(self._draw(scenes, views))
             fake_counts = decoded_counts(scenes, self.config.loss.completeness_target)
+            loss = SOFT * undecided + PLAUSIBLE * implausible(scenes, views)
+            loss = loss + self.config.gan.variety * sameness(scenes)
+            real_contents, fake_contents = contents(real, real_counts), contents(fake, fake_counts)
 
-        real_scores = self.discriminator(real, real_counts)
-        fake_scores = self.discriminator(fake.detach(), fake_counts.detach())
+        real_scores = self.discriminator(real, real_contents)
+        fake_scores = self.discriminator(fake.detach(), fake_contents.detach())
         told_apart = mistaken(real_scores, real=True) + mistaken(fake_scores, real=False)
         check_finite(told_apart, views)
         self._update(discriminator_optimizer, told_apart)
 
         self.discriminator.requires_grad_(False)
-        self.excess.lerp_((fake_counts.detach() - real_counts).mean(dim=0), 1 - MEMORY)
-        loss = mistaken(self.discriminator(fake, fake_counts), real=True) + SOFT * undecided
-        loss = loss + self.config.gan.counts * (fake_counts @ self.excess).mean()
-        loss = loss + self.config.gan.variety * sameness(scenes)
+        self.excess.lerp_((fake_contents.detach() - real_contents).mean(dim=0), 1 - MEMORY)
+        loss = loss + mistaken(self.discriminator(fake, fake_contents), real=True)
+        loss = loss + self.config.gan.counts * (fake_contents @ self.excess).mean()
         check_finite(loss, views)
         self._update(generator_optimizer, loss)
         self.discriminator.requires_grad_(True)
@@ -162,58 +167,31 @@ class GanStage(lightning.LightningModule):
         fake: Sequence[Tensor],
     ) -> None:
         target = self.config.loss.completeness_target
+        objects = kept_objects(scenes.completeness_logits, target).sum(dim=1).float()
         said = {
-            "loss": loss,
-            "discriminator": told_apart,
-            "real_score": torch.stack([score.mean() for score in real]).mean(),
-            "fake_score": torch.stack([score.mean() for score in fake]).mean(),
-            "objects": kept_objects(scenes.completeness_logits, target).sum(dim=1).float().mean(),
+            "train/loss": loss.detach(),
+            "train/discriminator": told_apart.detach(),
+            "train/real_score": torch.stack([score.detach().mean() for score in real]).mean(),
+            "train/fake_score": torch.stack([score.detach().mean() for score in fake]).mean(),
+            "train/objects": objects.mean(),
         }
-        named = {f"train/{name}": value.detach() for name, value in said.items()}
-        self.log_dict(named, on_step=False, on_epoch=True, batch_size=len(scenes.centers_m))
+        self.log_dict(said, on_step=False, on_epoch=True, batch_size=len(objects))
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         rates = self.config.gan
+        shape = list(self.generator.shape.parameters())
+        others = [p for name, p in self.generator.named_parameters() if "shape." not in name]
         both = (
-            (self.generator, rates.learning_rate),
-            (self.discriminator, rates.discriminator_learning_rate),
+            ((others, rates.learning_rate), (shape, SHAPES * rates.learning_rate)),
+            ((self.discriminator.parameters(), rates.discriminator_learning_rate),),
         )
         return [
-            torch.optim.Adam([{"params": part.parameters(), "initial_lr": rate}], rate, BETAS)
-            for part, rate in both
+            torch.optim.Adam(
+                [{"params": own, "lr": rate, "initial_lr": rate} for own, rate in parts],
+                betas=BETAS,
+            )
+            for parts in both
         ]
-
-
-def mistaken(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
-    """Cross entropy of scores, as logits of being real, with what is wanted of them.
-
-    Patches and rooms count alike. The generator minimises it for its own maps as if these were
-    real (Goodfellow et al., "Generative adversarial nets", NeurIPS 2014: the loss that does not
-    saturate).
-    """
-    sign = -1 if real else 1
-    return torch.stack([F.softplus(sign * score).mean() for score in scores]).sum()
-
-
-def certainty(scenes: DecodedScenes) -> Float[Tensor, ""]:
-    """Mean squares of the logits that decide: 0 is undecided. `void` is no choice."""
-    return (
-        scenes.class_logits[..., VOID + 1 :].square().mean()
-        + scenes.completeness_logits.square().mean()
-    )
-
-
-def sameness(scenes: DecodedScenes) -> Float[Tensor, ""]:
-    """How alike a slot's objects are in all rooms: minus the mean log spread of place and size, as
-    a share of `VARIED`.
-
-    It is minus the entropy of normal distributions of their spread (after Kumar et al., "Maximum
-    entropy generators for energy-based models", 2019). Below 1 mm a spread counts as 1 mm; above
-    `VARIED` there is nothing to gain, or objects would leave the room for the sake of it.
-    """
-    boxes = torch.cat([scenes.centers_m[..., [0, 2]], scenes.sizes_m], dim=-1)
-    wanted = boxes.new_tensor(VARIED).square()
-    return -((boxes.var(dim=0, correction=0) + 1e-6) / wanted).clamp(max=1).log().mean() / 2
 
 
 @torch.no_grad()
