@@ -184,7 +184,7 @@ class GanConfig(Section):
     counts: float = Field(1.0, ge=0)
     """Weight of the generator's second aim: as much of each class a room, on average, as real rooms
     have, in objects and in pixels. 0 leaves that to the discriminator, and classes drift."""
-    variety: float = Field(1.0, ge=0)
+    variety: float = Field(4.0, ge=0)
     """Weight of the generator's third aim: that the k-th object of different rooms has different
     places and sizes. Too small: all rooms end up as one; too large: objects are anywhere."""
     averaging: float = Field(0.97, ge=0, lt=1)
