@@ -1,14 +1,12 @@
 """How far from the test rooms a run's decoded training rooms are, and new ones by several laws.
 
-    python benchmarks/sampling_laws.py RUN [RUN ...]
-
-What a prior generates can hardly be nearer to test rooms than what it decodes from the latents it
-was trained with: the difference is what sampling costs, the rest is how well it decodes. Frechet
-distances of EfficientNet-Lite0 features (not FID), seed 0, as many rooms as training rooms; in
-brackets all rooms drawn as boxes.
+Run `python benchmarks/sampling_laws.py RUN [RUN ...]`. What a prior generates can hardly be nearer
+to test rooms than what it decodes from the latents it was trained with: the difference is what
+sampling costs, the rest is how well it decodes. Frechet distances of EfficientNet-Lite0 features
+(not FID), seed 0, as many rooms as training rooms; in brackets all rooms drawn as boxes.
 """
 
-import sys
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,8 +26,10 @@ LAWS = ("kernel", "geodesic", "paper")
 
 
 def main() -> None:
-    for name in sys.argv[1:]:
-        trained = load_run(Path(name))
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("runs", type=Path, nargs="+", help="that remember training rooms")
+    for name in parser.parse_args().runs:
+        trained = load_run(name)
         shards = Path(trained.config.data.shards)
         drawing = drawing_of(trained.config.label_set, open_renderer("auto"), None, None)
 
@@ -49,6 +49,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 2:
-        sys.exit(__doc__)
     main()

@@ -80,13 +80,17 @@ class ModelConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _transformer_parts(self) -> "ModelConfig":
+    def _parts_belong_to_the_decoder(self) -> "ModelConfig":
         for part in ("final_norm", "query_self_attention", "step_mlps"):
             if self.decoder != "transformer" and getattr(self, part):
                 raise ValueError(
                     f"{part} is a part of the transformer, but decoder is '{self.decoder}'; "
                     "set it to false"
                 )
+        if self.norm_first and self.decoder != "atiss":
+            raise ValueError(
+                f"norm_first is a part of atiss, but decoder is '{self.decoder}'; set it to false"
+            )
         return self
 
     @property

@@ -119,6 +119,14 @@ def test_a_part_of_the_transformer_without_a_transformer_is_a_sentence(config, p
     load_config(str(config), ("model.decoder=lstm",))
 
 
+def test_a_part_of_atiss_without_atiss_is_a_sentence(config):
+    assert refusal(config, "model.norm_first=true").startswith(
+        f"{config}: 'model': norm_first is a part of atiss, but decoder is 'transformer'; "
+        "set it to false"
+    )
+    load_config(str(config), ("model.decoder=atiss", "model.norm_first=true"))
+
+
 def test_a_room_has_as_many_logits_as_its_latent_space_asks_for(config):
     assert load_config(str(config)).model.logits_per_room == 10
     assert load_config(str(config), ("model.latent=uniform",)).model.logits_per_room == 16

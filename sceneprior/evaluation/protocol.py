@@ -125,14 +125,15 @@ def evaluate_synthesis(
         furnished = independent_rooms(reference_scenes(shards, "train"), len(train), seed, True)
         drawn["independent_meshes"] = draw("independent, furnished", furnished)
         del furnished
-        as_boxes = {"independent": drawn["independent"]}
-        for group, scenes in {"test": test, "generated": generated, "train": train}.items():
-            if boxes:
-                plain = [scene.without_meshes() for scene in scenes]
+        groups = {"test": test, "generated": generated, "train": train, "independent": independent}
+        as_boxes: dict[str, SceneFeatures] = {}
+        if boxes:
+            as_boxes["independent"] = drawn["independent"]  # which have no meshes
+            for group in ("test", "generated", "train"):
+                plain = [scene.without_meshes() for scene in groups[group]]
                 as_boxes[group] = draw(f"boxed {group}", plain)
 
     own = {"train": train_rows}
-    groups = {"test": test, "generated": generated, "train": train, "independent": independent}
     sets: dict[str, Rooms] = {}
     for number, (group, scenes) in enumerate(groups.items()):
         nearest = nearest_distances(scenes, every_train, own.get(group))

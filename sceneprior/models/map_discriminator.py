@@ -39,7 +39,7 @@ class MapDiscriminator(nn.Module):
             nn.LeakyReLU(0.2),
             spectral_norm(nn.Linear(widths[-1], 1)),
         )
-        self.counts = nn.Sequential(
+        self.contents = nn.Sequential(
             spectral_norm(nn.Linear(2 * classes, widths[-1])),
             nn.LeakyReLU(0.2),
             spectral_norm(nn.Linear(widths[-1], widths[-1])),
@@ -50,14 +50,14 @@ class MapDiscriminator(nn.Module):
     def forward(
         self,
         maps: Float[Tensor, "rooms views classes height width"],
-        counts: Float[Tensor, "rooms both"],
+        contents: Float[Tensor, "rooms both"],
     ) -> tuple[
         Float[Tensor, "rooms views rows columns"], Float[Tensor, " rooms"], Float[Tensor, " rooms"]
     ]:
         """Scores of patches, of rooms, and of what is in them; a higher score looks more real.
 
         A room is what its views show on average and at most, whatever their order and number.
-        What is in it is the number of objects of each class, and how much of its views they fill.
+        What is in it (`losses.adversarial.contents`): objects of each class, and their pixels.
         """
         x = maps.flatten(0, 1)
         for layer in self.layers:
@@ -65,4 +65,4 @@ class MapDiscriminator(nn.Module):
         patches = self.patch(x)[:, 0].unflatten(0, maps.shape[:2])
         features = x.mean(dim=(2, 3)).unflatten(0, maps.shape[:2])
         room = torch.cat([features.mean(dim=1), features.amax(dim=1)], dim=-1)
-        return GAIN * patches, GAIN * self.room(room)[:, 0], GAIN * self.counts(counts)[:, 0]
+        return GAIN * patches, GAIN * self.room(room)[:, 0], GAIN * self.contents(contents)[:, 0]
