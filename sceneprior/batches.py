@@ -76,6 +76,21 @@ class RoomBoxes:
         """The same boxes with every tensor on `device` (Lightning calls this)."""
         return replace(self, **_moved(self, device))
 
+    def split(self, rooms: int) -> list["RoomBoxes"]:
+        """Batches of at most so many rooms, without ids."""
+        tensors = (self.object_class, self.is_object, self.boxes_m)
+        parts = zip(*(tensor.split(rooms) for tensor in tensors), strict=True)
+        return [RoomBoxes(*part) for part in parts]
+
+    def take(self, order: Int[Tensor, "rooms slots"]) -> "RoomBoxes":
+        """The same rooms with other slots: those that `order` names, in its order."""
+        return replace(
+            self,
+            object_class=self.object_class.gather(1, order),
+            is_object=self.is_object.gather(1, order),
+            boxes_m=self.boxes_m.gather(1, order.unsqueeze(-1).expand(-1, -1, 6)),
+        )
+
 
 def _moved(noun: SceneViews | RoomBoxes, device: torch.device | str) -> dict[str, Any]:
     values = {item.name: getattr(noun, item.name) for item in fields(noun)}

@@ -93,36 +93,21 @@ class PairPrior(nn.Module):
         """Move every object over the floor by `steps` steps of Adam down the energy."""
         if steps == 0:
             return rooms
-        moved = [
-            self._refine(RoomBoxes(*parts), steps)
-            for parts in zip(
-                rooms.object_class.split(BATCH),
-                rooms.is_object.split(BATCH),
-                rooms.boxes_m.split(BATCH),
-                strict=True,
-            )
-        ]
+        moved = [self._refine(part, steps) for part in rooms.split(BATCH)]
         return replace(rooms, boxes_m=torch.cat(moved))
 
     @torch.enable_grad()
     def _refine(self, rooms: RoomBoxes, steps: int) -> Float[Tensor, "rooms objects 6"]:
-        boxes_m = rooms.boxes_m.detach()
-        start_m = boxes_m[..., [0, 2]]
-        floor_m = start_m.clone().requires_grad_(True)
-        # Adam treats each number by itself: no room depends on its neighbours in the batch.
-        optimizer = torch.optim.Adam([floor_m], lr=STEP_M)
+        start_m = rooms.boxes_m[..., [0, 2]]
+        rooms = replace(rooms, boxes_m=rooms.boxes_m.clone().requires_grad_())
+        # Adam treats each number by itself: no room depends on its neighbours in the batch, and
+        # what the energy does not ask for, heights and sizes, stays.
+        optimizer = torch.optim.Adam([rooms.boxes_m], lr=STEP_M)
         for _ in range(steps):
             optimizer.zero_grad()
-            self.energy(replace(rooms, boxes_m=_put(boxes_m, floor_m)), start_m).sum().backward()
+            self.energy(rooms, start_m).sum().backward()
             optimizer.step()
-        return _put(boxes_m, floor_m.detach())
-
-
-def _put(
-    boxes_m: Float[Tensor, "rooms objects 6"], floor_m: Float[Tensor, "rooms objects 2"]
-) -> Float[Tensor, "rooms objects 6"]:
-    x, z = floor_m.split(1, dim=-1)
-    return torch.cat([x, boxes_m[..., 1:2], z, boxes_m[..., 3:]], dim=-1)
+        return rooms.boxes_m.detach()
 
 
 def _offsets(

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from sceneprior.batches import RoomBoxes
+from sceneprior.models.layers import mlp
 from sceneprior.models.logistics import LogisticMixture, draw_index
 
 END = 0
@@ -168,4 +169,4 @@ def waves(unit: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch waves"
 
 
 def _head(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(inputs, inputs), nn.ReLU(), nn.Linear(inputs, outputs))
+    return mlp(nn.Linear(inputs, inputs), nn.Linear(inputs, outputs))

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.classes import VOID
+from sceneprior.models.layers import mlp
 from sceneprior.models.released import SeparateHeads
 
 
@@ -56,7 +57,7 @@ class LayoutDecoder(nn.Module):
         super().__init__()
         hidden = 2 * width
         self.classes, self.void = classes, void
-        self.mlp1 = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, hidden))
+        self.mlp1 = mlp(nn.Linear(width, width), nn.Linear(width, hidden))
         self.mlp2 = (
             SeparateHeads(hidden, classes) if heads == "separate" else JointHead(hidden, classes)
         )

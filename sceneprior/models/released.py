@@ -8,6 +8,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sceneprior.models.layers import mlp
+
 
 class SharedOutput(nn.Module):
     """The paper: an object feature is what the transformer says, at every step."""
@@ -30,8 +32,7 @@ class StepOutputs(nn.Module):
     def __init__(self, steps: int, width: int):
         super().__init__()
         self.mlps = nn.ModuleList(
-            nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width))
-            for _ in range(steps)
+            mlp(nn.Linear(width, width), nn.Linear(width, width)) for _ in range(steps)
         )
 
     def forward(self, x: Float[Tensor, "rooms width"], step: int) -> Float[Tensor, "rooms width"]:
@@ -72,7 +73,7 @@ class SeparateHeads(nn.Module):
         super().__init__()
         self.classes = nn.Linear(hidden, classes)
         self.coordinates = nn.ModuleList(
-            nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 1))
+            mlp(nn.Linear(hidden, hidden), nn.Linear(hidden, 1))
             for _ in ("x", "y", "z", "width", "height", "depth")
         )
         self.completeness = nn.Linear(hidden, 1)

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from sceneprior.batches import RoomBoxes
 from sceneprior.models.arrangement import PairPrior
+from sceneprior.models.layers import mlp
 
 ATTRIBUTES = 7
 """Of a slot: whether it exists, centre x, y, z, full extents along x, y, z."""
@@ -51,22 +52,16 @@ class Sync2Gen(nn.Module):
         self.register_buffer("mean_m", torch.zeros(classes - 1, 1, 6))
         self.register_buffer("spread_m", torch.ones(classes - 1, 1, 6))
         self.pairs = PairPrior(classes)
-        self.encoder = nn.Sequential(
+        self.encoder = mlp(
             SparseLinear(cells, width, ATTRIBUTES, seed),
-            nn.ReLU(),
             nn.Linear(width, width),
-            nn.ReLU(),
             SparseLinear(width, width, HIDDEN_GROUP, seed + 1),
-            nn.ReLU(),
             nn.Linear(width, 2 * latent),
         )
-        self.decoder = nn.Sequential(
+        self.decoder = mlp(
             nn.Linear(latent, width),
-            nn.ReLU(),
             SparseLinear(width, width, HIDDEN_GROUP, seed + 2),
-            nn.ReLU(),
             nn.Linear(width, width),
-            nn.ReLU(),
             nn.Linear(width, cells),
         )
 
@@ -75,10 +70,9 @@ class Sync2Gen(nn.Module):
         for label in range(1, self.classes):
             mine = rooms.boxes_m[rooms.is_object & (rooms.object_class == label)]
             if len(mine):
+                spread_m = mine.std(dim=0, correction=0)
                 self.mean_m[label - 1, 0] = mine.mean(dim=0)
-                self.spread_m[label - 1, 0] = mine.std(dim=0, correction=0).clamp(
-                    min=LEAST_SPREAD_M
-                )
+                self.spread_m[label - 1, 0] = spread_m.clamp(min=LEAST_SPREAD_M)
         self.pairs.fit(rooms, seed)
 
     def to_matrix(self, rooms: RoomBoxes) -> Float[Tensor, "rooms classes slots 7"]:
@@ -88,12 +82,11 @@ class Sync2Gen(nn.Module):
         # Sorting is stable, so the last key counts most.
         for key in (rooms.boxes_m[..., 2], rooms.boxes_m[..., 0], label):
             order = order.gather(1, key.gather(1, order).argsort(dim=1, stable=True))
-        label = label.gather(1, order).contiguous()
+        rooms, label = rooms.take(order), label.gather(1, order).contiguous()
         rank = torch.arange(label.shape[1], device=label.device) - torch.searchsorted(label, label)
         fits = (label < self.classes) & (rank < self.slots)
-        boxes_m = rooms.boxes_m.gather(1, order.unsqueeze(-1).expand(-1, -1, 6))
         row = (label - 1).clamp(max=self.classes - 2)
-        unit = (boxes_m - self.mean_m[row, 0]) / self.spread_m[row, 0]
+        unit = (rooms.boxes_m - self.mean_m[row, 0]) / self.spread_m[row, 0]
         cell = torch.cat([torch.ones_like(unit[..., :1]), unit], dim=-1)
         # What finds no slot goes to one behind the last, which is cut off again.
         last = (self.classes - 1) * self.slots
@@ -154,18 +147,13 @@ class Sync2Gen(nn.Module):
 
     def to_rooms(self, decoded: Float[Tensor, "rooms classes slots 7"]) -> RoomBoxes:
         """The slots that rather exist than not, in metres."""
-        unit = decoded[..., 1:]
-        boxes_m = (self.mean_m + self.spread_m * unit).flatten(1, 2)
+        boxes_m = (self.mean_m + self.spread_m * decoded[..., 1:]).flatten(1, 2)
         boxes_m = torch.cat([boxes_m[..., :3], boxes_m[..., 3:].clamp(min=LEAST_SIZE_M)], dim=-1)
         exists = (decoded[..., 0] > 0).flatten(1, 2)
+        label = 1 + torch.arange(exists.shape[1], device=exists.device) // self.slots
         widest = max(int(exists.sum(dim=1).max()), 1)
-        order = (~exists).long().argsort(dim=1, stable=True)[:, :widest]
-        is_object = exists.gather(1, order)
-        return RoomBoxes(
-            object_class=(1 + order // self.slots) * is_object,
-            is_object=is_object,
-            boxes_m=boxes_m.gather(1, order.unsqueeze(-1).expand(-1, -1, 6)),
-        )
+        first = (~exists).long().argsort(dim=1, stable=True)[:, :widest]
+        return RoomBoxes(label * exists, exists, boxes_m).take(first)
 
 
 class SparseLinear(nn.Linear):

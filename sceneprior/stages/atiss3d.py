@@ -68,10 +68,9 @@ def part_of_rooms(rooms: RoomBoxes, seed: int) -> PartialRooms:
     order = tickets.masked_fill(~rooms.is_object, 2.0).argsort(dim=1)
     kept = (torch.rand(len(count), generator=generator).to(device) * (count + 1)).long()
     # A column behind the last: what comes after a room's last object is its end.
-    labels = rooms.object_class.masked_fill(~rooms.is_object, END).gather(1, order)
-    labels = torch.nn.functional.pad(labels, (0, 1), value=END)
-    boxes_m = rooms.boxes_m.gather(1, order.unsqueeze(-1).expand(-1, -1, 6))
-    boxes_m = torch.nn.functional.pad(boxes_m, (0, 0, 0, 1))
+    shuffled = rooms.take(order)
+    labels = torch.nn.functional.pad(shuffled.object_class, (0, 1), value=END)
+    boxes_m = torch.nn.functional.pad(shuffled.boxes_m, (0, 0, 0, 1))
     placed = torch.arange(labels.shape[1] - 1, device=device) < kept[:, None]
     return PartialRooms(
         object_class=labels[:, :-1] * placed,

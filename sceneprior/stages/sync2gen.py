@@ -10,7 +10,7 @@ from sceneprior.config import RunConfig
 from sceneprior.data.truth import TruthDataset
 from sceneprior.models.sync2gen import Sync2Gen
 from sceneprior.stages.box_loss import build_box_optimizer, total_of_rooms
-from sceneprior.stages.view_loss import batch_number, full_precision, step_seed
+from sceneprior.stages.view_loss import full_precision
 
 
 class Sync2genStage(lightning.LightningModule):
@@ -27,12 +27,10 @@ class Sync2genStage(lightning.LightningModule):
         self.config = config
 
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
-        batch = batch_number(self.trainer, batch_idx)
-        seed = step_seed(self.config.seed, batch, self.global_rank)
         matrix = self.prior.to_matrix(rooms)
         mean, log_variance = self.prior.encode(matrix)
-        noise = torch.randn(mean.shape, generator=torch.Generator().manual_seed(seed))
-        z = mean + torch.exp(0.5 * log_variance) * noise.to(mean)
+        # `StepSeed` makes this step's noise its own, the same when a run is resumed.
+        z = mean + torch.exp(0.5 * log_variance) * torch.randn_like(mean)
         decoded = self.prior.decode(z)
         with full_precision(self.device):
             decoded = decoded.float()
@@ -57,13 +55,9 @@ def build_network(config: RunConfig) -> Sync2Gen:
     torch.manual_seed(config.seed)
     settings = config.sync2gen
     return Sync2Gen(
-        classes=len(label_set(config.label_set)),
-        slots=settings.slots,
-        width=settings.width,
-        latent=settings.latent,
-        refine_steps=settings.refine_steps,
-        seed=config.seed,
-    )
+        classes=len(label_set(config.label_set)), slots=settings.slots, width=settings.width,
+        latent=settings.latent, refine_steps=settings.refine_steps, seed=config.seed,
+    )  # fmt: skip
 
 
 def build(config: RunConfig, dataset: TruthDataset) -> Sync2genStage:
