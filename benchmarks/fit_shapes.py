@@ -124,8 +124,7 @@ def fit_rooms(dataset, truths, rows, mode, compositing, arguments):
 def cameras(views: SceneViews) -> tuple[torch.Tensor, torch.Tensor, tuple[int, int]]:
     """Poses, intrinsics and size of the views' mask images."""
     height, width = views.instance_ids.shape[-2:]
-    scale = torch.tensor([width / views.image_size[1], height / views.image_size[0], 1.0])
-    return views.world_to_camera, views.intrinsics * scale[:, None], (height, width)
+    return views.world_to_camera, views.intrinsics_at(height, width), (height, width)
 
 
 if __name__ == "__main__":

@@ -87,13 +87,12 @@ def mask_iou(trained: TrainedPrior) -> float:
         matches = match_objects(scenes, boxes, views)
         ids = observed_ids(views)
         height, width = ids.shape[-2:]
-        scale = torch.tensor([width / views.image_size[1], height / views.image_size[0], 1.0])
         drawn = torch.arange(scenes.centers_m.shape[1]) < views.is_object.sum(-1, keepdim=True)
         front = render_scene(
             scenes.vertices_m,
             trained.prior.shape.faces,
             views.world_to_camera,
-            views.intrinsics * scale[:, None],
+            views.intrinsics_at(height, width),
             (height, width),
             drawn=drawn,
         ).front

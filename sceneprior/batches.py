@@ -39,6 +39,14 @@ class SceneViews:
         """The same views with every tensor on `device` (Lightning calls this)."""
         return replace(self, **_moved(self, device))
 
+    def intrinsics_at(
+        self, height: int | float, width: int | float
+    ) -> Float[Tensor, "rooms views 3 3"]:
+        """The cameras' intrinsics in pixels of images of another size."""
+        full_height, full_width = self.image_size
+        scale = self.intrinsics.new_tensor([width / full_width, height / full_height, 1])
+        return self.intrinsics * scale[:, None]
+
 
 @dataclass(frozen=True)
 class DecodedScenes:

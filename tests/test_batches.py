@@ -1,9 +1,11 @@
-"""Rooms as boxes: split into batches, and with their slots in another order."""
+"""Rooms as boxes, split into batches or with other slots; cameras in pixels of other images."""
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from sceneprior.batches import RoomBoxes
+from sceneprior.data.dataset import ViewDataset
 
 
 @pytest.fixture
@@ -32,3 +34,12 @@ def test_slots_are_those_that_are_asked_for(rooms, torch_rng):
             assert taken.is_object[room, place] == rooms.is_object[room, slot]
             assert torch.equal(taken.boxes_m[room, place], rooms.boxes_m[room, slot])
     assert taken.room_ids == rooms.room_ids
+
+
+def test_intrinsics_of_another_size_show_the_same_picture(toy_shards):
+    views = ViewDataset(toy_shards, "train", views_per_room=2).__getitems__([(0, 0), (1, 0)])
+    height, width = views.image_size
+    point_m = torch.tensor([0.3, 0.4, 1.7])
+    here = views.intrinsics @ point_m
+    there = views.intrinsics_at(height / 3, width / 4) @ point_m
+    assert_close(there / here, torch.tensor([1 / 4, 1 / 3, 1]).expand(2, 2, 3))

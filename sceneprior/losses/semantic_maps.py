@@ -35,7 +35,6 @@ def rendered_maps(
     scenes: DecodedScenes,
     faces: Int[Tensor, "faces 3"],
     views: SceneViews,
-    *,
     mode: str = "fast",
     completeness_target: str = "first_n",
 ) -> Float[Tensor, "rooms views classes height width"]:
@@ -53,20 +52,15 @@ def rendered_maps(
         completeness_target: What completeness scores say (see `losses/completeness.py`).
     """
     assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
-    # As pooling does, which leaves out what does not fill a pixel.
-    ids = observed_ids(views)
-    height, width = ids.shape[-2] // LENS, ids.shape[-1] // LENS
-    scale = views.intrinsics.new_tensor(
-        [ids.shape[-1] / LENS / views.image_size[1], ids.shape[-2] / LENS / views.image_size[0], 1]
-    )
+    height, width = (side / LENS for side in observed_ids(views).shape[-2:])
     objects = scenes.vertices_m.shape[1]
     # Each object is drawn as a room of its own: whole, with its own depth.
     alone = render_scene(
         scenes.vertices_m.flatten(0, 1).unsqueeze(1),
         faces,
         views.world_to_camera.repeat_interleave(objects, dim=0),
-        (views.intrinsics * scale[:, None]).repeat_interleave(objects, dim=0),
-        (height, width),
+        views.intrinsics_at(height, width).repeat_interleave(objects, dim=0),
+        (int(height), int(width)),  # as pooling, which leaves out what does not fill a pixel
         sigma_px2=SIGMA_PX2,
         mode=mode,
         compositing="alone",

@@ -1,7 +1,7 @@
 """The GAN baseline: our network against a discriminator of semantic maps, with no view loss."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import lightning
 import torch
@@ -79,7 +79,8 @@ class GanStage(lightning.LightningModule):
         self.register_buffer("excess", torch.zeros(2 * self.classes))
 
     def training_step(self, views: SceneViews, batch_idx: int) -> None:
-        generator_optimizer, discriminator_optimizer = self._optimizers()
+        generator_optimizer, discriminator_optimizer = self._both()
+        target = self.config.loss.completeness_target
         scenes = self.generator.decode(self._latents(len(views.room_index)))
         with full_precision(self.device):
             # Before rendering, too, which refuses vertices that are not finite.
@@ -88,7 +89,7 @@ class GanStage(lightning.LightningModule):
             real = self._through_noise(observed_maps(views, self.classes))
             real_counts = observed_counts(views, self.classes)
             fake = self._through_noise(self._draw(scenes, views))
-            fake_counts = decoded_counts(scenes, self.config.loss.completeness_target)
+            fake_counts = decoded_counts(scenes, target)
             loss = SOFT * undecided + PLAUSIBLE * implausible(scenes, views)
             loss = loss + self.config.gan.variety * sameness(scenes)
             real_contents, fake_contents = contents(real, real_counts), contents(fake, fake_counts)
@@ -107,11 +108,20 @@ class GanStage(lightning.LightningModule):
         self._update(generator_optimizer, loss)
         self.discriminator.requires_grad_(True)
         self._average()
-        self._log(scenes, loss, told_apart, real_scores, fake_scores)
+        kept = kept_objects(scenes.completeness_logits, target)
+        said = {
+            "loss": loss,
+            "discriminator": told_apart,
+            "real_score": torch.stack([score.mean() for score in real_scores]).mean(),
+            "fake_score": torch.stack([score.mean() for score in fake_scores]).mean(),
+            "objects": kept.sum(dim=1).float().mean(),
+        }
+        said = {f"train/{name}": value.detach() for name, value in said.items()}
+        self.log_dict(said, on_step=False, on_epoch=True, batch_size=len(kept))
 
     def on_train_epoch_start(self) -> None:
         """Rates fall evenly to 0, so that the opponents' circling ends, too."""
-        for optimizer in self._optimizers():
+        for optimizer in self._both():
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * self._left()
 
@@ -125,23 +135,16 @@ class GanStage(lightning.LightningModule):
             return self.generator.sphere(torch.randn(shape, device=self.device))
 
     def _draw(self, scenes: DecodedScenes, views: SceneViews) -> Tensor:
-        return rendered_maps(
-            scenes,
-            self.generator.shape.faces,
-            views,
-            mode=self.config.shape.silhouettes,
-            completeness_target=self.config.loss.completeness_target,
-        )
+        target, mode = self.config.loss.completeness_target, self.config.shape.silhouettes
+        return rendered_maps(scenes, self.generator.shape.faces, views, mode, target)
 
     def _through_noise(self, maps: Tensor) -> Tensor:
         """Maps as the discriminator sees them; real ones come in steps that rendered ones lack."""
         return maps + self.config.gan.noise * self._left() * torch.randn_like(maps)
 
-    def _optimizers(self) -> tuple[LightningOptimizer, LightningOptimizer]:
-        both = self.optimizers()
-        assert isinstance(both, list), "configure_optimizers returns two"
-        generator, discriminator = both
-        return generator, discriminator  # type: ignore[return-value]
+    def _both(self) -> list[LightningOptimizer]:
+        """Optimisers of the generator and of the discriminator."""
+        return self.optimizers()  # type: ignore[return-value]
 
     def _update(self, optimizer: LightningOptimizer, loss: Tensor) -> None:
         optimizer.zero_grad()
@@ -158,40 +161,19 @@ class GanStage(lightning.LightningModule):
         for mean, newest in zip(self.prior.parameters(), self.generator.parameters(), strict=True):
             mean.lerp_(newest, 1 - keep)
 
-    def _log(
-        self,
-        scenes: DecodedScenes,
-        loss: Tensor,
-        told_apart: Tensor,
-        real: Sequence[Tensor],
-        fake: Sequence[Tensor],
-    ) -> None:
-        target = self.config.loss.completeness_target
-        objects = kept_objects(scenes.completeness_logits, target).sum(dim=1).float()
-        said = {
-            "train/loss": loss.detach(),
-            "train/discriminator": told_apart.detach(),
-            "train/real_score": torch.stack([score.detach().mean() for score in real]).mean(),
-            "train/fake_score": torch.stack([score.detach().mean() for score in fake]).mean(),
-            "train/objects": objects.mean(),
-        }
-        self.log_dict(said, on_step=False, on_epoch=True, batch_size=len(objects))
-
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         rates = self.config.gan
         shape = list(self.generator.shape.parameters())
         others = [p for name, p in self.generator.named_parameters() if "shape." not in name]
-        both = (
-            ((others, rates.learning_rate), (shape, SHAPES * rates.learning_rate)),
-            ((self.discriminator.parameters(), rates.discriminator_learning_rate),),
-        )
         return [
-            torch.optim.Adam(
-                [{"params": own, "lr": rate, "initial_lr": rate} for own, rate in parts],
-                betas=BETAS,
-            )
-            for parts in both
+            _adam((others, rates.learning_rate), (shape, SHAPES * rates.learning_rate)),
+            _adam((self.discriminator.parameters(), rates.discriminator_learning_rate)),
         ]
+
+
+def _adam(*parts: tuple[Iterable[nn.Parameter], float]) -> torch.optim.Optimizer:
+    groups = [{"params": own, "lr": rate, "initial_lr": rate} for own, rate in parts]
+    return torch.optim.Adam(groups, betas=BETAS)
 
 
 @torch.no_grad()

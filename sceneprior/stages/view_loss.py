@@ -89,14 +89,11 @@ def seen_masks(
     """
     slots = torch.arange(vertices_m.shape[1], device=vertices_m.device)
     height, width = observed_ids(views).shape[-2:]
-    scale = views.intrinsics.new_tensor(
-        [width / views.image_size[1], height / views.image_size[0], 1]
-    )
     return render_silhouettes(
         vertices_m,
         faces,
         views.world_to_camera,
-        views.intrinsics * scale[:, None],
+        views.intrinsics_at(height, width),
         (height, width),
         sigma_px2=settings.sigma_px2,
         mode=settings.silhouettes,

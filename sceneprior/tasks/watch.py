@@ -174,15 +174,14 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
     boxes = boxes_of_points(vertices, views.world_to_camera, views.intrinsics, views.image_size)
     matches = match_objects(scenes, boxes, views, weights.match_box, weights.hidden_overshoot)
     ids = observed_ids(views)
-    size = (ids.shape[-2], ids.shape[-1])
-    scale = torch.tensor([size[1] / views.image_size[1], size[0] / views.image_size[0], 1])
+    height, width = ids.shape[-2:]
     counts = views.is_object.sum(dim=-1, keepdim=True)
     front = render_scene(
         vertices,
         prior.shape.faces,
         views.world_to_camera,
-        views.intrinsics * scale[:, None],
-        size,
+        views.intrinsics_at(height, width),
+        (height, width),
         mode="fast",
         drawn=torch.arange(vertices.shape[1]) < counts,
     ).front
