@@ -5,15 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_prep.posed.labels import read_classes
-from data_prep.posed.transforms import PosedFrame, Recording, lens_matrix, room_name
-from data_prep.scannet.frames import (
+from data_prep.frames import (
     choose_frames,
     is_pose,
     mask_intrinsics,
     room_cameras,
     sampled_lines,
 )
+from data_prep.posed.labels import read_classes
+from data_prep.posed.transforms import PosedFrame, Recording, lens_matrix, room_name
 from data_prep.source import PreparedRoom
 from sceneprior.errors import InputError
 from sceneprior.instances.observations import observe

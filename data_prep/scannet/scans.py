@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_prep.frames import FrameChoice, choose_frames, mask_intrinsics, room_cameras
 from data_prep.scannet.annotations import (
     axis_alignment,
     object_bounds,
@@ -13,7 +14,6 @@ from data_prep.scannet.annotations import (
     read_segments,
     read_vertices,
 )
-from data_prep.scannet.frames import FrameChoice, choose_frames, mask_intrinsics, room_cameras
 from data_prep.scannet.labels import Labels
 from data_prep.scannet.masks import MASK_FILES, MaskArchive
 from data_prep.scannet.sens import SensFile

@@ -32,7 +32,7 @@ class SensFile:
     Attributes:
         intrinsic_color: (4, 4) float64, the colour camera's, pixels of a frame of `color_size`.
             ScanNet counts pixel centres in whole numbers (its own tools lift pixel x, y with
-            K^-1 (x, y, 1)); `data_prep.scannet.frames.mask_intrinsics` turns them into ours.
+            K^-1 (x, y, 1)); `data_prep.frames.mask_intrinsics` turns them into ours.
         color_size: (height, width) of the colour frames.
         color_kind: unknown, raw, png or jpeg.
         camera_to_world: (frames, 4, 4) float32, OpenCV axes, metres, as written: lost frames

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_prep.scannet.frames import sampled_lines
+from data_prep.frames import sampled_lines
 from data_prep.scannet.labels import LABEL_SET
 from data_prep.scannet.masks import MaskArchive
 from data_prep.scannet.scans import Scan

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data_prep.scannet import frames
-from data_prep.scannet.frames import (
+from data_prep import frames
+from data_prep.frames import (
     choose_frames,
     is_pose,
     mask_intrinsics,
