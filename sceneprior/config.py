@@ -306,7 +306,7 @@ class RunConfig(Section):
     that boxes and shapes are learnt together (ablation c3; the section `layout` has no say).
     Baselines, by the section of their name: `gan` learns from a discriminator instead of the view
     loss; `atiss3d` and `sync2gen` learn from true boxes in 3D, and of the other sections only
-    `data` and `model.max_objects` concern them."""
+    `data`, `samples` and `model.max_objects` concern them."""
     data: DataConfig
     model: ModelConfig
     loss: LossConfig = LossConfig()

@@ -7,6 +7,7 @@ from torch.nn import functional as F
 
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.classes import VOID
+from sceneprior.geometry.cameras import project
 from sceneprior.losses.completeness import kept_share
 from sceneprior.losses.shape import observed_ids
 from sceneprior.silhouettes.render import render_scene
@@ -35,21 +36,18 @@ def rendered_maps(
     scenes: DecodedScenes,
     faces: Int[Tensor, "faces 3"],
     views: SceneViews,
+    kept: Float[Tensor, "rooms objects"],
+    classes: Float[Tensor, "rooms objects classes"],
     mode: str = "fast",
-    completeness_target: str = "first_n",
 ) -> Float[Tensor, "rooms views classes height width"]:
     """What the views would show of other scenes: theirs, drawn into the views' cameras.
-
-    Classes and existence are those that `tasks.decode` reads, hard, so that what is drawn is what
-    will be generated; their gradients are those of softmax and sigmoid (straight through). What
-    does not exist hides nothing, and still learns what its appearance would change.
 
     Args:
         scenes: Of as many rooms as `views`, with meshes.
         faces: Of every mesh.
         views: Cameras, and the size of the maps: that of `instance_ids`.
+        kept, classes: Of the scenes' objects: `choices`.
         mode: Of `render_silhouettes`.
-        completeness_target: What completeness scores say (see `losses/completeness.py`).
     """
     assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
     height, width = (side / LENS for side in observed_ids(views).shape[-2:])
@@ -68,10 +66,9 @@ def rendered_maps(
     coverage = alone.masks[:, :, 0].unflatten(0, (-1, objects)).transpose(1, 2)
     depth_m = alone.depth_m.unflatten(0, (-1, objects)).transpose(1, 2)
     # Where only the soft edge reaches, the object is as far away as its centre.
-    ahead = (views.world_to_camera[:, :, None, 2, :3] * scenes.centers_m[:, None]).sum(dim=-1)
-    ahead = (ahead + views.world_to_camera[:, :, None, 2, 3])[..., None, None].detach()
-    kept, classes = choices(scenes, completeness_target)
-    return compose_maps(coverage, depth_m.where(depth_m.isfinite(), ahead), kept, classes)
+    centers = project(scenes.centers_m.unsqueeze(2), views.world_to_camera, views.intrinsics)
+    depth_m = depth_m.where(depth_m.isfinite(), centers[..., 2:].detach())
+    return compose_maps(coverage, depth_m, kept, classes)
 
 
 def observed_counts(views: SceneViews, classes: int) -> Float[Tensor, "rooms classes"]:
@@ -80,30 +77,23 @@ def observed_counts(views: SceneViews, classes: int) -> Float[Tensor, "rooms cla
     return of_objects.sum(dim=1).to(views.intrinsics.dtype)
 
 
-def decoded_counts(
-    scenes: DecodedScenes, completeness_target: str = "first_n"
-) -> Float[Tensor, "rooms classes"]:
-    """How many objects of each class the scenes have; whole numbers, with soft gradients."""
-    kept, classes = choices(scenes, completeness_target)
-    return torch.einsum("rk,rkc->rc", kept, classes)
-
-
 def choices(
-    scenes: DecodedScenes, completeness_target: str
+    scenes: DecodedScenes, completeness_target: str = "first_n"
 ) -> tuple[Float[Tensor, "rooms objects"], Float[Tensor, "rooms objects classes"]]:
-    """Which objects exist, and which class each has: hard, with soft gradients."""
-    classes = straight_through(scenes.class_logits.softmax(dim=-1))
+    """Which objects exist, and which class each has, as `tasks.decode` reads them: 0 or 1.
+
+    So what is drawn and counted is what will be generated. Gradients are those of sigmoid and
+    softmax (straight through): what does not exist still learns what it would change.
+    """
     scores = scenes.completeness_logits.sigmoid()
-    scores = (scenes.completeness_logits > 0).to(scores) + scores - scores.detach()
-    return kept_share(scores, completeness_target), classes
+    shares = scenes.class_logits.softmax(dim=-1)
+    likeliest = F.one_hot(shares.argmax(dim=-1), shares.shape[-1])
+    kept = kept_share(_straight_through(scores > 0.5, scores), completeness_target)
+    return kept, _straight_through(likeliest, shares)
 
 
-def straight_through(
-    shares: Float[Tensor, "*batch classes"],
-) -> Float[Tensor, "*batch classes"]:
-    """1 for the likeliest class, 0 for the others, with the gradient of the shares."""
-    hard = F.one_hot(shares.argmax(dim=-1), shares.shape[-1]).to(shares)
-    return hard + shares - shares.detach()
+def _straight_through(hard: Tensor, soft: Tensor) -> Tensor:
+    return hard.to(soft) + soft - soft.detach()
 
 
 def compose_maps(
@@ -114,26 +104,25 @@ def compose_maps(
 ) -> Float[Tensor, "rooms views classes height width"]:
     """Lay objects over each other, pixel by pixel, nearest first.
 
-        visible_k = a_k * prod_{j nearer than k} (1 - a_j),    a_k = kept_k (1 - void_k) coverage_k
+        visible_k = a_k * prod_{j nearer than k} (1 - a_j),    a_k = kept_k coverage_k
 
     is what the pixel shows of object k, and what is left of it shows nothing: `void`.
 
     Args:
         coverage: Of each object alone, in [0, 1].
         depth_m: Of each object at each pixel; orders them and carries no gradient.
-        kept: How far each object belongs to the scene, in [0, 1].
-        classes: What each object is; shares that sum to 1.
+        kept: How far each object belongs to the scene, in [0, 1]; what does not hides nothing.
+        classes: What each object is; shares that sum to 1, none of them of `void`.
 
     Returns:
         Shares that sum to 1 over the classes.
     """
-    there = kept * (1 - classes[..., VOID])
-    alpha = coverage * there[:, None, :, None, None]
+    alpha = coverage * kept[:, None, :, None, None]
     order = depth_m.argsort(dim=2)
     ordered = alpha.gather(2, order)
     left = (1 - ordered).cumprod(dim=2)
     before = torch.cat([torch.ones_like(left[:, :, :1]), left[:, :, :-1]], dim=2)
     visible = torch.zeros_like(alpha).scatter(2, order, ordered * before)
     maps = torch.einsum("rvkhw,rkc->rvchw", visible, classes)
-    nothing = F.one_hot(torch.tensor(VOID, device=maps.device), maps.shape[2]).to(maps)
-    return maps + left[:, :, -1:] * nothing[:, None, None]
+    maps[:, :, VOID] += left[:, :, -1]
+    return maps

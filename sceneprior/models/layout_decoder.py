@@ -29,10 +29,10 @@ class JointHead(nn.Sequential):
             nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, classes + 7)
         )
 
-    def box_rows(self) -> list[tuple[Tensor, Tensor]]:
-        """Weights and bias of the last layer of x, y, z, width, height, depth, completeness."""
+    def rows(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights and bias of each output in the last layer, in the outputs' order."""
         last: nn.Linear = self[-1]  # type: ignore[assignment]
-        return [(last.weight[row], last.bias[row]) for row in range(-7, 0)]
+        return list(zip(last.weight, last.bias, strict=True))
 
 
 class LayoutDecoder(nn.Module):
@@ -69,7 +69,7 @@ class LayoutDecoder(nn.Module):
         size = float(torch.log(torch.expm1(torch.tensor(size_m))))
         starts = (0.0, 0.1, 0.0, size, size, size, 0.0)
         with torch.no_grad():
-            for (weight, bias), start in zip(self.mlp2.box_rows(), starts, strict=True):
+            for (weight, bias), start in zip(self.mlp2.rows()[-7:], starts, strict=True):
                 weight *= 0.1
                 bias.fill_(start)
 

@@ -29,34 +29,25 @@ class MapDiscriminator(nn.Module):
 
     def __init__(self, classes: int, width: int = 32):
         super().__init__()
-        last = 2 * width
         self.layers = _bounded(
             nn.Conv2d(classes, width, 4, stride=2, padding=1),
-            nn.Conv2d(width, last, 4, stride=2, padding=1),
+            nn.Conv2d(width, 2 * width, 4, stride=2, padding=1),
         )
-        self.patch = _bounded(nn.Conv2d(last, 1, 3, padding=1))
-        self.room = _bounded(nn.Linear(2 * last, last), nn.Linear(last, 1))
-        self.contents = _bounded(
-            nn.Linear(2 * classes, last), nn.Linear(last, last), nn.Linear(last, 1)
-        )
+        self.patch = _bounded(nn.Conv2d(2 * width, 1, 3, padding=1))
+        self.room = _bounded(nn.Linear(4 * width, 2 * width), nn.Linear(2 * width, 1))
 
     def forward(
-        self,
-        maps: Float[Tensor, "rooms views classes height width"],
-        contents: Float[Tensor, "rooms both"],
-    ) -> tuple[
-        Float[Tensor, "rooms views rows columns"], Float[Tensor, " rooms"], Float[Tensor, " rooms"]
-    ]:
-        """Scores of patches, of rooms, and of what is in them; a higher score looks more real.
+        self, maps: Float[Tensor, "rooms views classes height width"]
+    ) -> tuple[Float[Tensor, "rooms views rows columns"], Float[Tensor, " rooms"]]:
+        """Scores of patches and of rooms; a higher score looks more real.
 
         A room is what its views show on average and at most, whatever their order and number.
-        What is in it (`losses.adversarial.contents`): objects of each class, and their pixels.
         """
         x = F.leaky_relu(self.layers(maps.flatten(0, 1)), SLOPE)
         patches = self.patch(x)[:, 0].unflatten(0, maps.shape[:2])
         features = x.mean(dim=(2, 3)).unflatten(0, maps.shape[:2])
         room = torch.cat([features.mean(dim=1), features.amax(dim=1)], dim=-1)
-        return GAIN * patches, GAIN * self.room(room)[:, 0], GAIN * self.contents(contents)[:, 0]
+        return GAIN * patches, GAIN * self.room(room)[:, 0]
 
 
 def _bounded(*layers: nn.Module) -> nn.Sequential:

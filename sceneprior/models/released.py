@@ -86,7 +86,8 @@ class SeparateHeads(nn.Module):
         parts = [self.classes(x), *(head(x) for head in self.coordinates), self.completeness(x)]
         return torch.cat(parts, dim=-1)
 
-    def box_rows(self) -> list[tuple[Tensor, Tensor]]:
-        """Weights and bias of the last layer of x, y, z, width, height, depth, completeness."""
-        last = [*(head[-1] for head in self.coordinates), self.completeness]  # type: ignore[index]
-        return [(layer.weight[0], layer.bias[0]) for layer in last]
+    def rows(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights and bias of each output in its last layer, in the outputs' order."""
+        coordinates = (head[-1] for head in self.coordinates)  # type: ignore[index]
+        last = (self.classes, *coordinates, self.completeness)
+        return [row for layer in last for row in zip(layer.weight, layer.bias, strict=True)]

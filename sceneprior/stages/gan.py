@@ -13,13 +13,7 @@ from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.classes import label_set
 from sceneprior.config import RunConfig
 from sceneprior.losses.adversarial import certainty, contents, implausible, mistaken, sameness
-from sceneprior.losses.completeness import kept_objects
-from sceneprior.losses.semantic_maps import (
-    decoded_counts,
-    observed_counts,
-    observed_maps,
-    rendered_maps,
-)
+from sceneprior.losses.semantic_maps import choices, observed_counts, observed_maps, rendered_maps
 from sceneprior.models.layout_decoder import LayoutDecoder
 from sceneprior.models.map_discriminator import MapDiscriminator
 from sceneprior.models.scene_prior import ScenePrior
@@ -80,44 +74,40 @@ class GanStage(lightning.LightningModule):
 
     def training_step(self, views: SceneViews, batch_idx: int) -> None:
         generator_optimizer, discriminator_optimizer = self._both()
-        target = self.config.loss.completeness_target
         scenes = self.generator.decode(self._latents(len(views.room_index)))
         with full_precision(self.device):
             # Before rendering, too, which refuses vertices that are not finite.
             undecided = certainty(scenes)
             check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views)
-            real = self._through_noise(observed_maps(views, self.classes))
-            real_counts = observed_counts(views, self.classes)
-            fake = self._through_noise(self._draw(scenes, views))
-            fake_counts = decoded_counts(scenes, target)
+            real = observed_maps(views, self.classes)
+            fake, counts = self._draw(scenes, views)
+            more = contents(fake, counts) - contents(real, observed_counts(views, self.classes))
+            self.excess.lerp_(more.detach().mean(dim=0), 1 - MEMORY)
             loss = SOFT * undecided + PLAUSIBLE * implausible(scenes, views)
             loss = loss + self.config.gan.variety * sameness(scenes)
-            real_contents, fake_contents = contents(real, real_counts), contents(fake, fake_counts)
+            loss = loss + self.config.gan.counts * (more @ self.excess).mean()
 
-        real_scores = self.discriminator(real, real_contents)
-        fake_scores = self.discriminator(fake.detach(), fake_contents.detach())
+        real, fake = self._through_noise(real), self._through_noise(fake)
+        real_scores = self.discriminator(real)
+        fake_scores = self.discriminator(fake.detach())
         told_apart = mistaken(real_scores, real=True) + mistaken(fake_scores, real=False)
-        check_finite(told_apart, views)
         self._update(discriminator_optimizer, told_apart)
 
         self.discriminator.requires_grad_(False)
-        self.excess.lerp_((fake_contents.detach() - real_contents).mean(dim=0), 1 - MEMORY)
-        loss = loss + mistaken(self.discriminator(fake, fake_contents), real=True)
-        loss = loss + self.config.gan.counts * (fake_contents @ self.excess).mean()
+        loss = loss + mistaken(self.discriminator(fake), real=True)
         check_finite(loss, views)
         self._update(generator_optimizer, loss)
         self.discriminator.requires_grad_(True)
         self._average()
-        kept = kept_objects(scenes.completeness_logits, target)
         said = {
             "loss": loss,
             "discriminator": told_apart,
             "real_score": torch.stack([score.mean() for score in real_scores]).mean(),
             "fake_score": torch.stack([score.mean() for score in fake_scores]).mean(),
-            "objects": kept.sum(dim=1).float().mean(),
+            "objects": counts.sum(dim=1).mean(),
         }
         said = {f"train/{name}": value.detach() for name, value in said.items()}
-        self.log_dict(said, on_step=False, on_epoch=True, batch_size=len(kept))
+        self.log_dict(said, on_step=False, on_epoch=True, batch_size=len(counts))
 
     def on_train_epoch_start(self) -> None:
         """Rates fall evenly to 0, so that the opponents' circling ends, too."""
@@ -134,9 +124,12 @@ class GanStage(lightning.LightningModule):
         with full_precision(self.device):
             return self.generator.sphere(torch.randn(shape, device=self.device))
 
-    def _draw(self, scenes: DecodedScenes, views: SceneViews) -> Tensor:
-        target, mode = self.config.loss.completeness_target, self.config.shape.silhouettes
-        return rendered_maps(scenes, self.generator.shape.faces, views, mode, target)
+    def _draw(self, scenes: DecodedScenes, views: SceneViews) -> tuple[Tensor, Tensor]:
+        """Maps, and how many objects of each class are in each room."""
+        kept, classes = choices(scenes, self.config.loss.completeness_target)
+        faces, mode = self.generator.shape.faces, self.config.shape.silhouettes
+        maps = rendered_maps(scenes, faces, views, kept, classes, mode)
+        return maps, (kept.unsqueeze(-1) * classes).sum(dim=1)
 
     def _through_noise(self, maps: Tensor) -> Tensor:
         """Maps as the discriminator sees them; real ones come in steps that rendered ones lack."""
@@ -180,28 +173,20 @@ def _adam(*parts: tuple[Iterable[nn.Parameter], float]) -> torch.optim.Optimizer
 def spread_out(layout: LayoutDecoder, features: Float[Tensor, "rooms objects width"]) -> None:
     """Start with objects all over the floor, of all sizes and classes.
 
-    A fresh layout decoder puts every object at the floor centre, and the discriminator would pull
-    all of them the same way: they would never part. So each layer is scaled and shifted until its
-    outputs have mean 0 and spread 1 over these rooms and objects (Salimans and Kingma, "Weight
-    normalization", NeurIPS 2016, section 3), and then those of boxes until they have `STARTS`.
+    A fresh layout decoder puts every object at the floor centre, all of one class, and the
+    discriminator would pull all of them the same way: they would never part. So its last layer is
+    scaled and shifted until each output has the mean and the spread over these rooms and objects
+    that `STARTS` names, and class logits 0 and 1 (after Salimans and Kingma, "Weight
+    normalization", NeurIPS 2016, section 3).
 
     Args:
         layout: Changed in place.
         features: Of random rooms.
     """
-
-    def normalise(layer: nn.Linear, _: tuple[Tensor], output: Tensor) -> Tensor:
-        rows = output.flatten(0, -2)
-        mean, spread = rows.mean(dim=0), rows.std(dim=0).clamp(min=1e-8)
-        layer.weight /= spread[:, None]
-        layer.bias.copy_((layer.bias - mean) / spread)
-        return (output - mean) / spread
-
-    layers = [layer for layer in layout.modules() if isinstance(layer, nn.Linear)]
-    hooks = [layer.register_forward_hook(normalise) for layer in layers]
-    layout(features)
-    for hook in hooks:
-        hook.remove()
-    for (weight, bias), (mean, spread) in zip(layout.mlp2.box_rows(), STARTS, strict=True):
-        weight *= spread
-        bias.mul_(spread).add_(mean)
+    outputs = layout.mlp2(layout.mlp1(features)).flatten(0, 1)
+    starts = [(0.0, 1.0)] * layout.classes + list(STARTS)
+    rows = zip(layout.mlp2.rows(), outputs.unbind(dim=1), starts, strict=True)
+    for (weight, bias), values, (mean, spread) in rows:
+        scale = spread / values.std()
+        weight *= scale
+        bias.copy_(mean + scale * (bias - values.mean()))

@@ -12,14 +12,14 @@ from sceneprior.batches import DecodedScenes
 from sceneprior.classes import VOID
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.geometry.boxes import place
+from sceneprior.losses.completeness import kept_objects
 from sceneprior.losses.semantic_maps import (
     LENS,
+    choices,
     compose_maps,
-    decoded_counts,
     observed_counts,
     observed_maps,
     rendered_maps,
-    straight_through,
 )
 from sceneprior.shards import iterate_rooms
 from sceneprior.silhouettes.render import render_silhouettes
@@ -73,7 +73,7 @@ def test_observed_maps_are_the_shares_of_classes_in_each_pixel(views):
 def test_the_true_room_looks_as_it_was_seen(views, toy_shards):
     """Boxes drawn into their own cameras: the two ways to a map meet."""
     scenes = true_scenes(toy_shards, 4)
-    drawn = rendered_maps(scenes, FACES, views)
+    drawn = drawn_maps(scenes, views)
     seen = observed_maps(views, CLASSES)
     assert drawn.shape == seen.shape
     assert_close(drawn.sum(dim=2), torch.ones_like(drawn[:, :, 0]), rtol=0, atol=1e-5)
@@ -85,6 +85,10 @@ def test_the_true_room_looks_as_it_was_seen(views, toy_shards):
     assert (drawn - seen).abs().mean() < 0.01
 
 
+def drawn_maps(scenes: DecodedScenes, views) -> torch.Tensor:
+    return rendered_maps(scenes, FACES, views, *choices(scenes))
+
+
 def whole(scenes: DecodedScenes, views) -> torch.Tensor:
     """Views of which no object has a corner behind the camera; its faces would be left out."""
     corners = torch.cat([scenes.vertices_m, torch.ones_like(scenes.vertices_m[..., :1])], dim=-1)
@@ -93,25 +97,19 @@ def whole(scenes: DecodedScenes, views) -> torch.Tensor:
     return ((ahead > 0.1) | ~there).flatten(2).all(dim=-1)
 
 
-def test_objects_behind_void_or_after_the_end_are_seen(views, toy_shards):
+def test_what_is_not_kept_hides_nothing(views, toy_shards):
     scenes = true_scenes(toy_shards, 4)
-    plain = rendered_maps(scenes, FACES, views)
-    # A slot that is not kept, in the middle of the room and large, hides nothing ...
+    plain = drawn_maps(scenes, views)
+    # In the middle of the room and large.
     centers, sizes = scenes.centers_m.clone(), scenes.sizes_m.clone()
     centers[:, 5], sizes[:, 5] = torch.tensor([0.0, 1.0, 0.0]), 2.0
     meshes = place(CORNERS.expand(4, 6, -1, -1), centers, sizes)
-    ghost = replace(scenes, centers_m=centers, sizes_m=sizes, vertices_m=meshes)
-    assert torch.equal(rendered_maps(ghost, FACES, views), plain)
-    # ... nor does it as void, though it is kept; as a bed it does.
-    kept = ghost.completeness_logits.abs()
-    label = ghost.class_logits.clone()
-    label[:, :, VOID] = label[:, :, VOID].where(label.amax(dim=-1) > 0, 2 * SURE)
-    void = replace(ghost, completeness_logits=kept, class_logits=label)
-    assert torch.equal(rendered_maps(void, FACES, views), plain)
-    label = label.clone()
+    label = scenes.class_logits.clone()
     label[:, 5, 9] = 3 * SURE
-    bed = replace(void, class_logits=label)
-    assert (rendered_maps(bed, FACES, views)[:, :, 9] > plain[:, :, 9]).any()
+    ghost = replace(scenes, class_logits=label, centers_m=centers, sizes_m=sizes, vertices_m=meshes)
+    assert torch.equal(drawn_maps(ghost, views), plain)
+    bed = replace(ghost, completeness_logits=ghost.completeness_logits.abs())
+    assert (drawn_maps(bed, views)[:, :, 9] > plain[:, :, 9]).any()
 
 
 def test_the_maps_are_the_renderers_layers(views, toy_shards):
@@ -123,9 +121,9 @@ def test_the_maps_are_the_renderers_layers(views, toy_shards):
         scenes.vertices_m, FACES, views.world_to_camera, views.intrinsics * scale[:, None],
         size, sigma_px2=0.25, mode="fast", drawn=scenes.completeness_logits > 0,
     )  # fmt: skip
-    maps = rendered_maps(scenes, FACES, views)
+    maps = drawn_maps(scenes, views)
     assert_close(maps[:, :, VOID], 1 - layers.sum(dim=2), rtol=0, atol=1e-5)
-    one_hot = straight_through(scenes.class_logits.softmax(dim=-1))
+    _, one_hot = choices(scenes)
     wanted = torch.einsum("rvkhw,rkc->rvchw", layers, one_hot)
     hard = (layers.amax(dim=2) > 0.999) & whole(scenes, views)[..., None, None]
     assert_close(
@@ -146,8 +144,7 @@ def test_laying_over_is_the_product_of_what_nearer_objects_leave(torch_rng):
         room, view, row, column = place_
         left, wanted = 1.0, torch.zeros(classes, dtype=torch.float64)
         for k in depth[room, view, :, row, column].argsort().tolist():
-            alpha = kept[room, k] * (1 - shares[room, k, VOID])
-            alpha = alpha * coverage[room, view, k, row, column]
+            alpha = kept[room, k] * coverage[room, view, k, row, column]
             wanted += left * alpha * shares[room, k]
             left *= 1 - alpha
         wanted[VOID] += left
@@ -166,18 +163,24 @@ def test_gradients_of_laying_over_pass_gradcheck(torch_rng):
 
 
 def test_choices_are_hard_and_their_gradients_soft(torch_rng):
-    logits = torch.randn(2, 3, 5, generator=torch_rng, dtype=torch.float64, requires_grad=True)
+    numbers = torch.randn(2, 3, 6, generator=torch_rng, dtype=torch.float64)
+    labels, complete = (part.requires_grad_() for part in (numbers[..., :5], numbers[..., 5]))
+    scenes = DecodedScenes(labels, numbers[..., :3], numbers[..., :3], complete)
     weights = torch.randn(2, 3, 5, generator=torch_rng, dtype=torch.float64)
-    chosen = straight_through(logits.softmax(dim=-1))
-    assert torch.equal(chosen.detach().round(), torch.nn.functional.one_hot(logits.argmax(-1), 5))
-    (wanted,) = torch.autograd.grad((logits.softmax(dim=-1) * weights).sum(), logits)
-    (got,) = torch.autograd.grad((chosen * weights).sum(), logits)
+    kept, classes = choices(scenes)
+    assert torch.equal(classes.detach().round(), torch.nn.functional.one_hot(labels.argmax(-1), 5))
+    assert torch.equal(kept.detach() > 0.5, kept_objects(complete))
+    (wanted,) = torch.autograd.grad((labels.softmax(dim=-1) * weights).sum(), labels)
+    (got,) = torch.autograd.grad((classes * weights).sum(), labels)
     assert_close(got, wanted, rtol=0, atol=1e-15)
 
 
+def counts_of(scenes: DecodedScenes) -> torch.Tensor:
+    return torch.einsum("rk,rkc->rc", *choices(scenes))
+
+
 def test_counts_are_those_of_the_objects_that_exist(views, toy_shards):
-    scenes = true_scenes(toy_shards, 4)
-    assert torch.equal(decoded_counts(scenes), observed_counts(views, CLASSES))
+    assert torch.equal(counts_of(true_scenes(toy_shards, 4)), observed_counts(views, CLASSES))
     for room, (shard, room_id) in zip(range(4), iterate_rooms(toy_shards, "train"), strict=False):
         wanted = torch.zeros(CLASSES)
         for label in shard.read_room(room_id).object_class:
@@ -185,18 +188,17 @@ def test_counts_are_those_of_the_objects_that_exist(views, toy_shards):
         assert torch.equal(observed_counts(views, CLASSES)[room], wanted)
 
 
-def test_counts_pull_on_existence_and_classes(views, toy_shards):
+def test_counts_pull_on_existence_and_classes(toy_shards):
     scenes = true_scenes(toy_shards, 4, objects=2)
     complete = torch.tensor([[0.5, -0.5]] * 4, requires_grad=True)
     labels = (scenes.class_logits / SURE).requires_grad_()
-    counts = decoded_counts(replace(scenes, completeness_logits=complete, class_logits=labels))
+    counts = counts_of(replace(scenes, completeness_logits=complete, class_logits=labels))
     assert_close(counts.detach().sum(dim=1), torch.ones(4))
     counts[:, 9].sum().backward()
     assert (labels.grad[:, 0, 9] > 0).all()  # of the object that exists
     assert (labels.grad[:, 1] == 0).all()
-    (more,) = torch.autograd.grad(
-        decoded_counts(replace(scenes, completeness_logits=complete)).sum(), complete
-    )
+    counts = counts_of(replace(scenes, completeness_logits=complete))
+    (more,) = torch.autograd.grad(counts.sum(), complete)
     assert (more > 0).all()
 
 
@@ -204,12 +206,8 @@ def test_what_is_not_there_learns_what_its_appearance_would_change(views, toy_sh
     """A bed that is not kept, where the camera would see it: asked for beds, it comes."""
     scenes = true_scenes(toy_shards, 4, objects=1)
     complete = torch.full((4, 1), -0.5, requires_grad=True)
-    label = torch.zeros(4, 1, CLASSES, requires_grad=True)
-    maps = rendered_maps(
-        replace(scenes, completeness_logits=complete, class_logits=label + scenes.class_logits / 9),
-        FACES,
-        views,
-    )
+    label = torch.zeros(4, 1, CLASSES, requires_grad=True) + scenes.class_logits / 9
+    maps = drawn_maps(replace(scenes, completeness_logits=complete, class_logits=label), views)
     assert (maps[:, :, VOID] == 1).all()
     beds = int(scenes.class_logits[0, 0].argmax())
     maps[:, :, beds].sum().backward()

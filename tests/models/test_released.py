@@ -154,15 +154,16 @@ def test_separate_heads_give_each_coordinate_an_mlp(torch_rng):
             assert_close(out[room, item], torch.stack(wanted), rtol=0, atol=1e-12)
 
 
-def test_the_box_rows_of_both_kinds_of_heads_are_those_that_move_the_box(torch_rng):
-    """Row k moves output `classes + k` of MLP2 and no other."""
+def test_the_rows_of_both_kinds_of_heads_are_in_the_order_of_their_outputs(torch_rng):
+    """Row k moves output k of MLP2 and no other."""
     for heads in ("joint", "separate"):
         model = LayoutDecoder(6, 4, heads=heads).double()
         x = torch.randn(1, 2, 6, generator=torch_rng, dtype=torch.float64)
         before = model.mlp2(model.mlp1(x))
-        for k, (_, bias) in enumerate(model.mlp2.box_rows()):
+        assert len(model.mlp2.rows()) == before.shape[-1]
+        for k, (_, bias) in enumerate(model.mlp2.rows()):
             with torch.no_grad():
                 bias += 1
             moved = model.mlp2(model.mlp1(x)) - before
-            assert_close(moved[..., 4 : 5 + k], torch.ones(1, 2, k + 1).double())
+            assert_close(moved[..., : k + 1], torch.ones(1, 2, k + 1).double())
             assert math.isclose(moved.sum().item(), 2 * (k + 1), abs_tol=1e-9)
