@@ -2,15 +2,13 @@
 
 import contextlib
 import errno
-import fcntl
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from sceneprior.errors import InputError
-from sceneprior.files import remove_parts, write_whole
+from sceneprior.files import only_writer, remove_parts, write_whole
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -25,31 +23,16 @@ def claimed(out: Path) -> Iterator[None]:
         InputError: another run writes there, or it cannot be written.
     """
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
-        # The folder itself is locked: no lock file stays, and the kernel frees it after a kill.
-        descriptor = os.open(out, os.O_RDONLY)
     try:
-        _lock(descriptor, out)
-        with writing(out):
-            remove_parts(out)
-        yield
+        with contextlib.ExitStack() as until_done:
+            with writing(out):
+                until_done.enter_context(only_writer(out))
+                remove_parts(out)
+            yield
     finally:
-        os.close(descriptor)
         with contextlib.suppress(OSError):
             for folder in made:
                 folder.rmdir()
-
-
-def _lock(descriptor: int, out: Path) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise InputError(
-            f"Another run is writing to {out}; wait for it, or choose another folder."
-        ) from None
-    except OSError:
-        pass  # some network folders have no locks
 
 
 @contextlib.contextmanager

@@ -1,9 +1,11 @@
 """Files that are whole or absent (bytes in, one atomic rename out), JSON files, file names."""
 
 import contextlib
+import fcntl
 import json
 import os
 import secrets
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +63,31 @@ def remove_parts(folder: Path) -> None:
     """
     for path in sorted(Path(folder).rglob(f"*{PART}")):
         path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Make a folder, if it is not there, and be the only process that writes to it.
+
+    Raises:
+        InputError: another one writes there, by this function.
+        OSError: it cannot be made.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    # The folder itself is locked: no lock file stays, and the kernel frees it after a kill.
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # some network folders have no locks
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError(
+                    f"Another run is writing to {folder}; wait for it, or choose another folder."
+                ) from None
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def file_stamp(path: Path) -> tuple[int, int]:

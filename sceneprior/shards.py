@@ -282,7 +282,7 @@ class Shard:
             raise _damaged(self.path, error, room_id) from None
 
     def read_ground_truth(self, room_id: str) -> RoomGroundTruth:
-        """The room in 3D. Evaluation reads it; training never does."""
+        """The room in 3D. For evaluation and baselines with 3D supervision."""
         try:
             group = self._file["rooms"][self._keys[room_id]]
             if "ground_truth" not in group:

@@ -27,6 +27,9 @@ def compare(
     inception: Annotated[
         Path | None, typer.Option(help="inception-2015-12-05.pt (TorchScript), for FID proper.")
     ] = None,
+    accelerator: Annotated[
+        str, typer.Option(help="cpu, gpu, auto; Lightning's option. One device a run.")
+    ] = "auto",
     renderer: RendererOption = "auto",
 ) -> None:
     """Train, judge and tabulate methods on the same rooms; run again to go on."""
@@ -37,13 +40,19 @@ def compare(
     comparison = load_comparison(config)
     part = part_of(comparison, methods, rooms, seeds)
     try:
-        failures = run_comparison(comparison, part, out, jobs, renderer, inception)
+        done = run_comparison(comparison, part, out, jobs, renderer, inception, accelerator)
     except KeyboardInterrupt:
         typer.echo("Stopped. The same command goes on from here.", err=True)
         raise typer.Exit(130) from None
-    if (out / "table.md").is_file():
-        typer.echo(f"Wrote {out / 'table.md'}")
-    if failures:
+    if done.table is not None:
+        typer.echo(f"Wrote {done.table}")
+    if done.left_out:
+        typer.echo(
+            f"Not in the table, since they were judged otherwise (rooms, seed, renderer or "
+            f"weights): {'; '.join(done.left_out)}. Without --methods they are judged again.",
+            err=True,
+        )
+    if done.failures:
         raise InputError(
-            f"{len(failures)} runs failed and are not in the table: {'; '.join(failures)}"
+            f"{len(done.failures)} runs failed and are not in the table: {'; '.join(done.failures)}"
         )

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.classes import label_set
@@ -67,6 +68,7 @@ class GanStage(lightning.LightningModule):
         self.generator = prior
         spread_out(prior.layout, prior.decoder(self._latents(START_ROOMS), prior.max_objects))
         self.prior = copy.deepcopy(prior).requires_grad_(False)
+        self.average = get_ema_multi_avg_fn(config.gan.averaging)
         self.latents = latents
         self.discriminator = MapDiscriminator(self.classes)
         self.excess: Tensor
@@ -87,7 +89,6 @@ class GanStage(lightning.LightningModule):
             loss = loss + self.config.gan.variety * sameness(scenes)
             loss = loss + self.config.gan.counts * (more @ self.excess).mean()
 
-        real, fake = self._through_noise(real), self._through_noise(fake)
         real_scores = self.discriminator(real)
         fake_scores = self.discriminator(fake.detach())
         told_apart = mistaken(real_scores, real=True) + mistaken(fake_scores, real=False)
@@ -98,7 +99,7 @@ class GanStage(lightning.LightningModule):
         check_finite(loss, views)
         self._update(generator_optimizer, loss)
         self.discriminator.requires_grad_(True)
-        self._average()
+        self.average(list(self.prior.parameters()), list(self.generator.parameters()), 0)
         said = {
             "loss": loss,
             "discriminator": told_apart,
@@ -111,13 +112,10 @@ class GanStage(lightning.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         """Rates fall evenly to 0, so that the opponents' circling ends, too."""
+        left = 1 - self.current_epoch / self.config.gan.epochs
         for optimizer in self._both():
             for group in optimizer.param_groups:
-                group["lr"] = group["initial_lr"] * self._left()
-
-    def _left(self) -> float:
-        """Share of the training that is still to come."""
-        return 1 - self.current_epoch / self.config.gan.epochs
+                group["lr"] = group["initial_lr"] * left
 
     def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:
         shape = (rooms, self.config.model.logits_per_room)
@@ -131,10 +129,6 @@ class GanStage(lightning.LightningModule):
         maps = rendered_maps(scenes, faces, views, kept, classes, mode)
         return maps, (kept.unsqueeze(-1) * classes).sum(dim=1)
 
-    def _through_noise(self, maps: Tensor) -> Tensor:
-        """Maps as the discriminator sees them; real ones come in steps that rendered ones lack."""
-        return maps + self.config.gan.noise * self._left() * torch.randn_like(maps)
-
     def _both(self) -> list[LightningOptimizer]:
         """Optimisers of the generator and of the discriminator."""
         return self.optimizers()  # type: ignore[return-value]
@@ -145,14 +139,6 @@ class GanStage(lightning.LightningModule):
         if self.config.gan.clip_gradient:
             self.clip_gradients(optimizer, self.config.gan.clip_gradient, "norm")  # type: ignore[arg-type]
         optimizer.step()
-
-    @torch.no_grad()
-    def _average(self) -> None:
-        # The first steps are averaged over less: else they would stay as they started for long.
-        done = self.current_epoch * int(self.trainer.num_training_batches)
-        keep = min(self.config.gan.averaging, (1 + done) / (10 + done))
-        for mean, newest in zip(self.prior.parameters(), self.generator.parameters(), strict=True):
-            mean.lerp_(newest, 1 - keep)
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         rates = self.config.gan

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from sceneprior.config import load_config
 from sceneprior.errors import InputError
@@ -37,8 +37,9 @@ class Comparison(Section):
 
     seeds: tuple[int, ...] = Field(min_length=1, strict=False)
     """A run each; the seed of training."""
-    count: int = Field(ge=2)
-    """Rooms that each run generates and is judged by."""
+    count: int | None = Field(None, ge=2)
+    """Rooms that each run generates and is judged by. None: as many as there are training rooms,
+    the numbers at which Frechet distances compare with those of the reference rows."""
     sampling_seed: int = Field(0, ge=0)
     """Of the generated rooms, the same for every run."""
     rooms: dict[str, Rooms] = Field(min_length=1)
@@ -50,6 +51,14 @@ class Comparison(Section):
         if len(set(seeds)) < len(seeds) or min(seeds) < 0:
             raise ValueError("seeds are numbers from 0 on, each once")
         return seeds
+
+    @model_validator(mode="after")
+    def _titles_differ(self) -> "Comparison":
+        for named in (self.rooms, self.methods):
+            titles = [entry.title for entry in named.values()]
+            if twice := [title for title in titles if titles.count(title) > 1]:
+                raise ValueError(f"the title '{twice[0]}' is given twice; a title names a row")
+        return self
 
 
 @dataclass(frozen=True)

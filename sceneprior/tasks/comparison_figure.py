@@ -26,24 +26,23 @@ MARGIN_PX = 190
 
 
 def write_figure(
-    comparison: Comparison, runs: Sequence[Run], path: Path, renderer: Renderer
+    comparison: Comparison, runs: Sequence[Run], count: int, path: Path, renderer: Renderer
 ) -> None:
     """Draw the first rooms that each run generates, under the real and the independent ones.
 
     Args:
         comparison: Names the methods.
         runs: Finished ones on the same rooms, one a method.
+        count: Rooms that each of them was judged by; the first few are drawn.
         path: PNG to write.
         renderer: From `sceneprior.offscreen.open_renderer`.
     """
     trained = [load_any_run(run.folder / "run") for run in runs]
     real = reference_scenes(Path(trained[0].config.data.shards), "train", limit=DRAWN_FROM)
-    rows = {
-        "Real training rooms": real[:SHOWN],
-        "Independent objects": independent_rooms(real, SHOWN, comparison.sampling_seed, True),
-    }
+    independent = independent_rooms(real, SHOWN, comparison.sampling_seed, True)
+    rows = {"Real training rooms": real[:SHOWN], "Independent objects": independent}
     for run, prior in zip(runs, trained, strict=True):
-        made = synthesize(prior, comparison.count, comparison.sampling_seed)
+        made = synthesize(prior, count, comparison.sampling_seed)
         rows[comparison.methods[run.method].title] = made[:SHOWN]
     sheet = np.concatenate([_row(title, scenes, renderer) for title, scenes in rows.items()])
     buffer = io.BytesIO()

@@ -1,6 +1,12 @@
 """A comparison of tiny runs, through the command: trained, judged, gone on with, tabulated."""
 
 import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -9,18 +15,21 @@ from PIL import Image
 from tiny_runs import write_tiny_config
 
 from sceneprior.errors import InputError
+from sceneprior.files import only_writer
 from sceneprior.stages.runs import load_any_run
-from sceneprior.tasks import compare as module
-from sceneprior.tasks.compare import compare, costs_of
+from sceneprior.tasks import comparison_steps
+from sceneprior.tasks.compare import Compared, compare
 from sceneprior.tasks.comparison import load_comparison, part_of, runs_of
+from sceneprior.tasks.comparison_steps import Commands, costs_of
+
+SOFTWARE = "software"
 
 
-@pytest.fixture
-def written(toy_shards, tmp_path):
-    """A comparison's YAML of one kind of room and two methods, and how to change it."""
-    config = write_tiny_config(
-        tmp_path / "tiny.yaml", toy_shards, layout__epochs=1, shape__epochs=1
-    )
+def write_comparison(folder: Path, shards: Path, **changes) -> str:
+    """A comparison's YAML of one kind of room and two methods."""
+    config = folder / "tiny.yaml"
+    if not config.is_file():
+        write_tiny_config(config, shards, layout__epochs=1, shape__epochs=1)
     data = {
         "seeds": [0],
         "count": 4,
@@ -34,13 +43,14 @@ def written(toy_shards, tmp_path):
             },
         },
     }
+    path = folder / "compare.yaml"
+    path.write_text(yaml.safe_dump(data | changes, sort_keys=False))
+    return str(path)
 
-    def write(**changes) -> str:
-        path = tmp_path / "compare.yaml"
-        path.write_text(yaml.safe_dump(data | changes, sort_keys=False))
-        return str(path)
 
-    return write
+@pytest.fixture
+def written(toy_shards, tmp_path):
+    return partial(write_comparison, tmp_path, toy_shards)
 
 
 def test_every_run_has_its_settings_its_seed_and_its_folder(written):
@@ -75,6 +85,10 @@ def test_a_part_keeps_the_order_and_names_what_there_is(written):
     ("changes", "message"),
     [
         ({"seed": [0]}, "unknown key 'seed'; the nearest valid key is 'seeds'"),
+        (
+            {"methods": {name: {"title": "A", "group": "2D"} for name in "ab"}},
+            "the title 'A' is given twice; a title names a row",
+        ),
         ({"seeds": [1, 1]}, "seeds are numbers from 0 on, each once"),
         (
             {"methods": {"a": {"title": "A", "grp": "2D", "group": "2D"}}},
@@ -95,92 +109,184 @@ def test_what_is_wrong_with_a_comparison_is_said_before_anything_runs(written, c
         load_comparison(written(**changes))
 
 
-def test_runs_are_trained_judged_tabulated_and_not_repeated(written, tmp_path, monkeypatch):
-    comparison = load_comparison(written())
-    out = tmp_path / "out"
-    part = part_of(comparison, "ours", None, None)
-    assert compare(comparison, part, out, 1, "software") == []
-    folder = out / "toy" / "ours" / "seed0"
-    noted = json.loads((folder / "steps.json").read_text())
+@pytest.fixture(scope="module")
+def trained(toy_shards, tmp_path_factory) -> Path:
+    """`ours` of the comparison below, trained and judged by real commands."""
+    folder = tmp_path_factory.mktemp("compared")
+    comparison = load_comparison(write_comparison(folder, toy_shards))
+    done = compare(comparison, part_of(comparison, "ours", None, None), folder / "out", 1, SOFTWARE)
+    assert done == Compared(folder / "out" / "table.md", [], [])
+    return folder
+
+
+@pytest.fixture
+def begun(trained, toy_shards, tmp_path) -> Path:
+    """A copy of it, to go on with: nothing in it knows where it lies."""
+    shutil.copytree(trained, tmp_path / "copy")
+    write_comparison(tmp_path / "copy", toy_shards)
+    return tmp_path / "copy"
+
+
+class Calls:
+    """Stands in for the commands; says how each ends."""
+
+    def __init__(self, status=0, before=lambda arguments: None):
+        self.names, self.status, self.before = [], status, before
+
+    def __call__(self, commands, arguments, log):
+        self.names.append(arguments[0])
+        self.before(arguments)
+        log.write_text("working\nError: no room for more.\n")
+        return self.status, 2.5, 3.0
+
+
+@pytest.fixture
+def calls(monkeypatch) -> Calls:
+    calls = Calls()
+    monkeypatch.setattr(Commands, "call", lambda *given: calls(*given))
+    return calls
+
+
+def again(begun: Path, toy_shards: Path, part: str | None = "ours", **changes) -> Compared:
+    comparison = load_comparison(write_comparison(begun, toy_shards, **changes))
+    return compare(comparison, part_of(comparison, part, None, None), begun / "out", 1, SOFTWARE)
+
+
+def test_a_run_is_trained_judged_and_tabulated(trained, toy_shards):
+    comparison = load_comparison(write_comparison(trained, toy_shards))
+    run = runs_of(comparison, trained / "out")[0]
+    noted = json.loads((run.folder / "steps.json").read_text())
     assert noted["fit"]["finished"] and noted["fit"]["cpu_s"] > 0
     assert noted["fit"]["arguments"][:2] == ["fit", "--config"]
-    costs = costs_of(folder)
+    assert "--devices 1 --resume" in " ".join(noted["fit"]["arguments"])
+    costs = costs_of(run)
     assert costs.steps == 3 + 2  # 12 rooms in batches of 5, then of 6
-    count = sum(item.numel() for item in load_any_run(folder / "run").prior.parameters())
-    assert costs.parameters == count
-    table = (out / "table.md").read_text()
+    count = sum(item.numel() for item in load_any_run(run.folder / "run").prior.parameters())
+    assert (costs.parameters, costs.cpu_s) == (count, noted["fit"]["cpu_s"])
+    table = (trained / "out" / "table.md").read_text()
     assert "| Ours |" in table and "LSTM" not in table and "4 generated rooms" in table
-    with Image.open(out / "toy.png") as sheet:
+    with Image.open(trained / "out" / "toy.png") as sheet:
         assert sheet.height == 3 * 160  # real, independent, ours
 
-    # A second method joins; the first is neither trained nor judged again, and stays in the table.
-    called = []
 
-    def failing(arguments, log, jobs):
-        called.append(arguments[0])
-        log.write_text("working\nError: no room for more.\n")
-        return 2, 1.0, 1.0
-
-    monkeypatch.setattr(module, "_call", failing)
-    failures = compare(comparison, comparison, out, 2, "software")
-    assert called == ["fit"]
-    assert failures == ["toy, lstm, seed 0: no room for more."]
-    assert "| Ours |" in (out / "table.md").read_text()
+def test_what_is_done_is_not_repeated_and_stays_in_the_table(begun, toy_shards, calls):
+    assert again(begun, toy_shards).failures == [] and calls.names == []
+    # A second method joins, and fails.
+    calls.status = 2
+    done = again(begun, toy_shards, None)
+    assert calls.names == ["fit"] and done.failures == ["toy, lstm, seed 0: no room for more."]
+    assert "| Ours |" in (begun / "out" / "table.md").read_text()
 
 
-def test_scores_of_a_run_that_was_there_before_are_not_taken_for_the_new_ones(
-    written, tmp_path, monkeypatch
-):
-    called = []
+def test_a_part_that_is_judged_otherwise_names_the_rows_it_leaves_out(begun, toy_shards, calls):
+    done = again(begun, toy_shards, "lstm", count=5)
+    assert done.table is None and done.left_out == ["toy, ours, seed 0"]
+    assert calls.names == ["fit", "eval-fid"]
+    again(begun, toy_shards, "ours", count=5)
+    assert calls.names[2:] == ["eval-fid"]
 
-    def working(arguments, log, jobs):
-        called.append(arguments[0])
-        run = Path(arguments[arguments.index("--run") + 1])
-        run.mkdir(exist_ok=True)
-        (run / "config.yaml").touch()
-        return 0, 2.0, 1.0
 
-    monkeypatch.setattr(module, "_call", working)
-    monkeypatch.setattr(module, "write_tables", lambda rows, out: None)
-    monkeypatch.setattr(module, "_rows", lambda comparison, done: [])
-    monkeypatch.setattr(module, "write_figure", lambda *given: None)
-    methods = {"ours": {"title": "Ours", "group": "2D"}}
-    before = load_comparison(written(methods=methods))
-    compare(before, before, tmp_path / "out", 1, "software")
-    compare(before, before, tmp_path / "out", 1, "software")
-    assert called == ["fit", "eval-fid"]
-    methods["ours"]["set"] = {"every": ["model.width=8"]}
-    after = load_comparison(written(methods=methods))
-    compare(after, after, tmp_path / "out", 1, "software")
-    assert called[2:] == ["fit", "eval-fid"]
-    more = load_comparison(written(methods=methods, count=5))
-    compare(more, more, tmp_path / "out", 1, "software")
-    assert called[4:] == ["eval-fid"]
+def test_without_a_count_as_many_rooms_are_made_as_are_trained_on(begun, toy_shards, calls):
+    said = []
+    calls.before = said.append
+    again(begun, toy_shards, count=None)
+    assert said[0][said[0].index("-n") + 1] == "12"
+
+
+def test_a_run_of_other_settings_is_named_and_left_as_it_is(begun, toy_shards, calls):
+    (begun / "tiny.yaml").write_text(
+        (begun / "tiny.yaml").read_text().replace("epochs: 1\n", "epochs: 2\n", 1)
+    )
+    comparison = load_comparison(str(begun / "compare.yaml"))
+    done = compare(comparison, part_of(comparison, "ours", None, None), begun / "out", 1, SOFTWARE)
+    assert done.table is None and calls.names == []
+    assert done.failures == [
+        f"toy, ours, seed 0: {begun}/out/toy/ours/seed0 holds a run of other settings than the "
+        "comparison now asks for; delete it to train anew, or name another --out."
+    ]
+
+
+def test_what_was_deleted_is_made_again(begun, toy_shards, calls):
+    folder = begun / "out" / "toy" / "ours" / "seed0"
+    (folder / "scores.json").unlink()
+    again(begun, toy_shards)
+    assert calls.names == ["eval-fid"]
+    shutil.rmtree(folder / "run")
+    done = again(begun, toy_shards)
+    assert calls.names[1:] == ["fit", "eval-fid"] and done.table is None  # they made nothing
+    assert json.loads((folder / "steps.json").read_text())["fit"]["cpu_s"] == 2.5
+
+
+def test_costs_of_a_run_add_up_and_are_unknown_after_a_kill(begun, toy_shards, calls):
+    folder = begun / "out" / "toy" / "ours" / "seed0"
+    (folder / "run" / "shape" / "final.ckpt").unlink()
+
+    def cpu_s():
+        return json.loads((folder / "steps.json").read_text())["fit"].get("cpu_s")
+
+    before = cpu_s()
+    again(begun, toy_shards)
+    assert cpu_s() == before + 2.5
+
+    def killed(arguments):
+        raise MemoryError
+
+    calls.before = killed
+    with pytest.raises(MemoryError):
+        again(begun, toy_shards)
+    assert cpu_s() is None
+    calls.before = lambda arguments: None
+    again(begun, toy_shards)
+    assert cpu_s() is None
 
 
 def test_a_command_that_failed_is_told_by_its_own_sentence(tmp_path):
     log = tmp_path / "fit.log"
     log.write_text("10%\nError: ValueError: odd.\nThis should not happen. Run again.\n")
-    assert module._reason(log) == "ValueError: odd."
-    log.write_text("\n 73% Killed\n")
-    assert module._reason(log) == "73% Killed"
+    assert comparison_steps._reason(log, 1) == "ValueError: odd."
+    log.write_text("\n 73%\n")
+    assert comparison_steps._reason(log, 1) == "73%"
+    assert comparison_steps._reason(log, -9) == "killed by SIGKILL; the same command goes on"
     log.write_text("")
-    assert module._reason(log) == f"it said nothing in {log}"
+    assert comparison_steps._reason(log, 1) == f"it said nothing in {log}"
 
 
-def test_a_stopped_comparison_says_so_and_keeps_what_the_run_took(written, tmp_path, monkeypatch):
-    comparison = load_comparison(written())
-
-    def stopped(arguments, log, jobs):
-        run = Path(arguments[arguments.index("--run") + 1])
-        run.mkdir(exist_ok=True)
-        (run / "config.yaml").touch()
-        return 130, 2.5, 3.0
-
-    monkeypatch.setattr(module, "_call", stopped)
-    for times in (1, 2):
-        with pytest.raises(KeyboardInterrupt):
-            compare(comparison, comparison, tmp_path / "out", 1, "software")
-        noted = json.loads((tmp_path / "out/toy/ours/seed0/steps.json").read_text())
-        assert noted["fit"]["cpu_s"] == 2.5 * times and not noted["fit"]["finished"]
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_to_compare_alone_stops_its_commands_which_save_what_they_have(
+    written, tmp_path, name
+):
+    path = written(rooms={"toy": {"title": "Toys", "config": str(tmp_path / "tiny.yaml")}})
+    text = (tmp_path / "tiny.yaml").read_text().replace("epochs: 1\n", "epochs: 100000\n")
+    (tmp_path / "tiny.yaml").write_text(text)
+    words = ["--config", path, "--methods", "ours", "--out", str(tmp_path / "out")]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sceneprior", "compare", *words, "--renderer", SOFTWARE],
+        stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    folder = tmp_path / "out/toy/ours/seed0"
+    deadline = time.monotonic() + 120
+    while not (folder / "run/layout/last.ckpt").is_file() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.Signals[name])
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130 and "The same command goes on from here" in said
+    assert "Stopped and saved" in (folder / "fit.log").read_text()
+    noted = json.loads((folder / "steps.json").read_text())
+    assert noted["fit"]["cpu_s"] > 0 and not noted["fit"]["finished"]
     assert not (tmp_path / "out" / "table.md").exists()
+
+
+def test_two_comparisons_do_not_write_to_one_folder(begun, toy_shards):
+    with only_writer(begun / "out"), pytest.raises(InputError, match="Another run is writing to"):
+        again(begun, toy_shards)
+    (begun / "file").touch()
+    comparison = load_comparison(str(begun / "compare.yaml"))
+    with pytest.raises(InputError, match="file cannot be written"):
+        compare(comparison, comparison, begun / "file", 1, SOFTWARE)
+
+
+def test_a_renderer_that_is_none_is_said_before_anything_is_trained(begun, toy_shards, calls):
+    comparison = load_comparison(str(begun / "compare.yaml"))
+    with pytest.raises(InputError, match="vulkan"):
+        compare(comparison, comparison, begun / "out", 1, "vulkan")
+    assert calls.names == []
