@@ -36,8 +36,7 @@ def mistaken(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
     real (Goodfellow et al., "Generative adversarial nets", NeurIPS 2014: the loss that does not
     saturate).
     """
-    sign = -1 if real else 1
-    return torch.stack([F.softplus(sign * score).mean() for score in scores]).sum()
+    return torch.stack([F.softplus(-score if real else score).mean() for score in scores]).sum()
 
 
 def contents(
@@ -67,10 +66,8 @@ def implausible(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""]:
 
 def certainty(scenes: DecodedScenes) -> Float[Tensor, ""]:
     """Mean squares of the logits that decide: 0 is undecided. `void` is no choice."""
-    return (
-        scenes.class_logits[..., VOID + 1 :].square().mean()
-        + scenes.completeness_logits.square().mean()
-    )
+    classes = scenes.class_logits[..., VOID + 1 :]
+    return classes.square().mean() + scenes.completeness_logits.square().mean()
 
 
 def sameness(scenes: DecodedScenes) -> Float[Tensor, ""]:

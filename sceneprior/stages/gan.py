@@ -75,7 +75,7 @@ class GanStage(lightning.LightningModule):
         self.register_buffer("excess", torch.zeros(2 * self.classes))
 
     def training_step(self, views: SceneViews, batch_idx: int) -> None:
-        generator_optimizer, discriminator_optimizer = self._both()
+        generator_optimizer, discriminator_optimizer = self.optimizers()  # type: ignore[attr-defined]
         scenes = self.generator.decode(self._latents(len(views.room_index)))
         with full_precision(self.device):
             # Before rendering, too, which refuses vertices that are not finite.
@@ -113,7 +113,7 @@ class GanStage(lightning.LightningModule):
     def on_train_epoch_start(self) -> None:
         """Rates fall evenly to 0, so that the opponents' circling ends, too."""
         left = 1 - self.current_epoch / self.config.gan.epochs
-        for optimizer in self._both():
+        for optimizer in self.optimizers():  # type: ignore[union-attr]
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * left
 
@@ -129,15 +129,10 @@ class GanStage(lightning.LightningModule):
         maps = rendered_maps(scenes, faces, views, kept, classes, mode)
         return maps, (kept.unsqueeze(-1) * classes).sum(dim=1)
 
-    def _both(self) -> list[LightningOptimizer]:
-        """Optimisers of the generator and of the discriminator."""
-        return self.optimizers()  # type: ignore[return-value]
-
     def _update(self, optimizer: LightningOptimizer, loss: Tensor) -> None:
         optimizer.zero_grad()
         self.manual_backward(loss)
-        if self.config.gan.clip_gradient:
-            self.clip_gradients(optimizer, self.config.gan.clip_gradient, "norm")  # type: ignore[arg-type]
+        self.clip_gradients(optimizer, self.config.gan.clip_gradient, "norm")  # type: ignore[arg-type]
         optimizer.step()
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:

@@ -95,7 +95,7 @@ def is_judged(run: Run, asked: Sequence[str] | None = None) -> bool:
     """Whether there are scores of a trained run; if `asked`, such as these words ask for."""
     noted = _journal(run.folder).get("scores", {})
     there = bool(noted.get("finished")) and (run.folder / "scores.json").is_file()
-    return there and (asked is None or noted["asked"] == list(asked))
+    return there and (asked is None or noted.get("asked") == list(asked))
 
 
 def costs_of(run: Run) -> Costs:
