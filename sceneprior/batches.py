@@ -1,5 +1,6 @@
 """Nouns that learning meets at: `SceneViews` (what cameras saw), `DecodedScenes`, `RoomBoxes`."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -37,7 +38,7 @@ class SceneViews:
 
     def to(self, device: torch.device | str) -> "SceneViews":
         """The same views with every tensor on `device` (Lightning calls this)."""
-        return replace(self, **_moved(self, device))
+        return replace(self, **_tensors(self, lambda tensor: tensor.to(device)))
 
     def intrinsics_at(
         self, height: int | float, width: int | float
@@ -79,27 +80,32 @@ class RoomBoxes:
     boxes_m: Float[Tensor, "rooms objects 6"]
     """Centre x, y, z, then full extents along x, y, z; axis-aligned, in the room frame."""
     room_ids: tuple[str, ...] = ()
+    yaw_rad: Float[Tensor, "rooms objects"] | None = None
+    """Turn about +y that takes +z to each piece's front, in [-pi, pi]; None: nobody knows."""
 
     def to(self, device: torch.device | str) -> "RoomBoxes":
         """The same boxes with every tensor on `device` (Lightning calls this)."""
-        return replace(self, **_moved(self, device))
+        return replace(self, **_tensors(self, lambda tensor: tensor.to(device)))
 
     def split(self, rooms: int) -> list["RoomBoxes"]:
         """Batches of at most so many rooms, without ids."""
-        tensors = (self.object_class, self.is_object, self.boxes_m)
-        parts = zip(*(tensor.split(rooms) for tensor in tensors), strict=True)
-        return [RoomBoxes(*part) for part in parts]
+
+        def batch(start: int) -> "RoomBoxes":
+            tensors = _tensors(self, lambda tensor: tensor[start : start + rooms])
+            return replace(self, **tensors, room_ids=())
+
+        return [batch(start) for start in range(0, len(self.is_object), rooms)]
 
     def take(self, order: Int[Tensor, "rooms slots"]) -> "RoomBoxes":
         """The same rooms with other slots: those that `order` names, in its order."""
-        return replace(
-            self,
-            object_class=self.object_class.gather(1, order),
-            is_object=self.is_object.gather(1, order),
-            boxes_m=self.boxes_m.gather(1, order.unsqueeze(-1).expand(-1, -1, 6)),
-        )
+
+        def taken(tensor: Tensor) -> Tensor:
+            rows = order if tensor.ndim == 2 else order.unsqueeze(-1)
+            return torch.take_along_dim(tensor, rows, dim=1)
+
+        return replace(self, **_tensors(self, taken))
 
 
-def _moved(noun: SceneViews | RoomBoxes, device: torch.device | str) -> dict[str, Any]:
+def _tensors(noun: SceneViews | RoomBoxes, change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
     values = {item.name: getattr(noun, item.name) for item in fields(noun)}
-    return {key: v.to(device) for key, v in values.items() if isinstance(v, Tensor)}
+    return {key: change(v) for key, v in values.items() if isinstance(v, Tensor)}

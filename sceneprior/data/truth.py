@@ -4,6 +4,7 @@ The only door from training to the shards' ground truth. The stages `atiss3d` an
 it; what learns from masks and 2D boxes never does (tests/data/test_truth.py).
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ class TruthDataset(Dataset):
     """Every furnished box of every room of a split, in memory; rows and turns are `ViewDataset`'s.
 
     All furniture that has a class counts, seen by a camera or not: who is given the room in 3D is
-    given all of it. A piece's yaw is left out, since a scene's boxes are axis-aligned.
+    given all of it.
 
     Args:
         folder: Of shards with ground truth.
@@ -40,7 +41,7 @@ class TruthDataset(Dataset):
     def __init__(self, folder: Path, split: str, rotations: int = 1):
         self.rotations = rotations
         self.label_set = ""
-        ids, classes, boxes = [], [], []
+        ids, classes, boxes, yaws = [], [], [], []
         for shard, room_id in iterate_rooms(folder, split):
             if self.label_set and shard.label_set != self.label_set:
                 raise ShardError(
@@ -58,12 +59,14 @@ class TruthDataset(Dataset):
             ids.append(room_id)
             classes.append(torch.from_numpy(truth.object_class).long())
             boxes.append(torch.from_numpy(np.hstack([truth.centers_m, truth.sizes_m])))
+            yaws.append(torch.from_numpy(truth.yaw_rad))
         if not ids:
             raise ShardError(f"The shards of {folder}/{split} hold no rooms; prepare them again.")
         self._plain_ids = tuple(ids)
         self._counts = torch.tensor([len(room) for room in classes])
         self._classes = torch.nn.utils.rnn.pad_sequence(classes, batch_first=True)
         self._boxes_m = torch.nn.utils.rnn.pad_sequence(boxes, batch_first=True)
+        self._yaw_rad = torch.nn.utils.rnn.pad_sequence(yaws, batch_first=True)
 
     def __len__(self) -> int:
         return len(self._plain_ids) * self.rotations
@@ -82,7 +85,7 @@ class TruthDataset(Dataset):
     def to(self, device: torch.device | str) -> "TruthDataset":
         """Move all boxes to `device`, where batches are then made."""
         self._counts, self._classes = self._counts.to(device), self._classes.to(device)
-        self._boxes_m = self._boxes_m.to(device)
+        self._boxes_m, self._yaw_rad = self._boxes_m.to(device), self._yaw_rad.to(device)
         return self
 
     def everything(self) -> RoomBoxes:
@@ -99,11 +102,14 @@ class TruthDataset(Dataset):
         counts = self._counts[rooms] * shown
         widest = max(int(counts.max()), 1)
         is_object = torch.arange(widest, device=device) < counts[:, None]
+        quarters = rows % self.rotations
+        yaw_rad = self._yaw_rad[rooms, :widest] + math.pi / 2 * quarters.unsqueeze(-1)
         return RoomBoxes(
             object_class=self._classes[rooms, :widest] * is_object,
             is_object=is_object,
-            boxes_m=turned(self._boxes_m[rooms, :widest], rows % self.rotations),
+            boxes_m=turned(self._boxes_m[rooms, :widest], quarters),
             room_ids=tuple(self._plain_ids[room] for room in rooms[shown].tolist()),
+            yaw_rad=torch.remainder(yaw_rad + math.pi, 2 * math.pi) - math.pi,
         )
 
 

@@ -16,6 +16,10 @@ from sceneprior.models.logistics import LogisticMixture, draw_index
 
 END = 0
 """The class that ends a room: void, which is no furniture."""
+PARTS = {"position": (0, 3), "angle": (3, 4), "size": (4, 7)}
+"""Which of an object's seven numbers are drawn together, in their order."""
+CUT_RAD = -3 * math.pi / 4
+"""Where angles begin and end as numbers of [-1, 1]: at a diagonal, as the fewest pieces stand."""
 CLASS_WIDTH = 64
 OCTAVES = 8
 """Sines and cosines a coordinate is shown to the network as; the finest has a period of two steps
@@ -29,8 +33,8 @@ class Atiss(nn.Module):
 
     A transformer encoder without positional encoding reads the objects there are and one learnt
     query. What it makes of the query gives the class of the next object, or the room's end; then,
-    given the class, its position; then, given both, its size. Every coordinate is a mixture of
-    logistics of its own.
+    given the class, its position; then its angle, then its size, each given all before it. Every
+    number is a mixture of logistics of its own. An object is seven `numbers` in [-1, 1].
 
     Args:
         classes: Size of the label set, void included.
@@ -58,7 +62,7 @@ class Atiss(nn.Module):
         self.register_buffer("low_m", torch.zeros(6))
         self.register_buffer("high_m", torch.ones(6))
         self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
-        self.object = nn.Linear(CLASS_WIDTH + 6 * 2 * OCTAVES, width)
+        self.object = nn.Linear(CLASS_WIDTH + 7 * 2 * OCTAVES, width)
         self.query = nn.Parameter(torch.randn(width))
         self.encoder = nn.ModuleList(
             nn.TransformerEncoderLayer(
@@ -67,10 +71,14 @@ class Atiss(nn.Module):
             # Each drawn by itself; nn.TransformerEncoder would start with copies of one.
             for _ in range(layers)
         )
-        of_three = 3 * 3 * mixtures
         self.class_head = _head(width, classes)
-        self.position_head = _head(width + CLASS_WIDTH, of_three)
-        self.size_head = _head(width + CLASS_WIDTH + 3 * 2 * OCTAVES, of_three)
+        known = width + CLASS_WIDTH
+        self.heads = nn.ModuleDict(
+            {
+                name: _head(known + start * 2 * OCTAVES, (end - start) * 3 * mixtures)
+                for name, (start, end) in PARTS.items()
+            }
+        )
 
     def fit_bounds(self, rooms: RoomBoxes) -> None:
         """Take the range of every coordinate and size from the training rooms."""
@@ -79,18 +87,26 @@ class Atiss(nn.Module):
         # Where all are alike (a toy), a range of nothing would divide by nothing.
         self.high_m.copy_(torch.maximum(boxes_m.amax(dim=0), self.low_m + 1e-3))
 
-    def to_unit(self, boxes_m: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
-        """From metres to [-1, 1]."""
-        return 2 * (boxes_m - self.low_m) / (self.high_m - self.low_m) - 1
+    def to_unit(self, rooms: RoomBoxes) -> Float[Tensor, "rooms objects 7"]:
+        """Each object's `numbers`: centre, yaw and extents, from metres and radians to [-1, 1]."""
+        assert rooms.yaw_rad is not None, "true boxes have it"
+        unit = 2 * (rooms.boxes_m - self.low_m) / (self.high_m - self.low_m) - 1
+        turn = torch.remainder(rooms.yaw_rad[..., None] - CUT_RAD, 2 * math.pi) / math.pi - 1
+        return torch.cat([unit[..., :3], turn, unit[..., 3:]], dim=-1)
 
-    def to_metres(self, unit: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
-        """From [-1, 1] to metres."""
-        return self.low_m + (unit + 1) / 2 * (self.high_m - self.low_m)
+    def to_metres(
+        self, unit: Float[Tensor, "*batch 7"]
+    ) -> tuple[Float[Tensor, "*batch 6"], Float[Tensor, "*batch"]]:
+        """Boxes and yaws of `numbers`."""
+        boxes = torch.cat([unit[..., :3], unit[..., 4:]], dim=-1)
+        boxes_m = self.low_m + (boxes + 1) / 2 * (self.high_m - self.low_m)
+        turn = (unit[..., 3] + 1) * math.pi + CUT_RAD
+        return boxes_m, torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
 
     def context(
         self,
         object_class: Int[Tensor, "rooms objects"],
-        unit: Float[Tensor, "rooms objects 6"],
+        unit: Float[Tensor, "rooms objects 7"],
         is_object: Bool[Tensor, "rooms objects"],
     ) -> Float[Tensor, "rooms width"]:
         """What a set of objects, in whatever order, means for the next one."""
@@ -106,59 +122,53 @@ class Atiss(nn.Module):
         self,
         context: Float[Tensor, "rooms width"],
         next_class: Int[Tensor, " rooms"],
-        next_unit: Float[Tensor, "rooms 6"],
+        next_unit: Float[Tensor, "rooms 7"],
     ) -> dict[str, Float[Tensor, " rooms"]]:
-        """Log-probability of the next object's class, position and size; of the latter two 0 where
-        the next class is `END`."""
+        """Log-probability of the next object's class, position, angle and size; of all but the
+        class 0 where that is `END`."""
         class_log_prob = self.class_head(context).log_softmax(dim=-1)
-        label = self.class_embedding(next_class)
-        exists = next_class != END
-        position = self._position(context, label).log_prob(next_unit[:, :3]).sum(dim=-1)
-        size = self._size(context, label, next_unit[:, :3]).log_prob(next_unit[:, 3:]).sum(dim=-1)
-        return {
-            "class": class_log_prob.gather(-1, next_class[:, None])[:, 0],
-            "position": position * exists,
-            "size": size * exists,
-        }
+        found = {"class": class_log_prob.gather(-1, next_class[:, None])[:, 0]}
+        for name, (start, end) in PARTS.items():
+            law = self._law(name, context, next_class, next_unit)
+            log_prob = law.log_prob(next_unit[:, start:end]).sum(dim=-1)
+            found[name] = log_prob * (next_class != END)
+        return found
 
-    def _position(self, context: Tensor, label: Tensor) -> LogisticMixture:
-        features = self.position_head(torch.cat([context, label], dim=-1))
-        return LogisticMixture.of(features.unflatten(-1, (3, -1)))
-
-    def _size(self, context: Tensor, label: Tensor, position: Tensor) -> LogisticMixture:
-        features = self.size_head(torch.cat([context, label, waves(position)], dim=-1))
-        return LogisticMixture.of(features.unflatten(-1, (3, -1)))
+    def _law(self, name: str, context: Tensor, label: Tensor, unit: Tensor) -> LogisticMixture:
+        """Of one of `PARTS`, given the class and those of the numbers `unit` that come before."""
+        start, end = PARTS[name]
+        known = [context, self.class_embedding(label), waves(unit[:, :start])]
+        features = self.heads[name](torch.cat(known, dim=-1))
+        return LogisticMixture.of(features.unflatten(-1, (end - start, -1)))
 
     @torch.no_grad()
     def sample(self, count: int, seed: int) -> RoomBoxes:
         """New rooms. The same seed gives the same rooms, the first of them however many follow."""
         generator = torch.Generator().manual_seed(seed)
-        uniform = torch.rand(count, self.max_objects, 13, generator=generator)
+        uniform = torch.rand(count, self.max_objects, 15, generator=generator)
         parts = [self._sample(part) for part in uniform.to(self.query.device).split(BATCH)]
-        return RoomBoxes(
-            object_class=torch.cat([part.object_class for part in parts]),
-            is_object=torch.cat([part.is_object for part in parts]),
-            boxes_m=torch.cat([part.boxes_m for part in parts]),
-        )
+        labels, unit = (torch.cat(part) for part in zip(*parts, strict=True))
+        boxes_m, yaw_rad = self.to_metres(unit)
+        return RoomBoxes(labels, labels != END, boxes_m, yaw_rad=yaw_rad)
 
-    def _sample(self, uniform: Float[Tensor, "rooms objects 13"]) -> RoomBoxes:
-        rooms = len(uniform)
-        object_class = torch.zeros(rooms, self.max_objects, dtype=torch.long, device=uniform.device)
-        unit = uniform.new_zeros(rooms, self.max_objects, 6)
-        is_object = torch.zeros_like(object_class, dtype=torch.bool)
-        going = torch.ones_like(is_object[:, 0])
+    def _sample(
+        self, uniform: Float[Tensor, "rooms objects 15"]
+    ) -> tuple[Int[Tensor, "rooms objects"], Float[Tensor, "rooms objects 7"]]:
+        """Classes, `END` from a room's end on, and numbers."""
+        labels = torch.full(uniform.shape[:2], END, device=uniform.device)
+        unit = uniform.new_zeros(*labels.shape, 7)
+        going = torch.ones_like(labels[:, 0], dtype=torch.bool)
         for step in range(self.max_objects):
-            context = self.context(object_class[:, :step], unit[:, :step], is_object[:, :step])
-            drawn, choice, place = uniform[:, step].split([1, 6, 6], dim=-1)
-            next_class = draw_index(self.class_head(context), drawn[:, 0])
-            going = going & (next_class != END)
-            label = self.class_embedding(next_class)
-            position = self._position(context, label).draw(choice[:, :3], place[:, :3])
-            size = self._size(context, label, position).draw(choice[:, 3:], place[:, 3:])
-            object_class[:, step] = next_class * going
-            unit[:, step] = torch.cat([position, size], dim=-1)
-            is_object[:, step] = going
-        return RoomBoxes(object_class, is_object, self.to_metres(unit))
+            before = labels[:, :step]
+            context = self.context(before, unit[:, :step], before != END)
+            drawn, choice, place = uniform[:, step].split([1, 7, 7], dim=-1)
+            label = draw_index(self.class_head(context), drawn[:, 0])
+            going = going & (label != END)
+            for name, (start, end) in PARTS.items():
+                law = self._law(name, context, label, unit[:, step])
+                unit[:, step, start:end] = law.draw(choice[:, start:end], place[:, start:end])
+            labels[:, step] = label.where(going, END)
+        return labels, unit
 
 
 def waves(unit: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch waves"]:

@@ -1,10 +1,10 @@
-"""Baseline with 3D supervision: ATISS learns the next object's class, position and size."""
+"""Baseline with 3D supervision: ATISS learns the next object's class, position, angle and size."""
 
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import NamedTuple
 
 import lightning
 import torch
-from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.batches import RoomBoxes
@@ -32,13 +32,11 @@ class Atiss3dStage(lightning.LightningModule):
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
         batch = batch_number(self.trainer, batch_idx)
         part = part_of_rooms(rooms, step_seed(self.config.seed, batch, self.global_rank))
-        context = self.prior.context(
-            part.object_class, self.prior.to_unit(part.boxes_m), part.is_object
-        )
+        placed, coming = self.prior.to_unit(part.placed), self.prior.to_unit(part.coming)
+        context = self.prior.context(part.placed.object_class, placed, part.placed.is_object)
         with full_precision(self.device):
-            log_probs = self.prior.log_prob(
-                context.float(), part.next_class, self.prior.to_unit(part.next_box_m)
-            )
+            next_class = part.coming.object_class[:, 0]
+            log_probs = self.prior.log_prob(context.float(), next_class, coming[:, 0])
             losses = {name: -log_prob for name, log_prob in log_probs.items()}
             return total_of_rooms(self, rooms, losses, weights={})
 
@@ -47,16 +45,12 @@ class Atiss3dStage(lightning.LightningModule):
         return build_box_optimizer(self.prior, self.config.atiss3d, steps)
 
 
-@dataclass(frozen=True)
-class PartialRooms:
-    """Rooms of which some objects are there, and the one that is to come."""
+class PartialRooms(NamedTuple):
+    """Rooms of which some objects are placed, and the one that is coming."""
 
-    object_class: Int[Tensor, "rooms objects"]
-    is_object: Bool[Tensor, "rooms objects"]
-    boxes_m: Float[Tensor, "rooms objects 6"]
-    next_class: Int[Tensor, " rooms"]
-    """`END` where all objects are there."""
-    next_box_m: Float[Tensor, "rooms 6"]
+    placed: RoomBoxes
+    coming: RoomBoxes
+    """One object a room; of class `END` where all objects are placed."""
 
 
 def part_of_rooms(rooms: RoomBoxes, seed: int) -> PartialRooms:
@@ -67,17 +61,13 @@ def part_of_rooms(rooms: RoomBoxes, seed: int) -> PartialRooms:
     tickets = torch.rand(rooms.is_object.shape, generator=generator).to(device)
     order = tickets.masked_fill(~rooms.is_object, 2.0).argsort(dim=1)
     kept = (torch.rand(len(count), generator=generator).to(device) * (count + 1)).long()
-    # A column behind the last: what comes after a room's last object is its end.
     shuffled = rooms.take(order)
-    labels = torch.nn.functional.pad(shuffled.object_class, (0, 1), value=END)
-    boxes_m = torch.nn.functional.pad(shuffled.boxes_m, (0, 0, 0, 1))
-    placed = torch.arange(labels.shape[1] - 1, device=device) < kept[:, None]
+    placed = torch.arange(order.shape[1], device=device) < kept[:, None]
+    coming = shuffled.take(kept[:, None].clamp(max=order.shape[1] - 1))
+    more = (kept < count)[:, None]
     return PartialRooms(
-        object_class=labels[:, :-1] * placed,
-        is_object=placed,
-        boxes_m=boxes_m[:, :-1],
-        next_class=labels.gather(1, kept[:, None])[:, 0],
-        next_box_m=boxes_m.gather(1, kept[:, None, None].expand(-1, 1, 6))[:, 0],
+        replace(shuffled, object_class=shuffled.object_class * placed, is_object=placed),
+        replace(coming, object_class=coming.object_class.where(more, END), is_object=more),
     )
 
 

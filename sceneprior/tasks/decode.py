@@ -55,7 +55,7 @@ def furnished_slots(
 
 
 def boxes_to_scenes(rooms: RoomBoxes, label_set_name: str, names: list[str]) -> list[Scene]:
-    """Objects that have no mesh; they are drawn as boxes."""
+    """Objects that have no mesh; they are drawn as boxes. Yaws, where known, are in `extra`."""
     classes = label_set(label_set_name)
     scenes = []
     for room, name in enumerate(names):
@@ -68,7 +68,9 @@ def boxes_to_scenes(rooms: RoomBoxes, label_set_name: str, names: list[str]) -> 
                 strict=True,
             )
         )
-        scenes.append(Scene(name, label_set_name, objects))
+        yaws = None if rooms.yaw_rad is None else rooms.yaw_rad[room, there].tolist()
+        extra = {} if yaws is None else {"yaw_rad": yaws}
+        scenes.append(Scene(name, label_set_name, objects, extra=extra))
     return scenes
 
 

@@ -64,6 +64,21 @@ def test_a_turned_room_is_the_room_seen_by_turned_cameras(toy_shards):
         np.testing.assert_allclose(other, seen[0], atol=2e-4)
 
 
+def test_fronts_turn_with_their_pieces(toy_shards, torch_rng):
+    dataset = TruthDataset(toy_shards, "train", 4)
+    dataset._yaw_rad = (torch.rand(dataset._yaw_rad.shape, generator=torch_rng) - 0.5) * 2 * np.pi
+    boxes = dataset.__getitems__([(row, 0) for row in range(8, 12)])
+    quarter = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    fronts = torch.stack(
+        [boxes.yaw_rad.sin(), torch.zeros_like(boxes.yaw_rad), boxes.yaw_rad.cos()], dim=-1
+    )
+    there = boxes.is_object[0]
+    assert len(boxes.yaw_rad[0, there].unique()) > 1 and boxes.yaw_rad.abs().max() <= np.pi + 1e-6
+    for turn in range(4):
+        wanted = fronts[0] @ torch.linalg.matrix_power(quarter, turn).T
+        np.testing.assert_allclose(fronts[turn, there], wanted[there], atol=1e-6)
+
+
 def test_four_quarters_are_none(torch_rng):
     boxes_m = torch.rand(5, 3, 6, generator=torch_rng)
     again = boxes_m

@@ -1,11 +1,14 @@
 """The ATISS network: sets in, distributions out, rooms sampled."""
 
+import math
+from dataclasses import replace
+
 import pytest
 import torch
 from torch.testing import assert_close
 
 from sceneprior.batches import RoomBoxes
-from sceneprior.models.atiss import END, OCTAVES, Atiss, waves
+from sceneprior.models.atiss import END, OCTAVES, PARTS, Atiss, waves
 
 
 @pytest.fixture
@@ -21,7 +24,7 @@ def network() -> Atiss:
 def objects(torch_rng):
     """Two rooms, of five objects and of three."""
     object_class = torch.randint(1, 6, (2, 5), generator=torch_rng)
-    unit = 2 * torch.rand(2, 5, 6, generator=torch_rng, dtype=torch.float64) - 1
+    unit = 2 * torch.rand(2, 5, 7, generator=torch_rng, dtype=torch.float64) - 1
     is_object = torch.arange(5) < torch.tensor([[5], [3]])
     return object_class, unit, is_object
 
@@ -48,45 +51,58 @@ def test_padding_and_neighbours_in_the_batch_mean_nothing(network, objects):
     assert_close(nothing[0], nothing[1], rtol=0, atol=0)
 
 
-def test_a_room_can_end_and_then_has_neither_place_nor_size(network, objects):
+def test_a_room_can_end_and_then_has_no_numbers(network, objects):
     context = network.context(*objects)
-    box = torch.zeros(2, 6, dtype=torch.float64)
+    unit = torch.zeros(2, 7, dtype=torch.float64)
     of_each = torch.stack([
-        network.log_prob(context, torch.full((2,), label), box)["class"] for label in range(6)
+        network.log_prob(context, torch.full((2,), label), unit)["class"] for label in range(6)
     ])  # fmt: skip
     assert_close(of_each.exp().sum(dim=0), torch.ones(2, dtype=torch.float64))
-    end = network.log_prob(context, torch.full((2,), END), box)
-    assert not end["position"].any() and not end["size"].any()
-    bed = network.log_prob(context, torch.tensor([2, 2]), box)
-    assert (bed["position"] < 0).all() and (bed["size"] < 0).all()
+    end = network.log_prob(context, torch.full((2,), END), unit)
+    bed = network.log_prob(context, torch.tensor([2, 2]), unit)
+    for name in PARTS:
+        assert not end[name].any() and (bed[name] < 0).all()
 
 
-def test_sizes_hear_of_class_and_position_and_positions_of_the_class(network, objects):
-    context = network.context(*objects)
-    box = torch.zeros(2, 6, dtype=torch.float64)
-    known = network.log_prob(context, torch.tensor([2, 2]), box)
-    other_class = network.log_prob(context, torch.tensor([3, 3]), box)
-    assert (other_class["position"] != known["position"]).all()
-    elsewhere = box.clone()
-    elsewhere[:, 0] = 0.3
-    assert (
-        network.log_prob(context, torch.tensor([2, 2]), elsewhere)["size"] != known["size"]
-    ).all()
-    larger = box.clone()
-    larger[:, 3] = 0.3
-    again = network.log_prob(context, torch.tensor([2, 2]), larger)
-    assert torch.equal(again["position"], known["position"])
+def test_each_part_hears_of_the_class_and_of_the_parts_before_it(network, objects):
+    context, beds = network.context(*objects), torch.tensor([2, 2])
+    unit = torch.zeros(2, 7, dtype=torch.float64)
+    known = network.log_prob(context, beds, unit)
+    other_class = network.log_prob(context, torch.tensor([3, 3]), unit)
+    assert all((other_class[name] != known[name]).all() for name in PARTS)
+    for number, hears in ((0, ("angle", "size")), (3, ("size",)), (4, ())):
+        moved = unit.clone()
+        moved[:, number] = 0.3
+        told = network.log_prob(context, beds, moved)
+        own = next(name for name, (start, end) in PARTS.items() if start <= number < end)
+        for name in PARTS:
+            assert (told[name] != known[name]).all() == (name in (*hears, own))
 
 
 def test_metres_and_back(network, objects):
-    _, unit, is_object = objects
-    assert_close(network.to_unit(network.to_metres(unit)), unit)
-    rooms = RoomBoxes(objects[0], is_object, network.to_metres(unit).float())
+    label, unit, is_object = objects
+    boxes_m, yaw_rad = network.to_metres(unit)
+    rooms = RoomBoxes(label, is_object, boxes_m, yaw_rad=yaw_rad)
+    assert_close(network.to_unit(rooms), unit)
+    assert (yaw_rad.abs() <= math.pi).all()
     plain = network.float()
+    rooms = replace(rooms, boxes_m=boxes_m.float(), yaw_rad=yaw_rad.float())
     plain.fit_bounds(rooms)
-    inside = plain.to_unit(rooms.boxes_m)[is_object]
+    inside = plain.to_unit(rooms)[is_object][:, [0, 1, 2, 4, 5, 6]]
     assert_close(inside.amin(dim=0), -torch.ones(6), rtol=0, atol=1e-6)
     assert_close(inside.amax(dim=0), torch.ones(6), rtol=0, atol=1e-6)
+
+
+def test_angles_that_look_alike_are_near_each_other(network):
+    """A hair's breadth to either side of a quarter turn is no jump in what the network learns."""
+    quarters = math.pi / 2 * torch.arange(-2, 3, dtype=torch.float64)
+    hair = 1e-7 * torch.tensor([[-1.0], [0], [1]], dtype=torch.float64)
+    yaw_rad = torch.remainder(quarters + hair + math.pi, 2 * math.pi) - math.pi
+    label = torch.ones(3, 5, dtype=torch.long)
+    boxes_m = torch.zeros(3, 5, 6, dtype=torch.float64)
+    turn = network.to_unit(RoomBoxes(label, label > 0, boxes_m, yaw_rad=yaw_rad))[..., 3]
+    assert (turn.amax(dim=0) - turn.amin(dim=0)).max() < 1e-6
+    assert turn[1, 0] == turn[1, 4] and len(turn[1].unique()) == 4
 
 
 def test_rooms_are_sampled_by_their_seed(network):
@@ -95,6 +111,7 @@ def test_rooms_are_sampled_by_their_seed(network):
     again = network.sample(40, 3)
     assert torch.equal(rooms.boxes_m, again.boxes_m)
     assert torch.equal(rooms.object_class, again.object_class)
+    assert torch.equal(rooms.yaw_rad, again.yaw_rad) and len(rooms.yaw_rad.unique()) > 40
     assert not torch.equal(rooms.is_object, network.sample(40, 4).is_object)
     # The first of many are those of few, but for the last bits of another batch size.
     few = network.sample(5, 3)
@@ -115,7 +132,7 @@ def test_a_sampled_room_ends_once(network):
 
 def test_the_first_class_comes_as_often_as_the_network_says(network):
     network = network.float()
-    nothing = torch.zeros(1, 0, 6), torch.zeros(1, 0, dtype=torch.bool)
+    nothing = torch.zeros(1, 0, 7), torch.zeros(1, 0, dtype=torch.bool)
     context = network.context(torch.zeros(1, 0, dtype=torch.long), *nothing)
     wanted = network.class_head(context).softmax(dim=-1)[0]
     first = network.sample(4000, 0).object_class[:, 0]

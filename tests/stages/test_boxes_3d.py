@@ -2,6 +2,7 @@
 
 import csv
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -70,7 +71,7 @@ def curve(run: Path, stage: str, name: str) -> list[float]:
 def test_a_run_leaves_what_runs_py_promises(run, stage):
     assert {path.name for path in run.iterdir()} == {"config.yaml", stage}
     assert find_checkpoint(run) == (stage, run / stage / "final.ckpt")
-    terms = ("class", "position", "size") if stage == "atiss3d" else (
+    terms = ("class", "position", "angle", "size") if stage == "atiss3d" else (
         "existence", "position", "size", "kl", "left_out"
     )  # fmt: skip
     for name in (*terms, "loss"):
@@ -110,9 +111,7 @@ def test_a_loss_that_is_no_number_names_its_rooms(stage, toy_shards, tmp_path, m
     def poisoned(self, rooms, batch_idx):
         bad = rooms.boxes_m.clone()
         bad[0] = torch.nan
-        return original(
-            self, RoomBoxes(rooms.object_class, rooms.is_object, bad, rooms.room_ids), batch_idx
-        )
+        return original(self, replace(rooms, boxes_m=bad), batch_idx)
 
     monkeypatch.setattr(STAGES[stage], "training_step", poisoned)
     with pytest.raises(FloatingPointError, match=r"The loss is nan on rooms toy/train_\d\d, toy/"):
@@ -160,9 +159,9 @@ def test_an_atiss_learns_by_heart_which_furniture_goes_together(tmp_path):
     optimizer, schedule = built["optimizer"], built["lr_scheduler"]["scheduler"]
     for step in range(500):
         part = part_of_rooms(rooms, step)
-        placed = network.to_unit(part.boxes_m)
-        context = network.context(part.object_class, placed, part.is_object)
-        log_probs = network.log_prob(context, part.next_class, network.to_unit(part.next_box_m))
+        placed, coming = network.to_unit(part.placed), network.to_unit(part.coming)
+        context = network.context(part.placed.object_class, placed, part.placed.is_object)
+        log_probs = network.log_prob(context, part.coming.object_class[:, 0], coming[:, 0])
         optimizer.zero_grad()
         (-sum(log_prob.mean() for log_prob in log_probs.values())).backward()
         optimizer.step()
@@ -184,21 +183,25 @@ def test_rooms_are_in_every_order_and_cut_anywhere(toy_shards):
     counts = rooms.is_object.sum(dim=1)
     seen, orders = set(), set()
     for seed in range(80):
-        part = part_of_rooms(rooms, seed)
+        part, coming = part_of_rooms(rooms, seed)
         kept = part.is_object.sum(dim=1)
+        ended = kept == counts
+        assert torch.equal(coming.is_object[:, 0], ~ended)
+        assert (coming.object_class[ended] == END).all() and not part.object_class[
+            ~part.is_object
+        ].any()
         assert (kept <= counts).all()
         for row in range(len(counts)):
             there = part.is_object[row]
             whole = {tuple(b) for b in rooms.boxes_m[row, rooms.is_object[row]].tolist()}
             known = {tuple(b) for b in part.boxes_m[row, there].tolist()}
             assert len(known) == int(kept[row]) and known <= whole
-            if kept[row] == counts[row]:
-                assert int(part.next_class[row]) == END
-            else:
-                box = tuple(part.next_box_m[row].tolist())
+            if not ended[row]:
+                box = tuple(coming.boxes_m[row, 0].tolist())
                 assert box in whole - known
                 at = [tuple(b) for b in rooms.boxes_m[row].tolist()].index(box)
-                assert part.next_class[row] == rooms.object_class[row, at]
+                assert coming.object_class[row, 0] == rooms.object_class[row, at]
+                assert coming.yaw_rad[row, 0] == rooms.yaw_rad[row, at]
         seen.add(int(kept[0]))
         orders.add(tuple(part.object_class[0].tolist()))
     assert seen == set(range(int(counts[0]) + 1)) and len(orders) > 10
@@ -216,6 +219,10 @@ def test_a_trained_run_makes_rooms_of_boxes(run, stage):
         assert one.objects == other.objects
     assert [s.objects for s in scenes] != [s.objects for s in synthesize(trained, 9, 3)]
     assert all(item.mesh is None and min(item.size_m) > 0 for s in scenes for item in s.objects)
+    for scene in scenes:
+        yaws = scene.extra.get("yaw_rad")
+        assert (yaws is None) == (stage == "sync2gen")
+        assert yaws is None or len(yaws) == len(scene.objects)
 
 
 def test_what_needs_a_latent_space_says_that_there_is_none(run, stage):
