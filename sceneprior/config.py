@@ -193,6 +193,9 @@ class GanConfig(Section):
     places and sizes. Too small: all rooms end up as one; too large: objects are anywhere."""
     averaging: float = Field(0.97, ge=0, lt=1)
     """Share of the averaged generator that is kept at each step; 0 keeps the newest alone."""
+    noise: float = Field(0.1, ge=0)
+    """Spread of the noise on all maps at the start; it falls to 0 over the epochs. Without it,
+    classes can be lost for good."""
     clip_gradient: float = Field(1.0, ge=0)
     """Largest gradient norm of each of the two; 0 does not clip."""
     cpu_threads: int | None = Field(None, ge=1)

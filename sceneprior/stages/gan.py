@@ -89,6 +89,9 @@ class GanStage(lightning.LightningModule):
             loss = loss + self.config.gan.variety * sameness(scenes)
             loss = loss + self.config.gan.counts * (more @ self.excess).mean()
 
+        # Real maps come in steps that rendered ones lack.
+        noise = self.config.gan.noise * self._left()
+        real, fake = (maps + noise * torch.randn_like(maps) for maps in (real, fake))
         real_scores = self.discriminator(real)
         fake_scores = self.discriminator(fake.detach())
         told_apart = mistaken(real_scores, real=True) + mistaken(fake_scores, real=False)
@@ -112,10 +115,13 @@ class GanStage(lightning.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         """Rates fall evenly to 0, so that the opponents' circling ends, too."""
-        left = 1 - self.current_epoch / self.config.gan.epochs
         for optimizer in self.optimizers():  # type: ignore[union-attr]
             for group in optimizer.param_groups:
-                group["lr"] = group["initial_lr"] * left
+                group["lr"] = group["initial_lr"] * self._left()
+
+    def _left(self) -> float:
+        """Share of the training that is still to come."""
+        return 1 - self.current_epoch / self.config.gan.epochs
 
     def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:
         shape = (rooms, self.config.model.logits_per_room)
