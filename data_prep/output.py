@@ -29,6 +29,8 @@ def claimed(out: Path) -> Iterator[None]:
                 until_done.enter_context(only_writer(out))
                 remove_parts(out)
             yield
+            with writing(out):
+                remove_parts(out)  # of workers that died on the way
     finally:
         with contextlib.suppress(OSError):
             for folder in made:

@@ -120,3 +120,12 @@ def test_leftovers_of_killed_runs_are_cleared_away(tmp_path):
         (out / name).write_bytes(b"half")
     build_shards(Job(ToySource(), out))
     assert digests(out) == expected
+
+
+def test_what_a_worker_left_that_died_on_the_way_is_cleared_away_at_the_end(tmp_path):
+    out = tmp_path / "shards"
+    with claimed(out):
+        (out / "whole").touch()
+        (out / "train").mkdir()
+        (out / "train" / "toys_0001.report.json.21dc.part").write_bytes(b"half")
+    assert [path.name for path in out.rglob("*") if path.is_file()] == ["whole"]
