@@ -48,8 +48,8 @@ def compare(
         typer.echo(f"Wrote {done.table}")
     if done.left_out:
         typer.echo(
-            f"Not in the table, since they were judged otherwise (rooms, seed, renderer or "
-            f"weights): {'; '.join(done.left_out)}. Without --methods they are judged again.",
+            "Not in the table, since judged otherwise (rooms, seed, renderer or weights): "
+            f"{'; '.join(done.left_out)}. Ask for them as well, and they are judged again.",
             err=True,
         )
     if done.failures:

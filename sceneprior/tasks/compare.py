@@ -61,7 +61,7 @@ def compare(
     Raises:
         InputError: shards are missing, another `compare` is writing to `out`, or the renderer or
             the weights cannot be used.
-        KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; the same call goes on.
+        KeyboardInterrupt: stopped by Ctrl-C, SIGTERM or SIGHUP; the same call goes on.
     """
     if inception is not None:
         check_inception(inception)
@@ -71,7 +71,7 @@ def compare(
     # Threads of several jobs on one core wait for each other, spinning: each job has its share.
     commands = Commands(max(1, (os.cpu_count() or 1) // jobs) if jobs > 1 else None)
     failures: list[str | None] = []
-    with _alone_in(out), _sigterm_as_ctrl_c(), ThreadPoolExecutor(max_workers=jobs) as pool:
+    with _alone_in(out), _ended_as_by_ctrl_c(), ThreadPoolExecutor(max_workers=jobs) as pool:
 
         def work(run: Run) -> str | None:
             return commands.train_and_judge(run, manner, counts[run.rooms])
@@ -122,15 +122,20 @@ def _alone_in(out: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _sigterm_as_ctrl_c() -> Iterator[None]:
+def _ended_as_by_ctrl_c() -> Iterator[None]:
+    """Whatever asks this process to end: the commands, which it does not reach, must save."""
     if threading.current_thread() is not threading.main_thread():
         yield  # where no signal can be answered
         return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before = {name: signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGHUP)}
+    for name, handler in before.items():
+        if handler is not signal.SIG_IGN:  # as nohup asks for
+            signal.signal(name, signal.default_int_handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for name, handler in before.items():
+            signal.signal(name, handler)
 
 
 def _rows(comparison: Comparison, done: Sequence[Run]) -> list[Row]:

@@ -148,7 +148,7 @@ class Commands:
                     return None
                 process = subprocess.Popen(
                     [sys.executable, "-m", "sceneprior", *arguments],
-                    stdout=file, stderr=file, env={**os.environ, **share},
+                    stdin=subprocess.DEVNULL, stdout=file, stderr=file, env={**os.environ, **share},
                     process_group=0,  # `stop` tells it of a Ctrl-C, and once
                 )  # fmt: skip
                 self._running.add(process)

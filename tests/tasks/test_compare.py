@@ -251,7 +251,7 @@ def test_a_command_that_failed_is_told_by_its_own_sentence(tmp_path):
     assert comparison_steps._reason(log, 1) == f"it said nothing in {log}"
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_signal_to_compare_alone_stops_its_commands_which_save_what_they_have(
     written, tmp_path, name
 ):
