@@ -12,7 +12,7 @@ SLOPE = 0.2
 """Of the leaky ReLUs."""
 
 GAIN = 10
-"""Of all scores: at 1, one object more or less would move the odds by e at most."""
+"""Of all scores: spectral norm makes them timid."""
 
 
 class MapDiscriminator(nn.Module):

@@ -4,7 +4,6 @@ Each run is two commands of `sceneprior`, `fit` and `eval-fid`, in processes of 
 doubts a figure types them again. What a run cost is noted beside it; finished runs are kept.
 """
 
-import json
 import os
 import signal
 import threading
@@ -23,7 +22,14 @@ from sceneprior.offscreen import open_renderer
 from sceneprior.shards import iterate_rooms
 from sceneprior.tasks.comparison import Comparison, Run, runs_of
 from sceneprior.tasks.comparison_figure import write_figure
-from sceneprior.tasks.comparison_steps import Commands, Manner, costs_of, is_judged, is_trained
+from sceneprior.tasks.comparison_steps import (
+    Commands,
+    Manner,
+    costs_of,
+    is_judged,
+    is_trained,
+    read_result,
+)
 
 
 @dataclass(frozen=True)
@@ -148,7 +154,7 @@ def _rows(comparison: Comparison, done: Sequence[Run]) -> list[Row]:
                 group=method.group,
                 title=method.title,
                 seed=run.seed,
-                scores=json.loads((run.folder / "scores.json").read_text()),
+                scores=read_result(run.folder / "scores.json"),
                 costs=vars(costs_of(run)),
             )
         )

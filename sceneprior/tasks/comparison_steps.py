@@ -1,7 +1,6 @@
 """One run of a comparison in; trained and judged by two commands, with what they took, out."""
 
 import contextlib
-import json
 import os
 import shlex
 import signal
@@ -18,7 +17,7 @@ from rich.console import Console
 
 from sceneprior.config import load_config
 from sceneprior.errors import InputError
-from sceneprior.files import write_json
+from sceneprior.files import read_json, write_json
 from sceneprior.stages.runs import STAGES_OF, load_any_run, read_checkpoint
 from sceneprior.tasks.comparison import Run
 
@@ -185,13 +184,13 @@ class Commands:
             noted.pop("scores", None)  # which were of what lay here before
         entry: dict[str, Any] = {"arguments": arguments, "asked": asked, "finished": False}
         # Without costs, until it ends: those of a run that is killed are unknown.
-        _note(run.folder, {**noted, name: entry})
+        write_json(run.folder / JOURNAL, {**noted, name: entry})
         log = run.folder / f"{name}.log"
         ended = self.call(arguments, log)
         status, cpu_s, wall_s = (None, 0.0, 0.0) if ended is None else ended
         sums = [None if a is None else a + b for a, b in zip(took, (cpu_s, wall_s), strict=True)]
         entry |= {"cpu_s": sums[0], "wall_s": sums[1], "finished": status == 0}
-        _note(run.folder, {**noted, name: entry})
+        write_json(run.folder / JOURNAL, {**noted, name: entry})
         return _reason(log, status) if status and not self.stopped else None
 
 
@@ -205,12 +204,21 @@ def _costs_so_far(noted: dict[str, Any], run: Run) -> tuple[float | None, float 
 
 def _journal(folder: Path) -> dict[str, Any]:
     path = folder / JOURNAL
-    found: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
-    return found
+    return read_result(path) if path.is_file() else {}
 
 
-def _note(folder: Path, noted: dict[str, Any]) -> None:
-    write_json(folder / JOURNAL, noted)
+def read_result(path: Path) -> dict[str, Any]:
+    """A JSON file of a run.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    try:
+        return dict(read_json(path))
+    except (InputError, TypeError, ValueError):
+        raise InputError(
+            f"{path} is damaged; delete it and run the same command again: training is kept."
+        ) from None
 
 
 def _reason(log: Path, status: int) -> str:

@@ -217,6 +217,14 @@ def test_what_was_deleted_is_made_again(begun, toy_shards, calls):
     assert json.loads((folder / "steps.json").read_text())["fit"]["cpu_s"] == 2.5
 
 
+@pytest.mark.parametrize("name", ["steps.json", "scores.json"])
+def test_a_truncated_file_is_a_sentence(begun, toy_shards, calls, name):
+    path = begun / "out" / "toy" / "ours" / "seed0" / name
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(InputError, match=f"seed0/{name} is damaged; delete it and run"):
+        again(begun, toy_shards)
+
+
 def test_costs_of_a_run_add_up_and_are_unknown_after_a_kill(begun, toy_shards, calls):
     folder = begun / "out" / "toy" / "ours" / "seed0"
     (folder / "run" / "shape" / "final.ckpt").unlink()
