@@ -1,6 +1,10 @@
 """What every test may use: toy rooms on disk, and a number generator."""
 
+import contextlib
 import os
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numba
@@ -24,6 +28,33 @@ def toy_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("toy") / "shards"
     write_toy_shards(folder)
     return folder
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., subprocess.Popen]]:
+    """Starts a command in a session of its own, ended with all its children after the test.
+
+    It answers Ctrl-C even where this suite runs in the background, ignoring SIGINT, which children
+    inherit; `background=True` starts it as a shell does there.
+    """
+    begun = []
+
+    def start(command, background: bool = False, **options) -> subprocess.Popen:
+        answer = signal.SIG_IGN if background else signal.SIG_DFL
+        process = subprocess.Popen(
+            command,
+            start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, answer),
+            **options,
+        )
+        begun.append(process)
+        return process
+
+    yield start
+    for process in begun:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 @pytest.fixture

@@ -133,10 +133,15 @@ def _ended_as_by_ctrl_c() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield  # where no signal can be answered
         return
-    before = {name: signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGHUP)}
+    names = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {name: signal.getsignal(name) for name in names}
     for name, handler in before.items():
         if handler is not signal.SIG_IGN:  # as nohup asks for
             signal.signal(name, signal.default_int_handler)
+        elif name == signal.SIGINT:
+            # In the background. Commands inherit what is ignored, but not an answer, and have to
+            # hear the SIGINT by which `Commands.stop` ends them.
+            signal.signal(name, lambda number, frame: None)
     try:
         yield
     finally:

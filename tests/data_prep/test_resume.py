@@ -206,7 +206,7 @@ def test_a_damaged_folder_is_not_taken_for_finished(front, tmp_path):
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill"])
-def test_the_command_is_stopped_and_gone_on_with(front, tmp_path, how):
+def test_the_command_is_stopped_and_gone_on_with(front, tmp_path, start, how):
     """As a user meets it; after Ctrl-C with exit code 130 and nothing but whole shards."""
     front.house("house", *(bedroom(f"Bedroom-{k}") for k in range(40)))
     script = tmp_path / "run.py"
@@ -221,7 +221,7 @@ def test_the_command_is_stopped_and_gone_on_with(front, tmp_path, how):
         "--future", str(front.future), "--workers", "2", "--renderer", "software",
         "--views-per-m2", "3",
     ]  # fmt: skip
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, text=True)
+    process = start(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
     while not list(out.glob("**/*.h5")) and time.monotonic() < deadline:
         time.sleep(0.02)

@@ -1,7 +1,6 @@
 """Training on toy rooms: what a run leaves behind, how it stops and goes on, what it may read."""
 
 import csv
-import os
 import shutil
 import signal
 import subprocess
@@ -173,25 +172,22 @@ def test_training_never_opens_the_ground_truth(toy_shards, tmp_path):
     assert not torch.equal(start[1].weight, results[0][1]["latents.weight"])  # it did train
 
 
-def test_ctrl_c_at_the_command_saves_and_resume_finishes(toy_shards, tmp_path):
+def test_ctrl_c_at_the_command_saves_and_resume_finishes(toy_shards, tmp_path, start):
     config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards, layout__epochs=100000)
     run = tmp_path / "run"
     command = [
         sys.executable, "-m", "sceneprior", "fit", "--config", str(config), "--run", str(run),
         "--accelerator", "cpu",
     ]  # fmt: skip
-    process = subprocess.Popen(
+    process = start(
         command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=tmp_path
     )
-    try:
-        deadline = time.monotonic() + 120
-        while not (run / "layout" / "last.ckpt").is_file():
-            assert process.poll() is None and time.monotonic() < deadline
-            time.sleep(0.2)
-        os.kill(process.pid, signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()
+    deadline = time.monotonic() + 120
+    while not (run / "layout" / "last.ckpt").is_file():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     go_on = f"sceneprior fit --config {run / 'config.yaml'} --run {run} --resume"
     assert f"Stopped and saved. Go on with: {go_on}" in errors

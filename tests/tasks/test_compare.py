@@ -3,7 +3,6 @@
 import json
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from functools import partial
@@ -259,17 +258,20 @@ def test_a_command_that_failed_is_told_by_its_own_sentence(tmp_path):
     assert comparison_steps._reason(log, 1) == f"it said nothing in {log}"
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize(
+    ("name", "background"),
+    [("SIGINT", False), ("SIGTERM", False), ("SIGHUP", False), ("SIGTERM", True)],
+)
 def test_a_signal_to_compare_alone_stops_its_commands_which_save_what_they_have(
-    written, tmp_path, name
+    written, tmp_path, start, name, background
 ):
     path = written(rooms={"toy": {"title": "Toys", "config": str(tmp_path / "tiny.yaml")}})
     text = (tmp_path / "tiny.yaml").read_text().replace("epochs: 1\n", "epochs: 100000\n")
     (tmp_path / "tiny.yaml").write_text(text)
     words = ["--config", path, "--methods", "ours", "--out", str(tmp_path / "out")]
-    process = subprocess.Popen(
+    process = start(
         [sys.executable, "-m", "sceneprior", "compare", *words, "--renderer", SOFTWARE],
-        stderr=subprocess.PIPE, text=True, start_new_session=True,
+        background, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     folder = tmp_path / "out/toy/ours/seed0"
     deadline = time.monotonic() + 120
