@@ -16,9 +16,9 @@ from rich.console import Console
 from rich.table import Table
 
 from sceneprior.evaluation.protocol import evaluate_synthesis
+from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import open_renderer
-from sceneprior.stages.runs import load_run
-from sceneprior.tasks.decode import synthesize
+from sceneprior.training.checkpoints import load_run
 
 T = TypeVar("T")
 

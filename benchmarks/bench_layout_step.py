@@ -23,13 +23,13 @@ import torch
 from bench_boxes import SIZE, make_batch
 from torch import Tensor
 
-from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.config import RunConfig, load_config
 from sceneprior.geometry.boxes import place
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.geometry.meshes import icosphere
-from sceneprior.models.scene_prior import ScenePrior
-from sceneprior.stages.view_loss import build_prior, match_and_score, proxy_boxes, weighted_sum
+from sceneprior.models.prior import ScenePrior
+from sceneprior.training.objective import build_prior, match_and_score, proxy_boxes, weighted_sum
+from sceneprior.views import DecodedScenes, SceneViews
 
 CLASSES = 23
 CONFIG = Path(__file__).parents[1] / "configs" / "bedroom.yaml"

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import torch
 
-from sceneprior.stages.runs import TrainedPrior, load_run
-from sceneprior.tasks.fitting import SCHEDULES, FitSchedule, fit_latents
-from sceneprior.tasks.observed import ObservedImage, as_views, images_of_split
-from sceneprior.tasks.reconstruct import MASK_COLUMNS
+from sceneprior.reconstruction.fit import SCHEDULES, FitSchedule, fit_latents
+from sceneprior.reconstruction.observed import ObservedImage, as_views, images_of_split
+from sceneprior.reconstruction.reconstruct import MASK_COLUMNS
+from sceneprior.training.checkpoints import TrainedPrior, load_run
 
 FULL = SCHEDULES["paper"].steps
 

@@ -20,11 +20,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sceneprior.furniture import CATEGORY_TABLE
+from sceneprior.generation.cad_bank import POINTS, CadBank, Shelf, unit_mesh
+from sceneprior.generation.retrieve import extruded, most_similar, retrieve_all
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.geometry.surfaces import surface_points
 from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.tasks.cad_bank import POINTS, CadBank, Shelf, unit_mesh
-from sceneprior.tasks.retrieve import extruded, most_similar, retrieve_all
 
 OBJECTS = 6
 LABEL_SET = "front3d_bedroom"

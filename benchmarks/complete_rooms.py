@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sceneprior.evaluation.layout_metrics import (
+from sceneprior.evaluation.metrics.layout_metrics import (
     category_kl,
     match_scenes,
     object_counts,
@@ -36,10 +36,10 @@ from sceneprior.evaluation.layout_metrics import (
     type_share,
 )
 from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.generation.complete import STEPS, complete
+from sceneprior.generation.insert import put_into
 from sceneprior.scene import Scene
-from sceneprior.stages.runs import load_run
-from sceneprior.tasks.complete import STEPS, complete
-from sceneprior.tasks.put_into import put_into
+from sceneprior.training.checkpoints import load_run
 
 
 def main() -> None:

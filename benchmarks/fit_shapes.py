@@ -20,15 +20,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sceneprior.batches import SceneViews
 from sceneprior.data.dataset import ViewDataset
-from sceneprior.evaluation.layout_metrics import box_iou_3d
+from sceneprior.evaluation.metrics.layout_metrics import box_iou_3d
 from sceneprior.geometry.boxes import place
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.losses.matching import Matches
 from sceneprior.losses.shape import mask_loss
 from sceneprior.shards import iterate_rooms
 from sceneprior.silhouettes import render_scene, render_silhouettes
+from sceneprior.views import SceneViews
 
 VARIANTS = ("exact/layered", "exact/paper", "fast/layered", "fast/paper")
 BATCH = 8

@@ -18,18 +18,18 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from sceneprior.batches import SceneViews
 from sceneprior.classes import label_set
 from sceneprior.config import RunConfig, load_config
 from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.data.flat_views import FlatViews
-from sceneprior.evaluation.layout_metrics import reconstruction_scores
+from sceneprior.evaluation.metrics.layout_metrics import reconstruction_scores
 from sceneprior.evaluation.reference import reference_scenes
-from sceneprior.stages.layout import LayoutStage
-from sceneprior.stages.runs import TrainedPrior
-from sceneprior.stages.view_loss import build_latents, build_prior
-from sceneprior.tasks.decode import decode_training_rooms
+from sceneprior.generation.decode import decode_training_rooms
+from sceneprior.training.checkpoints import TrainedPrior
+from sceneprior.training.layout import LayoutStage
+from sceneprior.training.objective import build_latents, build_prior
+from sceneprior.views import SceneViews
 
 BASE = Path(__file__).parents[1] / "configs" / "demo.yaml"
 SETTINGS = (

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
+from sceneprior.evaluation.metrics.set_metrics import frechet_distance
 from sceneprior.evaluation.protocol import without_void
 from sceneprior.evaluation.reference import reference_scenes
-from sceneprior.evaluation.set_metrics import frechet_distance
 from sceneprior.evaluation.stated_protocol import drawing_of
+from sceneprior.experiments.evaluate import decoded_and_true
+from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene
-from sceneprior.stages.runs import load_run
-from sceneprior.tasks.decode import synthesize
-from sceneprior.tasks.judge import decoded_and_true
+from sceneprior.training.checkpoints import load_run
 
 LAWS = ("kernel", "geodesic", "paper")
 

@@ -20,14 +20,14 @@ import torch
 from sceneprior.config import load_config
 from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
-from sceneprior.evaluation.layout_metrics import reconstruction_scores
+from sceneprior.evaluation.metrics.layout_metrics import reconstruction_scores
+from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.geometry.cameras import boxes_of_points
 from sceneprior.losses.matching import match_objects
 from sceneprior.losses.shape import observed_ids
 from sceneprior.silhouettes import render_scene
-from sceneprior.stages.runs import TrainedPrior, load_run
-from sceneprior.stages.train import fit
-from sceneprior.tasks.judge import decoded_and_true
+from sceneprior.training.checkpoints import TrainedPrior, load_run
+from sceneprior.training.fit import fit
 
 VARIANTS = ("exact/layered", "exact/paper", "fast/layered", "fast/paper")
 

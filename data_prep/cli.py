@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from data_prep.homes.command import make_homes_command
-from data_prep.inspect_command import inspect_command
+from data_prep.inspection.command import inspect_command
 
 if TYPE_CHECKING:
-    from data_prep.build import Job
+    from data_prep.engine.build import Job
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -71,7 +71,7 @@ def prep_front(
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
-    from data_prep.build import Job
+    from data_prep.engine.build import Job
     from data_prep.front.source import FrontSource
     from data_prep.recipe import load_recipe
 
@@ -121,7 +121,7 @@ def prep_scannet(
 
     Exit status: 0, or 3 if scans failed (the others are prepared; report.csv says why).
     """
-    from data_prep.build import Job
+    from data_prep.engine.build import Job
     from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings
     from data_prep.scannet.source import ScanNetSource
 
@@ -166,7 +166,7 @@ def prep_posed(
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
-    from data_prep.build import Job
+    from data_prep.engine.build import Job
     from data_prep.posed.labels import read_label_set
     from data_prep.posed.source import PosedSource
     from data_prep.posed.views import PosedSettings
@@ -190,9 +190,9 @@ def run_job(job: "Job") -> None:
     """
     from rich.console import Console
 
-    from data_prep.build import build_shards
-    from data_prep.report_tables import report_tables
-    from data_prep.shard_job import RoomFailedError
+    from data_prep.engine.build import build_shards
+    from data_prep.engine.report_tables import report_tables
+    from data_prep.engine.shard_job import RoomFailedError
 
     try:
         summary = build_shards(job)

@@ -70,7 +70,7 @@ def torch_rng() -> torch.Generator:
 @pytest.fixture(scope="session")
 def toy_run(toy_shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Both stages trained on the toy rooms for a few epochs. Tests read it and change nothing."""
-    from sceneprior.stages.train import fit
+    from sceneprior.training.fit import fit
 
     run = tmp_path_factory.mktemp("toy") / "run"
     fit(tiny_config(toy_shards, layout__epochs=20), run, trainer_options={"accelerator": "cpu"})

@@ -14,10 +14,10 @@ from pathlib import Path
 import torch
 
 from sceneprior.config import load_config
-from sceneprior.stages import train
-from sceneprior.stages.callbacks import StepSeed
-from sceneprior.stages.cluster import first_process
-from sceneprior.tasks.watch import SampleJudge
+from sceneprior.experiments.evaluate_samples import SampleJudge
+from sceneprior.training import fit as train
+from sceneprior.training.callbacks import StepSeed
+from sceneprior.training.slurm import first_process
 
 
 class Recorder(StepSeed):

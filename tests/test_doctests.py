@@ -16,4 +16,4 @@ def test_docstring_examples():
     results = {name: doctest.testmod(importlib.import_module(name)) for name in names}
     assert not [name for name, result in results.items() if result.failed]
     having = {name for name, result in results.items() if result.attempted}
-    assert {"sceneprior.silhouettes.render", "sceneprior.silhouettes.zbuffer"} <= having
+    assert {"sceneprior.silhouettes.render", "sceneprior.offscreen.zbuffer"} <= having

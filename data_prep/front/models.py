@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from data_prep.cache import ByteCache
+from data_prep.engine.cache import ByteCache
 from sceneprior.files import file_stamp, is_name
 from sceneprior.furniture import MODEL_FILE, model_categories, read_obj
 from sceneprior.scene import Mesh

@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 
 from data_prep.front.files import shown
+from data_prep.front.furnished import Furniture, Room
 from data_prep.front.geometry import (
     Surface,
     floor_of,
@@ -21,7 +22,6 @@ from data_prep.front.geometry import (
 from data_prep.front.houses import House, is_valid, key_of, parse_house
 from data_prep.front.models import ModelBank, unit_of
 from data_prep.recipe import Recipe
-from data_prep.rooms import Furniture, Room
 from sceneprior.errors import InputError
 from sceneprior.files import is_name
 from sceneprior.furniture import MODEL_FILE

@@ -5,26 +5,26 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from data_prep.drawing import prepare_room
-from data_prep.filters import broken_rule
-from data_prep.front.files import house_files
-from data_prep.front.houses import House, parse_house
-from data_prep.front.models import ModelBank
-from data_prep.front.rooms import HouseRooms, read_house
-from data_prep.plan import digest, digest_of_files
-from data_prep.recipe import Expected, Recipe
-from data_prep.rgb import rgb_files
-from data_prep.rooms import Room
-from data_prep.selection import (
+from data_prep.engine.plan import digest, digest_of_files
+from data_prep.engine.selection import (
     check_survey,
     house_may_match,
     is_asked_for,
     read_splits,
     seeded_split,
 )
-from data_prep.source import SPLITS, LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
-from data_prep.viewpoints import view_counts
-from data_prep.workers import Run
+from data_prep.engine.source import SPLITS, LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
+from data_prep.engine.workers import Run
+from data_prep.front.drawing import prepare_room
+from data_prep.front.files import house_files
+from data_prep.front.filters import broken_rule
+from data_prep.front.furnished import Room
+from data_prep.front.houses import House, parse_house
+from data_prep.front.models import ModelBank
+from data_prep.front.rgb import rgb_files
+from data_prep.front.rooms import HouseRooms, read_house
+from data_prep.front.viewpoints import view_counts
+from data_prep.recipe import Expected, Recipe
 from sceneprior.errors import InputError
 from sceneprior.files import file_stamp
 from sceneprior.furniture import model_info_path
@@ -35,7 +35,7 @@ _HOUSES_PER_TASK = 8
 
 @dataclass(frozen=True)
 class FrontSource:
-    """What `prep-front` reads: a `Source` (data_prep/source.py)."""
+    """What `prep-front` reads: a `Source` (data_prep/engine/source.py)."""
 
     front: Path
     """Folder of house JSONs."""

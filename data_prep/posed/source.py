@@ -7,7 +7,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from data_prep.plan import digest_of_files
+from data_prep.engine.plan import digest_of_files
+from data_prep.engine.selection import check_survey, house_may_match, is_asked_for
+from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
+from data_prep.engine.workers import Run
 from data_prep.posed.labels import TABLES
 from data_prep.posed.transforms import FILE_NAME, INSTANCES, read_transforms, room_name
 from data_prep.posed.views import (
@@ -18,9 +21,6 @@ from data_prep.posed.views import (
     usable_frames,
 )
 from data_prep.recipe import Expected
-from data_prep.selection import check_survey, house_may_match, is_asked_for
-from data_prep.source import LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
-from data_prep.workers import Run
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.offscreen import Renderer
@@ -28,7 +28,7 @@ from sceneprior.offscreen import Renderer
 
 @dataclass(frozen=True)
 class PosedSource:
-    """What `prep-posed` reads: a `Source` (data_prep/source.py)."""
+    """What `prep-posed` reads: a `Source` (data_prep/engine/source.py)."""
 
     folder: Path
     """One room, or a folder of rooms."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_prep.engine.source import PreparedRoom
 from data_prep.frames import (
     choose_frames,
     is_pose,
@@ -14,7 +15,6 @@ from data_prep.frames import (
 )
 from data_prep.posed.labels import read_classes
 from data_prep.posed.transforms import PosedFrame, Recording, lens_matrix, room_name
-from data_prep.source import PreparedRoom
 from sceneprior.errors import InputError
 from sceneprior.instances.observations import observe
 from sceneprior.instances.pngs import mask_size, read_mask

@@ -5,15 +5,15 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from data_prep.plan import digest
+from data_prep.engine.plan import digest
+from data_prep.engine.selection import check_survey, house_may_match, is_asked_for, seeded_split
+from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Survey
+from data_prep.engine.workers import Run
 from data_prep.recipe import Expected
 from data_prep.scannet.labels import LABEL_SET, Labels, read_labels
 from data_prep.scannet.scans import ScanSettings, read_scan
 from data_prep.scannet.splits import find_scans, space_of, split_scans
 from data_prep.scannet.views import prepare_scan
-from data_prep.selection import check_survey, house_may_match, is_asked_for, seeded_split
-from data_prep.source import LeftOut, PreparedRoom, RoomTask, Survey
-from data_prep.workers import Run
 from sceneprior.errors import InputError
 from sceneprior.offscreen import Renderer
 
@@ -25,7 +25,7 @@ _OFFICIAL = Expected(
 
 @dataclass(frozen=True)
 class ScanNetSource:
-    """What `prep-scannet` reads: a `Source` (data_prep/source.py)."""
+    """What `prep-scannet` reads: a `Source` (data_prep/engine/source.py)."""
 
     scans: Path
     """Folder of scan folders."""

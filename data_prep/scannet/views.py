@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_prep.engine.source import PreparedRoom
 from data_prep.frames import sampled_lines
 from data_prep.scannet.labels import LABEL_SET
 from data_prep.scannet.masks import MaskArchive
 from data_prep.scannet.scans import Scan
-from data_prep.source import PreparedRoom
 from sceneprior.classes import label_set
 from sceneprior.instances.observations import observe
 from sceneprior.shards import RoomGroundTruth, RoomViews

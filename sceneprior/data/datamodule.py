@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from torch.utils.data import DataLoader, Sampler
 
+from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.data.dataset import BLANK, ViewDataset
-from sceneprior.data.truth import TruthDataset
 
 
 class DrawSampler(Sampler[list[tuple[int, int]]]):

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from sceneprior.batches import SceneViews
 from sceneprior.data.flat_views import FlatViews
 from sceneprior.data.masks import MaskStore
 from sceneprior.errors import ShardError
 from sceneprior.shards import RoomViews, Shard, list_shards
+from sceneprior.views import SceneViews
 
 BLANK = -1
 """An epoch no one draws in: the room comes without objects, and teaches nothing."""

@@ -12,8 +12,9 @@ from sceneprior.classes import VOID, label_set
 from sceneprior.evaluation.alexnet import classify_pictures
 from sceneprior.evaluation.bootstrap import Figure, ratio, resample_counts
 from sceneprior.evaluation.classifier import found_out
-from sceneprior.evaluation.free_space import outside_count, walkable_share
-from sceneprior.evaluation.layout_metrics import (
+from sceneprior.evaluation.features import SceneFeatures
+from sceneprior.evaluation.metrics.free_space import outside_count, walkable_share
+from sceneprior.evaluation.metrics.layout_metrics import (
     category_kl,
     common_label_set,
     frequency_kl,
@@ -21,9 +22,8 @@ from sceneprior.evaluation.layout_metrics import (
     object_counts,
     room_overlaps,
 )
-from sceneprior.evaluation.novelty import NEAR_COPY_M
-from sceneprior.evaluation.scene_features import SceneFeatures
-from sceneprior.evaluation.set_metrics import (
+from sceneprior.evaluation.metrics.novelty import NEAR_COPY_M
+from sceneprior.evaluation.metrics.set_metrics import (
     frechet_distance,
     gap_closed,
     kernel_distance,

@@ -15,8 +15,8 @@ from rich.progress import Progress
 from sceneprior.classes import VOID
 from sceneprior.errors import InputError
 from sceneprior.evaluation.alexnet import check_alexnet
-from sceneprior.evaluation.as_boxes import box_figures
 from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES
+from sceneprior.evaluation.features import SceneFeatures
 from sceneprior.evaluation.figures import (
     Figure,
     Rooms,
@@ -26,13 +26,13 @@ from sceneprior.evaluation.figures import (
     gap_figures,
     rooms_of,
 )
-from sceneprior.evaluation.image_metrics import check_inception
 from sceneprior.evaluation.independent import independent_rooms
-from sceneprior.evaluation.layout_metrics import common_label_set
-from sceneprior.evaluation.novelty import nearest_distances
+from sceneprior.evaluation.metrics.as_boxes import box_figures
+from sceneprior.evaluation.metrics.image_metrics import check_inception
+from sceneprior.evaluation.metrics.layout_metrics import common_label_set
+from sceneprior.evaluation.metrics.novelty import nearest_distances
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.reference_file import draw_reference
-from sceneprior.evaluation.scene_features import SceneFeatures
 from sceneprior.evaluation.stated_protocol import definitions, drawing_of, package_versions
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Scene

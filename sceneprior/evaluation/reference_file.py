@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from sceneprior.errors import InputError
+from sceneprior.evaluation.features import SceneFeatures, scene_features
 from sceneprior.evaluation.reference import split_fingerprint, stream_scenes
-from sceneprior.evaluation.scene_features import SceneFeatures, scene_features
 from sceneprior.evaluation.topdown import TopDownProtocol
 from sceneprior.files import write_whole
 from sceneprior.offscreen import Renderer

@@ -11,7 +11,7 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from sceneprior import __version__
-from sceneprior.evaluation.layout_metrics import match_scenes
+from sceneprior.evaluation.metrics.layout_metrics import match_scenes
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.report_pictures import (
     RoomPictures,

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from sceneprior.classes import class_colors, label_set
-from sceneprior.evaluation import free_space, novelty, set_metrics
 from sceneprior.evaluation.alexnet import ALEXNET
 from sceneprior.evaluation.classifier import SCA_LINEAR
-from sceneprior.evaluation.image_metrics import EFFNET_LITE0, INCEPTION
-from sceneprior.evaluation.layout_metrics import KL_EPSILON, OVERLAP_SHARE, TYPE_CLASSES
+from sceneprior.evaluation.metrics import free_space, novelty, set_metrics
+from sceneprior.evaluation.metrics.image_metrics import EFFNET_LITE0, INCEPTION
+from sceneprior.evaluation.metrics.layout_metrics import KL_EPSILON, OVERLAP_SHARE, TYPE_CLASSES
 from sceneprior.evaluation.reference_file import Drawing
 from sceneprior.evaluation.topdown import topdown_protocol
 from sceneprior.offscreen import Renderer

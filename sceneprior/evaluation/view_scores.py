@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.layout_metrics import box_iou_3d
-from sceneprior.evaluation.mesh_metrics import (
+from sceneprior.evaluation.metrics.layout_metrics import box_iou_3d
+from sceneprior.evaluation.metrics.mesh_metrics import (
     F_THRESHOLD_M,
     POINTS,
     chamfer,

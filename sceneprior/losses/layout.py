@@ -5,12 +5,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.geometry.cameras import Boxes2D, camera_centers, pixel_rays
 from sceneprior.losses.completeness import completeness_targets
 from sceneprior.losses.matching import Matches, side_distance
 from sceneprior.losses.means import mean_of_objects
 from sceneprior.losses.processes import share_of_batch
+from sceneprior.views import DecodedScenes, SceneViews
 
 
 def take(values: Tensor, index: Int[Tensor, "rooms objects"], dim: int) -> Tensor:

@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.geometry.cameras import Boxes2D
+from sceneprior.views import DecodedScenes, SceneViews
 
 
 class Matches(NamedTuple):

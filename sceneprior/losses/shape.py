@@ -4,9 +4,9 @@ from jaxtyping import Float, Integer
 from torch import Tensor
 from torch.nn import functional as F
 
-from sceneprior.batches import SceneViews
 from sceneprior.losses.matching import Matches
 from sceneprior.losses.means import mean_of_objects
+from sceneprior.views import SceneViews
 
 CERTAIN = 1e-6
 """Pixels of a mask this near to 0 or 1 carry no gradient."""

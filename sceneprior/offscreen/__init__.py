@@ -1,7 +1,7 @@
 """Pictures without a screen: meshes and cameras in, instance ids or shaded colours out.
 
 The one front door to pyrender. Where the machine has no GL library, a z-buffer of our own
-(silhouettes/zbuffer.py) draws the same ids.
+(offscreen/zbuffer.py) draws the same ids.
 """
 
 import functools

@@ -142,7 +142,7 @@ class _PyrenderRenderer(Renderer):
         return images
 
     def _add_camera(self, scene: Any, camera: Camera, image_size: tuple[int, int]) -> Any:
-        from sceneprior.silhouettes.zbuffer import NEAR_M
+        from sceneprior.offscreen.zbuffer import NEAR_M
 
         if isinstance(camera, Pinhole):
             K = np.asarray(camera.intrinsics, dtype=np.float64)

@@ -73,7 +73,7 @@ class Renderer(abc.ABC):
         Behind the meshes is a colour, or another picture of this size. Our z-buffer draws it for
         both kinds, so that pictures look the same everywhere.
         """
-        from sceneprior.silhouettes.zbuffer import rasterize
+        from sceneprior.offscreen.zbuffer import rasterize
 
         height, width = image_size
         soup = join(meshes)

@@ -1,4 +1,4 @@
-"""The renderer of machines without GL: our z-buffer (silhouettes/zbuffer.py)."""
+"""The renderer of machines without GL: our z-buffer (offscreen/zbuffer.py)."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ class SoftwareRenderer(Renderer):
     def instance_ids_of_views(
         self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
     ) -> np.ndarray:
-        from sceneprior.silhouettes.zbuffer import draw_labels
+        from sceneprior.offscreen.zbuffer import draw_labels
 
         soup = join(meshes)
         id_of_face = (soup.mesh_of_face + 1).astype(np.int32)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from sceneprior.silhouettes.topology import topology_of
+from sceneprior.silhouettes.cpu.topology import topology_of
 
 MIN_AREA_PX2 = 1e-12
 """Doubled area under which a projected face is not drawn: it has no inside."""
@@ -219,7 +219,7 @@ def composite(
     order_m: Float[Tensor, "images objects height width"],
     compositing: str,
 ) -> Float[Tensor, "images objects height width"]:
-    """Visible soft masks from coverages and depths: see `sceneprior.silhouettes.compositing`."""
+    """Visible soft masks from coverages and depths: see `cpu.compositing`."""
     if compositing == "alone" or coverage.shape[1] == 0:
         return coverage
     sequence = order_m.argsort(dim=1, stable=True)

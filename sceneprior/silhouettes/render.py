@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.geometry.cameras import project
-from sceneprior.silhouettes.projection import project_in_threads
+from sceneprior.silhouettes.cpu.projection import project_in_threads
 from sceneprior.silhouettes.reference import Settings
 
 NEAR_M = 0.05

@@ -7,7 +7,7 @@ from typing import Any
 
 from front_files import FrontFolder, bedroom
 
-from data_prep.build import Job
+from data_prep.engine.build import Job
 from data_prep.front.source import FrontSource
 from data_prep.recipe import load_recipe
 from sceneprior.shards import Shard

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sceneprior.evaluation.bootstrap import COVERAGE, Figure, ratio, resample_counts
-from sceneprior.evaluation.set_metrics import frechet_distance
+from sceneprior.evaluation.metrics.set_metrics import frechet_distance
 
 
 def test_every_resample_has_as_many_rooms_and_seeds_repeat():

@@ -13,7 +13,8 @@ from rich.console import Console
 from sceneprior.errors import InputError, ShardError
 from sceneprior.evaluation import figures, protocol
 from sceneprior.evaluation.independent import independent_rooms
-from sceneprior.evaluation.layout_metrics import category_kl
+from sceneprior.evaluation.metrics.layout_metrics import category_kl
+from sceneprior.evaluation.metrics.set_metrics import frechet_distance, gap_closed
 from sceneprior.evaluation.protocol import (
     evaluate_synthesis,
     seeded_rows,
@@ -22,7 +23,6 @@ from sceneprior.evaluation.protocol import (
 )
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.score_table import SCORE_ROWS, print_scores, score_rows
-from sceneprior.evaluation.set_metrics import frechet_distance, gap_closed
 from sceneprior.evaluation.stated_protocol import drawing_of
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.offscreen import open_renderer

@@ -7,9 +7,9 @@ import pytest
 import torch
 from toy_rooms import look_at
 
-from sceneprior.batches import DecodedScenes, SceneViews
 from sceneprior.geometry.boxes import box_corners
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
+from sceneprior.views import DecodedScenes, SceneViews
 
 COUNTS = (4, 2, 3)
 SLOTS, CLASSES, VIEWS, SIZE = 5, 6, 6, (24, 32)

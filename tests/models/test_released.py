@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from sceneprior.models.layout_decoder import LayoutDecoder
 from sceneprior.models.released import QuerySelfAttention, SeparateHeads, StepOutputs
-from sceneprior.models.scene_decoder import SceneDecoder
+from sceneprior.models.transformer import SceneDecoder
 
 
 def shaken(model: nn.Module) -> nn.Module:

@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from sceneprior.geometry.meshes import icosphere, to_cube
-from sceneprior.models.scene_prior import ScenePrior
+from sceneprior.models.prior import ScenePrior
 from sceneprior.models.shape_decoder import ShapeDecoder, fill_unit_box
 
 

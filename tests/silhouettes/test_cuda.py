@@ -54,7 +54,7 @@ def test_the_kernels_in_a_process_of_their_own(where):
 
 
 def test_cpu_tensors_are_refused_where_kernels_are_compiled(monkeypatch):
-    from sceneprior.silhouettes import cuda
+    from sceneprior.silhouettes.cuda import backend as cuda
 
     monkeypatch.setattr(cuda, "INTERPRETED", False)
     with pytest.raises(ValueError, match=r"`cuda` needs tensors on a CUDA device.*'cpu'"):
@@ -62,7 +62,7 @@ def test_cpu_tensors_are_refused_where_kernels_are_compiled(monkeypatch):
 
 
 def test_a_long_image_is_refused(monkeypatch):
-    from sceneprior.silhouettes import cuda
+    from sceneprior.silhouettes.cuda import backend as cuda
 
     monkeypatch.setattr(cuda, "INTERPRETED", True)
     with pytest.raises(ValueError, match="at most 32767 pixels"):
@@ -71,13 +71,13 @@ def test_a_long_image_is_refused(monkeypatch):
 
 def test_without_triton_the_import_says_what_to_do(monkeypatch):
     monkeypatch.setitem(sys.modules, "triton", None)
-    monkeypatch.delitem(sys.modules, "sceneprior.silhouettes.cuda_kernels", raising=False)
+    monkeypatch.delitem(sys.modules, "sceneprior.silhouettes.cuda.kernels", raising=False)
     with pytest.raises(ImportError, match=r"backend `cuda` needs Triton.*pip install triton"):
-        importlib.import_module("sceneprior.silhouettes.cuda_kernels")
+        importlib.import_module("sceneprior.silhouettes.cuda.kernels")
 
 
 def test_edges_are_read_again_only_where_faces_were_written_to():
-    from sceneprior.silhouettes.cuda_outline import edges_of
+    from sceneprior.silhouettes.cuda.outline import edges_of
 
     faces = torch.tensor([[0, 1, 2], [2, 1, 3]])
     edges = edges_of(faces)
@@ -145,7 +145,7 @@ def drawing(draw, scene, how, dtype=torch.float64, device="cpu"):
 
 def agree(scene, how, dtype=torch.float64, masks_within=1e-12, pull_within=1e-7):
     """What `cuda` draws, after comparing it to what `reference` makes of the same numbers."""
-    from sceneprior.silhouettes import cuda
+    from sceneprior.silhouettes.cuda import backend as cuda
 
     got = drawing(cuda.draw, scene, how, dtype, DEVICE)
     rounded = (*(part.to(dtype).double() for part in scene[:2]), *scene[2:])
@@ -176,7 +176,7 @@ def check_soups_before_beside_behind_and_around_the_camera(mode, compositing):
 
 @pytest.mark.parametrize("mode", MODES)
 def check_float32_and_the_same_bits_again(mode):
-    from sceneprior.silhouettes import cuda
+    from sceneprior.silhouettes.cuda import backend as cuda
 
     # Seen 2e-6 in masks and 1e-6 of the largest pull.
     scene, how = soups(), settings(mode, "layered")

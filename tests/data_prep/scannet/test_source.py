@@ -4,14 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from conftest import make_scan
-from scan_files import write_table
+from scan_files import make_scan, write_table
 
-from data_prep.build import Job, build_shards
+from data_prep.engine.build import Job, build_shards
+from data_prep.engine.source import LeftOut, RoomTask
+from data_prep.engine.workers import pool
 from data_prep.scannet.scans import ScanSettings
 from data_prep.scannet.source import ScanNetSource
-from data_prep.source import LeftOut, RoomTask
-from data_prep.workers import pool
 from sceneprior.errors import InputError
 from sceneprior.shards import iterate_rooms
 

@@ -5,15 +5,24 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from conftest import alignment, make_scan
-from scan_files import BOX_FACES, Box, ScanFolder, frame_header, png, sens_header, write_zip
+from scan_files import (
+    BOX_FACES,
+    Box,
+    ScanFolder,
+    alignment,
+    frame_header,
+    make_scan,
+    png,
+    sens_header,
+    write_zip,
+)
 
 from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings, read_scan
 from data_prep.scannet.views import labelled_views, prepare_scan
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
+from sceneprior.offscreen.zbuffer import rasterize
 from sceneprior.shards import Shard, write_shard
-from sceneprior.silhouettes.zbuffer import rasterize
 
 BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 NAMES = label_set("scannet")

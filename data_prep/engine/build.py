@@ -1,0 +1,146 @@
+"""A source in, a folder of shards out: planned once, made in parallel, resumed, reported.
+
+The engine of every `prep-*` command. It runs the source's rooms shard by shard (shard_job.py) on
+this machine's processes (workers.py) or on a cluster (cluster.py), and ends with the report.
+"""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from data_prep.engine.cluster import cluster
+from data_prep.engine.finish import REPORT_FILES, Summary, finish
+from data_prep.engine.output import claimed, writing
+from data_prep.engine.plan import Plan, ShardPlan, job_settings, read_plan, write_plan
+from data_prep.engine.report import Line, line_of
+from data_prep.engine.selection import is_asked_for
+from data_prep.engine.shard_job import RoomFailedError, ShardReport, make_shard, read_finished
+from data_prep.engine.source import Source
+from data_prep.engine.workers import Run, pool
+from sceneprior.errors import InputError
+from sceneprior.offscreen import open_renderer
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a `prep-*` command was asked for. Only `source` and `renderer` decide the bytes."""
+
+    source: Source
+    out: Path
+    workers: int = 1
+    """Processes on this machine; 1 is this process itself."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler, whose workers do the work instead."""
+    renderer: str = "auto"
+    strict: bool = False
+    """Stop at the first room that fails."""
+    retry_failed: bool = False
+    """Make shards again in which rooms failed before."""
+
+
+def build_shards(job: Job) -> Summary:
+    """Prepare a data set. A second run with the same settings makes only what is missing.
+
+    Raises:
+        RoomFailedError: a room failed, with `strict`.
+        InputError: a folder is wrong, a split is empty, `out` holds shards of other settings, is
+            being written by another run, or cannot be written; the cluster cannot be reached.
+    """
+    source, out = job.source, Path(job.out)
+    if job.scheduler:
+        # A worker has a working folder of its own.
+        source, out = _with_absolute_paths(source), out.absolute()
+    settings = job_settings(source, source.only)  # tells a wrong folder before one is made
+    engine = cluster(job.scheduler) if job.scheduler else pool(job.workers)
+    with claimed(out), engine as run:
+        plan = read_plan(out, source, settings, job.renderer)
+        if plan is None:
+            plan = _make_plan(source, settings, job, run)
+            with writing(out):
+                write_plan(out, plan)
+        _refuse_failures(job, plan.left_out)
+        return _carry_out(replace(job, source=source, out=out), plan, run)
+
+
+def _make_plan(source: Source, settings: dict[str, Any], job: Job, run: Run) -> Plan:
+    kind = next(run(_renderer_kind, [(job.renderer,)], None)) if source.draws else None
+    survey = source.survey(run)
+    left_out = tuple(line_of(item) for item in survey.left_out)
+    _refuse_failures(job, left_out)
+    return Plan({**settings, "renderer": kind}, survey.rooms, left_out)
+
+
+def _renderer_kind(kind: str) -> str:
+    return open_renderer(kind).kind
+
+
+def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
+    source, out = job.source, job.out
+    shards = plan.shards(source.room_type)
+    reports: dict[str, ShardReport] = {}
+    for shard in shards:
+        report = read_finished(out / shard.name)
+        failed = report is not None and any(line.status == "failed" for line in report[1])
+        if report is not None and not (failed and job.retry_failed):
+            reports[shard.name] = report
+            _refuse_failures(job, report[1])
+    kept = len(reports)
+    missing = [shard for shard in _asked_for(source, plan, shards) if shard.name not in reports]
+    if missing:
+        with writing(out):
+            # Until the last shard is there again, nobody may take the folder for finished.
+            for name in REPORT_FILES:
+                (out / name).unlink(missing_ok=True)
+    kind = plan.settings["renderer"]
+    arguments = [(source, out, kind, shard, job.strict) for shard in missing]
+    made = run(make_shard, arguments, "preparing") if missing else iter(())
+    for shard, report in zip(missing, made, strict=True):
+        reports[shard.name] = report
+    lines = list(plan.left_out)
+    for shard in shards:
+        lines += reports[shard.name][1] if shard.name in reports else []
+    drawn = [reports[shard.name][0] for shard in shards if shard.name in reports]
+    open_shards = len(shards) - len(reports)
+    totals = Summary(source, lines, drawn[-1] if drawn else kind, len(missing), kept, open_shards)
+    if not open_shards:
+        finish(out, plan, totals)
+    if plan.settings["only"] == source.only:
+        return totals
+    # A part of a folder was asked for, so speak of this part.
+    asked = [line for line in lines if is_asked_for(source.only, line.room_id, line.house)]
+    return replace(totals, lines=asked)
+
+
+def _asked_for(source: Source, plan: Plan, shards: list[ShardPlan]) -> list[ShardPlan]:
+    """The shards that hold a room asked for: `--only` in a folder begun for everything."""
+    if plan.settings["only"] == source.only:
+        return shards
+    chosen = [
+        shard
+        for shard in shards
+        if any(is_asked_for(source.only, room.room_id, room.house) for room in shard.rooms)
+    ]
+    if not chosen:
+        whys = [
+            f": {line.room_id}, {line.reason.rstrip('.')}"
+            for line in plan.left_out
+            if is_asked_for(source.only, line.room_id, line.house)
+        ]
+        raise InputError(
+            f"No room of the plan is asked for by --only {source.only}{whys[0] if whys else ''}."
+        )
+    return chosen
+
+
+def _refuse_failures(job: Job, lines: list[Line] | tuple[Line, ...]) -> None:
+    for line in lines:
+        if job.strict and line.status == "failed":
+            raise RoomFailedError.of(line)
+
+
+def _with_absolute_paths(source: Any) -> Any:
+    paths = {item.name: getattr(source, item.name) for item in fields(source)}
+    return replace(
+        source,
+        **{name: value.absolute() for name, value in paths.items() if isinstance(value, Path)},
+    )

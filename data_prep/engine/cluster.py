@@ -1,0 +1,130 @@
+"""Worker processes on other machines: the same `run` as workers.py, on a Dask cluster."""
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from data_prep.engine.workers import Run, progress
+from sceneprior import __version__
+from sceneprior.errors import InputError
+
+_CONNECT_S = 20
+_WORKERS_S = 60
+_KEPT = "Finished shards are kept: run the same command again to go on."
+
+
+@contextlib.contextmanager
+def cluster(address: str) -> Iterator[Run]:
+    """Give `run(function, argument_lists, title)`, which yields the results in order.
+
+    It connects when it is first called. Start the cluster with `dask scheduler` and, on each
+    machine, `dask worker tcp://... --nworkers auto --nthreads 1`; every machine needs this package
+    and the folders of data and shards under the same paths. A task whose worker dies is given to
+    another.
+
+    Raises:
+        InputError: dask is not installed, nobody answers at `address`, there are no workers, they
+            lack this package or have another version of it, or the cluster is lost.
+    """
+    with contextlib.ExitStack() as stack:
+        clients: list[Any] = []
+
+        def in_cluster(
+            function: Callable[..., Any], arguments: list[Any], title: str | None
+        ) -> Iterator[Any]:
+            if not clients:
+                clients.append(stack.enter_context(_connect(address)))
+            with progress(title, len(arguments)) as advance:
+                yield from _run(clients[0], address, function, arguments, advance)
+
+        yield in_cluster
+
+
+def _run(
+    client: Any,
+    address: str,
+    function: Callable[..., Any],
+    arguments: list[Any],
+    advance: Callable[[], None],
+) -> Iterator[Any]:
+    from distributed import CancelledError, KilledWorker
+    from distributed.comm import CommClosedError
+
+    # Not pure: a task is never answered from what an earlier job left in the scheduler.
+    futures = [
+        client.submit(_in_one_thread, function, *item, pure=False, priority=-index)
+        for index, item in enumerate(arguments)
+    ]
+    for future in futures:
+        future.add_done_callback(lambda _: advance())
+    try:
+        for future in futures:
+            yield future.result()
+            future.release()
+    except KilledWorker:
+        raise InputError(
+            f"A task of the cluster at {address} killed every worker it was given to (for lack of "
+            f"memory?). {_KEPT}"
+        ) from None
+    except (CancelledError, CommClosedError, TimeoutError) as error:
+        raise InputError(
+            f"The cluster at {address} was lost ({type(error).__name__}). {_KEPT}"
+        ) from None
+    finally:
+        with contextlib.suppress(Exception):
+            client.cancel([future for future in futures if not future.done()])
+
+
+@contextlib.contextmanager
+def _connect(address: str) -> Iterator[Any]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError(
+            "--scheduler needs dask.distributed; install it with `pip install "
+            "'sceneprior[cluster]'`."
+        ) from None
+    try:
+        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise InputError(f"No Dask scheduler answers at {address} ({reason}).") from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_WORKERS_S)
+        except TimeoutError:
+            raise InputError(
+                f"The Dask scheduler at {address} has no workers; start some with "
+                f"`dask worker {address} --nworkers auto --nthreads 1`."
+            ) from None
+        try:
+            versions = client.run(_version)
+        except Exception as error:
+            raise InputError(
+                f"The workers of {address} cannot run this package ({type(error).__name__}: "
+                f"{error}); install sceneprior {__version__} where they run."
+            ) from None
+        strangers = {worker: found for worker, found in versions.items() if found != __version__}
+        if strangers:
+            worker, found = next(iter(strangers.items()))
+            raise InputError(
+                f"Worker {worker} has sceneprior {found}, and this is {__version__}: shards of two "
+                "releases would differ. Install the same on every machine."
+            )
+        yield client
+
+
+def _version() -> str:
+    return __version__
+
+
+_thread = ThreadPoolExecutor(max_workers=1)
+
+
+def _in_one_thread(function: Callable[..., Any], *arguments: Any) -> Any:
+    """In a worker, whatever threads it has: GL contexts belong to one, caches are for one."""
+    # llvmpipe's own threads would fight with the other workers for the same cores.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    return _thread.submit(function, *arguments).result()

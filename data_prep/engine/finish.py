@@ -1,0 +1,108 @@
+"""The end of a job: its totals in; report.json, report.csv and, last of all, index.json out."""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from data_prep.engine.output import write_changed, write_json, writing
+from data_prep.engine.plan import Plan
+from data_prep.engine.report import Line, count_splits, make_report, report_csv
+from data_prep.engine.source import SPLITS, Source
+from sceneprior.errors import InputError
+from sceneprior.shards import INDEX_NAME
+
+REPORT_NAME = "report.json"
+TABLE_NAME = "report.csv"
+REPORT_FILES = (INDEX_NAME, REPORT_NAME, TABLE_NAME)
+"""In the order in which they go when the folder is no longer finished."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The totals of a job."""
+
+    source: Source
+    lines: list[Line]
+    """Every room that was looked at; those asked for, with `--only` in a larger folder."""
+    renderer: str | None
+    """Its name; None where nothing was drawn."""
+    shards_made: int
+    shards_kept: int
+    shards_open: int
+    """Shards of the plan that `--only` left for later; with them the folder is not finished."""
+
+    @property
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Per split: rooms, views, objects."""
+        return count_splits(self.lines)
+
+    @property
+    def statuses(self) -> dict[str, int]:
+        """How many rooms were prepared, filtered, failed."""
+        return dict(Counter(line.status for line in self.lines))
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What `report.json` says."""
+        about = {
+            "source": self.source.name,
+            "room_type": self.source.room_type,
+            "label_set": self.source.label_set,
+            "renderer": self.renderer,
+            "summary": str(self),
+        }
+        # A part of a data set has no expected counts.
+        expected = self.source.expected if self.source.only is None else None
+        return make_report(self.lines, about, expected)
+
+    def __str__(self) -> str:
+        parts = [
+            f"{split} {count['rooms']} rooms, {count['views']} views, {count['objects']} objects"
+            for split, count in self.counts.items()
+        ]
+        left_out = ", ".join(
+            f"{self.statuses[status]} {status}"
+            for status in ("filtered", "failed")
+            if self.statuses.get(status)
+        )
+        return "; ".join(parts) + (f"; {left_out} ({TABLE_NAME} says why)" if left_out else "")
+
+
+def finish(out: Path, plan: Plan, totals: Summary) -> None:
+    """Write the report, then the index, which says that the folder is finished.
+
+    Raises:
+        InputError: a split, or everything, failed (the report is there); `out` cannot be written.
+    """
+    if plan.settings["only"] is None and totals.source.only is not None:
+        # `--only` made the last missing part: the files are those of the whole.
+        totals = replace(totals, source=_whole(totals.source))
+    with writing(out):
+        write_json(out / REPORT_NAME, totals.report)
+        write_changed(out / TABLE_NAME, report_csv(totals.lines).encode())
+    for split in SPLITS:
+        planned = any(room.split == split for room in plan.rooms)
+        if planned and plan.settings["only"] is None and not totals.counts[split]["rooms"]:
+            raise InputError(
+                f"The '{split}' split is empty: all its rooms failed; see {out}/{TABLE_NAME}."
+            )
+    if not totals.statuses.get("prepared"):
+        raise InputError(f"No room was prepared; {out}/{TABLE_NAME} says why.")
+    index = {
+        "format": "sceneprior-shards",
+        "version": 1,
+        "source": totals.source.name,
+        "label_set": totals.source.label_set,
+        "room_type": totals.source.room_type,
+        "counts": totals.counts,
+        "seed": plan.settings.get("seed"),
+        "recipe": plan.settings.get("recipe"),
+        "renderer": totals.renderer,
+    }
+    with writing(out):
+        write_json(out / INDEX_NAME, index)
+
+
+def _whole(source: Any) -> Any:
+    return replace(source, only=None)

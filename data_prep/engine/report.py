@@ -1,0 +1,173 @@
+"""What became of every room in, report.json and report.csv out: the same bytes from every run."""
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+from data_prep.engine.source import SPLITS, LeftOut, PreparedRoom, RoomTask
+from data_prep.recipe import Expected
+from sceneprior.classes import label_set
+
+_COLUMNS = ("room_id", "house", "split", "status", "rule", "reason", "views", "objects", "notes")
+
+
+@dataclass
+class Line:
+    """One line of the report: a room, or a house that could not be read."""
+
+    room_id: str
+    house: str
+    status: str
+    """prepared, filtered or failed."""
+    rule: str = ""
+    """Of a filtered room."""
+    reason: str = ""
+    split: str = ""
+    views: int = 0
+    objects: int = 0
+    """Tracked objects: those that at least one view shows."""
+    visible: int = 0
+    """Objects visible in a view, summed over the views."""
+    notes: list[str] = field(default_factory=list)
+    """What was left out of the room, and why."""
+    classes: dict[str, int] = field(default_factory=dict)
+    """Tracked objects of each class."""
+
+
+def line_of(
+    result: PreparedRoom | LeftOut, task: RoomTask | None = None, label_set_name: str = ""
+) -> Line:
+    """The line of a prepared room, or of one left out, by the survey (no task) or later."""
+    if isinstance(result, LeftOut):
+        return Line(
+            result.room_id, result.house, result.status, result.rule, result.reason,
+            split=task.split if task else "", notes=list(result.notes),
+        )  # fmt: skip
+    assert task is not None
+    names = label_set(label_set_name)
+    views = result.views
+    return Line(
+        task.room_id,
+        task.house,
+        "prepared",
+        split=task.split,
+        views=len(views.boxes),
+        objects=len(views.object_class),
+        visible=int(views.visible.sum()),
+        notes=list(result.notes),
+        classes=dict(Counter(names[index] for index in views.object_class)),
+    )
+
+
+def read_line(data: Any) -> Line:
+    """A line as JSON keeps it.
+
+    Raises:
+        TypeError, KeyError: it is none.
+    """
+    return Line(**{item.name: data[item.name] for item in fields(Line)})
+
+
+def count_splits(lines: Iterable[Line]) -> dict[str, dict[str, int]]:
+    """Per split: rooms, views, objects."""
+    prepared = [line for line in lines if line.status == "prepared"]
+    return {
+        split: {
+            "rooms": sum(line.split == split for line in prepared),
+            "views": sum(line.views for line in prepared if line.split == split),
+            "objects": sum(line.objects for line in prepared if line.split == split),
+        }
+        for split in SPLITS
+    }
+
+
+def make_report(
+    lines: Sequence[Line], about: dict[str, Any], expected: Expected | None = None
+) -> dict[str, Any]:
+    """Everything worth saying about a job; nothing in it depends on time, workers or stops.
+
+    Args:
+        lines: Every room that was looked at.
+        about: Source, recipe, renderer and the like; stands at the beginning.
+        expected: The recipe's counts, to compare with.
+    """
+    prepared = [line for line in lines if line.status == "prepared"]
+    filtered: dict[str, list[str]] = {}
+    for line in lines:
+        if line.status == "filtered":
+            filtered.setdefault(line.rule, []).append(line.room_id)
+    report = {
+        "format": "sceneprior-report",
+        "version": 1,
+        **about,
+        "found": len(lines),
+        "statuses": dict(sorted(Counter(line.status for line in lines).items())),
+        "filtered": {
+            rule: {"rooms": len(ids), "room_ids": ids} for rule, ids in sorted(filtered.items())
+        },
+        "failed": [
+            {"room_id": line.room_id, "house": line.house, "reason": line.reason}
+            for line in lines
+            if line.status == "failed"
+        ],
+        "with_notes": sum(bool(line.notes) for line in prepared),
+        "counts": count_splits(lines),
+        "per_split": {
+            split: _figures([line for line in prepared if line.split == split]) for split in SPLITS
+        },
+        "classes": _classes(prepared),
+    }
+    if expected is not None:
+        report["expected"] = {"of": expected.of, "rows": compare(expected, prepared)}
+    return report | {"rooms": [asdict(line) for line in lines]}
+
+
+def compare(expected: Expected, prepared: Sequence[Line]) -> list[dict[str, Any]]:
+    """Each count that the recipe states: what, expected, found, difference."""
+    found = {
+        "rooms": len(prepared),
+        **{split: sum(line.split == split for line in prepared) for split in SPLITS},
+        "views": sum(line.views for line in prepared),
+        "objects": sum(line.objects for line in prepared),
+    }
+    return [
+        {"what": what, "expected": count, "found": found[what], "difference": found[what] - count}
+        for what, count in asdict(expected).items()
+        if what != "of" and count is not None
+    ]
+
+
+def _figures(lines: Sequence[Line]) -> dict[str, Any]:
+    rooms = max(len(lines), 1)
+    views = sum(line.views for line in lines)
+    return {
+        "views_per_room": round(views / rooms, 3),
+        "objects_per_room": round(sum(line.objects for line in lines) / rooms, 3),
+        "objects_per_view": round(sum(line.visible for line in lines) / max(views, 1), 3),
+        "rooms_of_so_many_objects": {
+            str(count): rooms
+            for count, rooms in sorted(Counter(line.objects for line in lines).items())
+        },
+        "classes": _classes(lines),
+    }
+
+
+def _classes(lines: Iterable[Line]) -> dict[str, int]:
+    classes: Counter[str] = Counter()
+    for line in lines:
+        classes.update(line.classes)
+    return dict(sorted(classes.items()))
+
+
+def report_csv(lines: Iterable[Line]) -> str:
+    """One row a room, for spreadsheets and grep."""
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for line in lines:
+        row = asdict(line) | {"notes": " | ".join(line.notes)}
+        writer.writerow([row[column] for column in _COLUMNS])
+    return table.getvalue()

@@ -1,0 +1,178 @@
+"""Where cameras stand: a room and its furniture's boxes in, pinhole cameras out."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+
+from data_prep.front.furnished import Room
+from data_prep.recipe import ViewRules
+from sceneprior.offscreen import Pinhole
+
+_PLACES = 200  # random places tried before a rule about the place is relaxed
+_DARTS = 10_000  # random points tried before one is taken that is known to lie inside
+
+
+def view_counts(floor_areas_m2: Sequence[float], rules: ViewRules) -> list[int]:
+    """Views of each room of one house: in proportion to its floor, within the house's share.
+
+    A house whose rooms would get more than `per_house_at_most` shares that number by area. No room
+    gets fewer than `at_least`, unless the house has so many rooms that an equal share is less; no
+    room gets none.
+
+    Example:
+
+        >>> view_counts([10.0, 40.0, 50.0], ViewRules())
+        [10, 40, 50]
+    """
+    wanted = [rules.per_m2 * area for area in floor_areas_m2]
+    share = min(1.0, rules.per_house_at_most / max(sum(wanted), 1e-9))
+    limit = max(rules.per_house_at_most, len(wanted))
+    least = min(rules.at_least, limit // max(len(wanted), 1))
+    counts = [max(least, round(views * share)) for views in wanted]
+    while sum(counts) > limit:  # rounding up, and small rooms that got the least
+        surplus = [
+            (count - views * share if count > least else -math.inf)
+            for count, views in zip(counts, wanted, strict=True)
+        ]
+        counts[surplus.index(max(surplus))] -= 1
+    return counts
+
+
+def intrinsics(rules: ViewRules) -> np.ndarray:
+    """(3, 3) float64, pixels: square pixels, the optical axis through the image's centre."""
+    height, width = rules.image_size
+    focal_px = width / 2 / math.tan(math.radians(rules.fov_deg) / 2)
+    return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
+
+
+def look(eye_m: np.ndarray, yaw_rad: float, pitch_rad: float) -> np.ndarray:
+    """World to camera (4, 4) of an eye that looks along +z turned by yaw, and down by pitch.
+
+    Example: looking along +z, +x is on the left and what is above the eye has a negative camera y.
+
+        >>> (look(np.zeros(3), 0.0, 0.0) @ [1, 2, 3, 1]).tolist()
+        [-1.0, -2.0, 3.0, 1.0]
+    """
+    sin_yaw, cos_yaw = math.sin(yaw_rad), math.cos(yaw_rad)
+    sin_pitch, cos_pitch = math.sin(pitch_rad), math.cos(pitch_rad)
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = (
+        (-cos_yaw, 0.0, sin_yaw),  # right
+        (-sin_pitch * sin_yaw, -cos_pitch, -sin_pitch * cos_yaw),  # down
+        (sin_yaw * cos_pitch, -sin_pitch, cos_yaw * cos_pitch),  # forward
+    )
+    world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ eye_m
+    return world_to_camera
+
+
+class Viewpoints:
+    """Draws cameras for one room, turning to one piece of furniture after the other.
+
+    Args:
+        room: Its floor bounds where cameras stand.
+        boxes_m: (objects, 2, 3) lower and upper corners of all furniture in the room frame.
+        targets_m: (k, 3) centres of what is worth looking at.
+        rules: Heights, angles and margins.
+        rng: All randomness.
+    """
+
+    def __init__(
+        self,
+        room: Room,
+        boxes_m: np.ndarray,
+        targets_m: np.ndarray,
+        rules: ViewRules,
+        rng: np.random.Generator,
+    ):
+        self._boxes = np.asarray(boxes_m, dtype=np.float64).reshape(-1, 2, 3)
+        self._targets = np.asarray(targets_m, dtype=np.float64).reshape(-1, 3)
+        self._rules = rules
+        self._rng = rng
+        self._intrinsics = intrinsics(rules)
+        self._enough = min(rules.min_objects, len(self._targets))
+        self._queue: list[int] = []
+        self._area = room.floor
+        # A narrow room has no place far from every wall: come as close as it takes.
+        for margin in (rules.wall_margin_m, rules.wall_margin_m / 2, 0.05):
+            inner = room.floor.buffer(-margin)
+            if inner.area > 0.05:
+                self._area = inner
+                break
+        shapely.prepare(self._area)
+
+    def draw(self) -> Pinhole:
+        """One more camera."""
+        rules, rng = self._rules, self._rng
+        target = self._next_target()
+        for attempt in range(3 * _PLACES):
+            eye = self._place()
+            yaw = math.atan2(target[0] - eye[0], target[2] - eye[2])
+            yaw += rng.normal(0.0, math.radians(15))
+            away = math.hypot(target[0] - eye[0], target[2] - eye[2])
+            pitch = self._pitch(math.atan2(target[1] - eye[1], away))
+            camera = Pinhole(look(eye, yaw, pitch), self._intrinsics)
+            # Some rooms have no view with enough in it, and some are so full that no place is
+            # clear: a third of the attempts each, then the rule is given up.
+            poor = away < rules.target_distance_m or self._in_view(camera) < self._enough
+            if attempt < _PLACES and poor:
+                continue
+            if not self._blocked(camera, eye, strict=attempt < 2 * _PLACES):
+                break
+        return camera
+
+    def _next_target(self) -> np.ndarray:
+        if not len(self._targets):
+            return np.zeros(3)
+        if not self._queue:
+            self._queue = self._rng.permutation(len(self._targets)).tolist()
+        return self._targets[self._queue.pop()]
+
+    def _place(self) -> np.ndarray:
+        x1, z1, x2, z2 = self._area.bounds
+        for _ in range(_DARTS):
+            x, z = self._rng.uniform((x1, z1), (x2, z2))
+            if shapely.contains_xy(self._area, x, z):
+                return np.array([x, self._rng.uniform(*self._rules.eye_height_m), z])
+        # Slivers of floor, far apart: from now on every camera stands at one place that is inside.
+        self._area = self._area.representative_point().buffer(1e-3)
+        return self._place()
+
+    def _pitch(self, elevation_rad: float) -> float:
+        """A slight look down, raised as far as it takes to keep a lamp on the ceiling in view."""
+        pitch = math.radians(self._rng.uniform(*self._rules.pitch_deg))
+        half_view = math.atan2(self._rules.image_size[0] / 2, self._intrinsics[1, 1])
+        return max(min(pitch, 0.75 * half_view - elevation_rad), math.radians(-10))
+
+    def _in_view(self, camera: Pinhole) -> int:
+        """How many centres of objects fall into the picture: a guess that costs no rendering."""
+        points = self._targets @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        height, width = self._rules.image_size
+        limits = np.array([width / 2, height / 2]) / self._intrinsics[0, 0]
+        return int((np.abs(points[:, :2]) < limits * points[:, 2:]).all(axis=1).sum())
+
+    def _blocked(self, camera: Pinhole, eye: np.ndarray, strict: bool) -> bool:
+        """Whether the eye is inside a piece's box, or looks straight into one."""
+        margin = self._rules.furniture_margin_m if strict else 0.02
+        ahead = self._rules.clear_ahead_m if strict else 0.0
+        points = eye + np.linspace(0.0, ahead, 4)[:, None] * camera.world_to_camera[2, :3]
+        inside = (points > self._boxes[:, None, 0] - margin) & (
+            points < self._boxes[:, None, 1] + margin
+        )
+        return bool(inside.all(axis=2).any())
+
+
+def sees_enough(pixels: np.ndarray, rules: ViewRules) -> tuple[bool, float]:
+    """Judge a view by the visible pixels of each tracked object.
+
+    Returns:
+        Whether the view stays, and a score that ranks those that do not.
+    """
+    height, width = rules.image_size
+    seen = int((pixels >= rules.min_object_pixels).sum())
+    share = float(pixels.max(initial=0)) / (height * width)
+    return (
+        seen >= min(rules.min_objects, len(pixels)) and share <= rules.max_object_share,
+        seen - 2.0 * max(share - rules.max_object_share, 0.0) * len(pixels),
+    )

@@ -1,0 +1,177 @@
+"""`sceneprior inspect`: the command around inspection.py and verify.py."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from data_prep.inspection.verify import RoomCheck, Verdict
+
+SHEET_NAME = "inspect.png"
+_WORST_SHOWN = 5
+_PROBLEMS_SHOWN = 10
+
+
+def inspect_command(
+    shards: Annotated[Path, typer.Argument(help="Folder of shards.")],
+    room: Annotated[str | None, typer.Option(help="This room only, and its plan.")] = None,
+    png: Annotated[
+        Path | None, typer.Option(help=f"The sheet of pictures (default: SHARDS/{SHEET_NAME}).")
+    ] = None,
+    pictures: Annotated[int, typer.Option(min=1, help="Views on the sheet.")] = 24,
+    boxes_3d: Annotated[
+        bool, typer.Option("--boxes-3d/--no-boxes-3d", help="Draw the ground truth's 3D boxes.")
+    ] = True,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Check everything instead of drawing.")
+    ] = False,
+    workers: Annotated[int, typer.Option(min=1, help="Processes for --verify.")] = 1,
+) -> None:
+    """Say what a folder of shards holds and draw a sheet of it, or check it with --verify.
+
+    Exit status: 0, or 3 if --verify finds something wrong.
+    """
+    from rich.console import Console
+
+    from data_prep.inspection.inspection import contact_sheet
+
+    console = Console()
+    if verify:
+        _verify(console, shards, room, workers)
+    else:
+        for table in _count_tables(shards) if room is None else [_room_table(shards, room)]:
+            console.print(table)
+    if png is not None or not verify:
+        target = png or shards / SHEET_NAME
+        sheet = contact_sheet(shards, room, pictures, boxes_3d)
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            sheet.save(target, "PNG")
+        except OSError as error:
+            from sceneprior.errors import InputError
+
+            raise InputError(
+                f"{target} cannot be written ({error.strerror or error}); name another file with "
+                "--png."
+            ) from None
+        typer.echo(f"Drew {target}.")
+
+
+def _count_tables(shards: Path) -> "list[Table]":
+    from rich.table import Table
+
+    from data_prep.inspection.inspection import count_shards
+
+    counts = count_shards(shards)
+    totals = Table(
+        "split", "rooms", "views", "objects", "objects a room", "objects a view", "known in 3D",
+        "image size",
+    )  # fmt: skip
+    for split, row in counts.items():
+        sizes = row["image_sizes"]
+        totals.add_row(
+            split,
+            str(row["rooms"]),
+            str(row["views"]),
+            str(row["objects"]),
+            f"{row['objects'] / max(row['rooms'], 1):.2f}",
+            f"{row['seen']:.2f}",
+            f"{row['with_truth']} rooms" if row["with_truth"] else "no room",
+            ", ".join(f"{n} rooms: {s}" for s, n in sizes.items())
+            if len(sizes) > 1
+            else next(iter(sizes), ""),
+        )
+    histogram = Table("class", *counts)
+    for name in sorted({name for row in counts.values() for name in row["classes"]}):
+        histogram.add_row(name, *(str(row["classes"].get(name, 0)) for row in counts.values()))
+    return [totals, histogram]
+
+
+def _room_table(shards: Path, room: str) -> "Table":
+    from rich.table import Table
+
+    from data_prep.inspection.inspection import describe_room
+
+    table = Table("object", "class", "views", "share of image", "centre, m", "size, m", title=room)
+    for k, row in enumerate(describe_room(shards, room)):
+        place = [
+            "unknown" if row[key] is None else " ".join(f"{value:.2f}" for value in row[key])
+            for key in ("center_m", "size_m")
+        ]
+        share = f"{row['share']:.1%}" if row["views"] else "-"
+        table.add_row(str(k), row["class"], str(row["views"]), share, *place)
+    return table
+
+
+def _verify(console: "object", shards: Path, room: str | None, workers: int) -> None:
+    from data_prep.inspection.verify import verify
+
+    verdict = verify(shards, room, workers)
+    for table in _check_tables(verdict):
+        console.print(table)  # type: ignore[attr-defined]
+    for sentence in verdict.problems[1:_PROBLEMS_SHOWN]:
+        typer.echo(sentence, err=True)
+    if verdict.problems:
+        more = len(verdict.problems) - 1
+        others = f" ({more} more problem{'s' * (more > 1)}, listed above)" if more else ""
+        typer.echo(f"Error: {verdict.problems[0]}{others}", err=True)
+        raise typer.Exit(3)
+    typer.echo(f"{shards}: all is well. {_summary(verdict)}")
+
+
+def _check_tables(verdict: "Verdict") -> "list[Table]":
+    from rich.table import Table
+
+    totals = Table("split", "rooms", "views", "checksums", "unoccluded objects", "mean 2D IoU")
+    for split, checks in verdict.rooms.items():
+        rooms = [check for check in checks if check.room_id]
+        totals.add_row(
+            split,
+            str(len(rooms)),
+            str(sum(check.views for check in rooms)),
+            f"{sum(check.has_checksum for check in rooms)} rooms",
+            str(sum(len(check.agreement.mesh) + len(check.agreement.box) for check in rooms)),
+            _mean_iou(rooms),
+        )
+    every = [check for checks in verdict.rooms.values() for check in checks if check.mean_iou]
+    worst = sorted(every, key=lambda check: (min(check.mean_iou.values()), check.room_id))
+    table = Table("worst rooms", "unoccluded objects", "mean 2D IoU")
+    for check in worst[:_WORST_SHOWN]:
+        count = len(check.agreement.mesh) + len(check.agreement.box)
+        table.add_row(check.room_id, str(count), _mean_iou([check]))
+    return [totals, table] if worst else [totals]
+
+
+def _mean_iou(rooms: "list[RoomCheck]") -> str:
+    import numpy as np
+
+    mesh = [value for room in rooms for value in room.agreement.mesh]
+    box = [value for room in rooms for value in room.agreement.box]
+    parts = [
+        f"{np.mean(values):.3f} ({what})"
+        for values, what in ((mesh, "meshes"), (box, "3D boxes"))
+        if values
+    ]
+    return ", ".join(parts) or "-"
+
+
+def _summary(verdict: "Verdict") -> str:
+    rooms = [check for checks in verdict.rooms.values() for check in checks]
+    without = sum(not check.has_checksum for check in rooms)
+    count = len(verdict.agreement.mesh) + len(verdict.agreement.box)
+    parts = ["Checksums, shapes, ranges, 2D boxes and masks agree"]
+    if without:
+        parts.append(f"{without} rooms carry no checksum (shards of an earlier release)")
+    if count:
+        parts.append(
+            f"the ground truth of {count} unoccluded objects projects onto their masks with a mean "
+            f"2D IoU of {_mean_iou(rooms)}"
+        )
+    elif any(check.has_truth for check in rooms):
+        parts.append("no object is unoccluded in any view, so no ground truth could be projected")
+    else:
+        parts.append("no room is known in 3D, so no ground truth was projected")
+    return "; ".join(parts) + "."

@@ -1,0 +1,154 @@
+"""A folder of shards in, a table and a sheet of pictures out: to see with one's own eyes."""
+
+import textwrap
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from data_prep.engine.source import SPLITS
+from data_prep.inspection.pictures import draw_plan, draw_view
+from sceneprior.classes import label_set
+from sceneprior.errors import InputError
+from sceneprior.shards import Shard, iterate_rooms, list_shards, read_index
+
+LEGEND = (
+    "Filled: instance masks in class colours. Coloured frames: their 2D boxes. Black wires: 3D "
+    "boxes of the ground truth, with a bar ahead of the piece's front. Grid: the floor y = 0, "
+    "metres, with the room's axes x, y, z."
+)
+_TILE = (480, 360)
+_GAP, _CAPTION = 8, 18
+
+
+def count_shards(folder: Path) -> dict[str, dict[str, Any]]:
+    """Per split: rooms, views, objects, seen (visible objects a view), with_truth (rooms known in
+    3D), image_sizes ("480 x 360" -> rooms), classes (a histogram).
+
+    Raises:
+        ShardError: the folder is not a finished folder of shards, or a shard is damaged.
+    """
+    names = label_set(read_index(folder)["label_set"])
+    table: dict[str, dict[str, Any]] = {}
+    for split in SPLITS:
+        if not any((Path(folder) / split).glob("*.h5")):
+            continue  # made with --only
+        rooms, known = [], 0
+        for shard, room_id in iterate_rooms(folder, split):
+            rooms.append(shard.read_room(room_id))
+            known += shard.has_ground_truth(room_id)
+        classes = Counter(names[index] for room in rooms for index in room.object_class)
+        views = sum(len(room.visible) for room in rooms)
+        sizes = Counter("{1} x {0}".format(*room.image_size) for room in rooms)
+        table[split] = {
+            "rooms": len(rooms),
+            "views": views,
+            "objects": sum(len(room.object_class) for room in rooms),
+            "seen": sum(int(room.visible.sum()) for room in rooms) / max(views, 1),
+            "with_truth": known,
+            "image_sizes": dict(sizes.most_common()),
+            "classes": dict(classes.most_common()),
+        }
+    return table
+
+
+def describe_room(folder: Path, room_id: str) -> list[dict[str, Any]]:
+    """Per object of a room: class, views that show it, mean share of the image there (its 2D box),
+    and center_m, size_m where the room is known in 3D.
+
+    Raises:
+        InputError: no room has this id.
+    """
+    ((path, _, _),) = _choose(folder, room_id, 1)
+    with Shard(path) as shard:
+        views = shard.read_room(room_id)
+        truth = shard.read_ground_truth(room_id) if shard.has_ground_truth(room_id) else None
+        names = label_set(shard.label_set)
+    classes = views.object_class if truth is None else truth.object_class
+    rows = []
+    for k, index in enumerate(classes):
+        seen = views.visible[:, k] if k < len(views.object_class) else np.zeros(0, dtype=bool)
+        boxes = views.boxes[seen, k] if seen.any() else np.zeros((1, 4), dtype=np.float32)
+        rows.append(
+            {
+                "class": names[int(index)],
+                "views": int(seen.sum()),
+                "share": float((boxes[:, 2:] - boxes[:, :2]).prod(axis=1).mean()),
+                "center_m": None if truth is None else truth.centers_m[k].tolist(),
+                "size_m": None if truth is None else truth.sizes_m[k].tolist(),
+            }
+        )
+    return rows
+
+
+def contact_sheet(
+    folder: Path, room_id: str | None = None, pictures: int = 24, boxes_3d: bool = True
+) -> Image.Image:
+    """Views of a folder, or of one room and its plan, on one sheet; `LEGEND` says what is drawn.
+
+    Args:
+        folder: Shards.
+        room_id: Views of this room; None: some views of rooms throughout the folder.
+        pictures: How many views.
+        boxes_3d: Also the ground truth's 3D boxes, where there is one.
+
+    Raises:
+        InputError: no room has this id.
+    """
+    chosen = _choose(folder, room_id, pictures)
+    tiles: list[tuple[str, Image.Image]] = []
+    for path, name, view in chosen:
+        with Shard(path) as shard:
+            if room_id is not None and not tiles:
+                tiles.append((f"{_short(name)}  from above", draw_plan(shard, name, *_TILE)))
+            picture = draw_view(shard, name, view, boxes_3d, _TILE[0])
+        tiles.append((f"{_short(name)}  view {view}", picture))
+    columns = min(4, len(tiles))
+    width = _TILE[0]
+    height = max(tile.height for _, tile in tiles)
+    rows = -(-len(tiles) // columns)
+    sheet_width = columns * (width + _GAP) + _GAP
+    font, small = ImageFont.load_default(size=12), ImageFont.load_default(size=11)
+    legend = textwrap.wrap(LEGEND, max(40, sheet_width // 6))
+    top = _GAP + 15 * len(legend)
+    sheet = Image.new("RGB", (sheet_width, top + rows * (height + _CAPTION + _GAP) + _GAP), "white")
+    draw = ImageDraw.Draw(sheet)
+    for i, line in enumerate(legend):
+        draw.text((_GAP, 4 + 15 * i), line, fill="black", font=small)
+    for i, (caption, tile) in enumerate(tiles):
+        x = _GAP + (i % columns) * (width + _GAP)
+        y = top + (i // columns) * (height + _CAPTION + _GAP)
+        draw.text((x, y + 1), caption, fill="black", font=font)
+        sheet.paste(tile, (x, y + _CAPTION))
+    return sheet
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 56 else f"{name[:8]}...{name[-45:]}"
+
+
+def _choose(folder: Path, room_id: str | None, pictures: int) -> list[tuple[Path, str, int]]:
+    splits = [split for split in SPLITS if any((Path(folder) / split).glob("*.h5"))]
+    rooms = []
+    for path in [path for split in splits for path in list_shards(folder, split)]:
+        with Shard(path) as shard:
+            rooms += [(path, name) for name in shard.room_ids]
+    if not rooms:
+        list_shards(folder, "train")  # says what is wrong
+    if room_id is not None:
+        rooms = [room for room in rooms if room[1] == room_id]
+        if not rooms:
+            raise InputError(f"{folder} has no room '{room_id}'; its report.csv lists the rooms.")
+    if len(rooms) > pictures:
+        rooms = [rooms[i * len(rooms) // pictures] for i in range(pictures)]
+    chosen = []
+    for i, (path, name) in enumerate(rooms):
+        share = pictures // len(rooms) + (i < pictures % len(rooms))
+        with Shard(path) as shard:
+            views = len(shard.read_room(name).visible)
+        # Evenly over the room's views, which a recording has in the order it was walked.
+        places = np.unique(np.linspace(0, views, min(share, views), endpoint=False).astype(int))
+        chosen += [(path, name, int(view)) for view in places]
+    return chosen

@@ -1,0 +1,222 @@
+"""One view, or the plan, of a room in a shard in; a picture for one's own eyes out."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from data_prep.inspection.projection import BOX_EDGES, box_corners, to_camera, wire_pixels
+from sceneprior.classes import class_colors, label_set
+from sceneprior.shards import RoomGroundTruth, RoomViews, Shard
+
+BACKGROUND = (246, 246, 246)
+GRID = (206, 206, 206)
+OUTLINE = (120, 120, 120)
+AXES = {"x": (205, 30, 30), "y": (20, 140, 40), "z": (30, 60, 210)}
+_AXIS_M = 0.5
+_GRID_M = 1.0
+_BAR_M = 0.3
+_LARGEST_GRID_M = 15.0
+
+Color = tuple[int, int, int]
+
+
+def draw_view(
+    shard: Shard, room_id: str, view: int, boxes_3d: bool = True, width_px: int = 480
+) -> Image.Image:
+    """One view: masks in class colours with their 2D boxes, and where the room is known in 3D,
+    its boxes as black wires with a bar ahead of each piece's front.
+
+    The floor (y = 0) is a grid of metres with the axes of the room frame, so that a wrong floor,
+    axis or unit shows even where nothing is known in 3D.
+
+    Args:
+        shard: An open shard.
+        room_id: A room of it.
+        view: Which of its views.
+        boxes_3d: Draw the ground truth, if there is one.
+        width_px: Width of the picture; lines and names keep theirs.
+    """
+    room = shard.read_room(room_id)
+    truth = _truth(shard, room_id) if boxes_3d else None
+    names = label_set(shard.label_set)
+    height, width = room.image_size
+    zoom = width_px / width
+    size = (width_px, max(1, round(height * zoom)))
+    lens = np.diag([zoom, zoom, 1.0]) @ room.intrinsics[view].astype(np.float64)
+    camera = room.world_to_camera[view]
+    picture = Image.new("RGB", size, BACKGROUND)
+    draw = ImageDraw.Draw(picture)
+    _draw_floor(draw, room, truth, camera, lens)
+    ids = Image.fromarray(shard.read_instance_ids(room_id, [view])[0].astype(np.int32))
+    large = np.asarray(ids.resize(size, Image.Resampling.NEAREST))
+    palette = class_colors(len(names))[room.object_class]
+    picture.paste(_mask_colors(large, palette), mask=Image.fromarray(large > 0))
+    for name, end in zip(AXES, np.eye(3) * _AXIS_M, strict=True):
+        _line(draw, np.stack([np.zeros(3), end]), camera, lens, AXES[name], 2)
+        for line in wire_pixels(np.stack([np.zeros(3), end]), [(0, 1)], camera, lens):
+            draw.text(line[2:], name, fill=AXES[name], font=_font(12), anchor="mm")
+    seen = np.flatnonzero(room.visible[view])
+    for k in seen if truth is not None else ():
+        _draw_box(draw, truth, k, camera, lens)  # type: ignore[arg-type]
+    for k in seen:
+        x1, y1, x2, y2 = (room.boxes[view, k] * np.array([*size, *size])).tolist()
+        dark = _dark(palette[k])
+        draw.rectangle((x1, y1, max(x2 - 1, x1), max(y2 - 1, y1)), outline=dark, width=2)
+        _tag(draw, (x1 + 2, y1 + 2), names[int(room.object_class[k])], dark)
+    return picture
+
+
+def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 360) -> Image.Image:
+    """The room from above (right is +x, down is +z): floor, boxes, fronts, and the cameras."""
+    room, truth = shard.read_room(room_id), _truth(shard, room_id)
+    names = label_set(shard.label_set)
+    colors = class_colors(len(names))
+    low, high = _floor_bounds(room, truth)
+    margin = 0.4
+    zoom = min(
+        width_px / (high[0] - low[0] + 2 * margin), height_px / (high[1] - low[1] + 2 * margin)
+    )
+    middle = (low + high) / 2
+
+    def at(x: float, z: float) -> tuple[float, float]:
+        return (width_px / 2 + zoom * (x - middle[0]), height_px / 2 + zoom * (z - middle[1]))
+
+    picture = Image.new("RGB", (width_px, height_px), BACKGROUND)
+    draw = ImageDraw.Draw(picture)
+    for (x1, _, z1), (x2, _, z2) in _grid(low, high):
+        draw.line((*at(x1, z1), *at(x2, z2)), fill=GRID)
+    if truth is not None:
+        if len(truth.floor_m) > 2:
+            draw.polygon([at(*point) for point in truth.floor_m.tolist()], outline=OUTLINE, width=2)
+        for k in np.argsort(truth.centers_m[:, 1] + truth.sizes_m[:, 1] / 2, kind="stable"):
+            (x, _, z), half = truth.centers_m[k].tolist(), truth.sizes_m[k] / 2
+            color = tuple(int(channel) for channel in colors[truth.object_class[k]])
+            corners = (*at(x - half[0], z - half[2]), *at(x + half[0], z + half[2]))
+            draw.rectangle(corners, fill=color, outline="black")
+            if truth.model_ids[k]:
+                start, end = _front(truth, k)
+                draw.line((*at(start[0], start[2]), *at(end[0], end[2])), fill="black", width=3)
+            label = names[int(truth.object_class[k])]
+            _tag(
+                draw, (corners[0] + 2, corners[1] + 2), label, _dark(colors[truth.object_class[k]])
+            )
+    for matrix in room.world_to_camera.astype(np.float64):
+        eye = -matrix[:3, :3].T @ matrix[:3, 3]
+        u, v = at(eye[0], eye[2])
+        draw.ellipse((u - 2, v - 2, u + 2, v + 2), fill=OUTLINE)
+        ahead = eye + 0.3 * matrix[2, :3]
+        draw.line((u, v, *at(ahead[0], ahead[2])), fill=OUTLINE)
+    for name, (x, z) in {"x": (_AXIS_M, 0.0), "z": (0.0, _AXIS_M)}.items():
+        draw.line((*at(0, 0), *at(x, z)), fill=AXES[name], width=2)
+        draw.text(at(1.2 * x, 1.2 * z), name, fill=AXES[name], font=_font(12), anchor="mm")
+    return picture
+
+
+def _truth(shard: Shard, room_id: str) -> RoomGroundTruth | None:
+    return shard.read_ground_truth(room_id) if shard.has_ground_truth(room_id) else None
+
+
+def _mask_colors(ids: np.ndarray, palette: np.ndarray) -> Image.Image:
+    # Halfway to white, so that wires and names stand out; a dark rim parts neighbours of a class.
+    pale = (palette.astype(np.int32) + 255) // 2
+    image = np.concatenate([[BACKGROUND], pale]).astype(np.uint8)[ids]
+    rim = np.zeros(ids.shape, dtype=bool)
+    rim[:, 1:] |= ids[:, 1:] != ids[:, :-1]
+    rim[1:] |= ids[1:] != ids[:-1]
+    image[rim] = image[rim] // 2
+    return Image.fromarray(image)
+
+
+def _draw_floor(
+    draw: ImageDraw.ImageDraw,
+    room: RoomViews,
+    truth: RoomGroundTruth | None,
+    camera: np.ndarray,
+    lens: np.ndarray,
+) -> None:
+    for ends in _grid(*_floor_bounds(room, truth)):
+        _line(draw, np.asarray(ends), camera, lens, GRID)
+    if truth is not None and len(truth.floor_m) > 2:
+        outline = np.insert(truth.floor_m.astype(np.float64), 1, 0.0, axis=1)
+        for first, second in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+            _line(draw, np.stack([first, second]), camera, lens, OUTLINE, 2)
+
+
+def _floor_bounds(room: RoomViews, truth: RoomGroundTruth | None) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest x, z of the floor, or of the cameras where nobody knows the floor."""
+    points = np.zeros((0, 2))
+    if truth is not None:
+        half = truth.sizes_m[:, (0, 2)] / 2
+        middle = truth.centers_m[:, (0, 2)]
+        points = np.concatenate([truth.floor_m, middle - half, middle + half])
+    if not len(points):
+        turn, place = room.world_to_camera[:, :3, :3], room.world_to_camera[:, :3, 3]
+        points = -np.einsum("tij,ti->tj", turn, place)[:, (0, 2)]
+        points = np.concatenate([points - 1, points + 1])
+    # A unit that is wrong by a thousand must not ask for a million lines.
+    return (
+        np.clip(points.min(axis=0), -_LARGEST_GRID_M, -_GRID_M).astype(np.float64),
+        np.clip(points.max(axis=0), _GRID_M, _LARGEST_GRID_M).astype(np.float64),
+    )
+
+
+def _grid(low: np.ndarray, high: np.ndarray) -> list[tuple[Sequence[float], Sequence[float]]]:
+    """Lines of whole metres on the floor; a line a metre long each, so that a cut costs little."""
+    (x1, z1), (x2, z2) = np.floor(low).astype(int).tolist(), np.ceil(high).astype(int).tolist()
+    lines = [((x, 0.0, z), (x, 0.0, z + 1)) for x in range(x1, x2 + 1) for z in range(z1, z2)]
+    lines += [((x, 0.0, z), (x + 1, 0.0, z)) for z in range(z1, z2 + 1) for x in range(x1, x2)]
+    return lines  # type: ignore[return-value]
+
+
+def _front(truth: RoomGroundTruth, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """A bar from the middle of the piece's front on the floor, a third of a metre ahead."""
+    yaw, half = float(truth.yaw_rad[k]), truth.sizes_m[k].astype(np.float64) / 2
+    ahead = np.array([np.sin(yaw), 0.0, np.cos(yaw)])
+    reach = min(half[0] / max(abs(ahead[0]), 1e-9), half[2] / max(abs(ahead[2]), 1e-9))
+    foot = truth.centers_m[k].astype(np.float64) - (0, half[1], 0)
+    return foot + reach * ahead, foot + (reach + _BAR_M) * ahead
+
+
+def _draw_box(
+    draw: ImageDraw.ImageDraw,
+    truth: RoomGroundTruth,
+    k: int,
+    camera: np.ndarray,
+    lens: np.ndarray,
+) -> None:
+    corners = box_corners(truth.centers_m[k], truth.sizes_m[k])
+    for line in wire_pixels(corners, BOX_EDGES, camera, lens):
+        draw.line(line, fill="white", width=3)
+    for line in wire_pixels(corners, BOX_EDGES, camera, lens):
+        draw.line(line, fill="black", width=1)
+    if truth.model_ids[k]:  # without a mesh no front is known
+        _line(draw, np.stack(_front(truth, k)), camera, lens, (0, 0, 0), 3)
+
+
+def _line(
+    draw: ImageDraw.ImageDraw,
+    ends_m: np.ndarray,
+    camera: np.ndarray,
+    lens: np.ndarray,
+    color: Color,
+    width: int = 1,
+) -> None:
+    if to_camera(ends_m, camera)[:, 2].max() > 0:
+        for line in wire_pixels(ends_m, [(0, 1)], camera, lens):
+            draw.line(line, fill=color, width=width)
+
+
+def _tag(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str, color: Color) -> None:
+    left, top, right, bottom = draw.textbbox(place, text, font=_font(11))
+    draw.rectangle((left - 1, top - 1, right + 1, bottom + 1), fill=color)
+    draw.text(place, text, fill="white", font=_font(11))
+
+
+def _dark(color: np.ndarray) -> Color:
+    red, green, blue = (int(channel) * 11 // 20 for channel in color)
+    return (red, green, blue)
+
+
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size=size)

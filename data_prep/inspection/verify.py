@@ -1,0 +1,209 @@
+"""A folder of shards in, what is wrong with it out: checksums, shapes, ranges, boxes, masks, 3D."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_prep.engine.source import SPLITS
+from data_prep.engine.workers import pool
+from data_prep.inspection.agreement import Agreement, ModelPoints, measure
+from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
+from sceneprior.classes import label_set
+from sceneprior.errors import InputError, ShardError
+from sceneprior.shards import (
+    MODELS_FOLDER,
+    Shard,
+    check_views,
+    list_shards,
+    read_index,
+    room_checksum,
+)
+
+MESH_IOU_AT_LEAST = 0.85
+"""Mean over a folder. A mesh and its own mask agree to the pixel but for parts thinner than one."""
+BOX_IOU_AT_LEAST = 0.5
+"""The same where only 3D boxes are known: the corners of a box reach beyond the silhouette of what
+is in it, and annotated boxes are those of a partial scan. A wrong axis gives 0.1 or less."""
+ROOM_IOU_AT_LEAST = {"mesh": 0.6, "box": 0.2}
+"""For the mean of one room, so that one wrong room does not hide among many right ones."""
+_ROOM_OBJECTS = 5
+"""A mean over fewer says nothing about a room."""
+
+
+@dataclass(frozen=True)
+class RoomCheck:
+    """What was found in one room."""
+
+    shard: str
+    room_id: str
+    views: int = 0
+    objects: int = 0
+    problems: tuple[str, ...] = ()
+    """Sentences without the room's name."""
+    agreement: Agreement = field(default_factory=Agreement)
+    has_truth: bool = False
+    has_checksum: bool = False
+
+    @property
+    def mean_iou(self) -> dict[str, float]:
+        """`mesh` and `box`, each where it was measured."""
+        kinds = {"mesh": self.agreement.mesh, "box": self.agreement.box}
+        return {kind: float(np.mean(values)) for kind, values in kinds.items() if values}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was found in a folder."""
+
+    rooms: dict[str, list[RoomCheck]]
+    """By split."""
+    problems: tuple[str, ...]
+    """Sentences, each with the place; empty: all is well."""
+
+    @property
+    def agreement(self) -> Agreement:
+        """Over all rooms."""
+        every = [room.agreement for rooms in self.rooms.values() for room in rooms]
+        return sum(every, Agreement())
+
+
+def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Verdict:
+    """Read everything in a folder of shards and hold it against itself.
+
+    Args:
+        folder: Finished shards.
+        room_id: Only this room; the index's counts are then left alone.
+        workers: Processes.
+
+    Raises:
+        InputError: it is no finished folder of shards, or holds no such room.
+    """
+    folder = Path(folder)
+    index = read_index(folder)
+    name = str(index.get("label_set"))
+    label_set(name)
+    problems: list[str] = []
+    rooms: dict[str, list[RoomCheck]] = {}
+    for split in SPLITS:
+        if not any((folder / split).glob("*.h5")):
+            continue
+        paths = list_shards(folder, split)
+        arguments = [(folder, path, name, room_id) for path in paths]
+        with pool(workers) as run:
+            rooms[split] = [room for part in run(_check_shard, arguments, f"checking {split}")
+                            for room in part]  # fmt: skip
+    every = [room for checks in rooms.values() for room in checks]
+    if not every:
+        raise InputError(
+            f"{folder} has no room '{room_id}'; its report.csv lists the rooms."
+            if room_id is not None
+            else f"{folder} holds no rooms; prepare them again."
+        )
+    for room in every:
+        path = str(folder / room.shard)
+        where = path + (f", room {room.room_id}" if room.room_id else "")
+        for sentence in room.problems:
+            # What could not be read says itself where it is.
+            text = sentence if sentence.startswith(path) else f"{where}: {sentence}"
+            problems.append(text if text.endswith("?") else f"{text}.")
+    if room_id is None:
+        if all(room.views for room in every):  # else it is said already why something is missing
+            problems += _count_problems(folder, index, rooms)
+        agreement = sum((room.agreement for room in every), Agreement())
+        for kind, values, least in (
+            ("meshes", agreement.mesh, MESH_IOU_AT_LEAST),
+            ("3D boxes", agreement.box, BOX_IOU_AT_LEAST),
+        ):
+            if values and np.mean(values) < least:
+                problems.append(
+                    f"{folder}: the projected {kind} of the ground truth agree with the masks with "
+                    f"a mean 2D IoU of {np.mean(values):.2f}, expected at least {least}: is an "
+                    "axis or a unit wrong?"
+                )
+    return Verdict(rooms, tuple(problems))
+
+
+def _count_problems(
+    folder: Path, index: dict[str, Any], rooms: dict[str, list[RoomCheck]]
+) -> Iterator[str]:
+    counts = index.get("counts")
+    for split, expected in counts.items() if isinstance(counts, dict) else ():
+        checks = [room for room in rooms.get(split, ()) if room.room_id]
+        found = {
+            "rooms": len(checks),
+            "views": sum(room.views for room in checks),
+            "objects": sum(room.objects for room in checks),
+        }
+        for what, count in found.items():
+            if expected.get(what, count) != count:
+                yield (
+                    f"{folder}: index.json counts {expected[what]} {what} in '{split}', but its "
+                    f"shards hold {count}; run the same prep command again."
+                )
+
+
+def _check_shard(
+    folder: Path, path: Path, label_set_name: str, only: str | None
+) -> list[RoomCheck]:
+    """Every room of a shard, or the one asked for; a shard that cannot be read is one problem."""
+    name = str(path.relative_to(folder))
+    models = ModelPoints(folder / MODELS_FOLDER)
+    checks: list[RoomCheck] = []
+    try:
+        with Shard(path) as shard:
+            problems: tuple[str, ...] = ()
+            if shard.label_set != label_set_name:
+                problems = (
+                    f"the shard is labelled '{shard.label_set}', index.json says "
+                    f"'{label_set_name}'",
+                )
+                checks.append(RoomCheck(name, "", problems=problems))
+            for room_id in shard.room_ids:
+                if only is None or room_id == only:
+                    checks.append(_check_room(shard, name, room_id, models))
+    except ShardError as error:
+        checks.append(RoomCheck(name, "", problems=(str(error).removesuffix("."),)))
+    return checks
+
+
+def _check_room(shard: Shard, name: str, room_id: str, models: ModelPoints) -> RoomCheck:
+    truth = None
+    try:
+        views = shard.read_room(room_id, images=True)
+        check_views(str(shard.path), views)
+        if shard.has_ground_truth(room_id):
+            truth = shard.read_ground_truth(room_id)
+        stored = shard.read_checksum(room_id)
+    except ShardError as error:
+        return RoomCheck(name, room_id, problems=(str(error).removesuffix("."),))
+    problems = []
+    if stored is not None and stored != room_checksum(views, truth):
+        problems.append("its checksum is not that of its contents: the file was changed or damaged")
+    problems += array_problems(views, len(label_set(shard.label_set)))
+    problems += mask_problems(views)
+    agreement = Agreement()
+    if truth is not None:
+        found = list(truth_problems(views, truth))
+        if not found:
+            agreement, found = measure(views, truth, models)
+        problems += found
+    check = RoomCheck(
+        name, room_id, len(views.visible), len(views.object_class), tuple(problems), agreement,
+        truth is not None, stored is not None,
+    )  # fmt: skip
+    return _judge_overlap(check)
+
+
+def _judge_overlap(check: RoomCheck) -> RoomCheck:
+    sentences = list(check.problems)
+    for kind, mean in check.mean_iou.items():
+        count = len(getattr(check.agreement, kind))
+        if count >= _ROOM_OBJECTS and mean < ROOM_IOU_AT_LEAST[kind]:
+            sentences.append(
+                f"its ground truth projects onto its masks with a mean 2D IoU of {mean:.2f} only "
+                f"({count} unoccluded objects): is an axis or a unit wrong?"
+            )
+    return replace(check, problems=tuple(sentences))

@@ -1,0 +1,182 @@
+"""Placed boxes in, the next box's distribution out: the ATISS baseline, which learns from 3D.
+
+Source: Paschalidou et al., "ATISS: Autoregressive Transformers for Indoor Scene Synthesis", NeurIPS
+2021. Where we differ: docs/baselines_3d.md.
+"""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from sceneprior.baselines.atiss.logistics import LogisticMixture, draw_index
+from sceneprior.models.layers import mlp
+from sceneprior.views import RoomBoxes
+
+END = 0
+"""The class that ends a room: void, which is no furniture."""
+PARTS = {"position": (0, 3), "angle": (3, 4), "size": (4, 7)}
+"""Which of an object's seven numbers are drawn together, in their order."""
+CUT_RAD = -3 * math.pi / 4
+"""Where angles begin and end as numbers of [-1, 1]: at a diagonal, as the fewest pieces stand."""
+CLASS_WIDTH = 64
+OCTAVES = 8
+"""Sines and cosines a coordinate is shown to the network as; the finest has a period of two steps
+of the mixture. The published 32 octaves go far below what a float32 can tell apart."""
+BATCH = 256
+"""Rooms sampled at a time."""
+
+
+class Atiss(nn.Module):
+    """Objects one after the other, each given the set of those before it.
+
+    A transformer encoder without positional encoding reads the objects there are and one learnt
+    query. What it makes of the query gives the class of the next object, or the room's end; then,
+    given the class, its position; then its angle, then its size, each given all before it. Every
+    number is a mixture of logistics of its own. An object is seven `numbers` in [-1, 1].
+
+    Args:
+        classes: Size of the label set, void included.
+        max_objects: Where sampling stops, if the end was not drawn before.
+        width, layers, heads, hidden, dropout: Of the encoder.
+        mixtures: Logistics a coordinate.
+    """
+
+    low_m: Tensor
+    high_m: Tensor
+
+    def __init__(
+        self,
+        classes: int,
+        max_objects: int,
+        width: int,
+        layers: int,
+        heads: int,
+        hidden: int,
+        mixtures: int,
+        dropout: float,
+    ):
+        super().__init__()
+        self.max_objects = max_objects
+        self.register_buffer("low_m", torch.zeros(6))
+        self.register_buffer("high_m", torch.ones(6))
+        self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
+        self.object = nn.Linear(CLASS_WIDTH + 7 * 2 * OCTAVES, width)
+        self.query = nn.Parameter(torch.randn(width))
+        self.encoder = nn.ModuleList(
+            nn.TransformerEncoderLayer(
+                width, heads, hidden, dropout, activation="gelu", batch_first=True
+            )
+            # Each drawn by itself; nn.TransformerEncoder would start with copies of one.
+            for _ in range(layers)
+        )
+        self.class_head = _head(width, classes)
+        known = width + CLASS_WIDTH
+        self.heads = nn.ModuleDict(
+            {
+                name: _head(known + start * 2 * OCTAVES, (end - start) * 3 * mixtures)
+                for name, (start, end) in PARTS.items()
+            }
+        )
+
+    def fit_bounds(self, rooms: RoomBoxes) -> None:
+        """Take the range of every coordinate and size from the training rooms."""
+        boxes_m = rooms.boxes_m[rooms.is_object]
+        self.low_m.copy_(boxes_m.amin(dim=0))
+        # Where all are alike (a toy), a range of nothing would divide by nothing.
+        self.high_m.copy_(torch.maximum(boxes_m.amax(dim=0), self.low_m + 1e-3))
+
+    def to_unit(self, rooms: RoomBoxes) -> Float[Tensor, "rooms objects 7"]:
+        """Each object's `numbers`: centre, yaw and extents, from metres and radians to [-1, 1]."""
+        assert rooms.yaw_rad is not None, "true boxes have it"
+        unit = 2 * (rooms.boxes_m - self.low_m) / (self.high_m - self.low_m) - 1
+        turn = torch.remainder(rooms.yaw_rad[..., None] - CUT_RAD, 2 * math.pi) / math.pi - 1
+        return torch.cat([unit[..., :3], turn, unit[..., 3:]], dim=-1)
+
+    def to_metres(
+        self, unit: Float[Tensor, "*batch 7"]
+    ) -> tuple[Float[Tensor, "*batch 6"], Float[Tensor, "*batch"]]:
+        """Boxes and yaws of `numbers`."""
+        boxes = torch.cat([unit[..., :3], unit[..., 4:]], dim=-1)
+        boxes_m = self.low_m + (boxes + 1) / 2 * (self.high_m - self.low_m)
+        turn = (unit[..., 3] + 1) * math.pi + CUT_RAD
+        return boxes_m, torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
+
+    def context(
+        self,
+        object_class: Int[Tensor, "rooms objects"],
+        unit: Float[Tensor, "rooms objects 7"],
+        is_object: Bool[Tensor, "rooms objects"],
+    ) -> Float[Tensor, "rooms width"]:
+        """What a set of objects, in whatever order, means for the next one."""
+        objects = torch.cat([self.class_embedding(object_class), waves(unit)], dim=-1)
+        query = self.query.expand(len(unit), 1, -1)
+        tokens = torch.cat([query, self.object(objects)], dim=1)
+        padding = torch.cat([is_object.new_zeros(len(unit), 1), ~is_object], dim=1)
+        for layer in self.encoder:
+            tokens = layer(tokens, src_key_padding_mask=padding)
+        return tokens[:, 0]
+
+    def log_prob(
+        self,
+        context: Float[Tensor, "rooms width"],
+        next_class: Int[Tensor, " rooms"],
+        next_unit: Float[Tensor, "rooms 7"],
+    ) -> dict[str, Float[Tensor, " rooms"]]:
+        """Log-probability of the next object's class, position, angle and size; of all but the
+        class 0 where that is `END`."""
+        class_log_prob = self.class_head(context).log_softmax(dim=-1)
+        found = {"class": class_log_prob.gather(-1, next_class[:, None])[:, 0]}
+        for name, (start, end) in PARTS.items():
+            law = self._law(name, context, next_class, next_unit)
+            log_prob = law.log_prob(next_unit[:, start:end]).sum(dim=-1)
+            found[name] = log_prob * (next_class != END)
+        return found
+
+    def _law(self, name: str, context: Tensor, label: Tensor, unit: Tensor) -> LogisticMixture:
+        """Of one of `PARTS`, given the class and those of the numbers `unit` that come before."""
+        start, end = PARTS[name]
+        known = [context, self.class_embedding(label), waves(unit[:, :start])]
+        features = self.heads[name](torch.cat(known, dim=-1))
+        return LogisticMixture.of(features.unflatten(-1, (end - start, -1)))
+
+    @torch.no_grad()
+    def sample(self, count: int, seed: int) -> RoomBoxes:
+        """New rooms. The same seed gives the same rooms, the first of them however many follow."""
+        generator = torch.Generator().manual_seed(seed)
+        uniform = torch.rand(count, self.max_objects, 15, generator=generator)
+        parts = [self._sample(part) for part in uniform.to(self.query.device).split(BATCH)]
+        labels, unit = (torch.cat(part) for part in zip(*parts, strict=True))
+        boxes_m, yaw_rad = self.to_metres(unit)
+        return RoomBoxes(labels, labels != END, boxes_m, yaw_rad=yaw_rad)
+
+    def _sample(
+        self, uniform: Float[Tensor, "rooms objects 15"]
+    ) -> tuple[Int[Tensor, "rooms objects"], Float[Tensor, "rooms objects 7"]]:
+        """Classes, `END` from a room's end on, and numbers."""
+        labels = torch.full(uniform.shape[:2], END, device=uniform.device)
+        unit = uniform.new_zeros(*labels.shape, 7)
+        going = torch.ones_like(labels[:, 0], dtype=torch.bool)
+        for step in range(self.max_objects):
+            before = labels[:, :step]
+            context = self.context(before, unit[:, :step], before != END)
+            drawn, choice, place = uniform[:, step].split([1, 7, 7], dim=-1)
+            label = draw_index(self.class_head(context), drawn[:, 0])
+            going = going & (label != END)
+            for name, (start, end) in PARTS.items():
+                law = self._law(name, context, label, unit[:, step])
+                unit[:, step, start:end] = law.draw(choice[:, start:end], place[:, start:end])
+            labels[:, step] = label.where(going, END)
+        return labels, unit
+
+
+def waves(unit: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch waves"]:
+    """Each number of [-1, 1] as sines and cosines of `OCTAVES` octaves."""
+    octaves = math.pi * 2.0 ** torch.arange(OCTAVES, device=unit.device, dtype=unit.dtype)
+    phase = (unit.unsqueeze(-1) * octaves).flatten(-2)
+    return torch.cat([phase.sin(), phase.cos()], dim=-1)
+
+
+def _head(inputs: int, outputs: int) -> nn.Sequential:
+    return mlp(nn.Linear(inputs, inputs), nn.Linear(inputs, outputs))

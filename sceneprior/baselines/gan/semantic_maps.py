@@ -1,0 +1,128 @@
+"""Decoded scenes, or what cameras saw, in; semantic maps out: per pixel, how much of each class."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from sceneprior.classes import VOID
+from sceneprior.geometry.cameras import project
+from sceneprior.losses.completeness import kept_share
+from sceneprior.losses.shape import observed_ids
+from sceneprior.silhouettes.render import render_scene
+from sceneprior.views import DecodedScenes, SceneViews
+
+LENS = 2
+"""Pixels of the instance ids on the side of one of a map. What is real has hard edges and what is
+rendered has soft ones, which would give it away; seen through this lens both are soft."""
+
+SIGMA_PX2 = 0.25
+"""Softness of rendered edges: about that of a hard edge under the lens, from 0.27 to 0.73 within
+half a pixel to either side."""
+
+
+def observed_maps(
+    views: SceneViews, classes: int
+) -> Float[Tensor, "rooms views classes height width"]:
+    """What the views show: the share of each class in a pixel, of `void` where no object is."""
+    ids = observed_ids(views).long()
+    of_id = F.pad(views.object_class, (1, 0), value=VOID)
+    pixels = of_id.gather(1, ids.flatten(1)).view_as(ids)
+    maps = F.one_hot(pixels, classes).movedim(-1, 2).to(views.intrinsics.dtype)
+    return F.avg_pool2d(maps.flatten(0, 1), LENS).unflatten(0, maps.shape[:2])
+
+
+def rendered_maps(
+    scenes: DecodedScenes,
+    faces: Int[Tensor, "faces 3"],
+    views: SceneViews,
+    kept: Float[Tensor, "rooms objects"],
+    classes: Float[Tensor, "rooms objects classes"],
+    mode: str = "fast",
+) -> Float[Tensor, "rooms views classes height width"]:
+    """What the views would show of other scenes: theirs, drawn into the views' cameras.
+
+    Args:
+        scenes: Of as many rooms as `views`, with meshes.
+        faces: Of every mesh.
+        views: Cameras, and the size of the maps: that of `instance_ids`.
+        kept, classes: Of the scenes' objects: `choices`.
+        mode: Of `render_silhouettes`.
+    """
+    assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
+    height, width = (side / LENS for side in observed_ids(views).shape[-2:])
+    objects = scenes.vertices_m.shape[1]
+    # Each object is drawn as a room of its own: whole, with its own depth.
+    alone = render_scene(
+        scenes.vertices_m.flatten(0, 1).unsqueeze(1),
+        faces,
+        views.world_to_camera.repeat_interleave(objects, dim=0),
+        views.intrinsics_at(height, width).repeat_interleave(objects, dim=0),
+        (int(height), int(width)),  # as pooling, which leaves out what does not fill a pixel
+        sigma_px2=SIGMA_PX2,
+        mode=mode,
+        compositing="alone",
+    )
+    coverage = alone.masks[:, :, 0].unflatten(0, (-1, objects)).transpose(1, 2)
+    depth_m = alone.depth_m.unflatten(0, (-1, objects)).transpose(1, 2)
+    # Where only the soft edge reaches, the object is as far away as its centre.
+    centers = project(scenes.centers_m.unsqueeze(2), views.world_to_camera, views.intrinsics)
+    depth_m = depth_m.where(depth_m.isfinite(), centers[..., 2:].detach())
+    return compose_maps(coverage, depth_m, kept, classes)
+
+
+def observed_counts(views: SceneViews, classes: int) -> Float[Tensor, "rooms classes"]:
+    """How many objects of each class were tracked in each room."""
+    of_objects = F.one_hot(views.object_class.long(), classes) * views.is_object[..., None]
+    return of_objects.sum(dim=1).to(views.intrinsics.dtype)
+
+
+def choices(
+    scenes: DecodedScenes, completeness_target: str = "first_n"
+) -> tuple[Float[Tensor, "rooms objects"], Float[Tensor, "rooms objects classes"]]:
+    """Which objects exist, and which class each has, as `tasks.decode` reads them: 0 or 1.
+
+    So what is drawn and counted is what will be generated. Gradients are those of sigmoid and
+    softmax (straight through): what does not exist still learns what it would change.
+    """
+    scores = scenes.completeness_logits.sigmoid()
+    shares = scenes.class_logits.softmax(dim=-1)
+    likeliest = F.one_hot(shares.argmax(dim=-1), shares.shape[-1])
+    kept = kept_share(_straight_through(scores > 0.5, scores), completeness_target)
+    return kept, _straight_through(likeliest, shares)
+
+
+def _straight_through(hard: Tensor, soft: Tensor) -> Tensor:
+    return hard.to(soft) + soft - soft.detach()
+
+
+def compose_maps(
+    coverage: Float[Tensor, "rooms views objects height width"],
+    depth_m: Float[Tensor, "rooms views objects height width"],
+    kept: Float[Tensor, "rooms objects"],
+    classes: Float[Tensor, "rooms objects classes"],
+) -> Float[Tensor, "rooms views classes height width"]:
+    """Lay objects over each other, pixel by pixel, nearest first.
+
+        visible_k = a_k * prod_{j nearer than k} (1 - a_j),    a_k = kept_k coverage_k
+
+    is what the pixel shows of object k, and what is left of it shows nothing: `void`.
+
+    Args:
+        coverage: Of each object alone, in [0, 1].
+        depth_m: Of each object at each pixel; orders them and carries no gradient.
+        kept: How far each object belongs to the scene, in [0, 1]; what does not hides nothing.
+        classes: What each object is; shares that sum to 1, none of them of `void`.
+
+    Returns:
+        Shares that sum to 1 over the classes.
+    """
+    alpha = coverage * kept[:, None, :, None, None]
+    order = depth_m.argsort(dim=2)
+    ordered = alpha.gather(2, order)
+    left = (1 - ordered).cumprod(dim=2)
+    before = torch.cat([torch.ones_like(left[:, :, :1]), left[:, :, :-1]], dim=2)
+    visible = torch.zeros_like(alpha).scatter(2, order, ordered * before)
+    maps = torch.einsum("rvkhw,rkc->rvchw", visible, classes)
+    maps[:, :, VOID] += left[:, :, -1]
+    return maps

@@ -1,0 +1,184 @@
+"""The GAN baseline: our network against a discriminator of semantic maps, with no view loss."""
+
+import copy
+from collections.abc import Iterable
+
+import lightning
+import torch
+from jaxtyping import Float
+from lightning.pytorch.core.optimizer import LightningOptimizer
+from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+
+from sceneprior.baselines.gan.discriminator import MapDiscriminator
+from sceneprior.baselines.gan.losses import certainty, contents, implausible, mistaken, sameness
+from sceneprior.baselines.gan.semantic_maps import (
+    choices,
+    observed_counts,
+    observed_maps,
+    rendered_maps,
+)
+from sceneprior.classes import label_set
+from sceneprior.config import RunConfig
+from sceneprior.models.layout_decoder import LayoutDecoder
+from sceneprior.models.prior import ScenePrior
+from sceneprior.training.objective import check_finite, full_precision
+from sceneprior.views import DecodedScenes, SceneViews
+
+BETAS = (0.0, 0.99)
+"""Of both Adams: momentum would push on after the opponent has moved."""
+
+STARTS = ((0.0, 1.2), (0.4, 0.4), (0.0, 1.2), (0.4, 0.5), (0.4, 0.5), (0.4, 0.5), (1.5, 1.0))
+"""Mean and spread, over rooms and objects, of what the layout decoder starts from: x, y, z, then
+width, height, depth before their SoftPlus, then completeness. Metres where they are metres."""
+
+START_ROOMS = 64
+
+SHAPES = 0.1
+"""Of the generator's learning rate, for the shape decoder: maps are content with sheared boxes."""
+
+SOFT = 0.01
+"""Weight of the mean square of class and completeness logits. A choice that is all but certain has
+no gradient: a generator whose objects had all gone would never come back."""
+
+PLAUSIBLE = 10.0
+"""Weight of what leaves where rooms are and how large furniture is."""
+
+MEMORY = 0.9
+"""Share of `excess` that is kept at each step: a batch alone says little of rare classes."""
+
+
+class GanStage(lightning.LightningModule):
+    """Generator and discriminator in turn, once each a batch (supplement, Baselines).
+
+    A room is generated for each of the batch, from logits drawn from N(0, 1), and drawn as semantic
+    maps into that room's own cameras. There are no latents of rooms: nothing pairs a generated
+    room with a real one. What keeps it stable is listed in docs/baselines_2d.md.
+
+    `generator` is what plays; `prior`, which tasks take out of checkpoints, is a running average of
+    its weights, in which the two opponents' circling cancels. `excess` is how much more
+    of each class a generated room has than a real one, of late: objects, and pixels (`contents`).
+
+    Args:
+        prior: The network, freshly initialised.
+        latents: No rows; they make the run's checkpoints alike.
+        config: The run.
+    """
+
+    def __init__(self, prior: ScenePrior, latents: nn.Embedding, config: RunConfig):
+        super().__init__()
+        self.automatic_optimization = False
+        self.config = config
+        self.classes = len(label_set(config.label_set))
+        self.generator = prior
+        spread_out(prior.layout, prior.decoder(self._latents(START_ROOMS), prior.max_objects))
+        self.prior = copy.deepcopy(prior).requires_grad_(False)
+        self.average = get_ema_multi_avg_fn(config.gan.averaging)
+        self.latents = latents
+        self.discriminator = MapDiscriminator(self.classes)
+        self.excess: Tensor
+        self.register_buffer("excess", torch.zeros(2 * self.classes))
+
+    def training_step(self, views: SceneViews, batch_idx: int) -> None:
+        generator_optimizer, discriminator_optimizer = self.optimizers()  # type: ignore[attr-defined]
+        scenes = self.generator.decode(self._latents(len(views.room_index)))
+        with full_precision(self.device):
+            # Before rendering, too, which refuses vertices that are not finite.
+            undecided = certainty(scenes)
+            check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views)
+            real = observed_maps(views, self.classes)
+            fake, counts = self._draw(scenes, views)
+            more = contents(fake, counts) - contents(real, observed_counts(views, self.classes))
+            self.excess.lerp_(more.detach().mean(dim=0), 1 - MEMORY)
+            loss = SOFT * undecided + PLAUSIBLE * implausible(scenes, views)
+            loss = loss + self.config.gan.variety * sameness(scenes)
+            loss = loss + self.config.gan.counts * (more @ self.excess).mean()
+
+        # Real maps come in steps that rendered ones lack.
+        noise = self.config.gan.noise * self._left()
+        real, fake = (maps + noise * torch.randn_like(maps) for maps in (real, fake))
+        real_scores = self.discriminator(real)
+        fake_scores = self.discriminator(fake.detach())
+        told_apart = mistaken(real_scores, real=True) + mistaken(fake_scores, real=False)
+        self._update(discriminator_optimizer, told_apart)
+
+        self.discriminator.requires_grad_(False)
+        loss = loss + mistaken(self.discriminator(fake), real=True)
+        check_finite(loss, views)
+        self._update(generator_optimizer, loss)
+        self.discriminator.requires_grad_(True)
+        self.average(list(self.prior.parameters()), list(self.generator.parameters()), 0)
+        said = {
+            "loss": loss,
+            "discriminator": told_apart,
+            "real_score": torch.stack([score.mean() for score in real_scores]).mean(),
+            "fake_score": torch.stack([score.mean() for score in fake_scores]).mean(),
+            "objects": counts.sum(dim=1).mean(),
+        }
+        said = {f"train/{name}": value.detach() for name, value in said.items()}
+        self.log_dict(said, on_step=False, on_epoch=True, batch_size=len(counts))
+
+    def on_train_epoch_start(self) -> None:
+        """Rates fall evenly to 0, so that the opponents' circling ends, too."""
+        for optimizer in self.optimizers():  # type: ignore[union-attr]
+            for group in optimizer.param_groups:
+                group["lr"] = group["initial_lr"] * self._left()
+
+    def _left(self) -> float:
+        """Share of the training that is still to come."""
+        return 1 - self.current_epoch / self.config.gan.epochs
+
+    def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:
+        shape = (rooms, self.config.model.logits_per_room)
+        with full_precision(self.device):
+            return self.generator.sphere(torch.randn(shape, device=self.device))
+
+    def _draw(self, scenes: DecodedScenes, views: SceneViews) -> tuple[Tensor, Tensor]:
+        """Maps, and how many objects of each class are in each room."""
+        kept, classes = choices(scenes, self.config.loss.completeness_target)
+        faces, mode = self.generator.shape.faces, self.config.shape.silhouettes
+        maps = rendered_maps(scenes, faces, views, kept, classes, mode)
+        return maps, (kept.unsqueeze(-1) * classes).sum(dim=1)
+
+    def _update(self, optimizer: LightningOptimizer, loss: Tensor) -> None:
+        optimizer.zero_grad()
+        self.manual_backward(loss)
+        self.clip_gradients(optimizer, self.config.gan.clip_gradient, "norm")  # type: ignore[arg-type]
+        optimizer.step()
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        rates = self.config.gan
+        shape = list(self.generator.shape.parameters())
+        others = [p for name, p in self.generator.named_parameters() if "shape." not in name]
+        return [
+            _adam((others, rates.learning_rate), (shape, SHAPES * rates.learning_rate)),
+            _adam((self.discriminator.parameters(), rates.discriminator_learning_rate)),
+        ]
+
+
+def _adam(*parts: tuple[Iterable[nn.Parameter], float]) -> torch.optim.Optimizer:
+    groups = [{"params": own, "lr": rate, "initial_lr": rate} for own, rate in parts]
+    return torch.optim.Adam(groups, betas=BETAS)
+
+
+@torch.no_grad()
+def spread_out(layout: LayoutDecoder, features: Float[Tensor, "rooms objects width"]) -> None:
+    """Start with objects all over the floor, of all sizes and classes.
+
+    A fresh layout decoder puts every object at the floor centre, all of one class, and the
+    discriminator would pull all of them the same way: they would never part. So its last layer is
+    scaled and shifted until each output has the mean and the spread over these rooms and objects
+    that `STARTS` names, and class logits 0 and 1 (after Salimans and Kingma, "Weight
+    normalization", NeurIPS 2016, section 3).
+
+    Args:
+        layout: Changed in place.
+        features: Of random rooms.
+    """
+    outputs = layout.mlp2(layout.mlp1(features)).flatten(0, 1)
+    starts = [(0.0, 1.0)] * layout.classes + list(STARTS)
+    rows = zip(layout.mlp2.rows(), outputs.unbind(dim=1), starts, strict=True)
+    for (weight, bias), values, (mean, spread) in rows:
+        scale = spread / values.std()
+        weight *= scale
+        bias.copy_(mean + scale * (bias - values.mean()))

@@ -1,0 +1,176 @@
+"""A room's furniture as one matrix in, the same out, through a small latent: the Sync2Gen baseline.
+
+Source: Yang et al., "Scene Synthesis via Uncertainty-Driven Attribute Synchronization", ICCV 2021.
+What was ambiguous, and what we chose: docs/baselines_3d.md.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sceneprior.baselines.sync2gen.pairs import PairPrior
+from sceneprior.models.layers import mlp
+from sceneprior.views import RoomBoxes
+
+ATTRIBUTES = 7
+"""Of a slot: whether it exists, centre x, y, z, full extents along x, y, z."""
+READS = 4
+"""Groups of inputs that an output of a sparse layer is connected with."""
+HIDDEN_GROUP = 8
+LEAST_SPREAD_M = 0.05
+LEAST_SIZE_M = 0.02
+
+
+class Sync2Gen(nn.Module):
+    """A variational auto-encoder of arrangements: `slots` objects a class, each there or not.
+
+    Attributes are standardised per class. Objects of a class take its slots from left to right (by
+    x, then z); of more than `slots`, the rightmost are left out. Layers are sparsely and fully
+    connected in turn: a sparse one lets each output see few groups of inputs, chosen once by
+    `seed`, which holds overfitting down.
+
+    Args:
+        classes: Size of the label set, void included.
+        slots: Objects of one class a room can hold.
+        width: Of the hidden layers; a multiple of 8.
+        latent: Numbers a room is boiled down to.
+        refine_steps: Gradient steps on positions after decoding; 0 takes rooms as decoded.
+        seed: Chooses the sparse connections.
+    """
+
+    mean_m: Tensor
+    spread_m: Tensor
+
+    def __init__(
+        self, classes: int, slots: int, width: int, latent: int, refine_steps: int, seed: int
+    ):
+        super().__init__()
+        self.classes, self.slots, self.latent = classes, slots, latent
+        self.refine_steps = refine_steps
+        cells = (classes - 1) * slots * ATTRIBUTES
+        self.register_buffer("mean_m", torch.zeros(classes - 1, 1, 6))
+        self.register_buffer("spread_m", torch.ones(classes - 1, 1, 6))
+        self.pairs = PairPrior(classes)
+        self.encoder = mlp(
+            SparseLinear(cells, width, ATTRIBUTES, seed),
+            nn.Linear(width, width),
+            SparseLinear(width, width, HIDDEN_GROUP, seed + 1),
+            nn.Linear(width, 2 * latent),
+        )
+        self.decoder = mlp(
+            nn.Linear(latent, width),
+            SparseLinear(width, width, HIDDEN_GROUP, seed + 2),
+            nn.Linear(width, width),
+            nn.Linear(width, cells),
+        )
+
+    def fit_statistics(self, rooms: RoomBoxes, seed: int) -> None:
+        """Take means and spreads per class, and how pairs of classes lie, from training rooms."""
+        for label in range(1, self.classes):
+            mine = rooms.boxes_m[rooms.is_object & (rooms.object_class == label)]
+            if len(mine):
+                spread_m = mine.std(dim=0, correction=0)
+                self.mean_m[label - 1, 0] = mine.mean(dim=0)
+                self.spread_m[label - 1, 0] = spread_m.clamp(min=LEAST_SPREAD_M)
+        self.pairs.fit(rooms, seed)
+
+    def to_matrix(self, rooms: RoomBoxes) -> Float[Tensor, "rooms classes slots 7"]:
+        """Rooms as matrices, bit for bit the same for every order of their objects."""
+        label = rooms.object_class.where(rooms.is_object, self.classes)
+        order = torch.arange(label.shape[1], device=label.device).expand_as(label)
+        # Sorting is stable, so the last key counts most.
+        for key in (rooms.boxes_m[..., 2], rooms.boxes_m[..., 0], label):
+            order = order.gather(1, key.gather(1, order).argsort(dim=1, stable=True))
+        rooms, label = rooms.take(order), label.gather(1, order).contiguous()
+        rank = torch.arange(label.shape[1], device=label.device) - torch.searchsorted(label, label)
+        fits = (label < self.classes) & (rank < self.slots)
+        row = (label - 1).clamp(max=self.classes - 2)
+        unit = (rooms.boxes_m - self.mean_m[row, 0]) / self.spread_m[row, 0]
+        cell = torch.cat([torch.ones_like(unit[..., :1]), unit], dim=-1)
+        # What finds no slot goes to one behind the last, which is cut off again.
+        last = (self.classes - 1) * self.slots
+        slot = (row * self.slots + rank).where(fits, last)
+        matrix = cell.new_zeros(len(label), last + 1, ATTRIBUTES)
+        matrix = matrix.scatter(1, slot.unsqueeze(-1).expand_as(cell), cell)
+        return matrix[:, :last].unflatten(1, (self.classes - 1, self.slots))
+
+    def encode(
+        self, matrix: Float[Tensor, "rooms classes slots 7"]
+    ) -> tuple[Float[Tensor, "rooms latent"], Float[Tensor, "rooms latent"]]:
+        """Mean and log-variance of each room's latent."""
+        mean, log_variance = self.encoder(matrix.flatten(1)).chunk(2, dim=-1)
+        return mean, log_variance.clamp(-10, 10)
+
+    def decode(self, z: Float[Tensor, "rooms latent"]) -> Float[Tensor, "rooms classes slots 7"]:
+        """Matrices whose first attribute is the logit of a slot's existence."""
+        return self.decoder(z).unflatten(-1, (self.classes - 1, self.slots, ATTRIBUTES))
+
+    def losses(
+        self,
+        matrix: Float[Tensor, "rooms classes slots 7"],
+        decoded: Float[Tensor, "rooms classes slots 7"],
+        mean: Float[Tensor, "rooms latent"],
+        log_variance: Float[Tensor, "rooms latent"],
+    ) -> dict[str, Float[Tensor, " rooms"]]:
+        """Each room's terms: existence over all slots, the rest over slots that are filled."""
+        exists = matrix[..., 0]
+        off = F.smooth_l1_loss(decoded[..., 1:], matrix[..., 1:], reduction="none")
+        off = off * exists.unsqueeze(-1)
+        existence = F.binary_cross_entropy_with_logits(decoded[..., 0], exists, reduction="none")
+        return {
+            "existence": existence.sum(dim=(1, 2)),
+            "position": off[..., :3].sum(dim=(1, 2, 3)),
+            "size": off[..., 3:].sum(dim=(1, 2, 3)),
+            "kl": 0.5 * (mean**2 + log_variance.exp() - 1 - log_variance).sum(dim=-1),
+        }
+
+    @torch.no_grad()
+    def note_errors(
+        self,
+        matrix: Float[Tensor, "rooms classes slots 7"],
+        decoded: Float[Tensor, "rooms classes slots 7"],
+    ) -> None:
+        """Remember how far decoded centres are off, per class: what refinement may move them by."""
+        off_m = (decoded - matrix)[..., [1, 3]] * self.spread_m[..., [0, 2]]
+        squared = (off_m**2).mean(dim=-1) * matrix[..., 0]
+        self.pairs.note_errors(squared.sum(dim=(0, 2)), matrix[..., 0].sum(dim=(0, 2)))
+
+    @torch.no_grad()
+    def sample(self, count: int, seed: int) -> RoomBoxes:
+        """New rooms of latents from N(0, 1). The same seed gives the same rooms, the first of them
+        however many follow."""
+        generator = torch.Generator().manual_seed(seed)
+        z = torch.stack([torch.randn(self.latent, generator=generator) for _ in range(count)])
+        rooms = self.to_rooms(self.decode(z.to(self.mean_m)))
+        return self.pairs.refine(rooms, self.refine_steps)
+
+    def to_rooms(self, decoded: Float[Tensor, "rooms classes slots 7"]) -> RoomBoxes:
+        """The slots that rather exist than not, in metres."""
+        boxes_m = (self.mean_m + self.spread_m * decoded[..., 1:]).flatten(1, 2)
+        boxes_m = torch.cat([boxes_m[..., :3], boxes_m[..., 3:].clamp(min=LEAST_SIZE_M)], dim=-1)
+        exists = (decoded[..., 0] > 0).flatten(1, 2)
+        label = 1 + torch.arange(exists.shape[1], device=exists.device) // self.slots
+        widest = max(int(exists.sum(dim=1).max()), 1)
+        first = (~exists).long().argsort(dim=1, stable=True)[:, :widest]
+        return RoomBoxes(label * exists, exists, boxes_m).take(first)
+
+
+class SparseLinear(nn.Linear):
+    """A linear layer in which every output sees `READS` groups of neighbouring inputs."""
+
+    mask: Tensor
+
+    def __init__(self, inputs: int, outputs: int, group: int, seed: int):
+        super().__init__(inputs, outputs)
+        groups = inputs // group
+        reads = min(READS, groups)
+        generator = torch.Generator().manual_seed(seed)
+        seen = torch.rand(outputs, groups, generator=generator).argsort(dim=1) < reads
+        self.register_buffer("mask", seen.repeat_interleave(group, dim=1).float())
+        with torch.no_grad():  # as large as a layer of so many inputs starts
+            self.weight.mul_((groups / reads) ** 0.5)
+
+    def forward(self, x: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:
+        """Only the connections that there are."""
+        return F.linear(x, self.weight * self.mask, self.bias)

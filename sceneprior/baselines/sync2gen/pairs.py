@@ -1,0 +1,121 @@
+"""How pairs of furniture lie to each other in training rooms; rooms moved towards that.
+
+Sync2Gen's synchronisation, in a small form: absolute positions, as uncertain as the decoder is,
+meet relative ones, as uncertain as training rooms are. What is left out: docs/baselines_3d.md.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from sceneprior.views import RoomBoxes
+
+COMPONENTS = 64
+"""Offsets kept a pair of classes: each is the centre of one Gaussian of its mixture."""
+BANDWIDTH_M = 0.15
+ANYWHERE = 0.05
+"""Share of pairs that lie in no learnt way, evenly over `AREA_M2`: no pair pulls for ever."""
+AREA_M2 = 64.0
+STEP_M = 0.02
+MOMENTUM = 0.05
+"""Of the running error per class."""
+BATCH = 64
+"""Rooms refined at a time."""
+
+
+class PairPrior(nn.Module):
+    """For every pair of classes, a mixture over the offset between centres, in x and z."""
+
+    offsets_m: Tensor
+    known: Tensor
+    error_m2: Tensor
+
+    def __init__(self, classes: int):
+        super().__init__()
+        self.register_buffer("offsets_m", torch.zeros(classes, classes, COMPONENTS, 2))
+        self.register_buffer("known", torch.zeros(classes, classes, dtype=torch.bool))
+        self.register_buffer("error_m2", torch.full((classes,), 0.04))
+
+    def fit(self, rooms: RoomBoxes, seed: int) -> None:
+        """Keep offsets of training rooms: all of a rare pair, over and over; some of a frequent."""
+        generator = torch.Generator().manual_seed(seed)
+        offsets_m, together = _offsets(rooms)
+        room, one, other = together.nonzero(as_tuple=True)
+        first, second = rooms.object_class[room, one], rooms.object_class[room, other]
+        found_m = offsets_m[room, one, other]
+        classes = len(self.known)
+        pair = first * classes + second
+        for index in pair.unique().tolist():
+            mine = found_m[pair == index]
+            pick = torch.randperm(len(mine), generator=generator)
+            pick = pick.repeat(-(-COMPONENTS // len(mine)))[:COMPONENTS]
+            self.offsets_m[index // classes, index % classes] = mine[pick]
+            self.known[index // classes, index % classes] = True
+
+    def note_errors(
+        self, squared: Float[Tensor, " labels"], count: Float[Tensor, " labels"]
+    ) -> None:
+        """Let the running mean of squared errors of centres follow a batch's.
+
+        Args:
+            squared: Sum over a batch's objects, per class without void, in square metres.
+            count: How many objects it is over.
+        """
+        newest = squared / count.clamp(min=1)
+        weight = MOMENTUM * (count > 0)
+        self.error_m2[1:] += weight * (newest - self.error_m2[1:])
+
+    def energy(
+        self, rooms: RoomBoxes, start_m: Float[Tensor, "rooms objects 2"]
+    ) -> Float[Tensor, " rooms"]:
+        """Minus the log-posterior of positions, up to a constant:
+
+            sum_i |p_i - start_i|^2 / (2 error_i) - mean_(j != i) log p(p_j - p_i | classes)
+
+        A pair that training never saw together says nothing.
+        """
+        error_m2 = self.error_m2[rooms.object_class]
+        stray = ((rooms.boxes_m[..., [0, 2]] - start_m) ** 2).sum(dim=-1) / (2 * error_m2)
+        offsets_m, together = _offsets(rooms)
+        first, second = rooms.object_class.unsqueeze(2), rooms.object_class.unsqueeze(1)
+        centres_m = self.offsets_m[first, second]
+        squared = ((offsets_m.unsqueeze(-2) - centres_m) ** 2).sum(dim=-1)
+        peak = 1 / (2 * torch.pi * BANDWIDTH_M**2)
+        density = peak * torch.exp(-squared / (2 * BANDWIDTH_M**2)).mean(dim=-1)
+        log_prob = torch.log((1 - ANYWHERE) * density + ANYWHERE / AREA_M2)
+        counted = together & self.known[first, second]
+        of_pairs = (log_prob * counted).sum(dim=-1) / counted.sum(dim=-1).clamp(min=1)
+        return ((stray - of_pairs) * rooms.is_object).sum(dim=-1)
+
+    def refine(self, rooms: RoomBoxes, steps: int) -> RoomBoxes:
+        """Move every object over the floor by `steps` steps of Adam down the energy."""
+        if steps == 0:
+            return rooms
+        moved = [self._refine(part, steps) for part in rooms.split(BATCH)]
+        return replace(rooms, boxes_m=torch.cat(moved))
+
+    @torch.enable_grad()
+    def _refine(self, rooms: RoomBoxes, steps: int) -> Float[Tensor, "rooms objects 6"]:
+        start_m = rooms.boxes_m[..., [0, 2]]
+        rooms = replace(rooms, boxes_m=rooms.boxes_m.clone().requires_grad_())
+        # Adam treats each number by itself: no room depends on its neighbours in the batch, and
+        # what the energy does not ask for, heights and sizes, stays.
+        optimizer = torch.optim.Adam([rooms.boxes_m], lr=STEP_M)
+        for _ in range(steps):
+            optimizer.zero_grad()
+            self.energy(rooms, start_m).sum().backward()
+            optimizer.step()
+        return rooms.boxes_m.detach()
+
+
+def _offsets(
+    rooms: RoomBoxes,
+) -> tuple[Float[Tensor, "rooms objects objects 2"], Bool[Tensor, "rooms objects objects"]]:
+    """From each object i to each object j in x and z; and which are two objects of a room."""
+    floor_m = rooms.boxes_m[..., [0, 2]]
+    objects = floor_m.shape[1]
+    other = ~torch.eye(objects, dtype=torch.bool, device=floor_m.device)
+    together = rooms.is_object.unsqueeze(2) & rooms.is_object.unsqueeze(1) & other
+    return floor_m.unsqueeze(1) - floor_m.unsqueeze(2), together

@@ -1,0 +1,107 @@
+"""Verbs that make new rooms from a run; what a verb needs it imports when called."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sceneprior.cli.options import (
+    CheckpointOption,
+    LawOption,
+    OverwriteOption,
+    RendererOption,
+    RunOption,
+)
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Mount synthesize, interpolate and complete."""
+    for verb in (synthesize, interpolate, complete):
+        app.command()(verb)
+
+
+def synthesize(
+    run: RunOption,
+    out: Annotated[Path, typer.Option(help="Folder for the scenes.")],
+    count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many rooms.")] = 16,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same rooms.")] = 0,
+    law: LawOption = None,
+    checkpoint: CheckpointOption = "final",
+    overwrite: OverwriteOption = False,
+    renderer: RendererOption = "auto",
+) -> None:
+    """Generate rooms: JSON, GLB and a top-down PNG each, and latents where the method has them."""
+    from sceneprior.generation.decode import decode_latents, draw_latents
+    from sceneprior.generation.decode import synthesize as generate
+    from sceneprior.generation.export import check_free, write_scenes
+    from sceneprior.generation.latents import write_latents
+    from sceneprior.offscreen import open_renderer
+    from sceneprior.training.checkpoints import TrainedPrior, load_any_run
+
+    check_free(out, overwrite)
+    trained = load_any_run(run, checkpoint)
+    artist = open_renderer(renderer)
+    if isinstance(trained, TrainedPrior):
+        z, names = draw_latents(trained, count, seed, law)
+        write_scenes(decode_latents(trained, z, names), out, artist, overwrite)
+        write_latents(out, z, names)
+    else:
+        write_scenes(generate(trained, count, seed, law), out, artist, overwrite)
+    typer.echo(f"Wrote {count} rooms to {out}")
+
+
+_END_HELP = "a training room's id, seed:7, or a file of latents: scenes/latents.npz:seed0_0003."
+
+
+def interpolate(
+    run: RunOption,
+    start: Annotated[str, typer.Option("--from", help=f"Where to begin: {_END_HELP}")],
+    end: Annotated[str, typer.Option("--to", help="Where to end: named like the beginning.")],
+    out: Annotated[Path, typer.Option(help="Folder for the rooms and pictures.")],
+    steps: Annotated[int, typer.Option(min=2, max=1000, help="Rooms, both ends included.")] = 9,
+    checkpoint: CheckpointOption = "final",
+    overwrite: OverwriteOption = False,
+    renderer: RendererOption = "auto",
+) -> None:
+    """Walk from one room to another on the sphere: rooms, a strip and an animation."""
+    from sceneprior.generation.export import check_free, write_scenes
+    from sceneprior.generation.interpolate import interpolate as walk
+    from sceneprior.generation.interpolate import write_pictures
+    from sceneprior.generation.latents import write_latents
+    from sceneprior.offscreen import open_renderer
+    from sceneprior.training.checkpoints import load_run
+
+    check_free(out, overwrite)
+    trained = load_run(run, checkpoint)
+    z, scenes = walk(trained, start, end, steps)
+    artist = open_renderer(renderer)
+    write_scenes(scenes, out, artist, overwrite)
+    write_latents(out, z, [scene.name for scene in scenes])
+    write_pictures(trained, z, out, artist)
+    typer.echo(f"Wrote {steps} rooms, strip.png and animation.gif to {out}")
+
+
+def complete(
+    run: RunOption,
+    given: Annotated[Path, typer.Option(help="Scene JSON of the objects that are there.")],
+    out: Annotated[Path, typer.Option(help="Folder for the completed rooms.")],
+    count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many answers.")] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same answers.")] = 0,
+    law: LawOption = None,
+    checkpoint: CheckpointOption = "final",
+    overwrite: OverwriteOption = False,
+    renderer: RendererOption = "auto",
+) -> None:
+    """Furnish the rest of a room of which some objects are given."""
+    from sceneprior.generation.complete import complete as furnish
+    from sceneprior.generation.export import check_free, load_scene, write_scenes
+    from sceneprior.generation.latents import write_latents
+    from sceneprior.offscreen import open_renderer
+    from sceneprior.training.checkpoints import load_run
+
+    check_free(out, overwrite)
+    scene = load_scene(given)
+    z, scenes = furnish(load_run(run, checkpoint), [scene], count, seed, law)[0]
+    write_scenes(scenes, out, open_renderer(renderer), overwrite)
+    write_latents(out, z, [room.name for room in scenes])
+    typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects to {out}")

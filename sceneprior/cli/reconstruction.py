@@ -1,0 +1,175 @@
+"""Verbs that reconstruct rooms from single images; what a verb needs it imports when called."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sceneprior.cli.options import CheckpointOption, OverwriteOption, RendererOption, RunOption
+
+if TYPE_CHECKING:
+    from sceneprior.reconstruction.observed import ObservedImage
+    from sceneprior.reconstruction.reconstruct import FitOptions, Reconstruction
+    from sceneprior.training.checkpoints import TrainedPrior
+
+ScheduleOption = Annotated[
+    str, typer.Option(help="paper (1,000 steps) or released (the authors' code: 2,000).")
+]
+RestartsOption = Annotated[int, typer.Option(min=1, help="Latents fitted; the best is kept.")]
+StartOption = Annotated[
+    str, typer.Option(help="nearest (training rooms that look alike) or random.")
+]
+RefineOption = Annotated[
+    bool, typer.Option("--refine/--no-refine", help="Move the found boxes onto their masks.")
+]
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Mount reconstruct and eval-svr."""
+    app.command()(reconstruct)
+    app.command("eval-svr")(eval_svr)
+
+
+def reconstruct(
+    run: RunOption,
+    out: Annotated[Path, typer.Option(help="Folder for the rooms.")],
+    shards: Annotated[Path | None, typer.Option(help="Folder of shards with the images.")] = None,
+    room: Annotated[str | None, typer.Option(help="A room of the shards.")] = None,
+    view: Annotated[int, typer.Option(min=0, help="Which of its views.")] = 0,
+    split: Annotated[
+        str | None, typer.Option(help="One view of each room of train or test.")
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Only the first rooms.")] = None,
+    mask: Annotated[Path | None, typer.Option(help="Your own image: a PNG of ids.")] = None,
+    classes: Annotated[Path | None, typer.Option(help="Its table: CSV or JSON, id, class.")] = None,
+    intrinsics: Annotated[
+        str | None, typer.Option(help="Its lens: fx,fy,cx,cy in pixels, or a JSON file.")
+    ] = None,
+    pose: Annotated[Path | None, typer.Option(help="Its camera in the room frame, JSON.")] = None,
+    camera_height: Annotated[
+        float, typer.Option(min=0.1, help="Metres above the floor, without --pose.")
+    ] = 1.6,
+    schedule: ScheduleOption = "paper",
+    restarts: RestartsOption = 1,
+    start: StartOption = "nearest",
+    refine: RefineOption = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of drawn views and random starts.")] = 0,
+    checkpoint: CheckpointOption = "final",
+    overwrite: OverwriteOption = False,
+    renderer: RendererOption = "auto",
+) -> None:
+    """Reconstruct rooms from the instance masks of single images: JSON, GLB and pictures."""
+    from sceneprior.errors import InputError
+    from sceneprior.generation.export import check_free
+    from sceneprior.offscreen import open_renderer
+    from sceneprior.reconstruction.observed import image_from_shards, images_of_split
+    from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct
+    from sceneprior.reconstruction.reconstructions import write_reconstructions
+    from sceneprior.training.checkpoints import load_run
+
+    ways = [mask is not None, room is not None, split is not None]
+    if sum(ways) != 1 or (shards is None) != (mask is not None):
+        raise InputError(
+            "Say what to reconstruct from, in one way: --shards with --room (and --view) or with "
+            "--split; or --mask with --classes and --intrinsics."
+        )
+    if mask is None and any(given is not None for given in (classes, intrinsics, pose)):
+        raise InputError("--classes, --intrinsics and --pose belong to --mask.")
+    if (limit is not None and split is None) or (view and room is None):
+        raise InputError("--limit belongs to --split, and --view to --room.")
+    check_free(out, overwrite)
+    options = FitOptions(schedule, restarts, start, refine, seed=seed)
+    trained = load_run(run, checkpoint)
+    if mask is not None:
+        found = [_own(trained, options, mask, classes, intrinsics, pose, camera_height)]
+    else:
+        assert shards is not None
+        if room is not None:
+            images = [image_from_shards(shards, room, view)]
+        else:
+            images, blank = images_of_split(shards, split or "test", seed, limit)
+            for name in blank:
+                typer.echo(
+                    f"Note: no view of room {name} shows an object; it is left out.", err=True
+                )
+        found = reconstruct(trained, images, options)
+        _tell_unlearnt_classes(trained, images)
+    write_reconstructions(found, out, open_renderer(renderer))
+    typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
+
+
+def _own(
+    trained: "TrainedPrior",
+    options: "FitOptions",
+    mask: Path,
+    classes: Path | None,
+    intrinsics: str | None,
+    pose: Path | None,
+    camera_height: float,
+) -> "Reconstruction":
+    from sceneprior.errors import InputError
+    from sceneprior.reconstruction.image import read_own_image, sides_of_room
+    from sceneprior.reconstruction.reconstruct import reconstruct
+
+    if classes is None or intrinsics is None:
+        raise InputError("--mask needs --classes and --intrinsics beside it.")
+    own = read_own_image(mask, classes, intrinsics, trained.config.label_set, pose, camera_height)
+    for note in own.notes:
+        typer.echo(f"Note: {note}.", err=True)
+    sides = reconstruct(trained, sides_of_room(own, camera_height), options)
+    _tell_unlearnt_classes(trained, [own.image])
+    return min(sides, key=lambda found: found.score)
+
+
+def _tell_unlearnt_classes(trained: "TrainedPrior", images: "list[ObservedImage]") -> None:
+    from sceneprior.reconstruction.reconstruct import unlearnt_classes
+
+    if unlearnt := unlearnt_classes(trained, images):
+        typer.echo(
+            f"Note: the run never generates these classes, so expect little of them: "
+            f"{', '.join(unlearnt)}.",
+            err=True,
+        )
+
+
+def eval_svr(
+    shards: Annotated[Path, typer.Option(help="Shards with 3D ground truth.")],
+    run: Annotated[Path | None, typer.Option(help="A run: its fits are judged.")] = None,
+    scenes: Annotated[
+        Path | None, typer.Option(help="Instead: what reconstruct, or retrieve after it, wrote.")
+    ] = None,
+    split: Annotated[str, typer.Option(help="train or test.")] = "test",
+    limit: Annotated[int | None, typer.Option(min=1, help="Only the first rooms.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="JSON file (default: svr.json in RUN or SCENES).")
+    ] = None,
+    schedule: ScheduleOption = "paper",
+    restarts: RestartsOption = 1,
+    start: StartOption = "nearest",
+    refine: RefineOption = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of the views, random starts and rooms.")] = 0,
+    checkpoint: CheckpointOption = "final",
+    renderer: RendererOption = "auto",
+) -> None:
+    """Judge single-view reconstruction against the true rooms, and against known ones."""
+    from sceneprior.errors import InputError
+    from sceneprior.reconstruction.reconstruct import FitOptions
+    from sceneprior.reconstruction.score import judge_scenes, judge_views, print_view_scores
+
+    if run is not None and scenes is None:
+        target = out or run / "svr.json"
+        options = FitOptions(schedule, restarts, start, refine, seed=seed)
+        scores = judge_views(run, shards, split, limit, options, target, renderer, checkpoint)
+    elif scenes is not None and run is None:
+        fitting = (schedule, restarts, start, refine, checkpoint)
+        if limit is not None or fitting != ("paper", 1, "nearest", False, "final"):
+            raise InputError(
+                "--limit, --checkpoint, --schedule, --restarts, --start and --refine belong to "
+                "--run; scenes are judged as they are."
+            )
+        target = out or scenes / "svr.json"
+        scores = judge_scenes(scenes, shards, split, target, seed, renderer)
+    else:
+        raise InputError("Say what to judge: either --run, or --scenes with reconstructions.")
+    print_view_scores(scores)
+    typer.echo(f"Wrote {target}")

@@ -1,0 +1,93 @@
+"""Verbs that train, and show what was learnt; what a verb needs it imports when called."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sceneprior.cli.options import CheckpointOption, RendererOption, RunOption
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Mount fit, report and demo."""
+    app.command()(fit)
+    app.command()(report)
+    app.command()(demo)
+
+
+def fit(
+    config: Annotated[str, typer.Option(help="A YAML file, or a shipped one such as demo.yaml.")],
+    run: Annotated[
+        Path | None, typer.Option(help="Folder for checkpoints and logs (default: runs/<config>).")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Override: model.width=256. Repeatable.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")] = False,
+    logger: Annotated[
+        list[str] | None, typer.Option(help="csv, tensorboard, wandb. Repeatable.")
+    ] = None,
+    devices: Annotated[str, typer.Option(help="How many, or which; Lightning's option.")] = "auto",
+    accelerator: Annotated[str, typer.Option(help="cpu, gpu, auto; Lightning's option.")] = "auto",
+    precision: Annotated[str, typer.Option(help="32-true, bf16-mixed; Lightning's option.")] = (
+        "32-true"
+    ),
+) -> None:
+    """Train a run: the layout stage, then the shape stage; or a baseline (`stages`)."""
+    from sceneprior.config import load_config
+
+    settings = load_config(config, tuple(set_ or ()))
+    folder = run or Path("runs") / Path(config).stem
+    from sceneprior.experiments.evaluate_samples import SampleJudge
+    from sceneprior.training.fit import fit as run_fit
+
+    options = {"devices": devices, "accelerator": accelerator, "precision": precision}
+    try:
+        run_fit(
+            settings, folder, resume, tuple(logger or ("csv", "tensorboard")), options,
+            SampleJudge(settings),
+        )  # fmt: skip
+    except KeyboardInterrupt:
+        typer.echo(
+            "Stopped and saved. Go on with: sceneprior fit "
+            f"--config {folder / 'config.yaml'} --run {folder} --resume",
+            err=True,
+        )
+        raise typer.Exit(130) from None
+    typer.echo(f"Trained: {folder}")
+
+
+def report(
+    run: RunOption,
+    scores: Annotated[Path | None, typer.Option(help="From eval-fid (RUN/scores.json).")] = None,
+    out: Annotated[Path | None, typer.Option(help="HTML file (default: RUN/report.html).")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the generated rooms shown.")] = 0,
+    command: Annotated[
+        list[str] | None, typer.Option(help="A command to list on the page. Repeatable.")
+    ] = None,
+    checkpoint: CheckpointOption = "final",
+    renderer: RendererOption = "auto",
+) -> None:
+    """Write one self-contained page: inputs, curves, rooms, scores."""
+    from sceneprior.experiments.evaluate import report_run
+
+    target = out or run / "report.html"
+    report_run(
+        run, scores or run / "scores.json", target, seed, tuple(command or ()), renderer, checkpoint
+    )
+    typer.echo(f"Wrote {target}")
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for everything the demo makes.")] = Path(
+        "out/demo"
+    ),
+    config: Annotated[str, typer.Option(help="What to train.")] = "demo.yaml",
+    rooms: Annotated[int, typer.Option(min=20, help="Homes to make.")] = 480,
+    count: Annotated[int, typer.Option(min=2, help="Rooms to generate and judge.")] = 200,
+    renderer: RendererOption = "auto",
+) -> None:
+    """The whole path on homes made here: homes, shards, fit, new rooms, scores, a page."""
+    from sceneprior.experiments.demo import run_demo
+
+    run_demo(out, config, rooms, count, renderer)

@@ -1,0 +1,260 @@
+"""Other people's rooms as ours: box lists of ATISS and its kin in, a folder of scenes out.
+
+Docs: docs/evaluation.md, "Scenes of other methods".
+"""
+
+import json
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from sceneprior.classes import label_set
+from sceneprior.errors import InputError
+from sceneprior.evaluation.topdown import box_mesh
+from sceneprior.generation.export import write_scenes
+from sceneprior.offscreen import SoftwareRenderer
+from sceneprior.scene import Mesh, Scene, SceneObject
+
+NEEDED = ("class_labels", "translations", "sizes", "angles")
+FLOOR = ("floor_plan_vertices", "floor_plan_faces", "floor_plan_centroid")
+NOT_FURNITURE = ("start", "empty", "void")
+"""Columns of class_labels that stand for no object; `end` also ends the list."""
+SIZES = {"half": 2.0, "full": 1.0}
+_QUARTER_RAD = 1e-4  # closer than this to a quarter turn, a box stays a box
+
+
+def convert(
+    boxes: Path, out: Path, label_set_name: str, classes: str | None, sizes: str, overwrite: bool
+) -> int:
+    """Write the rooms of box lists as scenes: JSON, GLB and PNG each.
+
+    Args:
+        boxes: A `.npz` or `.json`, or a folder searched for them.
+        out: Folder for the scenes.
+        label_set_name: Theirs; every class must be in it.
+        classes: Comma-separated names of the columns (or indices) of `class_labels`; None takes
+            the label set without void, and `start` and `end` after it where there are two more.
+        sizes: `half` or `full`.
+        overwrite: Write into a folder that holds something.
+
+    Returns:
+        How many rooms.
+
+    Raises:
+        InputError: a file is no box list, or names a class that the label set lacks.
+    """
+    if sizes not in SIZES:
+        raise InputError(f"No sizes '{sizes}'; they are half (extents, as ATISS has them) or full.")
+    columns = None if classes is None else [name.strip() for name in classes.split(",")]
+    scenes = [
+        scene
+        for path, name in _files(Path(boxes))
+        for scene in read_boxes(path, name, label_set_name, columns, SIZES[sizes])
+    ]
+    write_scenes(scenes, out, SoftwareRenderer(), overwrite)
+    return len(scenes)
+
+
+def _files(boxes: Path) -> list[tuple[Path, str]]:
+    """Files with the names of their rooms: ATISS keeps one folder with a boxes.npz per room."""
+    if boxes.is_file():
+        return [(boxes, boxes.stem)]
+    found = [path for path in sorted(boxes.rglob("*")) if path.suffix in (".npz", ".json")]
+    if not found:
+        raise InputError(f"{boxes} holds no .npz and no .json; give box lists of ATISS's format.")
+    return [
+        (path, "_".join(path.relative_to(boxes).with_suffix("").parts).removesuffix("_boxes"))
+        for path in found
+    ]
+
+
+def read_boxes(
+    path: Path,
+    name: str,
+    label_set_name: str,
+    columns: Sequence[str] | None = None,
+    size_factor: float = 2.0,
+) -> list[Scene]:
+    """The rooms of one file.
+
+    Args:
+        path: `.npz` with one room (arrays over objects) or several (one more axis in front), or
+            `.json` with one such object, or a list of them.
+        name: Of the room; several get numbers.
+        label_set_name: Theirs.
+        columns: What the columns of `class_labels` mean; None as in `convert`.
+        size_factor: From `sizes` to full extents.
+
+    Raises:
+        InputError: it is no box list, or names a class that the label set lacks.
+    """
+    rooms = [room for record in _records(path) for room in _one_by_one(path, record)]
+    names = [name] if len(rooms) == 1 else [f"{name}_{row:04d}" for row in range(len(rooms))]
+    return [
+        _scene(path, room, name, label_set_name, columns, size_factor)
+        for room, name in zip(rooms, names, strict=True)
+    ]
+
+
+def _records(path: Path) -> list[dict[str, Any]]:
+    try:
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                records = [{key: file[key] for key in (*NEEDED, *FLOOR) if key in file}]
+        else:
+            loaded = json.loads(path.read_text())
+            records = loaded if isinstance(loaded, list) else [loaded]
+        missing = [key for key in NEEDED if any(key not in record for record in records)]
+    except (OSError, ValueError, TypeError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path} is no box list ({type(error).__name__}); expected an .npz or .json with "
+            f"{', '.join(NEEDED)}."
+        ) from None
+    if missing:
+        raise InputError(f"{path} has no {' and no '.join(missing)}; a box list has all of them.")
+    return records
+
+
+def _one_by_one(path: Path, record: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Rooms of a record, with arrays over objects; several rooms lie along a first axis."""
+    try:
+        centers = np.asarray(record["translations"], dtype=np.float64)
+        sizes = np.asarray(record["sizes"], dtype=np.float64)
+        angles = np.asarray(record["angles"], dtype=np.float64)
+    except (ValueError, TypeError):
+        raise InputError(
+            f"{path}: translations, sizes and angles must be arrays of numbers."
+        ) from None
+    labels = np.asarray(record["class_labels"])
+    if centers.size == 0:
+        centers, sizes, angles = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+        labels = np.zeros(0, dtype=int)
+    several = centers.ndim == 3
+    if angles.ndim == centers.ndim:
+        angles = angles[..., 0]
+    objects = centers.shape[:-1]
+    if (
+        centers.ndim not in (2, 3)
+        or centers.shape[-1] != 3
+        or sizes.shape != centers.shape
+        or angles.shape != objects
+        or labels.shape[: len(objects)] != objects
+        or labels.ndim > len(objects) + 1
+    ):
+        raise InputError(
+            f"{path}: class_labels {labels.shape}, translations {centers.shape}, sizes "
+            f"{sizes.shape} and angles {angles.shape} do not describe the same objects; expected "
+            "(objects, classes), (objects, 3), (objects, 3) and (objects, 1)."
+        )
+    if not all(np.isfinite(array).all() for array in (centers, sizes, angles)):
+        raise InputError(f"{path} holds numbers that are not finite; leave such rooms out.")
+    floor = {key: record[key] for key in FLOOR if key in record}
+    for row in range(len(centers)) if several else [...]:
+        yield {
+            "labels": labels[row], "centers": centers[row], "sizes": sizes[row],
+            "angles": angles[row], **({} if several else floor),
+        }  # fmt: skip
+
+
+def _scene(
+    path: Path,
+    room: dict[str, Any],
+    name: str,
+    label_set_name: str,
+    columns: Sequence[str] | None,
+    size_factor: float,
+) -> Scene:
+    known = label_set(label_set_name)
+    objects = []
+    labels = _label_names(path, room["labels"], known, columns)
+    for label, center, size, angle in zip(
+        labels, room["centers"], room["sizes"], room["angles"], strict=True
+    ):
+        if label == "end":
+            break
+        if label in NOT_FURNITURE:
+            continue
+        if label not in known:
+            raise InputError(
+                f"{path}: class '{label}' is not in label set '{label_set_name}'; use one of "
+                f"{', '.join(known[1:])}, or another --label-set."
+            )
+        if (size <= 0).any():
+            raise InputError(f"{path}: a {label} has size {size.tolist()}; sizes are above 0.")
+        objects.append(turned_box(label, center, size_factor * size, float(angle)))
+    return Scene(
+        name, label_set_name, tuple(objects), _floor(path, room), {"converted_from": path.name}
+    )
+
+
+def _label_names(
+    path: Path, labels: np.ndarray, known: Sequence[str], columns: Sequence[str] | None
+) -> list[str]:
+    if labels.dtype.kind in "US":
+        return [str(label) for label in labels]
+    if labels.dtype.kind not in "fiub":
+        raise InputError(f"{path}: class_labels are neither names, indices nor one-hot rows.")
+    rows = labels.argmax(-1) if labels.ndim == 2 else labels.astype(int)
+    if columns is None:
+        columns = known[1:]
+        if labels.ndim == 2 and labels.shape[1] == len(columns) + 2:
+            columns = [*columns, "start", "end"]
+    wide = labels.shape[1] if labels.ndim == 2 else int(rows.max(initial=-1)) + 1
+    if (labels.ndim == 2 and wide != len(columns)) or wide > len(columns) or (rows < 0).any():
+        raise InputError(
+            f"{path}: class_labels know {wide} classes, but {len(columns)} names stand for them; "
+            "give all names in order with --classes, start, end and empty among them."
+        )
+    return [columns[row] for row in rows]
+
+
+def turned_box(
+    label: str,
+    center: Float[np.ndarray, "3"],
+    size: Float[np.ndarray, "3"],
+    yaw_rad: float,
+) -> SceneObject:
+    """A box turned about +y, +z towards +x, as an object of ours.
+
+    Its box is the axis-aligned one around it; unless it stands in quarter turns, its mesh is the
+    turned box itself, which pictures show.
+
+    Example: a square table, 1 m wide, stands on a corner.
+
+        >>> turned = turned_box("table", np.zeros(3), np.array([1.0, 0.7, 1.0]), np.pi / 4)
+        >>> [round(float(side), 3) for side in turned.size_m]
+        [1.414, 0.7, 1.414]
+    """
+    sine, cosine = np.sin(yaw_rad), np.cos(yaw_rad)
+    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    width, height, depth = np.abs(turn) @ size
+    place = tuple(float(value) for value in center)
+    item = SceneObject(label, (place[0], place[1], place[2]), (width, height, depth))
+    if abs(yaw_rad - np.round(yaw_rad / (np.pi / 2)) * (np.pi / 2)) < _QUARTER_RAD:
+        return item
+    own = box_mesh((0.0, 0.0, 0.0), size.tolist())
+    return replace(item, mesh=Mesh(own.vertices_m @ turn.T + center, own.faces))
+
+
+def _floor(path: Path, room: dict[str, Any]) -> np.ndarray | None:
+    """The outline of the floor's triangles around the floor's own centre, as ATISS places boxes."""
+    if any(key not in room for key in FLOOR):
+        return None
+    try:
+        vertices, faces, centroid = (np.asarray(room[key]) for key in FLOOR)
+        flat = (vertices.astype(np.float64) - centroid)[:, [0, 2]]
+        # Buffered by nothing: two triangles that share an edge become one outline.
+        floor = shapely.union_all([shapely.Polygon(flat[face]).buffer(0) for face in faces])
+        largest = max(shapely.get_parts(floor), key=shapely.area)
+        return np.asarray(largest.exterior.coords)[:-1]
+    except (ValueError, IndexError, TypeError) as error:
+        raise InputError(
+            f"{path}: its floor plan cannot be read ({error}); expected vertices (V, 3), "
+            "triangles (F, 3) and a centroid (3,)."
+        ) from None

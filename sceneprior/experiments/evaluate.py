@@ -1,0 +1,212 @@
+"""A run, or anybody's scenes, in; scores and a report page out."""
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from sceneprior.errors import InputError
+from sceneprior.evaluation.bootstrap import RESAMPLES
+from sceneprior.evaluation.metrics.layout_metrics import reconstruction_scores
+from sceneprior.evaluation.protocol import evaluate_synthesis, seeded_rows, write_scores
+from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.report import write_report
+from sceneprior.generation.decode import decode_latents, decode_training_rooms, synthesize
+from sceneprior.generation.export import load_scene_folder
+from sceneprior.offscreen import open_renderer
+from sceneprior.scene import Scene
+from sceneprior.training.checkpoints import STAGES, TrainedPrior, TrainedSampler, load_any_run
+
+UNFOLDING_STEPS = 7
+CURVES = (
+    "loss", "class", "box", "completeness", "frustum", "mask", "mask_iou",
+    "discriminator", "objects", "existence", "position", "size", "kl",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How rooms are judged, whoever made them; see `evaluate_synthesis`."""
+
+    inception: Path | None = None
+    alexnet: Path | None = None
+    reference: Path | None = None
+    resamples: int = RESAMPLES
+    renderer: str = "auto"
+    boxes: bool = False
+
+
+def judge_run(
+    run: Path,
+    count: int,
+    seed: int,
+    shards: Path | None,
+    out: Path,
+    law: str | None,
+    judging: Judging,
+    checkpoint: str = "final",
+) -> dict[str, Any]:
+    """Score generated rooms against test rooms, and decoded training rooms, in runs that remember
+    them, against the truth.
+
+    Args:
+        run: A run's folder, of any kind.
+        count: Rooms to generate.
+        seed: Of their latents, and of everything random in judging.
+        shards: Folder with the test rooms; None takes the run's own.
+        out: JSON file to write.
+        law: Sampling law; None takes the config's.
+        judging: How.
+        checkpoint: `final` or `best`.
+
+    Raises:
+        InputError: the run, the shards or a file of weights cannot be used.
+    """
+    trained = load_any_run(run, checkpoint)
+    folder = shards or Path(trained.config.data.shards)
+    # First, because other shards than the run's are refused here.
+    pairs = decoded_and_true(trained, folder) if trained.remembers_rooms else []
+    scores = _judge(synthesize(trained, count, seed, law), folder, seed, judging)
+    if pairs:
+        scores |= reconstruction_scores(pairs)
+    scores["protocol"]["run"] = Path(run).resolve().name
+    scores["protocol"]["stage"] = trained.stage
+    scores["protocol"]["checkpoint"] = checkpoint
+    if isinstance(trained, TrainedPrior):
+        scores["protocol"]["sampling_law"] = law or trained.law
+    write_scores(scores, out)
+    return scores
+
+
+def judge_folder(
+    folder: Path, count: int | None, seed: int, shards: Path, out: Path, judging: Judging
+) -> dict[str, Any]:
+    """Score anybody's scenes against test rooms.
+
+    Args:
+        folder: Scene JSONs (docs/conventions.md), perhaps with the GLBs of their meshes.
+        count: At most so many of them, drawn by `seed`; None takes all.
+        seed: Of everything random.
+        shards: Folder with the test rooms.
+        out: JSON file to write.
+        judging: How.
+
+    Raises:
+        InputError: the scenes, the shards or a file of weights cannot be used.
+    """
+    scenes = load_scene_folder(folder)
+    rows = seeded_rows(len(scenes), count or len(scenes), seed)
+    scores = _judge([scenes[row] for row in rows], shards, seed, judging)
+    scores["protocol"]["scenes"] = Path(folder).resolve().name
+    scores["protocol"]["n_scenes_available"] = len(scenes)
+    write_scores(scores, out)
+    return scores
+
+
+def _judge(scenes: list[Scene], shards: Path, seed: int, judging: Judging) -> dict[str, Any]:
+    return evaluate_synthesis(
+        scenes,
+        shards,
+        inception=judging.inception,
+        alexnet=judging.alexnet,
+        seed=seed,
+        resamples=judging.resamples,
+        renderer=open_renderer(judging.renderer),
+        reference=judging.reference,
+        boxes=judging.boxes,
+    )
+
+
+def decoded_and_true(
+    trained: TrainedPrior | TrainedSampler, shards: Path, meshes: bool = False
+) -> list[tuple[Scene, Scene]]:
+    """Training rooms as decoded, each with what training never saw: the room in 3D.
+
+    Only tracked objects count: what no camera saw, nobody can know. Turned copies of a room
+    are left out. `meshes` are for pictures; scores of boxes need none of the true ones.
+    """
+    real = reference_scenes(shards, "train", tracked_only=True, meshes=meshes)
+    truth = {scene.name: scene for scene in real}
+    decoded = {scene.name: scene for scene in decode_training_rooms(trained)}
+    missing = sorted(set(decoded) - set(truth) - {name for name in decoded if "@" in name})
+    if missing:
+        raise InputError(
+            f"{shards} does not hold training room {missing[0]} of this run "
+            f"({len(missing)} are missing); give the shards it was trained on with --shards."
+        )
+    return [(decoded[name], truth[name]) for name in truth if name in decoded]
+
+
+def report_run(
+    run: Path,
+    scores: Path,
+    out: Path,
+    seed: int,
+    commands: tuple[str, ...],
+    renderer: str,
+    checkpoint: str = "final",
+) -> None:
+    """Write the page of a run.
+
+    Raises:
+        InputError: the run or its scores cannot be read.
+    """
+    trained = load_any_run(run, checkpoint)
+    try:
+        figures = json.loads(scores.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{scores} holds no scores ({error}); write them with "
+            f"`sceneprior eval-fid --run {run}`."
+        ) from None
+    shards = Path(trained.config.data.shards)
+    decoded: list[tuple[Scene, Scene]] = []
+    unfolding: list[Scene] = []
+    if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
+        decoded = decoded_and_true(trained, shards, meshes=True)
+        unfolding = unfold(trained)
+    from_boxes = isinstance(trained, TrainedSampler)
+    write_report(
+        out,
+        title=f"New rooms from a prior learnt from {'boxes in 3D' if from_boxes else 'masks'}",
+        shards=shards,
+        run=run,
+        generated=synthesize(trained, 8, seed),
+        scores=figures,
+        commands=commands,
+        curves=read_curves(run),
+        decoded=decoded,
+        unfolding=unfolding,
+        renderer=open_renderer(renderer),
+        from_boxes=from_boxes,
+    )
+
+
+def unfold(trained: TrainedPrior) -> list[Scene]:
+    """Rooms between two training rooms that lie far apart: on the sphere, along the geodesic."""
+    space = trained.prior.sphere
+    z = space(trained.logits)
+    end = int(space.nearness(z[:1], z).argmin())
+    start, far = z[:1].expand(UNFOLDING_STEPS, -1), z[end].expand(UNFOLDING_STEPS, -1)
+    names = [f"step_{step}" for step in range(UNFOLDING_STEPS)]
+    along = torch.linspace(0, 1, UNFOLDING_STEPS)
+    return decode_latents(trained, space.between(start, far, along), names)
+
+
+def read_curves(run: Path) -> dict[str, list[tuple[int, float]]]:
+    """Loss curves of every stage from its metrics.csv, as `stage/term` -> (epoch, value)."""
+    curves: dict[str, list[tuple[int, float]]] = {}
+    for stage in STAGES:
+        path = run / stage / "metrics.csv"
+        if not path.is_file():
+            continue
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                for term in CURVES:
+                    if row.get(f"train/{term}"):
+                        point = (int(row["epoch"]), float(row[f"train/{term}"]))
+                        curves.setdefault(f"{stage}/{term}", []).append(point)
+    return curves

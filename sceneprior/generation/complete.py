@@ -1,0 +1,226 @@
+"""Some objects of a room in, whole rooms round them out: latents fitted to what is given.
+
+1. Latents are drawn by the run's law and decoded. Those whose rooms come nearest to the given
+   objects are where the answers start, each answer from others.
+2. The network is frozen and each latent moves until its room holds the given classes and boxes,
+   drawn back towards its start. Which prediction stands for which given object is found anew at
+   each step, as in training, but in 3D.
+3. Of an answer's starts the one that ended best is taken, and the given objects are put into its
+   room (`sceneprior/generation/insert.py`).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from sceneprior.classes import VOID, label_set
+from sceneprior.errors import InputError
+from sceneprior.generation.decode import decode_latents, draw_latents
+from sceneprior.generation.insert import put_into
+from sceneprior.losses.layout import take
+from sceneprior.losses.matching import assign
+from sceneprior.scene import Scene
+from sceneprior.training.checkpoints import TrainedPrior
+from sceneprior.views import DecodedScenes
+
+DRAWN = 256
+"""Latents that starts are chosen from."""
+RESTARTS = 3
+"""Starts of each answer."""
+STEPS = 150
+RATE = 0.05
+"""Length of an early step of Adam, where the sphere's radius is 1; it falls to 0 by a cosine."""
+BOX_WEIGHT = 5.0
+"""Of the mean distance of centres and sides in metres, beside the class's cross entropy."""
+START_WEIGHT = 2.0
+"""Of half the squared distance from the start, which on a sphere is 1 - cosine. More leaves rooms
+as the law drew them; less fits the given objects better."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """The given objects of a batch of rooms, padded to the largest number."""
+
+    labels: Int[Tensor, "rooms objects"]
+    boxes_m: Float[Tensor, "rooms objects 6"]
+    """Centre and size."""
+    is_object: Bool[Tensor, "rooms objects"]
+
+    def repeated(self, times: int) -> "Given":
+        """Every room so many times, one after the other."""
+        labels, boxes_m, is_object = (
+            part.repeat_interleave(times, dim=0)
+            for part in (self.labels, self.boxes_m, self.is_object)
+        )
+        return Given(labels, boxes_m, is_object)
+
+
+def complete(
+    trained: TrainedPrior,
+    scenes: Sequence[Scene],
+    count: int = 4,
+    seed: int = 0,
+    law: str | None = None,
+    steps: int = STEPS,
+) -> list[tuple[Float[Tensor, "count dimension"], list[Scene]]]:
+    """Furnish the rest of rooms; all rooms and all answers in one batch.
+
+    Args:
+        trained: The run's prior.
+        scenes: The given objects of each room: classes, boxes, perhaps meshes. Without any, the
+            answers are what the run generates.
+        count: Answers a room.
+        seed: Of the latents that answers start from.
+        law: Of drawing them; None takes the config's.
+        steps: Of the fit; 0 leaves the drawn latents as they are.
+
+    Returns:
+        Of each room the answers' latents and the answers: see `put_into`.
+
+    Raises:
+        InputError: a given object cannot be used, or there are more than the run's rooms hold.
+    """
+    given = gather_given(trained, scenes)
+    starts = _starts(trained, given, count * RESTARTS, seed, law)
+    z, loss = fit_latents(trained, starts, given.repeated(count * RESTARTS), steps)
+    # Starts are in order of promise; dealt out in turn, every answer has good ones.
+    best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
+    z = take_along(z.view(len(scenes), RESTARTS, count, -1), best)
+    answers = []
+    for scene, own in zip(scenes, z, strict=True):
+        rooms = decode_latents(trained, own, [f"complete_{k:02d}" for k in range(count)])
+        answers.append((own, [put_into(room, scene, {"seed": seed}) for room in rooms]))
+    return answers
+
+
+def take_along(
+    values: Float[Tensor, "rooms starts answers dimension"],
+    best: Int[Tensor, "rooms 1 answers"],
+) -> Float[Tensor, "rooms answers dimension"]:
+    """The chosen start of each answer."""
+    return values.take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
+
+
+def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> Given:
+    """Given objects as tensors.
+
+    Raises:
+        InputError: a class is not of the run's label set, a box is none, or they are too many.
+    """
+    config = trained.config
+    names, most = label_set(config.label_set), config.model.max_objects
+    longest = max([1, *(len(scene.objects) for scene in scenes)])
+    labels = torch.zeros(len(scenes), longest, dtype=torch.int64)
+    boxes_m = torch.ones(len(scenes), longest, 6, dtype=trained.logits.dtype)
+    is_object = torch.zeros(len(scenes), longest, dtype=torch.bool)
+    for row, scene in enumerate(scenes):
+        if len(scene.objects) > most:
+            raise InputError(
+                f"{scene.name} gives {len(scene.objects)} objects, but rooms of this run hold at "
+                f"most {most} (model.max_objects); give fewer, or train with more."
+            )
+        for column, item in enumerate(scene.objects):
+            if item.label not in names or names.index(item.label) == VOID:
+                raise InputError(
+                    f"{scene.name}: object {column} is a '{item.label}', which this run does not "
+                    f"know; its classes are {', '.join(names[1:])}."
+                )
+            box = np.array([*item.center_m, *item.size_m], dtype=np.float64)
+            if not np.isfinite(box).all() or (box[3:] <= 0).any():
+                raise InputError(
+                    f"{scene.name}: the box of object {column} ({item.label}) is {box.tolist()}; "
+                    "expected a finite centre and three sides above 0 (metres)."
+                )
+            labels[row, column] = names.index(item.label)
+            boxes_m[row, column] = torch.from_numpy(box)
+            is_object[row, column] = True
+    return Given(labels, boxes_m, is_object)
+
+
+@torch.no_grad()
+def _starts(
+    trained: TrainedPrior, given: Given, each: int, seed: int, law: str | None
+) -> Float[Tensor, "starts dimension"]:
+    """The `each` drawn latents for every room that come nearest to what is given, best first."""
+    z, _ = draw_latents(trained, max(DRAWN, each), seed, law)
+    decoded = trained.prior.decode(z, with_shape=False)
+    chosen = []
+    for row in range(len(given.labels)):
+        one = Given(given.labels[[row]], given.boxes_m[[row]], given.is_object[[row]])
+        losses = given_loss(decoded, one.repeated(len(z)), trained.config.loss.completeness_target)
+        chosen.append(z[losses.argsort(stable=True)[:each]])
+    return torch.cat(chosen)
+
+
+def fit_latents(
+    trained: TrainedPrior,
+    starts: Float[Tensor, "rooms dimension"],
+    given: Given,
+    steps: int = STEPS,
+) -> tuple[Float[Tensor, "rooms dimension"], Float[Tensor, " rooms"]]:
+    """Move latents until their rooms hold what is given; the latents, and what is left to win."""
+    space, target = trained.prior.sphere, trained.config.loss.completeness_target
+    free = starts.clone().requires_grad_()
+    # Adam moves every coordinate by about its rate.
+    optimizer = torch.optim.Adam([free], lr=RATE / math.sqrt(starts.shape[1]))
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+
+    def loss_of(z: Tensor) -> Float[Tensor, " rooms"]:
+        loss = given_loss(trained.prior.decode(z, with_shape=False), given, target)
+        return loss + START_WEIGHT / 2 * (z - starts).square().sum(dim=-1)
+
+    for _ in range(steps):
+        optimizer.zero_grad()
+        # Summed, not averaged: a room's steps do not depend on who else is in the batch.
+        loss_of(space.onto(free)).sum().backward()
+        optimizer.step()
+        schedule.step()
+    with torch.no_grad():
+        z = space.onto(free)
+        return z, loss_of(z)
+
+
+def given_loss(
+    decoded: DecodedScenes, given: Given, completeness_target: str = "first_n"
+) -> Float[Tensor, " rooms"]:
+    """How far decoded rooms are from holding the given objects, mean over these; 0 without any.
+
+    Cross entropy of the class + `BOX_WEIGHT` x mean distance in metres + minus the logarithm of
+    the probability that the prediction is part of the room, of the predictions assigned at the
+    least cost, which has the class's probability in place of its logarithm (as DETR).
+    """
+    boxes = torch.cat([decoded.centers_m, decoded.sizes_m], dim=-1)
+    kept = -log_kept(decoded.completeness_logits, completeness_target)
+    with torch.no_grad():
+        slots, objects = boxes.shape[1], given.labels.shape[1]
+        wanted = given.labels.unsqueeze(1).expand(-1, slots, -1)
+        cost = -decoded.class_logits.softmax(dim=-1).gather(-1, wanted)
+        for side in range(6):
+            apart = boxes[..., side].unsqueeze(2) - given.boxes_m[..., side].unsqueeze(1)
+            cost += BOX_WEIGHT / 6 * apart.abs()
+        cost += kept.unsqueeze(-1)
+        rows = assign(cost, [slots] * len(cost), given.is_object.sum(dim=1).tolist())
+    logits = take(decoded.class_logits, rows, dim=1)
+    each = F.cross_entropy(logits.flatten(0, 1), given.labels.flatten(), reduction="none")
+    each = each.view(-1, objects) + take(kept, rows, dim=1)
+    each = each + BOX_WEIGHT * (take(boxes, rows, dim=1) - given.boxes_m).abs().mean(dim=-1)
+    # Padding is no class: where void is ruled out, its cross entropy has no end.
+    each = each.where(given.is_object, 0.0)
+    return each.sum(dim=1) / given.is_object.sum(dim=1).clamp(min=1)
+
+
+def log_kept(
+    completeness_logits: Float[Tensor, "rooms slots"], completeness_target: str
+) -> Float[Tensor, "rooms slots"]:
+    """Logarithm of the probability that each prediction belongs to the room: that no prediction up
+    to it ended the room (`first_n`), or none before it (`stop`)."""
+    if completeness_target == "stop":
+        goes_on = F.logsigmoid(-completeness_logits)
+        return goes_on.cumsum(dim=1) - goes_on
+    return F.logsigmoid(completeness_logits).cumsum(dim=1)

@@ -1,0 +1,224 @@
+"""Masks of single images in, the latents that explain them out; the network is frozen (5.2)."""
+
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sceneprior.errors import InputError
+from sceneprior.losses.matching import Matches
+from sceneprior.losses.shape import mask_loss
+from sceneprior.training.checkpoints import TrainedPrior
+from sceneprior.training.objective import (
+    check_finite,
+    match_and_score,
+    seen_boxes,
+    seen_masks,
+    weighted_sum,
+)
+from sceneprior.views import DecodedScenes, SceneViews
+
+CHECK_EVERY = 20
+"""Steps from one look at which images are done to the next."""
+SMOOTHING, EPSILON = 0.99, 1e-8
+"""RMSProp's, as in PyTorch."""
+
+
+@dataclass(frozen=True)
+class FitSchedule:
+    """How the latents of images are found."""
+
+    steps: int = 1000
+    drop_at: int = 500
+    """Steps after which the rate is multiplied by `decay`."""
+    learning_rate: float = 0.01
+    decay: float = 0.1
+    masks_from: int = 0
+    """Steps before the mask loss joins in."""
+    freeze_matching: bool = False
+    """Keep the matching from there on."""
+    patience: int = 100
+    """An image whose score has not fallen by `least_gain` of itself for so many steps goes on at
+    the low rate at once, and is done when that happens there. 0 takes every step."""
+    least_gain: float = 2e-3
+
+
+SCHEDULES = {
+    "paper": FitSchedule(),
+    "released": FitSchedule(steps=2000, drop_at=1200, masks_from=200, freeze_matching=True),
+}
+"""Supplement D, and the authors' code."""
+
+
+class ViewLoss(NamedTuple):
+    """What scenes are judged by from their images; one number an image."""
+
+    total: Float[Tensor, " images"]
+    """What is minimised: class, box, frustum and mask terms with the run's weights."""
+    score: Float[Tensor, " images"]
+    """What is compared: the layout terms plus lambda_S * (1 - mean IoU of the masks). The mask
+    term itself counts masks that miss as zero, so a worse fit may have the lower total."""
+    mask_iou: Float[Tensor, " images"]
+    """Mean over an image's masks, soft; 0 where masks are not compared."""
+    matches: Matches
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What was found for each image."""
+
+    z: Float[Tensor, "images width"]
+    scenes: DecodedScenes
+    """As many objects as the fullest image has; of an image with n, the first n are the answer."""
+    loss: ViewLoss
+    steps: Int[Tensor, " images"]
+    """Taken until nothing moved."""
+
+
+def decode_images(
+    trained: TrainedPrior, points: Float[Tensor, "images width"], views: SceneViews
+) -> DecodedScenes:
+    """As many objects of each latent as the fullest image shows; meshes after the shape stage."""
+    z = trained.prior.sphere.onto(points)
+    return trained.prior.decode(z, trained.stage == "shape", wanted=views.is_object)
+
+
+def view_loss(
+    trained: TrainedPrior,
+    scenes: DecodedScenes,
+    views: SceneViews,
+    masks: bool = True,
+    matches: Matches | None = None,
+) -> ViewLoss:
+    """The losses of training, per image and without completeness.
+
+    Args:
+        trained: Of the run. Scenes without meshes (before its shape stage) have no masks.
+        scenes: At least as many objects a room as the fullest image shows.
+        views: One room an image, with instance ids.
+        masks: Whether masks are compared.
+        matches: To keep; None matches anew.
+    """
+    config = trained.config
+    boxes = seen_boxes(scenes, views, config.shape)
+    losses, matches = match_and_score(scenes, boxes, views, config.loss, True, matches)
+    # An image does not tell how many objects there are beside those that it shows (supplement D).
+    del losses["completeness"]
+    total = weighted_sum(losses, config.loss)
+    if not masks or scenes.vertices_m is None:
+        return ViewLoss(total, total.detach(), torch.zeros_like(total), matches)
+    layout = total.detach()
+    # Before rendering, which refuses vertices that are not finite and knows no images.
+    check_finite(layout.sum(), views)
+    seen = seen_masks(scenes.vertices_m, trained.prior.shape.faces, views, config.shape)
+    mask, overlap = mask_loss(seen, views, matches, config.loss.iou_gate, per_room=True)
+    score = layout + config.loss.mask * (1 - overlap["mask_iou"])
+    return ViewLoss(total + config.loss.mask * mask, score, overlap["mask_iou"], matches)
+
+
+def fit_latents(
+    trained: TrainedPrior,
+    views: SceneViews,
+    start: Float[Tensor, "images width"],
+    schedule: FitSchedule = SCHEDULES["paper"],
+    masks: bool = True,
+) -> Fit:
+    """Fit one latent per image by RMSProp on its view loss; the best on the way is the answer.
+
+    What moves is z itself, put back onto the sphere before it is decoded, rather than the logits
+    that training moves: those reach only what is between the anchors, and reach it slowly.
+
+    Images do not know of each other: alone or among others, one takes the same steps, but for
+    rounding, which grows over a thousand of them.
+
+    Args:
+        trained: The prior.
+        views: One room an image, with instance ids.
+        start: Points of the latent space to begin with.
+        schedule: Steps, rates and when to stop.
+        masks: Whether the mask loss takes part.
+
+    Raises:
+        InputError: an image shows more objects than the prior can generate.
+        FloatingPointError: a loss is not a number.
+    """
+    refuse_crowds(trained, views)
+    points, square = start.detach().clone(), torch.zeros_like(start)
+    best, found = torch.full((len(start),), torch.inf), start.detach().clone()
+    rate = torch.full((len(start), 1), schedule.learning_rate)
+    stalled = torch.zeros(len(start), dtype=torch.int64)
+    taken = torch.full((len(start),), schedule.steps)
+    active, seen, matches = torch.arange(len(start)), views, None
+    for step in range(schedule.steps):
+        if step == schedule.drop_at:
+            rate = rate.clamp(max=schedule.learning_rate * schedule.decay)
+        if step == schedule.masks_from:
+            best.fill_(torch.inf)  # scores with and without masks do not compare
+        x = points[active].requires_grad_()
+        kept = matches if schedule.freeze_matching and step > schedule.masks_from else None
+        loss = view_loss(
+            trained, decode_images(trained, x, seen), seen, masks and step >= schedule.masks_from,
+            kept,
+        )  # fmt: skip
+        check_finite(loss.total.sum(), seen)
+        matches = loss.matches
+        gains = loss.score < best[active] * (1 - schedule.least_gain)
+        stalled[active] = torch.where(gains, 0, stalled[active] + 1)
+        better = active[loss.score < best[active]]
+        found[better] = points[better]
+        best[active] = torch.minimum(best[active], loss.score)
+        (slope,) = torch.autograd.grad(loss.total.sum(), x)
+        square[active] = SMOOTHING * square[active] + (1 - SMOOTHING) * slope**2
+        points[active] -= rate[active] * slope / (square[active].sqrt() + EPSILON)
+        if schedule.patience and (step + 1) % CHECK_EVERY == 0 and step >= schedule.masks_from:
+            still = (stalled >= schedule.patience)[active]
+            slow = rate[active, 0] < schedule.learning_rate
+            rate[active[still]] = schedule.learning_rate * schedule.decay
+            stalled[active[still]] = 0
+            taken[active[still & slow]] = step + 1
+            going = ~(still & slow)
+            if not going.any():
+                break
+            if not going.all():
+                active, seen = active[going], rows_of(seen, going)
+                most = seen.is_object.shape[1]
+                matches = Matches(*(part[going, :most] for part in matches))
+    with torch.no_grad():
+        scenes = decode_images(trained, found, views)
+        loss = view_loss(trained, scenes, views, masks)
+        return Fit(trained.prior.sphere.onto(found), scenes, loss, taken)
+
+
+def refuse_crowds(trained: TrainedPrior, views: SceneViews) -> None:
+    """Say so where an image shows more objects than the prior can generate.
+
+    Raises:
+        InputError: it does.
+    """
+    counts = views.is_object.sum(dim=-1)
+    row = int(counts.argmax())
+    if int(counts[row]) > trained.prior.max_objects:
+        raise InputError(
+            f"{views.room_ids[row] if views.room_ids else 'An image'} shows {int(counts[row])} "
+            f"objects, but the run generates at most {trained.prior.max_objects} "
+            "(model.max_objects); leave out the smallest masks, or train with more."
+        )
+
+
+def rows_of(views: SceneViews, rows: Tensor) -> SceneViews:
+    """Some rooms of a batch, padded to the fullest of them alone."""
+    chosen = {
+        item.name: getattr(views, item.name)[rows]
+        for item in fields(views)
+        if isinstance(getattr(views, item.name), Tensor)
+    }
+    most = max(int(chosen["is_object"].sum(dim=-1).max()), 1)
+    for name in ("object_class", "is_object"):
+        chosen[name] = chosen[name][:, :most]
+    for name in ("boxes", "visible", "sides_clear"):
+        chosen[name] = chosen[name][:, :, :most]
+    ids = np.array(views.room_ids)[rows.numpy()] if views.room_ids else ()
+    return replace(views, **chosen, room_ids=tuple(ids))

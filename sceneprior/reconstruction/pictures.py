@@ -1,0 +1,118 @@
+"""A reconstruction in; one picture out: the masks, the room from the same camera, from above."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from sceneprior.classes import class_colors, label_set
+from sceneprior.evaluation.topdown import object_colors, scene_meshes, topdown, topdown_protocol
+from sceneprior.offscreen import Pinhole, Renderer
+from sceneprior.reconstruction.observed import ObservedImage
+from sceneprior.reconstruction.reconstruct import Reconstruction
+from sceneprior.scene import Scene
+
+HEIGHT_PX = 360
+"""Of each panel; masks are drawn larger or smaller to fit."""
+GAP_PX, LINE_PX = 8, 24
+PAPER, INK, FRAME = (255, 255, 255), (40, 40, 40), (200, 200, 200)
+SIGHT_M = 0.8
+"""How far the camera's sides are drawn in the plan."""
+
+
+def picture(found: Reconstruction, renderer: Renderer) -> UInt8[np.ndarray, "height width 3"]:
+    """Three panels with titles, coloured by class, and the classes' names under them."""
+    panels = {
+        "masks given": masks_given(found.image),
+        "found, same camera": same_camera(found.scene, found.image, renderer),
+        "found, from above": from_above(found.scene, found.image, renderer),
+    }
+    tiles = [_as_tile(panel) for panel in panels.values()]
+    width = sum(tile.width for tile in tiles) + GAP_PX * (len(tiles) - 1)
+    rows = _legend_rows(found, width)
+    sheet = Image.new("RGB", (width, LINE_PX * (1 + len(rows)) + HEIGHT_PX), PAPER)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(14)
+    x = 0
+    for title, tile in zip(panels, tiles, strict=True):
+        draw.text((x + 2, 3), title, INK, font)
+        sheet.paste(tile, (x, LINE_PX))
+        draw.rectangle((x, LINE_PX, x + tile.width - 1, LINE_PX + HEIGHT_PX - 1), outline=FRAME)
+        x += tile.width + GAP_PX
+    for line, row in enumerate(rows):
+        y = LINE_PX * (1 + line) + HEIGHT_PX
+        for x, name, color in row:
+            draw.rectangle((x, y + 6, x + 12, y + 18), color)
+            draw.text((x + 17, y + 3), name, INK, font)
+    return np.asarray(sheet)
+
+
+def _as_tile(panel: UInt8[np.ndarray, "height width 3"]) -> Image.Image:
+    width = max(round(panel.shape[1] * HEIGHT_PX / panel.shape[0]), 1)
+    return Image.fromarray(panel).resize((width, HEIGHT_PX), Image.Resampling.NEAREST)
+
+
+def _legend_rows(
+    found: Reconstruction, width: int
+) -> list[list[tuple[int, str, tuple[int, int, int]]]]:
+    names = label_set(found.image.label_set)
+    shown = {names[index] for index in found.image.object_class} | {
+        item.label for item in found.scene.objects
+    }
+    colors, font = class_colors(len(names)), ImageFont.load_default(14)
+    rows: list[list[tuple[int, str, tuple[int, int, int]]]] = [[]]
+    x = 2
+    for index, name in enumerate(names):
+        if name not in shown:
+            continue
+        wide = 17 + round(font.getlength(name)) + 16
+        if x + wide > width and rows[-1]:
+            rows.append([])
+            x = 2
+        red, green, blue = (int(value) for value in colors[index])
+        rows[-1].append((x, name, (red, green, blue)))
+        x += wide
+    return rows
+
+
+def masks_given(image: ObservedImage) -> UInt8[np.ndarray, "height width 3"]:
+    """The image's masks in their class colours, with dark borders between them."""
+    colors = class_colors(len(label_set(image.label_set)))[image.object_class]
+    ids = image.instance_ids.astype(np.int64)
+    picture = np.concatenate([[PAPER], colors]).astype(np.uint8)[ids]
+    border = np.zeros(ids.shape, dtype=bool)
+    border[:, 1:] |= ids[:, 1:] != ids[:, :-1]
+    border[1:] |= ids[1:] != ids[:-1]
+    picture[border] = picture[border] // 2
+    return picture
+
+
+def same_camera(
+    scene: Scene, image: ObservedImage, renderer: Renderer
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The found objects as the image's camera would see them, shaded."""
+    camera = Pinhole(image.world_to_camera.astype(np.float64), image.intrinsics.astype(np.float64))
+    height, width = image.instance_ids.shape
+    return renderer.shaded(scene_meshes(scene), object_colors(scene), camera, (height, width))
+
+
+def from_above(
+    scene: Scene, image: ObservedImage, renderer: Renderer
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The plan of the found objects, with the camera and the sides of what it sees."""
+    protocol = replace(topdown_protocol(scene.label_set), image_size=(HEIGHT_PX, HEIGHT_PX))
+    plan = Image.fromarray(topdown(scene, renderer, protocol, outlines=True))
+    pose = image.world_to_camera.astype(np.float64)
+    turn, eye = pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+
+    def pixel(point_m: np.ndarray) -> tuple[float, float]:
+        x, z = point_m[[0, 2]] / protocol.metres_per_pixel + HEIGHT_PX / 2
+        return float(x), float(z)
+
+    draw = ImageDraw.Draw(plan)
+    for u in (0, image.instance_ids.shape[1]):
+        ray = turn.T @ np.array([(u - image.intrinsics[0, 2]) / image.intrinsics[0, 0], 0, 1])
+        draw.line((pixel(eye), pixel(eye + SIGHT_M * ray)), INK, 2)
+    x, y = pixel(eye)
+    draw.ellipse((x - 4, y - 4, x + 4, y + 4), INK)
+    return np.asarray(plan)

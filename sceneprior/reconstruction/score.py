@@ -1,0 +1,249 @@
+"""A run, or scenes, and shards in; how well single views are reconstructed, and a table, out."""
+
+import json
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from sceneprior.config import LossConfig
+from sceneprior.errors import InputError
+from sceneprior.evaluation.metrics.mesh_metrics import POINTS
+from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.score_table import wide_console
+from sceneprior.evaluation.view_scores import PROTOCOL, ObjectPair, score_views
+from sceneprior.files import write_whole
+from sceneprior.generation.export import load_scene_folder
+from sceneprior.offscreen import open_renderer
+from sceneprior.reconstruction.known_rooms import known_rooms, nearest_answers, random_answers
+from sceneprior.reconstruction.observed import ObservedImage, image_of_room, images_of_split
+from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct
+from sceneprior.scene import Scene, SceneObject
+from sceneprior.shards import iterate_rooms
+from sceneprior.training.checkpoints import load_run
+
+TITLES = {
+    "scenes": "given scenes",
+    "scenes_boxes": "the same, as boxes",
+    "fit": "fitted",
+    "fit_boxes": "the same, as boxes",
+    "layout_fit": "fitted to 2D boxes alone, as boxes",
+    "nearest_room": "nearest training room",
+    "random_room": "random training room",
+}
+COLUMNS = {
+    "box_iou_3d": ("3D box IoU", "{:.3f}"),
+    "oriented_box_iou_3d": ("oriented", "{:.3f}"),
+    "chamfer_l2_m": ("CD L2, m", "{:.3f}"),
+    "chamfer_squared_m2": ("CD squared, m2", "{:.3f}"),
+    "f_score": ("F at 5 cm", "{:.3f}"),
+    "class_accuracy": ("class", "{:.2f}"),
+}
+
+Answers = Sequence[Sequence[SceneObject | None]]
+"""For each image, one object a mask; None where there is none."""
+
+
+def judge_views(
+    run: Path,
+    shards: Path,
+    split: str,
+    limit: int | None,
+    options: FitOptions,
+    out: Path,
+    renderer: str = "auto",
+    checkpoint: str = "final",
+    points: int = POINTS,
+) -> dict[str, Any]:
+    """Reconstruct one view of each room and score it, and known rooms, against the truth.
+
+    Args:
+        run: A run's folder.
+        shards: With 3D ground truth; `train` is where known rooms come from.
+        split: Whose rooms are reconstructed.
+        limit: Only the first so many rooms.
+        options: Of the fit; the seed also draws the views and the random rooms.
+        out: JSON file to write.
+        renderer: Kind of renderer.
+        checkpoint: `final` or `best`.
+        points: Drawn from each surface.
+
+    Raises:
+        InputError: the run or the shards cannot be used.
+    """
+    trained = load_run(run, checkpoint)
+    reference_scenes(shards, split, limit=1, meshes=False)  # refuses before any fit
+    images, blank = images_of_split(shards, split, options.seed, limit)
+    fitted = reconstruct(trained, images, options)
+    plain = reconstruct(trained, images, replace(options, masks=False, refine=False))
+    rows: dict[str, Answers] = {
+        "fit": [one.scene.objects for one in fitted],
+        "fit_boxes": [one.scene.without_meshes().objects for one in fitted],
+        "layout_fit": [one.scene.without_meshes().objects for one in plain],
+        **known_answers(images, shards, trained.config.loss, options.seed, renderer),
+    }
+    scores = {
+        "rows": _scored(images, rows, shards, split, points),
+        "mask_iou": sum(one.mask_iou for one in fitted) / len(fitted),
+        "protocol": {
+            "run": Path(run).resolve().name,
+            "checkpoint": checkpoint,
+            "stage": trained.stage,
+            "views": "one a room, drawn at random from those that show an object",
+            "rooms_without_such_a_view": blank,
+            "fit": asdict(options),
+            **_protocol(shards, split, points),
+        },
+    }
+    write_whole(out, (json.dumps(scores, indent=1) + "\n").encode())
+    return scores
+
+
+def judge_scenes(
+    folder: Path,
+    shards: Path,
+    split: str,
+    out: Path,
+    seed: int = 0,
+    renderer: str = "auto",
+    points: int = POINTS,
+) -> dict[str, Any]:
+    """Score a folder of reconstructions: as `reconstruct` wrote them, or with CAD models since.
+
+    Args:
+        folder: Scene JSONs, with GLBs where there are meshes. Each one's `extra` names its
+            `room_id` and `view`; its objects are one a mask of that view, in the masks' order.
+        shards: The rooms, with 3D ground truth; `train` is where known rooms come from.
+        split: Where the scenes' rooms are.
+        out: JSON file to write.
+        seed: Of the random rooms.
+        renderer: Kind of renderer.
+        points: Drawn from each surface.
+
+    Raises:
+        InputError: a scene does not say which view it answers, or has another number of objects.
+        ShardError: a shard is missing or damaged.
+    """
+    images, scenes = scenes_with_images(folder, shards, split)
+    rows: dict[str, Answers] = {
+        "scenes": [scene.objects for scene in scenes],
+        "scenes_boxes": [scene.without_meshes().objects for scene in scenes],
+        **known_answers(images, shards, LossConfig(), seed, renderer),
+    }
+    scores = {
+        "rows": _scored(images, rows, shards, split, points),
+        "protocol": {
+            "scenes": str(folder),
+            "views": {image.room_id: image.view for image in images},
+            "seed": seed,
+            **_protocol(shards, split, points),
+        },
+    }
+    write_whole(out, (json.dumps(scores, indent=1) + "\n").encode())
+    return scores
+
+
+def scenes_with_images(
+    folder: Path, shards: Path, split: str
+) -> tuple[list[ObservedImage], list[Scene]]:
+    """The scenes of a folder, each with the view that it answers; see `judge_scenes`."""
+    of_room: dict[str, list[Scene]] = defaultdict(list)
+    for scene in load_scene_folder(folder):
+        room, view = scene.extra.get("room_id"), scene.extra.get("view")
+        if not isinstance(room, str) or not room or not isinstance(view, int):
+            raise InputError(
+                f"Scene '{scene.name}' of {folder} does not say which image it answers: its "
+                "'extra' needs a 'room_id' of the shards and a 'view', as `sceneprior reconstruct "
+                "--shards` writes them."
+            )
+        of_room[room].append(scene)
+    images, scenes = [], []
+    for shard, room in iterate_rooms(shards, split):
+        for scene in of_room.pop(room, []):
+            seen = shard.read_room(room, images=True)
+            image = image_of_room(seen, scene.extra["view"], shard.label_set)
+            if len(scene.objects) != len(image.rows):
+                raise InputError(
+                    f"Scene '{scene.name}' of {folder} has {len(scene.objects)} objects, but view "
+                    f"{image.view} of room {room} shows {len(image.rows)}; a reconstruction has "
+                    "one object a mask, in the masks' order."
+                )
+            images.append(image)
+            scenes.append(scene)
+    if of_room:
+        raise InputError(
+            f"The '{split}' split of {shards} has no room {', '.join(sorted(of_room)[:3])}, which "
+            f"scenes of {folder} are of; name the split, or the shards, they were made from."
+        )
+    return images, scenes
+
+
+def known_answers(
+    images: Sequence[ObservedImage], shards: Path, weights: LossConfig, seed: int, renderer: str
+) -> dict[str, Answers]:
+    """What training rooms, as they truly are, would score as answers."""
+    rooms = known_rooms(shards)
+    nearest = nearest_answers(rooms, images, weights, open_renderer(renderer))
+    drawn = random_answers(rooms, images, weights, seed)
+    return {
+        "nearest_room": [one.objects for one in nearest],
+        "random_room": [one.objects for one in drawn],
+    }
+
+
+def _scored(
+    images: Sequence[ObservedImage],
+    rows: dict[str, Answers],
+    shards: Path,
+    split: str,
+    points: int,
+) -> dict[str, Any]:
+    truth = {scene.name: scene for scene in reference_scenes(shards, split, tracked_only=True)}
+    return {
+        name: score_views(pairs_of(images, truth, answers), points)
+        for name, answers in rows.items()
+    }
+
+
+def _protocol(shards: Path, split: str, points: int) -> dict[str, Any]:
+    return {"shards": str(shards), "split": split, "points": points, **PROTOCOL}
+
+
+def pairs_of(
+    images: Sequence[ObservedImage], truth: dict[str, Scene], answers: Answers
+) -> list[list[ObjectPair]]:
+    """Each object that an image shows, with what was found for its mask."""
+    return [
+        [
+            ObjectPair(truth[image.room_id].objects[row], item)
+            for row, item in zip(image.rows, objects, strict=True)
+        ]
+        for image, objects in zip(images, answers, strict=True)
+    ]
+
+
+def print_view_scores(scores: dict[str, Any], console: Console | None = None) -> None:
+    """Print both tables of a result: all objects by method, and the first method by class."""
+    rows = {TITLES[name]: row["summary"] for name, row in scores["rows"].items()}
+    judged = next(iter(scores["rows"].values()))
+    summary = judged["summary"]
+    title = f"{summary['objects']} objects in {summary['images']} single views"
+    console = console or wide_console()
+    console.print(_table(title, rows))
+    console.print(_table(f"{next(iter(rows)).capitalize()}, by class", judged["classes"]))
+
+
+def _table(title: str, rows: dict[str, dict[str, Any]]) -> Table:
+    table = Table("", "objects", "unmatched", title=title)
+    for name, _ in COLUMNS.values():
+        table.add_column(name, justify="right")
+    for label, row in rows.items():
+        cells = [
+            "–" if row[key] is None else form.format(row[key]) for key, (_, form) in COLUMNS.items()
+        ]
+        table.add_row(label, str(row["objects"]), str(row["unmatched"]), *cells)
+    return table

@@ -1,0 +1,233 @@
+"""The exact formula on the CPU: every face near a pixel has its say.
+
+Buffers hold, for each pixel of each window (windows.py),
+
+    odds  P = prod_f (1 + exp(x_f)), x_f = +-d_f / sigma, so that the chance to miss is 1 / P, and
+    order what decides who is in front: 1 / z of the nearest face that contains the pixel centre,
+          or else -z of the nearest face whose blur reaches it, or else -inf (larger is nearer).
+
+The loops over a strip's pixels have no branch and no call that is not arithmetic: LLVM runs
+them 8 or 16 pixels at a time. Meshes are independent and each belongs to one thread, so the
+result does not depend on the number of threads.
+"""
+
+from typing import Any, no_type_check
+
+import numpy as np
+from numba import njit
+
+from sceneprior.silhouettes.cpu.threads import in_threads
+from sceneprior.silhouettes.cpu.vector_exp import vector_exp
+from sceneprior.silhouettes.cpu.windows import pixel_range
+from sceneprior.silhouettes.reference import MIN_AREA_PX2, SLACK
+
+_LOOSE: Any = {"contract", "reassoc", "nsz", "arcp"}
+"""Sums may be taken in another order, fused and by lanes; infinities stay what they are."""
+
+
+# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
+@njit(inline="always")
+@no_type_check
+def _region(ax, ay, bx, by, cx, cy, reach, bounds):
+    """Rows and strips of the window that a face reaches."""
+    top, bottom = pixel_range(min(ay, by, cy) - reach, max(ay, by, cy) + reach, bounds[1])
+    left, right = pixel_range(min(ax, bx, cx) - reach, max(ax, bx, cx) + reach, bounds[3] * 8)
+    return max(top, bounds[0]), bottom, max(left >> 3, bounds[2]), (right + 7) >> 3
+
+
+@njit(inline="always")
+@no_type_check
+def _from_edge(px, py, ax, ay, bx, by, over_length2, zero, one):
+    """From the nearest point of edge ab to p, how far along ab it lies, twice area (a, b, p)."""
+    ux, uy, x, y = bx - ax, by - ay, px - ax, py - ay
+    t = min(max((x * ux + y * uy) * over_length2, zero), one)
+    return x - t * ux, y - t * uy, t, ux * y - uy * x
+
+
+@njit(fastmath=_LOOSE, error_model="numpy", nogil=True)
+@no_type_check
+def _draw_strip(
+    odds, order, start, count, column, row, ax, ay, bx, by, cx, cy,
+    over_area, over1, over2, over3, near_a, near_b, near_c, over_sigma, blur,
+):  # fmt: skip
+    T = odds.dtype.type
+    zero, one, half, most, slack = T(0), T(1), T(0.5), T(80), T(-SLACK)
+    for k in range(count):
+        j = np.uintp(start) + np.uintp(k)  # unsigned: Python's negative indices cost the vectors
+        px = T(column + (np.int32(k) & 7)) + half
+        py = T(row + (np.int32(k) >> 3)) + half
+        x1, y1, _, wc = _from_edge(px, py, ax, ay, bx, by, over1, zero, one)
+        x2, y2, _, wa = _from_edge(px, py, bx, by, cx, cy, over2, zero, one)
+        x3, y3, _, _ = _from_edge(px, py, cx, cy, ax, ay, over3, zero, one)
+        d = min(x1 * x1 + y1 * y1, min(x2 * x2 + y2 * y2, x3 * x3 + y3 * y3))
+        wa, wc = wa * over_area, wc * over_area
+        wb = one - wa - wc
+        inside = min(wa, min(wb, wc)) > zero
+        touched = inside | (d < blur)
+        x = min(d * over_sigma, most)
+        odds[j] *= one + vector_exp(x if inside else -x) if touched else one
+        contained = min(wa, min(wb, wc)) > slack
+        wa, wb, wc = max(wa, zero), max(wb, zero), max(wc, zero)
+        nearness = wa * near_a + wb * near_b + wc * near_c
+        here = nearness if contained else -(wa + wb + wc) / nearness
+        order[j] = max(order[j], here if touched | contained else T(-np.inf))
+
+
+@njit(fastmath=_LOOSE, error_model="numpy", nogil=True)
+@no_type_check
+def _pull_strip(
+    force, start, count, column, row, ax, ay, bx, by, cx, cy,
+    over_area, over1, over2, over3, over_sigma, blur,
+):  # fmt: skip
+    """The pull of a strip's pixels on a face's three corners."""
+    T = force.dtype.type
+    zero, one, half, most = T(0), T(1), T(0.5), T(80)
+    gax, gay, gbx, gby, gcx, gcy = zero, zero, zero, zero, zero, zero
+    for k in range(count):
+        j = np.uintp(start) + np.uintp(k)
+        px = T(column + (np.int32(k) & 7)) + half
+        py = T(row + (np.int32(k) >> 3)) + half
+        x1, y1, t1, wc = _from_edge(px, py, ax, ay, bx, by, over1, zero, one)
+        x2, y2, t2, wa = _from_edge(px, py, bx, by, cx, cy, over2, zero, one)
+        x3, y3, t3, _ = _from_edge(px, py, cx, cy, ax, ay, over3, zero, one)
+        d1, d2, d3 = x1 * x1 + y1 * y1, x2 * x2 + y2 * y2, x3 * x3 + y3 * y3
+        d = min(d1, min(d2, d3))
+        wa, wc = wa * over_area, wc * over_area
+        wb = one - wa - wc
+        inside = min(wa, min(wb, wc)) > zero
+        touched = inside | (d < blur)
+        x = min(d * over_sigma, most)
+        x = x if inside else -x
+        # d coverage / d x is the chance to miss times sigmoid(x); force holds the first.
+        weight = force[j] * over_sigma / (one + vector_exp(-x))
+        weight = weight if inside else -weight
+        weight = weight if touched else zero
+        first = (d1 <= d2) & (d1 <= d3)
+        third = (d2 > d3) & (d1 > d3)
+        # Moving the nearest point of the edge by its ends' shares changes d.
+        m1 = weight if first else zero
+        m3 = weight if third else zero
+        m2 = weight - m1 - m3
+        gx, gy = m1 * x1, m1 * y1
+        gax += (one - t1) * gx
+        gay += (one - t1) * gy
+        gbx += t1 * gx
+        gby += t1 * gy
+        gx, gy = m2 * x2, m2 * y2
+        gbx += (one - t2) * gx
+        gby += (one - t2) * gy
+        gcx += t2 * gx
+        gcy += t2 * gy
+        gx, gy = m3 * x3, m3 * y3
+        gcx += (one - t3) * gx
+        gcy += (one - t3) * gy
+        gax += t3 * gx
+        gay += t3 * gy
+    return gax, gay, gbx, gby, gcx, gcy
+
+
+@njit(inline="always")
+@no_type_check
+def _over_length2(ax, ay, bx, by, one, least):
+    return one / max((bx - ax) * (bx - ax) + (by - ay) * (by - ay), least)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _cover(first, last, pixels, depths, faces, bounds, starts, sigma, blur, near, odds, order):
+    """Fill `odds` (from 1) and `order` (from -inf) of all windows."""
+    T = pixels.dtype.type
+    one, least = T(1), T(MIN_AREA_PX2)
+    over_sigma, blur_, reach = T(1 / sigma), T(blur), np.sqrt(blur)
+    for mesh in range(first, last):
+        rows = bounds[mesh, 1] - bounds[mesh, 0]
+        if rows <= 0:
+            continue
+        for f in range(faces.shape[0]):
+            ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
+            za, zb, zc = depths[mesh, ia], depths[mesh, ib], depths[mesh, ic]
+            if za <= near or zb <= near or zc <= near:
+                continue
+            ax, ay = pixels[mesh, ia, 0], pixels[mesh, ia, 1]
+            bx, by = pixels[mesh, ib, 0], pixels[mesh, ib, 1]
+            cx, cy = pixels[mesh, ic, 0], pixels[mesh, ic, 1]
+            area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+            if abs(area) <= least:
+                continue
+            top, bottom, strip0, strip1 = _region(ax, ay, bx, by, cx, cy, reach, bounds[mesh])
+            if bottom <= top:
+                continue
+            over_area = one / area
+            over1 = _over_length2(ax, ay, bx, by, one, least)
+            over2 = _over_length2(bx, by, cx, cy, one, least)
+            over3 = _over_length2(cx, cy, ax, ay, one, least)
+            near_a, near_b, near_c = one / za, one / zb, one / zc
+            for strip in range(strip0, strip1):
+                start = ((strip - bounds[mesh, 2]) * rows + top - bounds[mesh, 0]) * 8
+                _draw_strip(
+                    odds, order, starts[mesh] + start, (bottom - top) * 8,
+                    np.int32(strip * 8), np.int32(top), ax, ay, bx, by, cx, cy,
+                    over_area, over1, over2, over3, near_a, near_b, near_c, over_sigma, blur_,
+                )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _pull_back(
+    first, last, pixels, depths, faces, bounds, starts, sigma, blur, near, force, gradient
+):
+    """Add to `gradient` what `force`, dL/dcoverage times the chance to miss, does to `pixels`."""
+    T = pixels.dtype.type
+    one, two, least = T(1), T(2), T(MIN_AREA_PX2)
+    over_sigma, blur_, reach = T(1 / sigma), T(blur), np.sqrt(blur)
+    for mesh in range(first, last):
+        rows = bounds[mesh, 1] - bounds[mesh, 0]
+        if rows <= 0:
+            continue
+        for f in range(faces.shape[0]):
+            ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
+            if depths[mesh, ia] <= near or depths[mesh, ib] <= near or depths[mesh, ic] <= near:
+                continue
+            ax, ay = pixels[mesh, ia, 0], pixels[mesh, ia, 1]
+            bx, by = pixels[mesh, ib, 0], pixels[mesh, ib, 1]
+            cx, cy = pixels[mesh, ic, 0], pixels[mesh, ic, 1]
+            area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+            if abs(area) <= least:
+                continue
+            top, bottom, strip0, strip1 = _region(ax, ay, bx, by, cx, cy, reach, bounds[mesh])
+            if bottom <= top:
+                continue
+            over_area = one / area
+            over1 = _over_length2(ax, ay, bx, by, one, least)
+            over2 = _over_length2(bx, by, cx, cy, one, least)
+            over3 = _over_length2(cx, cy, ax, ay, one, least)
+            for strip in range(strip0, strip1):
+                start = ((strip - bounds[mesh, 2]) * rows + top - bounds[mesh, 0]) * 8
+                gax, gay, gbx, gby, gcx, gcy = _pull_strip(
+                    force, starts[mesh] + start, (bottom - top) * 8,
+                    np.int32(strip * 8), np.int32(top), ax, ay, bx, by, cx, cy,
+                    over_area, over1, over2, over3, over_sigma, blur_,
+                )  # fmt: skip
+                gradient[mesh, ia, 0] -= two * gax
+                gradient[mesh, ia, 1] -= two * gay
+                gradient[mesh, ib, 0] -= two * gbx
+                gradient[mesh, ib, 1] -= two * gby
+                gradient[mesh, ic, 0] -= two * gcx
+                gradient[mesh, ic, 1] -= two * gcy
+
+
+def cover(pixels, depths, faces, windows, settings):
+    """Odds and orders of all windows; nothing else has to be kept for the gradient."""
+    odds = np.ones(windows.start[-1], dtype=pixels.dtype)
+    order = np.full(windows.start[-1], -np.inf, dtype=pixels.dtype)
+    rest = (settings.sigma_px2, settings.blur_px2, settings.near_m)
+    in_threads(_cover, len(pixels), pixels, depths, faces, *windows, *rest, odds, order)
+    return odds, order, None
+
+
+def pull_back(pixels, depths, faces, windows, settings, odds, traced, force):
+    """dL/dpixels."""
+    gradient = np.zeros_like(pixels)
+    rest = (settings.sigma_px2, settings.blur_px2, settings.near_m)
+    in_threads(_pull_back, len(pixels), pixels, depths, faces, *windows, *rest, force, gradient)
+    return gradient

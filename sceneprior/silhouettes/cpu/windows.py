@@ -1,0 +1,83 @@
+"""Where the masks of projected meshes live: one window of pixels a mesh, packed in one array.
+
+A window is the bounding box of what is drawn of a mesh, grown by the reach of the blur and cut
+at the image. Memory grows with these pixels, not with objects x views x image. A window is stored
+in strips eight pixels wide, from top to bottom, so that the loop over the pixels around a small
+face runs through contiguous memory and the compiler turns it into vector instructions:
+
+    pixel (row, column) of mesh m  ->  start[m] + ((column // 8 - strip0) * rows + row - row0) * 8
+                                       + column % 8
+"""
+
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from numba import njit
+
+from sceneprior.silhouettes.cpu.threads import in_threads
+
+LANES = 8
+"""Pixels of a strip's row."""
+
+
+class Windows(NamedTuple):
+    """`bounds`: (meshes, 4) int32 of row0, row1, strip0, strip1; `start`: (meshes + 1,) int64."""
+
+    bounds: np.ndarray
+    start: np.ndarray
+
+
+def windows_of(
+    pixels: np.ndarray,
+    depths: np.ndarray,
+    drawn: np.ndarray,
+    image_size: tuple[int, int],
+    reach_px: float,
+    near_m: float,
+) -> Windows:
+    """Windows of projected meshes.
+
+    Args:
+        pixels: (meshes, vertices, 2) u and v.
+        depths: (meshes, vertices) in metres; vertices at or behind `near_m` have no face drawn.
+        drawn: (meshes,) bool; others get an empty window, as do meshes outside the image.
+        image_size: (height, width) in pixels.
+        reach_px: How far a face is felt outside itself.
+        near_m: See above.
+    """
+    bounds = np.zeros((len(pixels), 4), dtype=np.int32)
+    rest = (float(reach_px), float(near_m), *image_size, bounds)
+    in_threads(_bounds, len(pixels), pixels, depths, drawn, *rest)
+    area = (bounds[:, 1] - bounds[:, 0]).astype(np.int64) * (bounds[:, 3] - bounds[:, 2]) * LANES
+    return Windows(bounds, np.concatenate([[0], np.cumsum(area)]))
+
+
+# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
+@njit(inline="always")
+@no_type_check
+def pixel_range(low, high, size):
+    """First and one past the last pixel whose centre lies in [low, high], within the image."""
+    first = int(min(max(np.ceil(low - 0.5), 0.0), float(size)))
+    last = int(max(min(np.floor(high - 0.5), size - 1.0), -1.0)) + 1
+    return first, last
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _bounds(first, last, pixels, depths, drawn, reach, near, height, width, bounds):
+    for mesh in range(first, last):
+        if not drawn[mesh]:
+            continue
+        left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
+        for v in range(pixels.shape[1]):
+            if depths[mesh, v] > near:
+                x, y = pixels[mesh, v, 0], pixels[mesh, v, 1]
+                left, right = min(left, x), max(right, x)
+                top, bottom = min(top, y), max(bottom, y)
+        if left > right:
+            continue
+        column0, column1 = pixel_range(left - reach, right + reach, width)
+        row0, row1 = pixel_range(top - reach, bottom + reach, height)
+        if column0 < column1 and row0 < row1:
+            bounds[mesh, 0], bounds[mesh, 1] = row0, row1
+            bounds[mesh, 2], bounds[mesh, 3] = column0 // 8, (column1 - 1) // 8 + 1

@@ -1,0 +1,256 @@
+"""The Triton kernels behind `cuda.backend`: faces in, packed windows of pixels out.
+
+A mesh is one object in one image. Its window is the part of the image that its faces may touch,
+in whole tiles of TILE x TILE pixels; windows are packed one behind the other, row by row, so
+memory grows with what is seen. No kernel adds to a place that another program adds to: the same
+input gives the same bits.
+
+    cuda_kernels      bound_faces      per mesh          pixels that faces touch, and the window
+                      cover_tiles      per packed tile   chance to miss, and the order value
+    cuda_compositing  composite_tiles  per image tile    masks, front, depth
+                      pull_tiles       per image tile    how hard the loss pulls packed pixels
+    cuda_gradients    push_corners     per few faces     gradient of each face's corners
+                      gather_vertices  per few vertices  gradient of each vertex
+
+`cover_tiles` and `push_corners` are the exact mode's; `cuda_outline_kernels` lists the fast mode's.
+Block shapes are chosen for an H200 by counting instructions, not yet by measuring.
+"""
+
+from typing import no_type_check
+
+try:
+    import triton
+    import triton.language as tl
+except ImportError as error:
+    raise ImportError(
+        "the silhouettes' backend `cuda` needs Triton, which PyTorch's CUDA builds bring along; "
+        "install it (pip install triton), choose the backend `reference`, or move the tensors to "
+        "the CPU"
+    ) from error
+
+from sceneprior.silhouettes import reference
+
+TILE = tl.constexpr(8)
+"""Side of a tile in pixels: 64 pixels are 2 for each lane of a warp."""
+
+BLOCK = tl.constexpr(32)
+"""Faces tested at once: a hit is one bit of a 32-bit word. Neighbours in the list are near each
+other in an icosphere, so that most tiles pass over most blocks."""
+
+EMPTY = tl.constexpr(32767)
+"""First row and column of what touches no pixel; also the longest side of an image (int16)."""
+
+MIN_AREA, SLACK = tl.constexpr(reference.MIN_AREA_PX2), tl.constexpr(reference.SLACK)
+
+
+# no_type_check: the tests' type hook wraps every function, and Triton cannot compile a wrapper.
+@triton.jit
+@no_type_check
+def bound_faces(
+    pixels, depths, faces, drawn, face_bounds, block_bounds, windows,
+    vertex_count, face_count, block_count, height, width, reach, near, GROUP: tl.constexpr,
+):  # pragma: no cover - compiled  # fmt: skip
+    """First and last row, first and last column that each face, block and mesh may touch."""
+    mesh = tl.program_id(0).to(tl.int64)
+    shown = tl.where(tl.load(drawn + mesh) != 0, face_count, 0)
+    mesh_first_row, mesh_last_row = height, -1
+    mesh_first_column, mesh_last_column = width, -1
+    for group in range(0, block_count, GROUP):
+        block = group + tl.arange(0, GROUP)
+        face = block[:, None] * BLOCK + tl.arange(0, BLOCK)[None, :]
+        exists = face < shown
+        a = mesh * vertex_count + tl.load(faces + face * 3, mask=exists, other=0)
+        b = mesh * vertex_count + tl.load(faces + face * 3 + 1, mask=exists, other=0)
+        c = mesh * vertex_count + tl.load(faces + face * 3 + 2, mask=exists, other=0)
+        ax = tl.load(pixels + a * 2, mask=exists, other=0)
+        ay = tl.load(pixels + a * 2 + 1, mask=exists, other=0)
+        bx = tl.load(pixels + b * 2, mask=exists, other=0)
+        by = tl.load(pixels + b * 2 + 1, mask=exists, other=0)
+        cx = tl.load(pixels + c * 2, mask=exists, other=0)
+        cy = tl.load(pixels + c * 2 + 1, mask=exists, other=0)
+        nearest = tl.minimum(
+            tl.minimum(
+                tl.load(depths + a, mask=exists, other=0), tl.load(depths + b, mask=exists, other=0)
+            ),
+            tl.load(depths + c, mask=exists, other=0),
+        )
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        keep = exists & (nearest > near) & (tl.abs(area) > MIN_AREA)
+        low = tl.ceil(tl.minimum(tl.minimum(ay, by), cy) - reach - 0.5)
+        high = tl.floor(tl.maximum(tl.maximum(ay, by), cy) + reach - 0.5)
+        first_row = tl.minimum(tl.maximum(low, 0), height).to(tl.int32)
+        last_row = tl.maximum(tl.minimum(high, height - 1), -1).to(tl.int32)
+        low = tl.ceil(tl.minimum(tl.minimum(ax, bx), cx) - reach - 0.5)
+        high = tl.floor(tl.maximum(tl.maximum(ax, bx), cx) + reach - 0.5)
+        first_column = tl.minimum(tl.maximum(low, 0), width).to(tl.int32)
+        last_column = tl.maximum(tl.minimum(high, width - 1), -1).to(tl.int32)
+        keep &= (first_row <= last_row) & (first_column <= last_column)
+        first_row = tl.where(keep, first_row, EMPTY)
+        last_row = tl.where(keep, last_row, -1)
+        first_column = tl.where(keep, first_column, EMPTY)
+        last_column = tl.where(keep, last_column, -1)
+
+        row_size = block_count * BLOCK
+        to = face_bounds + mesh * 4 * row_size + face
+        known = block[:, None] < block_count
+        tl.store(to, first_row.to(tl.int16), mask=known)
+        tl.store(to + row_size, last_row.to(tl.int16), mask=known)
+        tl.store(to + 2 * row_size, first_column.to(tl.int16), mask=known)
+        tl.store(to + 3 * row_size, last_column.to(tl.int16), mask=known)
+        low_row, high_row = tl.min(first_row, axis=1), tl.max(last_row, axis=1)
+        low_column, high_column = tl.min(first_column, axis=1), tl.max(last_column, axis=1)
+        to = block_bounds + mesh * 4 * block_count + block
+        known = block < block_count
+        tl.store(to, low_row.to(tl.int16), mask=known)
+        tl.store(to + block_count, high_row.to(tl.int16), mask=known)
+        tl.store(to + 2 * block_count, low_column.to(tl.int16), mask=known)
+        tl.store(to + 3 * block_count, high_column.to(tl.int16), mask=known)
+        mesh_first_row = tl.minimum(mesh_first_row, tl.min(low_row, axis=0))
+        mesh_last_row = tl.maximum(mesh_last_row, tl.max(high_row, axis=0))
+        mesh_first_column = tl.minimum(mesh_first_column, tl.min(low_column, axis=0))
+        mesh_last_column = tl.maximum(mesh_last_column, tl.max(high_column, axis=0))
+    top, left = mesh_first_row // TILE, mesh_first_column // TILE
+    seen = mesh_last_row >= 0
+    tl.store(windows + mesh * 4, top)
+    tl.store(windows + mesh * 4 + 1, left)
+    tl.store(windows + mesh * 4 + 2, tl.where(seen, mesh_last_row // TILE - top + 1, 0))
+    tl.store(windows + mesh * 4 + 3, tl.where(seen, mesh_last_column // TILE - left + 1, 0))
+
+
+@triton.jit
+@no_type_check
+def window(windows, first_tiles, mesh):  # pragma: no cover - compiled
+    """(base, stride): pixel (row, column) of a mesh is packed at base + row * stride + column."""
+    top, left = tl.load(windows + mesh * 4), tl.load(windows + mesh * 4 + 1)
+    stride = tl.load(windows + mesh * 4 + 3) * TILE
+    base = tl.load(first_tiles + mesh) * (TILE * TILE) - top * TILE * stride - left * TILE
+    return base, stride
+
+
+@triton.jit
+@no_type_check
+def tile_pixels(windows, first_tiles, tile_meshes):  # pragma: no cover - compiled
+    """Mesh and first pixel of this program's packed tile; its pixels, and where they are packed."""
+    tile = tl.program_id(0).to(tl.int64)
+    mesh = tl.load(tile_meshes + tile).to(tl.int64)
+    base, stride = window(windows, first_tiles, mesh)
+    columns = stride // TILE
+    place = (tile - tl.load(first_tiles + mesh)).to(tl.int32)
+    top_row = (tl.load(windows + mesh * 4) + place // columns) * TILE
+    left_column = (tl.load(windows + mesh * 4 + 1) + place % columns) * TILE
+    pixel = tl.arange(0, TILE * TILE)
+    row, column = top_row + pixel // TILE, left_column + pixel % TILE
+    return mesh, top_row, left_column, row, column, base + row * stride + column
+
+
+@triton.jit
+@no_type_check
+def holds(windows, mesh, tile_row, tile_column):  # pragma: no cover - compiled
+    """Whether an image tile lies in the mesh's window."""
+    top, left = tl.load(windows + mesh * 4), tl.load(windows + mesh * 4 + 1)
+    rows, columns = tl.load(windows + mesh * 4 + 2), tl.load(windows + mesh * 4 + 3)
+    below = (tile_row >= top) & (tile_row < top + rows)
+    return below & (tile_column >= left) & (tile_column < left + columns)
+
+
+@triton.jit
+@no_type_check
+def hits(bounds, first, count, row_size, row, column):  # pragma: no cover - compiled
+    """Bit i is set where entry first + i of the bounds meets the tile at (row, column)."""
+    lane = tl.arange(0, BLOCK)
+    at = bounds + first + lane
+    known = first + lane < count
+    hit = known & (tl.load(at, mask=known, other=EMPTY) < row + TILE)
+    hit &= tl.load(at + row_size, mask=known, other=-1) >= row
+    hit &= tl.load(at + 2 * row_size, mask=known, other=EMPTY) < column + TILE
+    hit &= tl.load(at + 3 * row_size, mask=known, other=-1) >= column
+    bit = tl.full((BLOCK,), 1, tl.uint32) << lane.to(tl.uint32)
+    return tl.sum(tl.where(hit, bit, 0), axis=0).to(tl.uint32)
+
+
+@triton.jit
+@no_type_check
+def first_bit(bits):  # pragma: no cover - compiled
+    """Place of the lowest set bit: a power of two's exponent, read off its float32."""
+    lowest = bits ^ (bits & (bits - 1))
+    return (lowest.to(tl.float32).to(tl.int32, bitcast=True) >> 23) - 127
+
+
+@triton.jit
+@no_type_check
+def to_edge(px, py, ax, ay, bx, by):  # pragma: no cover - compiled
+    """From the nearest point of edge ab to p; how far along ab it lies; twice area of (p, a, b)."""
+    ex, ey = bx - ax, by - ay
+    qx, qy = px - ax, py - ay
+    t = (qx * ex + qy * ey) * (1.0 / tl.maximum(ex * ex + ey * ey, MIN_AREA))
+    t = tl.minimum(tl.maximum(t, 0.0), 1.0)
+    return qx - t * ex, qy - t * ey, t, ex * qy - ey * qx
+
+
+@triton.jit
+@no_type_check
+def cover_tiles(
+    pixels, inverse_depths, faces, face_bounds, block_bounds, windows, first_tiles, tile_meshes,
+    missed, order, vertex_count, block_count, sigma, blur,
+):  # pragma: no cover - compiled  # fmt: skip
+    """One mesh in one tile: the chance that every face misses a pixel, and the order value.
+
+    The order value is the depth where a face contains the pixel centre, minus the depth in the
+    halo, and infinite where no face counts.
+    """
+    mesh, top_row, left_column, row, column, at = tile_pixels(windows, first_tiles, tile_meshes)
+    real = missed.dtype.element_ty
+    px, py = column.to(real) + 0.5, row.to(real) + 0.5
+    # prod_f (1 + e^x_f), which may overflow to infinity: then the pixel is missed by chance 0.
+    odds = tl.full((TILE * TILE,), 1, real)
+    inverse_inside = tl.zeros((TILE * TILE,), real)  # 1 / depth; 0 is infinitely far
+    inverse_halo = tl.zeros((TILE * TILE,), real)
+    inverse_sigma = 1.0 / sigma
+    row_size = block_count * BLOCK
+    block_bounds += mesh * 4 * block_count
+    face_bounds += mesh * 4 * row_size
+    for group in range(0, block_count, BLOCK):
+        blocks = hits(block_bounds, group, block_count, block_count, top_row, left_column)
+        while blocks != 0:
+            first = (group + first_bit(blocks)) * BLOCK
+            blocks &= blocks - 1
+            found = hits(face_bounds, first, row_size, row_size, top_row, left_column)
+            while found != 0:
+                face = first + first_bit(found)
+                found &= found - 1
+                a = mesh * vertex_count + tl.load(faces + face * 3)
+                b = mesh * vertex_count + tl.load(faces + face * 3 + 1)
+                c = mesh * vertex_count + tl.load(faces + face * 3 + 2)
+                ax, ay = tl.load(pixels + a * 2), tl.load(pixels + a * 2 + 1)
+                bx, by = tl.load(pixels + b * 2), tl.load(pixels + b * 2 + 1)
+                cx, cy = tl.load(pixels + c * 2), tl.load(pixels + c * 2 + 1)
+                ia, ib = tl.load(inverse_depths + a), tl.load(inverse_depths + b)
+                ic = tl.load(inverse_depths + c)
+                rx, ry, _, wc = to_edge(px, py, ax, ay, bx, by)
+                distance = rx * rx + ry * ry
+                rx, ry, _, wa = to_edge(px, py, bx, by, cx, cy)
+                distance = tl.minimum(distance, rx * rx + ry * ry)
+                rx, ry, _, wb = to_edge(px, py, cx, cy, ax, ay)
+                distance = tl.minimum(distance, rx * rx + ry * ry)
+                area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+                turn = tl.where(area > 0, 1.0, -1.0)
+                wa, wb, wc = wa * turn, wb * turn, wc * turn
+                least = tl.minimum(tl.minimum(wa, wb), wc)
+                inside = least > 0
+                contained = least + SLACK * tl.abs(area) > 0
+                halo = (distance < blur) & (inside == 0)
+                x = tl.minimum(tl.where(inside, distance, -distance) * inverse_sigma, 80.0)
+                odds *= tl.where(inside | halo, 1.0 + tl.exp(x), 1.0)
+                wa, wb, wc = tl.maximum(wa, 0.0), tl.maximum(wb, 0.0), tl.maximum(wc, 0.0)
+                total = wa + wb + wc
+                # Far from a sliver, rounding may leave no weight at all: any corner will do.
+                inverse = tl.where(
+                    total > 0,
+                    (wa * ia + wb * ib + wc * ic) / tl.where(total > 0, total, 1.0),
+                    tl.maximum(tl.maximum(ia, ib), ic),
+                )
+                inverse_inside = tl.maximum(inverse_inside, tl.where(contained, inverse, 0.0))
+                inverse_halo = tl.maximum(inverse_halo, tl.where(halo, inverse, 0.0))
+    tl.store(missed + at, 1.0 / odds)
+    value = tl.where(inverse_inside > 0, 1.0 / inverse_inside, -1.0 / inverse_halo)
+    tl.store(order + at, value)

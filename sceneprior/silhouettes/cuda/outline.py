@@ -1,0 +1,182 @@
+"""The fast mode on CUDA: a mesh's outline is found once, and only it is soft.
+
+`outline.py` says what is drawn. Here, all meshes' outline edges are listed together and cut into
+pieces; pieces with a face beyond them are left out; every tile asks the pieces of its mesh. The
+host waits twice, for the number of edges and of pieces. What decides (areas, crossings, where a
+pixel centre lies) is computed in float64, which costs an H200 twice a float32; distances near the
+image are in the precision of the input.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
+
+from sceneprior.silhouettes.cpu.topology import topology_of
+from sceneprior.silhouettes.cuda.edge_kernels import EDGES, PIECES, certify_pieces, sum_layers
+from sceneprior.silhouettes.cuda.faces import sum_by_vertex
+from sceneprior.silhouettes.cuda.outline_kernels import PULLED, push_ends, trace_tiles
+from sceneprior.silhouettes.cuda.windows import TILE, Windows, launch, reach_of
+from sceneprior.silhouettes.reference import ASIDE_PX, PIECE_PX, Settings
+
+
+class Edges(NamedTuple):
+    """Edges of a mesh, and the faces at each: entries first_faces[e] to first_faces[e + 1]."""
+
+    ends: Tensor
+    """(edges, 2), the lower vertex first."""
+
+    first_faces: Tensor
+    faces: Tensor
+    ways: Tensor
+    """+1 where the face runs along the edge, -1 where against it."""
+
+
+class _Pieces(NamedTuple):
+    """Straight pieces of edges, sorted by mesh."""
+
+    shapes: Tensor
+    """(6, pieces): x and y of both ends in pixels, and 1 / depth at both."""
+
+    spans: Tensor
+    """(2, pieces): the part of the edge, from 0 at its first vertex to 1 at its second."""
+
+    vertices: Tensor
+    """(pieces, 2): ends of the edge, numbered through all meshes."""
+
+    meshes: Tensor
+    clear: Tensor
+    """Whether no face lies beyond the piece, so that it is outline."""
+
+
+_known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+
+
+def edges_of(faces: Tensor) -> Edges:
+    """Edges of a mesh, on its device; found anew only where `faces` is new or was written to."""
+    if faces.is_inference():  # such a tensor does not count how often it was written to
+        return _read_edges(faces)
+    version, edges = _known.get(faces, (None, None))
+    if version != faces._version:
+        version, edges = faces._version, _read_edges(faces)
+        _known[faces] = version, edges
+    return edges
+
+
+def _read_edges(faces: Tensor) -> Edges:
+    ends, edge_of, way = (torch.from_numpy(part) for part in topology_of(faces.cpu().numpy()))
+    owners, places = edge_of.flatten().sort(stable=True)
+    first = torch.searchsorted(owners, torch.arange(len(ends) + 1, dtype=owners.dtype))
+    parts = (ends, first, places // 3, way.flatten()[places])
+    return Edges(*(part.int().to(faces.device) for part in parts))
+
+
+def cover(
+    pixels: Tensor,
+    depths: Tensor,
+    faces: Tensor,
+    edges: Edges,
+    windows: Windows,
+    settings: Settings,
+) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    """The chance to miss and the order value of all windows, and what `pull_back` needs."""
+    meshes, vertices, tiles = len(windows.places), pixels.shape[2], len(windows.tile_meshes)
+    layers = torch.empty(meshes, len(edges.ends), dtype=torch.int32, device=pixels.device)
+    programs = meshes * -(-len(edges.ends) // EDGES.value)
+    launch(
+        sum_layers, programs, pixels, depths, faces, windows.places, edges.first_faces, edges.faces,
+        edges.ways, layers, vertices, len(edges.ends), settings.near_m, num_warps=4,
+        enable_fp_fusion=False,
+    )  # fmt: skip
+    nearness = depths.double().reciprocal()
+    pieces = _cut_edges(pixels, nearness, edges.ends, layers, settings)
+    missed = pixels.new_empty(tiles * TILE * TILE)
+    order = torch.empty_like(missed)
+    nearest = torch.empty_like(missed, dtype=torch.int32)
+    launch(
+        trace_tiles, tiles, pixels, nearness, faces, windows.face_bounds, windows.block_bounds,
+        windows.places, windows.first_tiles, windows.tile_meshes, pieces.shapes, pieces.clear,
+        _firsts(pieces.meshes, meshes), missed, order, nearest,
+        vertices, windows.block_bounds.shape[-1], len(pieces.meshes), settings.sigma_px2,
+        settings.blur_px2, reach_of(settings), num_warps=1,
+    )  # fmt: skip
+    return missed, order, (nearest, *pieces)
+
+
+def _cut_edges(
+    pixels: Tensor, nearness: Tensor, ends: Tensor, layers: Tensor, settings: Settings
+) -> _Pieces:
+    """Pieces of all edges beside which the number of faces changes, where the image feels them."""
+    meshes, edges = layers.nonzero().unbind(dim=1)
+    layers = layers[meshes, edges]
+    vertices = ends.long()[edges] + (meshes * pixels.shape[2]).unsqueeze(1)
+    start, end = pixels.reshape(-1, 2)[vertices].double().unbind(dim=1)
+    line, spans = _cut_lines(start, end, settings)
+    along, side = (end - start)[line], layers[line].sign()
+    # The side with fewer faces: away from the left, (-y, x), where layers are positive.
+    aside = torch.stack([along[:, 1], -along[:, 0]], dim=1) * side.unsqueeze(1)
+    aside *= ASIDE_PX / along.norm(dim=1, keepdim=True)
+    beside = start[line] + spans.mean(dim=0).unsqueeze(1) * along + aside
+    clear = torch.empty(len(line), dtype=torch.uint8, device=pixels.device)
+    launch(
+        certify_pieces, -(-len(line) // PIECES.value), beside.T.contiguous(), meshes[line].int(),
+        torch.cat([start, end], dim=1).T.contiguous(), layers,
+        _firsts(meshes, pixels.shape[0] * pixels.shape[1]), clear, len(line), len(start),
+        num_warps=4,
+    )  # fmt: skip
+    near0, near1 = nearness.flatten()[vertices[line]].unbind(dim=1)
+    shapes = [(start[line] + t.unsqueeze(1) * along).T for t in spans]
+    shapes += [torch.stack([(1 - t) * near0 + t * near1 for t in spans])]
+    shape, spans = torch.cat(shapes).to(pixels.dtype), spans.to(pixels.dtype).contiguous()
+    return _Pieces(shape, spans, vertices[line], meshes[line].int(), clear)
+
+
+def _cut_lines(start: Tensor, end: Tensor, settings: Settings) -> tuple[Tensor, Tensor]:
+    """Line and span of each piece of at most PIECE_PX: of a line far outside the image, only those
+    that the image feels."""
+    along = end - start
+    count = (along.norm(dim=1) / PIECE_PX).ceil()
+    low, high, reach = torch.zeros_like(count), torch.ones_like(count), reach_of(settings)
+    for axis, size in enumerate(reversed(settings.image_size)):
+        # Across a line of no extent: both infinite, or not a number; then it is left out.
+        t = torch.stack([-reach - start[:, axis], size + reach - start[:, axis]]) / along[:, axis]
+        low, high = torch.maximum(low, t.amin(dim=0)), torch.minimum(high, t.amax(dim=0))
+    felt = low < high
+    first = torch.where(felt, (low * count).floor(), 0.0)
+    number = (torch.where(felt, (high * count).ceil(), 0.0) - first).long()
+    last = number.cumsum(dim=0)
+    every = torch.arange(len(number), device=number.device)
+    line = every.repeat_interleave(number, output_size=int(last[-1]) if len(last) else 0)
+    place = torch.arange(len(line), device=line.device) - (last - number)[line] + first[line]
+    return line, torch.stack([place, place + 1]) / count[line]
+
+
+def _firsts(meshes: Tensor, count: int) -> Tensor:
+    """Where each mesh begins in a list sorted by mesh, and its end."""
+    every = torch.arange(count + 1, dtype=meshes.dtype, device=meshes.device)
+    return torch.searchsorted(meshes.contiguous(), every).int()
+
+
+def pull_back(
+    pixels: Tensor,
+    seen: tuple[Tensor, Tensor],
+    settings: Settings,
+    missed: Tensor,
+    order: Tensor,
+    traced: list[Tensor],
+    pull: Tensor,
+) -> Tensor:
+    """dL/dpixels from -dL/dlog(missed): each pixel pulls the ends of its nearest outline edge."""
+    nearest, *rest = traced
+    pieces = _Pieces(*rest)
+    count = len(pieces.meshes)
+    gradients = pixels.new_empty(count, 2, 2)
+    launch(
+        push_ends, -(-count // PULLED.value), pieces.shapes, pieces.spans, pieces.meshes,
+        pieces.clear, *seen, missed, order, nearest, pull, gradients, count,
+        settings.sigma_px2, reach_of(settings), num_warps=1,
+    )  # fmt: skip
+    # All meshes as one: their vertices are numbered through.
+    everywhere = torch.ones(1, 4, dtype=torch.int32, device=pixels.device)
+    return sum_by_vertex(gradients, pieces.vertices.flatten(), everywhere, pixels)

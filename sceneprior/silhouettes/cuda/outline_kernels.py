@@ -1,0 +1,193 @@
+"""Triton kernels of the fast mode: clear pieces of outlines in, packed windows out, and back.
+
+    cuda_edge_kernels     sum_layers      per few edges    where the number of faces changes
+                          certify_pieces  per few pieces   whether no face lies beyond a piece
+    cuda_outline_kernels  trace_tiles     per packed tile  chance to miss, order, nearest piece
+                          push_ends       per few pieces   gradient of the ends of its edge
+
+As in `cuda_kernels`, no kernel adds to a place that another program adds to. Block shapes are
+chosen for an H200 by counting registers, not yet by measuring.
+"""
+
+from typing import no_type_check
+
+from sceneprior.silhouettes.cuda.edge_kernels import corner_at
+from sceneprior.silhouettes.cuda.kernels import (
+    BLOCK,
+    MIN_AREA,
+    SLACK,
+    TILE,
+    first_bit,
+    hits,
+    tile_pixels,
+    tl,
+    triton,
+    window,
+)
+
+PULLED, PIXELS = tl.constexpr(8), tl.constexpr(8)
+"""Pieces of one program of `push_ends`, and pixels of each that it takes at once."""
+
+
+# no_type_check: the tests' type hook wraps every function, and Triton cannot compile a wrapper.
+@triton.jit
+@no_type_check
+def _pieces_near(
+    shapes, clear, first, last, piece_count, top_row, left_column, reach
+):  # pragma: no cover - compiled
+    """Bit i is set where piece first + i is outline and may be felt in the tile."""
+    lane = tl.arange(0, BLOCK)
+    piece = first + lane
+    known = piece < last
+    x0 = tl.load(shapes + piece, mask=known, other=0)
+    y0 = tl.load(shapes + piece_count + piece, mask=known, other=0)
+    x1 = tl.load(shapes + 2 * piece_count + piece, mask=known, other=0)
+    y1 = tl.load(shapes + 3 * piece_count + piece, mask=known, other=0)
+    hit = known & (tl.load(clear + piece, mask=known, other=0) != 0)
+    hit &= (tl.minimum(x0, x1) - reach < left_column + TILE) & (
+        tl.maximum(x0, x1) + reach > left_column
+    )
+    hit &= (tl.minimum(y0, y1) - reach < top_row + TILE) & (tl.maximum(y0, y1) + reach > top_row)
+    bit = tl.full((BLOCK,), 1, tl.uint32) << lane.to(tl.uint32)
+    return tl.sum(tl.where(hit, bit, 0), axis=0).to(tl.uint32)
+
+
+@triton.jit
+@no_type_check
+def _to_piece(px, py, x0, y0, x1, y1):  # pragma: no cover - compiled
+    """From the nearest point of a piece to p, and how far along the piece it lies."""
+    ux, uy = x1 - x0, y1 - y0
+    qx, qy = px - x0, py - y0
+    s = (qx * ux + qy * uy) / tl.maximum(ux * ux + uy * uy, MIN_AREA)
+    s = tl.minimum(tl.maximum(s, 0.0), 1.0)
+    return qx - s * ux, qy - s * uy, s
+
+
+@triton.jit
+@no_type_check
+def trace_tiles(
+    pixels, nearness, faces, face_bounds, block_bounds, windows, first_tiles, tile_meshes,
+    shapes, clear, first_pieces, missed, order, nearest,
+    vertex_count, block_count, piece_count, sigma, blur, reach,
+):  # pragma: no cover - compiled  # fmt: skip
+    """One mesh in one tile: the nearest face that contains a pixel centre, the nearest piece.
+
+    `nearness` is 1 / depth in float64. The order value is that of `cuda_kernels.cover_tiles`, and
+    in the halo the outline's depth.
+    """
+    mesh, top_row, left_column, row, column, at = tile_pixels(windows, first_tiles, tile_meshes)
+    px, py = column.to(tl.float64) + 0.5, row.to(tl.float64) + 0.5
+    inverse_inside = tl.zeros((TILE * TILE,), tl.float64)  # 1 / depth; 0 is infinitely far
+    row_size = block_count * BLOCK
+    block_bounds += mesh * 4 * block_count
+    face_bounds += mesh * 4 * row_size
+    for group in range(0, block_count, BLOCK):
+        blocks = hits(block_bounds, group, block_count, block_count, top_row, left_column)
+        while blocks != 0:
+            first = (group + first_bit(blocks)) * BLOCK
+            blocks &= blocks - 1
+            found = hits(face_bounds, first, row_size, row_size, top_row, left_column)
+            while found != 0:
+                face = first + first_bit(found)
+                found &= found - 1
+                a = mesh * vertex_count + tl.load(faces + face * 3)
+                b = mesh * vertex_count + tl.load(faces + face * 3 + 1)
+                c = mesh * vertex_count + tl.load(faces + face * 3 + 2)
+                ax, ay = corner_at(pixels, a, True)
+                bx, by = corner_at(pixels, b, True)
+                cx, cy = corner_at(pixels, c, True)
+                ux, uy, vx, vy = bx - ax, by - ay, cx - ax, cy - ay
+                qx, qy, over = px - ax, py - ay, 1.0 / (ux * vy - uy * vx)
+                wb, wc = (qx * vy - qy * vx) * over, (qy * ux - qx * uy) * over
+                inside = (wb > -SLACK) & (wc > -SLACK) & (wb + wc < 1.0 + SLACK)
+                ia, ib, ic = tl.load(nearness + a), tl.load(nearness + b), tl.load(nearness + c)
+                inverse = ia + wb * (ib - ia) + wc * (ic - ia)
+                inverse_inside = tl.maximum(inverse_inside, tl.where(inside, inverse, 0.0))
+    real = missed.dtype.element_ty
+    px, py = column.to(real) + 0.5, row.to(real) + 0.5
+    distance = tl.zeros((TILE * TILE,), real) + blur
+    inverse_halo = tl.zeros((TILE * TILE,), real)
+    who = tl.full((TILE * TILE,), -1, tl.int32)
+    last = tl.load(first_pieces + mesh + 1)
+    for start in range(tl.load(first_pieces + mesh), last, BLOCK):
+        found = _pieces_near(shapes, clear, start, last, piece_count, top_row, left_column, reach)
+        while found != 0:
+            piece = start + first_bit(found)
+            found &= found - 1
+            x0, y0 = tl.load(shapes + piece), tl.load(shapes + piece_count + piece)
+            shape = shapes + piece + 2 * piece_count
+            x1, y1 = tl.load(shape), tl.load(shape + piece_count)
+            i0, i1 = tl.load(shape + 2 * piece_count), tl.load(shape + 3 * piece_count)
+            rx, ry, s = _to_piece(px, py, x0, y0, x1, y1)
+            here = rx * rx + ry * ry
+            nearer = here < distance
+            distance = tl.where(nearer, here, distance)
+            inverse_halo = tl.where(nearer, i0 + s * (i1 - i0), inverse_halo)
+            who = tl.where(nearer, piece, who)
+    inside = inverse_inside > 0
+    x = tl.minimum(tl.where(inside, distance, -distance) / sigma, 80.0)
+    soft = tl.where(who >= 0, 1.0 / (1.0 + tl.exp(x)), tl.where(inside, 0.0, 1.0))
+    tl.store(missed + at, soft)
+    # Where there is neither, minus infinity.
+    halo = -1.0 / inverse_halo
+    tl.store(order + at, tl.where(inside, (1.0 / inverse_inside).to(real), halo))
+    tl.store(nearest + at, who)
+
+
+@triton.jit
+@no_type_check
+def push_ends(
+    shapes, spans, piece_meshes, clear, windows, first_tiles, missed, order, nearest, pull,
+    gradients, piece_count, sigma, reach,
+):  # pragma: no cover - compiled  # fmt: skip
+    """Every piece walks over the pixels that may feel it; lanes share it and are summed."""
+    piece = tl.program_id(0) * PULLED + tl.arange(0, PULLED)[:, None]
+    exists = piece < piece_count
+    mesh = tl.load(piece_meshes + piece, mask=exists, other=0).to(tl.int64)
+    x0 = tl.load(shapes + piece, mask=exists, other=0)
+    y0 = tl.load(shapes + piece_count + piece, mask=exists, other=0)
+    x1 = tl.load(shapes + 2 * piece_count + piece, mask=exists, other=0)
+    y1 = tl.load(shapes + 3 * piece_count + piece, mask=exists, other=0)
+    t0 = tl.load(spans + piece, mask=exists, other=0)
+    t1 = tl.load(spans + piece_count + piece, mask=exists, other=0)
+    base, stride = window(windows, first_tiles, mesh)
+    top, left = tl.load(windows + mesh * 4) * TILE, tl.load(windows + mesh * 4 + 1) * TILE
+    bottom = top + tl.load(windows + mesh * 4 + 2) * TILE - 1
+    right = left + stride - 1
+    first_row = tl.maximum(tl.ceil(tl.minimum(y0, y1) - reach - 0.5).to(tl.int32), top)
+    last_row = tl.minimum(tl.floor(tl.maximum(y0, y1) + reach - 0.5).to(tl.int32), bottom)
+    first_column = tl.maximum(tl.ceil(tl.minimum(x0, x1) - reach - 0.5).to(tl.int32), left)
+    last_column = tl.minimum(tl.floor(tl.maximum(x0, x1) + reach - 0.5).to(tl.int32), right)
+    columns = tl.maximum(last_column - first_column + 1, 1)
+    felt = (tl.load(clear + piece, mask=exists, other=0) != 0) & (last_row >= first_row)
+    felt &= last_column >= first_column
+    count = tl.where(felt, (last_row - first_row + 1) * columns, 0)
+    most = tl.max(tl.max(count, axis=1), axis=0)
+    real = gradients.dtype.element_ty
+    gax, gay = tl.zeros((PULLED, PIXELS), real), tl.zeros((PULLED, PIXELS), real)
+    gbx, gby = tl.zeros((PULLED, PIXELS), real), tl.zeros((PULLED, PIXELS), real)
+    lane = tl.arange(0, PIXELS)[None, :]
+    for start in range(0, most, PIXELS):
+        place = start + lane
+        row, column = first_row + place // columns, first_column + place % columns
+        at = base + row * stride + column
+        own = tl.load(nearest + at, mask=place < count, other=-1) == piece
+        force = tl.load(pull + at, mask=own, other=0)
+        if tl.max(tl.max(tl.abs(force), axis=1), axis=0) > 0:
+            px, py = column.to(real) + 0.5, row.to(real) + 0.5
+            rx, ry, s = _to_piece(px, py, x0, y0, x1, y1)
+            # Moving the nearest point of the outline changes the squared distance by -2 r.
+            weight = -2.0 * force * (1.0 - tl.load(missed + at, mask=own, other=1)) / sigma
+            weight = tl.where(tl.load(order + at, mask=own, other=1) > 0, weight, -weight)
+            share = t0 + s * (t1 - t0)
+            gax += (1.0 - share) * weight * rx
+            gay += (1.0 - share) * weight * ry
+            gbx += share * weight * rx
+            gby += share * weight * ry
+    piece = tl.program_id(0) * PULLED + tl.arange(0, PULLED)
+    exists = piece < piece_count
+    to = gradients + piece.to(tl.int64) * 4
+    tl.store(to, tl.sum(gax, axis=1), mask=exists)
+    tl.store(to + 1, tl.sum(gay, axis=1), mask=exists)
+    tl.store(to + 2, tl.sum(gbx, axis=1), mask=exists)
+    tl.store(to + 3, tl.sum(gby, axis=1), mask=exists)

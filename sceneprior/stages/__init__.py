@@ -1,1 +1,0 @@
-"""One LightningModule a training stage, and what runs them."""

@@ -1,1 +1,0 @@
-"""What a trained prior is used for."""

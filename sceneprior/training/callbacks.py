@@ -1,0 +1,105 @@
+"""What happens beside the training step: progress, checkpoints and a clean stop."""
+
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import Callback
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from sceneprior.training.objective import batch_number, step_seed
+
+
+class RunProgress(Callback):
+    """One bar for the whole stage, with the newest loss; on the error stream."""
+
+    def __init__(self, title: str):
+        self.title = title
+        self._progress: Progress | None = None
+        self._task = TaskID(0)
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module) -> None:
+        if not trainer.is_global_zero:
+            return
+        self._progress = Progress(
+            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+            TextColumn("{task.fields[loss]}"), TimeElapsedColumn(), TimeRemainingColumn(),
+            console=Console(stderr=True),
+        )  # fmt: skip
+        self._progress.start()
+        self._task = self._progress.add_task(
+            self.title, total=trainer.max_epochs, completed=trainer.current_epoch, loss=""
+        )
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
+        # Reading a metric reduces it over the processes: all must ask, though one shows it.
+        loss = trainer.callback_metrics.get("train/loss")
+        if self._progress is not None:
+            text = "" if loss is None else f"loss {float(loss):.4f}"
+            self._progress.update(self._task, completed=trainer.current_epoch + 1, loss=text)
+
+    def _stop(self) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+    def on_train_end(self, trainer: lightning.Trainer, pl_module) -> None:
+        self._stop()
+
+    def on_exception(self, trainer: lightning.Trainer, pl_module, exception) -> None:
+        self._stop()
+
+
+class StepSeed(Callback):
+    """Seed each batch anew, so that a resumed run drops out what it would have dropped out."""
+
+    def __init__(self, seed: int):
+        self.seed = seed
+
+    def on_train_batch_start(self, trainer: lightning.Trainer, pl_module, batch, batch_idx) -> None:
+        batch = batch_number(trainer, batch_idx)
+        torch.manual_seed(step_seed(self.seed, batch, trainer.global_rank))
+
+
+class RollingCheckpoint(Callback):
+    """Keep `last.ckpt` fresh: after every epoch, since only there a run can be taken up exactly.
+
+    A stop by hand loses the epoch it falls into, and the resumed run draws that epoch's views
+    again: it ends at the same weights as one that was never stopped.
+
+    Args:
+        folder: Where it goes.
+        extra: Plain data stored under its own key.
+    """
+
+    def __init__(self, folder: Path, extra: dict):
+        self.folder, self.extra = folder, extra
+
+    def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict) -> None:
+        checkpoint.update(self.extra)
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
+        write_checkpoint(trainer, self.folder, "last.ckpt")
+
+
+def write_checkpoint(trainer: lightning.Trainer, folder: Path, name: str) -> None:
+    """Write to a temporary name and move into place; all processes call, the first writes."""
+    part = folder / f"{name}.part"
+    try:
+        trainer.save_checkpoint(part)
+        if trainer.is_global_zero:
+            part.replace(folder / name)
+    finally:
+        if trainer.is_global_zero:
+            part.unlink(missing_ok=True)
+    # Others may be about to read it.
+    trainer.strategy.barrier()

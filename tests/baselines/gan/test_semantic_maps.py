@@ -1,0 +1,214 @@
+"""Semantic maps: of what cameras saw, of decoded scenes, and what lies in front of what."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+from torch.testing import assert_close
+
+from sceneprior.baselines.gan.semantic_maps import (
+    LENS,
+    choices,
+    compose_maps,
+    observed_counts,
+    observed_maps,
+    rendered_maps,
+)
+from sceneprior.classes import VOID
+from sceneprior.data.dataset import ViewDataset
+from sceneprior.geometry.boxes import place
+from sceneprior.losses.completeness import kept_objects
+from sceneprior.shards import iterate_rooms
+from sceneprior.silhouettes.render import render_silhouettes
+from sceneprior.views import DecodedScenes
+
+CLASSES = 22
+BOX = trimesh.creation.box()
+CORNERS, FACES = torch.tensor(2 * BOX.vertices).float(), torch.tensor(BOX.faces)
+SURE = 9.0
+
+
+@pytest.fixture(scope="module")
+def views(toy_shards):
+    return ViewDataset(toy_shards, "train", views_per_room=3, mask_step=2).__getitems__(
+        [(row, 0) for row in range(4)]
+    )
+
+
+def true_scenes(folder: Path, rooms: int, objects: int = 6) -> DecodedScenes:
+    """The toy rooms themselves, as a prior that knows everything would decode them."""
+    logits = torch.zeros(rooms, objects, CLASSES)
+    complete = torch.full((rooms, objects), -SURE)
+    centers, sizes = torch.zeros(rooms, objects, 3), torch.ones(rooms, objects, 3)
+    for row, (shard, room_id) in zip(range(rooms), iterate_rooms(folder, "train"), strict=False):
+        truth = shard.read_ground_truth(room_id)
+        count = min(objects, len(truth.object_class))
+        logits[row, torch.arange(count), torch.as_tensor(truth.object_class[:count]).long()] = SURE
+        centers[row, :count] = torch.as_tensor(truth.centers_m[:count])
+        sizes[row, :count] = torch.as_tensor(truth.sizes_m[:count])
+        complete[row, :count] = SURE
+    meshes = place(CORNERS.expand(rooms, objects, -1, -1), centers, sizes)
+    return DecodedScenes(logits, centers, sizes, complete, None, meshes)
+
+
+def test_observed_maps_are_the_shares_of_classes_in_each_pixel(views):
+    maps = observed_maps(views, CLASSES)
+    ids = views.instance_ids
+    rooms, seen, height, width = ids.shape
+    assert maps.shape == (rooms, seen, CLASSES, height // LENS, width // LENS)
+    wanted = torch.zeros_like(maps)
+    for room in range(rooms):
+        for view in range(seen):
+            for row in range(height // LENS * LENS):
+                for column in range(width // LENS * LENS):
+                    item = int(ids[room, view, row, column])
+                    label = int(views.object_class[room, item - 1]) if item else VOID
+                    wanted[room, view, label, row // LENS, column // LENS] += 1 / LENS**2
+    assert torch.equal(maps, wanted)
+    assert 0 < maps[:, :, VOID].mean() < 1
+
+
+def test_the_true_room_looks_as_it_was_seen(views, toy_shards):
+    """Boxes drawn into their own cameras: the two ways to a map meet."""
+    scenes = true_scenes(toy_shards, 4)
+    drawn = drawn_maps(scenes, views)
+    seen = observed_maps(views, CLASSES)
+    assert drawn.shape == seen.shape
+    assert_close(drawn.sum(dim=2), torch.ones_like(drawn[:, :, 0]), rtol=0, atol=1e-5)
+    # They part at edges alone: of the pixels that show one class alone, nearly all agree.
+    plain = (seen.amax(dim=2) == 1) & whole(scenes, views)[..., None, None]
+    assert plain.float().mean() > 0.1
+    agree = (drawn.argmax(dim=2) == seen.argmax(dim=2))[plain].float().mean()
+    assert agree > 0.995
+    assert (drawn - seen).abs().mean() < 0.01
+
+
+def drawn_maps(scenes: DecodedScenes, views) -> torch.Tensor:
+    return rendered_maps(scenes, FACES, views, *choices(scenes))
+
+
+def whole(scenes: DecodedScenes, views) -> torch.Tensor:
+    """Views of which no object has a corner behind the camera; its faces would be left out."""
+    corners = torch.cat([scenes.vertices_m, torch.ones_like(scenes.vertices_m[..., :1])], dim=-1)
+    ahead = torch.einsum("rvd,rkcd->rvkc", views.world_to_camera[:, :, 2], corners)
+    there = (scenes.completeness_logits > 0)[:, None, :, None]
+    return ((ahead > 0.1) | ~there).flatten(2).all(dim=-1)
+
+
+def test_what_is_not_kept_hides_nothing(views, toy_shards):
+    scenes = true_scenes(toy_shards, 4)
+    plain = drawn_maps(scenes, views)
+    # In the middle of the room and large.
+    centers, sizes = scenes.centers_m.clone(), scenes.sizes_m.clone()
+    centers[:, 5], sizes[:, 5] = torch.tensor([0.0, 1.0, 0.0]), 2.0
+    meshes = place(CORNERS.expand(4, 6, -1, -1), centers, sizes)
+    label = scenes.class_logits.clone()
+    label[:, 5, 9] = 3 * SURE
+    ghost = replace(scenes, class_logits=label, centers_m=centers, sizes_m=sizes, vertices_m=meshes)
+    assert torch.equal(drawn_maps(ghost, views), plain)
+    bed = replace(ghost, completeness_logits=ghost.completeness_logits.abs())
+    assert (drawn_maps(bed, views)[:, :, 9] > plain[:, :, 9]).any()
+
+
+def test_the_maps_are_the_renderers_layers(views, toy_shards):
+    """Independent of our own laying over: `compositing='layered'`, where no edge is soft."""
+    scenes = true_scenes(toy_shards, 4)
+    size = (views.instance_ids.shape[-2] // LENS, views.instance_ids.shape[-1] // LENS)
+    scale = torch.tensor([size[1] / views.image_size[1], size[0] / views.image_size[0], 1])
+    layers = render_silhouettes(
+        scenes.vertices_m, FACES, views.world_to_camera, views.intrinsics * scale[:, None],
+        size, sigma_px2=0.25, mode="fast", drawn=scenes.completeness_logits > 0,
+    )  # fmt: skip
+    maps = drawn_maps(scenes, views)
+    assert_close(maps[:, :, VOID], 1 - layers.sum(dim=2), rtol=0, atol=1e-5)
+    _, one_hot = choices(scenes)
+    wanted = torch.einsum("rvkhw,rkc->rvchw", layers, one_hot)
+    hard = (layers.amax(dim=2) > 0.999) & whole(scenes, views)[..., None, None]
+    assert_close(
+        maps.movedim(2, -1)[hard][:, 1:], wanted.movedim(2, -1)[hard][:, 1:], rtol=0, atol=2e-3
+    )
+    assert hard.sum() > 100
+
+
+def test_laying_over_is_the_product_of_what_nearer_objects_leave(torch_rng):
+    rooms, views, objects, classes = 2, 2, 4, 5
+    double = {"generator": torch_rng, "dtype": torch.float64}
+    coverage = torch.rand(rooms, views, objects, 3, 2, **double)
+    depth = torch.rand(rooms, views, objects, 3, 2, **double)
+    kept = torch.rand(rooms, objects, **double)
+    shares = torch.rand(rooms, objects, classes, **double).softmax(dim=-1)
+    maps = compose_maps(coverage, depth, kept, shares)
+    for place_ in torch.cartesian_prod(*map(torch.arange, (rooms, views, 3, 2))).tolist():
+        room, view, row, column = place_
+        left, wanted = 1.0, torch.zeros(classes, dtype=torch.float64)
+        for k in depth[room, view, :, row, column].argsort().tolist():
+            alpha = kept[room, k] * coverage[room, view, k, row, column]
+            wanted += left * alpha * shares[room, k]
+            left *= 1 - alpha
+        wanted[VOID] += left
+        assert_close(maps[room, view, :, row, column], wanted, rtol=0, atol=1e-12)
+
+
+def test_gradients_of_laying_over_pass_gradcheck(torch_rng):
+    double = {"generator": torch_rng, "dtype": torch.float64}
+    inputs = (
+        torch.rand(1, 1, 3, 2, 2, **double).requires_grad_(),
+        torch.rand(1, 1, 3, 2, 2, **double),
+        torch.rand(1, 3, **double).requires_grad_(),
+        torch.rand(1, 3, 4, **double).softmax(dim=-1).requires_grad_(),
+    )
+    assert torch.autograd.gradcheck(compose_maps, inputs)
+
+
+def test_choices_are_hard_and_their_gradients_soft(torch_rng):
+    numbers = torch.randn(2, 3, 6, generator=torch_rng, dtype=torch.float64)
+    labels, complete = (part.requires_grad_() for part in (numbers[..., :5], numbers[..., 5]))
+    scenes = DecodedScenes(labels, numbers[..., :3], numbers[..., :3], complete)
+    weights = torch.randn(2, 3, 5, generator=torch_rng, dtype=torch.float64)
+    kept, classes = choices(scenes)
+    assert torch.equal(classes.detach().round(), torch.nn.functional.one_hot(labels.argmax(-1), 5))
+    assert torch.equal(kept.detach() > 0.5, kept_objects(complete))
+    (wanted,) = torch.autograd.grad((labels.softmax(dim=-1) * weights).sum(), labels)
+    (got,) = torch.autograd.grad((classes * weights).sum(), labels)
+    assert_close(got, wanted, rtol=0, atol=1e-15)
+
+
+def counts_of(scenes: DecodedScenes) -> torch.Tensor:
+    return torch.einsum("rk,rkc->rc", *choices(scenes))
+
+
+def test_counts_are_those_of_the_objects_that_exist(views, toy_shards):
+    assert torch.equal(counts_of(true_scenes(toy_shards, 4)), observed_counts(views, CLASSES))
+    for room, (shard, room_id) in zip(range(4), iterate_rooms(toy_shards, "train"), strict=False):
+        wanted = torch.zeros(CLASSES)
+        for label in shard.read_room(room_id).object_class:
+            wanted[int(label)] += 1
+        assert torch.equal(observed_counts(views, CLASSES)[room], wanted)
+
+
+def test_counts_pull_on_existence_and_classes(toy_shards):
+    scenes = true_scenes(toy_shards, 4, objects=2)
+    complete = torch.tensor([[0.5, -0.5]] * 4, requires_grad=True)
+    labels = (scenes.class_logits / SURE).requires_grad_()
+    counts = counts_of(replace(scenes, completeness_logits=complete, class_logits=labels))
+    assert_close(counts.detach().sum(dim=1), torch.ones(4))
+    counts[:, 9].sum().backward()
+    assert (labels.grad[:, 0, 9] > 0).all()  # of the object that exists
+    assert (labels.grad[:, 1] == 0).all()
+    counts = counts_of(replace(scenes, completeness_logits=complete))
+    (more,) = torch.autograd.grad(counts.sum(), complete)
+    assert (more > 0).all()
+
+
+def test_what_is_not_there_learns_what_its_appearance_would_change(views, toy_shards):
+    """A bed that is not kept, where the camera would see it: asked for beds, it comes."""
+    scenes = true_scenes(toy_shards, 4, objects=1)
+    complete = torch.full((4, 1), -0.5, requires_grad=True)
+    label = torch.zeros(4, 1, CLASSES, requires_grad=True) + scenes.class_logits / 9
+    maps = drawn_maps(replace(scenes, completeness_logits=complete, class_logits=label), views)
+    assert (maps[:, :, VOID] == 1).all()
+    beds = int(scenes.class_logits[0, 0].argmax())
+    maps[:, :, beds].sum().backward()
+    assert (complete.grad > 0).any() and (complete.grad >= 0).all()

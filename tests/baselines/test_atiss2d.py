@@ -1,0 +1,113 @@
+"""The ATISS encoder in the transformer's place: a set in, whose order does not matter."""
+
+import pytest
+import torch
+from references.scene_decoder import attend, normalise
+from torch.nn import functional as F
+from torch.testing import assert_close
+
+from sceneprior.baselines.atiss2d import SceneAtiss
+
+# Sums in another order, through four layers: a few roundings of numbers around 1.
+TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
+
+
+def made(dtype=torch.float64, width=12, layers=4, dropout=0.0, norm_first=False) -> SceneAtiss:
+    torch.manual_seed(0)
+    model = SceneAtiss(width, 3, 20, dropout, layers, norm_first).to(dtype)
+    with torch.no_grad():  # biases and norms as different from their start as after training
+        for parameter in model.parameters():
+            parameter += 0.2 * torch.randn_like(parameter)
+    return model
+
+
+def inputs(torch_rng, dtype=torch.float64, rooms=3, objects=6, width=12):
+    z = F.normalize(torch.randn(rooms, width, generator=torch_rng, dtype=dtype), dim=-1)
+    return z, torch.randn(rooms, objects, width, generator=torch_rng, dtype=dtype)
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE)
+def test_the_next_object_does_not_depend_on_the_order_of_those_before(torch_rng, dtype):
+    model = made(dtype).eval()
+    z, previous = inputs(torch_rng, dtype)
+    wanted = model.next_object(z, previous)
+    for seed in range(5):
+        order = torch.randperm(6, generator=torch.Generator().manual_seed(seed))
+        shuffled = model.next_object(z, previous[:, order])
+        assert_close(shuffled, wanted, rtol=0, atol=TOLERANCE[dtype])
+    # ... but on what they are, and on z.
+    assert (model.next_object(z, previous[:, :5]) - wanted).abs().max() > 1e-3
+    assert (model.next_object(z, previous.flip(0)) - wanted).abs().max() > 1e-3
+    assert (model.next_object(z.flip(0), previous) - wanted).abs().max() > 1e-3
+
+
+def test_unrolling_is_asking_step_by_step_and_rooms_do_not_see_each_other(torch_rng):
+    model = made()
+    z, _ = inputs(torch_rng)
+    unrolled = model(z, 5)
+    assert unrolled.shape == (3, 5, 12)
+    for step in range(5):
+        asked = model.next_object(z, unrolled[:, :step])
+        assert_close(unrolled[:, step], asked, rtol=0, atol=1e-12)
+    assert_close(model(z[1:2], 5), unrolled[1:2], rtol=0, atol=1e-12)
+    assert_close(model(z, 2), unrolled[:, :2], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("norm_first", [False, True])
+def test_the_slow_twin_says_the_same(torch_rng, norm_first):
+    """Token by token and head by head: z is one of the tokens, and the answer is read off it."""
+    model = made(layers=2, norm_first=norm_first).eval()
+    z, previous = inputs(torch_rng, rooms=2, objects=3)
+    with torch.no_grad():
+        answers = model.next_object(z, previous)
+        for room in range(2):
+            tokens = [z[room] * 12**0.5, *previous[room]]
+            for layer in model.layers:
+                tokens = encode(layer, tokens, norm_first)
+            assert_close(answers[room], normalise(tokens[0], model.end), rtol=0, atol=1e-12)
+
+
+def encode(layer, tokens, norm_first):
+    """One layer of the ATISS encoder over a list of tokens."""
+
+    def before(token, norm):
+        return normalise(token, norm) if norm_first else token
+
+    def after(token, norm):
+        return token if norm_first else normalise(token, norm)
+
+    attention = layer.self_attn
+    weights = attention.in_proj_weight.chunk(3)
+    biases = attention.in_proj_bias.chunk(3)
+    query, key, value = (
+        [weight @ before(token, layer.norm1) + bias for token in tokens]
+        for weight, bias in zip(weights, biases, strict=True)
+    )
+    out = []
+    for token, asks in zip(tokens, query, strict=True):
+        mixed = attend(asks, key, value, attention.num_heads)
+        x = after(token + attention.out_proj.weight @ mixed + attention.out_proj.bias, layer.norm1)
+        inner = layer.linear1.weight @ before(x, layer.norm2) + layer.linear1.bias
+        inner = inner * 0.5 * (1 + torch.erf(inner / 2**0.5))  # GELU
+        out.append(after(x + layer.linear2.weight @ inner + layer.linear2.bias, layer.norm2))
+    return out
+
+
+def test_every_weight_has_a_gradient_that_gradcheck_confirms(torch_rng):
+    model = made(width=6, layers=2)
+    z, _ = inputs(torch_rng, rooms=1, width=6)
+    model(z, 3).pow(3).sum().backward()
+    assert all(parameter.grad.any() for parameter in model.parameters())
+    assert torch.autograd.gradcheck(lambda x: model(x, 3), (z.requires_grad_(),), atol=1e-6)
+
+
+def test_as_published_it_has_four_layers_of_two_million_weights():
+    layers = SceneAtiss(512, 8, 1024, 0.1).layers
+    counts = [sum(p.numel() for p in layer.parameters()) for layer in layers]
+    # Query, key, value and output; MLP[1024, 512]; two norms.
+    assert counts == [4 * (512 * 512 + 512) + 2 * 512 * 1024 + 1536 + 4 * 512] * 4
+
+
+def test_layers_start_with_weights_of_their_own():
+    first, *others = (layer.linear1.weight for layer in made().layers)
+    assert not any(torch.equal(first, other) for other in others)

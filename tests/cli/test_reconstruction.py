@@ -1,0 +1,152 @@
+"""reconstruct and eval-svr as commands: files, figures, and sentences for what does not work."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_cli import command, everything_in, one_sentence  # noqa: F401
+
+from sceneprior.classes import label_set
+from sceneprior.reconstruction.fit import SCHEDULES, FitSchedule
+from sceneprior.reconstruction.observed import image_from_shards
+
+SOFT = ("--renderer", "software")
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setitem(SCHEDULES, "paper", FitSchedule(steps=20, drop_at=10))
+
+
+@pytest.fixture
+def own(toy_shards, tmp_path):
+    """A view of the toy rooms as a user's files, and the arguments that name them."""
+    image = image_from_shards(toy_shards, "toy/test_00", 0)
+    names = label_set(image.label_set)
+    Image.fromarray(image.instance_ids.astype(np.uint8)).save(tmp_path / "mine.png")
+    rows = "".join(f"{k + 1},{names[c]}\n" for k, c in enumerate(image.object_class))
+    (tmp_path / "classes.csv").write_text("id,class\n" + rows)
+    (tmp_path / "pose.json").write_text(
+        json.dumps({"world_to_camera": image.world_to_camera.tolist()})
+    )
+    lens = ",".join(str(image.intrinsics[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return ["--mask", "mine.png", "--classes", "classes.csv", "--intrinsics", lens]
+
+
+def files_of(name: str) -> set[str]:
+    return {f"{name}.json", f"{name}.glb", f"{name}.png", f"{name}_seen.png"}
+
+
+def test_reconstruct_a_view_and_a_split(command, toy_run, toy_shards, tmp_path):  # noqa: F811
+    call = ["reconstruct", "--run", toy_run, "--shards", toy_shards, *SOFT]
+    one = [*call, "--room", "toy/test_01", "--view", 3, "--out", "one", "--refine"]
+    status, out, errors = command(*one)
+    assert (status, out) == (0, "Wrote 1 room to one\n"), errors
+    name = "toy_test_01_view3"
+    assert {path.name for path in (tmp_path / "one").iterdir()} == files_of(name)
+    scene = json.loads((tmp_path / "one" / f"{name}.json").read_text())
+    seen = image_from_shards(toy_shards, "toy/test_01", 3)
+    assert len(scene["objects"]) == len(seen.rows)
+    extra = scene["extra"]
+    assert (extra["room_id"], extra["view"], extra["image_size"]) == ("toy/test_01", 3, [72, 96])
+    assert 0 <= extra["mask_iou"] <= 1 and 0 < extra["steps"] <= 20
+    picture = Image.open(tmp_path / "one" / f"{name}_seen.png")
+    assert picture.height > 360 and picture.width > 2 * 480 + 360  # two views and a plan
+    before = everything_in(tmp_path)
+    assert "one is not empty; add --overwrite" in one_sentence(command(*one))
+    assert everything_in(tmp_path) == before
+    assert command(*one, "--overwrite")[0] == 0
+    status, out, errors = command(*call, "--split", "test", "--limit", 2, "--out", "two")
+    assert (status, out) == (0, "Wrote 2 rooms to two\n"), errors
+    assert len(list((tmp_path / "two").glob("*_seen.png"))) == 2
+
+
+def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):  # noqa: F811
+    call = ["reconstruct", "--run", toy_run, *own, *SOFT]
+    status, out, errors = command(*call, "--pose", "pose.json", "--out", "posed")
+    assert (status, out) == (0, "Wrote 1 room to posed\n"), errors
+    assert "without --pose" not in errors and "sofa" not in errors
+    assert {path.name for path in (tmp_path / "posed").iterdir()} == files_of("mine")
+    status, _, errors = command(*call, "--out", "level", "--camera-height", 1.4)
+    assert status == 0 and "Note: without --pose the camera is level, 1.4 m above" in errors
+    extra = json.loads((tmp_path / "level" / "mine.json").read_text())["extra"]
+    rows = (tmp_path / "classes.csv").read_text().splitlines()
+    (tmp_path / "classes.csv").write_text("\n".join([*rows[:1], "1,sofa", *rows[2:]]))
+    _, _, errors = command(*call, "--out", "sofa", "--pose", "pose.json")
+    assert "Note: the run never generates these classes" in errors and "sofa" in errors
+    pose = np.array(extra["world_to_camera"])
+    assert (-pose[:3, :3].T @ pose[:3, 3])[1] == pytest.approx(1.4)
+
+
+def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_path):  # noqa: F811
+    call = ["reconstruct", "--run", toy_run, "--out", "none"]
+    shards = ["--shards", toy_shards]
+    way = "Say what to reconstruct from, in one way"
+    before = everything_in(tmp_path)
+    for arguments, said in (
+        ([], way),
+        (shards, way),
+        ([*shards, "--room", "toy/test_00", "--split", "test"], way),
+        ([*shards, *own], way),
+        (own[:2], "--mask needs --classes and --intrinsics beside it."),
+        ([*shards, "--room", "attic"], "holds no room 'attic'"),
+        ([*shards, "--room", "toy/test_00", "--view", 8], "has no view 8; its 8 views are 0 to 7."),
+        ([*shards, "--split", "test", "--schedule", "slow"], "No schedule is called 'slow'"),
+        ([*shards, "--split", "test", "--start", "warm"], "No start is called 'warm'"),
+        ([*shards, "--split", "val"], "val"),
+    ):
+        assert said in one_sentence(command(*call, *arguments)), arguments
+    assert everything_in(tmp_path) == before
+    (tmp_path / "lens.json").write_text(
+        '{"fx": 48, "fy": 48, "cx": 48, "cy": 36, "width": 97, "height": 72}'
+    )
+    said = one_sentence(command(*call, *own[:-1], "lens.json"))
+    assert "is of an image of 97 x 72 pixels, but the mask has 96 x 72" in said
+    (tmp_path / "classes.csv").write_text("1,grand piano\n")
+    assert "none of its classes (grand piano)" in one_sentence(command(*call, *own))
+    assert not (tmp_path / "none").exists()
+
+
+def test_eval_svr_of_a_run_and_of_its_scenes(command, toy_run, toy_shards, tmp_path):  # noqa: F811
+    call = ["eval-svr", "--shards", toy_shards, *SOFT]
+    two = ["--limit", 2]
+    status, out, errors = command(*call, "--run", toy_run, *two, "--out", "run.json")
+    assert status == 0, errors
+    assert "single views" in out and out.endswith("Wrote run.json\n") and "nan" not in out.lower()
+    scores = json.loads((tmp_path / "run.json").read_text())
+    assert set(scores["rows"]) == {"fit", "fit_boxes", "layout_fit", "nearest_room", "random_room"}
+    made = ["reconstruct", "--run", toy_run, "--shards", toy_shards, "--split", "test", *two, *SOFT]
+    assert command(*made, "--out", "scenes")[0] == 0
+    status, out, errors = command(*call, "--scenes", "scenes")
+    assert status == 0 and out.endswith("Wrote scenes/svr.json\n"), errors
+    again = json.loads((tmp_path / "scenes" / "svr.json").read_text())
+    # Files hold boxes to 0.01 mm, and meshes in single precision.
+    for mine, theirs in (("scenes", "fit"), ("scenes_boxes", "fit_boxes")):
+        one, two_ = again["rows"][mine]["summary"], scores["rows"][theirs]["summary"]
+        assert one == pytest.approx(two_, abs=1e-3)
+    assert again["rows"]["nearest_room"] == scores["rows"]["nearest_room"]
+
+
+def test_scenes_that_answer_no_image(command, toy_run, toy_shards, tmp_path):  # noqa: F811
+    made = ["reconstruct", "--run", toy_run, "--shards", toy_shards, "--room", "toy/test_00", *SOFT]
+    assert command(*made, "--out", "scenes")[0] == 0
+    (path,) = (tmp_path / "scenes").glob("*.json")
+    path.with_suffix(".glb").unlink()
+    whole = json.loads(path.read_text())
+    call = ["eval-svr", "--shards", toy_shards, "--scenes", "scenes", *SOFT]
+
+    def said(**changes) -> str:
+        path.write_text(json.dumps({**whole, **changes}))
+        return one_sentence(command(*call))
+
+    assert "has 0 objects, but view 0 of room toy/test_00 shows" in said(objects=[])
+    assert "does not say which image it answers" in said(extra={})
+    attic = {**whole["extra"], "room_id": "attic"}
+    assert "The 'test' split of" in said(extra=attic) and "has no room attic" in said(extra=attic)
+    assert "has no view 9" in said(extra={**whole["extra"], "view": 9})
+    assert "Say what to judge" in one_sentence(command(*call, "--run", toy_run))
+    assert "Say what to judge" in one_sentence(command("eval-svr", "--shards", toy_shards))
+    shutil.rmtree(tmp_path / "scenes")
+    assert "No folder of scenes at scenes" in one_sentence(command(*call))

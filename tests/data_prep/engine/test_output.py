@@ -1,0 +1,131 @@
+"""Full disks, folders that cannot be written, two runs at once: a sentence, and no halves."""
+
+import errno
+import os
+import resource
+import stat
+import subprocess
+import sys
+
+import pytest
+from front_files import bedroom
+from front_jobs import digests, front_job, three_houses
+from toy_source import ToySource
+
+from data_prep.engine.build import Job, build_shards
+from data_prep.engine.output import claimed
+from sceneprior import files
+from sceneprior.errors import InputError
+
+
+def test_a_folder_that_cannot_be_written(front, tmp_path):
+    three_houses(front)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"cannot be written \(.*\)\. Finished shards are kept"):
+        build_shards(front_job(front, tmp_path / "file" / "shards"))
+
+    assert (tmp_path / "file").read_text() == ""
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (errno.ENOSPC, r"cannot be written \(No space left on device\)\. Finished shards are kept: "
+         "make room on the disk and run the same command again"),
+        (errno.EROFS, r"\(Read-only file system\)\. Finished shards are kept: run the same"),
+    ],
+    ids=["full", "read-only"],
+)  # fmt: skip
+@pytest.mark.parametrize("after", [0, 1, 4, 7, 9, 11, 13])
+def test_a_disk_that_fills_up(tmp_path, monkeypatch, number, said, after):
+    """From the `after`-th file on nothing can be written; then there is room again."""
+    out, whole = tmp_path / "shards", tmp_path / "whole"
+    source = ToySource(12)
+    build_shards(Job(source, whole))
+    expected = digests(whole)
+    count = 0
+
+    def full(descriptor):
+        nonlocal count
+        count += stat.S_ISREG(os.fstat(descriptor).st_mode)
+        if count > after:
+            raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files.os, "fsync", full)
+        with pytest.raises(InputError, match=said) as told:
+            build_shards(Job(source, out))
+    if after in (1, 4, 7):
+        assert "(rooms box_0 to box_8)" in str(told.value)  # the first shard's
+    found = digests(out) if out.exists() else {}
+    assert len(found) == after and found.items() <= expected.items()
+    build_shards(Job(source, out))
+    assert digests(out) == expected
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_kernel_refuses_large_files(front, tmp_path, workers):
+    """A real limit in a real process: no file may grow beyond 20 kB, and shards do."""
+    three_houses(front)
+    front.house("more", *(bedroom(f"Bedroom-{k}") for k in range(10)))
+    out = tmp_path / "shards"
+    command = [
+        sys.executable, "-m", "sceneprior", "prep-front", "--front", front.front, "--out", out,
+        "--future", front.future, "--workers", str(workers), "--renderer", "software",
+    ]  # fmt: skip
+    limit = (20_000, 20_000)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=os.environ | {"NUMBA_CACHE_DIR": ""},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit),
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert "(rooms " in done.stderr and "cannot be written (File too large)" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(out.rglob("*.part")) and not list(out.rglob("*.h5"))
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_folder_without_write_permission(front, tmp_path):
+    if os.geteuid() == 0:
+        pytest.skip("root may write everywhere")
+    three_houses(front)
+    closed = tmp_path / "closed"
+    closed.mkdir(mode=0o555)
+    with pytest.raises(InputError, match=r"cannot be written \(Permission denied\)"):
+        build_shards(front_job(front, closed / "shards"))
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path):
+    out = tmp_path / "deep" / "shards"
+    with (
+        claimed(out),
+        pytest.raises(InputError, match=r"Another run is writing to .*shards; wait for it"),
+        claimed(out),
+    ):
+        raise AssertionError
+    assert not (tmp_path / "deep").exists()  # nothing came to lie there
+    with claimed(out):
+        (out / "file").touch()
+    with claimed(out):
+        pass
+    assert (out / "file").exists()
+
+
+def test_leftovers_of_killed_runs_are_cleared_away(tmp_path):
+    out = tmp_path / "shards"
+    build_shards(Job(ToySource(), out))
+    expected = digests(out)
+    for name in ("plan.json.1a2b.part", "models/x.ply.ffff.part", "train/toys_0001.h5.0000.part"):
+        (out / name).write_bytes(b"half")
+    build_shards(Job(ToySource(), out))
+    assert digests(out) == expected
+
+
+def test_what_a_worker_left_that_died_on_the_way_is_cleared_away_at_the_end(tmp_path):
+    out = tmp_path / "shards"
+    with claimed(out):
+        (out / "whole").touch()
+        (out / "train").mkdir()
+        (out / "train" / "toys_0001.report.json.21dc.part").write_bytes(b"half")
+    assert [path.name for path in out.rglob("*") if path.is_file()] == ["whole"]

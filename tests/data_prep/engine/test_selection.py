@@ -1,0 +1,75 @@
+"""Which rooms are asked for, and the split each is in."""
+
+import pytest
+from front_files import room
+from front_jobs import front_job, three_houses
+
+from data_prep.engine.build import build_shards
+from data_prep.engine.selection import house_may_match, is_asked_for, seeded_split
+from sceneprior.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("only", "room_id", "house", "asked"),
+    [
+        (None, "abc_Bedroom-1", "abc", True),
+        ("abc", "abc_Bedroom-1", "abc", True),
+        ("ab", "abc_Bedroom-1", "abc", True),
+        ("b", "abc_Bedroom-1", "abc", False),
+        ("abc_Bedroom-1", "abc_Bedroom-1", "abc", True),
+        ("ab/Bedroom-1", "abc_Bedroom-1", "abc", True),
+        ("ab/Bedroom", "abc_Bedroom-1", "abc", False),
+        ("scene0000_00", "scene0000_00", "scene0000_00", True),
+    ],
+)
+def test_only_names_a_house_or_a_room(only, room_id, house, asked):
+    assert is_asked_for(only, room_id, house) == asked
+    assert house_may_match(only, house) or not asked
+
+
+def test_a_seeded_split_is_nine_to_one_and_keeps_its_order():
+    ids = [f"room{k}" for k in range(40)]
+    split = seeded_split(ids, 0)
+    tests = {room_id for room_id in ids if split[room_id] == "test"}
+    assert len(tests) == 4 and split == seeded_split(ids[::-1], 0) != seeded_split(ids, 1)
+    # A smaller data set draws its test rooms from the same order.
+    fewer = seeded_split([*sorted(tests), *sorted(set(ids) - tests)[:16]], 0)
+    assert {room_id for room_id, name in fewer.items() if name == "test"} < tests
+    assert seeded_split(["alone"], 0) == {"alone": "train"}
+
+
+def test_splits(front, tmp_path):
+    three_houses(front)
+    path = tmp_path / "splits.csv"
+    path.write_text(
+        "instanceid,split\nBedroom-0,train\nhouse0_MasterBedroom-0,test\nBedroom-1,val\n"
+        "MasterBedroom-1,test\n"
+    )
+
+    def split_sizes(name, **changes):
+        counts = build_shards(front_job(front, tmp_path / name, splits=path, **changes)).counts
+        return [counts[split]["rooms"] for split in ("train", "test")]
+
+    assert split_sizes("a") == [2, 2]
+    assert split_sizes("b", val="test") == [1, 3]
+    assert split_sizes("c", val="none") == [1, 2]
+    with pytest.raises(InputError, match="'dev' is not where val rooms can go"):
+        split_sizes("d", val="dev")
+    path.write_text("Bedroom-0,train\n")
+    with pytest.raises(InputError, match="The 'test' split is empty: none of the 1 usable rooms"):
+        split_sizes("e")
+    assert not (tmp_path / "e").exists()  # nothing half-written
+    path.write_text("nothing\n")
+    with pytest.raises(InputError, match="has no rows `room id,split`"):
+        split_sizes("f")
+    with pytest.raises(InputError, match="No split file can be read at"):
+        build_shards(front_job(front, tmp_path / "g", splits=tmp_path / "none.csv"))
+
+
+def test_nothing_passes(front, tmp_path):
+    front.house("house", room("Bedroom-1", [{"jid": "bed", "pos": (0, 0, 0)}]))
+    with pytest.raises(
+        InputError, match=r"No room of .* passes the recipe.*as here: 1 objects, min_objects is 2\)"
+    ):
+        build_shards(front_job(front, tmp_path / "shards"))
+    assert not (tmp_path / "shards").exists()

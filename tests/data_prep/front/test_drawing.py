@@ -1,0 +1,77 @@
+"""One room drawn: poor views are drawn again, so many times and no more."""
+
+import numpy as np
+import pytest
+from front_files import bedroom
+from front_reading import only_room
+
+from data_prep.front.drawing import prepare_room
+from data_prep.recipe import load_recipe
+from sceneprior.offscreen import SoftwareRenderer
+
+SMALL = ("views.image_size=[60, 80]", "views.min_object_pixels=20")
+
+
+class CountingRenderer(SoftwareRenderer):
+    """Counts views; the first `blind` of them see nothing."""
+
+    def __init__(self, blind=0):
+        self.blind, self.drawn, self.cameras = blind, [], []
+
+    def instance_ids_of_views(self, meshes, cameras, image_size):
+        images = super().instance_ids_of_views(meshes, cameras, image_size)
+        start = sum(self.drawn)
+        self.drawn.append(len(cameras))
+        self.cameras += cameras
+        images[: max(self.blind - start, 0)] = 0
+        return images
+
+
+@pytest.fixture
+def room(front):
+    return only_room(front, front.house("house", bedroom("A")))
+
+
+def prepare(room, renderer, *rules, count=12, seed=0):
+    recipe = load_recipe("front3d_bedroom", (*SMALL, *rules))
+    return prepare_room(room, count, recipe, seed, renderer)
+
+
+def test_views_that_see_too_little_are_drawn_again(room):
+    # Twelve views see nothing, five of their second tries neither.
+    renderer = CountingRenderer(blind=12 + 5)
+    views, _ = prepare(room, renderer)
+    assert renderer.drawn[0] == 12 and renderer.drawn[1] == 12 and renderer.drawn[2] >= 5
+    assert len(renderer.drawn) <= 8
+    assert (views.visible.sum(axis=1) > 0).all()
+
+
+def test_after_so_many_tries_the_best_view_stays(room):
+    # No view shows two objects that fill it: every one is drawn `tries` times.
+    renderer = CountingRenderer()
+    views, _ = prepare(room, renderer, "views.min_object_pixels=4800", "views.tries=3", count=6)
+    assert renderer.drawn == [6, 6, 6] and len(views.visible) == 6
+    # Nothing at all is worse than anything: what was drawn blind the first time is replaced.
+    renderer = CountingRenderer(blind=6)
+    views, _ = prepare(room, renderer, "views.max_object_share=0.0001", "views.tries=2", count=6)
+    assert renderer.drawn == [6, 6] and len(views.visible) == 6
+
+
+def test_a_blind_room_gives_nothing(room):
+    assert prepare(room, CountingRenderer(blind=10**6)) is None
+
+
+def test_the_room_and_the_seed_decide(room):
+    one, other, third = (prepare(room, SoftwareRenderer(), seed=seed)[0] for seed in (0, 0, 1))
+    np.testing.assert_array_equal(one.world_to_camera, other.world_to_camera)
+    np.testing.assert_array_equal(one.instance_ids, other.instance_ids)
+    assert (one.world_to_camera != third.world_to_camera).any()
+    eyes = -np.einsum("nji,nj->ni", one.world_to_camera[:, :3, :3], one.world_to_camera[:, :3, 3])
+    assert eyes[:, 1].min() >= 1.4 - 1e-5 and eyes[:, 1].max() <= 1.8 + 1e-5
+    assert one.image_size == (60, 80)
+
+
+def test_the_papers_pictures():
+    views = load_recipe("front3d_bedroom").views
+    assert views.image_size == (360, 480) and views.fov_deg == 90
+    assert views.eye_height_m == (1.4, 1.8) and views.per_house_at_most == 100

@@ -1,0 +1,158 @@
+"""3D-FRONT as a source: room types, rules and views of a house, and what its numbers promise."""
+
+import json
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+import pytest
+from front_files import FrontFolder, bedroom, room
+from front_jobs import SMALL, front_job
+from front_reading import shared_front
+
+from data_prep.engine.build import build_shards
+from data_prep.engine.source import Survey
+from data_prep.engine.workers import pool
+from data_prep.front.models import ModelBank
+from data_prep.front.rooms import read_house
+from data_prep.front.source import FrontSource
+from data_prep.recipe import load_recipe
+from sceneprior.errors import InputError
+from sceneprior.shards import read_index
+
+RULES_OFF = ("min_objects=null", "max_objects=null", "max_floor_m=null", "max_height_m=null",
+             "required_classes=[]", "scale_range=null")  # fmt: skip
+
+
+def survey(front: FrontFolder, recipe: str, *rules: str, **options: Any) -> Survey:
+    with pool(1) as run:
+        source = FrontSource(front.front, front.future, load_recipe(recipe, rules), **options)
+        return source.survey(run)
+
+
+def flat(front: FrontFolder) -> None:
+    """Five rooms of five types."""
+    front.model("sofa", "Loveseat Sofa", (1.6, 0.8, 0.9))
+    front.model("bar", "Barstool", (0.4, 0.9, 0.4))
+    front.model("books", "Bookcase / jewelry Armoire", (1.0, 2.0, 0.4))
+    pieces = [{"jid": "sofa", "pos": (0, 0, -1)}, {"jid": "bar", "pos": (1, 0, 1)}]
+    books = [{"jid": "books", "pos": (-1, 0, -1)}, {"jid": "books", "pos": (1, 0, -1)}]
+    kinds = ("LivingRoom", "LivingDiningRoom", "DiningRoom")
+    rooms = [room(f"{kind}-1", pieces, kind=kind) for kind in kinds]
+    rooms += [room("Library-1", books, kind="Library"), bedroom("MasterBedroom-1")]
+    rooms[-1]["type"] = "MasterBedroom"
+    front.house("flat", *rooms, room("Kitchen-1", books[:1], kind="Kitchen"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "rooms"),
+    [
+        ("bedroom", ["MasterBedroom-1"]),
+        ("living", ["LivingRoom-1", "LivingDiningRoom-1"]),
+        ("dining", ["LivingDiningRoom-1", "DiningRoom-1"]),
+        ("library", ["Library-1"]),
+        ("all", ["LivingRoom-1", "LivingDiningRoom-1", "DiningRoom-1", "Library-1",
+                 "MasterBedroom-1"]),
+    ],
+)  # fmt: skip
+def test_each_room_type_finds_its_rooms(front, kind, rooms):
+    flat(front)
+    found = survey(front, f"front3d_{kind}", only="flat")
+    assert [task.room_id for task in found.rooms] == [f"flat_{name}" for name in rooms]
+    assert sum(task.views for task in found.rooms) <= 100
+    # Of the kitchen's one piece, `all` says which rule leaves it out.
+    assert [item.rule for item in found.left_out] == (["min_objects"] if kind == "all" else [])
+
+
+def test_rooms_of_every_type_become_one_data_set(front, tmp_path):
+    flat(front)
+    recipe = load_recipe("front3d_all", SMALL)
+    summary = build_shards(front_job(front, tmp_path / "shards", recipe=recipe))
+    assert summary.statuses == {"prepared": 5, "filtered": 1}
+    index = read_index(tmp_path / "shards")
+    assert (index["label_set"], index["room_type"]) == ("front3d_all", "all")
+    classes = {name for line in summary.lines for name in line.classes}
+    assert {"stool", "bookshelf", "sofa", "double_bed"} <= classes
+
+
+def test_a_type_that_no_room_has(front):
+    flat(front)
+    with pytest.raises(InputError, match=r"is of a type that front3d_bedroom is about \(attic\)"):
+        survey(front, "front3d_bedroom", "room_types=[attic]")
+
+
+@pytest.mark.parametrize(
+    ("change", "rule", "why"),
+    [
+        ({"pieces": 1}, "min_objects", "1 objects, min_objects is 2"),
+        ({"pieces": 14}, "max_objects", "14 objects, max_objects is 13"),
+        ({"bounds": (-3.1, -2, 3.1, 2)}, "max_floor_m", "floor 6.20 x 4.00 m, max_floor_m is 6"),
+        ({"wall_m": 4.2}, "max_height_m", "height 4.20 m, max_height_m is 4"),
+        ({"jid": "stand"}, "required_classes", "none of double_bed, single_bed, kids_bed, which"),
+        ({"scale": [9, 1, 1]}, "scale_range", "bed is scaled by 9, 1, 1, beyond scale_range"),
+    ],
+)
+def test_each_rule_leaves_a_room_out_by_name_and_can_be_switched_off(front, change, rule, why):
+    count = change.get("pieces", 2)
+    bed = {"jid": change.get("jid", "bed"), "pos": (0, 0, 0), "scale": change.get("scale", [1] * 3)}
+    pieces = [bed] + [{"jid": "stand", "pos": (0.1 * k, 0, 1)} for k in range(1, count)]
+    written = room("A", pieces, bounds=change.get("bounds", (-2, -2, 2, 2)))
+    wall = written["_meshes"][1]["xyz"]
+    wall[7] = wall[10] = change.get("wall_m", 2.6)
+    front.house("house", written, bedroom("B"), bedroom("C"))
+    found = survey(front, "front3d_bedroom")
+    (item,) = found.left_out
+    assert (item.room_id, item.rule, item.status) == ("house_A", rule, "filtered")
+    assert item.reason.startswith(why)
+    off = f"{rule}=[]" if rule == "required_classes" else f"{rule}=null"
+    assert not survey(front, "front3d_bedroom", off).left_out
+
+
+def test_the_views_of_a_house(front):
+    """In proportion to floor area, 100 together."""
+    sides = (2.0, 3.0, 4.0, 5.0, 6.0)
+    pieces = [{"jid": "bed", "pos": (0, 0, 0)}, {"jid": "stand", "pos": (0, 0, 0)}]
+    rooms = [room(f"R{k}", pieces, bounds=(0, 0, side, 4)) for k, side in enumerate(sides)]
+    front.house("house", *rooms)
+    views = [task.views for task in survey(front, "front3d_bedroom").rooms]
+    assert views == [10, 15, 20, 25, 30]
+    # Rooms that the recipe leaves out take no views away.
+    views = [task.views for task in survey(front, "front3d_bedroom", "max_floor_m=4.5").rooms]
+    assert views == [16, 24, 32]
+
+
+@pytest.mark.parametrize(
+    ("kind", "csv", "train", "test"),
+    [("bedroom", "bedroom.csv", 152, 38), ("living", "livingroom.csv", 183, 46)],
+)
+def test_no_room_is_lost_that_the_shared_houses_promise(kind, csv, train, test):
+    folder = shared_front()
+    recipe = load_recipe(f"front3d_{kind}", RULES_OFF)
+    source = FrontSource(
+        folder / "3D-FRONT", folder / "3D-FUTURE-model", recipe, folder / "splits" / csv
+    )
+    with pool(1) as run:
+        found = source.survey(run)
+    splits = [task.split for task in found.rooms]
+    assert (splits.count("train"), splits.count("test"), found.left_out) == (train, test, ())
+
+
+def test_pieces_and_floors_are_what_the_shared_houses_promise():
+    folder = shared_front()
+    promised = json.loads((folder / "stats.json").read_text())["rooms"]
+    bank = ModelBank(folder / "3D-FUTURE-model")
+    recipe = load_recipe("front3d_all")
+    kinds = [kind for kind in promised if kind != "Kitchen"]  # this copy lacks some kitchens
+    pieces, areas = defaultdict(list), defaultdict(list)
+    for path in sorted((folder / "3D-FRONT").glob("*.json")):
+        result = read_house(path, bank, recipe, lambda _, kind: kind in kinds, load_models=False)
+        assert not result.failures and not result.filtered
+        for item in result.rooms:
+            assert not item.notes
+            pieces[item.type].append(len(item.furniture))
+            areas[item.type].append(item.floor.area)
+    for kind in kinds:
+        want = promised[kind]
+        assert len(pieces[kind]) == want["rooms"] and max(pieces[kind]) == want["objects max"]
+        assert np.mean(pieces[kind]) == pytest.approx(want["objects mean"], abs=0.0051)
+        assert np.mean(areas[kind]) == pytest.approx(want["area mean m2"], abs=0.051)

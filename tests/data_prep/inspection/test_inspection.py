@@ -1,0 +1,102 @@
+"""The sheet, the counts and the command around them."""
+
+import h5py
+import numpy as np
+import pytest
+import typer
+from front_jobs import front_job, three_houses
+from PIL import Image
+from typer.testing import CliRunner
+
+from data_prep.cli import add_commands
+from data_prep.engine.build import build_shards
+from data_prep.inspection.inspection import contact_sheet, count_shards, describe_room
+from sceneprior.errors import InputError
+
+
+@pytest.fixture
+def shards(front, tmp_path):
+    three_houses(front)
+    build_shards(front_job(front, tmp_path / "shards"))
+    return tmp_path / "shards"
+
+
+@pytest.fixture
+def cli():
+    app = typer.Typer()
+    add_commands(app)
+    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
+
+
+def test_counts_say_what_is_known(shards):
+    counts = count_shards(shards)
+    assert counts["train"]["with_truth"] == 5 and counts["test"]["with_truth"] == 1
+    assert counts["train"]["image_sizes"] == {"120 x 90": 5}
+
+
+def test_a_sheet_of_a_folder_and_of_a_room(shards):
+    # Tiles of 480 x 360 with 8 pixels between and 18 for the caption, under the legend.
+    for pictures, columns, rows in ((1, 1, 1), (5, 4, 2), (8, 4, 2)):
+        sheet = contact_sheet(shards, pictures=pictures)
+        assert sheet.width == columns * 488 + 8
+        assert (sheet.height - 8) // 386 == rows
+    room = contact_sheet(shards, "house0_Bedroom-0", pictures=3)
+    assert room.width == 4 * 488 + 8  # its plan comes first
+    with pytest.raises(InputError, match=r"has no room 'attic'; its report\.csv lists the rooms"):
+        contact_sheet(shards, "attic")
+
+
+def test_a_room_in_words(shards):
+    rows = describe_room(shards, "house0_Bedroom-0")
+    assert sorted(row["class"] for row in rows) == ["double_bed", "nightstand", "nightstand"]
+    (bed,) = (row for row in rows if row["class"] == "double_bed")
+    np.testing.assert_allclose(bed["size_m"], [1.8, 1.0, 2.0], atol=1e-5)  # stored as float32
+    assert bed["views"] > 0 and 0 < bed["share"] <= 1
+
+
+def test_the_command_prints_and_draws(shards, tmp_path, cli):
+    looked = cli("inspect", shards)
+    assert looked.exit_code == 0, looked.output
+    assert "nightstand" in looked.stdout and "120 x 90" in looked.stdout
+    with Image.open(shards / "inspect.png") as sheet:
+        assert sheet.width == 4 * 488 + 8
+    one = cli("inspect", shards, "--room", "house0_Bedroom-0", "--png", tmp_path / "a" / "b.png")
+    assert one.exit_code == 0 and "1.80" in one.stdout
+    assert (tmp_path / "a" / "b.png").is_file()
+    blocked = cli("inspect", shards, "--png", shards / "index.json" / "x.png")
+    assert isinstance(blocked.exception, InputError)
+    assert "x.png cannot be written" in str(blocked.exception)
+    assert str(blocked.exception).endswith("name another file with --png.")
+
+
+def test_verify_prints_the_overlap_and_exits_with_3_where_something_is_wrong(shards, cli):
+    (shards / "inspect.png").unlink(missing_ok=True)
+    well = cli("inspect", shards, "--verify")
+    said = " ".join(well.stdout.split())
+    assert well.exit_code == 0, well.output
+    assert "all is well. Checksums, shapes, ranges, 2D boxes and masks agree; the ground" in said
+    assert "mean 2D IoU of 0.9" in said and "worst rooms" in said and "(meshes)" in said
+    assert not (shards / "inspect.png").exists()
+    paths = sorted((shards / "train").glob("*.h5"))
+    with h5py.File(paths[0], "a") as file:
+        for group in list(file["rooms"].values())[:2]:
+            group["mask_pixels"][0, 0] += 1
+    wrong = cli("inspect", shards, "--verify")
+    assert wrong.exit_code == 3, wrong.output
+    last = wrong.stderr.strip().splitlines()[-1]
+    assert (
+        last.startswith(f"Error: {paths[0]}, room ") and "its checksum is not that of its" in last
+    )
+    assert last.endswith("(3 more problems, listed above)")
+    assert "mask_pixels says" in wrong.stderr
+
+
+def test_verify_says_what_it_could_not_check(shards, cli):
+    for path in shards.glob("*/*.h5"):
+        with h5py.File(path, "a") as file:
+            for group in file["rooms"].values():
+                del group.attrs["sha256"]
+                group["sides_clear"][...] = False
+    said = " ".join(cli("inspect", shards, "--verify").stdout.split())
+    assert "6 rooms carry no checksum (shards of an earlier release)" in said
+    assert "no object is unoccluded in any view, so no ground truth could be projected" in said

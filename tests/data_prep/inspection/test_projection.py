@@ -1,0 +1,63 @@
+"""Wires and boxes on the image, against corners projected by hand."""
+
+import doctest
+
+import numpy as np
+import pytest
+
+from data_prep.front.viewpoints import look
+from data_prep.inspection import projection
+from data_prep.inspection.projection import (
+    BOX_EDGES,
+    box_corners,
+    box_iou_2d,
+    boxes_around,
+    wire_pixels,
+)
+
+K = np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]])
+
+
+def test_examples():
+    assert doctest.testmod(projection).failed == 0
+
+
+def test_the_corners_and_edges_of_a_box():
+    corners = box_corners(np.array([1.0, 2, 3]), np.array([2.0, 4, 6]))
+    assert corners[0].tolist() == [0, 0, 0] and corners[7].tolist() == [2, 4, 6]
+    lengths = sorted(np.linalg.norm(corners[a] - corners[b]) for a, b in BOX_EDGES)
+    assert lengths == [2] * 4 + [4] * 4 + [6] * 4
+
+
+def test_wires_join_projected_points(numbers):
+    camera = look(np.array([0.3, 1.5, -3.0]), 0.2, 0.3)
+    points = box_corners(numbers.normal(size=3) * 0.2, np.array([1.0, 0.5, 0.8]))
+    here = points @ camera[:3, :3].T + camera[:3, 3]
+    assert here[:, 2].min() > 0.5
+    pixels = here @ K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    for line, (a, b) in zip(wire_pixels(points, BOX_EDGES, camera, K), BOX_EDGES, strict=True):
+        np.testing.assert_allclose(line, [*pixels[a], *pixels[b]], atol=1e-5)  # rounded to 1e-6
+    (box,) = boxes_around(points, camera[None], K[None])
+    np.testing.assert_allclose(box, [*pixels.min(axis=0), *pixels.max(axis=0)], atol=1e-9)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_line_through_the_camera_is_cut_where_it_becomes_visible(turned):
+    line = np.array([[0.0, 0.1, -2.0], [0.0, 0.1, 2.0]])[:: -1 if turned else 1]
+    ((u1, v1, u2, v2),) = wire_pixels(line, [(0, 1)], np.eye(4), K)
+    ends = [(u1, v1), (u2, v2)][:: -1 if turned else 1]
+    assert ends[0] == pytest.approx((60, 45 + 100 * 0.1 / projection.NEAR_M))
+    assert ends[1] == pytest.approx((60, 50))
+    assert wire_pixels(-np.abs(line), [(0, 1)], np.eye(4), K) == []
+    assert np.isnan(boxes_around(line, np.eye(4)[None], K[None])).all()
+
+
+def test_overlap_of_boxes():
+    unit = np.array([0.0, 0, 1, 1])
+    for other, expected in (
+        (unit, 1.0), ([0.5, 0, 1.5, 1], 1 / 3), ([1, 0, 2, 1], 0.0), ([3, 3, 4, 4], 0.0),
+        ([0.25, 0.25, 0.75, 0.75], 0.25),
+    ):  # fmt: skip
+        assert box_iou_2d(unit, np.array(other)) == pytest.approx(expected, abs=1e-15)
+    assert np.isnan(box_iou_2d(unit, np.full(4, np.nan)))

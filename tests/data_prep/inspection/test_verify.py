@@ -1,0 +1,167 @@
+"""A folder held against itself: what is damaged, swapped or missing is found and named."""
+
+import json
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from front_jobs import front_job, three_houses
+
+from data_prep.engine.build import build_shards
+from data_prep.inspection.verify import verify
+from sceneprior.errors import InputError, ShardError
+from sceneprior.shards import Shard, room_checksum
+
+
+@pytest.fixture
+def shards(front, tmp_path):
+    three_houses(front)
+    rules = ("views.per_m2=1.5", "views.image_size=[120, 160]")
+    build_shards(front_job(front, tmp_path / "shards", rules=rules))
+    return tmp_path / "shards"
+
+
+def tamper(path, change, seal=False):
+    """Change the first room of a shard, and its checksum with it if asked."""
+    with h5py.File(path, "a") as file:
+        group = next(iter(file["rooms"].values()))
+        change(group)
+        room_id = group.attrs["room_id"]
+    if seal:
+        with Shard(path) as shard:
+            views = shard.read_room(room_id, images=True)
+            checksum = room_checksum(views, shard.read_ground_truth(room_id))
+        with h5py.File(path, "a") as file:
+            next(iter(file["rooms"].values())).attrs["sha256"] = checksum
+    return room_id
+
+
+def test_a_prepared_folder_is_well(shards):
+    verdict = verify(shards)
+    assert verdict.problems == ()
+    rooms = [room for checks in verdict.rooms.values() for room in checks]
+    assert len(rooms) == 6 and all(room.has_checksum and room.has_truth for room in rooms)
+    assert np.mean(verdict.agreement.mesh) > 0.9 and not verdict.agreement.box
+    index = json.loads((shards / "index.json").read_text())
+    assert sum(room.views for room in verdict.rooms["train"]) == index["counts"]["train"]["views"]
+    assert verify(shards, workers=2).agreement == verdict.agreement
+
+
+def test_one_room(shards):
+    verdict = verify(shards, "house1_MasterBedroom-1")
+    assert [room.room_id for rooms in verdict.rooms.values() for room in rooms] == [
+        "house1_MasterBedroom-1"
+    ]
+    with pytest.raises(InputError, match=r"has no room 'attic'; its report\.csv lists the rooms"):
+        verify(shards, "attic")
+
+
+def test_what_is_no_finished_folder(shards, tmp_path):
+    with pytest.raises(ShardError, match=r"has no index\.json; it is not a finished folder"):
+        verify(tmp_path)
+    for split in ("train", "test"):
+        shutil.rmtree(shards / split)
+    with pytest.raises(InputError, match="holds no rooms; prepare them again"):
+        verify(shards)
+
+
+def test_a_changed_number_breaks_the_checksum(shards):
+    path = next((shards / "train").glob("*.h5"))
+    room_id = tamper(
+        path, lambda group: group["ground_truth/yaw_rad"].write_direct(np.ones(3, "f4"))
+    )
+    assert verify(shards).problems == (
+        f"{path}, room {room_id}: its checksum is not that of its contents: the file was changed "
+        "or damaged.",
+    )
+
+
+def test_a_box_that_does_not_fit_is_found_under_a_right_checksum(shards):
+    path = next((shards / "train").glob("*.h5"))
+
+    def shift(group):
+        boxes = group["boxes"][()]
+        boxes[group["visible"][()], 0] *= 0.5
+        group["boxes"][...] = boxes
+
+    room_id = tamper(path, shift, seal=True)
+    problem = verify(shards).problems[0]
+    assert "checksum" not in problem and problem.startswith(f"{path}, room {room_id}: view ")
+    assert problem.endswith("its 2D box does not fit its mask.")
+
+
+def test_a_truncated_shard_a_missing_one_and_another_label_set(shards):
+    path = next((shards / "test").glob("*.h5"))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:3000])
+    (problem,) = verify(shards).problems
+    assert problem.startswith(f"{path} cannot be read") and "the file is damaged" in problem
+    assert problem.count(str(path)) == 1
+    path.unlink()
+    first, *_ = verify(shards).problems
+    assert first == (
+        f"{shards}: index.json counts 1 rooms in 'test', but its shards hold 0; run the same prep "
+        "command again."
+    )
+    path.write_bytes(whole)
+    with h5py.File(path, "a") as file:
+        file.attrs["label_set"] = "scannet"
+    assert (
+        f"{path}: the shard is labelled 'scannet', index.json says 'front3d_bedroom'."
+        in verify(shards).problems
+    )
+
+
+def test_arrays_of_wrong_shapes(shards):
+    path = next((shards / "test").glob("*.h5"))
+
+    def cut(group):
+        sides = group["sides_clear"][()]
+        del group["sides_clear"]
+        group["sides_clear"] = sides[:1]
+
+    tamper(path, cut)
+    assert "sides_clear has shape (1, 3, 4), expected" in verify(shards).problems[0]
+
+
+def test_a_wrong_axis_in_all_rooms_and_in_one(shards):
+    """Models turned upside down: each room is named, and so is the folder."""
+    for path in (shards / "models").glob("*.ply"):
+        mesh = trimesh.load(path, process=False)
+        mesh.vertices = mesh.vertices * (1, -1, 1)
+        mesh.export(path)
+    paths = sorted(shards.glob("*/*.h5"))
+
+    def sink(group):
+        truth = group["ground_truth"]
+        truth["centers_m"][:, 1] *= -1
+
+    for path in paths:
+        with h5py.File(path) as file:
+            count = len(file["rooms"])
+        for number in range(count):
+            _tamper_room(path, number, sink)
+    problems = verify(shards).problems
+    assert (
+        "the projected meshes of the ground truth agree with the masks with a mean 2D IoU of"
+        in (problems[-1])
+        and problems[-1].endswith("expected at least 0.85: is an axis or a unit wrong?")
+    )
+    one = [text for text in problems if "projects onto its masks with a mean 2D IoU of 0." in text]
+    assert len(one) == 6
+    assert all(text.endswith("unoccluded objects): is an axis or a unit wrong?") for text in one)
+
+
+def _tamper_room(path, number, change):
+    with h5py.File(path, "a") as file:
+        group = list(file["rooms"].values())[number]
+        change(group)
+        room_id = group.attrs["room_id"]
+    with Shard(path) as shard:
+        checksum = room_checksum(
+            shard.read_room(room_id, images=True), shard.read_ground_truth(room_id)
+        )
+    with h5py.File(path, "a") as file:
+        list(file["rooms"].values())[number].attrs["sha256"] = checksum

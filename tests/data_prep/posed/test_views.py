@@ -1,0 +1,255 @@
+"""Posed rooms to views: every box where the picture says, whatever the axes, units and sizes."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from posed_files import PosedRoom, furniture
+
+from data_prep.inspection.agreement import unoccluded
+from data_prep.inspection.checks import array_problems, mask_problems
+from data_prep.inspection.projection import box_iou_2d, boxes_around
+from data_prep.posed.transforms import read_transforms
+from data_prep.posed.views import PosedSettings, cameras_in_room, prepare_posed, seems_up
+from sceneprior.classes import label_set
+from sceneprior.errors import InputError
+
+SET = "void,bed,chair"
+
+
+@pytest.fixture
+def room(tmp_path):
+    return PosedRoom(tmp_path / "room")
+
+
+def prepared(room, **settings):
+    return prepare_posed(read_transforms(room.folder), SET, PosedSettings(**settings))
+
+
+def overlaps(views, corners):
+    """IoU of the boxes round projected corners (in the room frame) with those of whole masks."""
+    height, width = views.image_size
+    found = []
+    for k, points in enumerate(corners):
+        boxes = boxes_around(points, views.world_to_camera, views.intrinsics)
+        iou = box_iou_2d(boxes, views.boxes[:, k] * np.array([width, height, width, height]))
+        found += iou[unoccluded(views)[:, k]].tolist()
+    return np.array(found)
+
+
+def in_room(room, center=(0.1, -0.2), floor=0.0, scale=1.0):
+    """Corners of bed and chair in the room frame: (x, y, z) with z up -> (x, z, -y)."""
+    return [
+        np.stack([c[:, 0] - center[0], c[:, 2] - floor, -(c[:, 1] - center[1])], axis=1) * scale
+        for c in (thing.corners for thing in room.things[:2])
+    ]
+
+
+def check(views):
+    assert not [*array_problems(views, len(label_set(SET))), *mask_problems(views)]
+
+
+def test_things_are_where_their_masks_are(room):
+    room.write(floor_m=0.0, floor_center_m=[0.1, -0.2])
+    made = prepared(room)
+    views = made.views
+    check(views)
+    assert views.object_class.tolist() == [1, 2] and made.truth is None
+    assert views.room_id == "room" and views.image_size == (96, 128)
+    assert made.notes == ("classes outside the label set are void: backpack (1)",)
+    iou = overlaps(views, in_room(room))
+    assert len(iou) >= 2 and iou.min() > 0.95  # some 30 pixels wide, half a pixel a side
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_units_and_axes_are_those_of_the_settings(room, up):
+    """The same room in feet, or with y up, is the same room."""
+    room.write(floor_m=0.0, floor_center_m=[0.1, -0.2])
+    plain = prepared(room).views
+    data, feet = room.data, 1 / 0.3048
+    for frame, pose in zip(data["frames"], room.poses, strict=True):
+        pose = pose.copy()
+        pose[:3, 3] *= feet
+        if up == "y":
+            pose = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]) @ pose
+        frame["transform_matrix"] = pose[:3].tolist()  # a last row may be left out
+    center = [0.1, -0.2] if up == "z" else [0.1, 0.2]
+    room.write_transforms(data | {"floor_m": 0.0, "floor_center_m": center})
+    turned = prepared(room, up=up, metres_per_unit=0.3048).views
+    np.testing.assert_allclose(turned.world_to_camera, plain.world_to_camera, atol=1e-6)
+    room.write_transforms(
+        data | {"floor_m": 0, "floor_center_m": center, "metres_per_unit": 0.3048}
+    )
+    same = prepared(room, up=up, metres_per_unit=9.0).views  # the file wins
+    np.testing.assert_array_equal(same.world_to_camera, turned.world_to_camera)
+    assert seems_up(read_transforms(room.folder)) == up
+
+
+def test_an_unknown_floor_is_an_assumption_that_is_said(room):
+    room.write()
+    made = prepared(room, camera_height_m=1.3)
+    assert made.notes[-1] == "the floor is assumed 1.3 m below the lowest camera"
+    eyes = np.linalg.inv(made.views.world_to_camera.astype(float))[:, :3, 3]
+    np.testing.assert_allclose(eyes[:, 1].min(), 1.3, atol=1e-5)  # float32 poses of metres
+    middle = (eyes.min(axis=0) + eyes.max(axis=0))[[0, 2]] / 2
+    np.testing.assert_allclose(middle, 0, atol=1e-5)
+    told = prepared(room, floor_m=-0.1)
+    eyes = np.linalg.inv(told.views.world_to_camera.astype(float))[:, :3, 3]
+    np.testing.assert_allclose(eyes[:, 1].min(), 1.6, atol=1e-5)
+    assert not any("assumed" in note for note in told.notes)
+
+
+def test_smaller_masks_keep_their_lens(room):
+    """Sampled down to any size, things stay where they are; so do masks smaller than pictures."""
+    room.size, room.focal_px = (480, 640), 400.0
+    room.write(floor_m=0.0, floor_center_m=[0.1, -0.2])
+    for max_side, size in ((None, (480, 640)), (160, (120, 160)), (150, (112, 150))):
+        views = prepared(room, max_side=max_side).views
+        assert views.image_size == size
+        check(views)
+        assert overlaps(views, in_room(room)).mean() > 0.95
+    small = PosedRoom(room.folder, size=(120, 160), focal_px=100.0)
+    for view in range(5):
+        Image.fromarray(small.ids(view)).save(room.png(view))
+    views = prepared(room).views
+    np.testing.assert_allclose(views.intrinsics[0, 0], [100, 0, 80], atol=1e-4)
+    assert overlaps(views, in_room(room)).mean() > 0.95
+
+
+def test_a_focal_length_may_be_an_angle_and_a_frames_own(room):
+    angle = 2 * np.arctan(64 / 80)
+    gone = dict.fromkeys(("fl_x", "fl_y", "cx", "cy", "w", "h"))
+    room.write(camera_angle_x=float(angle), **gone)
+    views = prepared(room).views
+    np.testing.assert_allclose(
+        views.intrinsics[0], [[80, 0, 64], [0, 80, 48], [0, 0, 1]], atol=1e-4
+    )
+    data = room.data
+    data["frames"][2]["fl_x"] = 77.0
+    room.write_transforms(data)
+    assert prepared(room).views.intrinsics[:, 0, 0].tolist() == [80, 80, 77, 80, 80]
+
+
+def test_frames_that_cannot_be_used_are_counted(room):
+    for k in range(6):
+        room.look((2 - 0.1 * k, -1.5, 1.5), (0, 0, 0.3))
+    room.write()
+    data = room.data
+    data["frames"][1]["transform_matrix"][0][3] = float("nan")
+    room.write_transforms(data)
+    room.png(3).unlink()
+    made = prepared(room)
+    assert len(made.views.visible) == 9
+    assert made.notes[:2] == (
+        "1 of 11 frames have no usable pose; skipped", "1 of 11 frames have no PNG; skipped",
+    )  # fmt: skip
+    assert len(prepared(room, max_views=4).views.visible) == 4
+
+
+def test_what_hides_and_what_does_not(room):
+    """Void things and unknown pixels take away the clearness of a side; walls do not."""
+    room.things = room.things[:1]
+    room.write()
+    (folder := room.folder / "known").mkdir()
+    base = room.ids(0)
+    rows, columns = np.nonzero(base)
+    left = (slice(rows.min(), rows.max() + 1), slice(columns.min() - 9, columns.min()))
+    assert prepared(room).views.sides_clear[0, 0].all()
+    beside = base.copy()
+    beside[left] = 9
+    Image.fromarray(beside).save(room.png(0))
+    strange = prepared(room)
+    assert strange.views.sides_clear[0, 0].tolist() == [False, True, True, True]
+    assert "the table of classes does not have (9): void" in " ".join(strange.notes)
+    assert strange.views.instance_ids.max() == 1
+    (room.folder / "classes.json").write_text('{"3": "bed", "9": "backpack"}')
+    assert not prepared(room).views.sides_clear[0, 0].all()
+    (room.folder / "classes.json").write_text('{"3": "bed", "9": "Wall"}')
+    assert prepared(room).views.sides_clear[0, 0].all()
+    Image.fromarray(base).save(room.png(0))
+    known = np.full(room.size, 255, dtype=np.uint8)
+    known[left] = 0
+    Image.fromarray(known).save(folder / "0.png")
+    data = room.data
+    data["frames"][0]["mask_path"] = "known/0.png"
+    room.write_transforms(data)
+    assert prepared(room).views.sides_clear[0, 0].tolist() == [False, True, True, True]
+    Image.fromarray(known[:-1]).save(folder / "0.png")
+    with pytest.raises(InputError, match=r"known/0.png is 128 x 95 pixels, but the ids 128 x 96\."):
+        prepared(room)
+
+
+def test_nothing_of_the_label_set(room):
+    room.things = furniture()[1:]
+    for thing in room.things:
+        thing.low, thing.high = (0, 0, 40), (1, 1, 41)
+    room.write()
+    assert prepared(room) is None
+    (room.folder / "classes.json").write_text(json.dumps({"1": "lamp", "2": "vase"}))
+    with pytest.raises(
+        InputError, match=r"none of its classes .lamp, vase. is in the label set .bed, chair.\."
+    ):
+        prepared(room)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"floor_m": 1.55}, r"lowest camera is at 1\.50 m, below the floor at 1\.55 m; check"),
+        ({"metres_per_unit": 100}, r"cameras are spread over 480 m; is metres_per_unit wrong\?"),
+        ({"w": 100}, r"masks are 128 x 96 pixels but the colour frames 100 x 96, another shape"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(room, changes, said):
+    room.write(**changes)
+    with pytest.raises(InputError, match=said):
+        prepared(room)
+
+
+def test_no_usable_frame(room):
+    room.poses = [np.diag([2.0, 2, 2, 1])] * 2
+    room.write()
+    with pytest.raises(InputError, match=r"no usable frame: 2 of 2 have no usable pose"):
+        prepared(room)
+    for view in range(2):
+        room.png(view).unlink()
+    with pytest.raises(InputError, match=r"none of its 2 frames has a PNG of instance ids; expect"):
+        prepared(room)
+
+
+def test_all_frames_of_a_room_have_one_size(room):
+    room.write()
+    Image.fromarray(room.ids(1)[:, :-1]).save(room.png(1))
+    with pytest.raises(
+        InputError, match=r"127 x 96 pixels, but the first frame's 128 x 96; a room"
+    ):
+        prepared(room)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"up": "x"}, "up is 'x'; choose z or y."),
+        ({"max_side": 0}, "max_side is 0; it counts from 1."),
+        ({"max_views": 0}, "max_views is 0; it counts from 1."),
+        ({"camera_height_m": 0.0}, "camera_height_m is 0.0; it must be above 0."),
+        ({"metres_per_unit": float("inf")}, "metres_per_unit is inf; it must be above 0."),
+        ({"floor_m": float("nan")}, "floor_m is nan; expected a height in metres."),
+    ],
+)
+def test_settings_are_checked(settings, said):
+    with pytest.raises(InputError) as error:
+        PosedSettings(**settings)
+    assert str(error.value) == said
+
+
+def test_the_axis_that_seems_up(room):
+    room.poses = [np.eye(4)]  # looks along -z, top along y
+    room.write()
+    recording = read_transforms(room.folder)
+    assert seems_up(recording) == "y"
+    assert cameras_in_room(recording, [0], PosedSettings(up="y"))[0].shape == (1, 4, 4)
+    room.poses = [np.full((4, 4), np.nan)]
+    room.write()
+    assert seems_up(read_transforms(room.folder)) is None

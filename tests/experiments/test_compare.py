@@ -1,0 +1,303 @@
+"""A comparison of tiny runs, through the command: trained, judged, gone on with, tabulated."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+import yaml
+from PIL import Image
+from tiny_runs import write_tiny_config
+
+from sceneprior.errors import InputError
+from sceneprior.experiments import steps as comparison_steps
+from sceneprior.experiments.compare import Compared, compare
+from sceneprior.experiments.comparison import load_comparison, part_of, runs_of
+from sceneprior.experiments.steps import Commands, costs_of
+from sceneprior.files import only_writer
+from sceneprior.training.checkpoints import load_any_run
+
+SOFTWARE = "software"
+
+
+def write_comparison(folder: Path, shards: Path, **changes) -> str:
+    """A comparison's YAML of one kind of room and two methods."""
+    config = folder / "tiny.yaml"
+    if not config.is_file():
+        write_tiny_config(config, shards, layout__epochs=1, shape__epochs=1)
+    data = {
+        "seeds": [0],
+        "count": 4,
+        "rooms": {"toy": {"title": "Toys", "config": str(config)}},
+        "methods": {
+            "ours": {"title": "Ours", "group": "2D"},
+            "lstm": {
+                "title": "LSTM",
+                "group": "2D",
+                "set": {"every": ["model.decoder=lstm"], "toy": ["model.width=8"]},
+            },
+        },
+    }
+    path = folder / "compare.yaml"
+    path.write_text(yaml.safe_dump(data | changes, sort_keys=False))
+    return str(path)
+
+
+@pytest.fixture
+def written(toy_shards, tmp_path):
+    return partial(write_comparison, tmp_path, toy_shards)
+
+
+def test_every_run_has_its_settings_its_seed_and_its_folder(written):
+    comparison = load_comparison(written(seeds=[0, 1]))
+    runs = runs_of(comparison, Path("out"))
+    assert [(run.method, run.seed) for run in runs] == [
+        ("ours", 0), ("lstm", 0), ("ours", 1), ("lstm", 1),
+    ]  # fmt: skip
+    assert runs[3].settings == ("model.decoder=lstm", "model.width=8", "seed=1")
+    assert runs[3].folder == Path("out/toy/lstm/seed1")
+
+
+def test_the_shipped_comparison_has_every_method_of_the_paper():
+    comparison = load_comparison("compare_front_small.yaml")
+    wanted = {"ours", "lstm", "atiss2d", "gan", "atiss3d", "sync2gen", "c1", "c3", "views25"}
+    assert wanted < set(comparison.methods) and set(comparison.rooms) == {"bedroom", "living"}
+
+
+def test_a_part_keeps_the_order_and_names_what_there_is(written):
+    comparison = load_comparison(written(seeds=[0, 1]))
+    part = part_of(comparison, "lstm, ours", "toy", "1")
+    assert tuple(part.methods) == ("ours", "lstm") and part.seeds == (1,)
+    with pytest.raises(InputError, match="No method 'gan' in this comparison; it has ours, lstm"):
+        part_of(comparison, "gan", None, None)
+    with pytest.raises(InputError, match="No seed '7'"):
+        part_of(comparison, None, None, "7")
+    with pytest.raises(InputError, match="No kind of rooms was named"):
+        part_of(comparison, None, ",", None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": [0]}, "unknown key 'seed'; the nearest valid key is 'seeds'"),
+        (
+            {"methods": {name: {"title": "A", "group": "2D"} for name in "ab"}},
+            "the title 'A' is given twice; a title names a row",
+        ),
+        ({"seeds": [1, 1]}, "seeds are numbers from 0 on, each once"),
+        (
+            {"methods": {"a": {"title": "A", "grp": "2D", "group": "2D"}}},
+            "unknown key 'methods.a.grp'; the nearest valid key is 'group'",
+        ),
+        (
+            {"methods": {"a": {"title": "A", "group": "2D", "set": {"attic": []}}}},
+            "methods.a.set has 'attic'; expected every or one of toy",
+        ),
+        (
+            {"methods": {"a": {"title": "A", "group": "b", "set": {"toy": ["model.widht=3"]}}}},
+            "unknown key 'model.widht'; the nearest valid key is 'width'",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_comparison_is_said_before_anything_runs(written, changes, message):
+    with pytest.raises(InputError, match=message):
+        load_comparison(written(**changes))
+
+
+@pytest.fixture(scope="module")
+def trained(toy_shards, tmp_path_factory) -> Path:
+    """`ours` of the comparison below, trained and judged by real commands."""
+    folder = tmp_path_factory.mktemp("compared")
+    comparison = load_comparison(write_comparison(folder, toy_shards))
+    done = compare(comparison, part_of(comparison, "ours", None, None), folder / "out", 1, SOFTWARE)
+    assert done == Compared(folder / "out" / "table.md", [], [])
+    return folder
+
+
+@pytest.fixture
+def begun(trained, toy_shards, tmp_path) -> Path:
+    """A copy of it, to go on with: nothing in it knows where it lies."""
+    shutil.copytree(trained, tmp_path / "copy")
+    write_comparison(tmp_path / "copy", toy_shards)
+    return tmp_path / "copy"
+
+
+class Calls:
+    """Stands in for the commands; says how each ends."""
+
+    def __init__(self, status=0, before=lambda arguments: None):
+        self.names, self.status, self.before = [], status, before
+
+    def __call__(self, commands, arguments, log):
+        self.names.append(arguments[0])
+        self.before(arguments)
+        log.write_text("working\nError: no room for more.\n")
+        return self.status, 2.5, 3.0
+
+
+@pytest.fixture
+def calls(monkeypatch) -> Calls:
+    calls = Calls()
+    monkeypatch.setattr(Commands, "call", lambda *given: calls(*given))
+    return calls
+
+
+def again(begun: Path, toy_shards: Path, part: str | None = "ours", **changes) -> Compared:
+    comparison = load_comparison(write_comparison(begun, toy_shards, **changes))
+    return compare(comparison, part_of(comparison, part, None, None), begun / "out", 1, SOFTWARE)
+
+
+def test_a_run_is_trained_judged_and_tabulated(trained, toy_shards):
+    comparison = load_comparison(write_comparison(trained, toy_shards))
+    run = runs_of(comparison, trained / "out")[0]
+    noted = json.loads((run.folder / "steps.json").read_text())
+    assert noted["fit"]["finished"] and noted["fit"]["cpu_s"] > 0
+    assert noted["fit"]["arguments"][:2] == ["fit", "--config"]
+    assert "--devices 1 --resume" in " ".join(noted["fit"]["arguments"])
+    costs = costs_of(run)
+    assert costs.steps == 3 + 2  # 12 rooms in batches of 5, then of 6
+    count = sum(item.numel() for item in load_any_run(run.folder / "run").prior.parameters())
+    assert (costs.parameters, costs.cpu_s) == (count, noted["fit"]["cpu_s"])
+    table = (trained / "out" / "table.md").read_text()
+    assert "| Ours |" in table and "LSTM" not in table and "4 generated rooms" in table
+    with Image.open(trained / "out" / "toy.png") as sheet:
+        assert sheet.height == 3 * 160  # real, independent, ours
+
+
+def test_what_is_done_is_not_repeated_and_stays_in_the_table(begun, toy_shards, calls):
+    assert again(begun, toy_shards).failures == [] and calls.names == []
+    # A second method joins, and fails.
+    calls.status = 2
+    done = again(begun, toy_shards, None)
+    assert calls.names == ["fit"] and done.failures == ["toy, lstm, seed 0: no room for more."]
+    assert "| Ours |" in (begun / "out" / "table.md").read_text()
+
+
+def test_a_part_that_is_judged_otherwise_names_the_rows_it_leaves_out(begun, toy_shards, calls):
+    done = again(begun, toy_shards, "lstm", count=5)
+    assert done.table is None and done.left_out == ["toy, ours, seed 0"]
+    assert calls.names == ["fit", "eval-fid"]
+    again(begun, toy_shards, "ours", count=5)
+    assert calls.names[2:] == ["eval-fid"]
+
+
+def test_without_a_count_as_many_rooms_are_made_as_are_trained_on(begun, toy_shards, calls):
+    said = []
+    calls.before = said.append
+    again(begun, toy_shards, count=None)
+    assert said[0][said[0].index("-n") + 1] == "12"
+
+
+def test_a_run_of_other_settings_is_named_and_left_as_it_is(begun, toy_shards, calls):
+    (begun / "tiny.yaml").write_text(
+        (begun / "tiny.yaml").read_text().replace("epochs: 1\n", "epochs: 2\n", 1)
+    )
+    comparison = load_comparison(str(begun / "compare.yaml"))
+    done = compare(comparison, part_of(comparison, "ours", None, None), begun / "out", 1, SOFTWARE)
+    assert done.table is None and calls.names == []
+    assert done.failures == [
+        f"toy, ours, seed 0: {begun}/out/toy/ours/seed0 holds a run of other settings than the "
+        "comparison now asks for; delete it to train anew, or name another --out."
+    ]
+
+
+def test_what_was_deleted_is_made_again(begun, toy_shards, calls):
+    folder = begun / "out" / "toy" / "ours" / "seed0"
+    (folder / "scores.json").unlink()
+    again(begun, toy_shards)
+    assert calls.names == ["eval-fid"]
+    shutil.rmtree(folder / "run")
+    done = again(begun, toy_shards)
+    assert calls.names[1:] == ["fit", "eval-fid"] and done.table is None  # they made nothing
+    assert json.loads((folder / "steps.json").read_text())["fit"]["cpu_s"] == 2.5
+
+
+@pytest.mark.parametrize("name", ["steps.json", "scores.json"])
+def test_a_truncated_file_is_a_sentence(begun, toy_shards, calls, name):
+    path = begun / "out" / "toy" / "ours" / "seed0" / name
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(InputError, match=f"seed0/{name} is damaged; delete it and run"):
+        again(begun, toy_shards)
+
+
+def test_costs_of_a_run_add_up_and_are_unknown_after_a_kill(begun, toy_shards, calls):
+    folder = begun / "out" / "toy" / "ours" / "seed0"
+    (folder / "run" / "shape" / "final.ckpt").unlink()
+
+    def cpu_s():
+        return json.loads((folder / "steps.json").read_text())["fit"].get("cpu_s")
+
+    before = cpu_s()
+    again(begun, toy_shards)
+    assert cpu_s() == before + 2.5
+
+    def killed(arguments):
+        raise MemoryError
+
+    calls.before = killed
+    with pytest.raises(MemoryError):
+        again(begun, toy_shards)
+    assert cpu_s() is None
+    calls.before = lambda arguments: None
+    again(begun, toy_shards)
+    assert cpu_s() is None
+
+
+def test_a_command_that_failed_is_told_by_its_own_sentence(tmp_path):
+    log = tmp_path / "fit.log"
+    log.write_text("10%\nError: ValueError: odd.\nThis should not happen. Run again.\n")
+    assert comparison_steps._reason(log, 1) == "ValueError: odd."
+    log.write_text("\n 73%\n")
+    assert comparison_steps._reason(log, 1) == "73%"
+    assert comparison_steps._reason(log, -9) == "killed by SIGKILL; the same command goes on"
+    log.write_text("")
+    assert comparison_steps._reason(log, 1) == f"it said nothing in {log}"
+
+
+@pytest.mark.parametrize(
+    ("name", "background"),
+    [("SIGINT", False), ("SIGTERM", False), ("SIGHUP", False), ("SIGTERM", True)],
+)
+def test_a_signal_to_compare_alone_stops_its_commands_which_save_what_they_have(
+    written, tmp_path, start, name, background
+):
+    path = written(rooms={"toy": {"title": "Toys", "config": str(tmp_path / "tiny.yaml")}})
+    text = (tmp_path / "tiny.yaml").read_text().replace("epochs: 1\n", "epochs: 100000\n")
+    (tmp_path / "tiny.yaml").write_text(text)
+    words = ["--config", path, "--methods", "ours", "--out", str(tmp_path / "out")]
+    process = start(
+        [sys.executable, "-m", "sceneprior", "compare", *words, "--renderer", SOFTWARE],
+        background, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    folder = tmp_path / "out/toy/ours/seed0"
+    deadline = time.monotonic() + 120
+    while not (folder / "run/layout/last.ckpt").is_file() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.Signals[name])
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130 and "The same command goes on from here" in said
+    assert "Stopped and saved" in (folder / "fit.log").read_text()
+    noted = json.loads((folder / "steps.json").read_text())
+    assert noted["fit"]["cpu_s"] > 0 and not noted["fit"]["finished"]
+    assert not (tmp_path / "out" / "table.md").exists()
+
+
+def test_two_comparisons_do_not_write_to_one_folder(begun, toy_shards):
+    with only_writer(begun / "out"), pytest.raises(InputError, match="Another run is writing to"):
+        again(begun, toy_shards)
+    (begun / "file").touch()
+    comparison = load_comparison(str(begun / "compare.yaml"))
+    with pytest.raises(InputError, match="file cannot be written"):
+        compare(comparison, comparison, begun / "file", 1, SOFTWARE)
+
+
+def test_a_renderer_that_is_none_is_said_before_anything_is_trained(begun, toy_shards, calls):
+    comparison = load_comparison(str(begun / "compare.yaml"))
+    with pytest.raises(InputError, match="vulkan"):
+        compare(comparison, comparison, begun / "out", 1, "vulkan")
+    assert calls.names == []

@@ -1,0 +1,125 @@
+"""eval-fid from the command line: a run or anybody's scenes, kept references, one sentence else."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprior import cli
+from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.generation.export import write_scenes
+from sceneprior.offscreen import SoftwareRenderer
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Run `sceneprior <arguments>` in this process: (exit status, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["sceneprior", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        output = capsys.readouterr()
+        return int(end.value.code or 0), output.out, output.err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def scenes(toy_shards, tmp_path_factory):
+    """Four training rooms as boxes, as another method might write them."""
+    folder = tmp_path_factory.mktemp("theirs") / "scenes"
+    rooms = reference_scenes(toy_shards, "train", limit=4)
+    plain = [replace(room.without_meshes(), name=f"room_{k}") for k, room in enumerate(rooms)]
+    write_scenes(plain, folder, SoftwareRenderer())
+    return folder
+
+
+def test_anybodys_scenes_are_judged_and_again_with_the_reference(
+    command, scenes, toy_shards, tmp_path
+):
+    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
+    status, out, errors = command(*call, "--resamples", 20, "--reference", "reference.npz")
+    assert status == 0, errors
+    assert f"Wrote {scenes / 'scores.json'}" in out.replace("\n", "") and "4 rooms" in out
+    first = json.loads((scenes / "scores.json").read_text())
+    assert first["protocol"]["scenes"] == "scenes" and first["protocol"]["resamples"] == 20
+    assert first["near_copy_share"] == 1 and first["out_of_bounds_share"] == 0
+    # scores.json lies among the scenes now, and is none.
+    status, _, errors = command(
+        *call, "--resamples", 20, "--reference", "reference.npz", "--out", "b.json"
+    )
+    assert status == 0, errors
+    assert json.loads((tmp_path / "b.json").read_text()) == first
+    status, _, errors = command(*call, "-n", 2, "--seed", 3, "--resamples", 0, "--out", "c.json")
+    assert status == 0, errors
+    protocol = json.loads((tmp_path / "c.json").read_text())["protocol"]
+    assert (protocol["n_generated"], protocol["n_scenes_available"]) == (2, 4)
+
+
+def test_a_run_is_judged_with_its_own_shards(command, toy_run, tmp_path):
+    call = ["eval-fid", "--run", toy_run, "-n", 5, "--renderer", "software", "--out", "s.json"]
+    status, out, errors = command(*call, "--resamples", 5)
+    assert status == 0, errors
+    assert "5 rooms" in out and "nan" not in out.lower()
+    scores = json.loads((tmp_path / "s.json").read_text())
+    assert scores["protocol"]["sampling_law"] and scores["rooms"] == 12
+    assert 0 <= scores["near_copy_share"] <= 1
+    assert np.isfinite([value for value in scores.values() if isinstance(value, float)]).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ([], "There is nothing to judge; give --run RUN, or --scenes DIR with --shards SHARDS."),
+        (["--run", "a", "--scenes", "b"], "Both --run and --scenes came; give --run"),
+        (["--scenes", "b"], "--scenes needs --shards: the folder with the test rooms."),
+        (["--scenes", "b", "--shards", "c", "--law", "paper"], "--law and --checkpoint belong to"),
+        (["--scenes", "b", "--shards", "c"], "No folder of scenes at b;"),
+        (["--run", "a"], "a is not a run folder"),
+    ],
+)
+def test_what_cannot_be_judged_is_one_sentence(command, tmp_path, arguments, sentence):
+    status, _, errors = command("eval-fid", *arguments, "--renderer", "software")
+    assert status == 2 and errors.startswith(f"Error: {sentence}"), errors
+    assert len(errors.strip().splitlines()) == 1 and list(tmp_path.iterdir()) == []
+
+
+def test_files_of_weights_and_references_are_checked_before_drawing(
+    command, scenes, toy_shards, tmp_path
+):
+    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
+    for option in ("--inception", "--alexnet"):
+        status, _, errors = command(*call, option, "absent.pt")
+        assert status == 2 and "at absent.pt" in errors and errors.count("\n") == 1
+    (tmp_path / "kept.npz").write_text("no")
+    status, _, errors = command(*call, "--reference", "kept.npz")
+    assert status == 2 and "kept.npz is no reference" in errors
+
+
+def test_boxes_are_converted_and_then_judged(command, toy_shards, tmp_path):
+    rng = np.random.default_rng(0)
+    for row in range(3):
+        np.savez(
+            tmp_path / f"{row}.npz",
+            class_labels=np.eye(23)[[8, 12]], translations=rng.uniform(0.5, 1, (2, 3)),
+            sizes=np.full((2, 3), 0.4), angles=rng.uniform(-3, 3, (2, 1)),
+        )  # fmt: skip
+    (tmp_path / "theirs").mkdir()
+    for path in tmp_path.glob("*.npz"):
+        path.rename(tmp_path / "theirs" / path.name)
+    call = ["convert-boxes", "theirs", "--out", "ours", "--label-set", "front3d_bedroom"]
+    assert command(*call)[:2] == (0, "Wrote 3 rooms to ours\n")
+    status, _, errors = command(*call)
+    assert status == 2 and "ours is not empty; add --overwrite" in errors
+    status, _, errors = command(
+        "eval-fid", "--scenes", "ours", "--shards", toy_shards, "--resamples", 0,
+        "--renderer", "software",
+    )  # fmt: skip
+    assert status == 0, errors
+    scores = json.loads((tmp_path / "ours" / "scores.json").read_text())
+    assert scores["mean_objects"] == 2 and scores["out_of_bounds_share"] is None

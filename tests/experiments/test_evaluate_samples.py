@@ -1,0 +1,104 @@
+"""Looks at a prior in training, by hand: what is scored, against whom, and what is drawn."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny_runs import tiny_config
+
+from sceneprior.classes import class_colors, label_set
+from sceneprior.errors import InputError
+from sceneprior.evaluation.metrics.layout_metrics import category_kl, object_counts, overlap_pairs
+from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.topdown import box_mesh
+from sceneprior.experiments.evaluate_samples import TILE_PX, SampleJudge, mask_iou_of_rooms, tile
+from sceneprior.generation.decode import decode_training_rooms, synthesize
+from sceneprior.geometry.boxes import place
+from sceneprior.training.checkpoints import load_run
+from sceneprior.views import DecodedScenes
+
+
+@pytest.fixture(scope="module")
+def trained(toy_run):
+    return load_run(toy_run)
+
+
+def test_a_look_scores_what_eval_would_score(trained, toy_shards):
+    config = tiny_config(toy_shards, samples={"every": 1, "count": 12, "seed": 7})
+    verdict = SampleJudge(config)(trained)
+    generated = synthesize(trained, 12, 7)
+    tracked = reference_scenes(toy_shards, "test", tracked_only=True)
+    assert verdict.against == "test"
+    counts, wanted = object_counts(generated).mean(), object_counts(tracked).mean()
+    assert verdict.scores["category_kl"] == pytest.approx(category_kl(generated, tracked))
+    assert verdict.scores["objects"] == counts
+    assert verdict.scores["objects_off"] == pytest.approx(abs(counts - wanted) / wanted)
+    assert verdict.scores["overlaps"] == overlap_pairs(generated).per_room
+    decoded = overlap_pairs(decode_training_rooms(trained)).per_room
+    assert verdict.scores["overlaps_decoded"] == decoded
+    assert 0 <= verdict.scores["mask_iou"] <= 1
+    assert verdict.picture.shape == (3 * TILE_PX, 4 * TILE_PX, 3)
+    again = SampleJudge(config)(trained)
+    assert again.scores == verdict.scores and np.array_equal(again.picture, verdict.picture)
+
+
+def test_training_rooms_stand_in_where_there_are_no_test_rooms(trained, toy_shards, tmp_path):
+    alone = shutil.copytree(toy_shards, tmp_path / "alone")
+    shutil.rmtree(alone / "test")
+    samples = {"every": 1, "count": 4}
+    there = SampleJudge(tiny_config(alone, samples=samples))(trained)
+    asked = SampleJudge(tiny_config(toy_shards, samples={**samples, "against": "train"}))(trained)
+    assert there.against == asked.against == "train" and there.scores == asked.scores
+
+
+def test_rooms_decoded_as_they_are_have_the_masks_that_were_seen(toy_run, toy_shards, monkeypatch):
+    """Toy rooms are boxes; with boxes for a template only pixels on edges may differ."""
+    cube = box_mesh((0.0, 0.0, 0.0), (2.0, 2.0, 2.0))
+    trained = load_run(toy_run)  # its own, since it is changed
+    shape = trained.prior.shape
+    shape.template = torch.from_numpy(cube.vertices_m).float()
+    shape.faces = torch.from_numpy(cube.faces)
+    config = tiny_config(toy_shards, seed=0, samples={"every": 1}, data__mask_step=1)
+    views = SampleJudge(config)._views
+    truth = {scene.name: scene for scene in reference_scenes(toy_shards, "train", None, True)}
+    rooms, slots = len(views.room_ids), 6
+    logits = torch.zeros(rooms, slots, len(label_set("front3d_bedroom")))
+    centers, sizes = torch.zeros(rooms, slots, 3), torch.full((rooms, slots, 3), 0.1)
+    for row, name in enumerate(views.room_ids):
+        scene = truth[name]
+        count = len(scene.objects)
+        # In another order than the tracks': matching has to find it out.
+        centers[row, :count] = torch.from_numpy(scene.centers_m).float().flip(0)
+        sizes[row, :count] = torch.from_numpy(scene.sizes_m).float().flip(0)
+        logits[row, range(count), scene.class_indices[::-1].copy()] = 5
+
+    def iou(stage, centers):
+        def decode(logits_, with_shape):
+            template = shape.template.expand(rooms, slots, -1, -1)
+            vertices = place(template, centers, sizes) if with_shape else None
+            return DecodedScenes(logits, centers, sizes, torch.ones(rooms, slots), None, vertices)
+
+        monkeypatch.setattr(trained.prior, "forward", decode)
+        return mask_iou_of_rooms(replace(trained, stage=stage), views)
+
+    for stage in ("layout", "shape"):
+        assert iou(stage, centers) > 0.95
+        assert iou(stage, centers + 0.5) < 0.5
+
+
+def test_the_picture_has_a_tile_a_room_in_its_classes_colours(trained):
+    scenes = synthesize(trained, 5, 0)
+    picture = tile(scenes)
+    assert picture.shape == (2 * TILE_PX, 4 * TILE_PX, 3)
+    assert (picture[TILE_PX:, TILE_PX:] == 255).all()  # the second row holds one
+    colors = class_colors(len(label_set("front3d_bedroom")))
+    known = {tuple(color) for color in [*colors, *(colors // 2), (255, 255, 255), (127, 127, 127)]}
+    assert {tuple(color) for color in picture.reshape(-1, 3)} <= known
+
+
+def test_a_metric_that_the_label_set_lacks_is_a_sentence(toy_shards):
+    samples = {"every": 1, "metric": "type_share"}
+    with pytest.raises(InputError, match=r"samples.metric is type_share, but scannet mixes room"):
+        SampleJudge(tiny_config(toy_shards, label_set="scannet", samples=samples))

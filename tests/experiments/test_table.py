@@ -1,0 +1,104 @@
+"""Scores of made-up runs: what stands in which cell of the three tables."""
+
+import csv
+import io
+from dataclasses import replace
+
+import pytest
+
+from sceneprior.experiments.table import Row, as_csv, latex, markdown, write_tables
+
+PROTOCOL = {"n_generated": 200, "n_test": 38, "n_train_rooms": 149, "shards": "front"}
+
+
+def row(title, seed, fd, group="from masks in 2D", rooms="Bedrooms", **more) -> Row:
+    scores = {
+        "protocol": PROTOCOL,
+        "fd_effnet_lite0": fd,
+        "category_kl": 0.1,
+        "independent": {"fd_effnet_lite0": 61.0, "category_kl": 0.13},
+        "independent_meshes": {"fd_effnet_lite0": 49.0},
+        "train_rooms": {"fd_effnet_lite0": 39.0, "category_kl": 0.12},
+        **more,
+    }
+    costs = {"cpu_s": 300.0 + 60 * seed, "steps": 4500, "parameters": 1_250_000}
+    return Row(rooms, group, title, seed, scores, costs)
+
+
+@pytest.fixture
+def rows() -> list[Row]:
+    return [
+        row("Ours", 0, 47.0, box_iou_3d=0.66),
+        row("GAN_x", 0, 58.25),
+        row("ATISS", 0, 44.0, "from boxes in 3D"),
+        row("Ours", 1, 49.0, box_iou_3d=0.68),
+    ]
+
+
+def cells(table: str, name: str) -> dict[str, str]:
+    lines = [line for line in table.splitlines() if line.startswith("|")]
+    head, line = (
+        [cell.strip() for cell in found.strip("|").split("|")]
+        for found in (lines[0], next(x for x in lines if x.startswith(f"| {name} ")))
+    )
+    return dict(zip(head, line, strict=True))
+
+
+def test_a_cell_is_the_mean_of_seeds_and_half_their_range(rows):
+    table = markdown(rows)
+    ours = cells(table, "Ours")
+    assert ours["FD ↓"] == "48.0 ± 1.0" and ours["train box IoU ↑"] == "0.67 ± 0.01"
+    assert (ours["steps"], ours["CPU min"], ours["parameters (M)"]) == ("4,500", "5.5", "1.25")
+    gan = cells(table, "GAN_x")
+    assert gan["FD ↓"] == "58.2" and gan["train box IoU ↑"] == "–"
+    assert cells(table, "Independent objects, as boxes")["FD ↓"] == "61.0"
+    furnished = cells(table, "Independent objects, with meshes")
+    assert (furnished["FD ↓"], furnished["category KL ↓"]) == ("49.0", "–")
+    real = cells(table, "Real training rooms")
+    assert (real["FD ↓"], real["category KL ↓"], real["steps"]) == ("39.0", "0.120", "–")
+    assert "FID ↓" not in table.splitlines()[4]  # nobody has it
+
+
+def test_methods_stand_under_their_group_in_the_order_they_came(rows):
+    order = [line.strip("| ").split(" |")[0] for line in markdown(rows).splitlines()[6:]]
+    assert order[:9] == [
+        "*reference*", "Independent objects, as boxes", "Independent objects, with meshes",
+        "Real training rooms", "*from masks in 2D*", "Ours", "GAN_x", "*from boxes in 3D*", "ATISS",
+    ]  # fmt: skip
+
+
+def test_each_kind_of_rooms_has_a_table_that_says_what_it_is_of(rows):
+    both = markdown([*rows, row("Ours", 0, 40.0, rooms="Living rooms")])
+    assert both.index("### Bedrooms") < both.index("### Living rooms")
+    assert "200 generated rooms a run against 38 test rooms of front; 149 real" in both
+    assert "seeds 0, 1." in both and both.count("| method |") == 2
+
+
+def test_latex_escapes_and_keeps_its_columns(rows):
+    text = latex(rows)
+    assert r"GAN\_x" in text and r"48.0 $\pm$ 1.0" in text and r"FD $\downarrow$" in text
+    columns = text.split(r"\begin{tabular}{l")[1].split("}")[0]
+    lines = [
+        line for line in text.splitlines() if line.endswith(r"\\") and "multicolumn" not in line
+    ]
+    assert {line.count("&") for line in lines} == {len(columns)}
+
+
+def test_the_csv_has_a_line_a_run_in_full_precision(rows):
+    lines = list(csv.DictReader(io.StringIO(as_csv(rows))))
+    assert [(line["method"], line["seed"]) for line in lines][-1] == ("Ours", "1")
+    assert lines[1]["fd_effnet_lite0"] == "58.25" and lines[1]["box_iou_3d"] == ""
+    assert lines[0]["cpu_s"] == "300.0"
+
+
+def test_what_nobody_knows_is_left_open(rows):
+    lost = replace(rows[1], costs={**rows[1].costs, "cpu_s": None})
+    table = [rows[0], lost]
+    assert cells(markdown(table), "GAN_x")["CPU min"] == "–"
+    lines = list(csv.DictReader(io.StringIO(as_csv(table))))
+    assert lines[1]["cpu_s"] == "" and lines[1]["steps"] == "4500"
+
+
+def test_three_files_are_written(rows, tmp_path):
+    write_tables(rows, tmp_path / "new")
+    assert {p.name for p in (tmp_path / "new").iterdir()} == {"table.md", "table.csv", "table.tex"}

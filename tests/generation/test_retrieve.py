@@ -1,0 +1,204 @@
+"""Retrieval: the supplement's rules, one by one, and the fast search against the slow one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_folder import blocks, corner_sofa
+
+from sceneprior.errors import InputError
+from sceneprior.generation.cad_bank import CadBank, Shelf, unit_mesh
+from sceneprior.generation.retrieve import (
+    TURNS,
+    _rough_distances,
+    _turned_views,
+    chamfer,
+    extruded,
+    most_similar,
+    placed,
+    retrieval_report,
+    retrieve,
+    retrieve_all,
+)
+from sceneprior.geometry.surfaces import surface_points
+from sceneprior.scene import Mesh, Scene, SceneObject
+
+POINTS = 256
+
+
+def bank_of(points: int = POINTS, **models) -> CadBank:
+    """label -> {model id: trimesh}."""
+    meshes = {
+        name: unit_mesh(Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
+        for shelf in models.values()
+        for name, mesh in shelf.items()
+    }
+    shelves = {
+        label: Shelf(
+            tuple(shelf),
+            np.stack(
+                [
+                    surface_points(meshes[name].vertices_m, meshes[name].faces, points)
+                    for name in shelf
+                ]
+            ).astype(np.float32),
+        )
+        for label, shelf in models.items()
+    }
+    return CadBank(shelves, meshes.__getitem__)
+
+
+@pytest.fixture(scope="module")
+def bank():
+    plain = blocks(((0, 0.5, 0), (1, 1, 1)))
+    table = blocks(((0, 0.7, 0), (1.2, 0.1, 0.8)), ((0.5, 0.35, 0), (0.1, 0.7, 0.7)))
+    return bank_of(sofa={"plain": plain, "corner": corner_sofa(), "table": table})
+
+
+def brute_chamfer(a: np.ndarray, b: np.ndarray) -> float:
+    apart = np.linalg.norm(a[:, None] - b[None], axis=2)
+    return float(apart.min(axis=1).mean() + apart.min(axis=0).mean()) / 2
+
+
+def room(*objects: SceneObject) -> Scene:
+    return Scene("room", "front3d_living", objects)
+
+
+def test_chamfer_is_its_definition(rng):
+    a, b = rng.normal(size=(70, 3)), rng.normal(size=(50, 3))
+    assert chamfer(a, b) == pytest.approx(brute_chamfer(a, b), rel=1e-12)
+    # Two parallel unit squares, sampled at the same places: nearer than neighbours are.
+    square = np.column_stack([rng.random((40, 2)), np.zeros(40)])
+    assert chamfer(square, square + np.array([0, 0, 0.01])) == pytest.approx(0.01, rel=1e-9)
+
+
+@pytest.mark.parametrize("step", [1, 4])
+def test_rough_distances_are_chamfer_distances_of_every_nth_point(rng, step):
+    shelf = rng.uniform(-0.5, 0.5, (7, 64, 3)).astype(np.float32)
+    points, size = rng.normal(size=(64, 3)), np.array([2.0, 0.7, 0.4])
+    choices = rng.permutation(7 * TURNS)[:19]
+    rough = _rough_distances(_turned_views(points, tuple(size)), shelf, choices, step)
+    for choice, got in zip(choices, rough, strict=True):
+        model, turn = divmod(int(choice), TURNS)
+        unit = Mesh(shelf[model].astype(np.float64), np.zeros((0, 3), np.int64))
+        item = SceneObject("sofa", (0.0, 0.0, 0.0), tuple(size))
+        in_room = placed(unit, item, 90 * turn).vertices_m
+        # Squared distances in float32, as a difference of squares of a few metres.
+        assert got == pytest.approx(brute_chamfer(points[::step], in_room[::step]), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("center_y", "height", "wanted"),
+    [
+        (1.0, 0.4, (0.6, 1.2)),  # exactly 1 m: down to the floor, the top stays
+        (1.001, 0.4, (1.001, 0.4)),
+        (0.3, 0.6, (0.3, 0.6)),  # stands already
+        (0.2, 0.6, (0.25, 0.5)),  # came from below the floor
+        (-1.0, 0.5, (-1.0, 0.5)),  # all of it is below: nothing to stand on
+    ],
+)
+def test_low_boxes_are_extruded_to_the_floor(center_y, height, wanted):
+    item = extruded(SceneObject("sofa", (1.0, center_y, 2.0), (0.5, height, 0.7)))
+    assert (item.center_m[1], item.size_m[1]) == pytest.approx(wanted)
+    assert (item.center_m[0], item.center_m[2], *item.size_m[::2]) == (1.0, 2.0, 0.5, 0.7)
+
+
+@pytest.mark.parametrize("turn", [0, 90, 180, 270])
+@pytest.mark.parametrize("size", [(2.0, 0.8, 1.2), (0.7, 1.9, 1.5)])
+def test_a_model_in_disguise_is_found_with_its_turn(bank, turn, size):
+    """The corner sofa itself, turned and stretched into a box, has distance nearly 0."""
+    item = SceneObject("sofa", (1.0, size[1] / 2, -2.0), size)
+    mesh = placed(bank.load("corner"), item, turn)
+    np.testing.assert_allclose(
+        mesh.vertices_m.min(0), np.subtract(item.center_m, np.divide(size, 2))
+    )
+    np.testing.assert_allclose(mesh.vertices_m.max(0), np.add(item.center_m, np.divide(size, 2)))
+    best = most_similar(replace(item, mesh=mesh), bank.shelves["sofa"])
+    assert (best.model_id, best.turn_deg) == ("corner", turn)
+    assert best.distance_m < 0.15  # two samples of one surface
+    made = retrieve(room(replace(item, mesh=mesh)), bank)
+    np.testing.assert_allclose(made.objects[0].mesh.vertices_m, mesh.vertices_m)
+
+
+def test_turns_are_yaws():
+    """docs/conventions.md: a yaw of 90 degrees turns +z towards +x."""
+    unit = Mesh(np.array([[0, 0, 0.5]]), np.zeros((0, 3), np.int64))
+    item = SceneObject("sofa", (0.0, 0.0, 0.0), (2.0, 1.0, 4.0))
+    np.testing.assert_allclose(placed(unit, item, 0).vertices_m[0], [0, 0, 2])
+    np.testing.assert_allclose(placed(unit, item, 90).vertices_m[0], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(placed(unit, item, 270).vertices_m[0], [-1, 0, 0], atol=1e-12)
+
+
+def random_furniture(rng):
+    """Two to five blocks on one another: many pieces, some much alike."""
+    parts = []
+    for _ in range(rng.integers(2, 6)):
+        size = rng.uniform(0.1, 1.0, 3)
+        parts.append((tuple(rng.uniform(-0.5, 0.5, 3)), tuple(size)))
+    return blocks(*parts)
+
+
+def test_the_fast_search_finds_the_winner_of_the_slow_one(rng):
+    bank = bank_of(1024, sofa={f"m{k:02d}": random_furniture(rng) for k in range(80)})
+    for _ in range(8):
+        size = tuple(rng.uniform(0.4, 2.2, 3))
+        like = random_furniture(rng)
+        item = SceneObject("sofa", (0.0, size[1] / 2, 0.0), size)
+        unit = unit_mesh(Mesh(np.asarray(like.vertices), np.asarray(like.faces)))
+        item = replace(item, mesh=placed(unit, item, 0))
+        slow = most_similar(item, bank.shelves["sofa"], keep=None)
+        assert most_similar(item, bank.shelves["sofa"]) == slow
+
+
+def test_without_a_mesh_the_box_is_compared(bank):
+    made = retrieve(room(SceneObject("sofa", (0.0, 0.9, 0.0), (1.0, 0.6, 1.0))), bank)
+    assert made.extra["retrieval"][0]["model_id"] == "plain"
+    assert made.objects[0].size_m == pytest.approx((1.0, 1.2, 1.0))
+
+
+def test_classes_without_models_keep_their_objects_and_the_report_says_so(bank):
+    own = Mesh(np.eye(3), np.array([[0, 1, 2]]))
+    lamp = SceneObject("pendant_lamp", (0.0, 2.2, 0.0), (0.5, 0.5, 0.5), own)
+    sofa = SceneObject("sofa", (0.0, 0.4, 0.0), (2.0, 0.8, 1.0))
+    made = retrieve(replace(room(lamp, sofa), extra={"seed": 3}), bank)
+    assert made.objects[0] == lamp and made.extra["retrieval"][0] is None
+    assert made.extra["seed"] == 3 and made.objects[1].mesh is not None
+    report = retrieval_report([made], replace(bank, broken={"x": "gone"}))
+    assert report["classes_without_models"] == ["pendant_lamp"]
+    assert (report["objects"], report["objects_with_a_model"]) == (2, 1)
+    assert report["classes"]["pendant_lamp"]["mean_distance_m"] is None
+    assert report["classes"]["sofa"]["models"] == 3 and report["broken_models"] == {"x": "gone"}
+
+
+def test_rooms_without_objects_and_objects_without_volume_have_defined_answers(bank):
+    assert retrieve(room(), bank).extra["retrieval"] == []
+    flat = SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
+    point = SceneObject("sofa", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    collapsed = SceneObject(
+        "sofa", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0), Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    )
+    made = retrieve(room(flat, point, collapsed), bank)
+    assert all(np.isfinite(found["distance_m"]) for found in made.extra["retrieval"])
+    assert made.extra["retrieval"][2]["model_id"] == "plain"  # by its box
+
+
+def test_what_is_no_number_is_a_sentence(bank):
+    with pytest.raises(InputError, match=r"room: the box of object 0 \(sofa\) is .*nan"):
+        retrieve(room(SceneObject("sofa", (0.0, float("nan"), 0.0), (1.0, 1.0, 1.0))), bank)
+    with pytest.raises(InputError, match="sides that are not negative"):
+        retrieve(room(SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, -1.0, 1.0))), bank)
+    holed = Mesh(np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
+    with pytest.raises(InputError, match=r"the mesh of object 0 .* no numbers"):
+        retrieve(room(SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), holed)), bank)
+
+
+def test_many_scenes_are_the_same_as_one_by_one(bank, rng):
+    scenes = [
+        replace(
+            room(SceneObject("sofa", (0.0, 0.4, 0.0), tuple(rng.uniform(0.3, 2, 3)))), name=str(k)
+        )
+        for k in range(6)
+    ]
+    many = list(retrieve_all(scenes, bank))
+    assert [scene.name for scene in many] == [str(k) for k in range(6)]
+    assert [m.extra for m in many] == [retrieve(scene, bank).extra for scene in scenes]

@@ -1,0 +1,151 @@
+"""Where new latents come from: seeds, covariances, neighbours."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from sceneprior.errors import InputError
+from sceneprior.generation import sample as sampling
+from sceneprior.generation.sample import LAWS, sample_latents, sample_logits
+from sceneprior.models.latents import LatentCube, LatentSphere
+
+MANY = 20_000
+
+
+@pytest.fixture
+def sphere() -> LatentSphere:
+    return LatentSphere(7, 12, seed=1)
+
+
+@pytest.fixture
+def trained(torch_rng) -> torch.Tensor:
+    """Logits of 40 rooms, correlated."""
+    mix = torch.randn(7, 7, generator=torch_rng)
+    return torch.randn(40, 7, generator=torch_rng) @ mix + torch.randn(7, generator=torch_rng)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_seed_gives_the_same_points_on_the_unit_sphere(sphere, trained, law):
+    one = sample_latents(sphere, trained, 9, 3, law)
+    assert one.shape == (9, 12)
+    assert_close(one.norm(dim=-1), torch.ones(9), rtol=0, atol=1e-5)
+    assert torch.equal(one, sample_latents(sphere, trained, 9, 3, law))
+    assert not torch.equal(one, sample_latents(sphere, trained, 9, 4, law))
+
+
+def test_the_gaussian_law_has_the_mean_and_covariance_of_the_training_rooms(trained):
+    drawn = sample_logits(trained, MANY, 0, "gaussian").double()
+    centred = trained.double() - trained.double().mean(dim=1, keepdim=True)
+    wanted = centred.T.cov()
+    spread = wanted.diagonal().sqrt()
+    # 20,000 draws: a standard error of the mean is 0.007 spreads, of a covariance about 0.01.
+    assert ((drawn.mean(dim=0) - centred.mean(dim=0)) / spread).abs().max() < 0.04
+    assert ((drawn.T.cov() - wanted) / spread[:, None] / spread).abs().max() < 0.05
+
+
+def test_few_rooms_are_never_left_behind(trained):
+    """Two rooms span a line: draws lie on it."""
+    drawn = sample_logits(trained[:2], 50, 0, "gaussian").double()
+    centred = trained[:2].double() - trained[:2].double().mean(dim=1, keepdim=True)
+    along = centred[1] - centred[0]
+    along = along / along.norm()
+    away = drawn - centred[0]
+    assert_close(
+        away - (away @ along)[:, None] * along, torch.zeros(50, 7).double(), rtol=0, atol=1e-5
+    )
+
+
+def test_the_gaussian_law_does_not_see_what_a_softmax_does_not(sphere, trained, torch_rng):
+    shifted = trained + 5 * torch.randn(40, 1, generator=torch_rng)
+    plain = sphere.double()(sample_logits(trained.double(), 20, 0, "gaussian"))
+    moved = sphere(sample_logits(shifted.double(), 20, 0, "gaussian"))
+    assert_close(moved, plain, rtol=0, atol=1e-5)
+
+
+def test_the_papers_law_is_standard_normal_whatever_was_trained(trained):
+    drawn = sample_logits(trained, MANY, 0, "paper")
+    assert torch.equal(drawn, sample_logits(100 * trained, MANY, 0, "paper"))
+    assert drawn.mean(dim=0).abs().max() < 0.04
+    assert (drawn.T.cov() - torch.eye(7)).abs().max() < 0.05
+
+
+def test_geodesics_lead_from_rooms_to_their_nearest_neighbours(sphere, trained, monkeypatch):
+    monkeypatch.setattr(sampling, "NEIGHBOURS", 3)
+    z = sphere(trained).double()
+    drawn = sample_latents(sphere, trained, 300, 0, "geodesic").double()
+    angle = torch.acos((z @ z.T).clamp(-1, 1))
+    angle.fill_diagonal_(torch.inf)
+    nearest = angle.topk(3, largest=False).indices
+    pairs = [(a, int(b)) for a in range(40) for b in nearest[a]]
+    used = set()
+    for point in drawn:
+        to_all = torch.acos((z @ point).clamp(-1, 1))
+        # On the geodesic of a pair: the detour over the point is no detour.
+        detour = torch.stack([to_all[a] + to_all[b] - angle[a, b] for a, b in pairs])
+        assert detour.min() < 2e-3
+        used.add(pairs[int(detour.argmin())])
+    assert len(used) > 80  # of 120
+
+
+def test_laws_that_cannot_be_followed_are_sentences(sphere, trained):
+    with pytest.raises(InputError) as error:
+        sample_latents(sphere, trained, 3, 0, "guess")
+    assert str(error.value) == (
+        "No sampling law 'guess'; choose from kernel, geodesic, gaussian, paper."
+    )
+    for law in ("kernel", "gaussian", "geodesic"):
+        with pytest.raises(InputError) as error:
+            sample_latents(sphere, trained[:1], 3, 0, law)
+        assert str(error.value) == (
+            f"The {law} law needs at least 2 training rooms; use --law paper."
+        )
+    assert sample_latents(sphere, trained[:1], 3, 0, "paper").shape == (3, 12)
+
+
+def test_kernel_draws_around_each_training_room_in_turn():
+    generator = torch.Generator().manual_seed(0)
+    trained = 5 * torch.randn(12, 40, generator=generator, dtype=torch.float64)
+    trained -= trained.mean(dim=1, keepdim=True)
+    drawn = sample_logits(trained, 24, seed=0, law="kernel")
+    # Twelve points in forty dimensions lie far apart: the nearest is the one drawn around.
+    nearest = torch.cdist(drawn, trained).argmin(dim=1)
+    assert sorted(nearest[:12].tolist()) == sorted(nearest[12:].tolist()) == list(range(12))
+
+
+def test_kernel_keeps_mean_and_covariance():
+    generator = torch.Generator().manual_seed(0)
+    trained = torch.randn(50, 3, generator=generator, dtype=torch.float64) * torch.tensor([1, 2, 3])
+    centred = trained - trained.mean(dim=1, keepdim=True)
+    drawn = sample_logits(trained, 200_000, seed=0, law="kernel")
+    torch.testing.assert_close(drawn.mean(0), centred.mean(0), rtol=0, atol=0.01)
+    torch.testing.assert_close(torch.cov(drawn.T), torch.cov(centred.T), rtol=0.05, atol=0.02)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_every_law_stays_in_the_cube_and_goes_by_its_seed(trained, law):
+    cube = LatentCube(7)
+    one = sample_latents(cube, trained, 9, 3, law)
+    assert one.shape == (9, 7) and one.abs().max() <= cube.half_edge
+    assert torch.equal(one, sample_latents(cube, trained, 9, 3, law))
+    assert not torch.equal(one, sample_latents(cube, trained, 9, 4, law))
+
+
+def test_in_the_cube_a_constant_added_to_the_logits_is_no_freedom(trained):
+    drawn = sample_logits(trained, MANY, 0, "gaussian", LatentCube.shift_free).double()
+    wanted = trained.double()
+    spread = wanted.std(dim=0)
+    assert ((drawn.mean(dim=0) - wanted.mean(dim=0)) / spread).abs().max() < 0.04
+    assert ((drawn.T.cov() - wanted.T.cov()) / spread[:, None] / spread).abs().max() < 0.05
+
+
+def test_in_the_cube_neighbours_are_joined_by_straight_lines(trained, monkeypatch):
+    monkeypatch.setattr(sampling, "NEIGHBOURS", 3)
+    cube = LatentCube(7)
+    z = cube(trained.double())
+    apart = torch.cdist(z, z).fill_diagonal_(torch.inf)
+    nearest = apart.topk(3, largest=False).indices
+    pairs = [(a, int(b)) for a in range(40) for b in nearest[a]]
+    for point in sample_latents(cube, trained.double(), 60, 0, "geodesic"):
+        to_all = (z - point).norm(dim=-1)
+        detour = torch.stack([to_all[a] + to_all[b] - apart[a, b] for a, b in pairs])
+        assert detour.min() < 1e-6

@@ -1,0 +1,186 @@
+"""Fitting latents: RMSProp as PyTorch has it, image by image, until nothing moves."""
+
+import itertools
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.nn import functional as F
+from torch.testing import assert_close
+
+from sceneprior.errors import InputError
+from sceneprior.reconstruction import fit as fitting
+from sceneprior.reconstruction.fit import (
+    SCHEDULES,
+    FitSchedule,
+    decode_images,
+    fit_latents,
+    rows_of,
+    view_loss,
+)
+from sceneprior.reconstruction.observed import as_views, images_of_split
+from sceneprior.reconstruction.starts import layout_losses_of_rooms, starting_latents
+from sceneprior.training.checkpoints import load_run
+
+SHORT = FitSchedule(steps=12, drop_at=8, patience=0)
+
+
+@pytest.fixture(scope="module")
+def trained(toy_run):
+    return load_run(toy_run)
+
+
+@pytest.fixture(scope="module")
+def views(toy_shards):
+    return as_views(images_of_split(toy_shards, "test", 0)[0], 4)
+
+
+@pytest.fixture(scope="module")
+def start(trained, views):
+    return trained.prior.sphere(trained.logits[:1]).expand(len(views.is_object), -1)
+
+
+def by_pytorch(trained, views, start, schedule):
+    """The schedule in PyTorch's own words; the best of what it passes through."""
+    x = start.clone().requires_grad_()
+    optimizer = torch.optim.RMSprop([x], lr=schedule.learning_rate)
+    drop = torch.optim.lr_scheduler.MultiStepLR(optimizer, [schedule.drop_at], schedule.decay)
+    passed, scores = [], []
+    for _ in range(schedule.steps):
+        loss = view_loss(trained, decode_images(trained, x, views), views)
+        passed.append(x.detach().clone())
+        scores.append(loss.score)
+        optimizer.zero_grad()
+        loss.total.sum().backward()
+        optimizer.step()
+        drop.step()
+    best = torch.stack(scores).argmin(dim=0)
+    return F.normalize(torch.stack(passed)[best, torch.arange(len(start))], dim=1)
+
+
+def test_it_is_pytorchs_rmsprop_with_the_papers_drop(trained, views, start):
+    fit = fit_latents(trained, views, start, SHORT)
+    assert_close(fit.z, by_pytorch(trained, views, start, SHORT), rtol=1e-4, atol=1e-5)
+    assert_close(fit.z.norm(dim=1), torch.ones(len(start)), rtol=1e-6, atol=0)
+    assert fit.steps.tolist() == [12] * len(start)
+
+
+def test_the_network_stays_as_it_was(trained, views, start):
+    before = {name: value.clone() for name, value in trained.prior.state_dict().items()}
+    fit_latents(trained, views, start, SHORT)
+    assert all(
+        torch.equal(before[name], value) for name, value in trained.prior.state_dict().items()
+    )
+
+
+def test_the_score_never_rises_and_mostly_falls(trained, views, start):
+    with torch.no_grad():
+        before = view_loss(trained, decode_images(trained, start, views), views)
+    fit = fit_latents(trained, views, start, FitSchedule(steps=60, drop_at=40))
+    assert (fit.loss.score <= before.score + 1e-6).all()
+    assert fit.loss.score.mean() < before.score.mean() - 0.05
+
+
+def test_alone_or_among_others_an_image_has_the_same_answer(trained, views, start):
+    together = fit_latents(trained, views, start, SHORT)
+    for row in range(len(start)):
+        alone = fit_latents(trained, rows_of(views, torch.tensor([row])), start[:1], SHORT)
+        # Sums in another order; a matching that is a tie could still tell them apart.
+        assert_close(alone.z[0], together.z[row], rtol=1e-3, atol=1e-4)
+
+
+def test_images_that_do_not_move_stop_early_and_others_go_on(trained, views, start):
+    hopeless = FitSchedule(steps=60, drop_at=50, patience=20, least_gain=2.0)
+    fit = fit_latents(trained, views, start, hopeless)
+    # Nothing gains 200%: down at the first look, done at the second.
+    assert fit.steps.tolist() == [40] * len(start)
+    eager = fit_latents(trained, views, start, replace(hopeless, patience=0))
+    assert eager.steps.tolist() == [60] * len(start)
+    assert (eager.loss.score <= fit.loss.score + 1e-6).all()
+
+
+def test_completeness_takes_no_part(trained, views, start):
+    scenes = decode_images(trained, start, views)
+    other = replace(scenes, completeness_logits=scenes.completeness_logits + 50)
+    one, two = (view_loss(trained, s, views, masks=False).total for s in (scenes, other))
+    assert torch.equal(one, two)
+
+
+def test_the_released_schedule_waits_for_masks_and_keeps_its_matching(trained, views, start):
+    schedule = replace(SCHEDULES["released"], steps=6, drop_at=5, masks_from=3, patience=0)
+    fit = fit_latents(trained, views, start, schedule)
+    assert (fit.loss.mask_iou > 0).any()
+    assert (SCHEDULES["released"].steps, SCHEDULES["released"].drop_at) == (2000, 1200)
+    assert (SCHEDULES["paper"].steps, SCHEDULES["paper"].drop_at) == (1000, 500)
+
+
+def test_a_kept_matching_goes_with_the_images_that_go_on(trained, views, start, monkeypatch):
+    counts = views.is_object.sum(dim=1)
+    assert counts.min() < counts.max()  # so that those that go on are padded to fewer objects
+    full = {name for name, n in zip(views.room_ids, counts, strict=True) if n == counts.max()}
+    ages = itertools.count(1)
+
+    def staged(trained, scenes, views, *more):
+        """The full images never gain anything, the others do at every step."""
+        loss = view_loss(trained, scenes, views, *more)
+        score = [1.0 if name in full else 1.0 / next(ages) for name in views.room_ids]
+        return loss._replace(score=torch.tensor(score))
+
+    monkeypatch.setattr(fitting, "view_loss", staged)
+    fit = fit_latents(
+        trained,
+        views,
+        start,
+        FitSchedule(50, 20, freeze_matching=True, patience=20, least_gain=0.0),
+    )
+    assert fit.steps.tolist() == [40 if name in full else 50 for name in views.room_ids]
+
+
+def test_without_masks_only_the_layout_counts(trained, views, start):
+    fit = fit_latents(trained, views, start, SHORT, masks=False)
+    assert (fit.loss.mask_iou == 0).all()
+    assert torch.equal(fit.loss.score, fit.loss.total)
+
+
+def test_more_objects_than_the_prior_generates(trained, views, start):
+    many = torch.arange(7) % views.is_object.shape[1]
+    crowded = replace(
+        views,
+        object_class=views.object_class[:, many],
+        is_object=torch.ones(4, 7, dtype=torch.bool),
+        boxes=views.boxes[:, :, many],
+        visible=views.visible[:, :, many],
+        sides_clear=views.sides_clear[:, :, many],
+    )
+    with pytest.raises(InputError, match=r"toy_test_00_view\d shows 7 objects, but .* at most 6"):
+        fit_latents(trained, crowded, start)
+
+
+def test_nearest_starts_are_the_rooms_of_least_layout_loss(trained, toy_shards):
+    views = as_views(images_of_split(toy_shards, "train", 0)[0], 4)
+    losses = layout_losses_of_rooms(trained, views)
+    assert losses.shape == (12, 12)
+    room = 5
+    first = rows_of(views, torch.tensor([room]))
+    own = trained.prior.sphere(trained.logits[3:4])
+    scenes = replace(decode_images(trained, own, first), vertices_m=None)
+    assert_close(
+        losses[room, 3], view_loss(trained, scenes, first, masks=False).score[0],
+        rtol=1e-4, atol=1e-5,
+    )  # fmt: skip
+    starts = starting_latents(trained, views, 2)
+    best = trained.prior.sphere(trained.logits)[losses[room].argmin()]
+    assert torch.equal(starts[room, 0], best)
+
+
+def test_starts_that_cannot_be(trained, views):
+    with pytest.raises(InputError, match="No start is called 'warm'; choose from nearest, random"):
+        starting_latents(trained, views, 1, "warm")
+    with pytest.raises(
+        InputError, match="13 nearest training rooms were asked for, but the run ha"
+    ):
+        starting_latents(trained, views, 13)
+    random = starting_latents(trained, views, 3, "random", seed=1)
+    assert random.shape == (4, 3, 16)
+    assert torch.equal(random, starting_latents(trained, views, 3, "random", seed=1))
+    assert not torch.equal(random, starting_latents(trained, views, 3, "random", seed=2))

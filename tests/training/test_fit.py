@@ -1,0 +1,287 @@
+"""Training on toy rooms: what a run leaves behind, how it stops and goes on, what it may read."""
+
+import csv
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from tiny_runs import tiny_config, write_tiny_config
+
+from sceneprior.config import load_config
+from sceneprior.errors import InputError
+from sceneprior.training import fit as train
+from sceneprior.training.callbacks import RollingCheckpoint
+from sceneprior.training.checkpoints import find_checkpoint, load_run, read_checkpoint
+from sceneprior.training.fit import fit
+from sceneprior.training.layout import LayoutStage
+
+CPU = {"accelerator": "cpu", "devices": 1}
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return read_checkpoint(path)["state_dict"]
+
+
+def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
+
+
+def curve(run: Path, stage: str, name: str = "train/loss") -> list[float]:
+    with (run / stage / "metrics.csv").open(newline="") as file:
+        return [float(row[name]) for row in csv.DictReader(file) if row.get(name)]
+
+
+class Stop(RollingCheckpoint):
+    """Presses Ctrl-C in the middle of an epoch of a stage."""
+
+    when = ("layout", 3)
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        if (self.folder.name, trainer.current_epoch, batch_idx) == (*self.when, 1):
+            raise KeyboardInterrupt
+
+
+def interrupted(monkeypatch, config, run: Path, stage: str, epoch: int) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(Stop, "when", (stage, epoch))
+        patch.setattr(train, "RollingCheckpoint", Stop)
+        with pytest.raises(KeyboardInterrupt):
+            fit(config, run, trainer_options=CPU)
+
+
+def test_both_stages_learn_and_leave_what_runs_py_promises(toy_run, toy_shards):
+    files = {str(path.relative_to(toy_run)) for path in toy_run.rglob("*") if path.is_file()}
+    for stage in ("layout", "shape"):
+        assert {f"{stage}/final.ckpt", f"{stage}/metrics.csv"} <= files
+        assert any(name.startswith(f"{stage}/events.out.tfevents") for name in files)
+    assert "layout/last.ckpt" in files
+    assert not [name for name in files if name.endswith(".part")]
+    assert load_config(str(toy_run / "config.yaml")) == tiny_config(toy_shards, layout__epochs=20)
+    layout, shape = curve(toy_run, "layout"), curve(toy_run, "shape")
+    assert (len(layout), len(shape)) == (20, 3)
+    assert layout[-1] < 0.75 * layout[0] and np.isfinite(layout + shape).all()
+    for name in ("class", "box", "completeness", "frustum", "mask", "mask_iou", "mask_used"):
+        values = curve(toy_run, "shape", f"train/{name}")
+        assert len(values) == 3, name
+    assert 0 < curve(toy_run, "shape", "train/mask_iou")[-1] < 1
+
+
+def test_a_trained_run_is_ready_for_use(toy_run):
+    trained = load_run(toy_run)
+    assert trained.stage == "shape"
+    assert trained.room_ids == tuple(f"toy/train_{k:02d}" for k in range(12))
+    assert trained.logits.shape == (12, 10) and not trained.logits.requires_grad
+    assert not trained.prior.training
+    assert not any(parameter.requires_grad for parameter in trained.prior.parameters())
+    assert same(
+        {f"prior.{k}": v for k, v in trained.prior.state_dict().items()}
+        | {"latents.weight": trained.logits},
+        weights(toy_run / "shape" / "final.ckpt"),
+    )
+
+
+def test_resuming_a_finished_run_trains_nothing(toy_run, toy_shards, tmp_path, monkeypatch):
+    run = shutil.copytree(toy_run, tmp_path / "run")
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    monkeypatch.setattr(train, "_fit_stage", None)  # calling it would fail
+    fit(tiny_config(toy_shards, layout__epochs=20), run, resume=True)
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize(("stage", "epoch"), [("layout", 4), ("shape", 2)])
+@pytest.mark.parametrize(
+    "extra",
+    [{}, {"model__dropout": 0.2}, {"layout__schedule": "cosine", "shape__schedule": "cosine"}],
+    ids=["plain", "dropout", "cosine"],
+)
+def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
+    toy_shards, tmp_path, monkeypatch, stage, epoch, extra
+):
+    config = tiny_config(toy_shards, **extra)
+    fit(config, tmp_path / "whole", trainer_options=CPU)
+    run = tmp_path / "stopped"
+    interrupted(monkeypatch, config, run, stage, epoch)
+    assert (run / stage / "last.ckpt").is_file() and not (run / stage / "final.ckpt").exists()
+    assert read_checkpoint(run / stage / "last.ckpt")["epoch"] == epoch - 1
+    fit(config, run, resume=True, trainer_options=CPU)
+    for name in ("layout", "shape"):
+        assert same(
+            weights(tmp_path / "whole" / name / "final.ckpt"), weights(run / name / "final.ckpt")
+        ), name
+    assert len(curve(run, stage)) == len(curve(tmp_path / "whole", stage))
+
+
+def test_a_stop_in_the_first_epoch_leaves_a_run_that_can_go_on(toy_shards, tmp_path, monkeypatch):
+    config = tiny_config(toy_shards, layout__epochs=2, shape__epochs=1)
+    interrupted(monkeypatch, config, tmp_path / "run", "layout", 0)
+    assert not list((tmp_path / "run").rglob("*.ckpt*"))
+    fit(config, tmp_path / "run", resume=True, trainer_options=CPU)
+    assert load_run(tmp_path / "run").stage == "shape"
+
+
+def test_every_epoch_draws_other_views_in_another_order(toy_shards, tmp_path, monkeypatch):
+    seen = []
+    original = LayoutStage.training_step
+
+    def watched(self, views, batch_idx):
+        seen.append((self.current_epoch, views.room_index.tolist(), views.world_to_camera.clone()))
+        return original(self, views, batch_idx)
+
+    monkeypatch.setattr(LayoutStage, "training_step", watched)
+    fit(
+        tiny_config(toy_shards, layout__epochs=3, shape__epochs=1),
+        tmp_path / "run",
+        trainer_options=CPU,
+    )
+    orders, draws = [], []
+    for epoch in range(3):
+        mine = [(rows, poses) for e, rows, poses in seen if e == epoch]
+        orders.append([row for rows, _ in mine for row in rows])
+        draws.append(dict(zip(orders[-1], torch.cat([poses for _, poses in mine]), strict=True)))
+        assert sorted(orders[-1]) == list(range(12))
+    assert orders[0] != orders[1] != orders[2] != orders[0]
+    assert sum(not torch.equal(draws[0][row], draws[1][row]) for row in range(12)) >= 10
+
+
+def test_training_never_opens_the_ground_truth(toy_shards, tmp_path):
+    """Three epochs with and without the group: every weight has the same bits."""
+    blind = shutil.copytree(toy_shards, tmp_path / "blind")
+    removed = 0
+    for path in blind.rglob("*.h5"):
+        with h5py.File(path, "r+") as file:
+            for room in file["rooms"].values():
+                del room["ground_truth"]
+                removed += 1
+    assert removed == 16
+    results = []
+    for shards in (toy_shards, blind):
+        run = tmp_path / f"run_of_{shards.name}"
+        fit(tiny_config(shards, layout__epochs=3), run, trainer_options=CPU)
+        results.append([weights(run / stage / "final.ckpt") for stage in ("layout", "shape")])
+    assert same(results[0][0], results[1][0]) and same(results[0][1], results[1][1])
+    start = train._start(
+        tiny_config(toy_shards), train._open_data("layout", tiny_config(toy_shards)), None
+    )
+    assert not torch.equal(start[1].weight, results[0][1]["latents.weight"])  # it did train
+
+
+def test_ctrl_c_at_the_command_saves_and_resume_finishes(toy_shards, tmp_path, start):
+    config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards, layout__epochs=100000)
+    run = tmp_path / "run"
+    command = [
+        sys.executable, "-m", "sceneprior", "fit", "--config", str(config), "--run", str(run),
+        "--accelerator", "cpu",
+    ]  # fmt: skip
+    process = start(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=tmp_path
+    )
+    deadline = time.monotonic() + 120
+    while not (run / "layout" / "last.ckpt").is_file():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    go_on = f"sceneprior fit --config {run / 'config.yaml'} --run {run} --resume"
+    assert f"Stopped and saved. Go on with: {go_on}" in errors
+    assert "Traceback" not in errors
+    assert not list(run.rglob("*.part")) and not (run / "layout" / "final.ckpt").exists()
+    reached = read_checkpoint(run / "layout" / "last.ckpt")["epoch"]
+    assert 0 <= reached < 100000
+    # Finish from there, with as many epochs as were reached and two more.
+    text = (run / "config.yaml").read_text().replace("epochs: 100000", f"epochs: {reached + 2}")
+    (run / "config.yaml").write_text(text)
+    fit(load_config(str(run / "config.yaml")), run, resume=True, trainer_options=CPU)
+    assert find_checkpoint(run) == ("shape", run / "shape" / "final.ckpt")
+
+
+def test_a_loss_that_is_no_number_names_its_rooms(toy_shards, tmp_path, monkeypatch):
+    original = LayoutStage.training_step
+
+    def poisoned(self, views, batch_idx):
+        with torch.no_grad():
+            self.latents.weight[int(views.room_index[0])] = torch.nan
+        return original(self, views, batch_idx)
+
+    monkeypatch.setattr(LayoutStage, "training_step", poisoned)
+    with pytest.raises(FloatingPointError) as error:
+        fit(tiny_config(toy_shards), tmp_path / "run", trainer_options=CPU)
+    message = str(error.value)
+    assert message.startswith("The loss is nan on rooms toy/train_")
+    assert message.count("toy/train_") == 5  # those of the batch
+    assert "lower the learning rate" in message
+    assert not list((tmp_path / "run").rglob("*.ckpt"))  # after an error, nothing is saved
+
+
+def test_a_shape_stage_that_is_no_number_names_its_rooms(toy_run, toy_shards, tmp_path):
+    run = shutil.copytree(toy_run, tmp_path / "run")
+    shutil.rmtree(run / "shape")
+    saved = read_checkpoint(run / "layout" / "final.ckpt")
+    saved["state_dict"]["latents.weight"][4] = torch.nan
+    torch.save(saved, run / "layout" / "final.ckpt")
+    with pytest.raises(FloatingPointError, match=r"The loss is nan on rooms .*toy/train_04"):
+        fit(tiny_config(toy_shards, layout__epochs=20), run, resume=True, trainer_options=CPU)
+
+
+def test_settings_and_shards_that_do_not_fit_are_sentences(toy_run, toy_shards, tmp_path):
+    config = tiny_config(toy_shards, layout__epochs=20)
+    with pytest.raises(InputError) as error:
+        fit(config, toy_run)
+    assert str(error.value) == (
+        f"{toy_run} already holds a run; add --resume to continue it, or name another folder."
+    )
+    with pytest.raises(
+        InputError, match=r"config.yaml differs from the settings given now; resume"
+    ):
+        fit(tiny_config(toy_shards, seed=4), toy_run, resume=True)
+    with pytest.raises(
+        InputError, match=r"is labelled 'front3d_bedroom' but the config says 'scan"
+    ):
+        fit(tiny_config(toy_shards, label_set="scannet"), tmp_path / "a")
+    with pytest.raises(
+        InputError, match=r"has 5 tracked objects but model.max_objects is 3; raise"
+    ):
+        fit(tiny_config(toy_shards, model__max_objects=3), tmp_path / "b")
+    with pytest.raises(InputError, match="No logger 'paper'; choose from csv, tensorboard, wandb"):
+        fit(config, tmp_path / "c", loggers=("paper",))
+
+
+def test_a_run_refused_can_be_started_again_without_resume(toy_shards, tmp_path):
+    """Nothing half-written: a refused run leaves no folder that the next try trips over."""
+    for changes in ({"data__shards": str(tmp_path / "none")}, {"model__max_objects": 3}):
+        with pytest.raises(InputError):
+            fit(tiny_config(toy_shards, **changes), tmp_path / "run")
+        assert not (tmp_path / "run").exists()
+
+
+def test_damaged_or_foreign_checkpoints_are_sentences(toy_run, tmp_path):
+    run = shutil.copytree(toy_run, tmp_path / "run")
+    path = run / "shape" / "final.ckpt"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"final.ckpt cannot be read .*; it is damaged. Delete it"):
+        load_run(run)
+    text = (run / "config.yaml").read_text()
+    path.unlink()
+    (run / "config.yaml").write_text(text.replace("width: 16", "width: 32"))
+    with pytest.raises(
+        InputError, match=r"does not fit the run's config.yaml .*use the config it was"
+    ):
+        load_run(run)
+    shutil.rmtree(run / "layout")
+    for path in run.rglob("*.ckpt"):
+        path.unlink()
+    with pytest.raises(
+        InputError, match=r"holds no checkpoint yet; let `sceneprior fit --config .*config.yaml"
+    ):
+        load_run(run)
+    with pytest.raises(
+        InputError, match=r"is not a run folder \(no config.yaml in it\); train one"
+    ):
+        load_run(tmp_path)

@@ -1,0 +1,85 @@
+"""What stands for an object in 2D before it has a mesh."""
+
+import numpy as np
+import pytest
+import torch
+from tiny_runs import tiny_config
+from torch.testing import assert_close
+from toy_rooms import look_at
+
+from sceneprior.config import ShapeConfig, StageConfig
+from sceneprior.geometry.cameras import boxes_of_points
+from sceneprior.training.objective import build_latents, build_prior, proxy_boxes, seen_boxes
+from sceneprior.views import DecodedScenes, SceneViews
+
+
+@pytest.fixture
+def seen() -> tuple[DecodedScenes, SceneViews]:
+    """Two rooms of three objects, wholly in front of four cameras and inside of their images."""
+    generator = torch.Generator().manual_seed(0)
+    rooms, views, objects = 2, 4, 3
+    eyes = [[4 * np.sin(a), 1.5, 4 * np.cos(a)] for a in range(views)]
+    poses = torch.from_numpy(np.stack([look_at(np.array(eye), np.zeros(3)) for eye in eyes]))
+    lens = torch.tensor([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
+    empty = torch.zeros(rooms, views, objects, dtype=torch.bool)
+    scenes = DecodedScenes(
+        class_logits=torch.zeros(rooms, objects, 5),
+        centers_m=torch.rand(rooms, objects, 3, generator=generator) * 2 - 1,
+        sizes_m=torch.rand(rooms, objects, 3, generator=generator) + 0.2,
+        completeness_logits=torch.zeros(rooms, objects),
+        chamfers=torch.full((rooms, objects, 2), 0.3),
+    )
+    return scenes, SceneViews(
+        room_index=torch.arange(rooms),
+        object_class=torch.ones(rooms, objects, dtype=torch.int64),
+        is_object=torch.ones(rooms, objects, dtype=torch.bool),
+        world_to_camera=poses.float().expand(rooms, views, 4, 4),
+        intrinsics=lens.expand(rooms, views, 3, 3),
+        boxes=torch.zeros(rooms, views, objects, 4),
+        visible=empty,
+        sides_clear=empty[..., None].expand(-1, -1, -1, 4),
+        image_size=(60, 80),
+    )
+
+
+def test_a_box_holds_the_ellipsoid_and_that_its_points(seen):
+    box, smooth, points = (
+        proxy_boxes(*seen, proxy) for proxy in ("box", "ellipsoid", "ellipsoid_points")
+    )
+    assert box.in_frustum.all() and smooth.in_frustum.all() and points.in_frustum.all()
+    outward = torch.tensor([-1.0, -1, 1, 1])
+    assert ((box.boxes - smooth.boxes) * outward).min() > 0
+    short = (smooth.boxes - points.boxes) * outward
+    width = smooth.boxes[..., 2:] - smooth.boxes[..., :2]
+    # Half widths fall short by up to 1.7%; nearer sides look larger.
+    assert short.min() > -1e-6 and (short / torch.cat([width, width], dim=-1)).max() < 0.0125
+
+
+def test_every_proxy_of_the_config_has_boxes_of_its_own(seen):
+    proxies = StageConfig.model_fields["proxy"].annotation.__args__
+    boxes = [proxy_boxes(*seen, proxy).boxes for proxy in proxies]
+    assert len(proxies) == 4
+    for i, one in enumerate(boxes):
+        assert all(not torch.equal(one, other) for other in boxes[:i])
+
+
+def test_the_papers_proxy_is_the_smooth_ellipsoid():
+    assert StageConfig.model_fields["proxy"].default == "ellipsoid"
+    assert ShapeConfig.model_fields["proxy"].default == "ellipsoid"
+
+
+@pytest.mark.parametrize("box_from", ["mesh", "proxy"])
+def test_the_shape_stage_takes_boxes_from_where_it_is_told(seen, tmp_path, box_from):
+    config = tiny_config(tmp_path, shape__box_from=box_from, shape__proxy="ellipsoid")
+    prior = build_prior(config, classes=5)
+    scenes = prior(build_latents(config, rooms=2).weight)
+    found = seen_boxes(scenes, seen[1], config.shape)
+    if box_from == "proxy":
+        expected = proxy_boxes(scenes, seen[1], "ellipsoid")
+    else:
+        views = seen[1]
+        expected = boxes_of_points(
+            scenes.vertices_m, views.world_to_camera, views.intrinsics, views.image_size
+        )
+    assert_close(found.boxes, expected.boxes, rtol=0, atol=0)
+    assert torch.equal(found.in_frustum, expected.in_frustum)

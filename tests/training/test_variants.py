@@ -1,0 +1,190 @@
+"""Ablations and released-code variants: each trains, resumes, is decoded and is sampled."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_runs import tiny_config
+from torch.testing import assert_close
+
+from sceneprior.baselines.lstm import SceneLstm
+from sceneprior.config import ModelConfig
+from sceneprior.experiments.evaluate import (
+    UNFOLDING_STEPS,
+    Judging,
+    decoded_and_true,
+    judge_run,
+    read_curves,
+    unfold,
+)
+from sceneprior.generation.decode import decode_training_rooms, synthesize
+from sceneprior.generation.sample import LAWS
+from sceneprior.models.latents import LatentCube
+from sceneprior.training import fit as train
+from sceneprior.training.callbacks import RollingCheckpoint
+from sceneprior.training.checkpoints import load_run, read_checkpoint
+from sceneprior.training.fit import fit
+from sceneprior.training.objective import build_prior
+
+CPU = {"accelerator": "cpu", "devices": 1}
+FAST = {"layout__epochs": 6, "shape__epochs": 2}
+RELEASED = {
+    "model__hidden": 16,
+    "model__final_norm": True,
+    "model__query_self_attention": True,
+    "model__step_mlps": True,
+    "model__layout_heads": "separate",
+    "loss__completeness_target": "stop",
+    "layout__proxy": "ellipsoid_points",
+}
+VARIANTS = {
+    "c1_uniform": {"model__latent": "uniform", "layout__latent_noise": 0.1},
+    "c2_lstm": {"model__decoder": "lstm"},
+    "c3_one_stage": {"stages": "one", "shape__epochs": 5},
+    "bulge": {"layout__proxy": "bulge", "shape__box_from": "proxy", "shape__proxy": "bulge"},
+    "released": RELEASED,
+}
+
+
+class Stop(RollingCheckpoint):
+    """Presses Ctrl-C in the middle of the second epoch of the shape stage."""
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        if (self.folder.name, trainer.current_epoch, batch_idx) == ("shape", 1, 1):
+            raise KeyboardInterrupt
+
+
+@pytest.fixture(scope="module", params=VARIANTS)
+def variant(request, toy_shards, tmp_path_factory):
+    """Name, config and a finished run."""
+    config = tiny_config(toy_shards, **(FAST | VARIANTS[request.param]))
+    run = tmp_path_factory.mktemp(request.param) / "run"
+    fit(config, run, trainer_options=CPU)
+    return request.param, config, run
+
+
+def test_a_variant_learns(variant):
+    name, config, run = variant
+    curves = read_curves(run)
+    assert [k.split("/")[0] for k in curves if k.endswith("/loss")] == (
+        ["shape"] if config.stages == "one" else ["layout", "shape"]
+    )
+    losses = [
+        value for _, value in curves["shape/loss" if name == "c3_one_stage" else "layout/loss"]
+    ]
+    assert losses[-1] < losses[0]
+    assert all(torch.isfinite(torch.tensor(value)) for _, value in curves["shape/mask"])
+
+
+def test_chamfers_are_learnt_by_the_bulge_alone(variant):
+    name, _, run = variant
+    moved = (load_run(run).prior.chamfers.logits != -2).any(dim=1)
+    assert moved.any() if name == "bulge" else not moved.any()
+
+
+def test_a_variant_is_decoded_sampled_and_interpolated(variant):
+    _, config, run = variant
+    trained = load_run(run)
+    assert trained.stage == "shape" and trained.config == config
+    assert trained.logits.shape == (12, config.model.logits_per_room)
+    rooms = decode_training_rooms(trained)
+    assert [room.name for room in rooms] == list(trained.room_ids)
+    assert len(decoded_and_true(trained, Path(config.data.shards))) == 12
+    for law in LAWS:
+        made = synthesize(trained, 4, 0, law)
+        assert len(made) == 4
+        again = synthesize(trained, 4, 0, law)
+        for scene, other in zip(made, again, strict=True):
+            assert torch.equal(torch.tensor(scene.centers_m), torch.tensor(other.centers_m))
+    steps = unfold(trained)
+    assert len(steps) == UNFOLDING_STEPS
+    assert [item.label for item in steps[0].objects] == [item.label for item in rooms[0].objects]
+    if config.loss.completeness_target == "stop":
+        # Up to the first that says stop, and that one; void ones are left out.
+        scenes = trained.prior(trained.logits)
+        kept = 1 + (scenes.completeness_logits.cummax(dim=1).values <= 0)[:, :-1].sum(dim=1)
+        labels = scenes.class_logits.argmax(dim=-1)
+        for room, n, label in zip(rooms, kept.tolist(), labels, strict=True):
+            assert len(room.objects) == int((label[:n] != 0).sum())
+
+
+def test_a_stopped_variant_resumes_to_the_same_weights(variant, tmp_path, monkeypatch):
+    _, config, whole = variant
+    run = shutil.copytree(whole, tmp_path / "run")
+    shutil.rmtree(run / "shape")
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "RollingCheckpoint", Stop)
+        with pytest.raises(KeyboardInterrupt):
+            fit(config, run, resume=True, trainer_options=CPU)
+    assert not (run / "shape" / "final.ckpt").exists()
+    fit(config, run, resume=True, trainer_options=CPU)
+    wanted = read_checkpoint(whole / "shape" / "final.ckpt")["state_dict"]
+    reached = read_checkpoint(run / "shape" / "final.ckpt")["state_dict"]
+    assert wanted.keys() == reached.keys()
+    for name, value in wanted.items():
+        assert torch.equal(reached[name], value), name
+
+
+@pytest.mark.parametrize("name", ["c1_uniform", "c3_one_stage"])
+def test_a_variant_is_judged(toy_shards, tmp_path, name):
+    changes = {**FAST, **VARIANTS[name], "layout__epochs": 1, "shape__epochs": 1}
+    run = tmp_path / "run"
+    fit(tiny_config(toy_shards, **changes), run, trainer_options=CPU)
+    scores = judge_run(run, 4, 0, None, run / "scores.json", None, Judging(renderer="software"))
+    assert scores["protocol"]["stage"] == "shape"
+    assert 0 <= scores["box_iou_3d"] <= 1
+
+
+def test_one_stage_begins_with_fresh_weights_and_leaves_no_layout_folder(toy_shards, tmp_path):
+    config = tiny_config(toy_shards, stages="one", shape__epochs=1, shape__learning_rate=1e-12,
+                         shape__latent_learning_rate=1e-12)  # fmt: skip
+    fit(config, tmp_path / "run", trainer_options=CPU)
+    assert not (tmp_path / "run" / "layout").exists()
+    trained = load_run(tmp_path / "run")
+    for mine, fresh in zip(
+        trained.prior.parameters(), build_prior(config, 22).parameters(), strict=True
+    ):
+        assert_close(mine, fresh, rtol=0, atol=1e-9)
+
+
+def test_the_ablations_change_their_module_and_no_other_module(toy_shards):
+    plain = build_prior(tiny_config(toy_shards), 22)
+    cube = build_prior(tiny_config(toy_shards, model__latent="uniform"), 22)
+    lstm = build_prior(tiny_config(toy_shards, model__decoder="lstm"), 22)
+    assert isinstance(cube.sphere, LatentCube) and isinstance(lstm.decoder, SceneLstm)
+
+    def shapes(prior, without):
+        return {
+            name: value.shape
+            for name, value in prior.state_dict().items()
+            if not name.startswith(without)
+        }
+
+    assert shapes(cube, "sphere.") == shapes(plain, "sphere.")
+    assert shapes(lstm, "decoder.") == shapes(plain, "decoder.")
+
+
+@pytest.mark.parametrize(
+    ("changes", "millions"),
+    [
+        ({}, 6.928),
+        ({"hidden": 512}, 5.878),
+        ({"final_norm": True}, 6.930),
+        ({"query_self_attention": True}, 7.454),
+        ({"step_mlps": True}, 13.757),
+        ({"layout_heads": "separate"}, 12.176),
+        ({"latent": "uniform"}, 6.928),
+        ({"decoder": "lstm"}, 4.824),
+        ({"hidden": 512, "final_norm": True, "query_self_attention": True, "step_mlps": True,
+          "layout_heads": "separate"}, 18.484),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
+)  # fmt: skip
+def test_docs_and_weights_count_alike(changes, millions):
+    """The table of docs/paper_map.md: weights at the paper's size, bedrooms."""
+    from sceneprior.models.prior import ScenePrior
+
+    settings = ModelConfig(max_objects=13, **changes).model_dump() | {"shape_level": 0}
+    count = sum(p.numel() for p in ScenePrior(classes=22, **settings).parameters())
+    assert count / 1e6 == pytest.approx(millions, abs=0.0005)
