@@ -106,7 +106,7 @@ def step_ratio(rooms: int = 128, views: int = 20, repeats: int = 5) -> dict[str,
     def seconds(step: Step) -> float:
         optimizer.zero_grad()
         start = time.perf_counter()
-        step(prior, prior.sphere(logits), batch, config)
+        step(prior, prior.latent_space(logits), batch, config)
         optimizer.step()
         return time.perf_counter() - start
 

@@ -28,7 +28,7 @@ FULL = SCHEDULES["paper"].steps
 def cpu_seconds(trained: TrainedPrior, images: list[ObservedImage], schedule: FitSchedule) -> float:
     """Processor time of fitting these images together, starts given."""
     views = as_views(images, max(1, round(images[0].instance_ids.shape[1] / MASK_COLUMNS)))
-    start = trained.prior.sphere(trained.logits[: len(images)])
+    start = trained.prior.latent_space(trained.logits[: len(images)])
     begin = time.process_time()
     fit_latents(trained, views, start, schedule)
     return time.process_time() - begin

@@ -184,9 +184,9 @@ def pytorch3d_step() -> Callable[[], None]:
     from pytorch3d.utils import cameras_from_opencv_projection
 
     room = furnished_room(3)
-    poses, lenses = room["world_to_camera"][0], room["intrinsics"][0]
+    poses, intrinsics = room["world_to_camera"][0], room["intrinsics"][0]
     size = torch.tensor([SIZE]).expand(VIEWS, -1)
-    cameras = cameras_from_opencv_projection(poses[:, :3, :3], poses[:, :3, 3], lenses, size)
+    cameras = cameras_from_opencv_projection(poses[:, :3, :3], poses[:, :3, 3], intrinsics, size)
     settings = RasterizationSettings(SIZE, np.log(1 / 1e-4 - 1) * 1e-4, 50, bin_size=0)
     renderer = MeshRenderer(
         MeshRasterizer(cameras, settings), SoftSilhouetteShader(BlendParams(sigma=1e-4))

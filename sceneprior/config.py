@@ -43,7 +43,7 @@ class ModelConfig(Section):
     dropout: float = Field(0.1, ge=0, lt=1)
     latent: Literal["sphere", "uniform"] = "sphere"
     """Where latents live: `sphere` (paper), or `uniform`, a cube with one logit a coordinate, in
-    which `sampling.law: paper` draws uniformly (ablation c1; `anchors` has no say)."""
+    which `sampling.distribution: paper` draws uniformly (ablation c1; `anchors` has no say)."""
     decoder: Literal["transformer", "lstm", "atiss"] = "transformer"
     """What emits object features: the `transformer` (paper); an `lstm` that takes z first and
     then its own last output (ablation c2; `heads`, `hidden` and `dropout` have no say); or the
@@ -114,7 +114,7 @@ class LossConfig(Section):
     """lambda_S."""
     match_box: float = Field(5.0, ge=0)
     """lambda_B of the matching cost."""
-    hidden_overshoot: float = Field(1.0, ge=0, le=1)
+    occlusion_slack: float = Field(1.0, ge=0, le=1)
     """Where another object touches a mask, the side of its 2D box there may be an occluder's. The
     part of a prediction that reaches further counts this much: 1 is the paper, which takes every
     side at its word; 0 lets objects go on behind others without end."""
@@ -149,11 +149,11 @@ class StageConfig(Section):
     cpu_threads: int | None = Field(None, ge=1)
     """Torch threads where a CPU trains; None leaves torch's choice. A small network gains little
     from a second thread and loses much when another program takes that core."""
-    proxy: Literal["ellipsoid", "ellipsoid_points", "box", "bulge"] = "ellipsoid"
+    proxy: Literal["ellipsoid", "ellipsoid_points", "box", "beveled_box"] = "ellipsoid"
     """What an object's 2D box is taken from where its mesh is not (see `box_from`): the smooth
     ellipsoid that fills the 3D box, exactly; 162 of its points, which is slower and moves what is
     behind the camera in front of it, as the authors do with 2,562; the 3D box's corners; or
-    `bulge`, the box with its edges cut off as far as its class has learnt to."""
+    `beveled_box`, the box with its edges cut off as far as its class has learnt to."""
 
 
 class ShapeConfig(StageConfig):
@@ -272,7 +272,7 @@ class Sync2genConfig(BoxStageConfig):
 class SamplingConfig(Section):
     """Where new latents come from."""
 
-    law: Literal["kernel", "geodesic", "gaussian", "paper"] = "kernel"
+    distribution: Literal["kernel", "geodesic", "gaussian", "paper"] = "kernel"
     """`kernel`: around training rooms; `geodesic`: between neighbouring ones; `gaussian`: fitted
     to their logits; `paper`: logits from N(0, 1)."""
 
@@ -283,7 +283,7 @@ class SamplesConfig(Section):
     every: int = Field(0, ge=0)
     """Epochs from one look to the next, and one at the stage's end; 0 never looks."""
     count: int = Field(200, ge=2)
-    """Rooms generated at each look, always from the same seed and by the run's sampling law."""
+    """Rooms generated at each look, always from the same seed and by the run's sampling distribution."""
     seed: int = Field(0, ge=0)
     metric: Literal["category_kl", "objects_off", "overlaps", "type_share", "mask_iou"] = (
         "category_kl"

@@ -60,8 +60,8 @@ class DecodedScenes:
     """Full extents of the axis-aligned boxes."""
     completeness_logits: Float[Tensor, "rooms objects"]
     """Above 0 while the scene is still being filled (the paper's supplement B)."""
-    chamfers: Float[Tensor, "rooms objects 2"] | None = None
-    """How far the edges of the proxy `bulge` are cut off (`geometry.boxes.chamfered_cube`); None
+    bevels: Float[Tensor, "rooms objects 2"] | None = None
+    """How far the edges of the proxy `beveled_box` are cut off (`geometry.boxes.beveled_cube`); None
     for rooms that no prior decoded."""
     vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
     """Mesh vertices in the room frame; None until the shape decoder ran."""

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from sceneprior.config import load_config
-from sceneprior.experiments.evaluate_samples import SampleJudge
+from sceneprior.experiments.evaluate_samples import SampleEvaluator
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import StepSeed
 from sceneprior.training.slurm import first_process
@@ -56,7 +56,9 @@ def record(config, run: Path, devices: int, **options) -> list[dict[str, torch.T
     usual, train.StepSeed = train.StepSeed, Recorder
     try:
         options = {"accelerator": "cpu", "devices": devices, **options}
-        train.fit(config, run, trainer_options=options, loggers=("csv",), judge=SampleJudge(config))
+        train.fit(
+            config, run, trainer_options=options, loggers=("csv",), judge=SampleEvaluator(config)
+        )
     finally:
         train.StepSeed = usual
     return Recorder.steps
@@ -68,7 +70,7 @@ def poison(config, run: Path, row: int) -> str:
     train.StepSeed = Poison
     options = {"accelerator": "cpu", "devices": 2}
     try:
-        train.fit(config, run, True, ("csv",), options, SampleJudge(config))
+        train.fit(config, run, True, ("csv",), options, SampleEvaluator(config))
     except FloatingPointError as error:
         return str(error)
     return "nothing"

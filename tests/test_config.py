@@ -78,7 +78,7 @@ def test_the_papers_numbers(name, objects, classes, mask_step):
         assert stage.latent_noise == stage.clip_gradient == 0
     loss = config.loss
     assert (loss.class_, loss.completeness, loss.frustum, loss.box, loss.mask) == (1, 1, 1, 5, 2)
-    assert (loss.match_box, loss.iou_gate, loss.hidden_overshoot) == (5.0, 0.5, 1.0)
+    assert (loss.match_box, loss.iou_gate, loss.occlusion_slack) == (5.0, 0.5, 1.0)
     assert config.layout.proxy == "ellipsoid" and config.shape.compositing == "paper"
     assert (model.template, model.fit_box, model.shape_level) == ("sphere", False, 4)
 
@@ -106,7 +106,7 @@ def test_the_released_codes_settings_are_one_command_away():
     assert model.final_norm and model.query_self_attention and model.step_mlps
     assert (config.layout.batch_size, config.layout.milestones) == (128, (400,))
     assert (config.shape.batch_size, config.shape.milestones) == (16, (300,))
-    assert config.layout.proxy == "ellipsoid_points" and config.sampling.law == "paper"
+    assert config.layout.proxy == "ellipsoid_points" and config.sampling.distribution == "paper"
 
 
 @pytest.mark.parametrize("part", ["final_norm", "query_self_attention", "step_mlps"])

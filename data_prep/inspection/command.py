@@ -8,7 +8,7 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from data_prep.inspection.verify import RoomCheck, Verdict
+    from data_prep.inspection.verify import EvaluationResult, RoomCheck
 
 SHEET_NAME = "inspect.png"
 _WORST_SHOWN = 5
@@ -122,7 +122,7 @@ def _verify(console: "object", shards: Path, room: str | None, workers: int) -> 
     typer.echo(f"{shards}: all is well. {_summary(verdict)}")
 
 
-def _check_tables(verdict: "Verdict") -> "list[Table]":
+def _check_tables(verdict: "EvaluationResult") -> "list[Table]":
     from rich.table import Table
 
     totals = Table("split", "rooms", "views", "checksums", "unoccluded objects", "mean 2D IoU")
@@ -158,7 +158,7 @@ def _mean_iou(rooms: "list[RoomCheck]") -> str:
     return ", ".join(parts) or "-"
 
 
-def _summary(verdict: "Verdict") -> str:
+def _summary(verdict: "EvaluationResult") -> str:
     rooms = [check for checks in verdict.rooms.values() for check in checks]
     without = sum(not check.has_checksum for check in rooms)
     count = len(verdict.agreement.mesh) + len(verdict.agreement.box)

@@ -55,7 +55,7 @@ class RoomCheck:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class EvaluationResult:
     """What was found in a folder."""
 
     rooms: dict[str, list[RoomCheck]]
@@ -70,7 +70,7 @@ class Verdict:
         return sum(every, Agreement())
 
 
-def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Verdict:
+def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> EvaluationResult:
     """Read everything in a folder of shards and hold it against itself.
 
     Args:
@@ -123,7 +123,7 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Verdic
                     f"a mean 2D IoU of {np.mean(values):.2f}, expected at least {least}: is an "
                     "axis or a unit wrong?"
                 )
-    return Verdict(rooms, tuple(problems))
+    return EvaluationResult(rooms, tuple(problems))
 
 
 def _count_problems(

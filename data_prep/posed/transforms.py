@@ -1,4 +1,4 @@
-"""A nerfstudio-style transforms.json in; frames with poses, lenses and the files beside them out.
+"""A nerfstudio-style transforms.json in; frames with poses, intrinsics and the files beside them out.
 
 Read, of the file: `frames`; lens keys (below) for all frames; `floor_m`, `floor_center_m`,
 `metres_per_unit`. Of a frame: `file_path`, `transform_matrix`, `instance_path`, `mask_path`, and

@@ -114,7 +114,7 @@ def prepare_posed(
     ]
     table = IdTable(read_classes(folder), label_set_name, str(folder))
     notes += table.notes
-    images, lenses = [], []
+    images, intrinsics = [], []
     for frame in chosen:
         try:
             values = _read(frame, first)
@@ -122,7 +122,7 @@ def prepare_posed(
             # That function counts pixel centres in whole numbers, as ScanNet does.
             shifted = np.eye(4)
             shifted[:3, :3] = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-            lenses.append(mask_intrinsics(shifted, picture, first, size))
+            intrinsics.append(mask_intrinsics(shifted, picture, first, size))
         except InputError as error:
             raise InputError(f"{recording.path}: {str(error).removesuffix('.')}.") from None
         rows, columns = sampled_lines(first[0], size[0]), sampled_lines(first[1], size[1])
@@ -139,7 +139,7 @@ def prepare_posed(
             room_id=room_name(folder),
             object_class=table.classes[seen.tracked],
             world_to_camera=world_to_camera.astype(np.float32),
-            intrinsics=np.stack(lenses).astype(np.float32),
+            intrinsics=np.stack(intrinsics).astype(np.float32),
             boxes=seen.boxes,
             visible=seen.visible,
             mask_pixels=seen.mask_pixels,

@@ -7,7 +7,7 @@ import typer
 
 from sceneprior.cli.options import (
     CheckpointOption,
-    LawOption,
+    DistributionOption,
     OverwriteOption,
     RendererOption,
 )
@@ -60,7 +60,7 @@ def eval_fid(
     out: Annotated[
         Path | None, typer.Option(help="JSON file (default: scores.json in RUN or SCENES).")
     ] = None,
-    law: LawOption = None,
+    distribution: DistributionOption = None,
     checkpoint: CheckpointOption = "final",
     renderer: RendererOption = "auto",
 ) -> None:
@@ -76,13 +76,15 @@ def eval_fid(
     judging = Judging(inception, alexnet, reference, resamples, renderer, boxes)
     if run is not None:
         target = out or run / "scores.json"
-        scores = judge_run(run, count or GENERATED, seed, shards, target, law, judging, checkpoint)
+        scores = judge_run(
+            run, count or GENERATED, seed, shards, target, distribution, judging, checkpoint
+        )
     elif scenes is not None:
         if shards is None:
             raise InputError("--scenes needs --shards: the folder with the test rooms.")
-        if law is not None or checkpoint != "final":
+        if distribution is not None or checkpoint != "final":
             raise InputError(
-                "--law and --checkpoint belong to --run; scenes are judged as they are."
+                "--distribution and --checkpoint belong to --run; scenes are judged as they are."
             )
         target = out or scenes / "scores.json"
         scores = judge_folder(scenes, count, seed, shards, target, judging)

@@ -7,7 +7,7 @@ import typer
 
 from sceneprior.cli.options import (
     CheckpointOption,
-    LawOption,
+    DistributionOption,
     OverwriteOption,
     RendererOption,
     RunOption,
@@ -25,7 +25,7 @@ def synthesize(
     out: Annotated[Path, typer.Option(help="Folder for the scenes.")],
     count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many rooms.")] = 16,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same rooms.")] = 0,
-    law: LawOption = None,
+    distribution: DistributionOption = None,
     checkpoint: CheckpointOption = "final",
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "auto",
@@ -42,11 +42,11 @@ def synthesize(
     trained = load_any_run(run, checkpoint)
     artist = open_renderer(renderer)
     if isinstance(trained, TrainedPrior):
-        z, names = draw_latents(trained, count, seed, law)
+        z, names = draw_latents(trained, count, seed, distribution)
         write_scenes(decode_latents(trained, z, names), out, artist, overwrite)
         write_latents(out, z, names)
     else:
-        write_scenes(generate(trained, count, seed, law), out, artist, overwrite)
+        write_scenes(generate(trained, count, seed, distribution), out, artist, overwrite)
     typer.echo(f"Wrote {count} rooms to {out}")
 
 
@@ -87,7 +87,7 @@ def complete(
     out: Annotated[Path, typer.Option(help="Folder for the completed rooms.")],
     count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many answers.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same answers.")] = 0,
-    law: LawOption = None,
+    distribution: DistributionOption = None,
     checkpoint: CheckpointOption = "final",
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "auto",
@@ -101,7 +101,7 @@ def complete(
 
     check_free(out, overwrite)
     scene = load_scene(given)
-    z, scenes = furnish(load_run(run, checkpoint), [scene], count, seed, law)[0]
+    z, scenes = furnish(load_run(run, checkpoint), [scene], count, seed, distribution)[0]
     write_scenes(scenes, out, open_renderer(renderer), overwrite)
     write_latents(out, z, [room.name for room in scenes])
     typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects to {out}")

@@ -9,7 +9,7 @@ RendererOption = Annotated[
     str, typer.Option(help="auto, pyrender or software (needs no GL library).")
 ]
 RunOption = Annotated[Path, typer.Option(help="Folder of a run that `fit` made.")]
-LawOption = Annotated[
+DistributionOption = Annotated[
     str | None,
     typer.Option(help="kernel, geodesic, gaussian or paper (default: the config's)."),
 ]

@@ -38,14 +38,14 @@ def fit(
 
     settings = load_config(config, tuple(set_ or ()))
     folder = run or Path("runs") / Path(config).stem
-    from sceneprior.experiments.evaluate_samples import SampleJudge
+    from sceneprior.experiments.evaluate_samples import SampleEvaluator
     from sceneprior.training.fit import fit as run_fit
 
     options = {"devices": devices, "accelerator": accelerator, "precision": precision}
     try:
         run_fit(
             settings, folder, resume, tuple(logger or ("csv", "tensorboard")), options,
-            SampleJudge(settings),
+            SampleEvaluator(settings),
         )  # fmt: skip
     except KeyboardInterrupt:
         typer.echo(

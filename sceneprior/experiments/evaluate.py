@@ -45,7 +45,7 @@ def judge_run(
     seed: int,
     shards: Path | None,
     out: Path,
-    law: str | None,
+    distribution: str | None,
     judging: Judging,
     checkpoint: str = "final",
 ) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def judge_run(
         seed: Of their latents, and of everything random in judging.
         shards: Folder with the test rooms; None takes the run's own.
         out: JSON file to write.
-        law: Sampling law; None takes the config's.
+        distribution: Sampling distribution; None takes the config's.
         judging: How.
         checkpoint: `final` or `best`.
 
@@ -69,14 +69,14 @@ def judge_run(
     folder = shards or Path(trained.config.data.shards)
     # First, because other shards than the run's are refused here.
     pairs = decoded_and_true(trained, folder) if trained.remembers_rooms else []
-    scores = _judge(synthesize(trained, count, seed, law), folder, seed, judging)
+    scores = _judge(synthesize(trained, count, seed, distribution), folder, seed, judging)
     if pairs:
         scores |= reconstruction_scores(pairs)
     scores["protocol"]["run"] = Path(run).resolve().name
     scores["protocol"]["stage"] = trained.stage
     scores["protocol"]["checkpoint"] = checkpoint
     if isinstance(trained, TrainedPrior):
-        scores["protocol"]["sampling_law"] = law or trained.law
+        scores["protocol"]["sampling_distribution"] = distribution or trained.distribution
     write_scores(scores, out)
     return scores
 
@@ -187,7 +187,7 @@ def report_run(
 
 def unfold(trained: TrainedPrior) -> list[Scene]:
     """Rooms between two training rooms that lie far apart: on the sphere, along the geodesic."""
-    space = trained.prior.sphere
+    space = trained.prior.latent_space
     z = space(trained.logits)
     end = int(space.nearness(z[:1], z).argmin())
     start, far = z[:1].expand(UNFOLDING_STEPS, -1), z[end].expand(UNFOLDING_STEPS, -1)

@@ -34,7 +34,7 @@ from sceneprior.scene import Scene
 from sceneprior.shards import iterate_rooms, list_shards
 from sceneprior.silhouettes.render import render_scene
 from sceneprior.training.checkpoints import TrainedPrior, TrainedSampler
-from sceneprior.training.monitor import Verdict
+from sceneprior.training.monitor import EvaluationResult
 from sceneprior.views import SceneViews
 
 PICTURED = 16
@@ -46,8 +46,8 @@ REMEMBERED = 8
 VIEWS = 4
 
 
-class SampleJudge:
-    """Look at a prior in training: see `SampleWatch`, which calls it, and `SamplesConfig`.
+class SampleEvaluator:
+    """Look at a prior in training: see `SampleMonitor`, which calls it, and `SamplesConfig`.
 
     The scores, of `samples.count` rooms generated from always the same seed:
 
@@ -85,25 +85,27 @@ class SampleJudge:
                 "choose category_kl, objects_off, overlaps or type_share."
             )
 
-    def __call__(self, trained: TrainedPrior | TrainedSampler) -> Verdict:
+    def __call__(self, trained: TrainedPrior | TrainedSampler) -> EvaluationResult:
         settings = self.config.samples
         if isinstance(trained, TrainedSampler):
             generated = synthesize(trained, settings.count, settings.seed)
-            return Verdict(self._scores(generated), tile(generated[:PICTURED]), self._compared[0])
+            return EvaluationResult(
+                self._scores(generated), tile(generated[:PICTURED]), self._compared[0]
+            )
         z = sample_latents(
-            trained.prior.sphere, trained.logits, settings.count, settings.seed,
-            trained.law,
+            trained.prior.latent_space, trained.logits, settings.count, settings.seed,
+            trained.distribution,
         )  # fmt: skip
         generated = _decode(trained, z, with_shape=False)
         scores = self._scores(generated)
         if trained.remembers_rooms:
             plain = [row for row, name in enumerate(trained.room_ids) if "@" not in name]
-            remembered = trained.prior.sphere(trained.logits[plain[: settings.count]])
+            remembered = trained.prior.latent_space(trained.logits[plain[: settings.count]])
             decoded = _decode(trained, remembered, with_shape=False)
             scores["overlaps_decoded"] = overlap_pairs(decoded).per_room
             scores["mask_iou"] = mask_iou_of_rooms(trained, self._views)
         pictured = _decode(trained, z[:PICTURED], with_shape=trained.stage != "layout")
-        return Verdict(scores, tile(pictured), self._compared[0])
+        return EvaluationResult(scores, tile(pictured), self._compared[0])
 
     def _scores(self, generated: list[Scene]) -> dict[str, float]:
         _, frequencies, mean_objects = self._compared
@@ -172,7 +174,7 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
         template = prior.shape.template.expand(*scenes.centers_m.shape[:2], -1, -1)
         vertices = place(template, scenes.centers_m, scenes.sizes_m)
     boxes = boxes_of_points(vertices, views.world_to_camera, views.intrinsics, views.image_size)
-    matches = match_objects(scenes, boxes, views, weights.match_box, weights.hidden_overshoot)
+    matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
     ids = observed_ids(views)
     height, width = ids.shape[-2:]
     counts = views.is_object.sum(dim=-1, keepdim=True)

@@ -1,6 +1,6 @@
 """Some objects of a room in, whole rooms round them out: latents fitted to what is given.
 
-1. Latents are drawn by the run's law and decoded. Those whose rooms come nearest to the given
+1. Latents are drawn by the run's distribution and decoded. Those whose rooms come nearest to the given
    objects are where the answers start, each answer from others.
 2. The network is frozen and each latent moves until its room holds the given classes and boxes,
    drawn back towards its start. Which prediction stands for which given object is found anew at
@@ -40,7 +40,7 @@ BOX_WEIGHT = 5.0
 """Of the mean distance of centres and sides in metres, beside the class's cross entropy."""
 START_WEIGHT = 2.0
 """Of half the squared distance from the start, which on a sphere is 1 - cosine. More leaves rooms
-as the law drew them; less fits the given objects better."""
+as the distribution drew them; less fits the given objects better."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def complete(
     scenes: Sequence[Scene],
     count: int = 4,
     seed: int = 0,
-    law: str | None = None,
+    distribution: str | None = None,
     steps: int = STEPS,
 ) -> list[tuple[Float[Tensor, "count dimension"], list[Scene]]]:
     """Furnish the rest of rooms; all rooms and all answers in one batch.
@@ -77,7 +77,7 @@ def complete(
             answers are what the run generates.
         count: Answers a room.
         seed: Of the latents that answers start from.
-        law: Of drawing them; None takes the config's.
+        distribution: Of drawing them; None takes the config's.
         steps: Of the fit; 0 leaves the drawn latents as they are.
 
     Returns:
@@ -87,7 +87,7 @@ def complete(
         InputError: a given object cannot be used, or there are more than the run's rooms hold.
     """
     given = gather_given(trained, scenes)
-    starts = _starts(trained, given, count * RESTARTS, seed, law)
+    starts = _starts(trained, given, count * RESTARTS, seed, distribution)
     z, loss = fit_latents(trained, starts, given.repeated(count * RESTARTS), steps)
     # Starts are in order of promise; dealt out in turn, every answer has good ones.
     best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
@@ -145,10 +145,10 @@ def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> Given:
 
 @torch.no_grad()
 def _starts(
-    trained: TrainedPrior, given: Given, each: int, seed: int, law: str | None
+    trained: TrainedPrior, given: Given, each: int, seed: int, distribution: str | None
 ) -> Float[Tensor, "starts dimension"]:
     """The `each` drawn latents for every room that come nearest to what is given, best first."""
-    z, _ = draw_latents(trained, max(DRAWN, each), seed, law)
+    z, _ = draw_latents(trained, max(DRAWN, each), seed, distribution)
     decoded = trained.prior.decode(z, with_shape=False)
     chosen = []
     for row in range(len(given.labels)):
@@ -165,7 +165,7 @@ def fit_latents(
     steps: int = STEPS,
 ) -> tuple[Float[Tensor, "rooms dimension"], Float[Tensor, " rooms"]]:
     """Move latents until their rooms hold what is given; the latents, and what is left to win."""
-    space, target = trained.prior.sphere, trained.config.loss.completeness_target
+    space, target = trained.prior.latent_space, trained.config.loss.completeness_target
     free = starts.clone().requires_grad_()
     # Adam moves every coordinate by about its rate.
     optimizer = torch.optim.Adam([free], lr=RATE / math.sqrt(starts.shape[1]))

@@ -104,20 +104,26 @@ def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]
             f"A run of `stages: {trained.config.stages}` keeps no latents of training rooms, so "
             "none can be decoded; take a run of `stages: two`."
         )
-    z = trained.prior.sphere(trained.logits)
+    z = trained.prior.latent_space(trained.logits)
     return decode_latents(trained, z, list(trained.room_ids))
 
 
 def draw_latents(
-    trained: TrainedPrior, count: int, seed: int, law: str | None = None
+    trained: TrainedPrior, count: int, seed: int, distribution: str | None = None
 ) -> tuple[Float[Tensor, "count width"], list[str]]:
-    """Latents sampled by a law (None: the run's own), and the names of their rooms."""
-    z = sample_latents(trained.prior.sphere, trained.logits, count, seed, law or trained.law)
+    """Latents sampled by a distribution (None: the run's own), and the names of their rooms."""
+    z = sample_latents(
+        trained.prior.latent_space,
+        trained.logits,
+        count,
+        seed,
+        distribution or trained.distribution,
+    )
     return z, scene_names(count, seed)
 
 
 def synthesize(
-    trained: TrainedPrior | TrainedSampler, count: int, seed: int, law: str | None = None
+    trained: TrainedPrior | TrainedSampler, count: int, seed: int, distribution: str | None = None
 ) -> list[Scene]:
     """New scenes, of a run of any kind.
 
@@ -125,20 +131,20 @@ def synthesize(
         trained: From `load_any_run`.
         count: How many.
         seed: Same seed, same rooms.
-        law: Where latents come from; None takes the run's own.
+        distribution: Where latents come from; None takes the run's own.
 
     Raises:
-        InputError: a law for a method without latents, or one that does not exist.
+        InputError: a distribution for a method without latents, or one that does not exist.
     """
     if isinstance(trained, TrainedSampler):
-        if law is not None:
+        if distribution is not None:
             raise InputError(
-                f"A law says where latents of rooms come from, but `stages: "
-                f"{trained.config.stages}` has none; leave out --law {law}."
+                f"A distribution says where latents of rooms come from, but `stages: "
+                f"{trained.config.stages}` has none; leave out --distribution {distribution}."
             )
         rooms = trained.prior.sample(count, seed)
         return boxes_to_scenes(rooms, trained.config.label_set, scene_names(count, seed))
-    return decode_latents(trained, *draw_latents(trained, count, seed, law))
+    return decode_latents(trained, *draw_latents(trained, count, seed, distribution))
 
 
 def scene_names(count: int, seed: int) -> list[str]:

@@ -80,7 +80,7 @@ def path_latents(
     """
     along = torch.linspace(0, 1, steps, dtype=start.dtype)
     try:
-        space = trained.prior.sphere
+        space = trained.prior.latent_space
         return space.between(start.expand(steps, -1), end.expand(steps, -1), along)
     except ValueError:
         raise InputError(

@@ -39,7 +39,7 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
     Raises:
         InputError: nothing is called so, or the file does not hold a latent of this run's size.
     """
-    space = trained.prior.sphere
+    space = trained.prior.latent_space
     if text in trained.room_ids:
         row = trained.room_ids.index(text)
         return space(trained.logits[row : row + 1])[0]

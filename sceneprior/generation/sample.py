@@ -1,4 +1,4 @@
-"""Latents of training rooms in, latents of new rooms out: the law that sampling follows."""
+"""Latents of training rooms in, latents of new rooms out: the distribution that sampling follows."""
 
 import torch
 from jaxtyping import Float, Int
@@ -11,10 +11,10 @@ NEIGHBOURS = 20
 """Rooms that a geodesic may lead to; more reach further from the training rooms."""
 
 BANDWIDTH = 0.15
-"""Of the kernel law, in standard deviations of the training rooms' logits: 0 copies training rooms,
-1 is the gaussian law. Larger is newer, and more often a room without a bed or with two."""
+"""Of the kernel distribution, in standard deviations of the training rooms' logits: 0 copies training rooms,
+1 is the gaussian distribution. Larger is newer, and more often a room without a bed or with two."""
 
-LAWS = ("kernel", "geodesic", "gaussian", "paper")
+DISTRIBUTIONS = ("kernel", "geodesic", "gaussian", "paper")
 
 
 def sample_latents(
@@ -22,7 +22,7 @@ def sample_latents(
     trained: Float[Tensor, "rooms anchors"],
     count: int,
     seed: int,
-    law: str = "kernel",
+    distribution: str = "kernel",
 ) -> Float[Tensor, "count dimension"]:
     """Draw points of the latent space.
 
@@ -31,19 +31,23 @@ def sample_latents(
         trained: The training rooms' logits.
         count: How many to draw.
         seed: Same seed, same rooms.
-        law: `geodesic`: a point anywhere on the geodesic (in a cube: the straight line) between a
+        distribution: `geodesic`: a point anywhere on the geodesic (in a cube: the straight line) between a
             training room drawn at random and one of its `NEIGHBOURS` nearest. The others: see
             `sample_logits`.
 
     Raises:
-        InputError: an unknown law, or fewer than two training rooms to draw between.
+        InputError: an unknown distribution, or fewer than two training rooms to draw between.
     """
-    if law not in LAWS:
-        raise InputError(f"No sampling law '{law}'; choose from {', '.join(LAWS)}.")
-    if law != "paper" and len(trained) < 2:
-        raise InputError(f"The {law} law needs at least 2 training rooms; use --law paper.")
-    if law != "geodesic":
-        return sphere(sample_logits(trained, count, seed, law, sphere.shift_free))
+    if distribution not in DISTRIBUTIONS:
+        raise InputError(
+            f"No sampling distribution '{distribution}'; choose from {', '.join(DISTRIBUTIONS)}."
+        )
+    if distribution != "paper" and len(trained) < 2:
+        raise InputError(
+            f"The {distribution} distribution needs at least 2 training rooms; use --distribution paper."
+        )
+    if distribution != "geodesic":
+        return sphere(sample_logits(trained, count, seed, distribution, sphere.shift_free))
     generator = torch.Generator().manual_seed(seed)
     start = _rooms_in_turn(len(trained), count, generator)
     z = sphere(trained)
@@ -60,7 +64,7 @@ def sample_logits(
     trained: Float[Tensor, "rooms anchors"],
     count: int,
     seed: int,
-    law: str,
+    distribution: str,
     shift_free: bool = True,
 ) -> Float[Tensor, "count anchors"]:
     """Draw logits of latent weights.
@@ -69,7 +73,7 @@ def sample_logits(
         trained: The training rooms' logits.
         count: How many to draw.
         seed: Same seed, same logits.
-        law: `paper`: N(0, 1), which is where training rooms' logits started, not where they
+        distribution: `paper`: N(0, 1), which is where training rooms' logits started, not where they
             ended. `gaussian`: the mean and covariance of the training rooms' logits. `kernel`:
             the same mean and covariance, as a mixture of Gaussians around the training rooms
             (a smoothed bootstrap of width `BANDWIDTH`).
@@ -78,7 +82,7 @@ def sample_logits(
     """
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(count, trained.shape[1], generator=generator, dtype=torch.float64)
-    if law == "paper":
+    if distribution == "paper":
         return noise.to(trained.dtype)
     logits = trained.double()
     if shift_free:
@@ -88,7 +92,7 @@ def sample_logits(
     # centred^T centred is the covariance; its square root needs no positive definiteness.
     _, scale, axes = torch.linalg.svd(centred / (len(logits) - 1) ** 0.5, full_matrices=False)
     drawn = (noise[:, : len(scale)] * scale) @ axes
-    if law == "kernel":
+    if distribution == "kernel":
         start = centred[_rooms_in_turn(len(logits), count, generator)]
         # Drawn in towards the mean by as much as the noise adds: the covariance stays.
         drawn = (1 - BANDWIDTH**2) ** 0.5 * start + BANDWIDTH * drawn

@@ -19,15 +19,15 @@ def unit_corners(like: Tensor) -> Float[Tensor, "8 3"]:
     return torch.cartesian_prod(side, side, side)
 
 
-def chamfered_cube(chamfers: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 32 3"]:
+def beveled_cube(bevels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 32 3"]:
     """The vertices of the cube [-1, 1]^3 with its edges cut off; they still touch all six sides.
 
     Args:
-        chamfers: How far the upright and the level edges are cut, in [0, 1] of half a side:
+        bevels: How far the upright and the level edges are cut, in [0, 1] of half a side:
             (0, 0) is the cube, (1, 0) a prism over a diamond, (1, 1) an octahedron.
     """
-    upright, level = (1 - chamfers).unsqueeze(-2).unbind(dim=-1)
-    x, y, z = unit_corners(chamfers).unbind(dim=-1)
+    upright, level = (1 - bevels).unsqueeze(-2).unbind(dim=-1)
+    x, y, z = unit_corners(bevels).unbind(dim=-1)
     rings = []
     for across, along in ((x, upright * z), (upright * x, z)):
         across, along = torch.broadcast_tensors(across, along)

@@ -27,7 +27,7 @@ def layout_losses(
     boxes_2d: Boxes2D,
     views: SceneViews,
     matches: Matches,
-    hidden_overshoot: float = 1.0,
+    occlusion_slack: float = 1.0,
     completeness_target: str = "first_n",
     per_room: bool = False,
 ) -> dict[str, Float[Tensor, "*rooms"]]:
@@ -40,7 +40,7 @@ def layout_losses(
         boxes_2d: Their 2D boxes in the views.
         views: What the cameras saw.
         matches: Which prediction answers for which object.
-        hidden_overshoot: See `side_distance`.
+        occlusion_slack: See `side_distance`.
         completeness_target: `first_n` or `stop`; see `losses/completeness.py`.
         per_room: Average over each room's objects alone: rooms that are fitted, not learnt from.
 
@@ -54,7 +54,7 @@ def layout_losses(
     return {
         "class": class_loss(scenes, views, matches, per_room),
         "box": box_loss(
-            predicted, views.boxes, views.sides_clear, seen & inside, hidden_overshoot, per_room
+            predicted, views.boxes, views.sides_clear, seen & inside, occlusion_slack, per_room
         ),
         "completeness": completeness_loss(scenes, views, completeness_target, per_room),
         "frustum": frustum_loss(centers, views, seen & ~inside, per_room),
@@ -75,7 +75,7 @@ def box_loss(
     target: Float[Tensor, "rooms views objects 4"],
     clear: Bool[Tensor, "rooms views objects 4"],
     counted: Bool[Tensor, "rooms views objects"],
-    hidden_overshoot: float = 1.0,
+    occlusion_slack: float = 1.0,
     per_room: bool = False,
 ) -> Float[Tensor, "*rooms"]:
     """L1 distance of 2D boxes (summed over x1, y1, x2, y2): mean over visible views, then objects.
@@ -83,7 +83,7 @@ def box_loss(
     The same distance as in the matching cost (`side_distance`).
     """
     apart = [
-        side_distance(predicted[..., i], target[..., i], clear[..., i], i, hidden_overshoot)
+        side_distance(predicted[..., i], target[..., i], clear[..., i], i, occlusion_slack)
         for i in range(4)
     ]
     return _mean_of_views(torch.stack(apart).sum(dim=0), counted, per_room)

@@ -26,7 +26,7 @@ def match_objects(
     boxes_2d: Boxes2D,
     views: SceneViews,
     box_weight: float = 5.0,
-    hidden_overshoot: float = 1.0,
+    occlusion_slack: float = 1.0,
     first_n: bool = True,
 ) -> Matches:
     """Find the cheapest one-to-one assignment of predictions to tracked objects.
@@ -41,13 +41,13 @@ def match_objects(
         boxes_2d: The predictions' 2D boxes in the views.
         views: What the cameras saw.
         box_weight: lambda_B.
-        hidden_overshoot: See `side_distance`.
+        occlusion_slack: See `side_distance`.
         first_n: False lets all predictions take part: those that have no order.
 
     Raises:
         ValueError: a room holds more objects than the prior can generate.
     """
-    cost = matching_cost(scenes, boxes_2d, views, box_weight, hidden_overshoot)
+    cost = matching_cost(scenes, boxes_2d, views, box_weight, occlusion_slack)
     counts = views.is_object.sum(dim=-1)
     slots = cost.shape[1]
     if int(counts.max()) > slots:
@@ -81,24 +81,24 @@ def assign(
 
 
 def side_distance(
-    predicted: Tensor, observed: Tensor, clear: Tensor, side: int, hidden_overshoot: float
+    predicted: Tensor, observed: Tensor, clear: Tensor, side: int, occlusion_slack: float
 ) -> Tensor:
     """How far one side of a predicted 2D box is from the observed one.
 
     Args:
         predicted, observed, clear: Of shapes that broadcast; relative to the image size.
         side: 0 to 3: left, upper, right, lower.
-        hidden_overshoot: Weight of reaching further than what is seen at a side that is not
+        occlusion_slack: Weight of reaching further than what is seen at a side that is not
             clear. 1 takes the absolute difference everywhere (paper). Below, an object may go
             on behind what stands in front, and the views that see its own edge decide where it
             ends. At 0 nothing would hold back an object that always touches another.
     """
     apart = predicted - observed
     distance = apart.abs()
-    if hidden_overshoot == 1:
+    if occlusion_slack == 1:
         return distance
     beyond = apart < 0 if side < 2 else apart > 0
-    return torch.where(beyond & ~clear, hidden_overshoot * distance, distance)
+    return torch.where(beyond & ~clear, occlusion_slack * distance, distance)
 
 
 def matching_cost(
@@ -106,7 +106,7 @@ def matching_cost(
     boxes_2d: Boxes2D,
     views: SceneViews,
     box_weight: float,
-    hidden_overshoot: float = 1.0,
+    occlusion_slack: float = 1.0,
 ) -> Float[Tensor, "rooms predictions objects"]:
     """Pairwise costs of all predictions and all tracked objects."""
     probability = scenes.class_logits.softmax(dim=-1)
@@ -120,7 +120,7 @@ def matching_cost(
         predicted = boxes_2d.boxes[..., side].unsqueeze(-1)
         target = views.boxes[..., side].unsqueeze(-2)
         clear = views.sides_clear[..., side].unsqueeze(-2)
-        apart = side_distance(predicted, target, clear, side, hidden_overshoot)
+        apart = side_distance(predicted, target, clear, side, occlusion_slack)
         distance += (apart * seen.unsqueeze(-2)).sum(dim=1)
     distance = distance / seen.sum(dim=1).clamp(min=1).unsqueeze(-2)
     cost = cost + box_weight * distance

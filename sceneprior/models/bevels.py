@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 
-class ClassChamfers(nn.Module):
-    """How far the edges of a class's boxes are cut off, in [0, 1]; see `chamfered_cube`.
+class ClassBevels(nn.Module):
+    """How far the edges of a class's boxes are cut off, in [0, 1]; see `beveled_cube`.
 
     Furniture fills its box neither as an ellipsoid does nor to the corners, so the 2D box of
     either misleads about its size. Chairs and round tables have much of their edges missing,
@@ -24,6 +24,6 @@ class ClassChamfers(nn.Module):
     def forward(
         self, class_logits: Float[Tensor, "rooms objects classes"]
     ) -> Float[Tensor, "rooms objects 2"]:
-        """Chamfers of upright and level edges: the mean over predicted classes, which learn nothing
+        """Bevels of upright and level edges: the mean over predicted classes, which learn nothing
         from it."""
         return class_logits.detach().softmax(dim=-1) @ self.logits.sigmoid()

@@ -1,7 +1,7 @@
 """Logits in, latents out: points on the hypersphere (section 3.1, equation 2), or in a cube.
 
 A latent space turns the logits of rooms, which are learnt, into latents, which are decoded. Logits
-drawn from N(0, 1) are where training rooms start and what the `paper` law samples. Beside that a
+drawn from N(0, 1) are where training rooms start and what the `paper` distribution samples. Beside that a
 space knows how near two latents are, what lies between them and what a small step is.
 """
 

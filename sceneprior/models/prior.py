@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from sceneprior.baselines.atiss2d import SceneAtiss
 from sceneprior.baselines.lstm import SceneLstm
 from sceneprior.geometry.boxes import place
-from sceneprior.models.bevels import ClassChamfers
+from sceneprior.models.bevels import ClassBevels
 from sceneprior.models.latents import LatentCube, LatentSpace, LatentSphere
 from sceneprior.models.layout_decoder import LayoutDecoder
 from sceneprior.models.shape_decoder import ShapeDecoder
@@ -62,11 +62,11 @@ class ScenePrior(nn.Module):
     ):
         super().__init__()
         self.max_objects = max_objects
-        self.sphere: LatentSpace
+        self.latent_space: LatentSpace
         if latent == "uniform":
-            self.sphere = LatentCube(width)
+            self.latent_space = LatentCube(width)
         else:
-            self.sphere = LatentSphere(anchors, width, seed)
+            self.latent_space = LatentSphere(anchors, width, seed)
         self.decoder: SceneDecoder | SceneLstm | SceneAtiss
         if decoder == "lstm":
             self.decoder = SceneLstm(width)
@@ -78,14 +78,14 @@ class ScenePrior(nn.Module):
                 width, heads, hidden, dropout, final_norm, query_self_attention, steps
             )
         self.layout = LayoutDecoder(width, classes, heads=layout_heads, void=void)
-        self.chamfers = ClassChamfers(classes)
+        self.bevels = ClassBevels(classes)
         self.shape = ShapeDecoder(2 * width, shape_width, shape_level, template, fit_box)
 
     def forward(
         self, logits: Float[Tensor, "rooms anchors"], with_shape: bool = True
     ) -> DecodedScenes:
         """Decode rooms from the logits of their latent weights."""
-        return self.decode(self.sphere(logits), with_shape)
+        return self.decode(self.latent_space(logits), with_shape)
 
     def decode(
         self,
@@ -120,6 +120,6 @@ class ScenePrior(nn.Module):
             centers_m=layout.centers_m,
             sizes_m=layout.sizes_m,
             completeness_logits=layout.completeness_logits,
-            chamfers=self.chamfers(layout.class_logits),
+            bevels=self.bevels(layout.class_logits),
             vertices_m=vertices,
         )

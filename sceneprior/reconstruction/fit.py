@@ -82,7 +82,7 @@ def decode_images(
     trained: TrainedPrior, points: Float[Tensor, "images width"], views: SceneViews
 ) -> DecodedScenes:
     """As many objects of each latent as the fullest image shows; meshes after the shape stage."""
-    z = trained.prior.sphere.onto(points)
+    z = trained.prior.latent_space.onto(points)
     return trained.prior.decode(z, trained.stage == "shape", wanted=views.is_object)
 
 
@@ -189,7 +189,7 @@ def fit_latents(
     with torch.no_grad():
         scenes = decode_images(trained, found, views)
         loss = view_loss(trained, scenes, views, masks)
-        return Fit(trained.prior.sphere.onto(found), scenes, loss, taken)
+        return Fit(trained.prior.latent_space.onto(found), scenes, loss, taken)
 
 
 def refuse_crowds(trained: TrainedPrior, views: SceneViews) -> None:

@@ -190,7 +190,7 @@ def _matched(
         box_corners(decoded.centers_m, decoded.sizes_m),
         view.world_to_camera, view.intrinsics, view.image_size,
     )  # fmt: skip
-    settings = (weights.match_box, weights.hidden_overshoot)
+    settings = (weights.match_box, weights.occlusion_slack)
     chosen = match_objects(decoded, boxes, view, *settings, first_n=False).prediction
     costs = matching_cost(decoded, boxes, view, *settings).gather(1, chosen.unsqueeze(1))
     return chosen.tolist(), costs[:, 0].mean(dim=1)

@@ -24,7 +24,7 @@ def starting_latents(
         views: One room an image.
         count: Starts an image.
         kind: `nearest`: the training rooms, as decoded, whose layout loss on the image is least.
-            `random`: drawn around the training rooms, as new rooms are (the kernel law); the same
+            `random`: drawn around the training rooms, as new rooms are (the kernel distribution); the same
             for every image.
         seed: Of the random ones.
 
@@ -35,7 +35,7 @@ def starting_latents(
         raise InputError(f"No start is called '{kind}'; choose from {', '.join(STARTS)}.")
     images = len(views.is_object)
     if kind == "random":
-        drawn = sample_latents(trained.prior.sphere, trained.logits, count, seed, "kernel")
+        drawn = sample_latents(trained.prior.latent_space, trained.logits, count, seed, "kernel")
         return drawn.expand(images, -1, -1)
     if count > len(trained.logits):
         raise InputError(
@@ -43,7 +43,9 @@ def starting_latents(
             f"{len(trained.logits)}; ask for fewer restarts."
         )
     losses = layout_losses_of_rooms(trained, views)
-    return trained.prior.sphere(trained.logits)[losses.topk(count, dim=1, largest=False).indices]
+    return trained.prior.latent_space(trained.logits)[
+        losses.topk(count, dim=1, largest=False).indices
+    ]
 
 
 @torch.no_grad()
@@ -52,7 +54,7 @@ def layout_losses_of_rooms(
 ) -> Float[Tensor, "images rooms"]:
     """What each decoded training room would cost as the answer to each image, by 2D boxes alone."""
     most = views.is_object.shape[1]
-    z = trained.prior.sphere(trained.logits)
+    z = trained.prior.latent_space(trained.logits)
     every = torch.ones(len(z), most, dtype=torch.bool)
     rooms = [
         trained.prior.decode(z[at : at + BATCH], False, every[at : at + BATCH])

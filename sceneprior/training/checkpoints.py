@@ -62,10 +62,10 @@ class TrainedPrior:
         return len(self.logits) > 0
 
     @property
-    def law(self) -> str:
-        """Where new latents come from unless a task says otherwise: the config's law, but where
-        there are no rooms to draw from, the law that the prior was trained under."""
-        return self.config.sampling.law if self.remembers_rooms else "paper"
+    def distribution(self) -> str:
+        """Where new latents come from unless a task says otherwise: the config's distribution, but where
+        there are no rooms to draw from, the distribution that the prior was trained under."""
+        return self.config.sampling.distribution if self.remembers_rooms else "paper"
 
 
 @dataclass(frozen=True)

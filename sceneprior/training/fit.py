@@ -22,7 +22,7 @@ from sceneprior.training.callbacks import RollingCheckpoint, RunProgress, StepSe
 from sceneprior.training.checkpoints import STAGES_OF, checkpoint_extra, restore
 from sceneprior.training.layout import LayoutStage
 from sceneprior.training.loggers import LOGGERS, make_logger, quiet_lightning
-from sceneprior.training.monitor import Judge, SampleWatch
+from sceneprior.training.monitor import Judge, SampleMonitor
 from sceneprior.training.objective import build_latents, build_prior
 from sceneprior.training.shape import ShapeStage
 from sceneprior.training.slurm import first_process, requeue_on_signal, slurm_plugins
@@ -49,7 +49,7 @@ def fit(
         resume: Continue an interrupted run: finished stages are not trained again.
         loggers: Of `csv`, `tensorboard`, `wandb`.
         trainer_options: Passed on to Lightning's Trainer (devices, accelerator, precision).
-        judge: Looks at the prior every `samples.every` epochs; `tasks.watch.SampleJudge(config)`.
+        judge: Looks at the prior every `samples.every` epochs; `tasks.watch.SampleEvaluator(config)`.
 
     Raises:
         InputError: the run exists and is not resumed, its settings differ from `config`, or the
@@ -59,7 +59,7 @@ def fit(
     if config.samples.every and judge is None:
         raise InputError(
             f"samples.every is {config.samples.every}, but nobody was given to judge what is "
-            "generated; pass judge=sceneprior.experiments.evaluate_samples.SampleJudge(config), "
+            "generated; pass judge=sceneprior.experiments.evaluate_samples.SampleEvaluator(config), "
             "or set it to 0."
         )
     _check_run(config, run, resume)
@@ -122,7 +122,7 @@ def _fit_stage(
     callbacks = [RunProgress(f"fit {stage} (epochs)"), StepSeed(config.seed)]
     if judge is not None and config.samples.every:
         # Before the rolling checkpoint, which holds the best so far.
-        callbacks.append(SampleWatch(folder, config, stage, room_ids, judge))
+        callbacks.append(SampleMonitor(folder, config, stage, room_ids, judge))
     quiet_lightning()
     lightning.seed_everything(config.seed, verbose=False)
     if settings.cpu_threads is not None:

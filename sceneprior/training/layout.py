@@ -33,7 +33,7 @@ class LayoutStage(lightning.LightningModule):
         super().__init__()
         # Several processes agree on gradients only of what takes part.
         prior.shape.requires_grad_(False)
-        prior.chamfers.requires_grad_(config.layout.proxy == "bulge")
+        prior.bevels.requires_grad_(config.layout.proxy == "beveled_box")
         self.prior = prior
         self.latents = latents
         self.config = config

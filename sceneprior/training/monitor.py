@@ -30,7 +30,7 @@ LOW_IS_BETTER = ("category_kl", "objects_off", "overlaps")
 
 
 @dataclass(frozen=True)
-class Verdict:
+class EvaluationResult:
     """What a look at a prior says."""
 
     scores: Mapping[str, float]
@@ -40,10 +40,10 @@ class Verdict:
     """The split that the scores compare with."""
 
 
-Judge = Callable[[TrainedPrior | TrainedSampler], Verdict]
+Judge = Callable[[TrainedPrior | TrainedSampler], EvaluationResult]
 
 
-class SampleWatch(Callback):
+class SampleMonitor(Callback):
     """Every few epochs, and after the last one, judge the prior as it stands.
 
     Leaves `samples/<epoch>.png` (whatever the loggers), `samples.json` (the newest scores, the
@@ -123,7 +123,7 @@ class SampleWatch(Callback):
             return not math.isnan(score)
         return score < self.best if metric in LOW_IS_BETTER else score > self.best
 
-    def _show(self, trainer: lightning.Trainer, verdict: Verdict, done: int) -> None:
+    def _show(self, trainer: lightning.Trainer, verdict: EvaluationResult, done: int) -> None:
         folder = self.folder / "samples"
         folder.mkdir(exist_ok=True)
         Image.fromarray(verdict.picture).save(folder / f"{done:05d}.png")
@@ -135,7 +135,7 @@ class SampleWatch(Callback):
             elif isinstance(logger, WandbLogger):
                 logger.log_image("samples", [verdict.picture], trainer.global_step)
 
-    def _note(self, verdict: Verdict, done: int) -> None:
+    def _note(self, verdict: EvaluationResult, done: int) -> None:
         metric = self.config.samples.metric
         note = {
             "epoch": done,

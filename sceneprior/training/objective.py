@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch import distributed as dist
 
 from sceneprior.config import LossConfig, RunConfig, ShapeConfig, StageConfig
-from sceneprior.geometry.boxes import box_corners, chamfered_cube, place
+from sceneprior.geometry.boxes import beveled_cube, box_corners, place
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
 from sceneprior.geometry.meshes import icosphere
@@ -27,18 +27,18 @@ POINTS_LEVEL = 2
 def proxy_boxes(scenes: DecodedScenes, views: SceneViews, proxy: str) -> Boxes2D:
     """2D boxes of objects that have no mesh yet; `StageConfig.proxy` says what each stands for."""
     centers_m, sizes_m = scenes.centers_m, scenes.sizes_m
-    cameras, lenses = views.world_to_camera, views.intrinsics
+    cameras, intrinsics = views.world_to_camera, views.intrinsics
     if proxy == "ellipsoid":
-        return boxes_of_ellipsoids(centers_m, sizes_m, cameras, lenses, views.image_size)
+        return boxes_of_ellipsoids(centers_m, sizes_m, cameras, intrinsics, views.image_size)
     if proxy == "box":
         points_m = box_corners(centers_m, sizes_m)
-    elif proxy == "bulge":
-        assert scenes.chamfers is not None, "decode() gives every object chamfers"
-        points_m = place(chamfered_cube(scenes.chamfers), centers_m, sizes_m)
+    elif proxy == "beveled_box":
+        assert scenes.bevels is not None, "decode() gives every object bevels"
+        points_m = place(beveled_cube(scenes.bevels), centers_m, sizes_m)
     else:
         sphere = icosphere(POINTS_LEVEL)[0].to(centers_m)
         points_m = place(sphere.expand(*centers_m.shape[:2], -1, -1), centers_m, sizes_m)
-    return boxes_of_points(points_m, cameras, lenses, views.image_size)
+    return boxes_of_points(points_m, cameras, intrinsics, views.image_size)
 
 
 def match_and_score(
@@ -59,9 +59,9 @@ def match_and_score(
         matches: To keep; None matches anew.
     """
     if matches is None:
-        matches = match_objects(scenes, boxes, views, weights.match_box, weights.hidden_overshoot)
+        matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
     losses = layout_losses(
-        scenes, boxes, views, matches, weights.hidden_overshoot, weights.completeness_target,
+        scenes, boxes, views, matches, weights.occlusion_slack, weights.completeness_target,
         per_room,
     )  # fmt: skip
     return losses, matches
@@ -190,8 +190,8 @@ def training_latents(
     end = stage.latent_noise if stage.latent_noise_end is None else stage.latent_noise_end
     noise = stage.latent_noise + progress * (end - stage.latent_noise)
     with full_precision(rows.device):
-        z = prior.sphere(latents(rows))
-        return prior.sphere.step(z, noise, seed) if noise else z
+        z = prior.latent_space(latents(rows))
+        return prior.latent_space.step(z, noise, seed) if noise else z
 
 
 def build_optimizer(
@@ -199,8 +199,8 @@ def build_optimizer(
 ) -> OptimizerLRSchedulerConfig:
     """Adam with the stage's schedule over `steps` updates, in the shape Lightning takes."""
     fresh = list(prior.shape.parameters())
-    tables = [*latents.parameters(), *prior.chamfers.parameters()]
-    others = ("shape.", "chamfers.")
+    tables = [*latents.parameters(), *prior.bevels.parameters()]
+    others = ("shape.", "bevels.")
     trained = [item for name, item in prior.named_parameters() if not name.startswith(others)]
     fresh_rate = getattr(stage, "decoder_learning_rate", None) or stage.learning_rate
     groups = [

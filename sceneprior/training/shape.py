@@ -36,7 +36,7 @@ class ShapeStage(lightning.LightningModule):
         self.prior = prior.requires_grad_(True)
         shape = config.shape
         # Several processes agree on gradients only of what takes part.
-        prior.chamfers.requires_grad_((shape.box_from, shape.proxy) == ("proxy", "bulge"))
+        prior.bevels.requires_grad_((shape.box_from, shape.proxy) == ("proxy", "beveled_box"))
         self.latents = latents
         self.config = config
 

@@ -19,7 +19,7 @@ from sceneprior.baselines.sync2gen.stage import Sync2genStage
 from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.errors import ConfigError, InputError
 from sceneprior.experiments.evaluate import Judging, judge_run, read_curves, report_run
-from sceneprior.experiments.evaluate_samples import SampleJudge
+from sceneprior.experiments.evaluate_samples import SampleEvaluator
 from sceneprior.generation.decode import decode_training_rooms, synthesize
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import RollingCheckpoint
@@ -238,7 +238,9 @@ def test_what_needs_a_latent_space_says_that_there_is_none(run, stage):
         InputError, match=f"A run of `stages: {stage}` keeps no latents of training"
     ):
         decode_training_rooms(load_any_run(run))
-    with pytest.raises(InputError, match=f"but `stages: {stage}` has none; leave out --law kernel"):
+    with pytest.raises(
+        InputError, match=f"but `stages: {stage}` has none; leave out --distribution kernel"
+    ):
         synthesize(load_any_run(run), 2, 0, "kernel")
 
 
@@ -246,7 +248,9 @@ def test_a_run_is_judged_and_reported(run, stage, tmp_path):
     scores = judge_run(
         run, 4, 0, None, tmp_path / "scores.json", None, Judging(renderer="software")
     )
-    assert scores["protocol"]["stage"] == stage and "sampling_law" not in scores["protocol"]
+    assert (
+        scores["protocol"]["stage"] == stage and "sampling_distribution" not in scores["protocol"]
+    )
     assert "box_iou_3d" not in scores and scores["mean_objects"] >= 0
     report_run(run, tmp_path / "scores.json", tmp_path / "page.html", 0, (), "software")
     page = (tmp_path / "page.html").read_text()
@@ -259,12 +263,12 @@ def test_a_run_is_judged_and_reported(run, stage, tmp_path):
 def test_looks_choose_a_checkpoint(stage, toy_shards, tmp_path):
     samples = {"every": 2, "count": 6, "metric": "objects_off"}
     config = settings(toy_shards, stage, samples=samples)
-    fit(config, tmp_path / "run", trainer_options=CPU, judge=SampleJudge(config))
+    fit(config, tmp_path / "run", trainer_options=CPU, judge=SampleEvaluator(config))
     assert (tmp_path / "run" / stage / "samples" / "00004.png").is_file()
     assert isinstance(load_any_run(tmp_path / "run", "best"), TrainedSampler)
     config = settings(toy_shards, stage, samples=samples | {"metric": "mask_iou"})
     with pytest.raises(InputError, match=f"mask_iou, but `stages: {stage}` remembers no rooms"):
-        SampleJudge(config)
+        SampleEvaluator(config)
 
 
 def test_what_does_not_fit_is_a_sentence(run, stage, toy_shards, tmp_path):

@@ -183,8 +183,8 @@ def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
     before = everything_in(tmp_path)
     said = one_sentence(command(*call, "--out", "made"))
     assert "made is not empty; add --overwrite or name another folder." in said
-    said = one_sentence(command(*call, "--out", "other", "--law", "guess"))
-    assert "No sampling law 'guess'; choose from " in said
+    said = one_sentence(command(*call, "--out", "other", "--distribution", "guess"))
+    assert "No sampling distribution 'guess'; choose from " in said
     assert everything_in(tmp_path) == before
     assert command(*call, "--out", "made", "--overwrite")[0] == 0
     assert everything_in(tmp_path) == before

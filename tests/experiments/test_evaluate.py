@@ -67,7 +67,7 @@ def test_a_run_is_judged_with_its_own_shards(command, toy_run, tmp_path):
     assert status == 0, errors
     assert "5 rooms" in out and "nan" not in out.lower()
     scores = json.loads((tmp_path / "s.json").read_text())
-    assert scores["protocol"]["sampling_law"] and scores["rooms"] == 12
+    assert scores["protocol"]["sampling_distribution"] and scores["rooms"] == 12
     assert 0 <= scores["near_copy_share"] <= 1
     assert np.isfinite([value for value in scores.values() if isinstance(value, float)]).all()
 
@@ -78,7 +78,10 @@ def test_a_run_is_judged_with_its_own_shards(command, toy_run, tmp_path):
         ([], "There is nothing to judge; give --run RUN, or --scenes DIR with --shards SHARDS."),
         (["--run", "a", "--scenes", "b"], "Both --run and --scenes came; give --run"),
         (["--scenes", "b"], "--scenes needs --shards: the folder with the test rooms."),
-        (["--scenes", "b", "--shards", "c", "--law", "paper"], "--law and --checkpoint belong to"),
+        (
+            ["--scenes", "b", "--shards", "c", "--distribution", "paper"],
+            "--distribution and --checkpoint belong to",
+        ),
         (["--scenes", "b", "--shards", "c"], "No folder of scenes at b;"),
         (["--run", "a"], "a is not a run folder"),
     ],

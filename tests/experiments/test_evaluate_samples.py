@@ -13,7 +13,12 @@ from sceneprior.errors import InputError
 from sceneprior.evaluation.metrics.layout_metrics import category_kl, object_counts, overlap_pairs
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.topdown import box_mesh
-from sceneprior.experiments.evaluate_samples import TILE_PX, SampleJudge, mask_iou_of_rooms, tile
+from sceneprior.experiments.evaluate_samples import (
+    TILE_PX,
+    SampleEvaluator,
+    mask_iou_of_rooms,
+    tile,
+)
 from sceneprior.generation.decode import decode_training_rooms, synthesize
 from sceneprior.geometry.boxes import place
 from sceneprior.training.checkpoints import load_run
@@ -27,7 +32,7 @@ def trained(toy_run):
 
 def test_a_look_scores_what_eval_would_score(trained, toy_shards):
     config = tiny_config(toy_shards, samples={"every": 1, "count": 12, "seed": 7})
-    verdict = SampleJudge(config)(trained)
+    verdict = SampleEvaluator(config)(trained)
     generated = synthesize(trained, 12, 7)
     tracked = reference_scenes(toy_shards, "test", tracked_only=True)
     assert verdict.against == "test"
@@ -40,7 +45,7 @@ def test_a_look_scores_what_eval_would_score(trained, toy_shards):
     assert verdict.scores["overlaps_decoded"] == decoded
     assert 0 <= verdict.scores["mask_iou"] <= 1
     assert verdict.picture.shape == (3 * TILE_PX, 4 * TILE_PX, 3)
-    again = SampleJudge(config)(trained)
+    again = SampleEvaluator(config)(trained)
     assert again.scores == verdict.scores and np.array_equal(again.picture, verdict.picture)
 
 
@@ -48,8 +53,10 @@ def test_training_rooms_stand_in_where_there_are_no_test_rooms(trained, toy_shar
     alone = shutil.copytree(toy_shards, tmp_path / "alone")
     shutil.rmtree(alone / "test")
     samples = {"every": 1, "count": 4}
-    there = SampleJudge(tiny_config(alone, samples=samples))(trained)
-    asked = SampleJudge(tiny_config(toy_shards, samples={**samples, "against": "train"}))(trained)
+    there = SampleEvaluator(tiny_config(alone, samples=samples))(trained)
+    asked = SampleEvaluator(tiny_config(toy_shards, samples={**samples, "against": "train"}))(
+        trained
+    )
     assert there.against == asked.against == "train" and there.scores == asked.scores
 
 
@@ -61,7 +68,7 @@ def test_rooms_decoded_as_they_are_have_the_masks_that_were_seen(toy_run, toy_sh
     shape.template = torch.from_numpy(cube.vertices_m).float()
     shape.faces = torch.from_numpy(cube.faces)
     config = tiny_config(toy_shards, seed=0, samples={"every": 1}, data__mask_step=1)
-    views = SampleJudge(config)._views
+    views = SampleEvaluator(config)._views
     truth = {scene.name: scene for scene in reference_scenes(toy_shards, "train", None, True)}
     rooms, slots = len(views.room_ids), 6
     logits = torch.zeros(rooms, slots, len(label_set("front3d_bedroom")))
@@ -101,4 +108,4 @@ def test_the_picture_has_a_tile_a_room_in_its_classes_colours(trained):
 def test_a_metric_that_the_label_set_lacks_is_a_sentence(toy_shards):
     samples = {"every": 1, "metric": "type_share"}
     with pytest.raises(InputError, match=r"samples.metric is type_share, but scannet mixes room"):
-        SampleJudge(tiny_config(toy_shards, label_set="scannet", samples=samples))
+        SampleEvaluator(tiny_config(toy_shards, label_set="scannet", samples=samples))

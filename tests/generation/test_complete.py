@@ -138,7 +138,7 @@ class Dial(ScenePrior):
 
     def __init__(self):
         nn.Module.__init__(self)
-        self.sphere = LatentSphere(4, 3)
+        self.latent_space = LatentSphere(4, 3)
 
     def decode(self, z, with_shape=True):
         logits = torch.zeros(len(z), 1, 22)

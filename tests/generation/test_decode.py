@@ -96,7 +96,7 @@ def test_training_rooms_are_decoded_under_their_own_names(toy_run):
     trained = load_run(toy_run)
     decoded = decode_training_rooms(trained)
     assert [scene.name for scene in decoded] == list(trained.room_ids)
-    z = trained.prior.sphere(trained.logits)
+    z = trained.prior.latent_space(trained.logits)
     for one, other in zip(decoded, decode_latents(trained, z, ["x"] * len(z)), strict=True):
         np.testing.assert_array_equal(one.centers_m, other.centers_m)
 
@@ -111,7 +111,7 @@ def test_unfolding_walks_from_one_training_room_to_another(toy_run):
     trained = load_run(toy_run)
     steps = unfold(trained)
     assert [scene.name for scene in steps] == [f"step_{k}" for k in range(UNFOLDING_STEPS)]
-    z = trained.prior.sphere(trained.logits)
+    z = trained.prior.latent_space(trained.logits)
     far = int((z @ z[0]).argmin())
     rooms = decode_training_rooms(trained)
     for step, room in ((steps[0], rooms[0]), (steps[-1], rooms[far])):

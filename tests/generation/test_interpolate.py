@@ -49,7 +49,7 @@ def test_steps_are_even_and_end_where_they_should(trained):
         np.linspace(0, 1, 7), abs=1e-6
     )
     assert (scenes[0].extra["from"], scenes[0].extra["to"]) == ("toy/train_00", "seed:4")
-    first = decode_latents(trained, trained.prior.sphere(trained.logits[:1]), ["step_00"])[0]
+    first = decode_latents(trained, trained.prior.latent_space(trained.logits[:1]), ["step_00"])[0]
     assert len(first.objects) == len(scenes[0].objects) > 0
     np.testing.assert_allclose(first.centers_m, scenes[0].centers_m, atol=1e-5)
 
@@ -61,7 +61,7 @@ def test_from_a_room_to_itself_nothing_changes(trained):
 
 
 def test_opposite_ends_are_a_sentence_and_in_a_cube_no_trouble(trained):
-    start = trained.prior.sphere(trained.logits[:1])[0]
+    start = trained.prior.latent_space(trained.logits[:1])[0]
     with pytest.raises(InputError) as error:
         path_latents(trained, start, -start, 5)
     assert str(error.value) == (
@@ -79,7 +79,7 @@ class Cubic(ScenePrior):
 
     def __init__(self):
         nn.Module.__init__(self)
-        self.sphere = LatentCube(16)
+        self.latent_space = LatentCube(16)
 
 
 class Decoder(ScenePrior):

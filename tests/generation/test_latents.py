@@ -19,7 +19,7 @@ def trained(toy_run):
 
 def test_rooms_and_seeds(trained):
     room = trained.room_ids[3]
-    wanted = trained.prior.sphere(trained.logits)[3]
+    wanted = trained.prior.latent_space(trained.logits)[3]
     torch.testing.assert_close(read_latent(trained, room), wanted)
     drawn, _ = draw_latents(trained, 1, seed=7)
     assert torch.equal(read_latent(trained, "seed:7"), drawn[0])

@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from sceneprior.errors import InputError
 from sceneprior.generation import sample as sampling
-from sceneprior.generation.sample import LAWS, sample_latents, sample_logits
+from sceneprior.generation.sample import DISTRIBUTIONS, sample_latents, sample_logits
 from sceneprior.models.latents import LatentCube, LatentSphere
 
 MANY = 20_000
@@ -24,13 +24,13 @@ def trained(torch_rng) -> torch.Tensor:
     return torch.randn(40, 7, generator=torch_rng) @ mix + torch.randn(7, generator=torch_rng)
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_a_seed_gives_the_same_points_on_the_unit_sphere(sphere, trained, law):
-    one = sample_latents(sphere, trained, 9, 3, law)
+@pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+def test_a_seed_gives_the_same_points_on_the_unit_sphere(sphere, trained, distribution):
+    one = sample_latents(sphere, trained, 9, 3, distribution)
     assert one.shape == (9, 12)
     assert_close(one.norm(dim=-1), torch.ones(9), rtol=0, atol=1e-5)
-    assert torch.equal(one, sample_latents(sphere, trained, 9, 3, law))
-    assert not torch.equal(one, sample_latents(sphere, trained, 9, 4, law))
+    assert torch.equal(one, sample_latents(sphere, trained, 9, 3, distribution))
+    assert not torch.equal(one, sample_latents(sphere, trained, 9, 4, distribution))
 
 
 def test_the_gaussian_law_has_the_mean_and_covariance_of_the_training_rooms(trained):
@@ -91,13 +91,13 @@ def test_laws_that_cannot_be_followed_are_sentences(sphere, trained):
     with pytest.raises(InputError) as error:
         sample_latents(sphere, trained, 3, 0, "guess")
     assert str(error.value) == (
-        "No sampling law 'guess'; choose from kernel, geodesic, gaussian, paper."
+        "No sampling distribution 'guess'; choose from kernel, geodesic, gaussian, paper."
     )
-    for law in ("kernel", "gaussian", "geodesic"):
+    for distribution in ("kernel", "gaussian", "geodesic"):
         with pytest.raises(InputError) as error:
-            sample_latents(sphere, trained[:1], 3, 0, law)
+            sample_latents(sphere, trained[:1], 3, 0, distribution)
         assert str(error.value) == (
-            f"The {law} law needs at least 2 training rooms; use --law paper."
+            f"The {distribution} distribution needs at least 2 training rooms; use --distribution paper."
         )
     assert sample_latents(sphere, trained[:1], 3, 0, "paper").shape == (3, 12)
 
@@ -106,7 +106,7 @@ def test_kernel_draws_around_each_training_room_in_turn():
     generator = torch.Generator().manual_seed(0)
     trained = 5 * torch.randn(12, 40, generator=generator, dtype=torch.float64)
     trained -= trained.mean(dim=1, keepdim=True)
-    drawn = sample_logits(trained, 24, seed=0, law="kernel")
+    drawn = sample_logits(trained, 24, seed=0, distribution="kernel")
     # Twelve points in forty dimensions lie far apart: the nearest is the one drawn around.
     nearest = torch.cdist(drawn, trained).argmin(dim=1)
     assert sorted(nearest[:12].tolist()) == sorted(nearest[12:].tolist()) == list(range(12))
@@ -116,18 +116,18 @@ def test_kernel_keeps_mean_and_covariance():
     generator = torch.Generator().manual_seed(0)
     trained = torch.randn(50, 3, generator=generator, dtype=torch.float64) * torch.tensor([1, 2, 3])
     centred = trained - trained.mean(dim=1, keepdim=True)
-    drawn = sample_logits(trained, 200_000, seed=0, law="kernel")
+    drawn = sample_logits(trained, 200_000, seed=0, distribution="kernel")
     torch.testing.assert_close(drawn.mean(0), centred.mean(0), rtol=0, atol=0.01)
     torch.testing.assert_close(torch.cov(drawn.T), torch.cov(centred.T), rtol=0.05, atol=0.02)
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_every_law_stays_in_the_cube_and_goes_by_its_seed(trained, law):
+@pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+def test_every_law_stays_in_the_cube_and_goes_by_its_seed(trained, distribution):
     cube = LatentCube(7)
-    one = sample_latents(cube, trained, 9, 3, law)
+    one = sample_latents(cube, trained, 9, 3, distribution)
     assert one.shape == (9, 7) and one.abs().max() <= cube.half_edge
-    assert torch.equal(one, sample_latents(cube, trained, 9, 3, law))
-    assert not torch.equal(one, sample_latents(cube, trained, 9, 4, law))
+    assert torch.equal(one, sample_latents(cube, trained, 9, 3, distribution))
+    assert not torch.equal(one, sample_latents(cube, trained, 9, 4, distribution))
 
 
 def test_in_the_cube_a_constant_added_to_the_logits_is_no_freedom(trained):

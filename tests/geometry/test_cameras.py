@@ -59,9 +59,9 @@ def test_every_room_and_view_has_its_own_camera():
     points, cameras = a_room()
     rooms = torch.cat([points, points + 0.3])
     poses = torch.cat([cameras, cameras.flip(1)])
-    lenses = LENS.expand(2, 6, 3, 3).clone()
-    lenses[1, 2, 0, 0] = 77
-    seen = project(rooms, poses, lenses)
+    intrinsics = LENS.expand(2, 6, 3, 3).clone()
+    intrinsics[1, 2, 0, 0] = 77
+    seen = project(rooms, poses, intrinsics)
     for room in range(2):
         for view in range(6):
             for item in range(5):
@@ -70,7 +70,7 @@ def test_every_room_and_view_has_its_own_camera():
                         [rooms[room, item, corner], rooms.new_ones(1)]
                     )
                     near = max(float(z), MIN_DEPTH_M)
-                    fx = lenses[room, view, 0, 0]
+                    fx = intrinsics[room, view, 0, 0]
                     # Behind the camera: cx * z is divided by the smallest depth too.
                     u = (fx * x + 40 * z) / near
                     v = (60 * y + 30 * z) / near

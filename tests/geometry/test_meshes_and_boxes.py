@@ -7,7 +7,7 @@ import torch
 from scipy.spatial import ConvexHull
 from torch.testing import assert_close
 
-from sceneprior.geometry.boxes import box_corners, chamfered_cube, place, unit_corners
+from sceneprior.geometry.boxes import beveled_cube, box_corners, place, unit_corners
 from sceneprior.geometry.meshes import icosphere, to_cube
 
 
@@ -53,7 +53,7 @@ def test_box_corners_are_center_plus_minus_half_a_size():
 
 
 def test_a_chamfered_cube_without_chamfers_is_the_cube():
-    vertices = chamfered_cube(torch.zeros(2, 5, 2))
+    vertices = beveled_cube(torch.zeros(2, 5, 2))
     assert vertices.shape == (2, 5, 32, 3)
     assert {tuple(v) for v in vertices[1, 3].tolist()} == set(itertools.product((-1, 1), repeat=3))
 
@@ -69,7 +69,7 @@ def test_a_chamfered_cube_without_chamfers_is_the_cube():
     ],
 )
 def test_a_chamfered_cube_touches_all_six_sides_and_has_its_volume(upright, level, volume):
-    vertices = chamfered_cube(torch.tensor([upright, level], dtype=torch.float64))
+    vertices = beveled_cube(torch.tensor([upright, level], dtype=torch.float64))
     one = torch.ones(3, dtype=torch.float64)
     assert_close(vertices.amax(dim=0), one)
     assert_close(vertices.amin(dim=0), -one)
@@ -77,8 +77,8 @@ def test_a_chamfered_cube_touches_all_six_sides_and_has_its_volume(upright, leve
 
 
 def test_gradients_of_chamfers_in_double_precision():
-    chamfers = torch.tensor([[0.2, 0.7], [0.5, 0.1]], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(chamfered_cube, chamfers)
+    bevels = torch.tensor([[0.2, 0.7], [0.5, 0.1]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(beveled_cube, bevels)
 
 
 def test_place_puts_the_unit_cube_into_the_box():

@@ -38,7 +38,7 @@ def test_a_triangle_is_filled_evenly():
         np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]), 20000
     )
     assert (points[:, :2] >= 0).all() and (points.sum(axis=1) <= 1 + 1e-12).all()
-    # Moments of the uniform law on this triangle: mean 1/3, variance 1/18, covariance -1/36.
+    # Moments of the uniform distribution on this triangle: mean 1/3, variance 1/18, covariance -1/36.
     np.testing.assert_allclose(points.mean(axis=0), [1 / 3, 1 / 3, 0], atol=0.006)
     covariance = np.cov(points[:, :2].T)
     np.testing.assert_allclose(covariance, [[1 / 18, -1 / 36], [-1 / 36, 1 / 18]], atol=0.002)

@@ -61,7 +61,7 @@ def test_all_four_terms_are_their_loops(batch, overshoot):
     predicted, observed = batch.boxes.boxes.tolist(), views.boxes.tolist()
     clear = views.sides_clear.tolist()
     centers, poses = scenes.centers_m.tolist(), views.world_to_camera.tolist()
-    lenses = views.intrinsics.tolist()
+    intrinsics = views.intrinsics.tolist()
 
     def box(r, v, k):
         return by_hand.box_distance(
@@ -71,7 +71,7 @@ def test_all_four_terms_are_their_loops(batch, overshoot):
     def ray(r, v, k):
         x1, y1, x2, y2 = observed[r][v][k]
         middle = ((x1 + x2) / 2 * 32, (y1 + y2) / 2 * 24)
-        return by_hand.frustum_angle(centers[r][slot[r][k]], poses[r][v], lenses[r][v], middle)
+        return by_hand.frustum_angle(centers[r][slot[r][k]], poses[r][v], intrinsics[r][v], middle)
 
     logits = scenes.class_logits.tolist()
     wanted = {

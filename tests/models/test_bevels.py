@@ -1,13 +1,13 @@
-"""Which chamfers an object has, and what learns from them."""
+"""Which bevels an object has, and what learns from them."""
 
 import torch
 from torch.testing import assert_close
 
-from sceneprior.models.bevels import ClassChamfers
+from sceneprior.models.bevels import ClassBevels
 
 
 def test_a_sure_class_has_its_own_chamfers_and_an_unsure_one_the_mean():
-    table = ClassChamfers(3)
+    table = ClassBevels(3)
     with torch.no_grad():
         table.logits.copy_(torch.tensor([[-2.0, 0], [0, 2], [3, -3]]))
     mixed = torch.tensor([[[0.0, 200, 0], [50, 50, -200]]])
@@ -17,6 +17,6 @@ def test_a_sure_class_has_its_own_chamfers_and_an_unsure_one_the_mean():
 
 
 def test_classes_learn_nothing_from_how_boxes_look():
-    table, logits = ClassChamfers(4), torch.randn(2, 3, 4, requires_grad=True)
+    table, logits = ClassBevels(4), torch.randn(2, 3, 4, requires_grad=True)
     table(logits).sum().backward()
     assert logits.grad is None and table.logits.grad.abs().min() > 0

@@ -37,7 +37,7 @@ def views(toy_shards):
 
 @pytest.fixture(scope="module")
 def start(trained, views):
-    return trained.prior.sphere(trained.logits[:1]).expand(len(views.is_object), -1)
+    return trained.prior.latent_space(trained.logits[:1]).expand(len(views.is_object), -1)
 
 
 def by_pytorch(trained, views, start, schedule):
@@ -162,14 +162,14 @@ def test_nearest_starts_are_the_rooms_of_least_layout_loss(trained, toy_shards):
     assert losses.shape == (12, 12)
     room = 5
     first = rows_of(views, torch.tensor([room]))
-    own = trained.prior.sphere(trained.logits[3:4])
+    own = trained.prior.latent_space(trained.logits[3:4])
     scenes = replace(decode_images(trained, own, first), vertices_m=None)
     assert_close(
         losses[room, 3], view_loss(trained, scenes, first, masks=False).score[0],
         rtol=1e-4, atol=1e-5,
     )  # fmt: skip
     starts = starting_latents(trained, views, 2)
-    best = trained.prior.sphere(trained.logits)[losses[room].argmin()]
+    best = trained.prior.latent_space(trained.logits)[losses[room].argmin()]
     assert torch.equal(starts[room, 0], best)
 
 

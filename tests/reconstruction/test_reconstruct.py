@@ -100,7 +100,7 @@ def test_classes_that_the_run_never_generates(trained, images):
 def displaced(trained, views, by_m: float):
     """What a fit finds, with every box and mesh moved along x."""
     fit = fit_latents(
-        trained, views, trained.prior.sphere(trained.logits[:1]).expand(4, -1),
+        trained, views, trained.prior.latent_space(trained.logits[:1]).expand(4, -1),
         FitSchedule(steps=40, drop_at=30),
     )  # fmt: skip
     step = torch.tensor([by_m, 0, 0])
@@ -137,7 +137,7 @@ def test_meshes_move_and_stretch_with_their_boxes(trained, views):
 
 
 def test_without_steps_refinement_changes_nothing(trained, views):
-    start = trained.prior.sphere(trained.logits[:1]).expand(4, -1)
+    start = trained.prior.latent_space(trained.logits[:1]).expand(4, -1)
     fit = fit_latents(trained, views, start, FitSchedule(steps=2, drop_at=1))
     found = refine(trained, views, fit, 0)
     assert_close(found.scenes.centers_m, decode_images(trained, fit.z, views).centers_m)

@@ -18,7 +18,7 @@ from sceneprior.training import monitor as samples
 from sceneprior.training.callbacks import StepSeed
 from sceneprior.training.checkpoints import load_run, read_checkpoint
 from sceneprior.training.fit import fit
-from sceneprior.training.monitor import Verdict
+from sceneprior.training.monitor import EvaluationResult
 
 CPU = {"accelerator": "cpu", "devices": 1}
 EPOCHS = 6
@@ -36,7 +36,7 @@ class Told:
         self.seen.append(trained)
         torch.rand(5)  # whoever judges may draw
         picture = np.full((4, 6, 3), look, np.uint8)
-        return Verdict(
+        return EvaluationResult(
             {name: float(told[look]) for name, told in self.scores.items()}, picture, "test"
         )
 

@@ -27,7 +27,7 @@ def seen() -> tuple[DecodedScenes, SceneViews]:
         centers_m=torch.rand(rooms, objects, 3, generator=generator) * 2 - 1,
         sizes_m=torch.rand(rooms, objects, 3, generator=generator) + 0.2,
         completeness_logits=torch.zeros(rooms, objects),
-        chamfers=torch.full((rooms, objects, 2), 0.3),
+        bevels=torch.full((rooms, objects, 2), 0.3),
     )
     return scenes, SceneViews(
         room_index=torch.arange(rooms),

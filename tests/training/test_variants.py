@@ -19,7 +19,7 @@ from sceneprior.experiments.evaluate import (
     unfold,
 )
 from sceneprior.generation.decode import decode_training_rooms, synthesize
-from sceneprior.generation.sample import LAWS
+from sceneprior.generation.sample import DISTRIBUTIONS
 from sceneprior.models.latents import LatentCube
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import RollingCheckpoint
@@ -42,7 +42,11 @@ VARIANTS = {
     "c1_uniform": {"model__latent": "uniform", "layout__latent_noise": 0.1},
     "c2_lstm": {"model__decoder": "lstm"},
     "c3_one_stage": {"stages": "one", "shape__epochs": 5},
-    "bulge": {"layout__proxy": "bulge", "shape__box_from": "proxy", "shape__proxy": "bulge"},
+    "beveled_box": {
+        "layout__proxy": "beveled_box",
+        "shape__box_from": "proxy",
+        "shape__proxy": "beveled_box",
+    },
     "released": RELEASED,
 }
 
@@ -77,10 +81,10 @@ def test_a_variant_learns(variant):
     assert all(torch.isfinite(torch.tensor(value)) for _, value in curves["shape/mask"])
 
 
-def test_chamfers_are_learnt_by_the_bulge_alone(variant):
+def test_bevels_are_learnt_by_the_beveled_box_alone(variant):
     name, _, run = variant
-    moved = (load_run(run).prior.chamfers.logits != -2).any(dim=1)
-    assert moved.any() if name == "bulge" else not moved.any()
+    moved = (load_run(run).prior.bevels.logits != -2).any(dim=1)
+    assert moved.any() if name == "beveled_box" else not moved.any()
 
 
 def test_a_variant_is_decoded_sampled_and_interpolated(variant):
@@ -91,10 +95,10 @@ def test_a_variant_is_decoded_sampled_and_interpolated(variant):
     rooms = decode_training_rooms(trained)
     assert [room.name for room in rooms] == list(trained.room_ids)
     assert len(decoded_and_true(trained, Path(config.data.shards))) == 12
-    for law in LAWS:
-        made = synthesize(trained, 4, 0, law)
+    for distribution in DISTRIBUTIONS:
+        made = synthesize(trained, 4, 0, distribution)
         assert len(made) == 4
-        again = synthesize(trained, 4, 0, law)
+        again = synthesize(trained, 4, 0, distribution)
         for scene, other in zip(made, again, strict=True):
             assert torch.equal(torch.tensor(scene.centers_m), torch.tensor(other.centers_m))
     steps = unfold(trained)
@@ -152,7 +156,7 @@ def test_the_ablations_change_their_module_and_no_other_module(toy_shards):
     plain = build_prior(tiny_config(toy_shards), 22)
     cube = build_prior(tiny_config(toy_shards, model__latent="uniform"), 22)
     lstm = build_prior(tiny_config(toy_shards, model__decoder="lstm"), 22)
-    assert isinstance(cube.sphere, LatentCube) and isinstance(lstm.decoder, SceneLstm)
+    assert isinstance(cube.latent_space, LatentCube) and isinstance(lstm.decoder, SceneLstm)
 
     def shapes(prior, without):
         return {

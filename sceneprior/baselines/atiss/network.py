@@ -129,12 +129,14 @@ class Atiss(nn.Module):
         class_log_prob = self.class_head(context).log_softmax(dim=-1)
         found = {"class": class_log_prob.gather(-1, next_class[:, None])[:, 0]}
         for name, (start, end) in PARTS.items():
-            law = self._law(name, context, next_class, next_unit)
-            log_prob = law.log_prob(next_unit[:, start:end]).sum(dim=-1)
+            distribution = self._distribution(name, context, next_class, next_unit)
+            log_prob = distribution.log_prob(next_unit[:, start:end]).sum(dim=-1)
             found[name] = log_prob * (next_class != END)
         return found
 
-    def _law(self, name: str, context: Tensor, label: Tensor, unit: Tensor) -> LogisticMixture:
+    def _distribution(
+        self, name: str, context: Tensor, label: Tensor, unit: Tensor
+    ) -> LogisticMixture:
         """Of one of `PARTS`, given the class and those of the numbers `unit` that come before."""
         start, end = PARTS[name]
         known = [context, self.class_embedding(label), waves(unit[:, :start])]
@@ -165,8 +167,10 @@ class Atiss(nn.Module):
             label = draw_index(self.class_head(context), drawn[:, 0])
             going = going & (label != END)
             for name, (start, end) in PARTS.items():
-                law = self._law(name, context, label, unit[:, step])
-                unit[:, step, start:end] = law.draw(choice[:, start:end], place[:, start:end])
+                distribution = self._distribution(name, context, label, unit[:, step])
+                unit[:, step, start:end] = distribution.draw(
+                    choice[:, start:end], place[:, start:end]
+                )
             labels[:, step] = label.where(going, END)
         return labels, unit
 

@@ -131,7 +131,7 @@ class GanStage(lightning.LightningModule):
     def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:
         shape = (rooms, self.config.model.logits_per_room)
         with full_precision(self.device):
-            return self.generator.sphere(torch.randn(shape, device=self.device))
+            return self.generator.latent_space(torch.randn(shape, device=self.device))
 
     def _draw(self, scenes: DecodedScenes, views: SceneViews) -> tuple[Tensor, Tensor]:
         """Maps, and how many objects of each class are in each room."""

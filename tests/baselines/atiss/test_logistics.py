@@ -27,11 +27,11 @@ def test_a_step_is_a_difference_of_scipys_distribution_functions(mixture):
     rng = np.random.default_rng(1)
     values = rng.uniform(-0.99, 0.99, size=(200, 7))
     weights = mixture.weight_logits.softmax(dim=-1).numpy()
-    law = stats.logistic(mixture.means.numpy(), mixture.log_scales.exp().numpy())
+    distribution = stats.logistic(mixture.means.numpy(), mixture.log_scales.exp().numpy())
     v = values[..., None]
     # From whichever end is smaller, so that scipy's difference keeps its digits.
-    below = law.cdf(v + HALF_STEP) - law.cdf(v - HALF_STEP)
-    above = law.sf(v - HALF_STEP) - law.sf(v + HALF_STEP)
+    below = distribution.cdf(v + HALF_STEP) - distribution.cdf(v - HALF_STEP)
+    above = distribution.sf(v - HALF_STEP) - distribution.sf(v + HALF_STEP)
     each = np.where(v < mixture.means.numpy(), below, above)
     wanted = np.log((weights * each).sum(axis=-1))
     ours = torch.stack([mixture.log_prob(row) for row in torch.from_numpy(values)])
@@ -46,9 +46,9 @@ def test_the_density_integrates_to_what_lies_inside(mixture):
     wide = LogisticMixture(*(part.expand(len(grid), -1) for part in (
         one.weight_logits, one.means, one.log_scales)))  # fmt: skip
     inside = torch.trapezoid(wide.log_prob(grid).exp(), grid) / (2 * HALF_STEP)
-    law = stats.logistic(one.means.numpy(), one.log_scales.exp().numpy())
+    distribution = stats.logistic(one.means.numpy(), one.log_scales.exp().numpy())
     shifts = np.linspace(-HALF_STEP, HALF_STEP, 2001)[:, None]
-    smooth = np.mean(law.cdf(0.9 + shifts) - law.cdf(-0.9 + shifts), axis=0)
+    smooth = np.mean(distribution.cdf(0.9 + shifts) - distribution.cdf(-0.9 + shifts), axis=0)
     wanted = (one.weight_logits.softmax(dim=-1).numpy() * smooth).sum()
     assert float(inside) == pytest.approx(wanted, rel=1e-5)  # the trapezoid's and the mean's error
 
@@ -71,7 +71,7 @@ def test_gradients(mixture):
     assert torch.autograd.gradcheck(lambda *p: LogisticMixture(*p).log_prob(values), parts)
 
 
-def test_draws_follow_the_law(torch_rng):
+def test_draws_follow_the_distribution(torch_rng):
     """Kolmogorov and Smirnov see no difference in 20,000 draws; they see a shift of 0.03."""
     logits = torch.tensor([0.3, -0.5, 1.0])
     means, log_scales = torch.tensor([-0.3, 0.1, 0.4]), torch.tensor([-2.5, -3.5, -3.0])
@@ -81,8 +81,8 @@ def test_draws_follow_the_law(torch_rng):
     ).numpy()
 
     def cdf(x):
-        law = stats.logistic(means.numpy(), log_scales.exp().numpy())
-        return (logits.softmax(dim=0).numpy() * law.cdf(x[..., None])).sum(axis=-1)
+        distribution = stats.logistic(means.numpy(), log_scales.exp().numpy())
+        return (logits.softmax(dim=0).numpy() * distribution.cdf(x[..., None])).sum(axis=-1)
 
     assert abs(draws).max() <= 1
     assert stats.kstest(draws, cdf).pvalue > 0.01

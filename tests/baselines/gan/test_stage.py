@@ -18,7 +18,7 @@ from sceneprior.cli import app
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.experiments.evaluate import Judging, judge_run, read_curves, report_run
-from sceneprior.experiments.evaluate_samples import SampleJudge
+from sceneprior.experiments.evaluate_samples import SampleEvaluator
 from sceneprior.generation.decode import decode_training_rooms, synthesize
 from sceneprior.generation.latents import read_latent
 from sceneprior.losses.completeness import kept_objects
@@ -132,7 +132,11 @@ def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
 
 def test_what_needs_latents_of_rooms_says_that_a_gan_has_none(gan_run):
     trained = load_run(gan_run)
-    assert trained.logits.shape == (0, 10) and trained.room_ids == () and trained.law == "paper"
+    assert (
+        trained.logits.shape == (0, 10)
+        and trained.room_ids == ()
+        and trained.distribution == "paper"
+    )
     with pytest.raises(InputError) as error:
         decode_training_rooms(trained)
     assert str(error.value) == (
@@ -143,16 +147,22 @@ def test_what_needs_latents_of_rooms_says_that_a_gan_has_none(gan_run):
         read_latent(trained, "typo")
     with pytest.raises(InputError, match="Fitting starts from training rooms"):
         reconstruct(trained, [], FitOptions())
-    for law in ("kernel", "geodesic", "gaussian"):
-        with pytest.raises(InputError, match=f"The {law} law needs at least 2 training rooms; use"):
-            synthesize(trained, 2, 0, law)
+    for distribution in ("kernel", "geodesic", "gaussian"):
+        with pytest.raises(
+            InputError,
+            match=f"The {distribution} distribution needs at least 2 training rooms; use",
+        ):
+            synthesize(trained, 2, 0, distribution)
 
 
 def test_a_gan_is_judged_and_reported_by_its_new_rooms_alone(gan_run, tmp_path):
     scores = judge_run(
         gan_run, 4, 0, None, tmp_path / "scores.json", None, Judging(renderer="software")
     )
-    assert scores["protocol"]["stage"] == "gan" and scores["protocol"]["sampling_law"] == "paper"
+    assert (
+        scores["protocol"]["stage"] == "gan"
+        and scores["protocol"]["sampling_distribution"] == "paper"
+    )
     assert "box_iou_3d" not in scores and scores["mean_objects"] >= 0
     report_run(gan_run, tmp_path / "scores.json", tmp_path / "page.html", 0, (), "software")
     page = (tmp_path / "page.html").read_text()
@@ -163,14 +173,14 @@ def test_a_gan_is_judged_and_reported_by_its_new_rooms_alone(gan_run, tmp_path):
 def test_looks_choose_a_checkpoint_of_a_gan(toy_shards, tmp_path):
     samples = {"every": 2, "count": 6, "metric": "objects_off"}
     config = settings(toy_shards, "gan", samples=samples)
-    fit(config, tmp_path / "run", trainer_options=CPU, judge=SampleJudge(config))
+    fit(config, tmp_path / "run", trainer_options=CPU, judge=SampleEvaluator(config))
     assert (tmp_path / "run" / "gan" / "samples" / "00004.png").is_file()
     assert not load_run(tmp_path / "run", "best").remembers_rooms
     with (tmp_path / "run" / "gan" / "metrics.csv").open(newline="") as file:
         header = next(csv.reader(file))
     assert "samples/overlaps" in header and "samples/mask_iou" not in header
     with pytest.raises(InputError, match="but `stages: gan` remembers no rooms"):
-        SampleJudge(settings(toy_shards, "gan", samples=samples | {"metric": "mask_iou"}))
+        SampleEvaluator(settings(toy_shards, "gan", samples=samples | {"metric": "mask_iou"}))
 
 
 def test_a_gan_of_several_processes_or_of_another_network_is_a_sentence(

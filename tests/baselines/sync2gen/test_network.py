@@ -79,8 +79,10 @@ def test_terms_by_hand(network, rooms, torch_rng):
                     terms["position" if k < 4 else "size"] += term * float(true[0])
         for name, value in terms.items():
             assert float(found[name][room]) == pytest.approx(value, rel=1e-5), name
-        law = torch.distributions.Normal(mean[room], (0.5 * log_variance[room]).exp())
-        kl = torch.distributions.kl_divergence(law, torch.distributions.Normal(0.0, 1.0)).sum()
+        distribution = torch.distributions.Normal(mean[room], (0.5 * log_variance[room]).exp())
+        kl = torch.distributions.kl_divergence(
+            distribution, torch.distributions.Normal(0.0, 1.0)
+        ).sum()
         assert float(found["kl"][room]) == pytest.approx(float(kl), rel=1e-5)
 
 

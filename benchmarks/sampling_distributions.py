@@ -1,6 +1,6 @@
-"""How far from the test rooms a run's decoded training rooms are, and new ones by several laws.
+"""How far from the test rooms a run's decoded training rooms are, and new ones by several distributions.
 
-Run `python benchmarks/sampling_laws.py RUN [RUN ...]`. What a prior generates can hardly be nearer
+Run `python benchmarks/sampling_distributions.py RUN [RUN ...]`. What a prior generates can hardly be nearer
 to test rooms than what it decodes from the latents it was trained with: the difference is what
 sampling costs, the rest is how well it decodes. Frechet distances of EfficientNet-Lite0 features
 (not FID), seed 0, as many rooms as training rooms; in brackets all rooms drawn as boxes.
@@ -22,7 +22,7 @@ from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene
 from sceneprior.training.checkpoints import load_run
 
-LAWS = ("kernel", "geodesic", "paper")
+DISTRIBUTIONS = ("kernel", "geodesic", "paper")
 
 
 def main() -> None:
@@ -40,8 +40,8 @@ def main() -> None:
         test = reference_scenes(shards, "test")
         real = features(test), features([scene.without_meshes() for scene in test])
         rooms = {"decoded": [decoded for decoded, _ in decoded_and_true(trained, shards)]}
-        for law in LAWS:
-            rooms[law] = synthesize(trained, len(rooms["decoded"]), 0, law)
+        for distribution in DISTRIBUTIONS:
+            rooms[distribution] = synthesize(trained, len(rooms["decoded"]), 0, distribution)
         for what, scenes in rooms.items():
             boxes = features([scene.without_meshes() for scene in scenes])
             apart = frechet_distance(features(scenes), real[0]), frechet_distance(boxes, real[1])
