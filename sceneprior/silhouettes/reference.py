@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from sceneprior.silhouettes.cpu.topology import topology_of
+from sceneprior.silhouettes.topology import topology_of
 
 MIN_AREA_PX2 = 1e-12
 """Doubled area under which a projected face is not drawn: it has no inside."""

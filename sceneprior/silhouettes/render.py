@@ -211,7 +211,8 @@ def render_scene(
 
 def _engine(backend: str):
     # Loaded when asked for: the CPU backend compiles, and Triton may not be installed.
-    return importlib.import_module(f"sceneprior.silhouettes.{backend}")
+    name = backend if backend == "reference" else f"{backend}.backend"
+    return importlib.import_module(f"sceneprior.silhouettes.{name}")
 
 
 def _refuse_unknown(name: str, value: str, known: tuple[str, ...]) -> None:

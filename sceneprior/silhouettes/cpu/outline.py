@@ -17,9 +17,9 @@ import numpy as np
 from numba import njit
 
 from sceneprior.silhouettes.cpu.threads import in_threads
-from sceneprior.silhouettes.cpu.topology import topology_of
 from sceneprior.silhouettes.cpu.windows import pixel_range
 from sceneprior.silhouettes.reference import ASIDE_PX, MIN_AREA_PX2, PIECE_PX, SLACK
+from sceneprior.silhouettes.topology import topology_of
 
 
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from sceneprior.silhouettes.cpu.topology import topology_of
 from sceneprior.silhouettes.cuda.edge_kernels import EDGES, PIECES, certify_pieces, sum_layers
 from sceneprior.silhouettes.cuda.faces import sum_by_vertex
 from sceneprior.silhouettes.cuda.outline_kernels import PULLED, push_ends, trace_tiles
 from sceneprior.silhouettes.cuda.windows import TILE, Windows, launch, reach_of
 from sceneprior.silhouettes.reference import ASIDE_PX, PIECE_PX, Settings
+from sceneprior.silhouettes.topology import topology_of
 
 
 class Edges(NamedTuple):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sceneprior.geometry.meshes import icosphere
-from sceneprior.silhouettes.cpu.topology import topology_of
+from sceneprior.silhouettes.topology import topology_of
 
 
 def consistent(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
