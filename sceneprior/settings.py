@@ -1,4 +1,4 @@
-"""A YAML in, checked settings out, or one sentence that names the file and the key."""
+"""Reading and checking YAML settings; a mistake is one sentence that names the file and the key."""
 
 import difflib
 import importlib.resources
@@ -10,6 +10,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from sceneprior.errors import ConfigError
+from sceneprior.files import write_whole
 
 
 class _Loader(yaml.SafeLoader):
@@ -102,30 +103,55 @@ def _apply(data: dict[str, Any], override: str) -> None:
         raise ConfigError(f"--set {override}: '{text}' is not a YAML value.") from None
 
 
+def dump_settings(settings: Section, path: Path) -> None:
+    """Write settings, every default included."""
+    data = settings.model_dump(mode="json", by_alias=True)
+    write_whole(path, yaml.safe_dump(data, sort_keys=False).encode())
+
+
 def _explain(model: type[Section], error: ValidationError, source: str) -> str:
     first, *others = error.errors(include_url=False)
-    location = [str(part) for part in first["loc"]]
+    location, section = _section_of(model, [str(part) for part in first["loc"]])
     key = ".".join(location)
     more = f" ({len(others)} more problem{'s' * (len(others) > 1)} after it)" if others else ""
     if first["type"] == "extra_forbidden":
-        known = _keys_beside(model, location)
+        known = [field.alias or name for name, field in section.model_fields.items()]
         near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.0)
         return f"{source}: unknown key '{key}'; the nearest valid key is '{near[0]}'.{more}"
     if first["type"] == "missing":
         return f"{source}: '{key}' is missing and has no default; add it.{more}"
+    if first["type"] == "union_tag_not_found":
+        return f"{source}: '{key}' has no name; add one of {_names(first)}.{more}"
+    if first["type"] == "union_tag_invalid":
+        tag = first["ctx"]["tag"]
+        return f"{source}: no '{key}' is named '{tag}'; choose from {_names(first)}.{more}"
     got = f" (got {first['input']!r})" if not isinstance(first["input"], dict) else ""
     reason = first["msg"].removeprefix("Value error, ")
     reason = reason[:1].lower() + reason[1:]
     return f"{source}: {f'{chr(39)}{key}{chr(39)}: ' if key else ''}{reason}{got}.{more}"
 
 
-def _keys_beside(model: type[Section], location: list[str]) -> list[str]:
-    section: type[BaseModel] = model
-    for part in location[:-1]:
-        if part not in section.model_fields:
-            continue  # a name that the user chose, of a section that `dict[str, ...]` holds
-        annotation = section.model_fields[part].annotation
-        for inner in (annotation, *get_args(annotation)):
-            if isinstance(inner, type) and issubclass(inner, BaseModel):
-                section = inner
-    return [field.alias or name for name, field in section.model_fields.items()]
+def _names(error: Any) -> str:
+    return error["ctx"].get("expected_tags", "its variants").replace("'", "")
+
+
+def _section_of(model: type[BaseModel], location: list[str]) -> tuple[list[str], type[BaseModel]]:
+    """Where an error is, as the YAML has it, and the section that holds its last key.
+
+    Pydantic puts the name of a section's variant (`decoder: {name: lstm}`) after its key.
+    """
+    section, keys, variants = model, [], list[type[BaseModel]]()
+    for part in location:
+        chosen = [v for v in variants if v.model_fields["name"].default == part]
+        if len(variants) > 1 and chosen:
+            section, variants = chosen[0], []
+            continue
+        keys.append(part)
+        if len(variants) == 1:
+            section = variants[0]
+        # A name that the user chose, of a section that `dict[str, ...]` holds, is no field.
+        field = section.model_fields.get(part)
+        if field is not None:
+            inner = (field.annotation, *get_args(field.annotation))
+            variants = [v for v in inner if isinstance(v, type) and issubclass(v, BaseModel)]
+    return keys, section

@@ -1,4 +1,4 @@
-"""Nouns that learning meets at: `SceneViews` (what cameras saw), `DecodedScenes`, `RoomBoxes`."""
+"""Batches of rooms: `SceneViews` (what cameras saw), `DecodedScenes`, `RoomBoxes`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -36,6 +36,17 @@ class SceneViews:
     """0 for nothing, k + 1 for object k; its own, smaller size. Only the shape stage has it."""
     room_ids: tuple[str, ...] = ()
 
+    @property
+    def observed_ids(self) -> Integer[Tensor, "rooms views height width"]:
+        """The instance-id images, where they cannot be done without.
+
+        Raises:
+            ValueError: the views were loaded without them.
+        """
+        if self.instance_ids is None:
+            raise ValueError("These views have no instance ids; load the data with a mask_step.")
+        return self.instance_ids
+
     def to(self, device: torch.device | str) -> "SceneViews":
         """The same views with every tensor on `device` (Lightning calls this)."""
         return replace(self, **_tensors(self, lambda tensor: tensor.to(device)))
@@ -61,7 +72,7 @@ class DecodedScenes:
     completeness_logits: Float[Tensor, "rooms objects"]
     """Above 0 while the scene is still being filled (the paper's supplement B)."""
     bevels: Float[Tensor, "rooms objects 2"] | None = None
-    """How far the edges of the proxy `beveled_box` are cut off (`geometry.boxes.beveled_cube`); None
+    """How far the edges of the proxy `beveled_box` are cut off (`geometry.boxes`); None
     for rooms that no prior decoded."""
     vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
     """Mesh vertices in the room frame; None until the shape decoder ran."""

@@ -1,48 +1,65 @@
-"""A latent in, a sequence of object features out: the ATISS encoder of the baseline ATISS-2D."""
+"""The encoder of ATISS in the transformer's place: the baseline ATISS-2D."""
+
+from typing import Literal
 
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
+
+from sceneprior.models.prior import DecoderConfig
+
+
+class Atiss2dConfig(DecoderConfig):
+    """Size of the encoder; published: 4 layers, 8 heads and an FFN of 1,024 at width 512."""
+
+    name: Literal["atiss2d"] = "atiss2d"
+    layers: int = Field(4, ge=1)
+    heads: int = Field(8, ge=1)
+    """Attention heads; must divide D_z."""
+    hidden: int = Field(1024, ge=8)
+    """Inner width of the feed-forward layers."""
+    dropout: float = Field(0.1, ge=0, lt=1)
+    norm_first: bool = False
+    """Normalise before attention and feed-forward, not after their residuals as published. Learns
+    at higher rates (docs/baselines_2d.md)."""
+
+    def build(self, width: int, max_objects: int) -> "SceneAtiss":
+        """An encoder for features of D_z = `width`."""
+        return SceneAtiss(width, self)
 
 
 class SceneAtiss(nn.Module):
-    """Stands where the transformer stands: x_k is what the encoder makes of z among x_1 .. x_(k-1).
+    """x_k is what the encoder makes of z among x_1 .. x_(k-1).
 
     ATISS appends a learnt 'empty' embedding to the set of objects that are there, and reads the
     next object off the place where it stood. Here z is that embedding (supplement, Baselines), so
     there is nothing to learn for the empty room, and no floor plan, which 2D views do not show.
     Nothing tells the tokens' order. Each layer normalises after its residuals, unless told
-    otherwise, and the last is normalised once more, as in the library that ATISS builds on. The
-    published model has 4 layers, 8 heads, a width of 512 and an FFN of 1,024.
+    otherwise, and the last is normalised once more, as in the library that ATISS builds on.
 
     Every token sees every other, so that a new object changes what all layers say of the old ones:
     each step encodes its set anew.
 
     Args:
         width: D_z, the size of z and of every object feature.
-        heads: Attention heads; must divide `width`.
-        hidden: Inner width of the feed-forward layers.
-        dropout: Applied where the library applies it; 0.1 is its default.
-        layers: How many.
-        norm_first: Normalise what goes into attention and feed-forward instead.
+        config: Sizes.
     """
 
-    def __init__(
-        self,
-        width: int,
-        heads: int,
-        hidden: int,
-        dropout: float,
-        layers: int = 4,
-        norm_first: bool = False,
-    ):
+    def __init__(self, width: int, config: Atiss2dConfig):
         super().__init__()
         # Layers one by one: TransformerEncoder copies its layer, so that all would start alike.
         self.layers = nn.ModuleList(
             nn.TransformerEncoderLayer(
-                width, heads, hidden, dropout, "gelu", batch_first=True, norm_first=norm_first
+                width,
+                config.heads,
+                config.hidden,
+                config.dropout,
+                "gelu",
+                batch_first=True,
+                norm_first=config.norm_first,
             )
-            for _ in range(layers)
+            for _ in range(config.layers)
         )
         self.end = nn.LayerNorm(width)
 

@@ -1,15 +1,72 @@
-"""What the two stages that learn from true boxes share, as functions."""
+"""What the two methods that learn from true boxes in 3D share: their config, loss and optimiser."""
+
+from abc import abstractmethod
+from pathlib import Path
+from typing import Any, Literal
 
 import lightning
 import torch
 from jaxtyping import Float
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
+from pydantic import Field
 from torch import Tensor, nn
 
-from sceneprior.config import BoxStageConfig
-from sceneprior.losses.processes import share_of_batch
-from sceneprior.training.objective import check_finite
+from sceneprior.baselines.true_boxes import TruthDataset
+from sceneprior.losses.averages import share_of_batch
+from sceneprior.training.checkpoints import read_checkpoint, restore, saved_room_ids
+from sceneprior.training.method import RunConfig, Stage, TrainedSampler, check_rooms, ready_copy
+from sceneprior.training.objective import check_finite, log_losses, with_cosine
+from sceneprior.training.settings import TrainConfig
 from sceneprior.views import RoomBoxes
+
+
+class BoxTraining(TrainConfig):
+    """How a method is trained that learns from boxes in 3D."""
+
+    batch_size: int = Field(ge=1)
+    """Rooms a batch and process."""
+    learning_rate: float = Field(gt=0)
+    schedule: Literal["constant", "cosine"] = "constant"
+    """`constant` (published, both), or a short rise and a `cosine` down to zero."""
+
+
+class BoxConfig(RunConfig):
+    """A run that learns from true boxes; its only stage has the method's name."""
+
+    training: BoxTraining
+
+    @abstractmethod
+    def build_network(self) -> nn.Module:
+        """The network, freshly initialised from the seed; it has `sample` (see `BoxSampler`)."""
+
+    @abstractmethod
+    def build(self, rooms: TruthDataset, previous: Path | None) -> lightning.LightningModule:
+        """The module to train, with statistics of the training rooms."""
+
+    def stages(self) -> tuple[Stage, ...]:
+        return (Stage(self.method, self.training, self._open, self.build),)
+
+    def load(self, stage: str, path: Path) -> TrainedSampler:
+        saved = read_checkpoint(path)
+        network: Any = self.build_network()
+        restore({"prior": network}, saved, path)
+        network.eval().requires_grad_(False)
+        return TrainedSampler(network, saved_room_ids(saved, path), self, stage)
+
+    def trained(
+        self, networks: lightning.LightningModule, stage: str, room_ids: tuple[str, ...]
+    ) -> TrainedSampler:
+        return TrainedSampler(ready_copy(networks.prior), room_ids, self, stage)
+
+    @property
+    def _most(self) -> int | None:
+        """Objects that a room can have."""
+        return None
+
+    def _open(self) -> TruthDataset:
+        rooms = TruthDataset(Path(self.data.shards), "train", self.data.rotations)
+        check_rooms(rooms, self, self._most)
+        return rooms
 
 
 def total_of_rooms(
@@ -36,21 +93,13 @@ def total_of_rooms(
     means = {name: share * loss.sum() / max(count, 1) for name, loss in losses.items()}
     total = torch.stack([weights.get(name, 1.0) * mean for name, mean in means.items()]).sum()
     check_finite(total, rooms)
-    named = {f"train/{name}": v.detach() for name, v in (means | (beside or {})).items()}
-    named["train/loss"] = total.detach()
-    stage.log_dict(named, on_step=False, on_epoch=True, batch_size=max(count, 1), sync_dist=True)
+    log_losses(stage, means | (beside or {}), total, max(count, 1))
     return total
 
 
 def build_box_optimizer(
-    network: nn.Module, settings: BoxStageConfig, steps: int
+    network: nn.Module, settings: BoxTraining, steps: int
 ) -> torch.optim.Optimizer | OptimizerLRSchedulerConfig:
     """Adam with the stage's schedule over `steps` updates."""
     optimizer = torch.optim.Adam(network.parameters(), lr=settings.learning_rate)
-    if settings.schedule == "constant":
-        return optimizer
-    rise = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, settings.learning_rate, total_steps=steps + 1, pct_start=0.05,
-        cycle_momentum=False,
-    )  # fmt: skip
-    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rise, "interval": "step"}}
+    return optimizer if settings.schedule == "constant" else with_cosine(optimizer, steps)

@@ -1,15 +1,29 @@
-"""A latent in, a sequence of object features out: the LSTM of ablation c2 and Table 1."""
+"""The LSTM of ablation c2 and Table 1, which takes the transformer's place."""
+
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sceneprior.models.prior import DecoderConfig
+
+
+class LstmConfig(DecoderConfig):
+    """An LSTM as wide as its features has nothing to choose."""
+
+    name: Literal["lstm"] = "lstm"
+
+    def build(self, width: int, max_objects: int) -> "SceneLstm":
+        """An LSTM for features of D_z = `width`."""
+        return SceneLstm(width)
+
 
 class SceneLstm(nn.Module):
-    """Stands where the transformer stands: x_k is the LSTM's output on x_(k-1), and x_0 is z.
+    """x_k is the LSTM's output on x_(k-1), and x_0 is z.
 
-    One layer whose state begins at zero. Unlike the transformer's, its answer depends on the order
-    of the objects before, and z is heard at the first step alone.
+    One layer whose state begins at zero. Unlike the transformer's, its output depends on the order
+    of the objects before, and z is an input of the first step alone.
 
     Args:
         width: D_z, the size of z, of the state and of every object feature.

@@ -1,7 +1,7 @@
-"""A folder of shards in, batches of true 3D boxes out: for the baselines with 3D supervision.
+"""True 3D boxes of a shard folder, in batches: for the baselines with 3D supervision.
 
-The only door from training to the shards' ground truth. The stages `atiss3d` and `sync2gen` open
-it; what learns from masks and 2D boxes never does (tests/baselines/test_true_boxes.py).
+The only door from training to the shards' ground truth. `atiss` and `sync2gen` open it; what
+learns from masks and 2D boxes never does (tests/baselines/test_true_boxes.py).
 """
 
 import math
@@ -22,8 +22,7 @@ from sceneprior.views import RoomBoxes
 class TruthDataset(Dataset):
     """Every furnished box of every room of a split, in memory; rows and turns are `ViewDataset`'s.
 
-    All furniture that has a class counts, seen by a camera or not: who is given the room in 3D is
-    given all of it.
+    All furniture that has a class counts, seen by a camera or not.
 
     Args:
         folder: Of shards with ground truth.
@@ -35,6 +34,8 @@ class TruthDataset(Dataset):
             the first.
     """
 
+    counted = "objects"
+    """What `max_objects` counts, in words."""
     masks = None
     """No images are read: batches are made in the training process (data/datamodule.py)."""
 
@@ -53,7 +54,7 @@ class TruthDataset(Dataset):
                 raise ShardError(
                     f"{shard.path}, room {room_id} carries no 3D ground truth, which is what this "
                     "stage learns from. Take shards of a data set that has it, or a stage that "
-                    "learns from masks (stages: two)."
+                    "learns from masks (method: ours)."
                 )
             truth = shard.read_ground_truth(room_id)
             ids.append(room_id)

@@ -31,12 +31,13 @@ def synthesize(
     renderer: RendererOption = "auto",
 ) -> None:
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents where the method has them."""
+    from sceneprior.config import load_any_run
     from sceneprior.generation.decode import decode_latents, draw_latents
     from sceneprior.generation.decode import synthesize as generate
     from sceneprior.generation.export import check_free, write_scenes
     from sceneprior.generation.latents import write_latents
     from sceneprior.offscreen import open_renderer
-    from sceneprior.training.checkpoints import TrainedPrior, load_any_run
+    from sceneprior.training.method import TrainedPrior
 
     check_free(out, overwrite)
     trained = load_any_run(run, checkpoint)

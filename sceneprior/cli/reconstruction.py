@@ -10,7 +10,7 @@ from sceneprior.cli.options import CheckpointOption, OverwriteOption, RendererOp
 if TYPE_CHECKING:
     from sceneprior.reconstruction.observed import ObservedImage
     from sceneprior.reconstruction.reconstruct import FitOptions, Reconstruction
-    from sceneprior.training.checkpoints import TrainedPrior
+    from sceneprior.training.method import TrainedPrior
 
 ScheduleOption = Annotated[
     str, typer.Option(help="paper (1,000 steps) or released (the authors' code: 2,000).")

@@ -33,7 +33,7 @@ def fit(
         "32-true"
     ),
 ) -> None:
-    """Train a run: the layout stage, then the shape stage; or a baseline (`stages`)."""
+    """Train a run: the layout stage, then the shape stage; or a baseline (`method`)."""
     from sceneprior.config import load_config
 
     settings = load_config(config, tuple(set_ or ()))

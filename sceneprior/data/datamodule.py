@@ -1,4 +1,4 @@
-"""A run's data settings in, Lightning loaders out."""
+"""Loaders whose order depends on seed and epoch alone, over any number of processes."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from torch.utils.data import DataLoader, Sampler
 
-from sceneprior.baselines.true_boxes import TruthDataset
-from sceneprior.data.dataset import BLANK, ViewDataset
+from sceneprior.data.dataset import BLANK
 
 
 class DrawSampler(Sampler[list[tuple[int, int]]]):
@@ -54,14 +53,14 @@ def _as_it_is(batch: Any) -> Any:
 
 
 def make_loader(
-    dataset: ViewDataset | TruthDataset,
+    dataset: Any,
     batch_size: int,
     seed: int,
     workers: int,
     rank: int = 0,
     world: int = 1,
 ) -> DataLoader:
-    """A loader whose batches are whole `SceneViews`, or whole `RoomBoxes` of true boxes.
+    """A loader of whole batches: `SceneViews` of a `ViewDataset`, or `RoomBoxes` of true boxes.
 
     `workers` read masks ahead. Without masks there is nothing to read: boxes and cameras are in
     memory, on the GPU perhaps, and no worker process stands between them and the step.

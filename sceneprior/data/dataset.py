@@ -1,4 +1,4 @@
-"""One split of a shard folder in memory; lists of (row, epoch) in, `SceneViews` out."""
+"""The rooms of one split of a shard folder, in memory, and batches of their views."""
 
 from pathlib import Path
 
@@ -37,6 +37,9 @@ class ViewDataset(Dataset):
     Raises:
         ShardError: a shard is missing, damaged, or of another label set than the first.
     """
+
+    counted = "tracked objects"
+    """What `max_objects` counts, in words."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Rooms in, one tensor a quantity over the views of all of them out; a batch is a few gathers."""
+"""Boxes and cameras of all views of a split as flat tensors; a batch is a few gathers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields

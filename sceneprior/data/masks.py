@@ -1,4 +1,4 @@
-"""Rooms and views in, their instance-id images at the size of training out, read view by view."""
+"""Instance-id images of a split at the size of training, read view by view and kept packed."""
 
 import sys
 import zlib

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from sceneprior.config import load_any_run, run_config
 from sceneprior.errors import InputError
 from sceneprior.evaluation.bootstrap import RESAMPLES
 from sceneprior.evaluation.metrics.layout_metrics import reconstruction_scores
@@ -18,7 +19,7 @@ from sceneprior.generation.decode import decode_latents, decode_training_rooms, 
 from sceneprior.generation.export import load_scene_folder
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene
-from sceneprior.training.checkpoints import STAGES, TrainedPrior, TrainedSampler, load_any_run
+from sceneprior.training.method import TrainedPrior, TrainedSampler
 
 UNFOLDING_STEPS = 7
 CURVES = (
@@ -199,7 +200,7 @@ def unfold(trained: TrainedPrior) -> list[Scene]:
 def read_curves(run: Path) -> dict[str, list[tuple[int, float]]]:
     """Loss curves of every stage from its metrics.csv, as `stage/term` -> (epoch, value)."""
     curves: dict[str, list[tuple[int, float]]] = {}
-    for stage in STAGES:
+    for stage in [stage.name for stage in run_config(run).stages()]:
         path = run / stage / "metrics.csv"
         if not path.is_file():
             continue

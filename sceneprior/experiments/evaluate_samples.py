@@ -11,7 +11,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sceneprior.classes import VOID, label_set
-from sceneprior.config import RunConfig
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError, ShardError
 from sceneprior.evaluation.metrics.layout_metrics import (
@@ -28,13 +27,13 @@ from sceneprior.generation.sample import sample_latents
 from sceneprior.geometry.boxes import place
 from sceneprior.geometry.cameras import boxes_of_points
 from sceneprior.losses.matching import match_objects
-from sceneprior.losses.shape import observed_ids
 from sceneprior.offscreen import SoftwareRenderer
 from sceneprior.scene import Scene
 from sceneprior.shards import iterate_rooms, list_shards
 from sceneprior.silhouettes.render import render_scene
-from sceneprior.training.checkpoints import TrainedPrior, TrainedSampler
+from sceneprior.training.method import RunConfig, TrainedPrior, TrainedSampler
 from sceneprior.training.monitor import EvaluationResult
+from sceneprior.training.ours import OursConfig
 from sceneprior.views import SceneViews
 
 PICTURED = 16
@@ -79,9 +78,9 @@ class SampleEvaluator:
                 f"samples.metric is type_share, but {config.label_set} mixes room types; choose "
                 "category_kl, objects_off, overlaps or mask_iou."
             )
-        if config.samples.metric == "mask_iou" and config.stages not in ("two", "one"):
+        if config.samples.metric == "mask_iou" and not config.remembers_rooms:
             raise InputError(
-                f"samples.metric is mask_iou, but `stages: {config.stages}` remembers no rooms; "
+                f"samples.metric is mask_iou, but `method: {config.method}` remembers no rooms; "
                 "choose category_kl, objects_off, overlaps or type_share."
             )
 
@@ -144,7 +143,7 @@ class SampleEvaluator:
             Path(data.shards),
             "train",
             views_per_room=VIEWS,
-            rotations=4 if data.augment_rotations else 1,
+            rotations=data.rotations,
             mask_step=data.mask_step,
             view_fraction=data.view_fraction,
             seed=self.config.seed,  # which chose the share of the views, too
@@ -167,7 +166,9 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
         trained: The prior; before the shape stage each box is filled with the plain template.
         views: Of training rooms, with instance ids.
     """
-    weights, prior = trained.config.loss, trained.prior
+    config, prior = trained.config, trained.prior
+    assert isinstance(config, OursConfig), "a run that remembers rooms has a view loss"
+    weights = config.loss
     scenes = prior(trained.logits[views.room_index], with_shape=trained.stage != "layout")
     vertices = scenes.vertices_m
     if vertices is None:
@@ -175,7 +176,7 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
         vertices = place(template, scenes.centers_m, scenes.sizes_m)
     boxes = boxes_of_points(vertices, views.world_to_camera, views.intrinsics, views.image_size)
     matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
-    ids = observed_ids(views)
+    ids = views.observed_ids
     height, width = ids.shape[-2:]
     counts = views.is_object.sum(dim=-1, keepdim=True)
     front = render_scene(

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from sceneprior.config import load_any_run
 from sceneprior.evaluation.independent import independent_rooms
 from sceneprior.evaluation.protocol import without_void
 from sceneprior.evaluation.reference import reference_scenes
@@ -16,7 +17,6 @@ from sceneprior.files import write_whole
 from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Scene
-from sceneprior.training.checkpoints import load_any_run
 
 SHOWN = 8
 DRAWN_FROM = 256

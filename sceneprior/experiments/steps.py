@@ -15,11 +15,11 @@ from typing import Any
 
 from rich.console import Console
 
-from sceneprior.config import load_config
+from sceneprior.config import load_any_run, load_config
 from sceneprior.errors import InputError
 from sceneprior.experiments.comparison import Run
 from sceneprior.files import read_json, write_json
-from sceneprior.training.checkpoints import STAGES_OF, load_any_run, read_checkpoint
+from sceneprior.training.checkpoints import read_checkpoint
 
 JOURNAL = "steps.json"
 SAY = Console(stderr=True, soft_wrap=True)
@@ -87,7 +87,7 @@ def is_trained(run: Run) -> bool:
             f"{run.folder} holds a run of other settings than the comparison now asks for; delete "
             "it to train anew, or name another --out."
         )
-    return (run.folder / "run" / STAGES_OF[wanted.stages][-1] / "final.ckpt").is_file()
+    return (run.folder / "run" / wanted.stages()[-1].name / "final.ckpt").is_file()
 
 
 def is_judged(run: Run, asked: Sequence[str] | None = None) -> bool:
@@ -101,7 +101,7 @@ def costs_of(run: Run) -> Costs:
     """What training took, from what was noted beside it and from its checkpoints."""
     folder = run.folder / "run"
     trained = load_any_run(folder)
-    stages = STAGES_OF[trained.config.stages]
+    stages = [stage.name for stage in trained.config.stages()]
     return Costs(
         cpu_s=_journal(run.folder).get("fit", {}).get("cpu_s"),
         steps=sum(_steps_of(folder / stage / "final.ckpt") for stage in stages),

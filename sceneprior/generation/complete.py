@@ -26,7 +26,7 @@ from sceneprior.generation.insert import put_into
 from sceneprior.losses.layout import take
 from sceneprior.losses.matching import assign
 from sceneprior.scene import Scene
-from sceneprior.training.checkpoints import TrainedPrior
+from sceneprior.training.method import TrainedPrior
 from sceneprior.views import DecodedScenes
 
 DRAWN = 256
@@ -153,7 +153,7 @@ def _starts(
     chosen = []
     for row in range(len(given.labels)):
         one = Given(given.labels[[row]], given.boxes_m[[row]], given.is_object[[row]])
-        losses = given_loss(decoded, one.repeated(len(z)), trained.config.loss.completeness_target)
+        losses = given_loss(decoded, one.repeated(len(z)), trained.config.model.completeness_target)
         chosen.append(z[losses.argsort(stable=True)[:each]])
     return torch.cat(chosen)
 
@@ -165,7 +165,7 @@ def fit_latents(
     steps: int = STEPS,
 ) -> tuple[Float[Tensor, "rooms dimension"], Float[Tensor, " rooms"]]:
     """Move latents until their rooms hold what is given; the latents, and what is left to win."""
-    space, target = trained.prior.latent_space, trained.config.loss.completeness_target
+    space, target = trained.prior.latent_space, trained.config.model.completeness_target
     free = starts.clone().requires_grad_()
     # Adam moves every coordinate by about its rate.
     optimizer = torch.optim.Adam([free], lr=RATE / math.sqrt(starts.shape[1]))

@@ -9,7 +9,7 @@ from sceneprior.errors import InputError
 from sceneprior.generation.sample import sample_latents
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.training.checkpoints import TrainedPrior, TrainedSampler
+from sceneprior.training.method import TrainedPrior, TrainedSampler
 from sceneprior.views import DecodedScenes, RoomBoxes
 
 BATCH = 64
@@ -88,7 +88,7 @@ def decode_latents(
             trained.prior.shape.faces,
             trained.config.label_set,
             names[part],
-            trained.config.loss.completeness_target,
+            trained.config.model.completeness_target,
         )
     return scenes
 
@@ -101,8 +101,8 @@ def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]
     """
     if isinstance(trained, TrainedSampler) or not trained.remembers_rooms:
         raise InputError(
-            f"A run of `stages: {trained.config.stages}` keeps no latents of training rooms, so "
-            "none can be decoded; take a run of `stages: two`."
+            f"A run of `method: {trained.config.method}` keeps no latents of training rooms, so "
+            "none can be decoded; take a run of `method: ours`."
         )
     z = trained.prior.latent_space(trained.logits)
     return decode_latents(trained, z, list(trained.room_ids))
@@ -128,7 +128,7 @@ def synthesize(
     """New scenes, of a run of any kind.
 
     Args:
-        trained: From `load_any_run`.
+        trained: From `sceneprior.config.load_any_run`.
         count: How many.
         seed: Same seed, same rooms.
         distribution: Where latents come from; None takes the run's own.
@@ -139,8 +139,8 @@ def synthesize(
     if isinstance(trained, TrainedSampler):
         if distribution is not None:
             raise InputError(
-                f"A distribution says where latents of rooms come from, but `stages: "
-                f"{trained.config.stages}` has none; leave out --distribution {distribution}."
+                f"A distribution says where latents of rooms come from, but `method: "
+                f"{trained.config.method}` has none; leave out --distribution {distribution}."
             )
         rooms = trained.prior.sample(count, seed)
         return boxes_to_scenes(rooms, trained.config.label_set, scene_names(count, seed))

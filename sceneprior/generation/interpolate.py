@@ -19,7 +19,7 @@ from sceneprior.generation.decode import BATCH, furnished_slots, to_scenes
 from sceneprior.generation.latents import read_latent
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Scene
-from sceneprior.training.checkpoints import TrainedPrior
+from sceneprior.training.method import TrainedPrior
 
 TILE = (240, 320)
 """Height and width of a step in the strip and of the animation, in pixels."""
@@ -94,7 +94,7 @@ def decode_path(
     trained: TrainedPrior, z: Float[Tensor, "steps dimension"], names: list[str]
 ) -> list[PathRoom]:
     """The rooms of latents on a path, with each object's prediction and mixed colour."""
-    config, target = trained.config, trained.config.loss.completeness_target
+    config, target = trained.config, trained.config.model.completeness_target
     palette = class_colors(len(label_set(config.label_set))).astype(np.float64)
     rooms: list[PathRoom] = []
     for start in range(0, len(z), BATCH):

@@ -14,7 +14,7 @@ from torch import Tensor
 from sceneprior.errors import InputError
 from sceneprior.files import write_whole
 from sceneprior.generation.decode import draw_latents
-from sceneprior.training.checkpoints import TrainedPrior
+from sceneprior.training.method import TrainedPrior
 
 LATENTS_FILE = "latents.npz"
 _ENDINGS = (".npz", ".npy", ".json")

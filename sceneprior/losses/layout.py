@@ -6,10 +6,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sceneprior.geometry.cameras import Boxes2D, camera_centers, pixel_rays
+from sceneprior.losses.averages import mean_of_objects, share_of_batch
 from sceneprior.losses.completeness import completeness_targets
 from sceneprior.losses.matching import Matches, side_distance
-from sceneprior.losses.means import mean_of_objects
-from sceneprior.losses.processes import share_of_batch
 from sceneprior.views import DecodedScenes, SceneViews
 
 

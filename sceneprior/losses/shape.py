@@ -1,11 +1,11 @@
-"""Rendered and observed masks of matched objects in, the gated mask loss out (equation 8)."""
+"""The mask loss of matched objects, L_S (section 3.4, Eq. 8)."""
 
-from jaxtyping import Float, Integer
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from sceneprior.losses.averages import mean_of_objects
 from sceneprior.losses.matching import Matches
-from sceneprior.losses.means import mean_of_objects
 from sceneprior.views import SceneViews
 
 CERTAIN = 1e-6
@@ -20,6 +20,8 @@ def mask_loss(
     per_room: bool = False,
 ) -> tuple[Float[Tensor, "*rooms"], dict[str, Float[Tensor, "*rooms"]]]:
     """Binary cross entropy of visible masks, where prediction and observation overlap enough.
+
+        L_S = sum_(p in T_j) BCE(r_k^p, m_j^p) [IoU(r_k^p, m_j^p) > 0.5],    j = sigma(k)
 
     Averaged over pixels, then over an object's views, then over objects; a mask whose IoU with
     its observation is not above `iou_gate` counts as zero, as in the paper.
@@ -39,7 +41,7 @@ def mask_loss(
     room, view, item = seen.nonzero(as_tuple=True)
     prediction = matches.prediction[room, item]
     mine = rendered[room, view, prediction]
-    observed = (observed_ids(views)[room, view] == (item + 1)[:, None, None]).to(mine.dtype)
+    observed = (views.observed_ids[room, view] == (item + 1)[:, None, None]).to(mine.dtype)
     iou = soft_iou(mine.detach(), observed)
     use = (iou > iou_gate).to(mine.dtype)
     # Where a wrong mask rounds to 0 or 1, the gradient of log would be torch's 1e12.
@@ -64,14 +66,3 @@ def soft_iou(
     """Intersection over union of soft masks; two empty masks have 0."""
     both = (a * b).sum(dim=(1, 2))
     return both / (a.sum(dim=(1, 2)) + b.sum(dim=(1, 2)) - both).clamp(min=1e-6)
-
-
-def observed_ids(views: SceneViews) -> Integer[Tensor, "rooms views height width"]:
-    """The views' instance-id images.
-
-    Raises:
-        ValueError: the views were loaded without them.
-    """
-    if views.instance_ids is None:
-        raise ValueError("mask_loss needs views with instance_ids; load the data with a mask_step")
-    return views.instance_ids

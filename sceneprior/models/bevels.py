@@ -1,4 +1,4 @@
-"""What a class looks like from outside its boxes: learned, and shared by all its objects."""
+"""How far the edges of each class's boxes are cut off, for the proxy `beveled_box`; learnt."""
 
 import torch
 from jaxtyping import Float

@@ -1,20 +1,57 @@
-"""Logits in, latents out: points on the hypersphere (section 3.1, equation 2), or in a cube.
+"""The latent space Z: from the logits of rooms to points z of the hypersphere (section 3.1, Eq. 2).
 
-A latent space turns the logits of rooms, which are learnt, into latents, which are decoded. Logits
-drawn from N(0, 1) are where training rooms start and what the `paper` distribution samples. Beside that a
-space knows how near two latents are, what lies between them and what a small step is.
+A latent space turns the logits of rooms, which are learnt, into latents z, which are decoded.
+Logits drawn from N(0, 1) are where training rooms start and what the `paper` distribution samples.
+Beside that a space knows how near two latents are, what lies between them and what a small step
+is. The hypersphere is the paper's; the cube is ablation c1.
 """
 
 import math
+from typing import Literal
 
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sceneprior.settings import Section
+
+
+class SphereConfig(Section):
+    """The hypersphere of the paper."""
+
+    name: Literal["sphere"] = "sphere"
+    anchors: int = Field(100, ge=2)
+    """M fixed unit vectors that latents are mixed from; 100 in the authors' code."""
+
+    def build(self, dimension: int, seed: int) -> "LatentSphere":
+        """A sphere of D_z = `dimension`."""
+        return LatentSphere(self.anchors, dimension, seed)
+
+    def logits(self, dimension: int) -> int:
+        """How many numbers a room's latent is learnt as."""
+        return self.anchors
+
+
+class CubeConfig(Section):
+    """A cube with one logit a coordinate: ablation c1. `distribution: paper` is uniform in it."""
+
+    name: Literal["cube"] = "cube"
+
+    def build(self, dimension: int, seed: int) -> "LatentCube":
+        """A cube of D_z = `dimension`; nothing in it is random."""
+        return LatentCube(dimension)
+
+    def logits(self, dimension: int) -> int:
+        """How many numbers a room's latent is learnt as."""
+        return dimension
+
 
 class LatentSphere(nn.Module):
-    """Map weights of M fixed unit vectors to a point on the unit hypersphere.
+    """Weights w_i of M fixed unit vectors phi_i to a point z of the unit hypersphere (Eq. 2).
+
+        z = sum_i w_i phi_i / |sum_i w_i phi_i|,    w = softmax(logits)
 
     A constant added to all logits of a room changes nothing: `shift_free`.
 
@@ -35,7 +72,7 @@ class LatentSphere(nn.Module):
         self.register_buffer("anchors", F.normalize(vectors, dim=-1))
 
     def forward(self, logits: Float[Tensor, "rooms anchors"]) -> Float[Tensor, "rooms dimension"]:
-        """z = normalise(sum_i w_i phi_i), w = softmax(logits): positive weights that sum to 1."""
+        """Latents z of rooms; the weights are positive and sum to 1."""
         return F.normalize(logits.softmax(dim=-1) @ self.anchors, dim=-1)
 
     def onto(self, points: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
@@ -54,14 +91,14 @@ class LatentSphere(nn.Module):
         end: Float[Tensor, "pairs dimension"],
         along: Float[Tensor, " pairs"],
     ) -> Float[Tensor, "pairs dimension"]:
-        """One point a pair, on the geodesic; see `slerp_pairs`."""
-        return slerp_pairs(start, end, along)
+        """One point a pair, on the geodesic; see `slerp`."""
+        return slerp(start, end, along)
 
     def step(
         self, z: Float[Tensor, "rooms dimension"], length: float, seed: int
     ) -> Float[Tensor, "rooms dimension"]:
-        """Move each point at random; see `jitter`."""
-        return jitter(z, length, seed)
+        """Move each point a random step of about `length`; the same seed, the same steps."""
+        return F.normalize(z + _random_steps(z, length, seed), dim=-1)
 
 
 class LatentCube(nn.Module):
@@ -117,36 +154,17 @@ class LatentCube(nn.Module):
 LatentSpace = LatentSphere | LatentCube
 
 
-def jitter(
-    z: Float[Tensor, "rooms dimension"], length: float, seed: int
-) -> Float[Tensor, "rooms dimension"]:
-    """Move points a random step of about `length` on the sphere; the same seed, the same steps."""
-    return F.normalize(z + _random_steps(z, length, seed), dim=-1)
-
-
 def _random_steps(z: Tensor, length: float, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(z.shape, generator=generator).to(z) * (length / z.shape[-1] ** 0.5)
 
 
 def slerp(
-    start: Float[Tensor, " dimension"], end: Float[Tensor, " dimension"], steps: int
-) -> Float[Tensor, "steps dimension"]:
-    """Points at equal angles along the geodesic between two unit vectors (section 5.3).
-
-    Raises:
-        ValueError: the two are opposite, so that no geodesic is the shortest.
-    """
-    along = torch.linspace(0, 1, steps, dtype=start.dtype, device=start.device)
-    return slerp_pairs(start.expand(steps, -1), end.expand(steps, -1), along)
-
-
-def slerp_pairs(
     start: Float[Tensor, "pairs dimension"],
     end: Float[Tensor, "pairs dimension"],
     along: Float[Tensor, " pairs"],
 ) -> Float[Tensor, "pairs dimension"]:
-    """One point a pair of unit vectors, `along` (0 to 1) of the geodesic between them.
+    """One point a pair of unit vectors, `along` (0 to 1) of the geodesic between them (5.3).
 
     Raises:
         ValueError: two vectors are opposite, so that no geodesic is the shortest.

@@ -1,4 +1,4 @@
-"""Layers in, one network of them out."""
+"""Multi-layer perceptrons of given layers."""
 
 from torch import nn
 

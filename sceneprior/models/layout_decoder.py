@@ -1,4 +1,4 @@
-"""Object features in; classes, axis-aligned boxes and completeness out (equation 5)."""
+"""The layout decoder: class, box and completeness of each object (section 3.3, Eq. 5)."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from sceneprior.models.released import SeparateHeads
 
 
 class Layout(NamedTuple):
-    """What the layout decoder says of each object; metres in the room frame."""
+    """Class l_k, centre c_k, size s_k and completeness p_k of each object; metres, room frame."""
 
     class_logits: Float[Tensor, "rooms objects classes"]
     centers_m: Float[Tensor, "rooms objects 3"]
@@ -36,7 +36,9 @@ class JointHead(nn.Sequential):
 
 
 class LayoutDecoder(nn.Module):
-    """MLP1 (shared with the shape decoder), then MLP2.
+    """MLP1 (shared with the shape decoder), then MLP2 (Eq. 5).
+
+        {l_k, c_k, s_k, p_k} = MLP2(MLP1(x_k))
 
     Args:
         width: Size of an object feature.

@@ -1,85 +1,85 @@
-"""The whole prior: latent logits in, decoded scenes out."""
+"""The whole prior, f of Eq. 1: from logits or latents to decoded scenes."""
+
+from abc import ABC, abstractmethod
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from sceneprior.baselines.atiss2d import SceneAtiss
-from sceneprior.baselines.lstm import SceneLstm
 from sceneprior.geometry.boxes import place
 from sceneprior.models.bevels import ClassBevels
-from sceneprior.models.latents import LatentCube, LatentSpace, LatentSphere
+from sceneprior.models.latents import CubeConfig, LatentSpace, SphereConfig
 from sceneprior.models.layout_decoder import LayoutDecoder
-from sceneprior.models.shape_decoder import ShapeDecoder
-from sceneprior.models.transformer import SceneDecoder
+from sceneprior.models.shape_decoder import ShapeDecoder, ShapeDecoderConfig
+from sceneprior.settings import Section
 from sceneprior.views import DecodedScenes
 
 
-class ScenePrior(nn.Module):
-    """f of equation 1: from the latent space to scenes.
+class DecoderConfig(Section, ABC):
+    """What makes object features x_k of a latent z: a section that builds its module.
 
-    `sphere` is the latent space, which is a sphere unless `latent` says otherwise.
-
-    Args:
-        classes: Size of the label set.
-        max_objects: N, how many objects are unrolled.
-        width: D_z.
-        anchors: M fixed vectors of the latent hypersphere.
-        latent: `sphere`, or `uniform` for a cube of logits (ablation c1).
-        decoder: `transformer`, `lstm` (ablation c2), or `atiss` (baseline ATISS-2D).
-        encoder_layers, norm_first: Of the encoder of `atiss`.
-        heads, hidden, dropout: Of the transformer, and of the encoder of `atiss`.
-        final_norm, query_self_attention: Of the transformer.
-        step_mlps: Whether each of the transformer's N steps ends in an MLP of its own.
-        layout_heads, void: Of the layout decoder.
-        shape_width, shape_level, template, fit_box: Of the shape decoder.
-        seed: Draws the fixed latent anchors.
+    The module takes (z of shape (rooms, D_z), N) to features of shape (rooms, N, D_z).
     """
 
-    def __init__(
-        self,
-        classes: int,
-        max_objects: int = 13,
-        width: int = 512,
-        anchors: int = 100,
-        heads: int = 4,
-        hidden: int = 1024,
-        dropout: float = 0.1,
-        latent: str = "sphere",
-        decoder: str = "transformer",
-        encoder_layers: int = 4,
-        norm_first: bool = False,
-        final_norm: bool = False,
-        query_self_attention: bool = False,
-        step_mlps: bool = False,
-        layout_heads: str = "joint",
-        void: bool = True,
-        shape_width: int = 256,
-        shape_level: int = 4,
-        template: str = "sphere",
-        fit_box: bool = False,
-        seed: int = 0,
-    ):
+    name: str
+
+    @abstractmethod
+    def build(self, width: int, max_objects: int) -> nn.Module:
+        """The module, for features of D_z = `width`, freshly initialised."""
+
+
+class ModelConfig(Section):
+    """The network (section 3 and supplement A). Which decoders there are is for a run to say."""
+
+    max_objects: int = Field(ge=1)
+    """N: 13 for bedrooms, 28 for living rooms, 53 for ScanNet."""
+    width: int = Field(512, ge=8)
+    """D_z, of latents and object features."""
+    latent_space: Annotated[SphereConfig | CubeConfig, Field(discriminator="name")] = SphereConfig()
+    decoder: DecoderConfig
+    layout_heads: Literal["joint", "separate"] = "joint"
+    """MLP2 is one MLP for all (`joint`), or a linear layer for the classes and an MLP of its own
+    for each of x, y, z, width, height and depth (`separate`, released code)."""
+    completeness_target: Literal["first_n", "stop"] = "first_n"
+    """Of n objects, `first_n` wants ones for the first n predictions and zeros after (supplement
+    B); `stop` wants ones from the last object on and ends a generated scene with the first object
+    that has one (main text, released code). Decoding follows the same convention."""
+    shape: ShapeDecoderConfig = ShapeDecoderConfig()
+
+    @model_validator(mode="after")
+    def _heads_divide_width(self) -> "ModelConfig":
+        heads = getattr(self.decoder, "heads", 1)
+        if self.width % heads:
+            raise ValueError(f"width {self.width} is not a multiple of heads {heads}")
+        return self
+
+    @property
+    def logits_per_room(self) -> int:
+        """How many numbers a room's latent is learnt as."""
+        return self.latent_space.logits(self.width)
+
+
+class ScenePrior(nn.Module):
+    """f of Eq. 1, s = f(z): from the latent space to scenes.
+
+    Args:
+        config: The network.
+        classes: Size of the label set.
+        seed: Draws the fixed anchors of the latent sphere.
+        void: Of the layout decoder.
+    """
+
+    def __init__(self, config: ModelConfig, classes: int, seed: int = 0, void: bool = True):
         super().__init__()
-        self.max_objects = max_objects
-        self.latent_space: LatentSpace
-        if latent == "uniform":
-            self.latent_space = LatentCube(width)
-        else:
-            self.latent_space = LatentSphere(anchors, width, seed)
-        self.decoder: SceneDecoder | SceneLstm | SceneAtiss
-        if decoder == "lstm":
-            self.decoder = SceneLstm(width)
-        elif decoder == "atiss":
-            self.decoder = SceneAtiss(width, heads, hidden, dropout, encoder_layers, norm_first)
-        else:
-            steps = max_objects if step_mlps else 0
-            self.decoder = SceneDecoder(
-                width, heads, hidden, dropout, final_norm, query_self_attention, steps
-            )
-        self.layout = LayoutDecoder(width, classes, heads=layout_heads, void=void)
+        width = config.width
+        self.max_objects = config.max_objects
+        self.latent_space: LatentSpace = config.latent_space.build(width, seed)
+        self.decoder = config.decoder.build(width, config.max_objects)
+        self.layout = LayoutDecoder(width, classes, heads=config.layout_heads, void=void)
         self.bevels = ClassBevels(classes)
-        self.shape = ShapeDecoder(2 * width, shape_width, shape_level, template, fit_box)
+        self.shape = ShapeDecoder(2 * width, config.shape)
 
     def forward(
         self, logits: Float[Tensor, "rooms anchors"], with_shape: bool = True
@@ -116,10 +116,5 @@ class ScenePrior(nn.Module):
                 canonical = canonical.index_put((wanted,), some)
             vertices = place(canonical, layout.centers_m, layout.sizes_m)
         return DecodedScenes(
-            class_logits=layout.class_logits,
-            centers_m=layout.centers_m,
-            sizes_m=layout.sizes_m,
-            completeness_logits=layout.completeness_logits,
-            bevels=self.bevels(layout.class_logits),
-            vertices_m=vertices,
+            **layout._asdict(), bevels=self.bevels(layout.class_logits), vertices_m=vertices
         )

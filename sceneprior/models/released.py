@@ -1,6 +1,6 @@
-"""What the authors' released code adds to the paper's network: modules that a config names.
+"""Parts that the authors' released code adds to the paper's network, each by a key of a config.
 
-Written from descriptions of that code, not from the code. Off by default; see `ModelConfig`.
+Written from descriptions of that code, not from the code. Off by default.
 """
 
 import torch

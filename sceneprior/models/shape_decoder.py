@@ -1,31 +1,50 @@
-"""MLP1's features and template vertices in, deformed canonical meshes out (equation 6)."""
+"""The shape decoder: a template mesh deformed by a point-wise MLP (section 3.3, Eq. 6)."""
+
+from typing import Literal
 
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
 
 from sceneprior.geometry.meshes import icosphere, to_cube
+from sceneprior.settings import Section
+
+
+class ShapeDecoderConfig(Section):
+    """Template and size of the shape decoder."""
+
+    width: int = Field(256, ge=8)
+    """Hidden width; the paper's network has 256."""
+    level: int = Field(4, ge=0, le=6)
+    """Icosphere subdivisions of the template: 20 * 4**level faces."""
+    template: Literal["sphere", "box"] = "sphere"
+    """What shapes are deformed from: the `sphere` (paper), or its vertices pushed out to the `box`
+    that the layout stage fitted."""
+    fit_box: bool = False
+    """Scale each mesh to fill its box exactly, so that boxes stay the meshes' own. The paper leaves
+    the two free to drift apart."""
 
 
 class ShapeDecoder(nn.Module):
-    """Offset every vertex of a template by a point-wise MLP3 of [feature, vertex].
+    """Offset every vertex v of a template by a point-wise MLP3 of [MLP1(x_k), v] (Eq. 6).
+
+        dv_k = MLP3([MLP1(x_k), v]),    S_k = {v + dv_k}
 
     Args:
         features: Size of MLP1's output.
-        width: Hidden width; the paper's network has 256.
-        level: Subdivisions of the icosphere: 4 gives 5,120 faces, the authors' choice.
-        template: `sphere` (paper) or `box`, the same vertices pushed out to the cube.
-        fit_box: Scale each deformed mesh to fill its box exactly, so that the predicted box
-            always is the mesh's own. The paper leaves the two free to drift apart.
+        config: Template and size.
     """
 
-    def __init__(self, features: int, width: int, level: int, template: str, fit_box: bool):
+    def __init__(self, features: int, config: ShapeDecoderConfig):
         super().__init__()
-        vertices, faces = icosphere(level)
-        self.fit_box = fit_box
+        vertices, faces = icosphere(config.level)
+        width = config.width
+        self.fit_box = config.fit_box
         self.template: Tensor
         self.faces: Tensor
-        self.register_buffer("template", to_cube(vertices) if template == "box" else vertices)
+        template = to_cube(vertices) if config.template == "box" else vertices
+        self.register_buffer("template", template)
         self.register_buffer("faces", faces)
         self.reduce = nn.Sequential(
             nn.ReLU(), nn.Linear(features, 2 * width), nn.ReLU(), nn.Linear(2 * width, width)
@@ -46,7 +65,7 @@ class ShapeDecoder(nn.Module):
     def forward(
         self, features: Float[Tensor, "rooms objects features"]
     ) -> Float[Tensor, "rooms objects vertices 3"]:
-        """Canonical vertices v + dv; the box spans [-1, 1]^3."""
+        """Canonical vertices S_k = v + dv_k; the box spans [-1, 1]^3."""
         code = self.from_feature(self.reduce(features)).unsqueeze(-2)
         vertices = self.template + self.offsets(code + self.from_vertex(self.template))
         return fill_unit_box(vertices) if self.fit_box else vertices

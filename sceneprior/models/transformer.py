@@ -1,11 +1,39 @@
-"""A latent in, a sequence of object features out: the permutation-invariant transformer (3.2)."""
+"""The permutation-invariant transformer: object features x_k from z (section 3.2, Eq. 3 and 4)."""
+
+from typing import Literal
 
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.models.released import QuerySelfAttention, SharedOutput, StepOutputs
+from sceneprior.settings import Section
+
+
+class TransformerConfig(Section):
+    """Size of the transformer (supplement A), and the released code's parts by name."""
+
+    name: Literal["transformer"] = "transformer"
+    heads: int = Field(4, ge=1)
+    """Attention heads; must divide D_z."""
+    hidden: int = Field(1024, ge=8)
+    """Inner width of the feed-forward layers."""
+    dropout: float = Field(0.1, ge=0, lt=1)
+    """Applied where the library applies it that the paper builds on; 0.1 is its default."""
+    final_norm: bool = False
+    """Normalise once more after the encoder layer and after the decoder layer, as the released
+    code and the default of the library that it builds on."""
+    query_self_attention: bool = False
+    """Give the decoder layer self attention over its one query, z, as the released code."""
+    step_mlps: bool = False
+    """End step k in a two-layer MLP of its own, as the released code: 0.5 million weights a step
+    at width 512, and the k-th object knows that it is the k-th."""
+
+    def build(self, width: int, max_objects: int) -> "SceneTransformer":
+        """A transformer for features of D_z = `width`."""
+        return SceneTransformer(width, self, max_objects)
 
 
 class FeedForward(nn.Module):
@@ -23,12 +51,14 @@ class FeedForward(nn.Module):
         return self.norm(x + self.dropout(self.contract(inner)))
 
 
-class SceneDecoder(nn.Module):
-    """Generate N object features, each from z and the unordered set of those before it.
+class SceneTransformer(nn.Module):
+    """Generate N object features x_k, each from z and the unordered set of those before it.
 
-    Per step k: one encoder layer (self attention among x_0 .. x_{k-1}, no positional
-    encoding) gives the scene context F_k; one decoder layer asks it with z as the query. Both
-    layers normalise after the residual, as the library does that the paper builds on.
+        P(x_1, ..., x_N | z) = P(x_1 | z) prod_k P(x_k | {x_1, ..., x_(k-1)}; z)
+
+    Step k: one encoder layer (self attention among x_0 .. x_(k-1), no positional encoding) gives
+    the scene context F_k; one decoder layer attends to it with z as the query. Both layers
+    normalise after the residual, as the library does that the paper builds on.
 
     In the encoder, an object's query, key and value never change once it is there: each is
     computed once and appended, and only the attention is taken anew, since old objects see
@@ -38,26 +68,14 @@ class SceneDecoder(nn.Module):
 
     Args:
         width: D_z, the size of z and of every object feature.
-        heads: Attention heads; must divide `width`.
-        hidden: Inner width of the feed-forward layers (paper: 1,024 for a width of 512).
-        dropout: Applied where the library applies it; 0.1 is its default.
-        final_norm: Normalise once more after each of the two layers (the library's default).
-        query_self_attention: Let z attend to itself before it asks (released code).
-        step_outputs: N gives each of N steps an MLP of its own (released code); 0 gives none.
+        config: Sizes and released parts.
+        max_objects: N, where `step_mlps` needs it.
     """
 
-    def __init__(
-        self,
-        width: int,
-        heads: int,
-        hidden: int,
-        dropout: float,
-        final_norm: bool = False,
-        query_self_attention: bool = False,
-        step_outputs: int = 0,
-    ):
+    def __init__(self, width: int, config: TransformerConfig, max_objects: int):
         super().__init__()
-        self.heads = heads
+        hidden, dropout = config.hidden, config.dropout
+        self.heads = config.heads
         self.dropout = dropout
         self.start = nn.Parameter(torch.randn(width) / width**0.5)
         self.encoder_qkv = nn.Linear(width, 3 * width)
@@ -70,24 +88,24 @@ class SceneDecoder(nn.Module):
         self.decoder_out = nn.Linear(width, width)
         self.decoder_norm = nn.LayerNorm(width)
         self.decoder_ff = FeedForward(width, hidden, dropout)
-        self.encoder_end = nn.LayerNorm(width) if final_norm else nn.Identity()
-        self.decoder_end = nn.LayerNorm(width) if final_norm else nn.Identity()
-        self.query = (
-            QuerySelfAttention(width, heads, dropout) if query_self_attention else nn.Identity()
-        )
-        self.output = StepOutputs(step_outputs, width) if step_outputs else SharedOutput()
+        self.encoder_end = nn.LayerNorm(width) if config.final_norm else nn.Identity()
+        self.decoder_end = nn.LayerNorm(width) if config.final_norm else nn.Identity()
+        self.query: nn.Module = nn.Identity()
+        if config.query_self_attention:
+            self.query = QuerySelfAttention(width, config.heads, dropout)
+        self.output = StepOutputs(max_objects, width) if config.step_mlps else SharedOutput()
 
     def forward(
         self, z: Float[Tensor, "rooms width"], objects: int
     ) -> Float[Tensor, "rooms objects width"]:
         """Unroll `objects` steps from the start token (the empty room)."""
-        wish = self._wish(z)
+        query = self._query(z)
         tokens = self.start.expand(len(z), 1, -1)
         qkv = self._split(self.encoder_qkv(tokens))
-        question = self._question(wish)
+        key_query = self._key_query(query)
         features: list[Tensor] = []
         for step in range(objects):
-            features.append(self._next(wish, question, tokens, qkv))
+            features.append(self._next(query, key_query, tokens, qkv))
             if step + 1 < objects:
                 newest = features[-1].unsqueeze(1)
                 tokens = torch.cat([tokens, newest], dim=1)
@@ -101,43 +119,45 @@ class SceneDecoder(nn.Module):
         previous: Float[Tensor, "rooms objects width"],
     ) -> Float[Tensor, "rooms width"]:
         """The feature that follows a set of objects, in whatever order they are given."""
-        wish = self._wish(z)
+        query = self._query(z)
         tokens = torch.cat([self.start.expand(len(z), 1, -1), previous], dim=1)
         qkv = self._split(self.encoder_qkv(tokens))
-        return self._next(wish, self._question(wish), tokens, qkv)
+        return self._next(query, self._key_query(query), tokens, qkv)
 
-    def _wish(self, z: Tensor) -> Tensor:
+    def _query(self, z: Tensor) -> Tensor:
         """(rooms, width): z as the query of every step.
 
         Coordinates of a unit vector are about 1 / sqrt(width), far below the normalised
-        features they are added to; scaled to about 1 they are heard. Without it the
-        class loss falls far more slowly (docs/results.md).
+        features they are added to, so z is scaled to about 1. Without it the class loss falls
+        far more slowly (docs/experiments/).
         """
         return self.query(z * z.shape[-1] ** 0.5)
 
-    def _next(self, wish: Tensor, question: Tensor, tokens: Tensor, qkv: list[Tensor]) -> Tensor:
+    def _next(
+        self, z_query: Tensor, key_query: Tensor, tokens: Tensor, qkv: list[Tensor]
+    ) -> Tensor:
         query, key, value = qkv
         # Written out: on a dozen tokens torch's fused CPU attention is slower.
         scores = query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5
         mixed = (self._drop(scores.softmax(dim=-1)) @ value).transpose(1, 2).flatten(2)
         context = self.encoder_norm(tokens + self._drop(self.encoder_out(mixed)))
         context = self.encoder_end(self.encoder_ff(context))
-        answer = wish + self._drop(self.decoder_out(self._ask(question, context)))
-        answer = self.decoder_end(self.decoder_ff(self.decoder_norm(answer)))
-        return self.output(answer, step=tokens.shape[1] - 1)
+        x = z_query + self._drop(self.decoder_out(self._cross_attend(key_query, context)))
+        x = self.decoder_end(self.decoder_ff(self.decoder_norm(x)))
+        return self.output(x, step=tokens.shape[1] - 1)
 
-    def _question(self, wish: Tensor) -> Tensor:
+    def _key_query(self, z_query: Tensor) -> Tensor:
         """(rooms, heads, width): z's query of each head, carried through the key projection.
 
         The key's bias would add the same to every token's score, which a softmax does not see.
         """
-        query = self.decoder_query(wish).unflatten(-1, (self.heads, -1))
+        query = self.decoder_query(z_query).unflatten(-1, (self.heads, -1))
         key = self.decoder_key.unflatten(0, (self.heads, -1))
         return torch.einsum("rhd,hdw->rhw", query, key) / query.shape[-1] ** 0.5
 
-    def _ask(self, question: Tensor, context: Tensor) -> Tensor:
-        """(rooms, width): the values of the context, weighted per head by its answer to z."""
-        weights = self._drop((question @ context.transpose(1, 2)).softmax(dim=-1))
+    def _cross_attend(self, key_query: Tensor, context: Tensor) -> Tensor:
+        """(rooms, width): the values of the context F_k, weighted per head by z's attention."""
+        weights = self._drop((key_query @ context.transpose(1, 2)).softmax(dim=-1))
         summed = (weights @ context).transpose(0, 1)
         value = self.decoder_value.weight.unflatten(0, (self.heads, -1))
         values = torch.baddbmm(

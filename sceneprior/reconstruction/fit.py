@@ -11,7 +11,7 @@ from torch import Tensor
 from sceneprior.errors import InputError
 from sceneprior.losses.matching import Matches
 from sceneprior.losses.shape import mask_loss
-from sceneprior.training.checkpoints import TrainedPrior
+from sceneprior.training.method import TrainedPrior
 from sceneprior.training.objective import (
     check_finite,
     match_and_score,
@@ -19,6 +19,7 @@ from sceneprior.training.objective import (
     seen_masks,
     weighted_sum,
 )
+from sceneprior.training.ours import OursConfig
 from sceneprior.views import DecodedScenes, SceneViews
 
 CHECK_EVERY = 20
@@ -103,8 +104,11 @@ def view_loss(
         matches: To keep; None matches anew.
     """
     config = trained.config
+    assert isinstance(config, OursConfig), "a run that remembers rooms has a view loss"
     boxes = seen_boxes(scenes, views, config.shape)
-    losses, matches = match_and_score(scenes, boxes, views, config.loss, True, matches)
+    losses, matches = match_and_score(
+        scenes, boxes, views, config.loss, config.model.completeness_target, True, matches
+    )
     # An image does not tell how many objects there are beside those that it shows (supplement D).
     del losses["completeness"]
     total = weighted_sum(losses, config.loss)

@@ -12,7 +12,7 @@ from sceneprior.reconstruction.observed import ObservedImage, as_views
 from sceneprior.reconstruction.refinement import refine
 from sceneprior.reconstruction.starts import starting_latents
 from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.training.checkpoints import TrainedPrior
+from sceneprior.training.method import TrainedPrior
 from sceneprior.views import DecodedScenes
 
 BATCH = 128
@@ -70,8 +70,8 @@ def reconstruct(
     check_options(options)
     if not trained.remembers_rooms:
         raise InputError(
-            f"Fitting starts from training rooms, and a run of `stages: {trained.config.stages}` "
-            "keeps no latents of them; take a run of `stages: two`."
+            f"Fitting starts from training rooms, and a run of `method: {trained.config.method}` "
+            "keeps no latents of them; take a run of `method: ours`."
         )
     for image in images:
         if image.label_set != trained.config.label_set:

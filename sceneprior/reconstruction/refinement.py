@@ -7,7 +7,7 @@ from torch import Tensor
 
 from sceneprior.geometry.boxes import place
 from sceneprior.reconstruction.fit import Fit, ViewLoss, view_loss
-from sceneprior.training.checkpoints import TrainedPrior
+from sceneprior.training.method import TrainedPrior
 from sceneprior.views import DecodedScenes, SceneViews
 
 STEPS = 100

@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from sceneprior.config import LossConfig
+from sceneprior.config import LossConfig, load_run
 from sceneprior.errors import InputError
 from sceneprior.evaluation.metrics.mesh_metrics import POINTS
 from sceneprior.evaluation.reference import reference_scenes
@@ -24,7 +24,6 @@ from sceneprior.reconstruction.observed import ObservedImage, image_of_room, ima
 from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct
 from sceneprior.scene import Scene, SceneObject
 from sceneprior.shards import iterate_rooms
-from sceneprior.training.checkpoints import load_run
 
 TITLES = {
     "scenes": "given scenes",

@@ -7,7 +7,7 @@ from torch import Tensor
 from sceneprior.errors import InputError
 from sceneprior.generation.sample import sample_latents
 from sceneprior.reconstruction.fit import rows_of, view_loss
-from sceneprior.training.checkpoints import TrainedPrior
+from sceneprior.training.method import TrainedPrior
 from sceneprior.views import DecodedScenes, SceneViews
 
 STARTS = ("nearest", "random")

@@ -16,6 +16,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from sceneprior.training.checkpoints import write_checkpoint
 from sceneprior.training.objective import batch_number, step_seed
 
 
@@ -89,17 +90,3 @@ class RollingCheckpoint(Callback):
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
         write_checkpoint(trainer, self.folder, "last.ckpt")
-
-
-def write_checkpoint(trainer: lightning.Trainer, folder: Path, name: str) -> None:
-    """Write to a temporary name and move into place; all processes call, the first writes."""
-    part = folder / f"{name}.part"
-    try:
-        trainer.save_checkpoint(part)
-        if trainer.is_global_zero:
-            part.replace(folder / name)
-    finally:
-        if trainer.is_global_zero:
-            part.unlink(missing_ok=True)
-    # Others may be about to read it.
-    trainer.strategy.barrier()

@@ -1,11 +1,10 @@
-"""Choosing checkpoints by what they generate: look now and then, log, keep the best.
+"""Choosing checkpoints by what they generate: evaluate now and then, log, keep the best.
 
-What a look is, is not known here: `fit` is handed a `Judge`, since generating and scoring are
-above training (docs/architecture.md). `experiments/evaluate_samples.py` makes
-the one that the command uses.
+How samples are scored is not known here: `fit` is handed a function, since generating and scoring
+are above training (docs/architecture.md). `experiments/evaluate_samples.py` makes the one that the
+command uses.
 """
 
-import copy
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -20,10 +19,9 @@ from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from numpy import ndarray
 from PIL import Image
 
-from sceneprior.config import RunConfig
 from sceneprior.errors import InputError
-from sceneprior.training.callbacks import write_checkpoint
-from sceneprior.training.checkpoints import SAMPLERS, TrainedPrior, TrainedSampler
+from sceneprior.training.checkpoints import write_checkpoint
+from sceneprior.training.method import RunConfig, Trained
 
 LOW_IS_BETTER = ("category_kl", "objects_off", "overlaps")
 """Of the metrics that `samples.metric` may name; of the others high is better."""
@@ -31,7 +29,7 @@ LOW_IS_BETTER = ("category_kl", "objects_off", "overlaps")
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """What a look at a prior says."""
+    """Scores and a picture of what a prior generates."""
 
     scores: Mapping[str, float]
     """By name, finite or NaN; logged as `samples/<name>`."""
@@ -40,33 +38,37 @@ class EvaluationResult:
     """The split that the scores compare with."""
 
 
-Judge = Callable[[TrainedPrior | TrainedSampler], EvaluationResult]
+Evaluate = Callable[[Trained], EvaluationResult]
 
 
 class SampleMonitor(Callback):
-    """Every few epochs, and after the last one, judge the prior as it stands.
+    """Every few epochs, and after the last one, evaluate the prior as it stands.
 
     Leaves `samples/<epoch>.png` (whatever the loggers), `samples.json` (the newest scores, the
-    best, and what they compare with) and `best.ckpt`. Training goes on as if nobody had looked:
-    a copy of the network is judged, on the CPU, and each batch has a seed of its own.
+    best, and what they compare with) and `best.ckpt`. Training goes on as if nothing had been
+    evaluated: it is done on a copy of the network, on the CPU, and each batch has its own seed.
 
-    Of several processes the first looks; the others wait for what it tells them, its errors
-    included. The best so far is part of every checkpoint, so a resumed run goes on choosing where
-    it stopped.
+    Of several processes the first evaluates; the others wait for its scores, or its error. The
+    best so far is part of every checkpoint, so a resumed run goes on choosing where it stopped.
 
     Args:
         folder: Of the stage.
         config: The run's; its section `samples` says when and by what.
-        stage: Of `STAGES`.
+        stage: Its name.
         room_ids: Of the training rooms.
-        judge: Takes the look.
+        evaluate: Scores a copy of what is being trained.
     """
 
     def __init__(
-        self, folder: Path, config: RunConfig, stage: str, room_ids: tuple[str, ...], judge: Judge
+        self,
+        folder: Path,
+        config: RunConfig,
+        stage: str,
+        room_ids: tuple[str, ...],
+        evaluate: Evaluate,
     ):
         self.folder, self.config, self.stage = folder, config, stage
-        self.room_ids, self.judge = room_ids, judge
+        self.room_ids, self.evaluate = room_ids, evaluate
         self.best: float | None = None
         self.best_epoch: int | None = None
 
@@ -84,38 +86,31 @@ class SampleMonitor(Callback):
         problem: Exception | None = None
         if trainer.is_global_zero:
             try:
-                verdict = self.judge(self._prior_of(pl_module))
-                told = (dict(verdict.scores), "")
-                self._show(trainer, verdict, done)
+                result = self.evaluate(self.config.trained(pl_module, self.stage, self.room_ids))
+                told = (dict(result.scores), "")
+                self._show(trainer, result, done)
             except Exception as error:
                 problem = error
                 told = ({}, f"{type(error).__name__}: {error}")
-        # Whoever waits here must hear of a failure, or waits for ever.
+        # A process that waits here must be told of a failure, or waits for ever.
         scores, trouble = trainer.strategy.broadcast(told)
         if problem is not None:
             raise problem
         if trouble:
-            raise InputError(f"Judging generated rooms failed in the first process: {trouble}")
+            raise InputError(f"Evaluating generated rooms failed in the first process: {trouble}")
         for name, score in scores.items():
             pl_module.log(f"samples/{name}", score, on_epoch=True, rank_zero_only=True)
         if self._is_best(scores):
             self.best, self.best_epoch = scores[self.config.samples.metric], done
             write_checkpoint(trainer, self.folder, "best.ckpt")
         if trainer.is_global_zero:
-            self._note(verdict, done)
-
-    def _prior_of(self, module: Any) -> TrainedPrior | TrainedSampler:
-        prior = copy.deepcopy(module.prior).cpu().eval().requires_grad_(False)
-        if self.stage in SAMPLERS:
-            return TrainedSampler(prior, self.room_ids, self.config, self.stage)
-        logits = module.latents.weight.detach().cpu().clone()
-        return TrainedPrior(prior, logits, self.room_ids, self.config, self.stage)
+            self._note(result, done)
 
     def _is_best(self, scores: Mapping[str, float]) -> bool:
         metric = self.config.samples.metric
         if metric not in scores:
             raise InputError(
-                f"samples.metric is {metric}, but a look gave only {', '.join(scores)}; name one "
+                f"samples.metric is {metric}, but there are only {', '.join(scores)}; name one "
                 "of these."
             )
         score = scores[metric]
@@ -123,24 +118,24 @@ class SampleMonitor(Callback):
             return not math.isnan(score)
         return score < self.best if metric in LOW_IS_BETTER else score > self.best
 
-    def _show(self, trainer: lightning.Trainer, verdict: EvaluationResult, done: int) -> None:
+    def _show(self, trainer: lightning.Trainer, result: EvaluationResult, done: int) -> None:
         folder = self.folder / "samples"
         folder.mkdir(exist_ok=True)
-        Image.fromarray(verdict.picture).save(folder / f"{done:05d}.png")
+        Image.fromarray(result.picture).save(folder / f"{done:05d}.png")
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 logger.experiment.add_image(
-                    "samples", verdict.picture, trainer.global_step, dataformats="HWC"
+                    "samples", result.picture, trainer.global_step, dataformats="HWC"
                 )
             elif isinstance(logger, WandbLogger):
-                logger.log_image("samples", [verdict.picture], trainer.global_step)
+                logger.log_image("samples", [result.picture], trainer.global_step)
 
-    def _note(self, verdict: EvaluationResult, done: int) -> None:
+    def _note(self, result: EvaluationResult, done: int) -> None:
         metric = self.config.samples.metric
         note = {
             "epoch": done,
-            "scores": {k: None if math.isnan(v) else v for k, v in verdict.scores.items()},
-            "compared_with": f"{verdict.against} rooms",
+            "scores": {k: None if math.isnan(v) else v for k, v in result.scores.items()},
+            "compared_with": f"{result.against} rooms",
             "best": {"metric": metric, "score": self.best, "epoch": self.best_epoch},
         }
         part = self.folder / "samples.json.part"

@@ -1,4 +1,4 @@
-"""Decoded scenes and what cameras saw in, weighted losses out: the part both stages share."""
+"""The view loss of decoded scenes, and what else both stages share: latents, optimiser, seeds."""
 
 import lightning
 import numpy as np
@@ -8,16 +8,15 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 from torch import distributed as dist
 
-from sceneprior.config import LossConfig, RunConfig, ShapeConfig, StageConfig
 from sceneprior.geometry.boxes import beveled_cube, box_corners, place
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.losses.layout import layout_losses
 from sceneprior.losses.matching import Matches, match_objects
-from sceneprior.losses.shape import observed_ids
 from sceneprior.models.prior import ScenePrior
 from sceneprior.silhouettes.render import render_silhouettes
+from sceneprior.training.settings import LossConfig, ShapeConfig, StageConfig
 from sceneprior.views import DecodedScenes, RoomBoxes, SceneViews
 
 POINTS_LEVEL = 2
@@ -46,6 +45,7 @@ def match_and_score(
     boxes: Boxes2D,
     views: SceneViews,
     weights: LossConfig,
+    completeness_target: str,
     per_room: bool = False,
     matches: Matches | None = None,
 ) -> tuple[dict[str, Float[Tensor, "*rooms"]], Matches]:
@@ -55,15 +55,15 @@ def match_and_score(
         scenes, boxes: Predictions, and where the views would see them.
         views: What the cameras saw.
         weights: Of the run.
+        completeness_target: Of the model.
         per_room: Losses of each room alone.
         matches: To keep; None matches anew.
     """
     if matches is None:
         matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
     losses = layout_losses(
-        scenes, boxes, views, matches, weights.occlusion_slack, weights.completeness_target,
-        per_room,
-    )  # fmt: skip
+        scenes, boxes, views, matches, weights.occlusion_slack, completeness_target, per_room
+    )
     return losses, matches
 
 
@@ -84,11 +84,11 @@ def seen_masks(
 ) -> Float[Tensor, "rooms views objects height width"]:
     """Soft visible masks of decoded objects, at the size of the views' instance ids.
 
-    Only the first n predictions of a room of n objects are drawn: they answer for objects, and
-    the rest would hide them.
+    Only the first n predictions of a room of n objects are drawn: they are matched to objects,
+    and the rest would hide them.
     """
-    slots = torch.arange(vertices_m.shape[1], device=vertices_m.device)
-    height, width = observed_ids(views).shape[-2:]
+    predictions = torch.arange(vertices_m.shape[1], device=vertices_m.device)
+    height, width = views.observed_ids.shape[-2:]
     return render_silhouettes(
         vertices_m,
         faces,
@@ -98,7 +98,7 @@ def seen_masks(
         sigma_px2=settings.sigma_px2,
         mode=settings.silhouettes,
         compositing=settings.compositing,
-        drawn=slots < views.is_object.sum(dim=-1, keepdim=True),
+        drawn=predictions < views.is_object.sum(dim=-1, keepdim=True),
     )
 
 
@@ -145,21 +145,6 @@ def full_precision(device: torch.device) -> torch.autocast:
     return torch.autocast(device.type, enabled=False)
 
 
-def build_prior(config: RunConfig, classes: int) -> ScenePrior:
-    """The network a config describes, freshly initialised from its seed."""
-    torch.manual_seed(config.seed)
-    # A GAN's objects are never void: see docs/baselines_2d.md.
-    void = config.stages != "gan"
-    return ScenePrior(classes=classes, void=void, seed=config.seed, **config.model.model_dump())
-
-
-def build_latents(config: RunConfig, rooms: int) -> nn.Embedding:
-    """One row of latent logits a training room, drawn from N(0, 1)."""
-    generator = torch.Generator().manual_seed(config.seed + 1)
-    logits = torch.randn(rooms, config.model.logits_per_room, generator=generator)
-    return nn.Embedding.from_pretrained(logits, freeze=False)
-
-
 def batch_number(trainer: lightning.Trainer, batch_idx: int) -> int:
     """How many batches came before this one; `accumulate` makes several of them one step."""
     return trainer.current_epoch * int(trainer.num_training_batches) + batch_idx
@@ -171,51 +156,75 @@ def step_seed(seed: int, batch: int, rank: int) -> int:
 
 
 def training_latents(
-    prior: ScenePrior,
-    latents: nn.Embedding,
+    module: lightning.LightningModule,
     rows: Int[Tensor, " rooms"],
     stage: StageConfig,
-    progress: float,
     seed: int,
+    batch_idx: int,
 ) -> Float[Tensor, "rooms width"]:
-    """The rooms' points of the latent space, moved a little where the stage asks for it.
+    """The rooms' latents z, moved at random as far as the stage says.
 
     Args:
-        prior, latents: Of the run.
+        module: Has `prior` and `latents`, and knows how far the training is.
         rows: Which rooms.
-        stage: Says how far to move.
-        progress: Share of the stage that is done, 0 to 1.
-        seed: Of this step's noise.
+        stage: Says how far to move, at its start and end.
+        seed: Of the run.
+        batch_idx: Of the epoch.
     """
+    prior, latents = module.prior, module.latents
+    assert isinstance(prior, ScenePrior) and isinstance(latents, nn.Embedding)
     end = stage.latent_noise if stage.latent_noise_end is None else stage.latent_noise_end
-    noise = stage.latent_noise + progress * (end - stage.latent_noise)
+    done = module.current_epoch / stage.epochs
+    noise = stage.latent_noise + done * (end - stage.latent_noise)
     with full_precision(rows.device):
         z = prior.latent_space(latents(rows))
-        return prior.latent_space.step(z, noise, seed) if noise else z
+        if not noise:
+            return z
+        batch = batch_number(module.trainer, batch_idx)
+        return prior.latent_space.step(z, noise, step_seed(seed, batch, module.global_rank))
+
+
+def log_losses(
+    module: lightning.LightningModule, values: dict[str, Tensor], total: Tensor, rooms: int
+) -> None:
+    """Log means over an epoch and all processes, as `train/<name>` and `train/loss`."""
+    named = {f"train/{name}": value.detach() for name, value in (values | {"loss": total}).items()}
+    module.log_dict(named, on_step=False, on_epoch=True, batch_size=rooms, sync_dist=True)
 
 
 def build_optimizer(
-    prior: ScenePrior, latents: nn.Embedding, stage: StageConfig, steps: int
+    prior: ScenePrior,
+    latents: nn.Embedding,
+    stage: StageConfig,
+    steps: int,
+    shape_rate: float | None = None,
 ) -> OptimizerLRSchedulerConfig:
-    """Adam with the stage's schedule over `steps` updates, in the shape Lightning takes."""
+    """Adam with the stage's schedule over `steps` updates, in the shape Lightning takes.
+
+    `shape_rate` is the shape decoder's learning rate; None: that of the rest.
+    """
     fresh = list(prior.shape.parameters())
     tables = [*latents.parameters(), *prior.bevels.parameters()]
     others = ("shape.", "bevels.")
     trained = [item for name, item in prior.named_parameters() if not name.startswith(others)]
-    fresh_rate = getattr(stage, "decoder_learning_rate", None) or stage.learning_rate
     groups = [
         {"params": trained, "lr": stage.learning_rate},
-        {"params": fresh, "lr": fresh_rate},
+        {"params": fresh, "lr": shape_rate or stage.learning_rate},
         {"params": tables, "lr": stage.latent_learning_rate},
     ]
     optimizer = torch.optim.Adam(groups, fused=True)
     if stage.schedule == "cosine":
-        rates = [group["lr"] for group in optimizer.param_groups]
-        rise = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, rates, total_steps=steps + 1, pct_start=0.05, cycle_momentum=False
-        )
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rise, "interval": "step"}}
+        return with_cosine(optimizer, steps)
     drops = torch.optim.lr_scheduler.MultiStepLR(
         optimizer, list(stage.milestones), gamma=stage.decay
     )
     return {"optimizer": optimizer, "lr_scheduler": drops}
+
+
+def with_cosine(optimizer: torch.optim.Optimizer, steps: int) -> OptimizerLRSchedulerConfig:
+    """The optimiser with rates that rise for a twentieth of `steps`, then fall to 0 by a cosine."""
+    rates = [group["lr"] for group in optimizer.param_groups]
+    rise = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, rates, total_steps=steps + 1, pct_start=0.05, cycle_momentum=False
+    )
+    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rise, "interval": "step"}}

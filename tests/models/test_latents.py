@@ -7,7 +7,7 @@ import torch
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.models.latents import LatentCube, LatentSphere, jitter, slerp, slerp_pairs
+from sceneprior.models.latents import LatentCube, LatentSphere, jitter, slerp, slerp
 
 
 def test_latents_are_positive_mixtures_of_unit_anchors_on_the_unit_sphere(torch_rng):
@@ -79,7 +79,7 @@ def test_what_the_sphere_knows_of_near_between_and_steps(torch_rng):
     angles = torch.acos(near.clamp(-1, 1))
     assert_close((z[:2, None] - z).norm(dim=-1), 2 * torch.sin(angles / 2), rtol=0, atol=1e-7)
     along = torch.tensor([0.2, 0.9], dtype=torch.float64)
-    assert torch.equal(sphere.between(z[:2], z[2:4], along), slerp_pairs(z[:2], z[2:4], along))
+    assert torch.equal(sphere.between(z[:2], z[2:4], along), slerp(z[:2], z[2:4], along))
     assert torch.equal(sphere.step(z, 0.3, 4), jitter(z, 0.3, 4))
 
 

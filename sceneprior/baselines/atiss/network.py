@@ -1,4 +1,4 @@
-"""Placed boxes in, the next box's distribution out: the ATISS baseline, which learns from 3D.
+"""The network of ATISS: the distribution of the next box, given those that are placed.
 
 Source: Paschalidou et al., "ATISS: Autoregressive Transformers for Indoor Scene Synthesis", NeurIPS
 2021. Where we differ: docs/baselines_3d.md.
@@ -8,10 +8,12 @@ import math
 
 import torch
 from jaxtyping import Bool, Float, Int
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from sceneprior.baselines.atiss.logistics import LogisticMixture, draw_index
 from sceneprior.models.layers import mlp
+from sceneprior.settings import Section
 from sceneprior.views import RoomBoxes
 
 END = 0
@@ -28,6 +30,29 @@ BATCH = 256
 """Rooms sampled at a time."""
 
 
+class AtissModel(Section):
+    """Size of the network; the defaults are the published settings."""
+
+    max_objects: int = Field(ge=1)
+    """Where sampling stops, if the end was not drawn before."""
+    width: int = Field(512, ge=8)
+    """Of the encoder and the hidden layers."""
+    layers: int = Field(4, ge=1)
+    """Of the transformer encoder."""
+    heads: int = Field(8, ge=1)
+    hidden: int = Field(1024, ge=8)
+    """Inner width of its feed-forward layers."""
+    mixtures: int = Field(10, ge=1)
+    """K, logistics a coordinate."""
+    dropout: float = Field(0.1, ge=0, lt=1)
+
+    @model_validator(mode="after")
+    def _heads_divide_width(self) -> "AtissModel":
+        if self.width % self.heads:
+            raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
+        return self
+
+
 class Atiss(nn.Module):
     """Objects one after the other, each given the set of those before it.
 
@@ -37,28 +62,17 @@ class Atiss(nn.Module):
     number is a mixture of logistics of its own. An object is seven `numbers` in [-1, 1].
 
     Args:
+        config: Sizes.
         classes: Size of the label set, void included.
-        max_objects: Where sampling stops, if the end was not drawn before.
-        width, layers, heads, hidden, dropout: Of the encoder.
-        mixtures: Logistics a coordinate.
     """
 
     low_m: Tensor
     high_m: Tensor
 
-    def __init__(
-        self,
-        classes: int,
-        max_objects: int,
-        width: int,
-        layers: int,
-        heads: int,
-        hidden: int,
-        mixtures: int,
-        dropout: float,
-    ):
+    def __init__(self, config: AtissModel, classes: int):
         super().__init__()
-        self.max_objects = max_objects
+        width = config.width
+        self.max_objects = config.max_objects
         self.register_buffer("low_m", torch.zeros(6))
         self.register_buffer("high_m", torch.ones(6))
         self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
@@ -66,16 +80,16 @@ class Atiss(nn.Module):
         self.query = nn.Parameter(torch.randn(width))
         self.encoder = nn.ModuleList(
             nn.TransformerEncoderLayer(
-                width, heads, hidden, dropout, activation="gelu", batch_first=True
+                width, config.heads, config.hidden, config.dropout, "gelu", batch_first=True
             )
             # Each drawn by itself; nn.TransformerEncoder would start with copies of one.
-            for _ in range(layers)
+            for _ in range(config.layers)
         )
         self.class_head = _head(width, classes)
         known = width + CLASS_WIDTH
         self.heads = nn.ModuleDict(
             {
-                name: _head(known + start * 2 * OCTAVES, (end - start) * 3 * mixtures)
+                name: _head(known + start * 2 * OCTAVES, (end - start) * 3 * config.mixtures)
                 for name, (start, end) in PARTS.items()
             }
         )
@@ -110,7 +124,7 @@ class Atiss(nn.Module):
         is_object: Bool[Tensor, "rooms objects"],
     ) -> Float[Tensor, "rooms width"]:
         """What a set of objects, in whatever order, means for the next one."""
-        objects = torch.cat([self.class_embedding(object_class), waves(unit)], dim=-1)
+        objects = torch.cat([self.class_embedding(object_class), fourier_features(unit)], dim=-1)
         query = self.query.expand(len(unit), 1, -1)
         tokens = torch.cat([query, self.object(objects)], dim=1)
         padding = torch.cat([is_object.new_zeros(len(unit), 1), ~is_object], dim=1)
@@ -129,17 +143,17 @@ class Atiss(nn.Module):
         class_log_prob = self.class_head(context).log_softmax(dim=-1)
         found = {"class": class_log_prob.gather(-1, next_class[:, None])[:, 0]}
         for name, (start, end) in PARTS.items():
-            distribution = self._distribution(name, context, next_class, next_unit)
-            log_prob = distribution.log_prob(next_unit[:, start:end]).sum(dim=-1)
+            mixture = self._mixture(name, context, next_class, next_unit)
+            log_prob = mixture.log_prob(next_unit[:, start:end]).sum(dim=-1)
             found[name] = log_prob * (next_class != END)
         return found
 
-    def _distribution(
+    def _mixture(
         self, name: str, context: Tensor, label: Tensor, unit: Tensor
     ) -> LogisticMixture:
         """Of one of `PARTS`, given the class and those of the numbers `unit` that come before."""
         start, end = PARTS[name]
-        known = [context, self.class_embedding(label), waves(unit[:, :start])]
+        known = [context, self.class_embedding(label), fourier_features(unit[:, :start])]
         features = self.heads[name](torch.cat(known, dim=-1))
         return LogisticMixture.of(features.unflatten(-1, (end - start, -1)))
 
@@ -167,15 +181,13 @@ class Atiss(nn.Module):
             label = draw_index(self.class_head(context), drawn[:, 0])
             going = going & (label != END)
             for name, (start, end) in PARTS.items():
-                distribution = self._distribution(name, context, label, unit[:, step])
-                unit[:, step, start:end] = distribution.draw(
-                    choice[:, start:end], place[:, start:end]
-                )
+                mixture = self._mixture(name, context, label, unit[:, step])
+                unit[:, step, start:end] = mixture.draw(choice[:, start:end], place[:, start:end])
             labels[:, step] = label.where(going, END)
         return labels, unit
 
 
-def waves(unit: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch waves"]:
+def fourier_features(unit: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch features"]:
     """Each number of [-1, 1] as sines and cosines of `OCTAVES` octaves."""
     octaves = math.pi * 2.0 ** torch.arange(OCTAVES, device=unit.device, dtype=unit.dtype)
     phase = (unit.unsqueeze(-1) * octaves).flatten(-2)

@@ -1,37 +1,72 @@
-"""Baseline with 3D supervision: ATISS learns the next object's class, position, angle and size."""
+"""The baseline ATISS with 3D supervision: its config, and its training by maximum likelihood."""
 
 from dataclasses import replace
-from typing import NamedTuple
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import lightning
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from sceneprior.baselines.atiss.network import END, Atiss
-from sceneprior.baselines.box_training import build_box_optimizer, total_of_rooms
+from sceneprior.baselines.atiss.network import END, Atiss, AtissModel
+from sceneprior.baselines.box_training import (
+    BoxConfig,
+    BoxTraining,
+    build_box_optimizer,
+    total_of_rooms,
+)
 from sceneprior.baselines.true_boxes import TruthDataset
-from sceneprior.classes import label_set
-from sceneprior.config import RunConfig
 from sceneprior.training.objective import batch_number, full_precision, step_seed
 from sceneprior.views import RoomBoxes
 
 
-class Atiss3dStage(lightning.LightningModule):
+class AtissTraining(BoxTraining):
+    """Do not clip gradients (docs/baselines_3d.md). The defaults are the published settings."""
+
+    epochs: int = Field(500, ge=1)
+    """With turned copies of 6,300 rooms these are the published 100,000 steps."""
+    batch_size: int = Field(128, ge=1)
+    learning_rate: float = Field(1e-4, gt=0)
+
+
+class AtissConfig(BoxConfig):
+    """A run of ATISS."""
+
+    method: Literal["atiss"] = "atiss"
+    model: AtissModel
+    training: AtissTraining = AtissTraining()
+
+    @property
+    def _most(self) -> int:
+        return self.model.max_objects
+
+    def build_network(self) -> Atiss:
+        torch.manual_seed(self.seed)
+        return Atiss(self.model, self.classes)
+
+    def build(self, rooms: TruthDataset, previous: Path | None) -> "AtissStage":
+        network = self.build_network()
+        network.fit_bounds(rooms.everything())
+        return AtissStage(network, self.training, self.seed)
+
+
+class AtissStage(lightning.LightningModule):
     """Maximum likelihood of one object of each room, given some of the others.
 
     Args:
         prior: The network, which knows the range of the training rooms' boxes.
-        config: The run.
+        training: How it is trained.
+        seed: Of the run.
     """
 
-    def __init__(self, prior: Atiss, config: RunConfig):
+    def __init__(self, prior: Atiss, training: AtissTraining, seed: int):
         super().__init__()
-        self.prior = prior
-        self.config = config
+        self.prior, self.training_settings, self.seed = prior, training, seed
 
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
         batch = batch_number(self.trainer, batch_idx)
-        part = part_of_rooms(rooms, step_seed(self.config.seed, batch, self.global_rank))
+        part = part_of_rooms(rooms, step_seed(self.seed, batch, self.global_rank))
         placed, coming = self.prior.to_unit(part.placed), self.prior.to_unit(part.coming)
         context = self.prior.context(part.placed.object_class, placed, part.placed.is_object)
         with full_precision(self.device):
@@ -42,7 +77,7 @@ class Atiss3dStage(lightning.LightningModule):
 
     def configure_optimizers(self):
         steps = int(self.trainer.estimated_stepping_batches)
-        return build_box_optimizer(self.prior, self.config.atiss3d, steps)
+        return build_box_optimizer(self.prior, self.training_settings, steps)
 
 
 class PartialRooms(NamedTuple):
@@ -69,26 +104,3 @@ def part_of_rooms(rooms: RoomBoxes, seed: int) -> PartialRooms:
         replace(shuffled, object_class=shuffled.object_class * placed, is_object=placed),
         replace(coming, object_class=coming.object_class.where(more, END), is_object=more),
     )
-
-
-def build_network(config: RunConfig) -> Atiss:
-    """The network a config describes, freshly initialised from its seed."""
-    torch.manual_seed(config.seed)
-    settings = config.atiss3d
-    return Atiss(
-        classes=len(label_set(config.label_set)),
-        max_objects=config.model.max_objects,
-        width=settings.width,
-        layers=settings.layers,
-        heads=settings.heads,
-        hidden=settings.hidden,
-        mixtures=settings.mixtures,
-        dropout=settings.dropout,
-    )
-
-
-def build(config: RunConfig, dataset: TruthDataset) -> Atiss3dStage:
-    """The stage at its start."""
-    prior = build_network(config)
-    prior.fit_bounds(dataset.everything())
-    return Atiss3dStage(prior, config)

@@ -1,4 +1,4 @@
-"""Semantic maps of rooms in, how real each patch, and each room, looks out: the GAN's opponent."""
+"""The GAN's discriminator: how real each patch of a map, and each room, looks."""
 
 import torch
 from jaxtyping import Float

@@ -1,7 +1,7 @@
-"""Scores and generated scenes in; what a GAN's two players minimise, beside the maps, out.
+"""Losses of the GAN: the adversarial one, and penalties and aims of the generator.
 
-`mistaken` is the game. Everything else is what a discriminator of maps does not say, or says too
-late; docs/baselines_2d.md tells what happens without each.
+`adversarial_loss` is what both players minimise. The others are what a discriminator of maps does
+not say, or says too late; docs/baselines_2d.md tells what happens without each.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,8 @@ from sceneprior.geometry.cameras import camera_centers
 from sceneprior.views import DecodedScenes, SceneViews
 
 VARIED = (1.5, 1.5, 0.3, 0.3, 0.3)
-"""Spread over rooms, in metres, that a slot's x, z, width, height and depth are pushed towards."""
+"""Spread over rooms, in metres, that the k-th object's x, z, width, height and depth are pushed
+towards."""
 
 AREA = 10
 """As how many objects of a class it counts if all pixels are of it: shares are a few hundredths."""
@@ -29,7 +30,7 @@ SIZES_M = (0.1, 2.5)
 """What generated sizes are to stay between."""
 
 
-def mistaken(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
+def adversarial_loss(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
     """Cross entropy of scores, as logits of being real, with what is wanted of them.
 
     Patches and rooms count alike. The generator minimises it for its own maps as if these were
@@ -46,7 +47,7 @@ def contents(
     return torch.cat([counts, AREA * maps.mean(dim=(1, 3, 4))], dim=-1)
 
 
-def implausible(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""]:
+def bounds_penalty(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""]:
     """How far boxes reach out of where cameras go, and sizes out of `SIZES_M`, in metres: a mean.
 
     A discriminator of maps cannot tell a bed from a bed-coloured wall behind the room, and what no
@@ -64,14 +65,14 @@ def implausible(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""]:
     return torch.stack(outside).mean()
 
 
-def certainty(scenes: DecodedScenes) -> Float[Tensor, ""]:
+def logit_penalty(scenes: DecodedScenes) -> Float[Tensor, ""]:
     """Mean squares of the logits that decide: 0 is undecided. `void` is no choice."""
     classes = scenes.class_logits[..., VOID + 1 :]
     return classes.square().mean() + scenes.completeness_logits.square().mean()
 
 
-def sameness(scenes: DecodedScenes) -> Float[Tensor, ""]:
-    """How alike a slot's objects are in all rooms: minus the mean log spread of place and size, as
+def diversity_loss(scenes: DecodedScenes) -> Float[Tensor, ""]:
+    """How alike the k-th objects of all rooms are: minus the mean log spread of place and size, as
     a share of `VARIED`.
 
     It is minus the entropy of normal distributions of their spread (after Kumar et al., "Maximum

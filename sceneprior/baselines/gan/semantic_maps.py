@@ -1,4 +1,4 @@
-"""Decoded scenes, or what cameras saw, in; semantic maps out: per pixel, how much of each class."""
+"""Semantic maps: per pixel the share of each class, of decoded scenes or of what cameras saw."""
 
 import torch
 from jaxtyping import Float, Int
@@ -8,16 +8,15 @@ from torch.nn import functional as F
 from sceneprior.classes import VOID
 from sceneprior.geometry.cameras import project
 from sceneprior.losses.completeness import kept_share
-from sceneprior.losses.shape import observed_ids
 from sceneprior.silhouettes.render import render_scene
 from sceneprior.views import DecodedScenes, SceneViews
 
-LENS = 2
+POOLING = 2
 """Pixels of the instance ids on the side of one of a map. What is real has hard edges and what is
-rendered has soft ones, which would give it away; seen through this lens both are soft."""
+rendered has soft ones, which would give it away; pooled, both are soft."""
 
 SIGMA_PX2 = 0.25
-"""Softness of rendered edges: about that of a hard edge under the lens, from 0.27 to 0.73 within
+"""Softness of rendered edges: about that of a hard edge after pooling, from 0.27 to 0.73 within
 half a pixel to either side."""
 
 
@@ -25,11 +24,11 @@ def observed_maps(
     views: SceneViews, classes: int
 ) -> Float[Tensor, "rooms views classes height width"]:
     """What the views show: the share of each class in a pixel, of `void` where no object is."""
-    ids = observed_ids(views).long()
+    ids = views.observed_ids.long()
     of_id = F.pad(views.object_class, (1, 0), value=VOID)
     pixels = of_id.gather(1, ids.flatten(1)).view_as(ids)
     maps = F.one_hot(pixels, classes).movedim(-1, 2).to(views.intrinsics.dtype)
-    return F.avg_pool2d(maps.flatten(0, 1), LENS).unflatten(0, maps.shape[:2])
+    return F.avg_pool2d(maps.flatten(0, 1), POOLING).unflatten(0, maps.shape[:2])
 
 
 def rendered_maps(
@@ -50,7 +49,7 @@ def rendered_maps(
         mode: Of `render_silhouettes`.
     """
     assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
-    height, width = (side / LENS for side in observed_ids(views).shape[-2:])
+    height, width = (side / POOLING for side in views.observed_ids.shape[-2:])
     objects = scenes.vertices_m.shape[1]
     # Each object is drawn as a room of its own: whole, with its own depth.
     alone = render_scene(
@@ -80,7 +79,7 @@ def observed_counts(views: SceneViews, classes: int) -> Float[Tensor, "rooms cla
 def choices(
     scenes: DecodedScenes, completeness_target: str = "first_n"
 ) -> tuple[Float[Tensor, "rooms objects"], Float[Tensor, "rooms objects classes"]]:
-    """Which objects exist, and which class each has, as `tasks.decode` reads them: 0 or 1.
+    """Which objects exist, and which class each has, as decoding reads them: 0 or 1.
 
     So what is drawn and counted is what will be generated. Gradients are those of sigmoid and
     softmax (straight through): what does not exist still learns what it would change.

@@ -1,28 +1,41 @@
-"""The GAN baseline: our network against a discriminator of semantic maps, with no view loss."""
+"""The GAN baseline: our network against a discriminator of semantic maps, without a view loss."""
 
 import copy
 from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
 
 import lightning
 import torch
 from jaxtyping import Float
 from lightning.pytorch.core.optimizer import LightningOptimizer
+from pydantic import Field
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sceneprior.baselines.gan.discriminator import MapDiscriminator
-from sceneprior.baselines.gan.losses import certainty, contents, implausible, mistaken, sameness
+from sceneprior.baselines.gan.losses import (
+    adversarial_loss,
+    bounds_penalty,
+    contents,
+    diversity_loss,
+    logit_penalty,
+)
 from sceneprior.baselines.gan.semantic_maps import (
     choices,
     observed_counts,
     observed_maps,
     rendered_maps,
 )
-from sceneprior.classes import label_set
-from sceneprior.config import RunConfig
+from sceneprior.data.dataset import ViewDataset
 from sceneprior.models.layout_decoder import LayoutDecoder
-from sceneprior.models.prior import ScenePrior
+from sceneprior.models.prior import ModelConfig, ScenePrior
+from sceneprior.models.transformer import TransformerConfig
+from sceneprior.training.checkpoints import restore_prior
+from sceneprior.training.method import PriorConfig, Stage, TrainedPrior
 from sceneprior.training.objective import check_finite, full_precision
+from sceneprior.training.ours import open_views
+from sceneprior.training.settings import TrainConfig
 from sceneprior.views import DecodedScenes, SceneViews
 
 BETAS = (0.0, 0.99)
@@ -34,18 +47,81 @@ width, height, depth before their SoftPlus, then completeness. Metres where they
 
 START_ROOMS = 64
 
-SHAPES = 0.1
+SHAPE_RATE = 0.1
 """Of the generator's learning rate, for the shape decoder: maps are content with sheared boxes."""
 
-SOFT = 0.01
+LOGIT_PENALTY = 0.01
 """Weight of the mean square of class and completeness logits. A choice that is all but certain has
 no gradient: a generator whose objects had all gone would never come back."""
 
-PLAUSIBLE = 10.0
+BOUNDS_PENALTY = 10.0
 """Weight of what leaves where rooms are and how large furniture is."""
 
 MEMORY = 0.9
 """Share of `excess` that is kept at each step: a batch alone says little of rare classes."""
+
+
+class GanTraining(TrainConfig):
+    """How the two opponents are trained; docs/baselines_2d.md says what each setting is for.
+
+    Maps are half as large as the instance ids that `data.mask_step` keeps.
+    """
+
+    epochs: int = Field(400, ge=1)
+    batch_size: int = Field(16, ge=1)
+    """Real rooms a step, and as many generated ones."""
+    accumulate: Literal[1] = 1
+    """The two opponents take turns at every batch."""
+    views_per_room: int = Field(4, ge=1)
+    learning_rate: float = Field(1e-3, gt=0)
+    """Of the generator's Adam; its shape decoder has a tenth."""
+    discriminator_learning_rate: float = Field(4e-3, gt=0)
+    """Of the discriminator's. Too large: it is soon always right, and teaches nothing; too small:
+    the generator runs ahead to whatever it finds unusual."""
+    counts: float = Field(1.0, ge=0)
+    """Weight of the generator's second aim: as much of each class a room, on average, as real rooms
+    have, in objects and in pixels. 0 leaves that to the discriminator, and classes drift."""
+    variety: float = Field(4.0, ge=0)
+    """Weight of the generator's third aim: that the k-th object of different rooms has different
+    places and sizes. Too small: all rooms end up as one; too large: objects are anywhere."""
+    averaging: float = Field(0.97, ge=0, lt=1)
+    """Share of the averaged generator that is kept at each step; 0 keeps the newest alone."""
+    noise: float = Field(0.1, ge=0)
+    """Spread of the noise on all maps at the start; it falls to 0 over the epochs. Without it,
+    classes can be lost for good."""
+    clip_gradient: float = Field(1.0, ge=0)
+    """Largest gradient norm of each of the two; 0 does not clip."""
+    silhouettes: Literal["exact", "fast"] = "fast"
+    """As in the shape stage of `ours`."""
+
+
+class GanModel(ModelConfig):
+    """The paper's network."""
+
+    decoder: TransformerConfig = TransformerConfig()
+
+
+class GanConfig(PriorConfig):
+    """A run of the GAN. Its objects are never void (docs/baselines_2d.md)."""
+
+    method: Literal["gan"] = "gan"
+    model: GanModel
+    training: GanTraining = GanTraining()
+
+    def stages(self) -> tuple[Stage, ...]:
+        return (Stage("gan", self.training, self._open, self._build, steps_itself=True),)
+
+    def load(self, stage: str, path: Path) -> TrainedPrior:
+        prior, latents, room_ids = restore_prior(self, path, void=False)
+        prior.eval().requires_grad_(False)
+        return TrainedPrior(prior, latents.weight.detach(), room_ids, self, stage)
+
+    def _open(self) -> ViewDataset:
+        return open_views(self, self.training.views_per_room, self.data.mask_step)
+
+    def _build(self, rooms: ViewDataset, previous: Path | None) -> "GanStage":
+        # A GAN pairs no point of the latent space with a room.
+        return GanStage(self.build_prior(void=False), self.build_latents(0), self)
 
 
 class GanStage(lightning.LightningModule):
@@ -65,15 +141,15 @@ class GanStage(lightning.LightningModule):
         config: The run.
     """
 
-    def __init__(self, prior: ScenePrior, latents: nn.Embedding, config: RunConfig):
+    def __init__(self, prior: ScenePrior, latents: nn.Embedding, config: GanConfig):
         super().__init__()
         self.automatic_optimization = False
-        self.config = config
-        self.classes = len(label_set(config.label_set))
+        self.model, self.settings = config.model, config.training
+        self.classes = config.classes
         self.generator = prior
         spread_out(prior.layout, prior.decoder(self._latents(START_ROOMS), prior.max_objects))
         self.prior = copy.deepcopy(prior).requires_grad_(False)
-        self.average = get_ema_multi_avg_fn(config.gan.averaging)
+        self.average = get_ema_multi_avg_fn(config.training.averaging)
         self.latents = latents
         self.discriminator = MapDiscriminator(self.classes)
         self.excess: Tensor
@@ -84,26 +160,28 @@ class GanStage(lightning.LightningModule):
         scenes = self.generator.decode(self._latents(len(views.room_index)))
         with full_precision(self.device):
             # Before rendering, too, which refuses vertices that are not finite.
-            undecided = certainty(scenes)
+            undecided = logit_penalty(scenes)
             check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views)
             real = observed_maps(views, self.classes)
             fake, counts = self._draw(scenes, views)
             more = contents(fake, counts) - contents(real, observed_counts(views, self.classes))
             self.excess.lerp_(more.detach().mean(dim=0), 1 - MEMORY)
-            loss = SOFT * undecided + PLAUSIBLE * implausible(scenes, views)
-            loss = loss + self.config.gan.variety * sameness(scenes)
-            loss = loss + self.config.gan.counts * (more @ self.excess).mean()
+            loss = LOGIT_PENALTY * undecided + BOUNDS_PENALTY * bounds_penalty(scenes, views)
+            loss = loss + self.settings.variety * diversity_loss(scenes)
+            loss = loss + self.settings.counts * (more @ self.excess).mean()
 
         # Real maps come in steps that rendered ones lack.
-        noise = self.config.gan.noise * self._left()
+        noise = self.settings.noise * self._left()
         real, fake = (maps + noise * torch.randn_like(maps) for maps in (real, fake))
         real_scores = self.discriminator(real)
         fake_scores = self.discriminator(fake.detach())
-        told_apart = mistaken(real_scores, real=True) + mistaken(fake_scores, real=False)
+        told_apart = adversarial_loss(real_scores, real=True) + adversarial_loss(
+            fake_scores, real=False
+        )
         self._update(discriminator_optimizer, told_apart)
 
         self.discriminator.requires_grad_(False)
-        loss = loss + mistaken(self.discriminator(fake), real=True)
+        loss = loss + adversarial_loss(self.discriminator(fake), real=True)
         check_finite(loss, views)
         self._update(generator_optimizer, loss)
         self.discriminator.requires_grad_(True)
@@ -126,32 +204,32 @@ class GanStage(lightning.LightningModule):
 
     def _left(self) -> float:
         """Share of the training that is still to come."""
-        return 1 - self.current_epoch / self.config.gan.epochs
+        return 1 - self.current_epoch / self.settings.epochs
 
     def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:
-        shape = (rooms, self.config.model.logits_per_room)
+        shape = (rooms, self.model.logits_per_room)
         with full_precision(self.device):
             return self.generator.latent_space(torch.randn(shape, device=self.device))
 
     def _draw(self, scenes: DecodedScenes, views: SceneViews) -> tuple[Tensor, Tensor]:
         """Maps, and how many objects of each class are in each room."""
-        kept, classes = choices(scenes, self.config.loss.completeness_target)
-        faces, mode = self.generator.shape.faces, self.config.shape.silhouettes
+        kept, classes = choices(scenes, self.model.completeness_target)
+        faces, mode = self.generator.shape.faces, self.settings.silhouettes
         maps = rendered_maps(scenes, faces, views, kept, classes, mode)
         return maps, (kept.unsqueeze(-1) * classes).sum(dim=1)
 
     def _update(self, optimizer: LightningOptimizer, loss: Tensor) -> None:
         optimizer.zero_grad()
         self.manual_backward(loss)
-        self.clip_gradients(optimizer, self.config.gan.clip_gradient, "norm")  # type: ignore[arg-type]
+        self.clip_gradients(optimizer, self.settings.clip_gradient, "norm")  # type: ignore[arg-type]
         optimizer.step()
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
-        rates = self.config.gan
+        rates = self.settings
         shape = list(self.generator.shape.parameters())
         others = [p for name, p in self.generator.named_parameters() if "shape." not in name]
         return [
-            _adam((others, rates.learning_rate), (shape, SHAPES * rates.learning_rate)),
+            _adam((others, rates.learning_rate), (shape, SHAPE_RATE * rates.learning_rate)),
             _adam((self.discriminator.parameters(), rates.discriminator_learning_rate)),
         ]
 

@@ -1,4 +1,4 @@
-"""A room's furniture as one matrix in, the same out, through a small latent: the Sync2Gen baseline.
+"""The network of the Sync2Gen-style baseline: a VAE of a room's furniture as one matrix.
 
 Source: Yang et al., "Scene Synthesis via Uncertainty-Driven Attribute Synchronization", ICCV 2021.
 What was ambiguous, and what we chose: docs/baselines_3d.md.
@@ -6,11 +6,13 @@ What was ambiguous, and what we chose: docs/baselines_3d.md.
 
 import torch
 from jaxtyping import Float
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.baselines.sync2gen.pairs import PairPrior
 from sceneprior.models.layers import mlp
+from sceneprior.settings import Section
 from sceneprior.views import RoomBoxes
 
 ATTRIBUTES = 7
@@ -22,6 +24,27 @@ LEAST_SPREAD_M = 0.05
 LEAST_SIZE_M = 0.02
 
 
+class Sync2genModel(Section):
+    """Size of the network; the latent is as released."""
+
+    width: int = Field(512, ge=8)
+    """Of the hidden layers; a multiple of 8."""
+    latent: int = Field(20, ge=1)
+    """Numbers that a room is encoded as."""
+    slots: int = Field(8, ge=1)
+    """Objects of one class that a room can hold (released: 4); further ones are left out, and
+    their share is logged as `train/left_out`."""
+    refine_steps: int = Field(100, ge=0)
+    """Gradient steps on each new room's positions, towards offsets between classes as training
+    rooms have them; 0 takes rooms as decoded (the paper's Sync2Gen*). Acts on sampling alone."""
+
+    @model_validator(mode="after")
+    def _width_in_groups(self) -> "Sync2genModel":
+        if self.width % HIDDEN_GROUP:
+            raise ValueError(f"width {self.width} is not a multiple of {HIDDEN_GROUP}")
+        return self
+
+
 class Sync2Gen(nn.Module):
     """A variational auto-encoder of arrangements: `slots` objects a class, each there or not.
 
@@ -31,23 +54,19 @@ class Sync2Gen(nn.Module):
     `seed`, which holds overfitting down.
 
     Args:
+        config: Sizes.
         classes: Size of the label set, void included.
-        slots: Objects of one class a room can hold.
-        width: Of the hidden layers; a multiple of 8.
-        latent: Numbers a room is boiled down to.
-        refine_steps: Gradient steps on positions after decoding; 0 takes rooms as decoded.
         seed: Chooses the sparse connections.
     """
 
     mean_m: Tensor
     spread_m: Tensor
 
-    def __init__(
-        self, classes: int, slots: int, width: int, latent: int, refine_steps: int, seed: int
-    ):
+    def __init__(self, config: Sync2genModel, classes: int, seed: int):
         super().__init__()
+        slots, width, latent = config.slots, config.width, config.latent
         self.classes, self.slots, self.latent = classes, slots, latent
-        self.refine_steps = refine_steps
+        self.refine_steps = config.refine_steps
         cells = (classes - 1) * slots * ATTRIBUTES
         self.register_buffer("mean_m", torch.zeros(classes - 1, 1, 6))
         self.register_buffer("spread_m", torch.ones(classes - 1, 1, 6))

@@ -1,4 +1,4 @@
-"""How pairs of furniture lie to each other in training rooms; rooms moved towards that.
+"""Offsets between pairs of furniture in training rooms, and rooms moved towards such offsets.
 
 Sync2Gen's synchronisation, in a small form: absolute positions, as uncertain as the decoder is,
 meet relative ones, as uncertain as training rooms are. What is left out: docs/baselines_3d.md.

@@ -1,30 +1,64 @@
-"""Baseline with 3D supervision: the Sync2Gen-style VAE learns to give back whole arrangements."""
+"""The Sync2Gen-style VAE with 3D supervision: its config and its training."""
+
+from pathlib import Path
+from typing import Literal
 
 import lightning
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from sceneprior.baselines.box_training import build_box_optimizer, total_of_rooms
-from sceneprior.baselines.sync2gen.network import Sync2Gen
+from sceneprior.baselines.box_training import (
+    BoxConfig,
+    BoxTraining,
+    build_box_optimizer,
+    total_of_rooms,
+)
+from sceneprior.baselines.sync2gen.network import Sync2Gen, Sync2genModel
 from sceneprior.baselines.true_boxes import TruthDataset
-from sceneprior.classes import label_set
-from sceneprior.config import RunConfig
 from sceneprior.training.objective import full_precision
 from sceneprior.views import RoomBoxes
 
 
+class Sync2genTraining(BoxTraining):
+    """Epochs, batch and rate as released."""
+
+    epochs: int = Field(800, ge=1)
+    batch_size: int = Field(64, ge=1)
+    learning_rate: float = Field(1e-3, gt=0)
+    kl_weight: float = Field(0.1, ge=0)
+    """Of the KL divergence from N(0, 1). Larger: new rooms are more like each other and better
+    formed; smaller: training rooms are remembered better, and what lies between is worse."""
+
+
+class Sync2genConfig(BoxConfig):
+    """A run of the Sync2Gen-style VAE."""
+
+    method: Literal["sync2gen"] = "sync2gen"
+    model: Sync2genModel = Sync2genModel()
+    training: Sync2genTraining = Sync2genTraining()
+
+    def build_network(self) -> Sync2Gen:
+        torch.manual_seed(self.seed)
+        return Sync2Gen(self.model, self.classes, self.seed)
+
+    def build(self, rooms: TruthDataset, previous: Path | None) -> "Sync2genStage":
+        network = self.build_network()
+        network.fit_statistics(rooms.everything(), self.seed)
+        return Sync2genStage(network, self.training)
+
+
 class Sync2genStage(lightning.LightningModule):
-    """What a VAE minimises: how badly rooms are given back, and how far latents are from N(0, 1).
+    """What a VAE minimises: reconstruction errors of rooms, and their latents' KL from N(0, 1).
 
     Args:
         prior: The network, which knows the training rooms' statistics.
-        config: The run.
+        training: How it is trained.
     """
 
-    def __init__(self, prior: Sync2Gen, config: RunConfig):
+    def __init__(self, prior: Sync2Gen, training: Sync2genTraining):
         super().__init__()
-        self.prior = prior
-        self.config = config
+        self.prior, self.training_settings = prior, training
 
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
         matrix = self.prior.to_matrix(rooms)
@@ -41,27 +75,10 @@ class Sync2genStage(lightning.LightningModule):
                 self,
                 rooms,
                 losses,
-                weights={"kl": self.config.sync2gen.kl_weight},
+                weights={"kl": self.training_settings.kl_weight},
                 beside={"left_out": (objects - matrix[..., 0].sum()) / objects.clamp(min=1)},
             )
 
     def configure_optimizers(self):
         steps = int(self.trainer.estimated_stepping_batches)
-        return build_box_optimizer(self.prior, self.config.sync2gen, steps)
-
-
-def build_network(config: RunConfig) -> Sync2Gen:
-    """The network a config describes, freshly initialised from its seed."""
-    torch.manual_seed(config.seed)
-    settings = config.sync2gen
-    return Sync2Gen(
-        classes=len(label_set(config.label_set)), slots=settings.slots, width=settings.width,
-        latent=settings.latent, refine_steps=settings.refine_steps, seed=config.seed,
-    )  # fmt: skip
-
-
-def build(config: RunConfig, dataset: TruthDataset) -> Sync2genStage:
-    """The stage at its start."""
-    prior = build_network(config)
-    prior.fit_statistics(dataset.everything(), config.seed)
-    return Sync2genStage(prior, config)
+        return build_box_optimizer(self.prior, self.training_settings, steps)

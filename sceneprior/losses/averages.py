@@ -1,9 +1,29 @@
-"""Losses of a batch that several processes share: what each process's mean counts for."""
+"""Means over objects: of a batch that several processes share, or of each room alone."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch import distributed as dist
+
+
+def mean_of_objects(
+    values: Float[Tensor, "rooms objects"],
+    counted: Bool[Tensor, "rooms objects"],
+    per_room: bool = False,
+) -> Float[Tensor, "*rooms"]:
+    """Mean over the objects that count; 0 where none does.
+
+    Args:
+        values: One number an object.
+        counted: Which objects count.
+        per_room: One mean a room, whatever else is in the batch: for rooms that are fitted each
+            on its own. Else one mean over all objects of the batch, and of all processes.
+    """
+    weights = counted.to(values.dtype)
+    if per_room:
+        return (values * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
+    count = weights.sum()
+    return (values * weights).sum() / count.clamp(min=1) * share_of_batch(count)
 
 
 def share_of_batch(count: Tensor) -> Float[Tensor, ""]:

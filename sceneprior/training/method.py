@@ -1,0 +1,186 @@
+"""What a method is: a run's config that names its stages and reads what they trained.
+
+`RunConfig` is the protocol. A method's config adds its own sections to it and implements `stages`
+(what `fit` trains), `load` (a checkpoint of a stage) and `trained` (a stage's networks, ready for
+use). The paper's method is `training/ours.py`, baselines have theirs; `config.py` lists all.
+"""
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+import lightning
+import torch
+from jaxtyping import Float
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from sceneprior.classes import label_set
+from sceneprior.errors import InputError
+from sceneprior.models.prior import ModelConfig, ScenePrior
+from sceneprior.settings import Section
+from sceneprior.training.settings import DataConfig, SamplesConfig, TrainConfig
+from sceneprior.views import RoomBoxes
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One LightningModule to train. It has the network as `prior`, and `latents` if any."""
+
+    name: str
+    """The stage's folder in the run."""
+    settings: TrainConfig
+    open_data: Callable[[], Any]
+    """Opens the training rooms: a `ViewDataset`, or a `TruthDataset`."""
+    build: Callable[[Any, Path | None], lightning.LightningModule]
+    """Makes the module from these rooms and the checkpoint of the stage before."""
+    steps_itself: bool = False
+    """The module has several optimisers and steps them: in one process, without accumulation."""
+
+
+class RunConfig(Section, ABC):
+    """What a run of any method is; saved with it as `config.yaml`."""
+
+    method: str
+    label_set: str
+    """A name in `sceneprior/classes.py`, or the user's own list: `void,bed,chair`."""
+    seed: int = Field(0, ge=0)
+    data: DataConfig
+    samples: SamplesConfig = SamplesConfig()
+
+    remembers_rooms: ClassVar[bool] = False
+    """Whether training rooms have latents of their own."""
+
+    @model_validator(mode="after")
+    def _known_label_set(self) -> "RunConfig":
+        try:
+            label_set(self.label_set)
+        except InputError as error:
+            raise ValueError(f"label_set: {str(error).removesuffix('.')}") from None
+        return self
+
+    @property
+    def classes(self) -> int:
+        """Size of the label set."""
+        return len(label_set(self.label_set))
+
+    @abstractmethod
+    def stages(self) -> tuple[Stage, ...]:
+        """What is trained, in order."""
+
+    @abstractmethod
+    def load(self, stage: str, path: Path) -> "Trained":
+        """What a checkpoint of a stage holds, in evaluation mode.
+
+        Raises:
+            InputError: it is damaged, or of another network.
+        """
+
+    @abstractmethod
+    def trained(
+        self, networks: lightning.LightningModule, stage: str, room_ids: tuple[str, ...]
+    ) -> "Trained":
+        """A copy of a module's networks as they stand, on the CPU and in evaluation mode."""
+
+
+class PriorConfig(RunConfig):
+    """A method that trains a `ScenePrior`."""
+
+    model: ModelConfig
+
+    @property
+    def distribution(self) -> str:
+        """Where new latents come from unless a task says otherwise."""
+        return "paper"
+
+    def build_prior(self, void: bool = True) -> ScenePrior:
+        """The network, freshly initialised from the seed; `void` as in `LayoutDecoder`."""
+        torch.manual_seed(self.seed)
+        return ScenePrior(self.model, self.classes, self.seed, void)
+
+    def build_latents(self, rooms: int) -> nn.Embedding:
+        """One row of latent logits a training room, drawn from N(0, 1)."""
+        generator = torch.Generator().manual_seed(self.seed + 1)
+        logits = torch.randn(rooms, self.model.logits_per_room, generator=generator)
+        return nn.Embedding.from_pretrained(logits, freeze=False)
+
+    def trained(
+        self, networks: lightning.LightningModule, stage: str, room_ids: tuple[str, ...]
+    ) -> "TrainedPrior":
+        prior, latents = networks.prior, networks.latents
+        assert isinstance(prior, ScenePrior) and isinstance(latents, nn.Embedding)
+        logits = latents.weight.detach().cpu().clone()
+        return TrainedPrior(ready_copy(prior), logits, room_ids, self, stage)
+
+
+@dataclass(frozen=True)
+class TrainedPrior:
+    """A prior with the latents of the rooms it was trained on, ready for use."""
+
+    prior: ScenePrior
+    logits: Float[Tensor, "rooms anchors"]
+    room_ids: tuple[str, ...]
+    config: PriorConfig
+    stage: str
+
+    @property
+    def remembers_rooms(self) -> bool:
+        """Whether training rooms have latents of their own; a GAN's have none."""
+        return len(self.logits) > 0
+
+    @property
+    def distribution(self) -> str:
+        """The config's distribution of new latents."""
+        return self.config.distribution
+
+
+class BoxSampler(Protocol):
+    """A network that makes rooms of labelled boxes from a seed alone."""
+
+    def sample(self, count: int, seed: int) -> RoomBoxes:
+        """New rooms. The same seed gives the same rooms, the first of them however many follow."""
+
+    def parameters(self) -> Any: ...
+
+
+@dataclass(frozen=True)
+class TrainedSampler:
+    """A trained method that makes rooms of boxes from a seed alone: no room has a latent, and no
+    object a mesh."""
+
+    prior: BoxSampler
+    room_ids: tuple[str, ...]
+    config: RunConfig
+    stage: str
+
+    remembers_rooms = False
+
+
+Trained = TrainedPrior | TrainedSampler
+
+
+def ready_copy(network: Any) -> Any:
+    """A copy of a network on the CPU, in evaluation mode and without gradients."""
+    return copy.deepcopy(network).cpu().eval().requires_grad_(False)
+
+
+def check_rooms(dataset: Any, config: RunConfig, max_objects: int | None) -> None:
+    """Refuse training rooms that do not fit a config.
+
+    Raises:
+        InputError: another label set, or more objects than the network generates.
+    """
+    shards = config.data.shards
+    if dataset.label_set != config.label_set:
+        raise InputError(
+            f"{shards} is labelled '{dataset.label_set}' but the config says "
+            f"'{config.label_set}'; set label_set or point data.shards elsewhere."
+        )
+    if max_objects is not None and dataset.max_objects > max_objects:
+        raise InputError(
+            f"A room of {shards} has {dataset.max_objects} {dataset.counted} but "
+            f"model.max_objects is {max_objects}; raise it."
+        )
