@@ -140,18 +140,16 @@ def _section_of(model: type[BaseModel], location: list[str]) -> tuple[list[str],
 
     Pydantic puts the name of a section's variant (`decoder: {name: lstm}`) after its key.
     """
-    section, keys, variants = model, [], list[type[BaseModel]]()
+    section, keys, inner = model, list[str](), list[type[BaseModel]]()
     for part in location:
-        chosen = [v for v in variants if v.model_fields["name"].default == part]
-        if len(variants) > 1 and chosen:
-            section, variants = chosen[0], []
+        if len(inner) > 1:  # the variants of a section; the next part names one
+            section = next(v for v in inner if v.model_fields["name"].default == part)
+            inner = []
             continue
+        section = inner[0] if inner else section
         keys.append(part)
-        if len(variants) == 1:
-            section = variants[0]
         # A name that the user chose, of a section that `dict[str, ...]` holds, is no field.
         field = section.model_fields.get(part)
-        if field is not None:
-            inner = (field.annotation, *get_args(field.annotation))
-            variants = [v for v in inner if isinstance(v, type) and issubclass(v, BaseModel)]
+        types = (field.annotation, *get_args(field.annotation)) if field is not None else ()
+        inner = [v for v in types if isinstance(v, type) and issubclass(v, BaseModel)]
     return keys, section

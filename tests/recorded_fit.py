@@ -57,7 +57,7 @@ def record(config, run: Path, devices: int, **options) -> list[dict[str, torch.T
     try:
         options = {"accelerator": "cpu", "devices": devices, **options}
         train.fit(
-            config, run, trainer_options=options, loggers=("csv",), judge=SampleEvaluator(config)
+            config, run, trainer_options=options, loggers=("csv",), evaluate=SampleEvaluator(config)
         )
     finally:
         train.StepSeed = usual

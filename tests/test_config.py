@@ -6,12 +6,13 @@ import pytest
 from tiny_runs import write_tiny_config
 
 from sceneprior.classes import LABEL_SETS, label_set
-from sceneprior.config import dump_config, load_config
+from sceneprior.config import METHODS, load_config
 from sceneprior.errors import ConfigError, InputError
-from sceneprior.settings import find_config
+from sceneprior.settings import dump_settings, find_config
 
 FOLDER = Path(__file__).parents[1] / "configs"
 SHIPPED = sorted(set(FOLDER.glob("*.yaml")) - set(FOLDER.glob("compare_*.yaml")))
+OURS = [path for path in SHIPPED if "method: ours" in path.read_text()]
 
 
 @pytest.fixture
@@ -42,7 +43,7 @@ def test_the_demo_and_the_papers_settings_are_there():
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
 def test_shipped_configs_load_and_survive_being_saved(path, tmp_path):
     config = load_config(str(path))
-    dump_config(config, tmp_path / "saved.yaml")
+    dump_settings(config, tmp_path / "saved.yaml")
     assert load_config(str(tmp_path / "saved.yaml")) == config
 
 
@@ -68,7 +69,8 @@ def test_the_papers_numbers(name, objects, classes, mask_step):
     config = load_config(f"{name}.yaml")
     assert len(label_set(config.label_set)) == classes
     model = config.model
-    assert (model.max_objects, model.width, model.heads, model.hidden) == (objects, 512, 4, 1024)
+    assert (model.max_objects, model.width) == (objects, 512)
+    assert (model.decoder.heads, model.decoder.hidden, model.decoder.dropout) == (4, 1024, 0.1)
     assert (config.data.views_per_room, config.data.mask_step) == (20, mask_step)
     assert config.data.augment_rotations and config.data.view_fraction == 1
     for stage, epochs in ((config.layout, 800), (config.shape, 500)):
@@ -80,16 +82,18 @@ def test_the_papers_numbers(name, objects, classes, mask_step):
     assert (loss.class_, loss.completeness, loss.frustum, loss.box, loss.mask) == (1, 1, 1, 5, 2)
     assert (loss.match_box, loss.iou_gate, loss.occlusion_slack) == (5.0, 0.5, 1.0)
     assert config.layout.proxy == "ellipsoid" and config.shape.compositing == "paper"
-    assert (model.template, model.fit_box, model.shape_level) == ("sphere", False, 4)
+    assert (model.shape.template, model.shape.fit_box, model.shape.level) == ("sphere", False, 4)
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+@pytest.mark.parametrize("path", OURS, ids=lambda path: path.name)
 def test_no_shipped_config_is_a_variant_or_an_ablation(path):
     config = load_config(str(path))
     model = config.model
-    assert (config.stages, config.loss.completeness_target) == ("two", "first_n")
-    assert (model.latent, model.decoder, model.layout_heads) == ("sphere", "transformer", "joint")
-    assert not (model.final_norm or model.query_self_attention or model.step_mlps)
+    assert config.layout is not None and model.completeness_target == "first_n"
+    names = (model.latent_space.name, model.decoder.name, model.layout_heads)
+    assert names == ("sphere", "transformer", "joint")
+    decoder = model.decoder
+    assert not (decoder.final_norm or decoder.query_self_attention or decoder.step_mlps)
 
 
 def test_the_released_codes_settings_are_one_command_away():
@@ -100,10 +104,11 @@ def test_the_released_codes_settings_are_one_command_away():
     assert words[:4] == ["sceneprior", "fit", "--config", "bedroom.yaml"]
     config = load_config(words[3], tuple(words[i + 1] for i, w in enumerate(words) if w == "--set"))
     model = config.model
-    assert (model.hidden, model.layout_heads, config.loss.completeness_target) == (
+    decoder = model.decoder
+    assert (decoder.hidden, model.layout_heads, model.completeness_target) == (
         512, "separate", "stop",
     )  # fmt: skip
-    assert model.final_norm and model.query_self_attention and model.step_mlps
+    assert decoder.final_norm and decoder.query_self_attention and decoder.step_mlps
     assert (config.layout.batch_size, config.layout.milestones) == (128, (400,))
     assert (config.shape.batch_size, config.shape.milestones) == (16, (300,))
     assert config.layout.proxy == "ellipsoid_points" and config.sampling.distribution == "paper"
@@ -111,25 +116,46 @@ def test_the_released_codes_settings_are_one_command_away():
 
 @pytest.mark.parametrize("part", ["final_norm", "query_self_attention", "step_mlps"])
 def test_a_part_of_the_transformer_without_a_transformer_is_a_sentence(config, part):
-    message = refusal(config, "model.decoder=lstm", f"model.{part}=true")
-    assert message.startswith(
-        f"{config}: 'model': {part} is a part of the transformer, but decoder is 'lstm'; "
-        "set it to false"
+    message = refusal(config, f"model.decoder={{name: lstm, {part}: true}}")
+    assert (
+        message == f"{config}: unknown key 'model.decoder.{part}'; the nearest valid key is 'name'."
     )
-    load_config(str(config), ("model.decoder=lstm",))
+    load_config(str(config), ("model.decoder={name: lstm}",))
 
 
 def test_a_part_of_atiss_without_atiss_is_a_sentence(config):
-    assert refusal(config, "model.norm_first=true").startswith(
-        f"{config}: 'model': norm_first is a part of atiss, but decoder is 'transformer'; "
-        "set it to false"
+    assert refusal(config, "model.decoder.norm_first=true").startswith(
+        f"{config}: unknown key 'model.decoder.norm_first'; the nearest valid key is '"
     )
-    load_config(str(config), ("model.decoder=atiss", "model.norm_first=true"))
+    load_config(str(config), ("model.decoder={name: atiss2d, heads: 2, norm_first: true}",))
+
+
+def test_a_variant_that_does_not_exist_lists_those_that_do(config):
+    assert refusal(config, "model.decoder={name: gru}") == (
+        f"{config}: no 'model.decoder' is named 'gru'; choose from transformer, lstm, atiss2d."
+    )
+    assert refusal(config, "model.latent_space={anchors: 4}") == (
+        f"{config}: 'model.latent_space' has no name; add one of sphere, cube."
+    )
+
+
+def test_a_method_that_does_not_exist_and_a_config_of_before_are_sentences(config):
+    assert refusal(config, "method=usl") == (
+        f"{config}: no method is called 'usl'; choose from {', '.join(METHODS)}."
+    )
+    replaced(config, "method: ours", "stages: two")
+    assert refusal(config).startswith(f"{config} was written before methods had names")
+
+
+def test_keys_of_another_method_are_refused(config):
+    assert refusal(config, "training.epochs=3").startswith(f"{config}: unknown key 'training'; the")
 
 
 def test_a_room_has_as_many_logits_as_its_latent_space_asks_for(config):
     assert load_config(str(config)).model.logits_per_room == 10
-    assert load_config(str(config), ("model.latent=uniform",)).model.logits_per_room == 16
+    assert (
+        load_config(str(config), ("model.latent_space={name: cube}",)).model.logits_per_room == 16
+    )
 
 
 def test_a_shipped_config_is_found_by_name_from_any_folder(tmp_path, monkeypatch):
@@ -173,13 +199,13 @@ def test_a_typo_names_the_key_the_file_and_the_nearest_key(config, old, new, key
          "'model.width': input should be a valid integer (got 'wide')."),
         ("  width: 16", "  width: 16.5",
          "'model.width': input should be a valid integer (got 16.5)."),
-        ("  fit_box: true", "  fit_box: 1",
-         "'model.fit_box': input should be a valid boolean (got 1)."),
+        ("    fit_box: true", "    fit_box: 1",
+         "'model.shape.fit_box': input should be a valid boolean (got 1)."),
         ("  epochs: 6", "  epochs: 0",
          "'layout.epochs': input should be greater than or equal to 1 (got 0)."),
-        ("  template: box", "  template: cone",
-         "'model.template': input should be 'sphere' or 'box' (got 'cone')."),
-        ("  heads: 2", "  heads: 3", "'model': width 16 is not a multiple of heads 3."),
+        ("    template: box", "    template: cone",
+         "'model.shape.template': input should be 'sphere' or 'box' (got 'cone')."),
+        ("    heads: 2", "    heads: 3", "'model': width 16 is not a multiple of heads 3."),
         ("  epochs: 6\n", "", "'layout.epochs' is missing and has no default; add it."),
         ("label_set: front3d_bedroom", "label_set: attic",
          f"label_set: No label set is called 'attic'; there are {', '.join(LABEL_SETS)}, or write "

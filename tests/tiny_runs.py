@@ -1,5 +1,6 @@
 """Settings of a run small enough to train both stages in seconds on a CPU."""
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,21 @@ import yaml
 from sceneprior.config import RunConfig, check_config
 
 
+def tiny_model() -> dict[str, Any]:
+    """Plain data of the network."""
+    return {
+        "max_objects": 6,
+        "width": 16,
+        "latent_space": {"name": "sphere", "anchors": 10},
+        "decoder": {"name": "transformer", "heads": 2, "hidden": 24, "dropout": 0.0},
+        "shape": {"width": 8, "level": 1, "template": "box", "fit_box": True},
+    }
+
+
 def tiny_settings(shards: Path, **changes: Any) -> dict[str, Any]:
     """Plain data for a config; changes are written `layout__epochs=2`."""
     data = {
+        "method": "ours",
         "label_set": "front3d_bedroom",
         "seed": 3,
         "data": {
@@ -19,18 +32,7 @@ def tiny_settings(shards: Path, **changes: Any) -> dict[str, Any]:
             "augment_rotations": False,
             "mask_step": 4,
         },
-        "model": {
-            "max_objects": 6,
-            "width": 16,
-            "anchors": 10,
-            "heads": 2,
-            "hidden": 24,
-            "dropout": 0.0,
-            "shape_width": 8,
-            "shape_level": 1,
-            "template": "box",
-            "fit_box": True,
-        },
+        "model": tiny_model(),
         "loss": {},
         "layout": {
             "epochs": 6,
@@ -51,6 +53,39 @@ def tiny_settings(shards: Path, **changes: Any) -> dict[str, Any]:
             "sigma_px2": 0.3,
         },
     }
+    return _changed(data, changes)
+
+
+TINY_BASELINES: dict[str, dict[str, Any]] = {
+    "gan": {
+        "model": {**tiny_model(), "decoder": {**tiny_model()["decoder"], "step_mlps": True, "dropout": 0.1}},
+        "training": {"epochs": 4, "batch_size": 5, "views_per_room": 3},
+    },
+    "atiss": {
+        "model": {"max_objects": 6, "width": 16, "layers": 1, "heads": 2, "hidden": 16, "mixtures": 3},
+        "training": {"epochs": 6, "batch_size": 5, "learning_rate": 2e-3, "schedule": "cosine"},
+    },
+    "sync2gen": {
+        "model": {"width": 32, "latent": 8, "slots": 2, "refine_steps": 5},
+        "training": {"epochs": 6, "batch_size": 5, "learning_rate": 3e-3},
+    },
+}  # fmt: skip
+
+
+def tiny_baseline_settings(shards: Path, method: str, **changes: Any) -> dict[str, Any]:
+    """Plain data for a baseline's config; changes are written `training__epochs=2`."""
+    ours = tiny_settings(shards)
+    shared = {key: ours[key] for key in ("label_set", "seed", "data")}
+    data = {"method": method, **shared, **copy.deepcopy(TINY_BASELINES[method])}
+    return _changed(data, changes)
+
+
+def tiny_baseline(shards: Path, method: str, **changes: Any) -> RunConfig:
+    """The same, checked."""
+    return check_config(tiny_baseline_settings(shards, method, **changes), "tiny")
+
+
+def _changed(data: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     for key, value in changes.items():
         *sections, name = key.split("__")
         node = data

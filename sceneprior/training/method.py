@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import lightning
 import torch
@@ -137,6 +137,7 @@ class TrainedPrior:
         return self.config.distribution
 
 
+@runtime_checkable
 class BoxSampler(Protocol):
     """A network that makes rooms of labelled boxes from a seed alone."""
 

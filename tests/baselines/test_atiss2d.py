@@ -6,7 +6,7 @@ from references.scene_decoder import attend, normalise
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.baselines.atiss2d import SceneAtiss
+from sceneprior.baselines.atiss2d import Atiss2dConfig, SceneAtiss
 
 # Sums in another order, through four layers: a few roundings of numbers around 1.
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
@@ -14,7 +14,10 @@ TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
 
 def made(dtype=torch.float64, width=12, layers=4, dropout=0.0, norm_first=False) -> SceneAtiss:
     torch.manual_seed(0)
-    model = SceneAtiss(width, 3, 20, dropout, layers, norm_first).to(dtype)
+    model = SceneAtiss(
+        width,
+        Atiss2dConfig(heads=3, hidden=20, dropout=dropout, layers=layers, norm_first=norm_first),
+    ).to(dtype)
     with torch.no_grad():  # biases and norms as different from their start as after training
         for parameter in model.parameters():
             parameter += 0.2 * torch.randn_like(parameter)
@@ -102,7 +105,7 @@ def test_every_weight_has_a_gradient_that_gradcheck_confirms(torch_rng):
 
 
 def test_as_published_it_has_four_layers_of_two_million_weights():
-    layers = SceneAtiss(512, 8, 1024, 0.1).layers
+    layers = SceneAtiss(512, Atiss2dConfig()).layers
     counts = [sum(p.numel() for p in layer.parameters()) for layer in layers]
     # Query, key, value and output; MLP[1024, 512]; two norms.
     assert counts == [4 * (512 * 512 + 512) + 2 * 512 * 1024 + 1536 + 4 * 512] * 4

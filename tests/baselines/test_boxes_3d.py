@@ -7,52 +7,32 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_runs import tiny_config
+from tiny_runs import tiny_baseline
 from torch.testing import assert_close
 from toy_rooms import write_toy_shards
 
-from sceneprior.baselines.atiss import stage as atiss3d
 from sceneprior.baselines.atiss.network import END
-from sceneprior.baselines.atiss.stage import Atiss3dStage, part_of_rooms
+from sceneprior.baselines.atiss.stage import AtissStage, part_of_rooms
 from sceneprior.baselines.box_training import build_box_optimizer
 from sceneprior.baselines.sync2gen.stage import Sync2genStage
 from sceneprior.baselines.true_boxes import TruthDataset
+from sceneprior.config import load_any_run, load_run
 from sceneprior.errors import ConfigError, InputError
 from sceneprior.experiments.evaluate import Judging, judge_run, read_curves, report_run
 from sceneprior.experiments.evaluate_samples import SampleEvaluator
 from sceneprior.generation.decode import decode_training_rooms, synthesize
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import RollingCheckpoint
-from sceneprior.training.checkpoints import (
-    TrainedSampler,
-    find_checkpoint,
-    load_any_run,
-    load_run,
-    read_checkpoint,
-)
+from sceneprior.training.checkpoints import find_checkpoint, read_checkpoint
 from sceneprior.training.fit import fit
+from sceneprior.training.method import TrainedSampler
 from sceneprior.views import RoomBoxes
 
 CPU = {"accelerator": "cpu", "devices": 1}
-ATISS = {
-    "epochs": 6, "batch_size": 5, "learning_rate": 2e-3, "width": 16, "layers": 1, "heads": 2,
-    "hidden": 16, "mixtures": 3, "dropout": 0.1, "schedule": "cosine",
-}  # fmt: skip
-SYNC = {
-    "epochs": 6, "batch_size": 5, "learning_rate": 3e-3, "width": 32, "latent": 8, "slots": 2,
-    "refine_steps": 5,
-}  # fmt: skip
-SECTIONS = {"atiss3d": ATISS, "sync2gen": SYNC}
-STAGES = {"atiss3d": Atiss3dStage, "sync2gen": Sync2genStage}
+STAGES = {"atiss": AtissStage, "sync2gen": Sync2genStage}
 
 
-def settings(shards: Path, stage: str, section: dict | None = None, **changes):
-    sections = {name: {**keys} for name, keys in SECTIONS.items()}
-    sections[stage] |= section or {}
-    return tiny_config(shards, stages=stage, **sections, **changes)
-
-
-@pytest.fixture(scope="module", params=["atiss3d", "sync2gen"])
+@pytest.fixture(scope="module", params=STAGES)
 def stage(request) -> str:
     return request.param
 
@@ -60,7 +40,7 @@ def stage(request) -> str:
 @pytest.fixture(scope="module")
 def run(stage, toy_shards, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp(stage) / "run"
-    fit(settings(toy_shards, stage), folder, trainer_options=CPU)
+    fit(tiny_baseline(toy_shards, stage), folder, trainer_options=CPU)
     return folder
 
 
@@ -71,8 +51,8 @@ def curve(run: Path, stage: str, name: str) -> list[float]:
 
 def test_a_run_leaves_what_runs_py_promises(run, stage):
     assert {path.name for path in run.iterdir()} == {"config.yaml", stage}
-    assert find_checkpoint(run) == (stage, run / stage / "final.ckpt")
-    terms = ("class", "position", "angle", "size") if stage == "atiss3d" else (
+    assert find_checkpoint(run, [stage]) == (stage, run / stage / "final.ckpt")
+    terms = ("class", "position", "angle", "size") if stage == "atiss" else (
         "existence", "position", "size", "kl", "left_out"
     )  # fmt: skip
     for name in (*terms, "loss"):
@@ -92,7 +72,7 @@ class Stop(RollingCheckpoint):
 def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
     run, stage, toy_shards, tmp_path, monkeypatch
 ):
-    config = settings(toy_shards, stage)
+    config = tiny_baseline(toy_shards, stage)
     with monkeypatch.context() as patch:
         patch.setattr(train, "RollingCheckpoint", Stop)
         with pytest.raises(KeyboardInterrupt):
@@ -118,7 +98,7 @@ def test_a_loss_that_is_no_number_names_its_rooms(stage, toy_shards, tmp_path, m
     with pytest.raises(FloatingPointError, match=r"The loss is nan on rooms toy/train_\d\d, toy/"):
         # One batch of all rooms: whatever is drawn of the first, some object's place is asked for.
         fit(
-            settings(toy_shards, stage, {"batch_size": 12, "epochs": 5}),
+            tiny_baseline(toy_shards, stage, training__batch_size=12, training__epochs=5),
             tmp_path / "run",
             trainer_options=CPU,
         )
@@ -127,11 +107,11 @@ def test_a_loss_that_is_no_number_names_its_rooms(stage, toy_shards, tmp_path, m
 
 def test_a_vae_learns_three_rooms_by_heart(tmp_path):
     write_toy_shards(tmp_path / "shards", train=3, test=2, seed=5)
-    section = {
-        "batch_size": 3, "learning_rate": 5e-3, "schedule": "cosine", "epochs": 300, "width": 64,
-        "kl_weight": 1e-3, "refine_steps": 0,
-    }  # fmt: skip
-    config = settings(tmp_path / "shards", "sync2gen", section)
+    training = {"batch_size": 3, "learning_rate": 5e-3, "schedule": "cosine", "epochs": 300}
+    config = tiny_baseline(
+        tmp_path / "shards", "sync2gen", training=training | {"kl_weight": 1e-3},
+        model__width=64, model__refine_steps=0,
+    )  # fmt: skip
     fit(config, tmp_path / "run", loggers=("csv",), trainer_options=CPU)
     trained = load_any_run(tmp_path / "run")
     truth = TruthDataset(tmp_path / "shards", "train").everything()
@@ -148,15 +128,15 @@ def test_an_atiss_learns_by_heart_which_furniture_goes_together(tmp_path):
     """Under its full loss. Rooms are drawn object by object, so one holds exactly the furniture of
     a training room only where every class and the end were drawn by what was there already."""
     write_toy_shards(tmp_path / "shards", train=3, test=2, seed=5)
-    section = {
-        "width": 64, "hidden": 128, "heads": 4, "layers": 2, "mixtures": 10, "dropout": 0.0,
-        "learning_rate": 3e-3,
+    model = {
+        "max_objects": 6, "width": 64, "hidden": 128, "heads": 4, "layers": 2, "mixtures": 10,
+        "dropout": 0.0,
     }  # fmt: skip
-    config = settings(tmp_path / "shards", "atiss3d", section)
+    config = tiny_baseline(tmp_path / "shards", "atiss", model=model, training__learning_rate=3e-3)
     dataset = TruthDataset(tmp_path / "shards", "train")
-    network = atiss3d.build(config, dataset).prior
+    network = config.build(dataset, None).prior
     rooms = dataset.__getitems__([(row, 0) for row in [0, 1, 2] * 32])
-    built = build_box_optimizer(network, config.atiss3d, 500)
+    built = build_box_optimizer(network, config.training, 500)
     optimizer, schedule = built["optimizer"], built["lr_scheduler"]["scheduler"]
     for step in range(500):
         part = part_of_rooms(rooms, step)
@@ -230,16 +210,16 @@ def test_what_needs_a_latent_space_says_that_there_is_none(run, stage):
     with pytest.raises(InputError) as error:
         load_run(run)
     assert str(error.value) == (
-        f"{run} is a run of `stages: {stage}`, which has no latent space of rooms, and this needs "
-        "one. Take a run of `stages: two`; with this one, `sceneprior synthesize`, `eval-fid` and "
+        f"{run} is a run of `method: {stage}`, which has no latent space of rooms, and this needs "
+        "one. Take a run of `method: ours`; with this one, `sceneprior synthesize`, `eval-fid` and "
         "`report` work."
     )
     with pytest.raises(
-        InputError, match=f"A run of `stages: {stage}` keeps no latents of training"
+        InputError, match=f"A run of `method: {stage}` keeps no latents of training"
     ):
         decode_training_rooms(load_any_run(run))
     with pytest.raises(
-        InputError, match=f"but `stages: {stage}` has none; leave out --distribution kernel"
+        InputError, match=f"but `method: {stage}` has none; leave out --distribution kernel"
     ):
         synthesize(load_any_run(run), 2, 0, "kernel")
 
@@ -262,39 +242,38 @@ def test_a_run_is_judged_and_reported(run, stage, tmp_path):
 
 def test_looks_choose_a_checkpoint(stage, toy_shards, tmp_path):
     samples = {"every": 2, "count": 6, "metric": "objects_off"}
-    config = settings(toy_shards, stage, samples=samples)
-    fit(config, tmp_path / "run", trainer_options=CPU, judge=SampleEvaluator(config))
+    config = tiny_baseline(toy_shards, stage, samples=samples)
+    fit(config, tmp_path / "run", trainer_options=CPU, evaluate=SampleEvaluator(config))
     assert (tmp_path / "run" / stage / "samples" / "00004.png").is_file()
     assert isinstance(load_any_run(tmp_path / "run", "best"), TrainedSampler)
-    config = settings(toy_shards, stage, samples=samples | {"metric": "mask_iou"})
-    with pytest.raises(InputError, match=f"mask_iou, but `stages: {stage}` remembers no rooms"):
+    config = tiny_baseline(toy_shards, stage, samples=samples | {"metric": "mask_iou"})
+    with pytest.raises(InputError, match=f"mask_iou, but `method: {stage}` remembers no rooms"):
         SampleEvaluator(config)
 
 
 def test_what_does_not_fit_is_a_sentence(run, stage, toy_shards, tmp_path):
     with pytest.raises(InputError, match=r"has 5 objects but model.max_objects is 3; raise"):
-        fit(settings(toy_shards, stage, model__max_objects=3), tmp_path / "a")
+        fit(tiny_baseline(toy_shards, "atiss", model__max_objects=3), tmp_path / "a")
     with pytest.raises(
         InputError, match=r"is labelled 'front3d_bedroom' but the config says 'scan"
     ):
-        fit(settings(toy_shards, stage, label_set="scannet"), tmp_path / "b")
+        fit(tiny_baseline(toy_shards, stage, label_set="scannet"), tmp_path / "b")
     assert not list(tmp_path.iterdir())
     other = shutil.copytree(run, tmp_path / "run")
     text = (other / "config.yaml").read_text()
-    at = text.index(f"\n{stage}:")
-    (other / "config.yaml").write_text(text[:at] + text[at:].replace("width: ", "width: 2", 1))
+    (other / "config.yaml").write_text(text.replace("width: ", "width: 2", 1))
     with pytest.raises(InputError, match=r"does not fit the run's config.yaml .*use the config it"):
         load_any_run(other)
-    with pytest.raises(ConfigError, match="'atiss3d': width 16 is not a multiple of heads 3"):
-        settings(toy_shards, "atiss3d", {"heads": 3})
-    with pytest.raises(ConfigError, match="'sync2gen': width 36 is not a multiple of 8"):
-        settings(toy_shards, "sync2gen", {"width": 36})
+    with pytest.raises(ConfigError, match="'model': width 16 is not a multiple of heads 3"):
+        tiny_baseline(toy_shards, "atiss", model__heads=3)
+    with pytest.raises(ConfigError, match="'model': width 36 is not a multiple of 8"):
+        tiny_baseline(toy_shards, "sync2gen", model__width=36)
 
 
 def test_refinement_acts_on_sampling_alone(toy_shards, tmp_path):
     """One training serves both of the paper's rows, Sync2Gen and Sync2Gen*."""
     fit(
-        settings(toy_shards, "sync2gen", {"refine_steps": 40}),
+        tiny_baseline(toy_shards, "sync2gen", model__refine_steps=40),
         tmp_path / "run",
         trainer_options=CPU,
     )

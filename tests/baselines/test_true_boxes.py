@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from tiny_runs import tiny_config
+from tiny_runs import tiny_baseline, tiny_config
 
 from sceneprior.baselines.true_boxes import TruthDataset, turned
 from sceneprior.data.dataset import BLANK, ViewDataset
@@ -114,7 +114,7 @@ def test_shards_without_ground_truth_are_a_sentence(toy_shards, tmp_path):
 
 def test_only_the_two_baselines_come_to_the_ground_truth():
     """By name, over the whole package: evaluation reads it, and of training one module, which two
-    stages and what dispatches to them import."""
+    baselines and what they share import."""
     readers, importers = set(), set()
     for path in sorted(PACKAGE.rglob("*.py")):
         name = path.relative_to(PACKAGE).as_posix()
@@ -128,24 +128,25 @@ def test_only_the_two_baselines_come_to_the_ground_truth():
                 importers.add(name)
     assert readers == {"baselines/true_boxes.py", "evaluation/reference.py"}
     assert importers == {
-        "data/datamodule.py", "baselines/atiss/stage.py", "baselines/sync2gen/stage.py",
-        "training/fit.py",
+        "baselines/atiss/stage.py", "baselines/box_training.py", "baselines/sync2gen/stage.py",
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("stages", ["two", "one"])
-def test_stages_under_2d_supervision_never_ask_for_it(toy_shards, tmp_path, monkeypatch, stages):
+@pytest.mark.parametrize("one_stage", [False, True])
+def test_stages_under_2d_supervision_never_ask_for_it(toy_shards, tmp_path, monkeypatch, one_stage):
     from sceneprior.training.fit import fit
 
     def refuse(self, room_id):
         raise AssertionError(f"the ground truth of {room_id} was opened")
 
     monkeypatch.setattr(Shard, "read_ground_truth", refuse)
-    config = tiny_config(toy_shards, stages=stages, layout__epochs=1, shape__epochs=1)
+    config = tiny_config(toy_shards, layout__epochs=1, shape__epochs=1)
+    if one_stage:
+        config = config.model_copy(update={"layout": None})
     fit(config, tmp_path / "run", trainer_options={"accelerator": "cpu"})
     with pytest.raises(AssertionError, match="the ground truth of toy/train_00 was opened"):
         fit(
-            tiny_config(toy_shards, stages="atiss3d"),
+            tiny_baseline(toy_shards, "atiss"),
             tmp_path / "other",
             trainer_options={"accelerator": "cpu"},
         )

@@ -6,7 +6,7 @@ import pytest
 from model_folder import corner_sofa, write_models
 from test_cli import command, everything_in, one_sentence  # noqa: F401
 
-from sceneprior.training.checkpoints import load_run
+from sceneprior.config import load_run
 
 SOFT = ("--renderer", "software")
 

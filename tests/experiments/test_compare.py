@@ -14,13 +14,13 @@ import yaml
 from PIL import Image
 from tiny_runs import write_tiny_config
 
+from sceneprior.config import load_any_run
 from sceneprior.errors import InputError
 from sceneprior.experiments import steps as comparison_steps
 from sceneprior.experiments.compare import Compared, compare
 from sceneprior.experiments.comparison import load_comparison, part_of, runs_of
 from sceneprior.experiments.steps import Commands, costs_of
 from sceneprior.files import only_writer
-from sceneprior.training.checkpoints import load_any_run
 
 SOFTWARE = "software"
 

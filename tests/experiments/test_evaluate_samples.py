@@ -9,6 +9,7 @@ import torch
 from tiny_runs import tiny_config
 
 from sceneprior.classes import class_colors, label_set
+from sceneprior.config import load_run
 from sceneprior.errors import InputError
 from sceneprior.evaluation.metrics.layout_metrics import category_kl, object_counts, overlap_pairs
 from sceneprior.evaluation.reference import reference_scenes
@@ -21,7 +22,6 @@ from sceneprior.experiments.evaluate_samples import (
 )
 from sceneprior.generation.decode import decode_training_rooms, synthesize
 from sceneprior.geometry.boxes import place
-from sceneprior.training.checkpoints import load_run
 from sceneprior.views import DecodedScenes
 
 

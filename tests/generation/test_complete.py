@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from sceneprior.classes import label_set
+from sceneprior.config import load_run
 from sceneprior.errors import InputError
 from sceneprior.generation.complete import (
     BOX_WEIGHT,
@@ -25,7 +26,6 @@ from sceneprior.losses.completeness import kept_objects
 from sceneprior.models.latents import LatentSphere
 from sceneprior.models.prior import ScenePrior
 from sceneprior.scene import Scene, SceneObject
-from sceneprior.training.checkpoints import load_run
 from sceneprior.views import DecodedScenes
 
 BED = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))

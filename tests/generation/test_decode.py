@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from sceneprior.classes import label_set
+from sceneprior.config import load_run
 from sceneprior.experiments.evaluate import UNFOLDING_STEPS, read_curves, unfold
 from sceneprior.generation import decode
 from sceneprior.generation.decode import (
@@ -15,7 +16,6 @@ from sceneprior.generation.decode import (
     synthesize,
     to_scenes,
 )
-from sceneprior.training.checkpoints import load_run
 from sceneprior.views import DecodedScenes
 
 NAMES = label_set("front3d_bedroom")

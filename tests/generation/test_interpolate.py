@@ -10,6 +10,7 @@ from PIL import Image
 from torch import nn
 
 from sceneprior.classes import class_colors
+from sceneprior.config import load_run
 from sceneprior.errors import InputError
 from sceneprior.evaluation.topdown import corner_view
 from sceneprior.generation.decode import decode_latents
@@ -25,7 +26,6 @@ from sceneprior.generation.interpolate import (
 from sceneprior.models.latents import LatentCube
 from sceneprior.models.prior import ScenePrior
 from sceneprior.offscreen import open_renderer
-from sceneprior.training.checkpoints import load_run
 from sceneprior.views import DecodedScenes
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from sceneprior.config import load_run
 from sceneprior.errors import InputError
 from sceneprior.generation.decode import draw_latents
 from sceneprior.generation.latents import read_latent, write_latents
-from sceneprior.training.checkpoints import load_run
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.config import LossConfig
+from sceneprior.models.prior import ModelConfig
 from sceneprior.losses.completeness import completeness_targets, kept_objects, kept_share
 
-CONVENTIONS = LossConfig.model_fields["completeness_target"].annotation.__args__
+CONVENTIONS = ModelConfig.model_fields["completeness_target"].annotation.__args__
 
 
 def test_the_two_conventions_written_out():

@@ -7,7 +7,7 @@ import torch
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.models.latents import LatentCube, LatentSphere, jitter, slerp, slerp
+from sceneprior.models.latents import LatentCube, LatentSphere, slerp
 
 
 def test_latents_are_positive_mixtures_of_unit_anchors_on_the_unit_sphere(torch_rng):
@@ -50,7 +50,8 @@ def test_slerp_walks_at_equal_angles_on_the_unit_sphere(torch_rng, angle):
     ).unbind()
     across = F.normalize(other - (other @ start) * start, dim=-1)
     end = math.cos(angle) * start + math.sin(angle) * across
-    path = slerp(start, end, 6)
+    along = torch.linspace(0, 1, 6, dtype=torch.float64)
+    path = slerp(start.expand(6, -1), end.expand(6, -1), along)
     assert path.shape == (6, 9)
     assert_close(path[0], start, rtol=0, atol=1e-12)
     assert_close(path[-1], end, rtol=0, atol=1e-12)
@@ -68,7 +69,7 @@ def test_slerp_walks_at_equal_angles_on_the_unit_sphere(torch_rng, angle):
 def test_opposite_points_have_no_shortest_path():
     start = F.normalize(torch.ones(4), dim=-1)
     with pytest.raises(ValueError, match="opposite points; any great circle joins them"):
-        slerp(start, -start, 3)
+        slerp(start[None], -start[None], torch.ones(1))
 
 
 def test_what_the_sphere_knows_of_near_between_and_steps(torch_rng):
@@ -80,7 +81,12 @@ def test_what_the_sphere_knows_of_near_between_and_steps(torch_rng):
     assert_close((z[:2, None] - z).norm(dim=-1), 2 * torch.sin(angles / 2), rtol=0, atol=1e-7)
     along = torch.tensor([0.2, 0.9], dtype=torch.float64)
     assert torch.equal(sphere.between(z[:2], z[2:4], along), slerp(z[:2], z[2:4], along))
-    assert torch.equal(sphere.step(z, 0.3, 4), jitter(z, 0.3, 4))
+    moved = sphere.step(z, 0.3, 4)
+    assert torch.equal(moved, sphere.step(z, 0.3, 4)) and not torch.equal(
+        moved, sphere.step(z, 0.3, 5)
+    )
+    assert_close(moved.norm(dim=-1), torch.ones(5, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert 0.1 < (moved - z).norm(dim=-1).mean() < 0.5  # steps of about 0.3
 
 
 def test_standard_normal_logits_are_spread_uniformly_over_the_cube(torch_rng):

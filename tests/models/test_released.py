@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from sceneprior.models.layout_decoder import LayoutDecoder
 from sceneprior.models.released import QuerySelfAttention, SeparateHeads, StepOutputs
-from sceneprior.models.transformer import SceneDecoder
+from sceneprior.models.transformer import SceneTransformer, TransformerConfig
 
 
 def shaken(model: nn.Module) -> nn.Module:
@@ -21,9 +21,12 @@ def shaken(model: nn.Module) -> nn.Module:
     return model.double().eval()
 
 
-def released_decoder(width=24, steps=7) -> SceneDecoder:
+def released_decoder(width=24, steps=7) -> SceneTransformer:
+    parts = TransformerConfig(
+        heads=3, hidden=40, final_norm=True, query_self_attention=True, step_mlps=True
+    )
     torch.manual_seed(0)
-    return shaken(SceneDecoder(width, 3, 40, 0.1, True, True, steps))
+    return shaken(SceneTransformer(width, parts, steps))
 
 
 def points(torch_rng, rooms=3, width=24) -> torch.Tensor:

@@ -4,15 +4,18 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from sceneprior.config import Model
 from sceneprior.geometry.meshes import icosphere, to_cube
+from sceneprior.models.latents import SphereConfig
 from sceneprior.models.prior import ScenePrior
-from sceneprior.models.shape_decoder import ShapeDecoder, fill_unit_box
+from sceneprior.models.shape_decoder import ShapeDecoder, ShapeDecoderConfig, fill_unit_box
+from sceneprior.models.transformer import TransformerConfig
 
 
 @pytest.mark.parametrize("template", ["sphere", "box"])
 def test_deformation_starts_from_the_plain_template(torch_rng, template):
     torch.manual_seed(0)
-    model = ShapeDecoder(32, 16, 1, template, fit_box=False)
+    model = ShapeDecoder(32, ShapeDecoderConfig(width=16, level=1, template=template))
     meshes = model(torch.randn(3, 4, 32, generator=torch_rng))
     sphere, faces = icosphere(1)
     wanted = sphere if template == "sphere" else to_cube(sphere)
@@ -47,7 +50,7 @@ def test_fill_unit_box_keeps_what_already_fills_it_and_survives_a_flat_mesh():
 def test_the_split_first_layer_is_the_concatenated_one(torch_rng):
     """Equation 6 as written, MLP3(Concat[feature, v]), one vertex at a time."""
     torch.manual_seed(0)
-    model = ShapeDecoder(6, 5, 0, "sphere", fit_box=False).double()
+    model = ShapeDecoder(6, ShapeDecoderConfig(width=8, level=0)).double()
     features = torch.randn(2, 3, 6, generator=torch_rng, dtype=torch.float64)
     weight = torch.cat([model.from_feature.weight, model.from_vertex.weight], dim=1)
     meshes = model(features)
@@ -62,10 +65,14 @@ def test_the_split_first_layer_is_the_concatenated_one(torch_rng):
 
 def test_the_prior_places_meshes_in_the_boxes_of_the_layout(torch_rng):
     torch.manual_seed(0)
-    prior = ScenePrior(
-        classes=5, max_objects=4, width=16, anchors=9, heads=2, hidden=24, dropout=0.0,
-        shape_width=8, shape_level=1, template="box", fit_box=True,
-    ).double()  # fmt: skip
+    config = Model(
+        max_objects=4,
+        width=16,
+        latent_space=SphereConfig(anchors=9),
+        decoder=TransformerConfig(heads=2, hidden=24, dropout=0.0),
+        shape=ShapeDecoderConfig(width=8, level=1, template="box", fit_box=True),
+    )
+    prior = ScenePrior(config, classes=5).double()
     logits = torch.randn(3, 9, generator=torch_rng, dtype=torch.float64)
     scenes = prior(logits)
     low, high = scenes.vertices_m.amin(dim=-2), scenes.vertices_m.amax(dim=-2)

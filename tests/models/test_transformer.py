@@ -6,15 +6,17 @@ from references.scene_decoder import next_object_loop
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.models.transformer import SceneDecoder
+from sceneprior.models.transformer import SceneTransformer, TransformerConfig
 
 # Sums in another order: a few roundings of numbers around 1.
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 
 
-def decoder(dtype=torch.float64, dropout=0.0, seed=0, width=24, heads=3) -> SceneDecoder:
+def decoder(dtype=torch.float64, dropout=0.0, seed=0, width=24, heads=3) -> SceneTransformer:
     torch.manual_seed(seed)
-    made = SceneDecoder(width, heads, 40, dropout).to(dtype)
+    made = SceneTransformer(
+        width, TransformerConfig(heads=heads, hidden=40, dropout=dropout), max_objects=6
+    ).to(dtype)
     with torch.no_grad():  # biases and norms as different from their start as after training
         for parameter in made.parameters():
             parameter += 0.2 * torch.randn_like(parameter)

@@ -8,6 +8,7 @@ import torch
 from torch.nn import functional as F
 from torch.testing import assert_close
 
+from sceneprior.config import load_run
 from sceneprior.errors import InputError
 from sceneprior.reconstruction import fit as fitting
 from sceneprior.reconstruction.fit import (
@@ -20,7 +21,6 @@ from sceneprior.reconstruction.fit import (
 )
 from sceneprior.reconstruction.observed import as_views, images_of_split
 from sceneprior.reconstruction.starts import layout_losses_of_rooms, starting_latents
-from sceneprior.training.checkpoints import load_run
 
 SHORT = FitSchedule(steps=12, drop_at=8, patience=0)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprior.config import LossConfig
+from sceneprior.training.settings import LossConfig
 from sceneprior.errors import InputError
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.offscreen import open_renderer

@@ -8,6 +8,7 @@ import torch
 from torch.testing import assert_close
 
 from sceneprior.classes import label_set
+from sceneprior.config import load_run
 from sceneprior.errors import InputError
 from sceneprior.reconstruction import reconstruct as reconstruct_module
 from sceneprior.reconstruction.fit import (
@@ -20,7 +21,6 @@ from sceneprior.reconstruction.fit import (
 from sceneprior.reconstruction.observed import as_views, images_of_split
 from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct, unlearnt_classes
 from sceneprior.reconstruction.refinement import refine
-from sceneprior.training.checkpoints import load_run
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,10 @@ import torch
 
 
 def next_object_loop(decoder, z, previous, key_bias):
-    """SceneDecoder.next_object in float64; `key_bias` is any (width,) bias of the decoder's keys.
+    """`SceneTransformer.next_object` in float64; `key_bias` is any (width,) bias of its keys.
 
     Args:
-        decoder: A SceneDecoder in evaluation mode, in float64.
+        decoder: A SceneTransformer in evaluation mode, in float64.
         z: (rooms, width), points on the unit sphere.
         previous: (rooms, objects, width).
         key_bias: Attention does not see it.

@@ -14,11 +14,11 @@ import pytest
 import torch
 from tiny_runs import tiny_config, write_tiny_config
 
-from sceneprior.config import load_config
+from sceneprior.config import load_config, load_run
 from sceneprior.errors import InputError
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import RollingCheckpoint
-from sceneprior.training.checkpoints import find_checkpoint, load_run, read_checkpoint
+from sceneprior.training.checkpoints import find_checkpoint, read_checkpoint
 from sceneprior.training.fit import fit
 from sceneprior.training.layout import LayoutStage
 
@@ -98,7 +98,11 @@ def test_resuming_a_finished_run_trains_nothing(toy_run, toy_shards, tmp_path, m
 @pytest.mark.parametrize(("stage", "epoch"), [("layout", 4), ("shape", 2)])
 @pytest.mark.parametrize(
     "extra",
-    [{}, {"model__dropout": 0.2}, {"layout__schedule": "cosine", "shape__schedule": "cosine"}],
+    [
+        {},
+        {"model__decoder__dropout": 0.2},
+        {"layout__schedule": "cosine", "shape__schedule": "cosine"},
+    ],
     ids=["plain", "dropout", "cosine"],
 )
 def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
@@ -166,10 +170,8 @@ def test_training_never_opens_the_ground_truth(toy_shards, tmp_path):
         fit(tiny_config(shards, layout__epochs=3), run, trainer_options=CPU)
         results.append([weights(run / stage / "final.ckpt") for stage in ("layout", "shape")])
     assert same(results[0][0], results[1][0]) and same(results[0][1], results[1][1])
-    start = train._start(
-        tiny_config(toy_shards), train._open_data("layout", tiny_config(toy_shards)), None
-    )
-    assert not torch.equal(start[1].weight, results[0][1]["latents.weight"])  # it did train
+    start = tiny_config(toy_shards).build_latents(12)
+    assert not torch.equal(start.weight, results[0][1]["latents.weight"])  # it did train
 
 
 def test_ctrl_c_at_the_command_saves_and_resume_finishes(toy_shards, tmp_path, start):
@@ -199,7 +201,7 @@ def test_ctrl_c_at_the_command_saves_and_resume_finishes(toy_shards, tmp_path, s
     text = (run / "config.yaml").read_text().replace("epochs: 100000", f"epochs: {reached + 2}")
     (run / "config.yaml").write_text(text)
     fit(load_config(str(run / "config.yaml")), run, resume=True, trainer_options=CPU)
-    assert find_checkpoint(run) == ("shape", run / "shape" / "final.ckpt")
+    assert find_checkpoint(run, ("layout", "shape")) == ("shape", run / "shape" / "final.ckpt")
 
 
 def test_a_loss_that_is_no_number_names_its_rooms(toy_shards, tmp_path, monkeypatch):

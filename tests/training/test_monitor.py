@@ -12,11 +12,12 @@ from PIL import Image
 from tiny_runs import tiny_config
 from torch.testing import assert_close
 
+from sceneprior.config import load_run
 from sceneprior.errors import InputError
 from sceneprior.training import fit as train
 from sceneprior.training import monitor as samples
 from sceneprior.training.callbacks import StepSeed
-from sceneprior.training.checkpoints import load_run, read_checkpoint
+from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit
 from sceneprior.training.monitor import EvaluationResult
 
@@ -54,7 +55,7 @@ class Stop(StepSeed):
 
 def settings(shards: Path, **section):
     return tiny_config(
-        shards, layout__epochs=EPOCHS, shape__epochs=1, model__dropout=0.1,
+        shards, layout__epochs=EPOCHS, shape__epochs=1, model__decoder__dropout=0.1,
         samples={"every": 2, "count": 5, **section},
     )  # fmt: skip
 
@@ -65,7 +66,7 @@ def state(path: Path) -> dict[str, torch.Tensor]:
 
 def test_the_best_look_is_kept_and_training_never_notices(toy_shards, tmp_path):
     judge = Told(category_kl=[0.5, 0.2, 0.9, 0.3], objects=[4, 5, 6, 7])
-    fit(settings(toy_shards), tmp_path / "run", trainer_options=CPU, judge=judge)
+    fit(settings(toy_shards), tmp_path / "run", trainer_options=CPU, evaluate=judge)
     folder = tmp_path / "run" / "layout"
     assert read_checkpoint(folder / "best.ckpt")["epoch"] == 3  # counted from 0: after the fourth
     # What was judged is what was kept.
@@ -97,7 +98,7 @@ def test_the_best_look_is_kept_and_training_never_notices(toy_shards, tmp_path):
 def test_each_metric_knows_which_way_is_better(toy_shards, tmp_path, metric, told, best):
     config = settings(toy_shards, metric=metric)
     judge = Told(**{metric: [*told, 0.0]})
-    fit(config, tmp_path / "run", trainer_options=CPU, judge=judge)
+    fit(config, tmp_path / "run", trainer_options=CPU, evaluate=judge)
     assert read_checkpoint(tmp_path / "run" / "layout" / "best.ckpt")["epoch"] == best - 1
 
 
@@ -106,14 +107,14 @@ def test_a_resumed_run_remembers_its_best(toy_shards, tmp_path, monkeypatch, epo
     """Stopped after one look and after two, of which the first was the best."""
     told = [0.2, 0.5, 0.3, 0.1]
     config = settings(toy_shards)
-    fit(config, tmp_path / "whole", trainer_options=CPU, judge=Told(category_kl=told))
+    fit(config, tmp_path / "whole", trainer_options=CPU, evaluate=Told(category_kl=told))
     with monkeypatch.context() as patch:
         patch.setattr(Stop, "epoch", epoch)
         patch.setattr(train, "StepSeed", Stop)
         with pytest.raises(KeyboardInterrupt):
-            fit(config, tmp_path / "run", trainer_options=CPU, judge=Told(category_kl=told))
+            fit(config, tmp_path / "run", trainer_options=CPU, evaluate=Told(category_kl=told))
     rest = Told(category_kl=told[epoch // 2 :])
-    fit(config, tmp_path / "run", resume=True, trainer_options=CPU, judge=rest)
+    fit(config, tmp_path / "run", resume=True, trainer_options=CPU, evaluate=rest)
     for stage in ("layout", "shape"):
         for name in ("best.ckpt", "final.ckpt", "last.ckpt"):
             one, other = (
@@ -190,7 +191,7 @@ def test_what_cannot_be_judged_is_a_sentence(toy_shards, tmp_path):
         InputError, match=r"samples.metric is category_kl, but a look gave only objects, ov"
     ):
         judge = Told(objects=[1], overlaps=[2])
-        fit(settings(toy_shards), tmp_path / "b", trainer_options=CPU, judge=judge)
+        fit(settings(toy_shards), tmp_path / "b", trainer_options=CPU, evaluate=judge)
     with pytest.raises(IndexError):  # the judge's own error comes out as it is
         judge = Told(category_kl=[])
-        fit(settings(toy_shards), tmp_path / "c", trainer_options=CPU, judge=judge)
+        fit(settings(toy_shards), tmp_path / "c", trainer_options=CPU, evaluate=judge)

@@ -7,9 +7,9 @@ from tiny_runs import tiny_config
 from torch.testing import assert_close
 from toy_rooms import look_at
 
-from sceneprior.config import ShapeConfig, StageConfig
 from sceneprior.geometry.cameras import boxes_of_points
-from sceneprior.training.objective import build_latents, build_prior, proxy_boxes, seen_boxes
+from sceneprior.training.objective import proxy_boxes, seen_boxes
+from sceneprior.training.settings import ShapeConfig, StageConfig
 from sceneprior.views import DecodedScenes, SceneViews
 
 
@@ -71,8 +71,8 @@ def test_the_papers_proxy_is_the_smooth_ellipsoid():
 @pytest.mark.parametrize("box_from", ["mesh", "proxy"])
 def test_the_shape_stage_takes_boxes_from_where_it_is_told(seen, tmp_path, box_from):
     config = tiny_config(tmp_path, shape__box_from=box_from, shape__proxy="ellipsoid")
-    prior = build_prior(config, classes=5)
-    scenes = prior(build_latents(config, rooms=2).weight)
+    prior = config.build_prior()
+    scenes = prior(config.build_latents(2).weight)
     found = seen_boxes(scenes, seen[1], config.shape)
     if box_from == "proxy":
         expected = proxy_boxes(scenes, seen[1], "ellipsoid")

@@ -9,7 +9,7 @@ from tiny_runs import tiny_config
 from torch.testing import assert_close
 
 from sceneprior.baselines.lstm import SceneLstm
-from sceneprior.config import ModelConfig
+from sceneprior.config import Model, load_run
 from sceneprior.experiments.evaluate import (
     UNFOLDING_STEPS,
     Judging,
@@ -23,25 +23,24 @@ from sceneprior.generation.sample import DISTRIBUTIONS
 from sceneprior.models.latents import LatentCube
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import RollingCheckpoint
-from sceneprior.training.checkpoints import load_run, read_checkpoint
+from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit
-from sceneprior.training.objective import build_prior
 
 CPU = {"accelerator": "cpu", "devices": 1}
 FAST = {"layout__epochs": 6, "shape__epochs": 2}
 RELEASED = {
-    "model__hidden": 16,
-    "model__final_norm": True,
-    "model__query_self_attention": True,
-    "model__step_mlps": True,
+    "model__decoder__hidden": 16,
+    "model__decoder__final_norm": True,
+    "model__decoder__query_self_attention": True,
+    "model__decoder__step_mlps": True,
     "model__layout_heads": "separate",
-    "loss__completeness_target": "stop",
+    "model__completeness_target": "stop",
     "layout__proxy": "ellipsoid_points",
 }
 VARIANTS = {
-    "c1_uniform": {"model__latent": "uniform", "layout__latent_noise": 0.1},
-    "c2_lstm": {"model__decoder": "lstm"},
-    "c3_one_stage": {"stages": "one", "shape__epochs": 5},
+    "c1_uniform": {"model__latent_space": {"name": "cube"}, "layout__latent_noise": 0.1},
+    "c2_lstm": {"model__decoder": {"name": "lstm"}},
+    "c3_one_stage": {"layout": None, "shape__epochs": 5},
     "beveled_box": {
         "layout__proxy": "beveled_box",
         "shape__box_from": "proxy",
@@ -72,7 +71,7 @@ def test_a_variant_learns(variant):
     name, config, run = variant
     curves = read_curves(run)
     assert [k.split("/")[0] for k in curves if k.endswith("/loss")] == (
-        ["shape"] if config.stages == "one" else ["layout", "shape"]
+        ["shape"] if config.layout is None else ["layout", "shape"]
     )
     losses = [
         value for _, value in curves["shape/loss" if name == "c3_one_stage" else "layout/loss"]
@@ -104,7 +103,7 @@ def test_a_variant_is_decoded_sampled_and_interpolated(variant):
     steps = unfold(trained)
     assert len(steps) == UNFOLDING_STEPS
     assert [item.label for item in steps[0].objects] == [item.label for item in rooms[0].objects]
-    if config.loss.completeness_target == "stop":
+    if config.model.completeness_target == "stop":
         # Up to the first that says stop, and that one; void ones are left out.
         scenes = trained.prior(trained.logits)
         kept = 1 + (scenes.completeness_logits.cummax(dim=1).values <= 0)[:, :-1].sum(dim=1)
@@ -141,21 +140,21 @@ def test_a_variant_is_judged(toy_shards, tmp_path, name):
 
 
 def test_one_stage_begins_with_fresh_weights_and_leaves_no_layout_folder(toy_shards, tmp_path):
-    config = tiny_config(toy_shards, stages="one", shape__epochs=1, shape__learning_rate=1e-12,
+    config = tiny_config(toy_shards, layout=None, shape__epochs=1, shape__learning_rate=1e-12,
                          shape__latent_learning_rate=1e-12)  # fmt: skip
     fit(config, tmp_path / "run", trainer_options=CPU)
     assert not (tmp_path / "run" / "layout").exists()
     trained = load_run(tmp_path / "run")
     for mine, fresh in zip(
-        trained.prior.parameters(), build_prior(config, 22).parameters(), strict=True
+        trained.prior.parameters(), config.build_prior().parameters(), strict=True
     ):
         assert_close(mine, fresh, rtol=0, atol=1e-9)
 
 
 def test_the_ablations_change_their_module_and_no_other_module(toy_shards):
-    plain = build_prior(tiny_config(toy_shards), 22)
-    cube = build_prior(tiny_config(toy_shards, model__latent="uniform"), 22)
-    lstm = build_prior(tiny_config(toy_shards, model__decoder="lstm"), 22)
+    plain = tiny_config(toy_shards).build_prior()
+    cube = tiny_config(toy_shards, model__latent_space={"name": "cube"}).build_prior()
+    lstm = tiny_config(toy_shards, model__decoder={"name": "lstm"}).build_prior()
     assert isinstance(cube.latent_space, LatentCube) and isinstance(lstm.decoder, SceneLstm)
 
     def shapes(prior, without):
@@ -173,14 +172,15 @@ def test_the_ablations_change_their_module_and_no_other_module(toy_shards):
     ("changes", "millions"),
     [
         ({}, 6.928),
-        ({"hidden": 512}, 5.878),
-        ({"final_norm": True}, 6.930),
-        ({"query_self_attention": True}, 7.454),
-        ({"step_mlps": True}, 13.757),
+        ({"decoder": {"name": "transformer", "hidden": 512}}, 5.878),
+        ({"decoder": {"name": "transformer", "final_norm": True}}, 6.930),
+        ({"decoder": {"name": "transformer", "query_self_attention": True}}, 7.454),
+        ({"decoder": {"name": "transformer", "step_mlps": True}}, 13.757),
         ({"layout_heads": "separate"}, 12.176),
-        ({"latent": "uniform"}, 6.928),
-        ({"decoder": "lstm"}, 4.824),
-        ({"hidden": 512, "final_norm": True, "query_self_attention": True, "step_mlps": True,
+        ({"latent_space": {"name": "cube"}}, 6.928),
+        ({"decoder": {"name": "lstm"}}, 4.824),
+        ({"decoder": {"name": "transformer", "hidden": 512, "final_norm": True,
+                      "query_self_attention": True, "step_mlps": True},
           "layout_heads": "separate"}, 18.484),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
@@ -189,6 +189,7 @@ def test_docs_and_weights_count_alike(changes, millions):
     """The table of docs/paper_map.md: weights at the paper's size, bedrooms."""
     from sceneprior.models.prior import ScenePrior
 
-    settings = ModelConfig(max_objects=13, **changes).model_dump() | {"shape_level": 0}
-    count = sum(p.numel() for p in ScenePrior(classes=22, **settings).parameters())
+    plain = {"max_objects": 13, "decoder": {"name": "transformer"}, "shape": {"level": 0}}
+    prior = ScenePrior(Model.model_validate(plain | changes), classes=22)
+    count = sum(p.numel() for p in prior.parameters())
     assert count / 1e6 == pytest.approx(millions, abs=0.0005)

@@ -7,14 +7,22 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.baselines.atiss.network import END, OCTAVES, PARTS, Atiss, waves
+from sceneprior.baselines.atiss.network import (
+    END,
+    OCTAVES,
+    PARTS,
+    Atiss,
+    AtissModel,
+    fourier_features,
+)
 from sceneprior.views import RoomBoxes
 
 
 @pytest.fixture
 def network() -> Atiss:
     torch.manual_seed(0)
-    network = Atiss(6, 9, width=16, layers=2, heads=2, hidden=24, mixtures=3, dropout=0.1)
+    sizes = AtissModel(max_objects=9, width=16, layers=2, heads=2, hidden=24, mixtures=3)
+    network = Atiss(sizes, classes=6)
     network.low_m.copy_(torch.tensor([-2.0, 0, -3, 0.1, 0.2, 0.3]))
     network.high_m.copy_(torch.tensor([2.0, 2, 3, 1.1, 2.2, 3.3]))
     return network.double().eval()
@@ -145,9 +153,9 @@ def test_the_first_class_comes_as_often_as_the_network_says(network):
     assert (share - wanted).abs().max() < 4 * (0.25 / 4000) ** 0.5
 
 
-def test_waves_are_octaves():
+def test_fourier_features_are_octaves():
     x = torch.tensor([[0.25, -0.5]], dtype=torch.float64)
-    found = waves(x)
+    found = fourier_features(x)
     assert found.shape == (1, 4 * OCTAVES)
     by_hand = [torch.sin(torch.pi * 2**k * v) for v in x[0] for k in range(OCTAVES)]
     by_hand += [torch.cos(torch.pi * 2**k * v) for v in x[0] for k in range(OCTAVES)]

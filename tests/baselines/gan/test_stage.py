@@ -6,15 +6,16 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_runs import tiny_config, write_tiny_config
+from tiny_runs import tiny_baseline_settings, tiny_settings
 from torch.testing import assert_close
 from typer.testing import CliRunner
 
 from sceneprior.baselines.atiss2d import SceneAtiss
-from sceneprior.baselines.gan.losses import mistaken
+from sceneprior.baselines.gan.losses import adversarial_loss
 from sceneprior.baselines.gan.semantic_maps import observed_maps
 from sceneprior.baselines.gan.stage import MEMORY, GanStage
 from sceneprior.cli import app
+from sceneprior.config import check_config, load_run
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.experiments.evaluate import Judging, judge_run, read_curves, report_run
@@ -25,22 +26,31 @@ from sceneprior.losses.completeness import kept_objects
 from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import RollingCheckpoint
-from sceneprior.training.checkpoints import find_checkpoint, load_run, read_checkpoint
+from sceneprior.training.checkpoints import find_checkpoint, read_checkpoint
 from sceneprior.training.fit import fit
-from sceneprior.training.objective import build_latents, build_prior
 
 CPU = {"accelerator": "cpu", "devices": 1}
-GAN = {"epochs": 4, "batch_size": 5, "views_per_room": 3}
 BASELINES = {
-    "atiss": {"model__decoder": "atiss", "model__dropout": 0.1, "layout__epochs": 3,
-              "shape__epochs": 2},
-    "gan": {"stages": "gan", "gan": GAN, "model__step_mlps": True, "model__dropout": 0.1},
+    "atiss2d": {
+        "model__decoder": {
+            "name": "atiss2d", "heads": 2, "hidden": 24, "dropout": 0.1, "norm_first": False,
+        },
+        "layout__epochs": 3,
+        "shape__epochs": 2,
+    },
+    "gan": {},
 }  # fmt: skip
-LAST = {"atiss": "shape", "gan": "gan"}
+STAGES = {"atiss2d": ("layout", "shape"), "gan": ("gan",)}
+
+
+def plain(shards: Path, name: str, **changes):
+    if name == "gan":
+        return tiny_baseline_settings(shards, "gan", **changes)
+    return tiny_settings(shards, **(BASELINES[name] | changes))
 
 
 def settings(shards: Path, name: str, **changes):
-    return tiny_config(shards, **(BASELINES[name] | changes))
+    return check_config(plain(shards, name, **changes), "tiny")
 
 
 @pytest.fixture(scope="module", params=BASELINES)
@@ -79,9 +89,9 @@ def test_the_command_line_trains_generates_and_judges(name, toy_shards, tmp_path
 
 
 def test_a_run_leaves_what_runs_py_promises(run, name):
-    stages = {"atiss": ("layout", "shape"), "gan": ("gan",)}[name]
-    assert {path.name for path in run.iterdir()} == {"config.yaml", *stages}
-    assert find_checkpoint(run) == (LAST[name], run / LAST[name] / "final.ckpt")
+    assert {path.name for path in run.iterdir()} == {"config.yaml", *STAGES[name]}
+    last = STAGES[name][-1]
+    assert find_checkpoint(run, STAGES[name]) == (last, run / last / "final.ckpt")
     trained = load_run(run)
     assert not trained.prior.training and trained.remembers_rooms == (name == "atiss")
     assert isinstance(trained.prior.decoder, SceneAtiss) == (name == "atiss")
@@ -140,8 +150,8 @@ def test_what_needs_latents_of_rooms_says_that_a_gan_has_none(gan_run):
     with pytest.raises(InputError) as error:
         decode_training_rooms(trained)
     assert str(error.value) == (
-        "A run of `stages: gan` keeps no latents of training rooms, so none can be decoded; take "
-        "a run of `stages: two`."
+        "A run of `method: gan` keeps no latents of training rooms, so none can be decoded; take "
+        "a run of `method: ours`."
     )
     with pytest.raises(InputError, match="which keeps none"):
         read_latent(trained, "typo")
@@ -173,20 +183,20 @@ def test_a_gan_is_judged_and_reported_by_its_new_rooms_alone(gan_run, tmp_path):
 def test_looks_choose_a_checkpoint_of_a_gan(toy_shards, tmp_path):
     samples = {"every": 2, "count": 6, "metric": "objects_off"}
     config = settings(toy_shards, "gan", samples=samples)
-    fit(config, tmp_path / "run", trainer_options=CPU, judge=SampleEvaluator(config))
+    fit(config, tmp_path / "run", trainer_options=CPU, evaluate=SampleEvaluator(config))
     assert (tmp_path / "run" / "gan" / "samples" / "00004.png").is_file()
     assert not load_run(tmp_path / "run", "best").remembers_rooms
     with (tmp_path / "run" / "gan" / "metrics.csv").open(newline="") as file:
         header = next(csv.reader(file))
     assert "samples/overlaps" in header and "samples/mask_iou" not in header
-    with pytest.raises(InputError, match="but `stages: gan` remembers no rooms"):
+    with pytest.raises(InputError, match="but `method: gan` remembers no rooms"):
         SampleEvaluator(settings(toy_shards, "gan", samples=samples | {"metric": "mask_iou"}))
 
 
 def test_a_gan_of_several_processes_or_of_another_network_is_a_sentence(
     gan_run, toy_shards, tmp_path
 ):
-    with pytest.raises(InputError, match=r"stages: gan trains in one process, but 2 were asked"):
+    with pytest.raises(InputError, match=r"method: gan trains in one process, but 2 were asked"):
         fit(settings(toy_shards, "gan"), tmp_path / "a",
             trainer_options={"accelerator": "cpu", "devices": 2})  # fmt: skip
     assert not list(tmp_path.iterdir())
@@ -198,7 +208,7 @@ def test_a_gan_of_several_processes_or_of_another_network_is_a_sentence(
 
 
 def test_a_loss_that_is_no_number_names_its_rooms(toy_shards, tmp_path, monkeypatch):
-    monkeypatch.setattr("sceneprior.baselines.gan.stage.SOFT", float("nan"))
+    monkeypatch.setattr("sceneprior.baselines.gan.stage.LOGIT_PENALTY", float("nan"))
     with pytest.raises(FloatingPointError, match=r"The loss is nan on rooms toy/train_\d\d, toy/"):
         fit(settings(toy_shards, "gan"), tmp_path / "run", trainer_options=CPU)
     assert not list(tmp_path.rglob("final.ckpt"))
@@ -206,12 +216,12 @@ def test_a_loss_that_is_no_number_names_its_rooms(toy_shards, tmp_path, monkeypa
 
 def fresh(shards: Path, **changes) -> GanStage:
     config = settings(shards, "gan", **changes)
-    return GanStage(build_prior(config, 22), build_latents(config, 0), config)
+    return GanStage(config.build_prior(void=False), config.build_latents(0), config)
 
 
 def test_objects_start_all_over_the_floor_and_in_most_slots(toy_shards):
     torch.manual_seed(0)
-    stage = fresh(toy_shards, model__dropout=0.0)
+    stage = fresh(toy_shards, model__decoder__dropout=0.0)
     with torch.no_grad():
         scenes = stage.generator(torch.randn(400, 10))
     for name, value in stage.generator.state_dict().items():
@@ -223,7 +233,7 @@ def test_objects_start_all_over_the_floor_and_in_most_slots(toy_shards):
     assert 0.4 < scenes.sizes_m.median() < 1.5 and (scenes.sizes_m > 0).all()
     assert 2 < kept_objects(scenes.completeness_logits).sum(dim=1).float().mean() < 5.9
     # Objects of a room part, as without step MLPs they do not.
-    together = fresh(toy_shards, model__dropout=0.0, model__step_mlps=False)
+    together = fresh(toy_shards, model__decoder__dropout=0.0, model__decoder__step_mlps=False)
     with torch.no_grad():
         alike = together.generator(torch.randn(400, 10))
     within = [s.centers_m.std(dim=1).mean() for s in (scenes, alike)]
@@ -257,7 +267,7 @@ def test_a_discriminator_told_to_tell_apart_does_and_its_views_have_no_order(toy
     optimizer = torch.optim.Adam(judge.parameters(), 2e-3, (0.0, 0.99))
     for _ in range(60):
         optimizer.zero_grad()
-        loss = mistaken(judge(real), True) + mistaken(judge(fake), False)
+        loss = adversarial_loss(judge(real), True) + adversarial_loss(judge(fake), False)
         loss.backward()
         optimizer.step()
     judge.eval()
@@ -285,8 +295,9 @@ def test_the_excess_is_a_running_mean_that_pushes_down(toy_shards, tmp_path, mon
     drawn = GanStage._draw
     monkeypatch.setattr(GanStage, "_draw", draw)
     monkeypatch.setattr("sceneprior.baselines.gan.stage.observed_counts", observed)
-    big = {**GAN, "counts": 1e3, "epochs": 2}  # beside it the discriminator does not matter
-    fit(settings(toy_shards, "gan", gan=big), tmp_path / "run", trainer_options=CPU)
+    # Beside it the discriminator does not matter.
+    big = settings(toy_shards, "gan", training__counts=1e3, training__epochs=2)
+    fit(big, tmp_path / "run", trainer_options=CPU)
     excess = read_checkpoint(tmp_path / "run" / "gan" / "final.ckpt")["state_dict"]["excess"]
     assert_close(excess[:22], (1 - MEMORY ** len(said)) * (more - less), rtol=1e-4, atol=1e-5)
     assert excess[22:].any()  # of pixels
@@ -302,9 +313,9 @@ def test_rates_fall_evenly_to_nothing(toy_shards, tmp_path, monkeypatch):
 
     step = GanStage._update
     monkeypatch.setattr(GanStage, "_update", note)
-    config = settings(toy_shards, "gan", gan=GAN)
+    config = settings(toy_shards, "gan")
     fit(config, tmp_path / "run", trainer_options=CPU)
-    rates = [config.gan.discriminator_learning_rate, config.gan.learning_rate]
+    rates = [config.training.discriminator_learning_rate, config.training.learning_rate]
     for epoch, kept in enumerate((1, 0.75, 0.5, 0.25)):
         batches = len(seen) // 4
         here = seen[epoch * batches : (epoch + 1) * batches]

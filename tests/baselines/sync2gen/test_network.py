@@ -5,7 +5,7 @@ import torch
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.baselines.sync2gen.network import READS, SparseLinear, Sync2Gen
+from sceneprior.baselines.sync2gen.network import READS, SparseLinear, Sync2Gen, Sync2genModel
 from sceneprior.views import RoomBoxes
 
 
@@ -22,7 +22,7 @@ def rooms(torch_rng) -> RoomBoxes:
 @pytest.fixture
 def network(rooms) -> Sync2Gen:
     torch.manual_seed(0)
-    network = Sync2Gen(5, slots=2, width=16, latent=20, refine_steps=0, seed=0)
+    network = Sync2Gen(Sync2genModel(slots=2, width=16, refine_steps=0), classes=5, seed=0)
     network.fit_statistics(rooms, 0)
     return network
 
