@@ -15,10 +15,10 @@ from typing import Any, TypeVar
 from rich.console import Console
 from rich.table import Table
 
+from sceneprior.config import load_run
 from sceneprior.evaluation.protocol import evaluate_synthesis
 from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import open_renderer
-from sceneprior.training.checkpoints import load_run
 
 T = TypeVar("T")
 

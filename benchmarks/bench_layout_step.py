@@ -23,12 +23,12 @@ import torch
 from bench_boxes import SIZE, make_batch
 from torch import Tensor
 
-from sceneprior.config import RunConfig, load_config
+from sceneprior.config import OursConfig, load_config
 from sceneprior.geometry.boxes import place
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.models.prior import ScenePrior
-from sceneprior.training.objective import build_prior, match_and_score, proxy_boxes, weighted_sum
+from sceneprior.training.objective import match_and_score, proxy_boxes, weighted_sum
 from sceneprior.views import DecodedScenes, SceneViews
 
 CLASSES = 23
@@ -66,14 +66,14 @@ def room(batch: Batch, index: int) -> Batch:
     return replace(batch, **part)
 
 
-def our_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: RunConfig) -> None:
+def our_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: OursConfig) -> None:
     scenes = prior.decode(z, with_shape=False)
     boxes = proxy_boxes(scenes, views, "ellipsoid")
-    losses, _ = match_and_score(scenes, boxes, views, config.loss)
+    losses, _ = match_and_score(scenes, boxes, views, config.loss, "first_n")
     weighted_sum(losses, config.loss).backward()
 
 
-def their_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: RunConfig) -> None:
+def their_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: OursConfig) -> None:
     scenes = prior.decode(z, with_shape=False)
     names = ("class_logits", "centers_m", "sizes_m", "completeness_logits")
     outputs = [getattr(scenes, name) for name in names]
@@ -86,12 +86,12 @@ def their_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: RunConfi
         boxes: Boxes2D = boxes_of_points(
             points, seen.world_to_camera, seen.intrinsics, seen.image_size
         )
-        losses, _ = match_and_score(one, boxes, seen, config.loss)
+        losses, _ = match_and_score(one, boxes, seen, config.loss, "first_n")
         (weighted_sum(losses, config.loss) / len(z)).backward()
     torch.autograd.backward(outputs, [leaf.grad for leaf in leaves])
 
 
-Step = Callable[[ScenePrior, Tensor, SceneViews, RunConfig], None]
+Step = Callable[[ScenePrior, Tensor, SceneViews, OursConfig], None]
 
 
 def step_ratio(rooms: int = 128, views: int = 20, repeats: int = 5) -> dict[str, float]:
@@ -99,8 +99,8 @@ def step_ratio(rooms: int = 128, views: int = 20, repeats: int = 5) -> dict[str,
     config = load_config(str(CONFIG))
     objects = config.model.max_objects
     batch = make_views(rooms, views, objects)
-    prior = build_prior(config, CLASSES)
-    logits = torch.randn(rooms, config.model.anchors, requires_grad=True)
+    prior = config.build_prior()
+    logits = torch.randn(rooms, config.model.logits_per_room, requires_grad=True)
     optimizer = torch.optim.Adam([*prior.parameters(), logits], lr=1e-4, fused=True)
 
     def seconds(step: Step) -> float:

@@ -17,10 +17,11 @@ from pathlib import Path
 
 import torch
 
+from sceneprior.config import load_run
 from sceneprior.reconstruction.fit import SCHEDULES, FitSchedule, fit_latents
 from sceneprior.reconstruction.observed import ObservedImage, as_views, images_of_split
 from sceneprior.reconstruction.reconstruct import MASK_COLUMNS
-from sceneprior.training.checkpoints import TrainedPrior, load_run
+from sceneprior.training.method import TrainedPrior
 
 FULL = SCHEDULES["paper"].steps
 

@@ -28,6 +28,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from sceneprior.config import load_run
 from sceneprior.evaluation.metrics.layout_metrics import (
     category_kl,
     match_scenes,
@@ -39,7 +40,6 @@ from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.generation.complete import STEPS, complete
 from sceneprior.generation.insert import put_into
 from sceneprior.scene import Scene
-from sceneprior.training.checkpoints import load_run
 
 
 def main() -> None:

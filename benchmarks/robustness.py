@@ -18,17 +18,15 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from sceneprior.classes import label_set
-from sceneprior.config import RunConfig, load_config
+from sceneprior.config import OursConfig, load_config
 from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.data.flat_views import FlatViews
 from sceneprior.evaluation.metrics.layout_metrics import reconstruction_scores
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.generation.decode import decode_training_rooms
-from sceneprior.training.checkpoints import TrainedPrior
 from sceneprior.training.layout import LayoutStage
-from sceneprior.training.objective import build_latents, build_prior
+from sceneprior.training.method import TrainedPrior
 from sceneprior.views import SceneViews
 
 BASE = Path(__file__).parents[1] / "configs" / "demo.yaml"
@@ -109,23 +107,25 @@ class SmallRooms(Dataset):
         return replace(batch, room_index=torch.tensor([row for row, _ in draws]))
 
 
-def train(config: RunConfig, rooms: SmallRooms) -> TrainedPrior:
+def train(config: OursConfig, rooms: SmallRooms) -> TrainedPrior:
     """The layout stage alone, on what is in memory."""
     lightning.seed_everything(config.seed, verbose=False)
-    prior = build_prior(config, len(label_set(config.label_set)))
-    latents = build_latents(config, len(rooms))
+    prior, latents = config.build_prior(), config.build_latents(len(rooms))
     trainer = lightning.Trainer(
         max_epochs=config.layout.epochs, logger=False, enable_checkpointing=False,
         enable_progress_bar=False, enable_model_summary=False, accelerator="cpu",
         gradient_clip_val=config.layout.clip_gradient or None,
     )  # fmt: skip
     loader = make_loader(rooms, config.layout.batch_size, config.seed, 0)  # type: ignore[arg-type]
-    trainer.fit(LayoutStage(prior, latents, config), loader)
+    stage = LayoutStage(
+        prior, latents, config.layout, config.loss, config.model.completeness_target, config.seed
+    )
+    trainer.fit(stage, loader)
     prior = prior.eval().requires_grad_(False)
     return TrainedPrior(prior, latents.weight.detach(), rooms.room_ids, config, "layout")
 
 
-def row(name: str, config: RunConfig, rooms: int, masks: bool, poses: bool) -> None:
+def row(name: str, config: OursConfig, rooms: int, masks: bool, poses: bool) -> None:
     """Train on some rooms, spoilt or not, and print how well they are remembered."""
     folder = Path(config.data.shards)
     data = ViewDataset(folder, "train", config.data.views_per_room, seed=config.seed)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sceneprior.config import load_run
 from sceneprior.evaluation.metrics.set_metrics import frechet_distance
 from sceneprior.evaluation.protocol import without_void
 from sceneprior.evaluation.reference import reference_scenes
@@ -20,7 +21,6 @@ from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene
-from sceneprior.training.checkpoints import load_run
 
 DISTRIBUTIONS = ("kernel", "geodesic", "paper")
 

@@ -14,13 +14,15 @@ from statistics import mean
 
 import numpy as np
 
+from sceneprior.config import load_run
 from sceneprior.evaluation.metrics.layout_metrics import match_scenes
 from sceneprior.evaluation.metrics.mesh_metrics import chamfer, f_score, sample_surface
 from sceneprior.evaluation.topdown import box_mesh
 from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.training.checkpoints import TrainedPrior, load_run, restore
+from sceneprior.training.checkpoints import restore
+from sceneprior.training.method import TrainedPrior
 
 SPHERE_LEVEL = 3
 

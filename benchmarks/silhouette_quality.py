@@ -17,17 +17,16 @@ from pathlib import Path
 
 import torch
 
-from sceneprior.config import load_config
+from sceneprior.config import load_config, load_run
 from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.evaluation.metrics.layout_metrics import reconstruction_scores
 from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.geometry.cameras import boxes_of_points
 from sceneprior.losses.matching import match_objects
-from sceneprior.losses.shape import observed_ids
 from sceneprior.silhouettes import render_scene
-from sceneprior.training.checkpoints import TrainedPrior, load_run
 from sceneprior.training.fit import fit
+from sceneprior.training.method import TrainedPrior
 
 VARIANTS = ("exact/layered", "exact/paper", "fast/layered", "fast/paper")
 
@@ -85,7 +84,7 @@ def mask_iou(trained: TrainedPrior) -> float:
             scenes.vertices_m, views.world_to_camera, views.intrinsics, views.image_size
         )
         matches = match_objects(scenes, boxes, views)
-        ids = observed_ids(views)
+        ids = views.observed_ids
         height, width = ids.shape[-2:]
         drawn = torch.arange(scenes.centers_m.shape[1]) < views.is_object.sum(-1, keepdim=True)
         front = render_scene(
