@@ -31,7 +31,7 @@ from sceneprior.models.prior import ScenePrior
 from sceneprior.training.objective import match_and_score, proxy_boxes, weighted_sum
 from sceneprior.views import DecodedScenes, SceneViews
 
-CLASSES = 23
+CLASSES = 22
 CONFIG = Path(__file__).parents[1] / "configs" / "bedroom.yaml"
 Batch = TypeVar("Batch", SceneViews, DecodedScenes)
 
