@@ -1,4 +1,4 @@
-"""World points and cameras in, pixels and depths out (OpenCV axes, docs/conventions.md)."""
+"""Pinhole cameras: projected points, their 2D boxes, rays (OpenCV axes, docs/conventions.md)."""
 
 from typing import NamedTuple
 

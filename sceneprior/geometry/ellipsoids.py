@@ -1,4 +1,4 @@
-"""Axis-aligned ellipsoids and cameras in, 2D boxes out: in closed form, without sampled points."""
+"""2D boxes of axis-aligned ellipsoids in closed form, without sampled points."""
 
 from typing import Any, NamedTuple
 
@@ -51,9 +51,9 @@ def boxes_of_ellipsoids(
     Example: a ball of radius 0.6 m, 1 m ahead, is seen under tan(asin(0.6)) = 0.75.
 
         >>> center, size = torch.tensor([[[0.0, 0, 1]]]), torch.full((1, 1, 3), 1.2)
-        >>> lens = torch.tensor([[[[40.0, 0, 50], [0, 40, 50], [0, 0, 1]]]])
+        >>> intrinsics = torch.tensor([[[[40.0, 0, 50], [0, 40, 50], [0, 0, 1]]]])
         >>> ahead = torch.eye(4)[None, None]
-        >>> boxes, inside = boxes_of_ellipsoids(center, size, ahead, lens, (100, 100))
+        >>> boxes, inside = boxes_of_ellipsoids(center, size, ahead, intrinsics, (100, 100))
         >>> [round(x, 5) for x in boxes.flatten().tolist()], inside.item()
         ([0.2, 0.2, 0.8, 0.8], True)
     """

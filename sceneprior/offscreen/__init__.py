@@ -1,6 +1,6 @@
-"""Pictures without a screen: meshes and cameras in, instance ids or shaded colours out.
+"""Draws instance ids and shaded pictures of meshes without a screen.
 
-The one front door to pyrender. Where the machine has no GL library, a z-buffer of our own
+The only user of pyrender. Where the machine has no GL library, a z-buffer of our own
 (offscreen/zbuffer.py) draws the same ids.
 """
 
@@ -10,8 +10,13 @@ import sys
 
 from sceneprior.errors import InputError
 from sceneprior.offscreen.gl import NoGLError, open_pyrender
-from sceneprior.offscreen.renderer import Camera, Orthographic, Pinhole, Renderer
-from sceneprior.offscreen.software import SoftwareRenderer
+from sceneprior.offscreen.renderer import (
+    Camera,
+    Orthographic,
+    Pinhole,
+    Renderer,
+    SoftwareRenderer,
+)
 
 __all__ = ["Camera", "Orthographic", "Pinhole", "Renderer", "SoftwareRenderer", "open_renderer"]
 

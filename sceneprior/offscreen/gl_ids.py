@@ -1,4 +1,4 @@
-"""pyrender's own renderer, changed where exact instance ids need it."""
+"""A pyrender renderer that draws exact instance ids."""
 
 import ctypes
 import functools

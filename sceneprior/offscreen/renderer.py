@@ -1,7 +1,7 @@
-"""What a renderer is, what its cameras are, and pictures for people, alike from every renderer.
+"""Renderers and their cameras: the interface, its software z-buffer, and shaded pictures.
 
 The z-buffer is imported where it draws: Numba takes 60 MB and half a second, which a command that
-draws nothing (prep-scannet) should not pay.
+draws nothing (prep-scannet) should not pay for.
 """
 
 import abc
@@ -93,6 +93,33 @@ class Renderer(abc.ABC):
         behind = np.broadcast_to(np.asarray(background), (height, width, 3))[:, None, :, None]
         fine = np.where((face_index < 0).reshape(height, 2, width, 2, 1), behind, fine)
         return np.rint(fine.mean(axis=(1, 3))).astype(np.uint8)
+
+
+class SoftwareRenderer(Renderer):
+    """Our Numba z-buffer: needs no library of the system, the same pixels on every machine."""
+
+    name = "software"
+    kind = "software"
+
+    def instance_ids_of_views(
+        self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
+    ) -> np.ndarray:
+        from sceneprior.offscreen.zbuffer import draw_labels
+
+        soup = join(meshes)
+        id_of_face = (soup.mesh_of_face + 1).astype(np.int32)
+        images = np.empty((len(cameras), *image_size), dtype=np.uint16)
+        for image, camera in zip(images, cameras, strict=True):
+            image[...] = draw_labels(
+                soup.vertices,
+                soup.faces,
+                id_of_face,
+                camera.world_to_camera,
+                projection(camera, image_size),
+                image_size,
+                perspective=isinstance(camera, Pinhole),
+            )[0]
+        return images
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The hard rasteriser: triangles and one camera in, each pixel's nearest face and depth out."""
+"""The hard rasteriser: a z-buffer of triangles, sampled at pixel centres."""
 
 import math
 from typing import no_type_check
@@ -6,7 +6,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-NEAR_M = 0.01
+NEAR_PLANE_M = 0.01
 """Triangles are cut where they come nearer to the camera than this."""
 
 # Rounding must not open a crack where a pixel centre lies on the edge of two faces. It widens a
@@ -25,7 +25,6 @@ def rasterize(
     projection: tuple[float, float, float, float],
     image_size: tuple[int, int],
     perspective: bool = True,
-    near_m: float = NEAR_M,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw triangles into a z-buffer, sampled at pixel centres.
 
@@ -40,7 +39,6 @@ def rasterize(
             (orthographic, fx in pixels per metre); v likewise from y.
         image_size: (height, width) in pixels.
         perspective: False for an orthographic camera.
-        near_m: What is nearer than this plane is cut away.
 
     Returns:
         face_index: (height, width) int32, -1 where nothing is drawn.
@@ -55,8 +53,8 @@ def rasterize(
         [2.0, 2.0, inf, inf]
     """
     labels = np.arange(len(faces), dtype=np.int32)
-    face_index, nearness = _draw_image(
-        vertices, faces, labels, -1, world_to_camera, projection, image_size, perspective, near_m
+    face_index, nearness = draw_labels(
+        vertices, faces, labels, world_to_camera, projection, image_size, perspective, -1
     )
     with np.errstate(divide="ignore"):
         depth = 1 / nearness if perspective else -nearness
@@ -72,56 +70,36 @@ def draw_labels(
     projection: tuple[float, float, float, float],
     image_size: tuple[int, int],
     perspective: bool = True,
-    near_m: float = NEAR_M,
-) -> np.ndarray:
-    """Draw each triangle in its label: what `rasterize` draws, without the depth.
-
-    Args:
-        labels: (F,) int32, one a triangle. The other arguments are those of `rasterize`.
+    background: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """`rasterize` with a label of each triangle instead of its index.
 
     Returns:
-        (height, width) int32, 0 where nothing is drawn.
+        image: (height, width) int32 of labels, `background` where nothing is drawn.
+        nearness: (height, width) float32, 1 / z of what is drawn, -z of an orthographic camera:
+            both are straight lines across a triangle on screen.
     """
-    return _draw_image(
-        vertices, faces, labels, 0, world_to_camera, projection, image_size, perspective, near_m
-    )[0]
-
-
-def _draw_image(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    labels: np.ndarray,
-    background: int,
-    world_to_camera: np.ndarray,
-    projection: tuple[float, float, float, float],
-    image_size: tuple[int, int],
-    perspective: bool,
-    near_m: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Labels (int32) and nearness (float32), each (height, width)."""
     height, width = image_size
     pixels = height * width
-    # Flat, and a few pixels longer than the image: `_fill_narrow` reads past a row's end.
+    # Flat, and a few pixels longer than the image: `_fill` reads past a row's end.
     image = np.full(pixels + _NARROW_PX - 1, background, dtype=np.int32)
-    # 1/z (or -z) of what is nearest so far: both are straight lines across a triangle on screen.
     nearness = np.full(pixels + _NARROW_PX - 1, -np.inf, dtype=np.float32)
-    fx, fy, cx, cy = (float(value) for value in projection)
     _draw(
         np.ascontiguousarray(vertices, dtype=np.float64),
         np.ascontiguousarray(faces, dtype=np.int32),
         np.ascontiguousarray(labels, dtype=np.int32),
         np.ascontiguousarray(world_to_camera, dtype=np.float64),
-        fx, fy, cx, cy, perspective, float(near_m), height, width, image, nearness,
+        *(float(value) for value in projection), perspective, height, width, image, nearness,
     )  # fmt: skip
     return image[:pixels].reshape(image_size), nearness[:pixels].reshape(image_size)
 
 
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
-# error_model: numpy's division asks no question; what is not a number is refused by its area.
+# error_model: numpy's division does not check; what is not a number is refused by its area.
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _draw(
-    vertices, faces, labels, world_to_camera, fx, fy, cx, cy, perspective, near_m,
+    vertices, faces, labels, world_to_camera, fx, fy, cx, cy, perspective,
     height, width, image, nearness,
 ):  # fmt: skip
     m = world_to_camera
@@ -138,15 +116,17 @@ def _draw(
     clipped = np.empty((4, 3))
     corners = np.empty((4, 3))
     for face in range(len(faces)):
-        # Unsigned: Numba asks every signed index whether it counts from the end.
+        # Unsigned: Numba tests every signed index for counting from the end.
         a, b, c = np.uint32(faces[face, 0]), np.uint32(faces[face, 1]), np.uint32(faces[face, 2])
         in_front = (
-            int(camera[a, 2] >= near_m) + int(camera[b, 2] >= near_m) + int(camera[c, 2] >= near_m)
+            int(camera[a, 2] >= NEAR_PLANE_M)
+            + int(camera[b, 2] >= NEAR_PLANE_M)
+            + int(camera[c, 2] >= NEAR_PLANE_M)
         )
         if in_front == 3:
             _fill(screen, a, b, c, labels[face], height, width, image, nearness)
         elif in_front > 0:
-            count = _clip(camera[a], camera[b], camera[c], near_m, clipped)
+            count = _clip(camera[a], camera[b], camera[c], clipped)
             for i in range(count):
                 corners[i, 0], corners[i, 1], corners[i, 2] = _project(
                     clipped[i, 0], clipped[i, 1], clipped[i, 2], fx, fy, cx, cy, perspective
@@ -167,21 +147,21 @@ def _project(x, y, z, fx, fy, cx, cy, perspective):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _clip(a, b, c, near_m, out):
+def _clip(a, b, c, out):
     """Keep the part of a triangle beyond the near plane: three or four corners."""
     count = 0
     triangle = (a, b, c)
     for i in range(3):
         here, there = triangle[i], triangle[(i + 1) % 3]
-        if here[2] >= near_m:
+        if here[2] >= NEAR_PLANE_M:
             for axis in range(3):
                 out[count, axis] = here[axis]
             count += 1
-        if (here[2] >= near_m) != (there[2] >= near_m):
-            share = (near_m - here[2]) / (there[2] - here[2])
+        if (here[2] >= NEAR_PLANE_M) != (there[2] >= NEAR_PLANE_M):
+            share = (NEAR_PLANE_M - here[2]) / (there[2] - here[2])
             for axis in range(2):
                 out[count, axis] = here[axis] + share * (there[axis] - here[axis])
-            out[count, 2] = near_m
+            out[count, 2] = NEAR_PLANE_M
             count += 1
     return count
 

@@ -1,4 +1,4 @@
-"""Projected meshes in, visible soft masks out, in plain torch: the readable definition.
+"""The readable definition of the renderer: visible soft masks of projected meshes, in plain torch.
 
 Slow, differentiable by autograd, in any precision and on any device. The fast backends are
 tested against it.
@@ -20,8 +20,7 @@ PIECE_PX = 4.0
 """An edge of an outline is cut into equal pieces of at most this length: outline or not."""
 
 ASIDE_PX = 1e-3
-"""How far beside the middle of a piece it is asked whether a face lies there."""
-
+"""How far beside the middle of a piece it is tested whether a face lies there."""
 
 SLACK = 1e-6
 """Share of its size by which a face is wider for ids and depths, where rounding must not open a
@@ -39,13 +38,22 @@ class Settings(NamedTuple):
     compositing: str
 
 
+class Drawing(NamedTuple):
+    """What a backend draws: see `sceneprior.silhouettes.render.RenderedScene`."""
+
+    masks: Float[Tensor, "images objects height width"]
+    front: Int[Tensor, "images height width"]
+    depth_m: Float[Tensor, "images height width"]
+
+
 class Alone(NamedTuple):
-    """One mesh, drawn alone: coverage, depth where it is felt, depth where a face contains
-    the pixel centre (else infinite)."""
+    """One mesh, drawn alone."""
 
     coverage: Float[Tensor, "*image"]
     order_m: Float[Tensor, "*image"]
+    """Depth where the mesh covers or blurs a pixel, by which masks are ordered; else infinite."""
     depth_m: Float[Tensor, "*image"]
+    """Depth where a face contains the pixel centre; else infinite."""
 
 
 def draw(
@@ -54,12 +62,8 @@ def draw(
     faces: Int[Tensor, "faces 3"],
     drawn: Bool[Tensor, "images objects"],
     settings: Settings,
-) -> tuple[
-    Float[Tensor, "images objects height width"],
-    Int[Tensor, "images height width"],
-    Float[Tensor, "images height width"],
-]:
-    """Masks, front-most object and its depth: see `sceneprior.silhouettes.render`."""
+) -> Drawing:
+    """Draw every object in its image: masks, front-most object and its depth."""
     images, objects = pixels.shape[:2]
     flat = zip(pixels.flatten(0, 1), depths.flatten(0, 1), drawn.flatten(), strict=True)
     alone = [draw_alone(*mesh[:2], faces, mesh[2], settings) for mesh in flat]
@@ -70,14 +74,9 @@ def draw(
         coverage, order, depth = (torch.stack(x).reshape(shape) for x in zip(*alone, strict=True))
     masks = composite(coverage, order, settings.compositing)
     if objects == 0:
-        return masks, *_nothing(pixels, (images, *settings.image_size))
+        depth = pixels.new_full((images, 1, *settings.image_size), float("inf"))
     nearest, front = depth.detach().min(dim=1)
-    return masks, torch.where(nearest < float("inf"), front, -1).int(), nearest
-
-
-def _nothing(like: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    front = torch.full(shape, -1, dtype=torch.int32, device=like.device)
-    return front, like.new_full(shape, float("inf"))
+    return Drawing(masks, torch.where(nearest < float("inf"), front, -1).int(), nearest)
 
 
 def draw_alone(
@@ -107,7 +106,7 @@ def draw_alone(
 
 
 def _faces(grid: Tensor, corners: Tensor, z: Tensor, settings: Settings) -> tuple[Tensor, ...]:
-    """The exact formula: every face has its say."""
+    """The exact mode: the formula over all faces."""
     a, b, c = corners.unbind(dim=1)
     squared = torch.stack(
         [_segment_distance2(grid, *edge)[0] for edge in ((a, b), (b, c), (c, a))]
@@ -121,8 +120,8 @@ def _faces(grid: Tensor, corners: Tensor, z: Tensor, settings: Settings) -> tupl
     face_depth = clipped.sum(dim=-1) / (clipped / z.detach()).sum(dim=-1)
     contained = (weights > -SLACK).all(dim=-1)
     depth = torch.where(contained, face_depth, float("inf")).amin(dim=-1)
-    felt = torch.where(touched, face_depth, float("inf")).amin(dim=-1)
-    return -torch.expm1(log_missed), torch.where(depth < float("inf"), depth, felt), depth
+    soft_depth = torch.where(touched, face_depth, float("inf")).amin(dim=-1)
+    return -torch.expm1(log_missed), torch.where(depth < float("inf"), depth, soft_depth), depth
 
 
 def _outline(
@@ -148,9 +147,9 @@ def _outline(
     x = torch.where(inside, squared, -squared) / settings.sigma_px2
     coverage = torch.where(on_outline, torch.sigmoid(x), inside.to(x.dtype))
     z0, z1 = depths.detach()[ends[nearest]].unbind(dim=-1)
-    felt = 1 / ((1 - share) / z0 + share / z1)
-    felt = torch.where(on_outline, felt, float("inf"))
-    return coverage, torch.where(inside, depth, felt), depth
+    soft_depth = 1 / ((1 - share) / z0 + share / z1)
+    soft_depth = torch.where(on_outline, soft_depth, float("inf"))
+    return coverage, torch.where(inside, depth, soft_depth), depth
 
 
 def _outline_pieces(

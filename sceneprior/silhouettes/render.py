@@ -1,8 +1,9 @@
-"""Meshes and cameras in, soft masks out: the public door of the differentiable renderer."""
+"""The differentiable renderer: soft visible masks of meshes in many views, with gradients."""
 
 import importlib
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, ParamSpec
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,7 +13,7 @@ from sceneprior.geometry.cameras import project
 from sceneprior.silhouettes.cpu.projection import project_in_threads
 from sceneprior.silhouettes.reference import Settings
 
-NEAR_M = 0.05
+NEAR_FACE_M = 0.05
 """A face with a corner nearer than this, or behind the camera, is left out of that view."""
 
 SIGMA_NDC = 1e-4
@@ -24,16 +25,14 @@ BACKENDS = ("auto", "cpu", "cuda", "reference")
 
 
 class RenderedScene(NamedTuple):
-    """What `render_scene` draws.
-
-    `masks` is what `render_silhouettes` returns. `front` is the index of the object whose surface
-    is nearest at the pixel centre, -1 where there is none, and `depth_m` how far away it is along
-    the optical axis, infinite where there is none; both are hard and carry no gradient.
-    """
+    """What `render_scene` draws; `front` and `depth_m` are hard and carry no gradient."""
 
     masks: Float[Tensor, "rooms views objects height width"]
+    """In [0, 1], differentiable in the vertices."""
     front: Int[Tensor, "rooms views height width"]
+    """The object whose surface is nearest at the pixel centre; -1 where there is none."""
     depth_m: Float[Tensor, "rooms views height width"]
+    """How far away it is along the optical axis; infinite where there is none."""
 
 
 def sigma_from_ndc(sigma_ndc: float, image_size: tuple[int, int]) -> float:
@@ -41,7 +40,7 @@ def sigma_from_ndc(sigma_ndc: float, image_size: tuple[int, int]) -> float:
     return sigma_ndc * (min(image_size) / 2) ** 2
 
 
-def render_silhouettes(
+def render_scene(
     vertices_m: Float[Tensor, "rooms objects vertices 3"],
     faces: Int[Tensor, "faces 3"],
     world_to_camera: Float[Tensor, "rooms views 4 4"],
@@ -55,8 +54,8 @@ def render_silhouettes(
     compositing: str = "layered",
     drawn: Bool[Tensor, "rooms objects"] | None = None,
     backend: str = "auto",
-) -> Float[Tensor, "rooms views objects height width"]:
-    """Draw every object's soft mask in every view of its room.
+) -> RenderedScene:
+    """Draw every object's soft mask, and which object is in front, in every view of its room.
 
     In `exact` mode a pixel is covered unless every face misses it:
 
@@ -76,19 +75,16 @@ def render_silhouettes(
         world_to_camera: One rigid transform a view, OpenCV axes.
         intrinsics: Pixels of an image of `image_size`.
         image_size: (height, width) of the masks.
-        sigma_px2: Softness of an edge in squared pixels. Larger pulls on more pixels and
-            blurs more. None takes `sigma_ndc`.
+        sigma_px2: Softness of an edge in squared pixels. Larger blurs more, and gives more pixels
+            a gradient. None takes `sigma_ndc`.
         sigma_ndc: The same in PyTorch3D's squared-NDC units; None takes the paper's 1e-4.
         blur_ndc: Squared blur radius in the same units; None takes the authors', at which the
             sigmoid is 1e-4: log(1 / 1e-4 - 1) sigma.
         mode: `exact` or `fast`.
-        compositing: `layered` or `paper` (visible masks, see `compositing.py`), or `alone`.
+        compositing: `layered` or `paper` (visible masks, see `cpu/compositing.py`), or `alone`.
         drawn: Objects to draw; others are empty and hide nothing. None draws all.
         backend: `cpu` (Numba), `cuda` (Triton), `reference` (plain torch), or `auto`: the fast
             one of the tensors' device.
-
-    Returns:
-        Masks in [0, 1], differentiable in `vertices_m`.
 
     Raises:
         ValueError: an unknown mode, a sigma that is not positive, a face without its vertex, or a
@@ -102,56 +98,14 @@ def render_silhouettes(
 
         >>> triangle = torch.tensor([[[[0.0, 0, 2], [1, 0, 2], [0, 1, 2]]]])
         >>> ahead = torch.eye(4)[None, None]
-        >>> lens = torch.tensor([[[[32.0, 0, 16], [0, 32, 16], [0, 0, 1]]]])
-        >>> masks = render_silhouettes(
-        ...     triangle, torch.tensor([[0, 1, 2]]), ahead, lens, (32, 32), sigma_px2=1e-3
+        >>> intrinsics = torch.tensor([[[[32.0, 0, 16], [0, 32, 16], [0, 0, 1]]]])
+        >>> scene = render_scene(
+        ...     triangle, torch.tensor([[0, 1, 2]]), ahead, intrinsics, (32, 32), sigma_px2=1e-3
         ... )
-        >>> masks.shape, round(masks.sum().item(), 3)
+        >>> scene.masks.shape, round(scene.masks.sum().item(), 3)
         (torch.Size([1, 1, 1, 32, 32]), 128.0)
-    """
-    return render_scene(
-        vertices_m,
-        faces,
-        world_to_camera,
-        intrinsics,
-        image_size,
-        sigma_px2=sigma_px2,
-        sigma_ndc=sigma_ndc,
-        blur_ndc=blur_ndc,
-        mode=mode,
-        compositing=compositing,
-        drawn=drawn,
-        backend=backend,
-    ).masks
-
-
-def render_scene(
-    vertices_m: Float[Tensor, "rooms objects vertices 3"],
-    faces: Int[Tensor, "faces 3"],
-    world_to_camera: Float[Tensor, "rooms views 4 4"],
-    intrinsics: Float[Tensor, "rooms views 3 3"],
-    image_size: tuple[int, int],
-    *,
-    sigma_px2: float | None = None,
-    sigma_ndc: float | None = None,
-    blur_ndc: float | None = None,
-    mode: str = "exact",
-    compositing: str = "layered",
-    drawn: Bool[Tensor, "rooms objects"] | None = None,
-    backend: str = "auto",
-) -> RenderedScene:
-    """`render_silhouettes`, and which object is in front at each pixel, and how far away.
-
-    Arguments and errors are those of `render_silhouettes`.
-
-    Example: what a room's camera would label.
-
-        >>> triangle = torch.tensor([[[[0.0, 0, 2], [0.9, 0, 2], [0, 0.9, 2]]]])
-        >>> ahead = torch.eye(4)[None, None]
-        >>> lens = torch.tensor([[[[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]]])
-        >>> scene = render_scene(triangle, torch.tensor([[0, 1, 2]]), ahead, lens, (4, 4))
-        >>> scene.front[0, 0].tolist()
-        [[-1, -1, -1, -1], [-1, -1, -1, -1], [-1, -1, 0, -1], [-1, -1, -1, -1]]
+        >>> scene.front[0, 0, 20, ::4].tolist()
+        [-1, -1, -1, -1, 0, 0, 0, -1]
     """
     _refuse_unknown("mode", mode, MODES)
     _refuse_unknown("compositing", compositing, COMPOSITING)
@@ -180,7 +134,7 @@ def render_scene(
     seen &= torch.isfinite(intrinsics).flatten(2).all(-1)
     if not bool(seen.all()):
         room, view = (~seen).nonzero()[0].tolist()
-        raise ValueError(f"view {view} of room {room} has a pose or lens that is not finite")
+        raise ValueError(f"view {view} of room {room} has a pose or intrinsics that is not finite")
     rooms, objects, vertices = vertices_m.shape[:3]
     views = world_to_camera.shape[1]
     if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < vertices:
@@ -199,18 +153,29 @@ def render_scene(
     else:
         projected = project(vertices_m, world_to_camera, intrinsics).flatten(0, 1)
         pixels, depths = projected[..., :2], projected[..., 2]
-    masks, front, depth_m = _engine(backend).draw(
-        pixels,
-        depths,
-        faces,
-        drawn.repeat_interleave(views, dim=0),
-        Settings((image_size[0], image_size[1]), sigma_px2, blur_px2, NEAR_M, mode, compositing),
-    )
-    return RenderedScene(*(array.unflatten(0, (rooms, views)) for array in (masks, front, depth_m)))
+    size = (image_size[0], image_size[1])
+    settings = Settings(size, sigma_px2, blur_px2, NEAR_FACE_M, mode, compositing)
+    drawn = drawn.repeat_interleave(views, dim=0)
+    images = _engine(backend).draw(pixels, depths, faces, drawn, settings)
+    return RenderedScene(*(array.unflatten(0, (rooms, views)) for array in images))
+
+
+Arguments = ParamSpec("Arguments")
+
+
+def _masks_of(draw: Callable[Arguments, RenderedScene]) -> Callable[Arguments, Tensor]:
+    def render_silhouettes(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Tensor:
+        """The masks of `render_scene`, which documents the arguments and errors."""
+        return draw(*args, **kwargs).masks
+
+    return render_silhouettes
+
+
+render_silhouettes = _masks_of(render_scene)
 
 
 def _engine(backend: str):
-    # Loaded when asked for: the CPU backend compiles, and Triton may not be installed.
+    # Loaded when needed: the CPU backend compiles, and Triton may not be installed.
     name = backend if backend == "reference" else f"{backend}.backend"
     return importlib.import_module(f"sceneprior.silhouettes.{name}")
 

@@ -1,4 +1,4 @@
-"""Triangles in, edges out: which faces meet at an edge, and from which side."""
+"""Edges of a triangle mesh: which faces meet at each, and from which side."""
 
 from functools import lru_cache
 from typing import NamedTuple

@@ -72,7 +72,7 @@ def test_narrow_and_wide_triangles_are_drawn_to_the_bit(width):
     with np.errstate(divide="ignore"):
         np.testing.assert_array_equal(depth[index >= 0], 1 / nearness[index >= 0])
     labels = rng.integers(1, 500, 70).astype(np.int32)
-    drawn = draw_labels(vertices, faces, labels, IDENTITY, projection, (9, width))
+    drawn, _ = draw_labels(vertices, faces, labels, IDENTITY, projection, (9, width))
     np.testing.assert_array_equal(drawn, np.where(by_hand < 0, 0, labels[by_hand]))
 
 

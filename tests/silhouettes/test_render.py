@@ -142,7 +142,7 @@ def test_a_camera_that_is_no_number_names_view_and_room(which):
     scene = random_scene(0)
     scene[which] = scene[which].clone()
     scene[which][1, 2, 0, 1] = math.nan
-    message = r"^view 2 of room 1 has a pose or lens that is not finite$"
+    message = r"^view 2 of room 1 has a pose or intrinsics that is not finite$"
     with pytest.raises(ValueError, match=message):
         render_silhouettes(**scene)
 

@@ -1,6 +1,5 @@
-"""Projected meshes in, visible masks and their gradient out: the Numba backend's front door."""
+"""The Numba backend: visible masks of projected meshes, and their gradient."""
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -8,28 +7,18 @@ from torch.autograd.function import once_differentiable
 
 from sceneprior.silhouettes.cpu import compositing, faces, outline
 from sceneprior.silhouettes.cpu.windows import windows_of
-from sceneprior.silhouettes.reference import Settings
+from sceneprior.silhouettes.reference import Drawing, Settings
 
 
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(ctx, pixels, depths, triangles, drawn, settings):
-        shape = pixels.shape[:2]
-        points = pixels.detach().flatten(0, 1).contiguous().numpy()
-        z = depths.detach().flatten(0, 1).contiguous().numpy()
-        triangles = triangles.contiguous().numpy()
-        windows = windows_of(
-            points,
-            z,
-            drawn.contiguous().flatten().numpy(),
-            settings.image_size,
-            float(np.sqrt(settings.blur_px2)),
-            settings.near_m,
-        )
-        arguments = (points, z, triangles, windows, settings)
+        points, z = (part.detach().flatten(0, 1).contiguous().numpy() for part in (pixels, depths))
+        windows = windows_of(points, z, drawn.contiguous().flatten().numpy(), settings)
+        arguments = (points, z, triangles.contiguous().numpy(), windows, settings)
         engine = outline if settings.mode == "fast" else faces
         odds, order, traced = engine.cover(*arguments)
-        size = (*shape, *settings.image_size)
+        size = (*pixels.shape[:2], *settings.image_size)
         composed = compositing.compose(odds, order, windows, settings.compositing, size)
         ctx.rest = (engine, arguments, odds, order, traced)
         results = tuple(torch.from_numpy(array) for array in composed)
@@ -41,9 +30,10 @@ class _Draw(torch.autograd.Function):
     def backward(ctx, upstream, _front, _depth):
         engine, arguments, odds, order, traced = ctx.rest
         windows, settings = arguments[3:]
-        pull = upstream.contiguous().numpy()
-        force = compositing.force_of(odds, order, windows, settings.compositing, pull)
-        gradient = engine.pull_back(*arguments, odds, traced, force)
+        packed = compositing.compose_backward(
+            odds, order, windows, settings.compositing, upstream.contiguous().numpy()
+        )
+        gradient = engine.cover_backward(*arguments, odds, traced, packed)
         gradient = gradient.reshape(*upstream.shape[:2], *gradient.shape[1:])
         return torch.from_numpy(gradient), None, None, None, None
 
@@ -54,10 +44,6 @@ def draw(
     triangles: Int[Tensor, "faces 3"],
     drawn: Bool[Tensor, "images objects"],
     settings: Settings,
-) -> tuple[
-    Float[Tensor, "images objects height width"],
-    Int[Tensor, "images height width"],
-    Float[Tensor, "images height width"],
-]:
-    """Masks, front-most object and its depth: see `sceneprior.silhouettes.render`."""
-    return _Draw.apply(pixels, depths, triangles.long(), drawn, settings)
+) -> Drawing:
+    """What `reference.draw` draws."""
+    return Drawing(*_Draw.apply(pixels, depths, triangles.long(), drawn, settings))

@@ -1,4 +1,4 @@
-"""Odds and orders of single objects in, visible soft masks out.
+"""Visible soft masks from the coverage and the depth order of single objects, and back.
 
 With coverage_k = 1 - 1 / odds_k of object k alone:
 
@@ -121,8 +121,8 @@ def _compose(first, last, odds, order, bounds, starts, mode, visible, front, fro
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _force_of(first, last, odds, order, bounds, starts, mode, upstream, force):
-    """dL/dvisible (dense) to dL/dcoverage times the chance to miss, packed in windows."""
+def _compose_backward(first, last, odds, order, bounds, starts, mode, upstream, packed):
+    """dL/dvisible (dense) to -dL/dlog(missed), packed in windows."""
     _, objects, height, width = upstream.shape
     T = upstream.dtype.type
     one, zero = T(1), T(0)
@@ -141,7 +141,7 @@ def _force_of(first, last, odds, order, bounds, starts, mode, upstream, force):
                     for i in range(found):
                         for lane in range(lanes):
                             j = where[i] + lane
-                            force[j] = upstream[image, who[i], row, strip * 8 + lane] / odds[j]
+                            packed[j] = upstream[image, who[i], row, strip * 8 + lane] / odds[j]
                     continue
                 for lane in range(lanes if found > 0 else 0):
                     column = strip * 8 + lane
@@ -154,13 +154,13 @@ def _force_of(first, last, odds, order, bounds, starts, mode, upstream, force):
                         j = where[sequence[place]] + lane
                         missed = one / odds[j]
                         if mode == LAYERED:
-                            pull = upstream[image, who[sequence[place]], row, column]
-                            force[j] = before[place] * (pull - behind) * missed
-                            behind = pull * (one - missed) + missed * behind
+                            above = upstream[image, who[sequence[place]], row, column]
+                            packed[j] = before[place] * (above - behind) * missed
+                            behind = above * (one - missed) + missed * behind
                         else:
                             # Of the front-most object's mask: one minus all chances to miss.
-                            pull = upstream[image, who[sequence[0]], row, column]
-                            force[j] = pull * before[place] * behind * missed
+                            above = upstream[image, who[sequence[0]], row, column]
+                            packed[j] = above * before[place] * behind * missed
                             behind *= missed
 
 
@@ -175,9 +175,9 @@ def compose(odds, order, windows, compositing, shape):
     return visible, front, depth
 
 
-def force_of(odds, order, windows, compositing, upstream):
-    """dL/dvisible to dL/dcoverage times the chance to miss, packed in windows."""
-    force = np.zeros_like(odds)
+def compose_backward(odds, order, windows, compositing, upstream):
+    """-dL/dlog(missed) = dL/dcoverage times the chance to miss, packed in windows."""
+    packed = np.zeros_like(odds)
     mode = MODES.index(compositing)
-    in_threads(_force_of, len(upstream), odds, order, *windows, mode, upstream, force)
-    return force
+    in_threads(_compose_backward, len(upstream), odds, order, *windows, mode, upstream, packed)
+    return packed

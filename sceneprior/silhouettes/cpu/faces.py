@@ -1,4 +1,4 @@
-"""The exact formula on the CPU: every face near a pixel has its say.
+"""The exact mode on the CPU: the formula over every face near a pixel.
 
 Buffers hold, for each pixel of each window (windows.py),
 
@@ -75,12 +75,12 @@ def _draw_strip(
 
 @njit(fastmath=_LOOSE, error_model="numpy", nogil=True)
 @no_type_check
-def _pull_strip(
-    force, start, count, column, row, ax, ay, bx, by, cx, cy,
+def _strip_gradient(
+    upstream, start, count, column, row, ax, ay, bx, by, cx, cy,
     over_area, over1, over2, over3, over_sigma, blur,
 ):  # fmt: skip
-    """The pull of a strip's pixels on a face's three corners."""
-    T = force.dtype.type
+    """What a strip's pixels add to the gradient of a face's three corners, times -1/2."""
+    T = upstream.dtype.type
     zero, one, half, most = T(0), T(1), T(0.5), T(80)
     gax, gay, gbx, gby, gcx, gcy = zero, zero, zero, zero, zero, zero
     for k in range(count):
@@ -98,8 +98,8 @@ def _pull_strip(
         touched = inside | (d < blur)
         x = min(d * over_sigma, most)
         x = x if inside else -x
-        # d coverage / d x is the chance to miss times sigmoid(x); force holds the first.
-        weight = force[j] * over_sigma / (one + vector_exp(-x))
+        # d coverage / d x is the chance to miss times sigmoid(x); upstream holds the first.
+        weight = upstream[j] * over_sigma / (one + vector_exp(-x))
         weight = weight if inside else -weight
         weight = weight if touched else zero
         first = (d1 <= d2) & (d1 <= d3)
@@ -132,6 +132,20 @@ def _over_length2(ax, ay, bx, by, one, least):
     return one / max((bx - ax) * (bx - ax) + (by - ay) * (by - ay), least)
 
 
+@njit(inline="always")
+@no_type_check
+def _drawn(pixels, depths, faces, mesh, f, near, least):
+    """Whether a face is in front of the camera and has an area; its corners, and twice its area."""
+    ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
+    za, zb, zc = depths[mesh, ia], depths[mesh, ib], depths[mesh, ic]
+    in_front = not (za <= near or zb <= near or zc <= near)
+    ax, ay = pixels[mesh, ia, 0], pixels[mesh, ia, 1]
+    bx, by = pixels[mesh, ib, 0], pixels[mesh, ib, 1]
+    cx, cy = pixels[mesh, ic, 0], pixels[mesh, ic, 1]
+    area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    return in_front and not abs(area) <= least, ax, ay, bx, by, cx, cy, area
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _cover(first, last, pixels, depths, faces, bounds, starts, sigma, blur, near, odds, order):
@@ -141,79 +155,61 @@ def _cover(first, last, pixels, depths, faces, bounds, starts, sigma, blur, near
     over_sigma, blur_, reach = T(1 / sigma), T(blur), np.sqrt(blur)
     for mesh in range(first, last):
         rows = bounds[mesh, 1] - bounds[mesh, 0]
-        if rows <= 0:
-            continue
-        for f in range(faces.shape[0]):
-            ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
-            za, zb, zc = depths[mesh, ia], depths[mesh, ib], depths[mesh, ic]
-            if za <= near or zb <= near or zc <= near:
-                continue
-            ax, ay = pixels[mesh, ia, 0], pixels[mesh, ia, 1]
-            bx, by = pixels[mesh, ib, 0], pixels[mesh, ib, 1]
-            cx, cy = pixels[mesh, ic, 0], pixels[mesh, ic, 1]
-            area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-            if abs(area) <= least:
+        for f in range(faces.shape[0] if rows > 0 else 0):
+            drawn, ax, ay, bx, by, cx, cy, area = _drawn(
+                pixels, depths, faces, mesh, f, near, least
+            )
+            if not drawn:
                 continue
             top, bottom, strip0, strip1 = _region(ax, ay, bx, by, cx, cy, reach, bounds[mesh])
             if bottom <= top:
                 continue
-            over_area = one / area
             over1 = _over_length2(ax, ay, bx, by, one, least)
             over2 = _over_length2(bx, by, cx, cy, one, least)
             over3 = _over_length2(cx, cy, ax, ay, one, least)
-            near_a, near_b, near_c = one / za, one / zb, one / zc
+            near_a, near_b = one / depths[mesh, faces[f, 0]], one / depths[mesh, faces[f, 1]]
             for strip in range(strip0, strip1):
                 start = ((strip - bounds[mesh, 2]) * rows + top - bounds[mesh, 0]) * 8
                 _draw_strip(
-                    odds, order, starts[mesh] + start, (bottom - top) * 8,
-                    np.int32(strip * 8), np.int32(top), ax, ay, bx, by, cx, cy,
-                    over_area, over1, over2, over3, near_a, near_b, near_c, over_sigma, blur_,
+                    odds, order, starts[mesh] + start, (bottom - top) * 8, np.int32(strip * 8),
+                    np.int32(top), ax, ay, bx, by, cx, cy, one / area, over1, over2, over3,
+                    near_a, near_b, one / depths[mesh, faces[f, 2]], over_sigma, blur_,
                 )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _pull_back(
-    first, last, pixels, depths, faces, bounds, starts, sigma, blur, near, force, gradient
+def _cover_backward(
+    first, last, pixels, depths, faces, bounds, starts, sigma, blur, near, upstream, gradient
 ):
-    """Add to `gradient` what `force`, dL/dcoverage times the chance to miss, does to `pixels`."""
+    """Add to `gradient` what `upstream`, -dL/dlog(missed), does to `pixels`."""
     T = pixels.dtype.type
     one, two, least = T(1), T(2), T(MIN_AREA_PX2)
     over_sigma, blur_, reach = T(1 / sigma), T(blur), np.sqrt(blur)
     for mesh in range(first, last):
         rows = bounds[mesh, 1] - bounds[mesh, 0]
-        if rows <= 0:
-            continue
-        for f in range(faces.shape[0]):
-            ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
-            if depths[mesh, ia] <= near or depths[mesh, ib] <= near or depths[mesh, ic] <= near:
-                continue
-            ax, ay = pixels[mesh, ia, 0], pixels[mesh, ia, 1]
-            bx, by = pixels[mesh, ib, 0], pixels[mesh, ib, 1]
-            cx, cy = pixels[mesh, ic, 0], pixels[mesh, ic, 1]
-            area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-            if abs(area) <= least:
+        for f in range(faces.shape[0] if rows > 0 else 0):
+            drawn, ax, ay, bx, by, cx, cy, area = _drawn(
+                pixels, depths, faces, mesh, f, near, least
+            )
+            if not drawn:
                 continue
             top, bottom, strip0, strip1 = _region(ax, ay, bx, by, cx, cy, reach, bounds[mesh])
             if bottom <= top:
                 continue
-            over_area = one / area
             over1 = _over_length2(ax, ay, bx, by, one, least)
             over2 = _over_length2(bx, by, cx, cy, one, least)
             over3 = _over_length2(cx, cy, ax, ay, one, least)
             for strip in range(strip0, strip1):
                 start = ((strip - bounds[mesh, 2]) * rows + top - bounds[mesh, 0]) * 8
-                gax, gay, gbx, gby, gcx, gcy = _pull_strip(
-                    force, starts[mesh] + start, (bottom - top) * 8,
-                    np.int32(strip * 8), np.int32(top), ax, ay, bx, by, cx, cy,
-                    over_area, over1, over2, over3, over_sigma, blur_,
+                corners = _strip_gradient(
+                    upstream, starts[mesh] + start, (bottom - top) * 8, np.int32(strip * 8),
+                    np.int32(top), ax, ay, bx, by, cx, cy, one / area, over1, over2, over3,
+                    over_sigma, blur_,
                 )  # fmt: skip
-                gradient[mesh, ia, 0] -= two * gax
-                gradient[mesh, ia, 1] -= two * gay
-                gradient[mesh, ib, 0] -= two * gbx
-                gradient[mesh, ib, 1] -= two * gby
-                gradient[mesh, ic, 0] -= two * gcx
-                gradient[mesh, ic, 1] -= two * gcy
+                for corner in range(3):
+                    gradient[mesh, faces[f, corner], 0] -= two * corners[2 * corner]
+                    gradient[mesh, faces[f, corner], 1] -= two * corners[2 * corner + 1]
 
 
 def cover(pixels, depths, faces, windows, settings):
@@ -225,9 +221,9 @@ def cover(pixels, depths, faces, windows, settings):
     return odds, order, None
 
 
-def pull_back(pixels, depths, faces, windows, settings, odds, traced, force):
+def cover_backward(pixels, depths, faces, windows, settings, odds, traced, upstream):
     """dL/dpixels."""
     gradient = np.zeros_like(pixels)
-    rest = (settings.sigma_px2, settings.blur_px2, settings.near_m)
-    in_threads(_pull_back, len(pixels), pixels, depths, faces, *windows, *rest, force, gradient)
+    rest = (settings.sigma_px2, settings.blur_px2, settings.near_m, upstream, gradient)
+    in_threads(_cover_backward, len(pixels), pixels, depths, faces, *windows, *rest)
     return gradient

@@ -195,8 +195,8 @@ def _cover(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _pull_back(
-    first, last, pixels, edges, bounds, starts, sigma, odds, order, edge, share, force, gradient
+def _cover_backward(
+    first, last, pixels, edges, bounds, starts, sigma, odds, order, edge, share, upstream, gradient
 ):  # fmt: skip
     for mesh in range(first, last):
         row0, row1, strip0, strip1 = bounds[mesh]
@@ -204,13 +204,13 @@ def _pull_back(
         for strip in range(strip0, strip1 if row1 > row0 else strip0):
             for row in range(row0, row1):
                 for column in range(strip * 8, strip * 8 + 8):
-                    if edge[j] >= 0 and force[j] != 0.0:
+                    if edge[j] >= 0 and upstream[j] != 0.0:
                         a, b, t = edges[edge[j], 0], edges[edge[j], 1], float(share[j])
                         ax, ay = float(pixels[mesh, a, 0]), float(pixels[mesh, a, 1])
                         x = column + 0.5 - ax - t * (pixels[mesh, b, 0] - ax)
                         y = row + 0.5 - ay - t * (pixels[mesh, b, 1] - ay)
                         # sigmoid(x) = 1 - 1 / odds; moving the nearest point changes d.
-                        weight = -2.0 * force[j] * (1.0 - 1.0 / odds[j]) / sigma
+                        weight = -2.0 * upstream[j] * (1.0 - 1.0 / odds[j]) / sigma
                         weight = weight if order[j] > 0.0 else -weight
                         gradient[mesh, a, 0] += (1.0 - t) * weight * x
                         gradient[mesh, a, 1] += (1.0 - t) * weight * y
@@ -235,10 +235,10 @@ def cover(pixels, depths, faces, windows, settings):
     return odds, order, (mesh.edges, order, edge, share)
 
 
-def pull_back(pixels, depths, faces, windows, settings, odds, traced, force):
+def cover_backward(pixels, depths, faces, windows, settings, odds, traced, upstream):
     """dL/dpixels."""
     edges, order, edge, share = traced
     gradient = np.zeros_like(pixels)
-    rest = (settings.sigma_px2, odds, order, edge, share, force, gradient)
-    in_threads(_pull_back, len(pixels), pixels, edges, *windows, *rest)
+    rest = (settings.sigma_px2, odds, order, edge, share, upstream, gradient)
+    in_threads(_cover_backward, len(pixels), pixels, edges, *windows, *rest)
     return gradient

@@ -1,5 +1,7 @@
-"""`geometry.cameras.project` for the CPU backend, compiled: a dozen small torch operations on
-millions of numbers would take as long as drawing them."""
+"""Compiled `geometry.cameras.project` for the CPU backend, and its gradient.
+
+As a dozen small torch operations it would take as long as drawing.
+"""
 
 from typing import no_type_check
 
@@ -32,7 +34,7 @@ def _project(first, last, points, cameras, views, pixels, depths):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _pull_back(first, last, cameras, pixels, depths, objects, upstream, gradient):
+def _project_backward(first, last, cameras, pixels, depths, objects, upstream, gradient):
     """Items are objects of all rooms, so that each vertex belongs to one thread."""
     rooms, points, _ = gradient.shape
     views, each = cameras.shape[0] // rooms, points // objects
@@ -42,15 +44,15 @@ def _pull_back(first, last, cameras, pixels, depths, objects, upstream, gradient
         for image in range(room * views, (room + 1) * views):
             m = cameras[image]
             for k in range(start, start + each):
-                pull_u, pull_v = upstream[image, k]
-                if pull_u == 0 and pull_v == 0:
+                upstream_u, upstream_v = upstream[image, k]
+                if upstream_u == 0 and upstream_v == 0:
                     continue
                 over = 1 / max(depths[image, k], least)
-                along = pull_u * pixels[image, k, 0] + pull_v * pixels[image, k, 1]
+                along = upstream_u * pixels[image, k, 0] + upstream_v * pixels[image, k, 1]
                 along = along if depths[image, k] > least else along * 0
                 for axis in range(3):
                     gradient[room, k, axis] += over * (
-                        pull_u * m[0, axis] + pull_v * m[1, axis] - along * m[2, axis]
+                        upstream_u * m[0, axis] + upstream_v * m[1, axis] - along * m[2, axis]
                     )
 
 
@@ -77,9 +79,9 @@ class _Project(torch.autograd.Function):
         matrices, pixels, depths, objects = ctx.rest
         rooms, _, each, _ = ctx.shape
         gradient = np.zeros((rooms, objects * each, 3), dtype=pixels.dtype)
-        pull = upstream.contiguous().numpy().reshape(pixels.shape)
+        upstream = upstream.contiguous().numpy().reshape(pixels.shape)
         items = rooms * objects
-        in_threads(_pull_back, items, matrices, pixels, depths, objects, pull, gradient)
+        in_threads(_project_backward, items, matrices, pixels, depths, objects, upstream, gradient)
         return torch.from_numpy(gradient).view(ctx.shape), None, None
 
 

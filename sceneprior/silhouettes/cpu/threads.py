@@ -1,4 +1,4 @@
-"""A compiled loop over meshes or images in, the same loop run by several threads out.
+"""Runs a compiled loop over meshes or images on several threads.
 
 Each function takes the first and one past the last of its items, lets go of the interpreter's
 lock, and writes only what belongs to them, so the result does not depend on how many threads

@@ -1,5 +1,4 @@
-"""exp for compiled loops over many pixels: a library call would keep LLVM from running them as
-vectors."""
+"""An exp for compiled loops over pixels, which LLVM can run as vectors."""
 
 from typing import no_type_check
 
@@ -29,7 +28,7 @@ def _compiled(x):
         return lambda x: np.exp(x)
 
     def exp32(x):
-        # A library call would end vectorisation. 2**n * e**f with |f| <= ln(2) / 2; the series
+        # A library call would end vectorisation: 2**n * e**f with |f| <= ln(2) / 2; the series
         # to f**6 is within 2 units in the last place.
         n = np.int32(np.floor(x * np.float32(1.4426950408889634) + np.float32(0.5)))
         f = x - np.float32(n) * np.float32(0.6931471805599453)

@@ -1,4 +1,4 @@
-"""Where the masks of projected meshes live: one window of pixels a mesh, packed in one array.
+"""Windows: the pixels that each projected mesh may touch, packed in one array.
 
 A window is the bounding box of what is drawn of a mesh, grown by the reach of the blur and cut
 at the image. Memory grows with these pixels, not with objects x views x image. A window is stored
@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from sceneprior.silhouettes.cpu.threads import in_threads
+from sceneprior.silhouettes.reference import Settings
 
 LANES = 8
 """Pixels of a strip's row."""
@@ -31,22 +32,18 @@ def windows_of(
     pixels: np.ndarray,
     depths: np.ndarray,
     drawn: np.ndarray,
-    image_size: tuple[int, int],
-    reach_px: float,
-    near_m: float,
+    settings: Settings,
 ) -> Windows:
     """Windows of projected meshes.
 
     Args:
         pixels: (meshes, vertices, 2) u and v.
-        depths: (meshes, vertices) in metres; vertices at or behind `near_m` have no face drawn.
+        depths: (meshes, vertices) in metres.
         drawn: (meshes,) bool; others get an empty window, as do meshes outside the image.
-        image_size: (height, width) in pixels.
-        reach_px: How far a face is felt outside itself.
-        near_m: See above.
     """
     bounds = np.zeros((len(pixels), 4), dtype=np.int32)
-    rest = (float(reach_px), float(near_m), *image_size, bounds)
+    reach_px = float(np.sqrt(settings.blur_px2))
+    rest = (reach_px, float(settings.near_m), *settings.image_size, bounds)
     in_threads(_bounds, len(pixels), pixels, depths, drawn, *rest)
     area = (bounds[:, 1] - bounds[:, 0]).astype(np.int64) * (bounds[:, 3] - bounds[:, 2]) * LANES
     return Windows(bounds, np.concatenate([[0], np.cumsum(area)]))

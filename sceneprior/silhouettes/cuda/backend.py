@@ -1,12 +1,12 @@
-"""Projected meshes in, visible masks and their gradient out: the Triton backend's front door.
+"""The Triton backend: visible masks of projected meshes, and their gradient.
 
 Where no GPU is at hand, the kernels run on CPU tensors through Triton's interpreter
 (TRITON_INTERPRET=1 before Triton is first imported): right, and far too slow for more than a test.
 
-    cuda_windows      where each mesh may touch the image, in tiles
-    cuda_faces        exact mode: what each pixel of the windows sees of its mesh, and back
-    cuda_outline      fast mode: the same
-    cuda_compositing  windows to images, and back
+    windows      where each mesh may touch the image, in tiles
+    faces        exact mode: what each pixel of the windows sees of its mesh, and its gradient
+    outline      fast mode: the same
+    compositing  windows to images, and the gradient
 """
 
 import torch
@@ -14,26 +14,19 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sceneprior.silhouettes.cuda import compositing as cuda_compositing
-from sceneprior.silhouettes.cuda import faces as cuda_faces
-from sceneprior.silhouettes.cuda import kernels as cuda_kernels
-from sceneprior.silhouettes.cuda import outline as cuda_outline
+from sceneprior.silhouettes.cuda import compositing, faces, kernels, outline
 from sceneprior.silhouettes.cuda.windows import INTERPRETED, find_windows, launch, tiles_across
-from sceneprior.silhouettes.reference import Settings
+from sceneprior.silhouettes.reference import Drawing, Settings
 
 
 def draw(
     pixels: Float[Tensor, "images objects vertices 2"],
     depths: Float[Tensor, "images objects vertices"],
-    faces: Int[Tensor, "faces 3"],
+    triangles: Int[Tensor, "faces 3"],
     drawn: Bool[Tensor, "images objects"],
     settings: Settings,
-) -> tuple[
-    Float[Tensor, "images objects height width"],
-    Int[Tensor, "images height width"],
-    Float[Tensor, "images height width"],
-]:
-    """Masks, front-most object and its depth: see `sceneprior.silhouettes.render`.
+) -> Drawing:
+    """What `reference.draw` draws.
 
     Beside the masks, memory grows with the pixels that the objects' bounding boxes cover; every
     face of every mesh keeps 8 bytes (14 while drawing in fast mode; 24 more while gradients are
@@ -49,34 +42,32 @@ def draw(
             f"the backend `cuda` needs tensors on a CUDA device, but these are on "
             f"'{pixels.device}'; move them there or choose another backend"
         )
-    if max(settings.image_size) > cuda_kernels.EMPTY.value:
+    if max(settings.image_size) > kernels.EMPTY.value:
         raise ValueError(
             f"image_size is {settings.image_size}; the backend `cuda` draws sides of at most "
-            f"{cuda_kernels.EMPTY.value} pixels"
+            f"{kernels.EMPTY.value} pixels"
         )
-    return _Draw.apply(pixels, depths, faces, drawn, settings)
+    return Drawing(*_Draw.apply(pixels, depths, triangles, drawn, settings))
 
 
 class _Draw(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, pixels, depths, faces, drawn, settings):
+    def forward(ctx, pixels, depths, triangles, drawn, settings):
         images, objects = depths.shape[:2]
         height, width = settings.image_size
         pixels, depths = pixels.contiguous(), depths.contiguous()
-        triangles = faces.to(torch.int32).contiguous()
+        edges = outline.edges_of(triangles) if settings.mode == "fast" else None
+        triangles = triangles.to(torch.int32).contiguous()
         windows = find_windows(pixels, depths, triangles, drawn, settings)
-        if settings.mode == "fast":
-            mesh = cuda_outline.edges_of(faces)
-            missed, order, traced = cuda_outline.cover(
-                pixels, depths, triangles, mesh, windows, settings
-            )
-        else:
-            missed, order, traced = cuda_faces.cover(pixels, depths, triangles, windows, settings)
+        meshes = (pixels, depths, triangles, windows, settings)
+        missed, order, traced = (
+            faces.cover(*meshes) if edges is None else outline.cover(*meshes, edges)
+        )
         masks = pixels.new_empty(images, objects, height, width)
         front = torch.empty(images, height, width, dtype=torch.int32, device=pixels.device)
         depth = pixels.new_empty(images, height, width)
         launch(
-            cuda_compositing.composite_tiles, images * tiles_across(height) * tiles_across(width),
+            compositing.composite_tiles, images * tiles_across(height) * tiles_across(width),
             missed, order, windows.places, windows.first_tiles, masks, front, depth, objects,
             height, width, MODE=settings.compositing, num_warps=1,
         )  # fmt: skip
@@ -95,17 +86,17 @@ class _Draw(torch.autograd.Function):
         images, objects = pixels.shape[:2]
         height, width = ctx.settings.image_size
         upstream = upstream.contiguous()
-        pull = torch.empty_like(missed)
+        packed = torch.empty_like(missed)
         launch(
-            cuda_compositing.pull_tiles, images * tiles_across(height) * tiles_across(width),
+            compositing.composite_backward, images * tiles_across(height) * tiles_across(width),
             missed, order, places, first_tiles, upstream if masks is None else masks, upstream,
-            pull, objects, height, width, MODE=ctx.settings.compositing, num_warps=1,
+            packed, objects, height, width, MODE=ctx.settings.compositing, num_warps=1,
         )  # fmt: skip
         seen = (places, first_tiles)
         if ctx.settings.mode == "fast":
-            gradient = cuda_outline.pull_back(
-                pixels, seen, ctx.settings, missed, order, traced, pull
+            gradient = outline.cover_backward(
+                pixels, seen, ctx.settings, missed, order, traced, packed
             )
         else:
-            gradient = cuda_faces.pull_back(pixels, triangles, seen, ctx.settings, traced, pull)
+            gradient = faces.cover_backward(pixels, triangles, seen, ctx.settings, traced, packed)
         return gradient, None, None, None, None

@@ -1,16 +1,16 @@
-"""Triton kernels that stack the packed windows of all objects over an image, and go back.
+"""Triton kernels that composite the packed windows of all objects to images, and their gradient.
 
 One program per tile of an image. Few objects meet in a tile, so every pair of them is compared
-instead of sorting. `missed` and `order` are what `cuda_kernels.cover_tiles` wrote.
+instead of sorting. `missed` and `order` are what `kernels.cover_tiles` wrote.
 """
 
 from typing import no_type_check
 
-from sceneprior.silhouettes.cuda.kernels import TILE, holds, tl, triton, window
+from sceneprior.silhouettes.cuda.kernels import TILE, holds, packed_at, tl, triton
 
 CERTAIN = tl.constexpr(1.5e-8)
-"""A pixel missed with less than this chance is covered whatever its outline does: it pulls on
-nothing, and costs nothing. 1 - 1.5e-8 is 1 in float32."""
+"""A pixel missed with less than this chance has no gradient, and costs nothing: 1 - 1.5e-8 is 1 in
+float32."""
 
 
 @triton.jit
@@ -36,8 +36,7 @@ def _missed_before(
     before = tl.full((TILE * TILE,), 1, missed.dtype.element_ty)
     for other in range(0, objects):
         if (other != k) & holds(windows, mesh - k + other, tile_row, tile_column):
-            base, stride = window(windows, first_tiles, mesh - k + other)
-            at = base + row * stride + column
+            at = packed_at(windows, first_tiles, mesh - k + other, row, column)
             there = tl.abs(tl.load(order + at))
             nearer = (there < z) | ((there == z) & (other < k))
             before *= tl.where(nearer, tl.load(missed + at), 1.0)
@@ -61,8 +60,7 @@ def composite_tiles(
     for k in range(0, objects):
         mesh = image * objects + k
         if holds(windows, mesh, tile_row, tile_column):
-            base, stride = window(windows, first_tiles, mesh)
-            at = base + row * stride + column
+            at = packed_at(windows, first_tiles, mesh, row, column)
             z = tl.load(order + at)
             nearer = (z > 0) & (z < surface)
             surface, surface_id = tl.where(nearer, z, surface), tl.where(nearer, k, surface_id)
@@ -78,8 +76,7 @@ def composite_tiles(
         mesh = image * objects + k
         mask = tl.zeros((TILE * TILE,), real)
         if holds(windows, mesh, tile_row, tile_column):
-            base, stride = window(windows, first_tiles, mesh)
-            at = base + row * stride + column
+            at = packed_at(windows, first_tiles, mesh, row, column)
             if MODE == "paper":
                 mask = tl.where(nearest_id == k, 1.0 - nothing, 0.0)
             else:
@@ -95,11 +92,11 @@ def composite_tiles(
 
 @triton.jit
 @no_type_check
-def pull_tiles(
-    missed, order, windows, first_tiles, masks, upstream, pull, objects, height, width,
+def composite_backward(
+    missed, order, windows, first_tiles, masks, upstream, packed, objects, height, width,
     MODE: tl.constexpr,
 ):  # pragma: no cover - compiled  # fmt: skip
-    """pull = -dL/dlog(missed), which needs no division where a pixel is surely covered.
+    """packed = -dL/dlog(missed), which needs no division where a pixel is surely covered.
 
     In `layered`, dmask_k/dlog(missed_k) is -missed_k times what lies before, and each mask
     behind k grows with missed_k in proportion to itself.
@@ -114,8 +111,7 @@ def pull_tiles(
         for k in range(0, objects):
             mesh = image * objects + k
             if holds(windows, mesh, tile_row, tile_column):
-                base, stride = window(windows, first_tiles, mesh)
-                at = base + row * stride + column
+                at = packed_at(windows, first_tiles, mesh, row, column)
                 z = tl.abs(tl.load(order + at))
                 wanted = tl.load(
                     upstream + (mesh * height + row) * width + column, mask=real_pixel, other=0
@@ -127,28 +123,27 @@ def pull_tiles(
     for k in range(0, objects):
         mesh = image * objects + k
         if holds(windows, mesh, tile_row, tile_column):
-            base, stride = window(windows, first_tiles, mesh)
-            at = base + row * stride + column
+            at = packed_at(windows, first_tiles, mesh, row, column)
             own = tl.load(missed + at)
-            force = shared
+            grad = shared
             if MODE != "paper":
                 wanted = tl.load(
                     upstream + (mesh * height + row) * width + column, mask=real_pixel, other=0
                 )
-                force = wanted * own
+                grad = wanted * own
             if MODE == "layered":
                 z = tl.abs(tl.load(order + at))
-                force *= _missed_before(
+                grad *= _missed_before(
                     missed, order, windows, first_tiles, mesh, objects, k, z,
                     tile_row, tile_column, row, column,
                 )  # fmt: skip
                 for other in range(0, objects):
                     if (other != k) & holds(windows, mesh - k + other, tile_row, tile_column):
-                        base, stride = window(windows, first_tiles, mesh - k + other)
-                        there = tl.abs(tl.load(order + base + row * stride + column))
+                        there = packed_at(windows, first_tiles, mesh - k + other, row, column)
+                        there = tl.abs(tl.load(order + there))
                         behind = real_pixel & ((there > z) | ((there == z) & (other > k)))
                         to = ((mesh - k + other) * height + row) * width + column
-                        force -= tl.load(masks + to, mask=behind, other=0) * tl.load(
+                        grad -= tl.load(masks + to, mask=behind, other=0) * tl.load(
                             upstream + to, mask=behind, other=0
                         )
-            tl.store(pull + at, tl.where(own > CERTAIN, force, 0.0))
+            tl.store(packed + at, tl.where(own > CERTAIN, grad, 0.0))

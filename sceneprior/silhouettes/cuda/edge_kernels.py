@@ -1,25 +1,17 @@
-"""Triton kernels that find the outline of meshes: edges in, layers and clear pieces out."""
+"""Triton kernels that find which edges, and which pieces of them, are the outline of a mesh."""
 
 from typing import no_type_check
 
-from sceneprior.silhouettes.cuda.kernels import MIN_AREA, tl, triton
+from sceneprior.silhouettes.cuda.kernels import MIN_AREA, tl, triton, vertex_at64, vertices_of
 
 EDGES = tl.constexpr(128)
 """Edges of one program of `sum_layers`."""
 
 PIECES, LINES = tl.constexpr(16), tl.constexpr(32)
-"""Pieces of one program of `certify_pieces`, and edges that each asks at once."""
+"""Pieces of one program of `certify_pieces`, and edges that each takes at once."""
 
 
 # no_type_check: the tests' type hook wraps every function, and Triton cannot compile a wrapper.
-@triton.jit
-@no_type_check
-def corner_at(pixels, vertex, mask):  # pragma: no cover - compiled
-    """A projected vertex, in float64."""
-    x = tl.load(pixels + vertex * 2, mask=mask, other=0).to(tl.float64)
-    return x, tl.load(pixels + vertex * 2 + 1, mask=mask, other=0).to(tl.float64)
-
-
 @triton.jit
 @no_type_check
 def sum_layers(
@@ -40,12 +32,10 @@ def sum_layers(
         here = step < count
         face = tl.load(edge_faces + first + step, mask=here, other=0)
         way = tl.load(edge_ways + first + step, mask=here, other=0)
-        a = mesh * vertex_count + tl.load(faces + face * 3, mask=here, other=0)
-        b = mesh * vertex_count + tl.load(faces + face * 3 + 1, mask=here, other=0)
-        c = mesh * vertex_count + tl.load(faces + face * 3 + 2, mask=here, other=0)
-        ax, ay = corner_at(pixels, a, here)
-        bx, by = corner_at(pixels, b, here)
-        cx, cy = corner_at(pixels, c, here)
+        a, b, c = vertices_of(faces, face, mesh * vertex_count, here)
+        ax, ay = vertex_at64(pixels, a, here)
+        bx, by = vertex_at64(pixels, b, here)
+        cx, cy = vertex_at64(pixels, c, here)
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         keep = here & (tl.abs(area) > MIN_AREA)
         keep &= tl.load(depths + a, mask=here, other=0) > near

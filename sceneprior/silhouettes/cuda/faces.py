@@ -1,10 +1,9 @@
-"""The exact mode on CUDA: every face near a pixel has its say. Launches of its kernels."""
+"""The exact mode on CUDA: launches of its kernels."""
 
 import torch
 from torch import Tensor
 
-from sceneprior.silhouettes.cuda import gradients as cuda_gradients
-from sceneprior.silhouettes.cuda import kernels as cuda_kernels
+from sceneprior.silhouettes.cuda import gradients, kernels
 from sceneprior.silhouettes.cuda.windows import BLOCK, TILE, Windows, launch
 from sceneprior.silhouettes.reference import Settings
 
@@ -19,12 +18,12 @@ VERTICES = 128
 def cover(
     pixels: Tensor, depths: Tensor, faces: Tensor, windows: Windows, settings: Settings
 ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    """The chance to miss and the order value of all windows, and what `pull_back` needs."""
+    """The chance to miss and the order value of all windows, and what `cover_backward` needs."""
     tiles = len(windows.tile_meshes)
     missed = pixels.new_empty(tiles * TILE * TILE)
     order = torch.empty_like(missed)
     launch(
-        cuda_kernels.cover_tiles, tiles, pixels, depths.reciprocal(), faces, windows.face_bounds,
+        kernels.cover_tiles, tiles, pixels, depths.reciprocal(), faces, windows.face_bounds,
         windows.block_bounds, windows.places, windows.first_tiles, windows.tile_meshes, missed,
         order, pixels.shape[2], windows.block_bounds.shape[-1], settings.sigma_px2,
         settings.blur_px2, num_warps=1,
@@ -32,35 +31,36 @@ def cover(
     return missed, order, (windows.face_bounds,)
 
 
-def pull_back(
+def cover_backward(
     pixels: Tensor,
     faces: Tensor,
     seen: tuple[Tensor, Tensor],
     settings: Settings,
     traced: list[Tensor],
-    pull: Tensor,
+    upstream: Tensor,
 ) -> Tensor:
     """dL/dpixels from -dL/dlog(missed)."""
     (face_bounds,), (places, first_tiles) = traced, seen
     images, objects, vertices, _ = pixels.shape
-    corner_gradients = pixels.new_empty(images * objects, len(faces), 3, 2)
+    by_corner = pixels.new_empty(images * objects, len(faces), 3, 2)
     launch(
-        cuda_gradients.push_corners, images * objects * -(-len(faces) // FACES), pixels, faces,
-        face_bounds, places, first_tiles, pull, corner_gradients, vertices, len(faces),
+        gradients.corner_gradients, images * objects * -(-len(faces) // FACES), pixels, faces,
+        face_bounds, places, first_tiles, upstream, by_corner, vertices, len(faces),
         face_bounds.shape[-1] // BLOCK, settings.sigma_px2, settings.blur_px2, FACES=FACES,
         PIXELS=PIXELS, num_warps=1,
     )  # fmt: skip
-    return sum_by_vertex(corner_gradients, faces.flatten(), places, pixels)
+    return sum_by_vertex(by_corner, faces.flatten(), places, pixels)
 
 
-def sum_by_vertex(gradients: Tensor, owners: Tensor, places: Tensor, pixels: Tensor) -> Tensor:
-    """Add what each mesh (a row of `places`) pulls at its corners to their owners, the vertices."""
+def sum_by_vertex(by_corner: Tensor, owners: Tensor, places: Tensor, pixels: Tensor) -> Tensor:
+    """Sum the gradients of each mesh's corners by their owners, the vertices; a row of `places` a
+    mesh."""
     gradient = torch.empty_like(pixels)
     vertices = pixels.numel() // 2 // max(len(places), 1)
     owners, corners = owners.sort(stable=True)
     every = torch.arange(vertices + 1, dtype=owners.dtype, device=owners.device)
     launch(
-        cuda_gradients.gather_vertices, len(places) * -(-vertices // VERTICES), gradients, corners,
+        gradients.gather_vertices, len(places) * -(-vertices // VERTICES), by_corner, corners,
         torch.searchsorted(owners, every), places, gradient, vertices, len(corners),
         VERTICES=VERTICES, num_warps=4,
     )  # fmt: skip

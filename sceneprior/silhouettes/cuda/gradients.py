@@ -1,17 +1,25 @@
-"""Triton kernels from the pull of packed pixels to the gradient of the projected vertices.
+"""Triton kernels of the exact mode's backward: packed pixels to projected vertices.
 
 Each face sums over its own pixels, then each vertex over its own corners: always in one order.
 """
 
 from typing import no_type_check
 
-from sceneprior.silhouettes.cuda.kernels import BLOCK, tl, to_edge, triton, window
+from sceneprior.silhouettes.cuda.kernels import (
+    BLOCK,
+    tl,
+    to_edge,
+    triton,
+    vertex_at,
+    vertices_of,
+    window,
+)
 
 
 @triton.jit
 @no_type_check
-def push_corners(
-    pixels, faces, face_bounds, windows, first_tiles, pull, corner_gradients,
+def corner_gradients(
+    pixels, faces, face_bounds, windows, first_tiles, upstream, by_corner,
     vertex_count, face_count, block_count, sigma, blur, FACES: tl.constexpr, PIXELS: tl.constexpr,
 ):  # pragma: no cover - compiled  # fmt: skip
     """Every face walks over its own pixels; lanes share a face and are summed at the end."""
@@ -30,14 +38,12 @@ def push_corners(
     most = tl.max(tl.max(count, axis=1), axis=0)
     base, stride = window(windows, first_tiles, mesh)
 
-    a = mesh * vertex_count + tl.load(faces + face * 3, mask=exists, other=0)
-    b = mesh * vertex_count + tl.load(faces + face * 3 + 1, mask=exists, other=0)
-    c = mesh * vertex_count + tl.load(faces + face * 3 + 2, mask=exists, other=0)
-    ax, ay = tl.load(pixels + a * 2), tl.load(pixels + a * 2 + 1)
-    bx, by = tl.load(pixels + b * 2), tl.load(pixels + b * 2 + 1)
-    cx, cy = tl.load(pixels + c * 2), tl.load(pixels + c * 2 + 1)
+    a, b, c = vertices_of(faces, face, mesh * vertex_count, exists)
+    ax, ay = vertex_at(pixels, a, exists)
+    bx, by = vertex_at(pixels, b, exists)
+    cx, cy = vertex_at(pixels, c, exists)
     turn = tl.where((bx - ax) * (cy - ay) - (by - ay) * (cx - ax) > 0, 1.0, -1.0)
-    real = corner_gradients.dtype.element_ty
+    real = by_corner.dtype.element_ty
     gax, gay = tl.zeros((FACES, PIXELS), real), tl.zeros((FACES, PIXELS), real)
     gbx, gby = tl.zeros((FACES, PIXELS), real), tl.zeros((FACES, PIXELS), real)
     gcx, gcy = tl.zeros((FACES, PIXELS), real), tl.zeros((FACES, PIXELS), real)
@@ -48,9 +54,9 @@ def push_corners(
     inverse_sigma = 1.0 / sigma
     for start in range(0, most, PIXELS):
         at = base + (first_row + row) * stride + first_column + column
-        force = tl.load(pull + at, mask=start + lane < count, other=0)
+        grad = tl.load(upstream + at, mask=start + lane < count, other=0)
         # Covered for certain, hidden, or without a loss: nothing to do.
-        if tl.max(tl.max(tl.abs(force), axis=1), axis=0) > 0:
+        if tl.max(tl.max(tl.abs(grad), axis=1), axis=0) > 0:
             px, py = (first_column + column).to(real) + 0.5, (first_row + row).to(real) + 0.5
             rx, ry, t, wc = to_edge(px, py, ax, ay, bx, by)
             distance = rx * rx + ry * ry
@@ -70,10 +76,10 @@ def push_corners(
 
             inside = tl.minimum(tl.minimum(wa * turn, wb * turn), wc * turn) > 0
             sign = tl.where(inside, 1.0, -1.0)
-            # dmask/dx_f is `pull` times the chance that this face covers; dd_f/dcorner is
+            # dmask/dx_f is `upstream` times the chance that this face covers; dd_f/dcorner is
             # -2 (p - nearest) times the corner's share of the nearest point.
             covers = 1.0 / (1.0 + tl.exp(-sign * distance * inverse_sigma))
-            weight = -2.0 * force * sign * covers * inverse_sigma
+            weight = -2.0 * grad * sign * covers * inverse_sigma
             weight = tl.where(inside | (distance < blur), weight, 0.0)
             gx, gy = weight * rx, weight * ry
             gax += share_a * gx
@@ -86,7 +92,7 @@ def push_corners(
         row += down + wraps.to(tl.int32)
         column += along - tl.where(wraps, columns, 0)
     face = (tl.program_id(0) % programs) * FACES + tl.arange(0, FACES)
-    to = corner_gradients + (mesh * face_count + face) * 6
+    to = by_corner + (mesh * face_count + face) * 6
     exists = face < face_count
     tl.store(to, tl.sum(gax, axis=1), mask=exists)
     tl.store(to + 1, tl.sum(gay, axis=1), mask=exists)
@@ -99,7 +105,7 @@ def push_corners(
 @triton.jit
 @no_type_check
 def gather_vertices(
-    corner_gradients, corners, first_corners, windows, gradient, vertex_count, corner_count,
+    by_corner, corners, first_corners, windows, gradient, vertex_count, corner_count,
     VERTICES: tl.constexpr,
 ):  # pragma: no cover - compiled  # fmt: skip
     """Sum each vertex over the corners that are it: corners[first_corners[v] : ..[v + 1]]."""
@@ -116,8 +122,8 @@ def gather_vertices(
     for step in range(0, most):
         here = step < count
         corner = mesh * corner_count + tl.load(corners + first + step, mask=here, other=0)
-        gx += tl.load(corner_gradients + corner * 2, mask=here, other=0)
-        gy += tl.load(corner_gradients + corner * 2 + 1, mask=here, other=0)
+        gx += tl.load(by_corner + corner * 2, mask=here, other=0)
+        gy += tl.load(by_corner + corner * 2 + 1, mask=here, other=0)
     to = gradient + (mesh * vertex_count + vertex) * 2
     tl.store(to, gx, mask=exists)
     tl.store(to + 1, gy, mask=exists)

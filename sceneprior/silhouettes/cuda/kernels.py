@@ -1,18 +1,18 @@
-"""The Triton kernels behind `cuda.backend`: faces in, packed windows of pixels out.
+"""Triton kernels of the exact mode: what each pixel of a packed window sees of its mesh.
 
 A mesh is one object in one image. Its window is the part of the image that its faces may touch,
 in whole tiles of TILE x TILE pixels; windows are packed one behind the other, row by row, so
 memory grows with what is seen. No kernel adds to a place that another program adds to: the same
 input gives the same bits.
 
-    cuda_kernels      bound_faces      per mesh          pixels that faces touch, and the window
-                      cover_tiles      per packed tile   chance to miss, and the order value
-    cuda_compositing  composite_tiles  per image tile    masks, front, depth
-                      pull_tiles       per image tile    how hard the loss pulls packed pixels
-    cuda_gradients    push_corners     per few faces     gradient of each face's corners
-                      gather_vertices  per few vertices  gradient of each vertex
+    kernels      bound_faces         per mesh          pixels that faces touch, and the window
+                 cover_tiles         per packed tile   chance to miss, and the order value
+    compositing  composite_tiles     per image tile    masks, front, depth
+                 composite_backward  per image tile    gradient of packed pixels
+    gradients    corner_gradients    per few faces     gradient of each face's corners
+                 gather_vertices     per few vertices  gradient of each vertex
 
-`cover_tiles` and `push_corners` are the exact mode's; `cuda_outline_kernels` lists the fast mode's.
+`cover_tiles` and `corner_gradients` are the exact mode's; `outline_kernels` lists the fast mode's.
 Block shapes are chosen for an H200 by counting instructions, not yet by measuring.
 """
 
@@ -46,6 +46,31 @@ MIN_AREA, SLACK = tl.constexpr(reference.MIN_AREA_PX2), tl.constexpr(reference.S
 # no_type_check: the tests' type hook wraps every function, and Triton cannot compile a wrapper.
 @triton.jit
 @no_type_check
+def vertices_of(faces, face, first_vertex, mask):  # pragma: no cover - compiled
+    """The three vertices of faces, numbered through all meshes."""
+    a = first_vertex + tl.load(faces + face * 3, mask=mask, other=0)
+    b = first_vertex + tl.load(faces + face * 3 + 1, mask=mask, other=0)
+    return a, b, first_vertex + tl.load(faces + face * 3 + 2, mask=mask, other=0)
+
+
+@triton.jit
+@no_type_check
+def vertex_at(pixels, vertex, mask):  # pragma: no cover - compiled
+    """u and v of a vertex."""
+    x = tl.load(pixels + vertex * 2, mask=mask, other=0)
+    return x, tl.load(pixels + vertex * 2 + 1, mask=mask, other=0)
+
+
+@triton.jit
+@no_type_check
+def vertex_at64(pixels, vertex, mask):  # pragma: no cover - compiled
+    """u and v of a vertex, in float64."""
+    x, y = vertex_at(pixels, vertex, mask)
+    return x.to(tl.float64), y.to(tl.float64)
+
+
+@triton.jit
+@no_type_check
 def bound_faces(
     pixels, depths, faces, drawn, face_bounds, block_bounds, windows,
     vertex_count, face_count, block_count, height, width, reach, near, GROUP: tl.constexpr,
@@ -59,21 +84,14 @@ def bound_faces(
         block = group + tl.arange(0, GROUP)
         face = block[:, None] * BLOCK + tl.arange(0, BLOCK)[None, :]
         exists = face < shown
-        a = mesh * vertex_count + tl.load(faces + face * 3, mask=exists, other=0)
-        b = mesh * vertex_count + tl.load(faces + face * 3 + 1, mask=exists, other=0)
-        c = mesh * vertex_count + tl.load(faces + face * 3 + 2, mask=exists, other=0)
-        ax = tl.load(pixels + a * 2, mask=exists, other=0)
-        ay = tl.load(pixels + a * 2 + 1, mask=exists, other=0)
-        bx = tl.load(pixels + b * 2, mask=exists, other=0)
-        by = tl.load(pixels + b * 2 + 1, mask=exists, other=0)
-        cx = tl.load(pixels + c * 2, mask=exists, other=0)
-        cy = tl.load(pixels + c * 2 + 1, mask=exists, other=0)
+        a, b, c = vertices_of(faces, face, mesh * vertex_count, exists)
+        ax, ay = vertex_at(pixels, a, exists)
+        bx, by = vertex_at(pixels, b, exists)
+        cx, cy = vertex_at(pixels, c, exists)
         nearest = tl.minimum(
-            tl.minimum(
-                tl.load(depths + a, mask=exists, other=0), tl.load(depths + b, mask=exists, other=0)
-            ),
-            tl.load(depths + c, mask=exists, other=0),
+            tl.load(depths + a, mask=exists, other=0), tl.load(depths + b, mask=exists, other=0)
         )
+        nearest = tl.minimum(nearest, tl.load(depths + c, mask=exists, other=0))
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         keep = exists & (nearest > near) & (tl.abs(area) > MIN_AREA)
         low = tl.ceil(tl.minimum(tl.minimum(ay, by), cy) - reach - 0.5)
@@ -129,6 +147,22 @@ def window(windows, first_tiles, mesh):  # pragma: no cover - compiled
 
 @triton.jit
 @no_type_check
+def packed_at(windows, first_tiles, mesh, row, column):  # pragma: no cover - compiled
+    """Where pixels of a mesh are packed."""
+    base, stride = window(windows, first_tiles, mesh)
+    return base + row * stride + column
+
+
+@triton.jit
+@no_type_check
+def bits_of(hit, lane):  # pragma: no cover - compiled
+    """BLOCK booleans as the bits of one word."""
+    bit = tl.full((BLOCK,), 1, tl.uint32) << lane.to(tl.uint32)
+    return tl.sum(tl.where(hit, bit, 0), axis=0).to(tl.uint32)
+
+
+@triton.jit
+@no_type_check
 def tile_pixels(windows, first_tiles, tile_meshes):  # pragma: no cover - compiled
     """Mesh and first pixel of this program's packed tile; its pixels, and where they are packed."""
     tile = tl.program_id(0).to(tl.int64)
@@ -164,8 +198,7 @@ def hits(bounds, first, count, row_size, row, column):  # pragma: no cover - com
     hit &= tl.load(at + row_size, mask=known, other=-1) >= row
     hit &= tl.load(at + 2 * row_size, mask=known, other=EMPTY) < column + TILE
     hit &= tl.load(at + 3 * row_size, mask=known, other=-1) >= column
-    bit = tl.full((BLOCK,), 1, tl.uint32) << lane.to(tl.uint32)
-    return tl.sum(tl.where(hit, bit, 0), axis=0).to(tl.uint32)
+    return bits_of(hit, lane)
 
 
 @triton.jit
@@ -218,12 +251,10 @@ def cover_tiles(
             while found != 0:
                 face = first + first_bit(found)
                 found &= found - 1
-                a = mesh * vertex_count + tl.load(faces + face * 3)
-                b = mesh * vertex_count + tl.load(faces + face * 3 + 1)
-                c = mesh * vertex_count + tl.load(faces + face * 3 + 2)
-                ax, ay = tl.load(pixels + a * 2), tl.load(pixels + a * 2 + 1)
-                bx, by = tl.load(pixels + b * 2), tl.load(pixels + b * 2 + 1)
-                cx, cy = tl.load(pixels + c * 2), tl.load(pixels + c * 2 + 1)
+                a, b, c = vertices_of(faces, face, mesh * vertex_count, True)
+                ax, ay = vertex_at(pixels, a, True)
+                bx, by = vertex_at(pixels, b, True)
+                cx, cy = vertex_at(pixels, c, True)
                 ia, ib = tl.load(inverse_depths + a), tl.load(inverse_depths + b)
                 ic = tl.load(inverse_depths + c)
                 rx, ry, _, wc = to_edge(px, py, ax, ay, bx, by)

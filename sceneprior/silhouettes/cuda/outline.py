@@ -1,7 +1,7 @@
 """The fast mode on CUDA: a mesh's outline is found once, and only it is soft.
 
-`outline.py` says what is drawn. Here, all meshes' outline edges are listed together and cut into
-pieces; pieces with a face beyond them are left out; every tile asks the pieces of its mesh. The
+`cpu.outline` says what is drawn. Here, all meshes' outline edges are listed together and cut into
+pieces; pieces with a face beyond them are left out; every tile takes the pieces of its mesh. The
 host waits twice, for the number of edges and of pieces. What decides (areas, crossings, where a
 pixel centre lies) is computed in float64, which costs an H200 twice a float32; distances near the
 image are in the precision of the input.
@@ -15,7 +15,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from sceneprior.silhouettes.cuda.edge_kernels import EDGES, PIECES, certify_pieces, sum_layers
 from sceneprior.silhouettes.cuda.faces import sum_by_vertex
-from sceneprior.silhouettes.cuda.outline_kernels import PULLED, push_ends, trace_tiles
+from sceneprior.silhouettes.cuda.outline_kernels import PER_PROGRAM, end_gradients, trace_tiles
 from sceneprior.silhouettes.cuda.windows import TILE, Windows, launch, reach_of
 from sceneprior.silhouettes.reference import ASIDE_PX, PIECE_PX, Settings
 from sceneprior.silhouettes.topology import topology_of
@@ -76,11 +76,11 @@ def cover(
     pixels: Tensor,
     depths: Tensor,
     faces: Tensor,
-    edges: Edges,
     windows: Windows,
     settings: Settings,
+    edges: Edges,
 ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    """The chance to miss and the order value of all windows, and what `pull_back` needs."""
+    """The chance to miss and the order value of all windows, and what `cover_backward` needs."""
     meshes, vertices, tiles = len(windows.places), pixels.shape[2], len(windows.tile_meshes)
     layers = torch.empty(meshes, len(edges.ends), dtype=torch.int32, device=pixels.device)
     programs = meshes * -(-len(edges.ends) // EDGES.value)
@@ -107,7 +107,7 @@ def cover(
 def _cut_edges(
     pixels: Tensor, nearness: Tensor, ends: Tensor, layers: Tensor, settings: Settings
 ) -> _Pieces:
-    """Pieces of all edges beside which the number of faces changes, where the image feels them."""
+    """Pieces of all edges beside which the number of faces changes, near the image."""
     meshes, edges = layers.nonzero().unbind(dim=1)
     layers = layers[meshes, edges]
     vertices = ends.long()[edges] + (meshes * pixels.shape[2]).unsqueeze(1)
@@ -134,7 +134,7 @@ def _cut_edges(
 
 def _cut_lines(start: Tensor, end: Tensor, settings: Settings) -> tuple[Tensor, Tensor]:
     """Line and span of each piece of at most PIECE_PX: of a line far outside the image, only those
-    that the image feels."""
+    near the image."""
     along = end - start
     count = (along.norm(dim=1) / PIECE_PX).ceil()
     low, high, reach = torch.zeros_like(count), torch.ones_like(count), reach_of(settings)
@@ -142,9 +142,9 @@ def _cut_lines(start: Tensor, end: Tensor, settings: Settings) -> tuple[Tensor, 
         # Across a line of no extent: both infinite, or not a number; then it is left out.
         t = torch.stack([-reach - start[:, axis], size + reach - start[:, axis]]) / along[:, axis]
         low, high = torch.maximum(low, t.amin(dim=0)), torch.minimum(high, t.amax(dim=0))
-    felt = low < high
-    first = torch.where(felt, (low * count).floor(), 0.0)
-    number = (torch.where(felt, (high * count).ceil(), 0.0) - first).long()
+    near = low < high
+    first = torch.where(near, (low * count).floor(), 0.0)
+    number = (torch.where(near, (high * count).ceil(), 0.0) - first).long()
     last = number.cumsum(dim=0)
     every = torch.arange(len(number), device=number.device)
     line = every.repeat_interleave(number, output_size=int(last[-1]) if len(last) else 0)
@@ -158,25 +158,25 @@ def _firsts(meshes: Tensor, count: int) -> Tensor:
     return torch.searchsorted(meshes.contiguous(), every).int()
 
 
-def pull_back(
+def cover_backward(
     pixels: Tensor,
     seen: tuple[Tensor, Tensor],
     settings: Settings,
     missed: Tensor,
     order: Tensor,
     traced: list[Tensor],
-    pull: Tensor,
+    upstream: Tensor,
 ) -> Tensor:
-    """dL/dpixels from -dL/dlog(missed): each pixel pulls the ends of its nearest outline edge."""
+    """dL/dpixels from -dL/dlog(missed): a pixel moves the ends of its nearest outline edge."""
     nearest, *rest = traced
     pieces = _Pieces(*rest)
     count = len(pieces.meshes)
-    gradients = pixels.new_empty(count, 2, 2)
+    by_end = pixels.new_empty(count, 2, 2)
     launch(
-        push_ends, -(-count // PULLED.value), pieces.shapes, pieces.spans, pieces.meshes,
-        pieces.clear, *seen, missed, order, nearest, pull, gradients, count,
+        end_gradients, -(-count // PER_PROGRAM.value), pieces.shapes, pieces.spans, pieces.meshes,
+        pieces.clear, *seen, missed, order, nearest, upstream, by_end, count,
         settings.sigma_px2, reach_of(settings), num_warps=1,
     )  # fmt: skip
     # All meshes as one: their vertices are numbered through.
     everywhere = torch.ones(1, 4, dtype=torch.int32, device=pixels.device)
-    return sum_by_vertex(gradients, pieces.vertices.flatten(), everywhere, pixels)
+    return sum_by_vertex(by_end, pieces.vertices.flatten(), everywhere, pixels)

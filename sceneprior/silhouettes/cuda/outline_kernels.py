@@ -1,32 +1,34 @@
-"""Triton kernels of the fast mode: clear pieces of outlines in, packed windows out, and back.
+"""Triton kernels of the fast mode: packed windows from pieces of outlines, and their gradient.
 
-    cuda_edge_kernels     sum_layers      per few edges    where the number of faces changes
-                          certify_pieces  per few pieces   whether no face lies beyond a piece
-    cuda_outline_kernels  trace_tiles     per packed tile  chance to miss, order, nearest piece
-                          push_ends       per few pieces   gradient of the ends of its edge
+    edge_kernels     sum_layers      per few edges    where the number of faces changes
+                     certify_pieces  per few pieces   whether no face lies beyond a piece
+    outline_kernels  trace_tiles     per packed tile  chance to miss, order, nearest piece
+                     end_gradients   per few pieces   gradient of the ends of its edge
 
-As in `cuda_kernels`, no kernel adds to a place that another program adds to. Block shapes are
+As in `kernels`, no kernel adds to a place that another program adds to. Block shapes are
 chosen for an H200 by counting registers, not yet by measuring.
 """
 
 from typing import no_type_check
 
-from sceneprior.silhouettes.cuda.edge_kernels import corner_at
 from sceneprior.silhouettes.cuda.kernels import (
     BLOCK,
     MIN_AREA,
     SLACK,
     TILE,
+    bits_of,
     first_bit,
     hits,
     tile_pixels,
     tl,
     triton,
+    vertex_at64,
+    vertices_of,
     window,
 )
 
-PULLED, PIXELS = tl.constexpr(8), tl.constexpr(8)
-"""Pieces of one program of `push_ends`, and pixels of each that it takes at once."""
+PER_PROGRAM, PIXELS = tl.constexpr(8), tl.constexpr(8)
+"""Pieces of one program of `end_gradients`, and pixels of each that it takes at once."""
 
 
 # no_type_check: the tests' type hook wraps every function, and Triton cannot compile a wrapper.
@@ -35,7 +37,7 @@ PULLED, PIXELS = tl.constexpr(8), tl.constexpr(8)
 def _pieces_near(
     shapes, clear, first, last, piece_count, top_row, left_column, reach
 ):  # pragma: no cover - compiled
-    """Bit i is set where piece first + i is outline and may be felt in the tile."""
+    """Bit i is set where piece first + i is outline and its blur may reach the tile."""
     lane = tl.arange(0, BLOCK)
     piece = first + lane
     known = piece < last
@@ -48,8 +50,7 @@ def _pieces_near(
         tl.maximum(x0, x1) + reach > left_column
     )
     hit &= (tl.minimum(y0, y1) - reach < top_row + TILE) & (tl.maximum(y0, y1) + reach > top_row)
-    bit = tl.full((BLOCK,), 1, tl.uint32) << lane.to(tl.uint32)
-    return tl.sum(tl.where(hit, bit, 0), axis=0).to(tl.uint32)
+    return bits_of(hit, lane)
 
 
 @triton.jit
@@ -72,7 +73,7 @@ def trace_tiles(
 ):  # pragma: no cover - compiled  # fmt: skip
     """One mesh in one tile: the nearest face that contains a pixel centre, the nearest piece.
 
-    `nearness` is 1 / depth in float64. The order value is that of `cuda_kernels.cover_tiles`, and
+    `nearness` is 1 / depth in float64. The order value is that of `kernels.cover_tiles`, and
     in the halo the outline's depth.
     """
     mesh, top_row, left_column, row, column, at = tile_pixels(windows, first_tiles, tile_meshes)
@@ -90,12 +91,10 @@ def trace_tiles(
             while found != 0:
                 face = first + first_bit(found)
                 found &= found - 1
-                a = mesh * vertex_count + tl.load(faces + face * 3)
-                b = mesh * vertex_count + tl.load(faces + face * 3 + 1)
-                c = mesh * vertex_count + tl.load(faces + face * 3 + 2)
-                ax, ay = corner_at(pixels, a, True)
-                bx, by = corner_at(pixels, b, True)
-                cx, cy = corner_at(pixels, c, True)
+                a, b, c = vertices_of(faces, face, mesh * vertex_count, True)
+                ax, ay = vertex_at64(pixels, a, True)
+                bx, by = vertex_at64(pixels, b, True)
+                cx, cy = vertex_at64(pixels, c, True)
                 ux, uy, vx, vy = bx - ax, by - ay, cx - ax, cy - ay
                 qx, qy, over = px - ax, py - ay, 1.0 / (ux * vy - uy * vx)
                 wb, wc = (qx * vy - qy * vx) * over, (qy * ux - qx * uy) * over
@@ -136,12 +135,12 @@ def trace_tiles(
 
 @triton.jit
 @no_type_check
-def push_ends(
-    shapes, spans, piece_meshes, clear, windows, first_tiles, missed, order, nearest, pull,
-    gradients, piece_count, sigma, reach,
+def end_gradients(
+    shapes, spans, piece_meshes, clear, windows, first_tiles, missed, order, nearest, upstream,
+    by_end, piece_count, sigma, reach,
 ):  # pragma: no cover - compiled  # fmt: skip
-    """Every piece walks over the pixels that may feel it; lanes share it and are summed."""
-    piece = tl.program_id(0) * PULLED + tl.arange(0, PULLED)[:, None]
+    """Every piece walks over the pixels its blur may reach; lanes share it and are summed."""
+    piece = tl.program_id(0) * PER_PROGRAM + tl.arange(0, PER_PROGRAM)[:, None]
     exists = piece < piece_count
     mesh = tl.load(piece_meshes + piece, mask=exists, other=0).to(tl.int64)
     x0 = tl.load(shapes + piece, mask=exists, other=0)
@@ -159,34 +158,34 @@ def push_ends(
     first_column = tl.maximum(tl.ceil(tl.minimum(x0, x1) - reach - 0.5).to(tl.int32), left)
     last_column = tl.minimum(tl.floor(tl.maximum(x0, x1) + reach - 0.5).to(tl.int32), right)
     columns = tl.maximum(last_column - first_column + 1, 1)
-    felt = (tl.load(clear + piece, mask=exists, other=0) != 0) & (last_row >= first_row)
-    felt &= last_column >= first_column
-    count = tl.where(felt, (last_row - first_row + 1) * columns, 0)
+    seen = (tl.load(clear + piece, mask=exists, other=0) != 0) & (last_row >= first_row)
+    seen &= last_column >= first_column
+    count = tl.where(seen, (last_row - first_row + 1) * columns, 0)
     most = tl.max(tl.max(count, axis=1), axis=0)
-    real = gradients.dtype.element_ty
-    gax, gay = tl.zeros((PULLED, PIXELS), real), tl.zeros((PULLED, PIXELS), real)
-    gbx, gby = tl.zeros((PULLED, PIXELS), real), tl.zeros((PULLED, PIXELS), real)
+    real = by_end.dtype.element_ty
+    gax, gay = tl.zeros((PER_PROGRAM, PIXELS), real), tl.zeros((PER_PROGRAM, PIXELS), real)
+    gbx, gby = tl.zeros((PER_PROGRAM, PIXELS), real), tl.zeros((PER_PROGRAM, PIXELS), real)
     lane = tl.arange(0, PIXELS)[None, :]
     for start in range(0, most, PIXELS):
         place = start + lane
         row, column = first_row + place // columns, first_column + place % columns
         at = base + row * stride + column
         own = tl.load(nearest + at, mask=place < count, other=-1) == piece
-        force = tl.load(pull + at, mask=own, other=0)
-        if tl.max(tl.max(tl.abs(force), axis=1), axis=0) > 0:
+        grad = tl.load(upstream + at, mask=own, other=0)
+        if tl.max(tl.max(tl.abs(grad), axis=1), axis=0) > 0:
             px, py = column.to(real) + 0.5, row.to(real) + 0.5
             rx, ry, s = _to_piece(px, py, x0, y0, x1, y1)
             # Moving the nearest point of the outline changes the squared distance by -2 r.
-            weight = -2.0 * force * (1.0 - tl.load(missed + at, mask=own, other=1)) / sigma
+            weight = -2.0 * grad * (1.0 - tl.load(missed + at, mask=own, other=1)) / sigma
             weight = tl.where(tl.load(order + at, mask=own, other=1) > 0, weight, -weight)
             share = t0 + s * (t1 - t0)
             gax += (1.0 - share) * weight * rx
             gay += (1.0 - share) * weight * ry
             gbx += share * weight * rx
             gby += share * weight * ry
-    piece = tl.program_id(0) * PULLED + tl.arange(0, PULLED)
+    piece = tl.program_id(0) * PER_PROGRAM + tl.arange(0, PER_PROGRAM)
     exists = piece < piece_count
-    to = gradients + piece.to(tl.int64) * 4
+    to = by_end + piece.to(tl.int64) * 4
     tl.store(to, tl.sum(gax, axis=1), mask=exists)
     tl.store(to + 1, tl.sum(gay, axis=1), mask=exists)
     tl.store(to + 2, tl.sum(gbx, axis=1), mask=exists)

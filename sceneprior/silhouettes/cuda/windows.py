@@ -1,16 +1,16 @@
-"""Projected meshes in, the tiles of the image that each may touch out; how kernels are launched."""
+"""Windows: the tiles of the image that each mesh may touch; and how kernels are launched."""
 
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from sceneprior.silhouettes.cuda import kernels as cuda_kernels
+from sceneprior.silhouettes.cuda import kernels
 from sceneprior.silhouettes.reference import Settings
 
-TILE = cuda_kernels.TILE.value
-BLOCK = cuda_kernels.BLOCK.value
-INTERPRETED = not isinstance(cuda_kernels.cover_tiles, cuda_kernels.triton.JITFunction)
+TILE = kernels.TILE.value
+BLOCK = kernels.BLOCK.value
+INTERPRETED = not isinstance(kernels.cover_tiles, kernels.triton.JITFunction)
 """Whether Triton's interpreter runs the kernels, on tensors anywhere."""
 
 REACH_MARGIN_PX = 1e-3
@@ -18,7 +18,7 @@ REACH_MARGIN_PX = 1e-3
 
 
 class Windows(NamedTuple):
-    """The parts of the images that the meshes may touch; see `cuda_kernels`."""
+    """The parts of the images that the meshes may touch; see `kernels`."""
 
     face_bounds: Tensor
     block_bounds: Tensor
@@ -33,7 +33,7 @@ class Windows(NamedTuple):
 
 
 def reach_of(settings: Settings) -> float:
-    """How far a face or an outline is felt, a little more rather than less."""
+    """How far a face or an outline blurs, a little more rather than less."""
     return settings.blur_px2**0.5 + REACH_MARGIN_PX
 
 
@@ -71,7 +71,7 @@ def _bound(
     places = torch.empty((meshes, 4), dtype=torch.int32, device=pixels.device)
     # Without fused multiply-adds, whose rounding would lend an area to a face that has none.
     launch(
-        cuda_kernels.bound_faces, meshes, pixels, depths, faces, drawn, bounds, block_bounds,
+        kernels.bound_faces, meshes, pixels, depths, faces, drawn, bounds, block_bounds,
         places, vertices, len(faces), blocks, *settings.image_size, reach, settings.near_m,
         GROUP=8, num_warps=4, enable_fp_fusion=False,
     )  # fmt: skip

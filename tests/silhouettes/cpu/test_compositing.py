@@ -1,4 +1,4 @@
-"""Who hides whom: compositing in both backends against loops, and what each way can pull."""
+"""Compositing in both backends against loops, and its gradient."""
 
 import numpy as np
 import pytest
@@ -66,11 +66,11 @@ def test_compositing_and_its_gradient_are_the_definitions(way):
 
     upstream = np.random.default_rng(1).normal(size=coverage.shape)
     masks.backward(torch.from_numpy(upstream))
-    force = compositing.force_of(odds, order, whole_windows(), way, upstream)
-    # `force` has the chance to miss in it: d coverage / d x = missed * sigmoid(x).
-    pull = pack(np.where(np.isfinite(z), alpha.grad.numpy() * (1 - coverage), 0), 0.0)
+    packed = compositing.compose_backward(odds, order, whole_windows(), way, upstream)
+    # `packed` has the chance to miss in it: d coverage / d x = missed * sigmoid(x).
+    wanted = pack(np.where(np.isfinite(z), alpha.grad.numpy() * (1 - coverage), 0), 0.0)
     touched = order > -np.inf
-    np.testing.assert_allclose(force[touched], pull[touched], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(packed[touched], wanted[touched], rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("way", COMPOSITING)
@@ -87,7 +87,7 @@ def test_a_face_that_contains_the_pixel_centre_decides_the_depth_before_a_nearer
     mode, backend
 ):
     # Object 0 is one large wall at 3 m; object 1 a wall at 2 m whose right edge runs along
-    # u = 16. One pixel to its right, 0 contains the centre and 1 only reaches it: 1 is felt
+    # u = 16. One pixel to its right, 0 contains the centre and 1 only reaches it: 1 counts
     # as the nearer, for it is, but what a camera would see there is 0.
     wall = [[-20, -20, 3], [20, -20, 3], [0, 40, 3]]
     half = [[0, -20, 2], [-20, 0, 2], [0, 20, 2]]

@@ -10,7 +10,7 @@ from sceneprior.geometry.meshes import icosphere
 from sceneprior.silhouettes.cpu import faces, outline
 from sceneprior.silhouettes.cpu.windows import LANES, windows_of
 from sceneprior.silhouettes.reference import Settings
-from sceneprior.silhouettes.render import NEAR_M, render_silhouettes
+from sceneprior.silhouettes.render import NEAR_FACE_M, render_silhouettes
 
 
 def projected(scene: dict) -> tuple[np.ndarray, np.ndarray]:
@@ -19,11 +19,15 @@ def projected(scene: dict) -> tuple[np.ndarray, np.ndarray]:
     return seen[..., :2].contiguous().numpy(), seen[..., 2].contiguous().numpy()
 
 
+def settings_of(size: tuple[int, int], blur_px2: float) -> Settings:
+    return Settings(size, 0.5, blur_px2, NEAR_FACE_M, "", "")
+
+
 def boxes_by_hand(pixels, depths, drawn, image_size, reach):
     """Pixels with their centre within reach of a mesh's box: (row0, row1, column0, column1)."""
     boxes = []
     for points, z, shown in zip(pixels, depths, drawn, strict=True):
-        points = points[z > NEAR_M]
+        points = points[z > NEAR_FACE_M]
         rows = columns = np.zeros(0, dtype=int)
         if shown and len(points):
             (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
@@ -42,7 +46,7 @@ def test_windows_are_the_boxes_by_hand_in_strips_of_eight(reach):
     scene = random_scene(0, rooms=2, objects=6, views=8)
     pixels, depths = projected(scene)
     drawn = np.arange(len(pixels)) % 7 != 3
-    windows = windows_of(pixels, depths, drawn, (24, 32), reach, NEAR_M)
+    windows = windows_of(pixels, depths, drawn, settings_of((24, 32), reach**2))
     boxes = boxes_by_hand(pixels, depths, drawn, (24, 32), reach)
     assert 0 < (boxes[:, 1] == 0).sum() < len(boxes)
     wanted = np.column_stack([boxes[:, :2], boxes[:, 2] // 8, -(-boxes[:, 3] // 8)])
@@ -62,9 +66,7 @@ def test_memory_grows_with_visible_pixels_not_with_objects_x_views_x_image():
         windows_of(
             *projected(seen_ahead(torch.stack(meshes), torch.zeros(0, 3).long(), size, 64.0)),
             np.ones(len(meshes), dtype=bool),
-            size,
-            2.0,
-            NEAR_M,
+            settings_of(size, 2.0**2),
         )
         for meshes in ([ahead], [ahead, *unseen * 50])
     )
@@ -78,10 +80,10 @@ def test_memory_grows_with_visible_pixels_not_with_objects_x_views_x_image():
 def test_every_pixel_is_where_the_layout_says(engine, dtype):
     scene = random_scene(17, views=2)
     scene["image_size"] = (21, 29)
-    settings = Settings((21, 29), 0.5, 4.6, NEAR_M, "", "")
+    settings = settings_of((21, 29), 4.6)
     pixels, depths = (array.astype(dtype) for array in projected(scene))
     drawn = np.ones(len(pixels), dtype=bool)
-    windows = windows_of(pixels, depths, drawn, (21, 29), 4.6**0.5, NEAR_M)
+    windows = windows_of(pixels, depths, drawn, settings)
     triangles = scene["faces"].numpy()
     odds, order, _ = engine.cover(pixels, depths, triangles, windows, settings)
     assert odds.shape == order.shape == (windows.start[-1],) and odds.dtype == order.dtype == dtype
