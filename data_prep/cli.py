@@ -72,8 +72,8 @@ def prep_front(
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
     from data_prep.engine.build import Job
+    from data_prep.front.recipe import load_recipe
     from data_prep.front.source import FrontSource
-    from data_prep.recipe import load_recipe
 
     changes = list(rule or [])
     if views_per_m2 is not None:

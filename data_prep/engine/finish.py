@@ -1,4 +1,4 @@
-"""The end of a job: its totals in; report.json, report.csv and, last of all, index.json out."""
+"""The end of a job: writes report.json, report.csv and, last of all, index.json."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -78,7 +78,8 @@ def finish(out: Path, plan: Plan, totals: Summary) -> None:
     """
     if plan.settings["only"] is None and totals.source.only is not None:
         # `--only` made the last missing part: the files are those of the whole.
-        totals = replace(totals, source=_whole(totals.source))
+        whole: Any = replace(totals.source, only=None)  # type: ignore[type-var]
+        totals = replace(totals, source=whole)
     with writing(out):
         write_changed(out / REPORT_NAME, json_text(totals.report))
         write_changed(out / TABLE_NAME, report_csv(totals.lines))
@@ -103,7 +104,3 @@ def finish(out: Path, plan: Plan, totals: Summary) -> None:
     }
     with writing(out):
         write_changed(out / INDEX_NAME, json_text(index))
-
-
-def _whole(source: Any) -> Any:
-    return replace(source, only=None)

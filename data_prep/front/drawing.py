@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from data_prep.front.furnished import Room
+from data_prep.front.recipe import Recipe, ViewRules
 from data_prep.front.viewpoints import Viewpoints, intrinsics, sees_enough
-from data_prep.recipe import Recipe, ViewRules
 from sceneprior.classes import VOID, label_set
 from sceneprior.instances.observations import observe, pixel_counts
 from sceneprior.offscreen import Renderer

@@ -1,7 +1,7 @@
 """3D-FRONT (or homes in its format) as a source of rooms: surveyed by house, drawn by room."""
 
 import functools
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,15 @@ from data_prep.engine.selection import (
     read_splits,
     seeded_split,
 )
-from data_prep.engine.source import SPLITS, LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
+from data_prep.engine.source import (
+    SPLITS,
+    Expected,
+    LeftOut,
+    PreparedRoom,
+    RoomTask,
+    Survey,
+    sentence_of,
+)
 from data_prep.engine.workers import Run
 from data_prep.front.drawing import prepare_room
 from data_prep.front.files import house_files
@@ -21,10 +29,10 @@ from data_prep.front.filters import broken_rule
 from data_prep.front.furnished import Room
 from data_prep.front.houses import House, parse_house
 from data_prep.front.models import ModelBank
+from data_prep.front.recipe import Recipe
 from data_prep.front.rgb import rgb_files
 from data_prep.front.rooms import HouseRooms, read_house
 from data_prep.front.viewpoints import view_counts
-from data_prep.recipe import Expected, Recipe
 from sceneprior.errors import InputError
 from sceneprior.files import file_stamp
 from sceneprior.furniture import model_info_path
@@ -77,10 +85,8 @@ class FrontSource:
         info = model_info_path(Path(self.future))
         if self.splits is not None:
             read_splits(self.splits, self.val)
-        recipe = asdict(self.recipe)
-        del recipe["expected"]
         return {
-            "recipe": recipe,
+            "recipe": self.recipe.model_dump(exclude={"expected"}),
             "seed": self.seed,
             "val": self.val,
             "rgb": self.rgb,

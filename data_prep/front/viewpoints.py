@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 
 from data_prep.front.furnished import Room
-from data_prep.recipe import ViewRules
+from data_prep.front.recipe import ViewRules
 from sceneprior.offscreen import Pinhole
 
 _PLACES = 200  # random places tried before a rule about the place is relaxed

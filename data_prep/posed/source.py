@@ -9,7 +9,7 @@ from typing import Any
 
 from data_prep.engine.plan import digest_of_files
 from data_prep.engine.selection import check_survey, house_may_match, is_asked_for
-from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
+from data_prep.engine.source import Expected, LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
 from data_prep.engine.workers import Run
 from data_prep.posed.labels import TABLES
 from data_prep.posed.transforms import FILE_NAME, INSTANCES, read_transforms, room_name
@@ -20,7 +20,6 @@ from data_prep.posed.views import (
     stored_size,
     usable_frames,
 )
-from data_prep.recipe import Expected
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.offscreen import Renderer

@@ -7,9 +7,8 @@ from typing import Any
 
 from data_prep.engine.plan import digest
 from data_prep.engine.selection import check_survey, house_may_match, is_asked_for, seeded_split
-from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Survey
+from data_prep.engine.source import Expected, LeftOut, PreparedRoom, RoomTask, Survey
 from data_prep.engine.workers import Run
-from data_prep.recipe import Expected
 from data_prep.scannet.labels import LABEL_SET, Labels, read_labels
 from data_prep.scannet.scans import ScanSettings, read_scan
 from data_prep.scannet.splits import find_scans, space_of, split_scans

@@ -10,9 +10,9 @@ from front_files import bedroom, room
 from front_jobs import digests, front_job, rooms_of, three_houses
 
 from data_prep.engine.build import Job, build_shards
+from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.inspection.contents import count_shards, draw_sheet
-from data_prep.recipe import load_recipe
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.shards import iterate_rooms, list_shards, read_index

@@ -7,8 +7,8 @@ import pytest
 import shapely
 
 from data_prep.front.furnished import Room
+from data_prep.front.recipe import ViewRules
 from data_prep.front.viewpoints import Viewpoints, intrinsics, look, sees_enough, view_counts
-from data_prep.recipe import ViewRules
 
 RULES = ViewRules()
 L_SHAPE = [(-2, -3), (2, -3), (2, 0), (0, 0), (0, 3), (-2, 3)]
