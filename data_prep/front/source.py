@@ -3,16 +3,10 @@
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from data_prep.engine.plan import digest, digest_of_files
-from data_prep.engine.selection import (
-    check_survey,
-    house_may_match,
-    is_asked_for,
-    read_splits,
-    seeded_split,
-)
+from data_prep.engine.selection import house_may_match, read_splits, seeded_split, select
 from data_prep.engine.source import (
     SPLITS,
     Expected,
@@ -45,6 +39,8 @@ _HOUSES_PER_TASK = 8
 class FrontSource:
     """What `prep-front` reads: a `Source` (data_prep/engine/source.py)."""
 
+    name: ClassVar = "3d-front"
+    draws: ClassVar = True
     front: Path
     """Folder of house JSONs."""
     future: Path
@@ -61,20 +57,12 @@ class FrontSource:
     """Also draw shaded pictures, `rgb/<room>/<view>.png` (rgb.py). The shards do not change."""
 
     @property
-    def name(self) -> str:
-        return "3d-front"
-
-    @property
     def label_set(self) -> str:
         return self.recipe.label_set
 
     @property
     def room_type(self) -> str:
         return self.recipe.name.removeprefix("front3d_")
-
-    @property
-    def draws(self) -> bool:
-        return True
 
     @property
     def expected(self) -> Expected | None:
@@ -123,14 +111,9 @@ class FrontSource:
             else:
                 why = "it is in no split"
                 left_out.append(LeftOut(room_id, house, "filtered", why, rule="split"))
-        survey = Survey(
-            tuple(task for task in tasks if is_asked_for(self.only, task.room_id, task.house)),
-            tuple(item for item in left_out if is_asked_for(self.only, item.room_id, item.house)),
-        )
         where = f"{self.front} passes the recipe {self.recipe.name}"
         hint = str(self.splits or "that the data set has more than one usable room")
-        check_survey(survey, where, self.only, hint)
-        return survey
+        return select(Survey(tuple(tasks), tuple(left_out)), self.only, where, hint)
 
     def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
         """Read one room with its meshes and draw its views."""

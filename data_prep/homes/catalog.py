@@ -154,7 +154,7 @@ def at_score(low: float, middle: float, high: float, score: float) -> float:
 @lru_cache(maxsize=1)
 def real_sizes() -> dict[str, tuple[tuple[float, ...], ...]]:
     """Class -> percentiles 10, 50, 90 of width, height and depth in metres."""
-    text = files("data_prep.front.recipes").joinpath("furniture_sizes.csv").read_text()
+    text = files("data_prep.recipes").joinpath("furniture_sizes.csv").read_text()
     sizes: dict[str, tuple[tuple[float, ...], ...]] = {}
     for row in csv.DictReader(text.splitlines()):
         sizes[row["class"]] = tuple(

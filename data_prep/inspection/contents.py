@@ -98,7 +98,8 @@ def draw_sheet(
     Raises:
         InputError: no room has this id.
     """
-    captions, tiles = [], []
+    captions: list[str] = []
+    tiles: list[np.ndarray] = []
     for path, name, view in _choose(folder, room_id, pictures):
         short = name if len(name) <= 56 else f"{name[:8]}...{name[-45:]}"
         with Shard(path) as shard:

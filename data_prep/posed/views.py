@@ -1,4 +1,4 @@
-"""One room's folder in; its labelled views, in the arrays that shards store, out."""
+"""Labels the views of one room of posed pictures, in the arrays that shards store."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from data_prep.frames import (
     sampled_lines,
 )
 from data_prep.posed.labels import read_classes
-from data_prep.posed.transforms import PosedFrame, Recording, lens_matrix, room_name
+from data_prep.posed.transforms import PosedFrame, Recording, frame_intrinsics, room_name
 from sceneprior.errors import InputError
 from sceneprior.instances.observations import observe
 from sceneprior.instances.pngs import mask_size, read_mask
@@ -87,9 +87,8 @@ def stored_size(frame: PosedFrame, settings: PosedSettings) -> tuple[int, int]:
 def prepare_posed(
     recording: Recording, label_set_name: str, settings: PosedSettings
 ) -> PreparedRoom | None:
-    """Label the views of one room; None if no view shows an object of the label set.
-
-    There is no ground truth: nobody knows the room in 3D.
+    """Label the views of one room, which has no ground truth in 3D; None if no view shows an
+    object of the label set.
 
     Raises:
         InputError: a file is missing, damaged, or does not fit the others.
@@ -117,7 +116,7 @@ def prepare_posed(
     for frame in chosen:
         try:
             values = _read(frame, first)
-            K, picture = lens_matrix(frame, first)
+            K, picture = frame_intrinsics(frame, first)
             # That function counts pixel centres in whole numbers, as ScanNet does.
             shifted = np.eye(4)
             shifted[:3, :3] = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
