@@ -1,4 +1,4 @@
-"""Tables of instance ids in; the class of every id, and ids as `observe` takes them, out."""
+"""Reads the class of every instance id, and renumbers ids as `observe` takes them."""
 
 import csv
 import io
