@@ -1,4 +1,4 @@
-"""A room and a recipe in; the first rule that leaves the room out."""
+"""The rules of a recipe that leave rooms out."""
 
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import Recipe

@@ -1,4 +1,4 @@
-"""A parsed house in, its rooms out, whatever the quirks of the files."""
+"""Reads the rooms of a parsed house, whatever the quirks of the files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""A scan in, its labelled views out, in the arrays that shards store."""
+"""Labels the views of one scan, in the arrays that shards store."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
