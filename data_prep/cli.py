@@ -10,7 +10,7 @@ from data_prep.homes.command import make_homes_command
 from data_prep.inspection.command import inspect_command
 
 if TYPE_CHECKING:
-    from data_prep.engine.build import Job
+    from data_prep.engine.source import Source
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -71,26 +71,15 @@ def prep_front(
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
-    from data_prep.engine.build import Job
+    from data_prep.front.recipe import load_recipe
     from data_prep.front.source import FrontSource
-    from data_prep.recipe import load_recipe
 
     changes = list(rule or [])
     if views_per_m2 is not None:
         changes.append(f"views.per_m2={views_per_m2}")
     recipe = load_recipe(f"front3d_{room_type}", tuple(changes))
     source = FrontSource(front, future, recipe, splits, seed, only, val, rgb)
-    run_job(
-        Job(
-            source,
-            out,
-            workers=workers or len(os.sched_getaffinity(0)),
-            scheduler=scheduler,
-            renderer=renderer,
-            strict=strict,
-            retry_failed=retry_failed,
-        )
-    )
+    run_job(source, out, workers, scheduler, renderer, strict, retry_failed)
 
 
 def prep_scannet(
@@ -121,15 +110,13 @@ def prep_scannet(
 
     Exit status: 0, or 3 if scans failed (the others are prepared; report.csv says why).
     """
-    from data_prep.engine.build import Job
     from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings
     from data_prep.scannet.source import ScanNetSource
 
     size = FULL_SIZE if full_size else QUARTER_SIZE
     settings = ScanSettings(frame_step, max_views, masks, size)
     source = ScanNetSource(scans, labels, settings, train_list, val_list, seed, only)
-    count = workers or len(os.sched_getaffinity(0))
-    run_job(Job(source, out, count, scheduler, strict=strict, retry_failed=retry_failed))
+    run_job(source, out, workers, scheduler, "auto", strict, retry_failed)
 
 
 def prep_posed(
@@ -166,7 +153,6 @@ def prep_posed(
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
-    from data_prep.engine.build import Job
     from data_prep.posed.labels import read_label_set
     from data_prep.posed.source import PosedSource
     from data_prep.posed.views import PosedSettings
@@ -176,13 +162,20 @@ def prep_posed(
     source = PosedSource(rooms, classes, settings, val_share, seed, only)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
-    count = workers or len(os.sched_getaffinity(0))
-    run_job(Job(source, out, count, scheduler, strict=strict))
+    run_job(source, out, workers, scheduler, "auto", strict, retry_failed=False)
     typer.echo(f"To train on them: sceneprior fit --set 'label_set={classes}' ...")
 
 
-def run_job(job: "Job") -> None:
-    """Carry out a `prep-*` job, print its report, and exit as every such command does.
+def run_job(
+    source: "Source",
+    out: Path,
+    workers: int | None,
+    scheduler: str | None,
+    renderer: str,
+    strict: bool,
+    retry_failed: bool,
+) -> None:
+    """Build shards from a source, print the report, and exit as every `prep-*` command does.
 
     Raises:
         InputError: see `build_shards`; `main` prints it and exits with 2.
@@ -190,12 +183,13 @@ def run_job(job: "Job") -> None:
     """
     from rich.console import Console
 
-    from data_prep.engine.build import build_shards
+    from data_prep.engine.build import Job, build_shards
     from data_prep.engine.report_tables import report_tables
     from data_prep.engine.shard_job import RoomFailedError
 
+    workers = workers or len(os.sched_getaffinity(0))
     try:
-        summary = build_shards(job)
+        summary = build_shards(Job(source, out, workers, scheduler, renderer, strict, retry_failed))
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to go on.", err=True)
         raise typer.Exit(130) from None
@@ -209,6 +203,6 @@ def run_job(job: "Job") -> None:
     if summary.shards_open:
         made += f", {summary.shards_open} still to make: run without --only"
     drawn = f"; {summary.renderer}" if summary.renderer else ""
-    typer.echo(f"{job.out}: {summary} ({made}{drawn})")
+    typer.echo(f"{out}: {summary} ({made}{drawn})")
     if summary.statuses.get("failed"):
         raise typer.Exit(3)

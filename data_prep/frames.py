@@ -1,4 +1,4 @@
-"""Poses, masks and lens of a recording in; which frames are views, and their cameras, out."""
+"""Chooses the frames of a recording that become views, and computes their cameras."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -37,8 +37,8 @@ def choose_frames(
     Args:
         camera_to_world: (frames, 4, 4), as recorded.
         with_mask: Frame numbers that have a mask.
-        step: As ScanNet's exports, 15.
-        at_most: The paper's 100.
+        step: ScanNet's exports have 15.
+        at_most: The paper has 100.
 
     Example: 7 candidates, one lost, thinned to 3.
 
@@ -62,11 +62,7 @@ def choose_frames(
 
 
 def is_pose(camera_to_world: np.ndarray) -> np.ndarray:
-    """(frames,) bool: finite, and a rotation with a translation.
-
-    Args:
-        camera_to_world: (frames, 4, 4).
-    """
+    """(frames,) bool: each (4, 4) is finite, and a rotation with a translation."""
     poses = np.asarray(camera_to_world, dtype=np.float64)
     finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     safe = np.where(finite[:, None, None], poses, 0.0)
@@ -115,7 +111,7 @@ def mask_intrinsics(
     mask_size: tuple[int, int],
     image_size: tuple[int, int],
 ) -> np.ndarray:
-    """The lens of an image of `image_size` sampled (`sampled_lines`) from a mask of `mask_size`.
+    """The intrinsics of an image of `image_size`, sampled at `sampled_lines` of a mask's lines.
 
     Colour frames, masks and what is stored may all differ in size; this is the one place that
     minds it. Three steps, each exact:

@@ -35,7 +35,6 @@ LABEL_SETS |= {
 VOID = 0
 """Index of `void` in every label set: furniture outside the list."""
 
-
 _OWN = "void,"
 _LONGEST_NAME = 60
 
@@ -43,8 +42,8 @@ _LONGEST_NAME = 60
 def label_set(name: str) -> tuple[str, ...]:
     """The class names of a label set, `void` first.
 
-    A list of one's own needs no entry in `LABEL_SETS`: its name is the list itself, so it goes
-    wherever names go (shards, configs, checkpoints, scene JSONs, workers) and is known there.
+    The user's own list needs no entry in `LABEL_SETS`: its name is the list itself, so it is known
+    wherever names go (shards, configs, checkpoints, scene JSONs, workers).
 
         >>> label_set("void,bed,night stand")
         ('void', 'bed', 'night stand')
@@ -63,7 +62,7 @@ def label_set(name: str) -> tuple[str, ...]:
 
 
 def own_label_set(names: Sequence[str]) -> tuple[str, ...]:
-    """Check a list of class names of one's own, given without `void`, and put `void` first.
+    """Check a user's list of class names, given without `void`, and put `void` first.
 
     Raises:
         InputError: a name is empty, too long, repeated, or holds a comma or odd characters.
@@ -85,10 +84,7 @@ def own_label_set(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def label_set_name(names: Sequence[str]) -> str:
-    """The name of a label set of one's own: the list itself, as `label_set` reads it.
-
-    Args:
-        names: Class names, without `void`.
+    """The name of a user's label set: the list itself, as `label_set` reads it.
 
     Raises:
         InputError: see `own_label_set`.

@@ -1,4 +1,4 @@
-"""The one error a user meets: a sentence that says what was expected, what came, and what to do."""
+"""The errors a user meets: a sentence that says what was expected, what came, and what to do."""
 
 
 class InputError(ValueError):

@@ -1,4 +1,4 @@
-"""Furniture models as 3D-FUTURE keeps them: a folder in; categories, classes and meshes out.
+"""Reads furniture models as 3D-FUTURE keeps them: their categories, classes and meshes.
 
     <folder>/model_info.json        or model_info_revised.json: the category of each model
     <folder>/<model id>/raw_model.obj
@@ -22,11 +22,7 @@ CATEGORY_TABLE = Path(__file__).with_name("front3d_categories.csv")
 
 
 def model_info_path(folder: Path, option: str = "--future") -> Path:
-    """3D-FUTURE's list of models.
-
-    Args:
-        folder: 3D-FUTURE-model.
-        option: What the user named the folder with, for the sentence.
+    """3D-FUTURE's list of models; `option` is what the user named the folder with, for errors.
 
     Raises:
         InputError: the folder is missing, or has none.
@@ -103,11 +99,6 @@ def class_of_category(category: str, label_set_name: str, names: tuple[str, ...]
         'double_bed'
         >>> class_of_category("dining table", "scannet", ("void", "table"))
         'table'
-
-    Args:
-        category: As `model_categories` gives it.
-        label_set_name: Of `sceneprior.classes`.
-        names: The classes of that set.
     """
     if label_set_name not in _COLUMNS and category in names:
         return category

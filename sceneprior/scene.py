@@ -1,4 +1,4 @@
-"""One room of objects in 3D, as numbers: what synthesis writes and evaluation reads."""
+"""The objects of one room in 3D and their JSON, which generation writes and evaluation reads."""
 
 import json
 from dataclasses import dataclass, field, replace
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, Field, ValidationError
 
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
@@ -40,7 +41,7 @@ class Scene:
     label_set: str
     objects: tuple[SceneObject, ...] = ()
     floor_m: np.ndarray | None = None
-    """(P, 2) outline of the floor as x, z; None where nobody knows it (a generated room)."""
+    """(P, 2) outline of the floor as x, z; None where it is unknown (a generated room)."""
     extra: dict[str, Any] = field(default_factory=dict)
     """Where the scene comes from: seed, run, room. Written to the JSON, never interpreted."""
 
@@ -87,6 +88,20 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
     }
 
 
+class _ObjectEntry(BaseModel):
+    label: str = Field(alias="class")
+    center_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]
+
+
+class _SceneEntry(BaseModel):
+    name: str | None = None
+    label_set: str
+    objects: list[_ObjectEntry]
+    floor_m: Any = None
+    extra: dict[str, Any] = {}
+
+
 def read_scene(path: Path) -> Scene:
     """Read a scene's JSON.
 
@@ -94,60 +109,42 @@ def read_scene(path: Path) -> Scene:
         InputError: the file is missing, not JSON, not this format, names unknown classes, or
             holds numbers that no room has.
     """
+    path = Path(path)
     try:
-        data = json.loads(Path(path).read_text())
-        if not isinstance(data, dict):
-            raise InputError(
-                f"{path} is not a scene JSON: expected an object with 'format' and 'objects', got "
-                f"a {type(data).__name__}; docs/conventions.md describes the format."
-            )
-        if data["format"] != FORMAT or data["version"] != VERSION:
+        data = json.loads(path.read_text())
+        if isinstance(data, dict) and (data["format"], data["version"]) != (FORMAT, VERSION):
             raise InputError(
                 f"{path} says format '{data['format']}' version {data['version']}; "
                 f"expected '{FORMAT}' version {VERSION}. Write it again with "
                 "`sceneprior synthesize`."
             )
-        names = label_set(data["label_set"])
-        for item in data["objects"]:
-            if item["class"] not in names:
-                raise InputError(
-                    f"{path}: class '{item['class']}' is not in label set '{data['label_set']}'; "
-                    f"use one of {', '.join(names)}."
-                )
-        objects = tuple(
-            SceneObject(item["class"], _triple(item["center_m"]), _triple(item["size_m"]))
-            for item in data["objects"]
-        )
-        floor = data.get("floor_m")
-        floor_m = None if floor is None else np.asarray(floor, dtype=np.float64)
+        entry = _SceneEntry.model_validate(data)
+        floor = None if entry.floor_m is None else np.asarray(entry.floor_m, dtype=np.float64)
     except InputError:
         raise
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}).") from None
     except (ValueError, KeyError, TypeError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        if isinstance(error, ValidationError):
+            first = error.errors(include_url=False)[0]
+            reason = ": ".join([".".join(map(str, first["loc"])), first["msg"]]).lstrip(": ")
         raise InputError(
-            f"{path} is not a scene JSON ({type(error).__name__}: {error}); "
-            "docs/conventions.md describes the format."
+            f"{path} is not a scene JSON: expected an object with 'format' and 'objects' "
+            f"({reason}); docs/conventions.md describes the format."
         ) from None
-    scene = Scene(
-        name=str(data.get("name", Path(path).stem)),
-        label_set=data["label_set"],
-        objects=objects,
-        floor_m=floor_m,
-        extra=data.get("extra", {}),
-    )
-    _check_numbers(path, scene)
-    return scene
-
-
-def _check_numbers(path: Path, scene: Scene) -> None:
-    for item in scene.objects:
+    names = label_set(entry.label_set)
+    for item in entry.objects:
+        if item.label not in names:
+            raise InputError(
+                f"{path}: class '{item.label}' is not in label set '{entry.label_set}'; "
+                f"use one of {', '.join(names)}."
+            )
         if not np.isfinite([*item.center_m, *item.size_m]).all() or min(item.size_m) < 0:
             raise InputError(
                 f"{path}: a {item.label} has centre {list(item.center_m)} and size "
                 f"{list(item.size_m)}; expected finite metres, and sizes not below 0."
             )
-    floor = scene.floor_m
     if floor is not None and (
         floor.ndim != 2 or floor.shape[1] != 2 or len(floor) < 3 or not np.isfinite(floor).all()
     ):
@@ -155,8 +152,10 @@ def _check_numbers(path: Path, scene: Scene) -> None:
             f"{path}: floor_m has shape {floor.shape}; expected at least 3 corners [x, z] in "
             "finite metres, or no floor_m."
         )
-
-
-def _triple(values: Any) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return (x, y, z)
+    return Scene(
+        name=path.stem if entry.name is None else entry.name,
+        label_set=entry.label_set,
+        objects=tuple(SceneObject(o.label, o.center_m, o.size_m) for o in entry.objects),
+        floor_m=floor,
+        extra=entry.extra,
+    )

@@ -1,5 +1,6 @@
 """View shards: the HDF5 files in which preparing and learning meet (docs/shard_format.md)."""
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Sequence
@@ -80,11 +81,10 @@ _VIEW_ARRAYS = (
 _TRUTH_ARRAYS = ("object_class", "centers_m", "sizes_m", "yaw_rad", "model_to_room", "floor_m")
 
 
-def write_shard(
-    path: Path,
-    label_set_name: str,
-    rooms: Iterable[tuple[RoomViews, RoomGroundTruth | None]],
-) -> None:
+Rooms = Iterable[tuple[RoomViews, RoomGroundTruth | None]]
+
+
+def write_shard(path: Path, label_set_name: str, rooms: Rooms) -> None:
     """Write rooms to one shard, whole or not at all; the same rooms give the same bytes.
 
     Raises:
@@ -94,9 +94,7 @@ def write_shard(
     write_whole(path, shard_bytes(path.name, label_set_name, rooms))
 
 
-def shard_bytes(
-    name: str, label_set_name: str, rooms: Iterable[tuple[RoomViews, RoomGroundTruth | None]]
-) -> bytes:
+def shard_bytes(name: str, label_set_name: str, rooms: Rooms) -> bytes:
     """A shard as it would lie on disk. `rooms` may be a generator: one is held at a time.
 
     Built in memory, where a shard is a few MB: HDF5 does not recover from a disk that fills up.
@@ -246,45 +244,43 @@ class Shard:
         """Ids of the rooms in this shard, in the order they are stored."""
         return tuple(self._keys)
 
+    @contextlib.contextmanager
+    def _group(self, room_id: str) -> Iterator[h5py.Group]:
+        """A room's group; what cannot be read in it is told as damage."""
+        try:
+            yield self._file["rooms"][self._keys[room_id]]
+        except (OSError, KeyError, RuntimeError) as error:
+            raise _damaged(self.path, error, room_id) from None
+
     def read_room(self, room_id: str, images: bool = False) -> RoomViews:
         """What cameras saw of a room; `images` also reads every instance-id image."""
-        try:
-            group = self._file["rooms"][self._keys[room_id]]
+        with self._group(room_id) as group:
             arrays = {name: group[name][()] for name in _VIEW_ARRAYS}
             height, width = (int(side) for side in group.attrs["image_size"])
             ids = group["instance_ids"][()] if images else None
-        except (OSError, KeyError, RuntimeError) as error:
-            raise _damaged(self.path, error, room_id) from None
         return RoomViews(room_id=room_id, instance_ids=ids, image_size=(height, width), **arrays)
 
     def read_instance_ids(self, room_id: str, views: Sequence[int], step: int = 1) -> np.ndarray:
         """Instance-id images of some views, every `step`-th pixel: (views, H/step, W/step)."""
-        try:
-            images = self._file["rooms"][self._keys[room_id]]["instance_ids"]
+        with self._group(room_id) as group:
+            images = group["instance_ids"]
             # Start in the middle of a block, so that the small image is not shifted.
             return np.stack([images[view][step // 2 :: step, step // 2 :: step] for view in views])
-        except (OSError, KeyError, RuntimeError) as error:
-            raise _damaged(self.path, error, room_id) from None
 
     def has_ground_truth(self, room_id: str) -> bool:
-        """Whether the room is known in 3D; posed pictures of one's own have none."""
-        try:
-            return "ground_truth" in self._file["rooms"][self._keys[room_id]]
-        except (OSError, KeyError, RuntimeError) as error:
-            raise _damaged(self.path, error, room_id) from None
+        """Whether the room is known in 3D; the user's posed pictures have none."""
+        with self._group(room_id) as group:
+            return "ground_truth" in group
 
     def read_checksum(self, room_id: str) -> str | None:
         """What `room_checksum` said when the room was written; None in shards of before."""
-        try:
-            stored = self._file["rooms"][self._keys[room_id]].attrs.get("sha256")
+        with self._group(room_id) as group:
+            stored = group.attrs.get("sha256")
             return None if stored is None else str(stored)
-        except (OSError, KeyError, RuntimeError) as error:
-            raise _damaged(self.path, error, room_id) from None
 
     def read_ground_truth(self, room_id: str) -> RoomGroundTruth:
         """The room in 3D. For evaluation and baselines with 3D supervision."""
-        try:
-            group = self._file["rooms"][self._keys[room_id]]
+        with self._group(room_id) as group:
             if "ground_truth" not in group:
                 raise ShardError(
                     f"{self.path}, room {room_id} carries no 3D ground truth, which this "
@@ -297,8 +293,6 @@ class Shard:
                 height_m=float(hidden.attrs["height_m"]),
                 **{name: hidden[name][()] for name in _TRUTH_ARRAYS},
             )
-        except (OSError, KeyError, RuntimeError) as error:
-            raise _damaged(self.path, error, room_id) from None
 
 
 def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:

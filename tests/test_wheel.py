@@ -36,10 +36,10 @@ def run(installed: Path, *arguments: str, cwd: Path) -> subprocess.CompletedProc
 
 def test_shipped_configs_are_found_by_name(installed, tmp_path):
     code = (
-        "import sceneprior, data_prep.recipe\n"
+        "import sceneprior, data_prep.front.recipe\n"
         "from sceneprior.config import load_config\n"
         "assert load_config('bedroom.yaml').model.max_objects == 13\n"
-        "assert data_prep.recipe.load_recipe('front3d_bedroom')\n"
+        "assert data_prep.front.recipe.load_recipe('front3d_bedroom')\n"
         "print(sceneprior.__file__)"
     )
     done = run(installed, "-c", code, cwd=tmp_path)

@@ -1,9 +1,10 @@
-"""A source in, a folder of shards out: planned once, made in parallel, resumed, reported.
+"""Builds a folder of shards from a source: planned once, made in parallel, resumed, reported.
 
 The engine of every `prep-*` command. It runs the source's rooms shard by shard (shard_job.py) on
 this machine's processes (workers.py) or on a cluster (cluster.py), and ends with the report.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -80,10 +81,9 @@ def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
     reports: dict[str, ShardReport] = {}
     for shard in shards:
         report = read_finished(out / shard.name)
-        failed = report is not None and any(line.status == "failed" for line in report[1])
-        if report is not None and not (failed and job.retry_failed):
+        if report is not None and not (job.retry_failed and report.has("failed")):
             reports[shard.name] = report
-            _refuse_failures(job, report[1])
+            _refuse_failures(job, report.lines)
     kept = len(reports)
     missing = [shard for shard in _asked_for(source, plan, shards) if shard.name not in reports]
     if missing:
@@ -96,12 +96,11 @@ def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
     made = run(make_shard, arguments, "preparing") if missing else iter(())
     for shard, report in zip(missing, made, strict=True):
         reports[shard.name] = report
-    lines = list(plan.left_out)
-    for shard in shards:
-        lines += reports[shard.name][1] if shard.name in reports else []
-    drawn = [reports[shard.name][0] for shard in shards if shard.name in reports]
+    done = [reports[shard.name] for shard in shards if shard.name in reports]
+    lines = [*plan.left_out, *(line for report in done for line in report.lines)]
+    drawn = done[-1].renderer if done else kind
     open_shards = len(shards) - len(reports)
-    totals = Summary(source, lines, drawn[-1] if drawn else kind, len(missing), kept, open_shards)
+    totals = Summary(source, lines, drawn, len(missing), kept, open_shards)
     if not open_shards:
         finish(out, plan, totals)
     if plan.settings["only"] == source.only:
@@ -132,7 +131,7 @@ def _asked_for(source: Source, plan: Plan, shards: list[ShardPlan]) -> list[Shar
     return chosen
 
 
-def _refuse_failures(job: Job, lines: list[Line] | tuple[Line, ...]) -> None:
+def _refuse_failures(job: Job, lines: Iterable[Line]) -> None:
     for line in lines:
         if job.strict and line.status == "failed":
             raise RoomFailedError.of(line)

@@ -7,10 +7,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from data_prep.engine.output import write_json
-from data_prep.engine.report import Line, read_line
+from pydantic import TypeAdapter, ValidationError
+
+from data_prep.engine.report import Line
 from data_prep.engine.source import SPLITS, RoomTask, Source
 from sceneprior.errors import InputError
+from sceneprior.files import write_json
 from sceneprior.shards import INDEX_NAME
 
 PLAN_NAME = "plan.json"
@@ -59,19 +61,8 @@ def job_settings(source: Source, only: str | None) -> dict[str, Any]:
 
 
 def write_plan(out: Path, plan: Plan) -> None:
-    """Write plan.json.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    write_json(
-        out / PLAN_NAME,
-        {
-            "settings": plan.settings,
-            "rooms": [asdict(room) for room in plan.rooms],
-            "left_out": [asdict(line) for line in plan.left_out],
-        },
-    )
+    """Write plan.json."""
+    write_json(out / PLAN_NAME, asdict(plan))
 
 
 def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str) -> Plan | None:
@@ -89,18 +80,15 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
             raise InputError(f"{out} holds shards without a {PLAN_NAME}; choose a new folder.")
         return None
     try:
-        data = json.loads(path.read_text())
+        data = json.loads(path.read_bytes())
         before = dict(data["settings"])
+        if (version := before["plan_version"]) != PLAN_VERSION:
+            why = f"is of another release (plan version {version})"
+            raise InputError(f"{path} {why}; choose a new folder, or delete {out}.")
         drawn_with = before.pop("renderer")
-        plan = Plan(
-            data["settings"],
-            tuple(RoomTask(**room) for room in data["rooms"]),
-            tuple(read_line(line) for line in data["left_out"]),
-        )
-    except (OSError, ValueError, KeyError, TypeError):
-        older = _older_version(path)
-        why = f"is of another release (plan version {older})" if older else "cannot be read"
-        raise InputError(f"{path} {why}; choose a new folder, or delete {out}.") from None
+        plan = TypeAdapter(Plan).validate_python(data)
+    except (OSError, ValidationError, json.JSONDecodeError, KeyError, TypeError):
+        raise InputError(f"{path} cannot be read; choose a new folder, or delete {out}.") from None
     if source.only is not None and before.get("only", "") is None:
         settings = job_settings(source, None)
     changed = [key for key in settings if before.get(key) != settings[key]]
@@ -112,14 +100,6 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
             "give --out a new folder, or delete this one."
         )
     return plan
-
-
-def _older_version(path: Path) -> int | None:
-    try:
-        version = json.loads(path.read_text())["settings"]["plan_version"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return version if isinstance(version, int) and version != PLAN_VERSION else None
 
 
 def digest(text: str) -> str:

@@ -1,14 +1,13 @@
-"""What became of every room in, report.json and report.csv out: the same bytes from every run."""
+"""What became of every room, as report.json and report.csv tell it: the same bytes each run."""
 
 import csv
 import io
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from data_prep.engine.source import SPLITS, LeftOut, PreparedRoom, RoomTask
-from data_prep.recipe import Expected
+from data_prep.engine.source import SPLITS, Expected, LeftOut, PreparedRoom, RoomTask
 from sceneprior.classes import label_set
 
 _COLUMNS = ("room_id", "house", "split", "status", "rule", "reason", "views", "objects", "notes")
@@ -62,15 +61,6 @@ def line_of(
     )
 
 
-def read_line(data: Any) -> Line:
-    """A line as JSON keeps it.
-
-    Raises:
-        TypeError, KeyError: it is none.
-    """
-    return Line(**{item.name: data[item.name] for item in fields(Line)})
-
-
 def count_splits(lines: Iterable[Line]) -> dict[str, dict[str, int]]:
     """Per split: rooms, views, objects."""
     prepared = [line for line in lines if line.status == "prepared"]
@@ -116,7 +106,7 @@ def make_report(
         "with_notes": sum(bool(line.notes) for line in prepared),
         "counts": count_splits(lines),
         "per_split": {
-            split: _figures([line for line in prepared if line.split == split]) for split in SPLITS
+            split: _means([line for line in prepared if line.split == split]) for split in SPLITS
         },
         "classes": _classes(prepared),
     }
@@ -135,12 +125,12 @@ def compare(expected: Expected, prepared: Sequence[Line]) -> list[dict[str, Any]
     }
     return [
         {"what": what, "expected": count, "found": found[what], "difference": found[what] - count}
-        for what, count in asdict(expected).items()
+        for what, count in expected.model_dump().items()
         if what != "of" and count is not None
     ]
 
 
-def _figures(lines: Sequence[Line]) -> dict[str, Any]:
+def _means(lines: Sequence[Line]) -> dict[str, Any]:
     rooms = max(len(lines), 1)
     views = sum(line.views for line in lines)
     return {

@@ -1,4 +1,4 @@
-"""A report in, tables for the terminal out."""
+"""The report of a job as tables for the terminal."""
 
 from typing import Any
 
@@ -39,12 +39,12 @@ def _splits(report: dict[str, Any]) -> Table:
         "split", "rooms", "views", "objects", "views a room", "objects a room", "objects a view"
     )
     for split, counts in report["counts"].items():
-        figures = report["per_split"][split]
+        means = report["per_split"][split]
         table.add_row(
             split,
             *(str(counts[key]) for key in ("rooms", "views", "objects")),
             *(
-                f"{figures[key]:.2f}"
+                f"{means[key]:.2f}"
                 for key in ("views_per_room", "objects_per_room", "objects_per_view")
             ),
         )

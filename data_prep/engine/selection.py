@@ -5,14 +5,13 @@ import hashlib
 import io
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 from data_prep.engine.source import SPLITS, LeftOut, Survey
 from sceneprior.errors import InputError
 
 VAL_CHOICES = ("train", "test", "none")
-_TEST_SHARE = 0.1
 
 
 def house_may_match(only: str | None, house: str) -> bool:
@@ -63,34 +62,44 @@ def read_splits(path: Path, val: str) -> dict[str, str]:
     return found
 
 
-def seeded_split(room_ids: Sequence[str], seed: int) -> dict[str, str]:
-    """Nine rooms of ten train; an id keeps its place in the order whatever else is there."""
+def seeded_split(room_ids: Iterable[str], seed: int, test_share: float = 0.1) -> dict[str, str]:
+    """Room id -> split; an id keeps its place in the order whatever else is there.
+
+    At least one of several rooms is in the split `test`, unless its share is 0.
+    """
     order = sorted(room_ids, key=lambda item: hashlib.sha256(f"{seed}:{item}".encode()).digest())
-    tests = round(_TEST_SHARE * len(order)) or min(1, len(order) - 1)
+    tests = 0
+    if test_share > 0:
+        tests = min(round(test_share * len(order)) or 1, len(order) - 1)
     return {room_id: "test" if i < tests else "train" for i, room_id in enumerate(order)}
 
 
-def check_survey(survey: Survey, where: str, only: str | None, hint: str) -> None:
-    """Refuse a survey that leaves nothing to prepare, or an empty split.
+def select(survey: Survey, only: str | None, where: str, empty_split: str = "") -> Survey:
+    """The part of a survey that `--only` asks for.
 
     Args:
         survey: What was found.
+        only: As given.
         where: "FOLDER passes the recipe NAME": the end of "No room of ...".
-        only: As given; one room has one split.
-        hint: What to check if a split is empty.
+        empty_split: What to check if a split of a whole data set is empty; "": it may be.
 
     Raises:
-        InputError: says which, with the most frequent reason.
+        InputError: nothing is left to prepare, with the most frequent reason; or an empty split.
     """
-    if not survey.rooms:
+    rooms = tuple(room for room in survey.rooms if is_asked_for(only, room.room_id, room.house))
+    left_out = tuple(
+        item for item in survey.left_out if is_asked_for(only, item.room_id, item.house)
+    )
+    if not rooms:
         about = f" for --only {only}" if only else ""
-        raise InputError(f"No room of {where}{about} ({_in_words(survey.left_out)}).")
-    for split in SPLITS:
-        if only is None and not any(room.split == split for room in survey.rooms):
+        raise InputError(f"No room of {where}{about} ({_in_words(left_out)}).")
+    for split in SPLITS if empty_split and only is None else ():
+        if not any(room.split == split for room in rooms):
             raise InputError(
-                f"The '{split}' split is empty: none of the {len(survey.rooms)} usable rooms is in "
-                f"it. Check {hint}."
+                f"The '{split}' split is empty: none of the {len(rooms)} usable rooms is in "
+                f"it. Check {empty_split}."
             )
+    return Survey(rooms, left_out)
 
 
 def _in_words(left_out: Iterable[LeftOut]) -> str:

@@ -1,16 +1,17 @@
-"""What a worker does: the rooms of one shard in; its models, its report and the shard out."""
+"""Makes one shard: prepares its rooms, and writes their models, the shard's report, the shard."""
 
-import json
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 
-from data_prep.engine.output import write_json, writing
+from pydantic import TypeAdapter, ValidationError
+
+from data_prep.engine.output import writing
 from data_prep.engine.plan import PLAN_NAME, ShardPlan
-from data_prep.engine.report import Line, line_of, read_line
+from data_prep.engine.report import Line, line_of
 from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Source, sentence_of
 from sceneprior.errors import InputError
-from sceneprior.files import write_whole
+from sceneprior.files import write_json, write_whole
 from sceneprior.offscreen import Renderer, open_renderer
 from sceneprior.scene import Mesh
 from sceneprior.shards import (
@@ -21,8 +22,19 @@ from sceneprior.shards import (
     shard_bytes,
 )
 
-ShardReport = tuple[str | None, list[Line]]
-"""The renderer's name (None where nothing was drawn), and a line for each room."""
+
+@dataclass(frozen=True)
+class ShardReport:
+    """What became of a shard's rooms, as `<shard>.report.json` keeps it."""
+
+    renderer: str | None
+    """Its name; None where nothing was drawn."""
+    lines: list[Line]
+    """One a room."""
+
+    def has(self, status: str) -> bool:
+        """Whether a room was prepared, filtered or failed."""
+        return any(line.status == status for line in self.lines)
 
 
 class RoomFailedError(InputError):
@@ -54,35 +66,29 @@ def make_shard(
             f"A worker finds no {PLAN_NAME} in {out}: workers must reach the folders of the data "
             "and of the shards under the same paths as this machine."
         )
+    path = out / shard.name
     first, last = shard.rooms[0].room_id, shard.rooms[-1].room_id
     with writing(out, f"rooms {first} to {last}"):
         # A report without its shard is "not finished" whatever stops us from here on.
-        _report_path(out / shard.name).unlink(missing_ok=True)
-        (out / shard.name).unlink(missing_ok=True)
+        _report_path(path).unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
         renderer = None if renderer_kind is None else open_renderer(renderer_kind)
-        lines: list[Line] = []
-        rooms = _prepared(source, out, renderer, shard, strict, lines)
+        report = ShardReport(renderer.name if renderer else None, [])
+        rooms = _prepared(source, out, renderer, shard, strict, report.lines)
         data = shard_bytes(shard.name, source.label_set, rooms)
-        name = renderer.name if renderer else None
-        write_json(
-            _report_path(out / shard.name),
-            {"renderer": name, "lines": [asdict(line) for line in lines]},
-        )
-        if any(line.status == "prepared" for line in lines):
-            write_whole(out / shard.name, data)
-    return name, lines
+        write_json(_report_path(path), asdict(report))
+        if report.has("prepared"):
+            write_whole(path, data)
+    return report
 
 
 def read_finished(shard: Path) -> ShardReport | None:
     """The report of a shard that is whole; None if there is work to do."""
     try:
-        report = json.loads(_report_path(shard).read_text())
-        name, lines = report["renderer"], [read_line(line) for line in report["lines"]]
-    except (OSError, ValueError, KeyError, TypeError):
+        report = TypeAdapter(ShardReport).validate_json(_report_path(shard).read_bytes())
+    except (OSError, ValidationError):
         return None
-    if any(line.status == "prepared" for line in lines) and not shard.is_file():
-        return None
-    return name, lines
+    return report if shard.is_file() or not report.has("prepared") else None
 
 
 def _report_path(shard: Path) -> Path:

@@ -1,4 +1,4 @@
-"""The door for data sets: what a source tells the engine, and what the engine asks of it.
+"""What a data set tells the engine (`Source`), and what the engine asks of it.
 
 A source knows a data set's files and nothing of processes, shards and reports; the engine
 (build.py) knows those and nothing of data sets. 3D-FRONT's is `front/source.py`.
@@ -10,14 +10,28 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 from data_prep.engine.workers import Run
-from data_prep.recipe import Expected
 from sceneprior.errors import InputError
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Mesh
+from sceneprior.settings import Section
 from sceneprior.shards import RoomGroundTruth, RoomViews
 
 SPLITS = ("train", "test")
 _DEBUG_VARIABLE = "SCENEPRIOR_DEBUG"
+
+
+class Expected(Section):
+    """The known counts of a finished job on the real data set."""
+
+    of: str = ""
+    """Which data these counts are of, and who counted: "3D-FRONT, ATISS's index"."""
+    rooms: int | None = None
+    """Prepared rooms."""
+    train: int | None = None
+    test: int | None = None
+    """Prepared rooms of the split."""
+    views: int | None = None
+    objects: int | None = None
 
 
 @dataclass(frozen=True)
@@ -88,7 +102,7 @@ class Source(Protocol):
 
     @property
     def label_set(self) -> str:
-        """A key of `LABEL_SETS`."""
+        """As `sceneprior.classes.label_set` takes it."""
 
     @property
     def room_type(self) -> str:
@@ -134,16 +148,12 @@ class Source(Protocol):
         """Read one room and see it through its cameras, in a worker process.
 
         The same task gives the same arrays, whatever was prepared before, and wherever. Raising
-        instead of returning LeftOut is well, too: the engine makes a failed room of it.
+        instead of returning LeftOut is fine, too: the engine makes a failed room of it.
         """
 
 
 def sentence_of(error: Exception) -> str:
-    """Why a room failed, in words; SCENEPRIOR_DEBUG=1 lets what is unforeseen through.
-
-    Raises:
-        Exception: the error itself, if it is unforeseen and one debugs.
-    """
+    """Why a room failed, in words; SCENEPRIOR_DEBUG=1 lets what is unforeseen through."""
     if isinstance(error, InputError):
         return str(error)
     if isinstance(error, OSError) and error.filename:

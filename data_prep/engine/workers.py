@@ -1,4 +1,4 @@
-"""Worker processes: functions and their arguments in, results in order out, with a progress bar."""
+"""Runs functions in worker processes, with a progress bar."""
 
 import contextlib
 import multiprocessing

@@ -1,4 +1,4 @@
-"""What lies where in 3D-FRONT, and how the texts in its files are shown."""
+"""Finds 3D-FRONT's house files, and shows the texts in them."""
 
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,7 @@
-"""A room and a recipe in; the first rule that leaves the room out."""
+"""The rules of a recipe that leave rooms out."""
 
 from data_prep.front.furnished import Room
-from data_prep.recipe import Recipe
+from data_prep.front.recipe import Recipe
 
 
 def broken_rule(room: Room, recipe: Recipe) -> tuple[str, str] | None:

@@ -1,4 +1,4 @@
-"""A house's JSON numbers in; placements, surfaces, the floor and the room's own frame out."""
+"""Placements, surfaces, the floor and the room's own frame, from the numbers of a house's JSON."""
 
 import math
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""A house's JSON file in, its entries by uid out: checked as far as all rooms need it."""
+"""Parses a house's JSON file, checked as far as all its rooms need it."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,12 +1,12 @@
-"""3D-FUTURE: model ids in; categories, meshes in metres and colours out."""
+"""The furniture models of 3D-FUTURE: categories, meshes in metres, colours."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cachetools import LRUCache, cachedmethod
 
-from data_prep.engine.cache import ByteCache
 from sceneprior.files import file_stamp, is_name
 from sceneprior.furniture import MODEL_FILE, model_categories, read_obj
 from sceneprior.scene import Mesh
@@ -33,7 +33,7 @@ class ModelBank:
     def __init__(self, folder: Path, cache_bytes: int = _CACHE_BYTES):
         self.folder = Path(folder)
         self._categories = model_categories(self.folder)
-        self._meshes = ByteCache[Mesh](
+        self._meshes: LRUCache = LRUCache(
             cache_bytes, lambda mesh: mesh.vertices_m.nbytes + mesh.faces.nbytes
         )
 
@@ -55,7 +55,14 @@ class ModelBank:
             InputError: there is none, or it is damaged.
         """
         path = self.folder / model_id / MODEL_FILE
-        return self._meshes.get((model_id, file_stamp(path)), lambda: _read_model(path))
+        return self._read(path, file_stamp(path))
+
+    @cachedmethod(lambda self: self._meshes)
+    def _read(self, path: Path, stamp: tuple[int, int]) -> Mesh:
+        mesh = read_obj(path)
+        if float(np.ptp(mesh.vertices_m, axis=0).max()) > _NO_FURNITURE_M:
+            return Mesh(mesh.vertices_m / np.float32(100), mesh.faces)
+        return mesh
 
     def color(self, model_id: str) -> tuple[int, int, int] | None:
         """One RGB colour for the whole model: the mean of its texture, or its material's; None
@@ -88,13 +95,6 @@ def _longest(size: Any) -> float | None:
     except (TypeError, ValueError, OverflowError):
         return None
     return max(sides) if len(sides) == 3 and all(1e-3 < side < 1e3 for side in sides) else None
-
-
-def _read_model(path: Path) -> Mesh:
-    mesh = read_obj(path)
-    if float(np.ptp(mesh.vertices_m, axis=0).max()) > _NO_FURNITURE_M:
-        return Mesh(mesh.vertices_m / np.float32(100), mesh.faces)
-    return mesh
 
 
 def _mean_of_texture(folder: Path) -> tuple[int, int, int] | None:

@@ -1,4 +1,4 @@
-"""A parsed house in, its rooms out, whatever the quirks of the files."""
+"""Reads the rooms of a parsed house, whatever the quirks of the files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ from data_prep.front.geometry import (
 )
 from data_prep.front.houses import House, is_valid, key_of, parse_house
 from data_prep.front.models import ModelBank, unit_of
-from data_prep.recipe import Recipe
+from data_prep.front.recipe import Recipe
 from sceneprior.errors import InputError
 from sceneprior.files import is_name
 from sceneprior.furniture import MODEL_FILE

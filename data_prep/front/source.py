@@ -1,19 +1,21 @@
 """3D-FRONT (or homes in its format) as a source of rooms: surveyed by house, drawn by room."""
 
 import functools
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from data_prep.engine.plan import digest, digest_of_files
-from data_prep.engine.selection import (
-    check_survey,
-    house_may_match,
-    is_asked_for,
-    read_splits,
-    seeded_split,
+from data_prep.engine.selection import house_may_match, read_splits, seeded_split, select
+from data_prep.engine.source import (
+    SPLITS,
+    Expected,
+    LeftOut,
+    PreparedRoom,
+    RoomTask,
+    Survey,
+    sentence_of,
 )
-from data_prep.engine.source import SPLITS, LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
 from data_prep.engine.workers import Run
 from data_prep.front.drawing import prepare_room
 from data_prep.front.files import house_files
@@ -21,10 +23,10 @@ from data_prep.front.filters import broken_rule
 from data_prep.front.furnished import Room
 from data_prep.front.houses import House, parse_house
 from data_prep.front.models import ModelBank
+from data_prep.front.recipe import Recipe
 from data_prep.front.rgb import rgb_files
 from data_prep.front.rooms import HouseRooms, read_house
 from data_prep.front.viewpoints import view_counts
-from data_prep.recipe import Expected, Recipe
 from sceneprior.errors import InputError
 from sceneprior.files import file_stamp
 from sceneprior.furniture import model_info_path
@@ -37,6 +39,8 @@ _HOUSES_PER_TASK = 8
 class FrontSource:
     """What `prep-front` reads: a `Source` (data_prep/engine/source.py)."""
 
+    name: ClassVar = "3d-front"
+    draws: ClassVar = True
     front: Path
     """Folder of house JSONs."""
     future: Path
@@ -53,20 +57,12 @@ class FrontSource:
     """Also draw shaded pictures, `rgb/<room>/<view>.png` (rgb.py). The shards do not change."""
 
     @property
-    def name(self) -> str:
-        return "3d-front"
-
-    @property
     def label_set(self) -> str:
         return self.recipe.label_set
 
     @property
     def room_type(self) -> str:
         return self.recipe.name.removeprefix("front3d_")
-
-    @property
-    def draws(self) -> bool:
-        return True
 
     @property
     def expected(self) -> Expected | None:
@@ -77,10 +73,8 @@ class FrontSource:
         info = model_info_path(Path(self.future))
         if self.splits is not None:
             read_splits(self.splits, self.val)
-        recipe = asdict(self.recipe)
-        del recipe["expected"]
         return {
-            "recipe": recipe,
+            "recipe": self.recipe.model_dump(exclude={"expected"}),
             "seed": self.seed,
             "val": self.val,
             "rgb": self.rgb,
@@ -117,14 +111,9 @@ class FrontSource:
             else:
                 why = "it is in no split"
                 left_out.append(LeftOut(room_id, house, "filtered", why, rule="split"))
-        survey = Survey(
-            tuple(task for task in tasks if is_asked_for(self.only, task.room_id, task.house)),
-            tuple(item for item in left_out if is_asked_for(self.only, item.room_id, item.house)),
-        )
         where = f"{self.front} passes the recipe {self.recipe.name}"
         hint = str(self.splits or "that the data set has more than one usable room")
-        check_survey(survey, where, self.only, hint)
-        return survey
+        return select(Survey(tuple(tasks), tuple(left_out)), self.only, where, hint)
 
     def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
         """Read one room with its meshes and draw its views."""

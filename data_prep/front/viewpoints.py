@@ -1,4 +1,4 @@
-"""Where cameras stand: a room and its furniture's boxes in, pinhole cameras out."""
+"""Draws the cameras of a room: where they stand and what they turn to."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 
 from data_prep.front.furnished import Room
-from data_prep.recipe import ViewRules
+from data_prep.front.recipe import ViewRules
 from sceneprior.offscreen import Pinhole
 
 _PLACES = 200  # random places tried before a rule about the place is relaxed
@@ -47,12 +47,12 @@ def intrinsics(rules: ViewRules) -> np.ndarray:
     return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
 
 
-def look(eye_m: np.ndarray, yaw_rad: float, pitch_rad: float) -> np.ndarray:
+def camera_pose(eye_m: np.ndarray, yaw_rad: float, pitch_rad: float) -> np.ndarray:
     """World to camera (4, 4) of an eye that looks along +z turned by yaw, and down by pitch.
 
     Example: looking along +z, +x is on the left and what is above the eye has a negative camera y.
 
-        >>> (look(np.zeros(3), 0.0, 0.0) @ [1, 2, 3, 1]).tolist()
+        >>> (camera_pose(np.zeros(3), 0.0, 0.0) @ [1, 2, 3, 1]).tolist()
         [-1.0, -2.0, 3.0, 1.0]
     """
     sin_yaw, cos_yaw = math.sin(yaw_rad), math.cos(yaw_rad)
@@ -112,7 +112,7 @@ class Viewpoints:
             yaw += rng.normal(0.0, math.radians(15))
             away = math.hypot(target[0] - eye[0], target[2] - eye[2])
             pitch = self._pitch(math.atan2(target[1] - eye[1], away))
-            camera = Pinhole(look(eye, yaw, pitch), self._intrinsics)
+            camera = Pinhole(camera_pose(eye, yaw, pitch), self._intrinsics)
             # Some rooms have no view with enough in it, and some are so full that no place is
             # clear: a third of the attempts each, then the rule is given up.
             poor = away < rules.target_distance_m or self._in_view(camera) < self._enough
@@ -164,11 +164,8 @@ class Viewpoints:
 
 
 def sees_enough(pixels: np.ndarray, rules: ViewRules) -> tuple[bool, float]:
-    """Judge a view by the visible pixels of each tracked object.
-
-    Returns:
-        Whether the view stays, and a score that ranks those that do not.
-    """
+    """Whether a view stays, by the visible pixels of each tracked object, and a score that ranks
+    those that do not."""
     height, width = rules.image_size
     seen = int((pixels >= rules.min_object_pixels).sum())
     share = float(pixels.max(initial=0)) / (height * width)

@@ -1,4 +1,4 @@
-"""Does the room in 3D stand where its masks say? Ground truth in, 2D overlaps with masks out."""
+"""How well the ground truth in 3D, projected, agrees with the masks in 2D."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from cachetools import LRUCache, cachedmethod
 
-from data_prep.engine.cache import ByteCache
 from data_prep.inspection.projection import box_iou_2d, boxes_around
 from sceneprior.errors import ShardError
 from sceneprior.geometry.corners import box_corners
@@ -19,25 +19,22 @@ _BOX_SLACK_M = 0.005
 
 
 class ModelPoints:
-    """The vertices of `models/<id>.ply`, the last used ones kept.
-
-    Args:
-        folder: `models/` of a folder of shards.
-    """
+    """The vertices of `models/<id>.ply` in a folder of shards, the last used ones kept."""
 
     def __init__(self, folder: Path):
         self.folder = Path(folder)
-        self._cache: ByteCache[np.ndarray] = ByteCache(_MODEL_BYTES, lambda points: points.nbytes)
+        self._cache: LRUCache[str, np.ndarray] = LRUCache(
+            _MODEL_BYTES, lambda points: points.nbytes
+        )
 
+    @cachedmethod(lambda self: self._cache, key=lambda self, model_id: model_id)
     def get(self, model_id: str) -> np.ndarray:
         """(V, 3) float64, only vertices that a face uses.
 
         Raises:
             ShardError: the file is missing or damaged.
         """
-        return self._cache.get(model_id, lambda: self._load(self.folder / f"{model_id}.ply"))
-
-    def _load(self, path: Path) -> np.ndarray:
+        path = self.folder / f"{model_id}.ply"
         try:
             mesh = trimesh.load_mesh(path, process=False)
             points = np.asarray(mesh.vertices, dtype=np.float64)[np.unique(mesh.faces)]

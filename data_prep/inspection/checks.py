@@ -1,4 +1,4 @@
-"""One room's arrays in, sentences about what is wrong with them out."""
+"""Finds what is wrong with the arrays of one room, as sentences."""
 
 from collections.abc import Iterator
 

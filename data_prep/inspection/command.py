@@ -1,4 +1,4 @@
-"""`sceneprior inspect`: the command around inspection.py and verify.py."""
+"""`sceneprior inspect`: the command around contents.py and verify.py."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -8,7 +8,7 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from data_prep.inspection.verify import EvaluationResult, RoomCheck
+    from data_prep.inspection.verify import FolderCheck, RoomCheck
 
 SHEET_NAME = "inspect.png"
 _WORST_SHOWN = 5
@@ -36,7 +36,10 @@ def inspect_command(
     """
     from rich.console import Console
 
-    from data_prep.inspection.inspection import contact_sheet
+    from data_prep.inspection.contents import draw_sheet
+    from sceneprior.errors import InputError
+    from sceneprior.files import write_whole
+    from sceneprior.pictures import png_bytes
 
     console = Console()
     if verify:
@@ -46,13 +49,10 @@ def inspect_command(
             console.print(table)
     if png is not None or not verify:
         target = png or shards / SHEET_NAME
-        sheet = contact_sheet(shards, room, pictures, boxes_3d)
+        sheet = draw_sheet(shards, room, pictures, boxes_3d)
         try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            sheet.save(target, "PNG")
+            write_whole(target, png_bytes(sheet))
         except OSError as error:
-            from sceneprior.errors import InputError
-
             raise InputError(
                 f"{target} cannot be written ({error.strerror or error}); name another file with "
                 "--png."
@@ -63,7 +63,7 @@ def inspect_command(
 def _count_tables(shards: Path) -> "list[Table]":
     from rich.table import Table
 
-    from data_prep.inspection.inspection import count_shards
+    from data_prep.inspection.contents import count_shards
 
     counts = count_shards(shards)
     totals = Table(
@@ -93,7 +93,7 @@ def _count_tables(shards: Path) -> "list[Table]":
 def _room_table(shards: Path, room: str) -> "Table":
     from rich.table import Table
 
-    from data_prep.inspection.inspection import describe_room
+    from data_prep.inspection.contents import describe_room
 
     table = Table("object", "class", "views", "share of image", "centre, m", "size, m", title=room)
     for k, row in enumerate(describe_room(shards, room)):
@@ -109,24 +109,24 @@ def _room_table(shards: Path, room: str) -> "Table":
 def _verify(console: "object", shards: Path, room: str | None, workers: int) -> None:
     from data_prep.inspection.verify import verify
 
-    verdict = verify(shards, room, workers)
-    for table in _check_tables(verdict):
+    found = verify(shards, room, workers)
+    for table in _check_tables(found):
         console.print(table)  # type: ignore[attr-defined]
-    for sentence in verdict.problems[1:_PROBLEMS_SHOWN]:
+    for sentence in found.problems[1:_PROBLEMS_SHOWN]:
         typer.echo(sentence, err=True)
-    if verdict.problems:
-        more = len(verdict.problems) - 1
+    if found.problems:
+        more = len(found.problems) - 1
         others = f" ({more} more problem{'s' * (more > 1)}, listed above)" if more else ""
-        typer.echo(f"Error: {verdict.problems[0]}{others}", err=True)
+        typer.echo(f"Error: {found.problems[0]}{others}", err=True)
         raise typer.Exit(3)
-    typer.echo(f"{shards}: all is well. {_summary(verdict)}")
+    typer.echo(f"{shards}: all is well. {_summary(found)}")
 
 
-def _check_tables(verdict: "EvaluationResult") -> "list[Table]":
-    from rich.table import Table
+def _check_tables(found: "FolderCheck") -> "list[Table]":
+    from rich.table import Column, Table
 
     totals = Table("split", "rooms", "views", "checksums", "unoccluded objects", "mean 2D IoU")
-    for split, checks in verdict.rooms.items():
+    for split, checks in found.rooms.items():
         rooms = [check for check in checks if check.room_id]
         totals.add_row(
             split,
@@ -136,10 +136,14 @@ def _check_tables(verdict: "EvaluationResult") -> "list[Table]":
             str(sum(len(check.agreement.mesh) + len(check.agreement.box) for check in rooms)),
             _mean_iou(rooms),
         )
-    every = [check for checks in verdict.rooms.values() for check in checks if check.mean_iou]
+    every = [check for checks in found.rooms.values() for check in checks if check.mean_iou]
     worst = sorted(every, key=lambda check: (min(check.mean_iou.values()), check.room_id))
-    table = Table("worst rooms", "unoccluded objects", "mean 2D IoU")
-    for check in worst[:_WORST_SHOWN]:
+    worst = worst[:_WORST_SHOWN]
+    # Ids without spaces would be cut off in a narrow terminal.
+    longest = max((len(check.room_id) for check in worst), default=0)
+    rooms_column = Column("worst rooms", min_width=longest)
+    table = Table(rooms_column, "unoccluded objects", "mean 2D IoU")
+    for check in worst:
         count = len(check.agreement.mesh) + len(check.agreement.box)
         table.add_row(check.room_id, str(count), _mean_iou([check]))
     return [totals, table] if worst else [totals]
@@ -158,10 +162,10 @@ def _mean_iou(rooms: "list[RoomCheck]") -> str:
     return ", ".join(parts) or "-"
 
 
-def _summary(verdict: "EvaluationResult") -> str:
-    rooms = [check for checks in verdict.rooms.values() for check in checks]
+def _summary(found: "FolderCheck") -> str:
+    rooms = [check for checks in found.rooms.values() for check in checks]
     without = sum(not check.has_checksum for check in rooms)
-    count = len(verdict.agreement.mesh) + len(verdict.agreement.box)
+    count = len(found.agreement.mesh) + len(found.agreement.box)
     parts = ["Checksums, shapes, ranges, 2D boxes and masks agree"]
     if without:
         parts.append(f"{without} rooms carry no checksum (shards of an earlier release)")

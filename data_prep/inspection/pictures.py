@@ -1,13 +1,15 @@
-"""One view, or the plan, of a room in a shard in; a picture for one's own eyes out."""
+"""Draws one view, or the plan, of a room in a shard."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from data_prep.inspection.projection import to_camera, wire_pixels
+from data_prep.inspection.projection import Segment, to_camera, wire_pixels
 from sceneprior.classes import class_colors, label_set
 from sceneprior.geometry.corners import BOX_EDGES, box_corners
+from sceneprior.pictures import paint_ids
 from sceneprior.shards import RoomGroundTruth, RoomViews, Shard
 
 BACKGROUND = (246, 246, 246)
@@ -29,14 +31,8 @@ def draw_view(
     its boxes as black wires with a bar ahead of each piece's front.
 
     The floor (y = 0) is a grid of metres with the axes of the room frame, so that a wrong floor,
-    axis or unit shows even where nothing is known in 3D.
-
-    Args:
-        shard: An open shard.
-        room_id: A room of it.
-        view: Which of its views.
-        boxes_3d: Draw the ground truth, if there is one.
-        width_px: Width of the picture; lines and names keep theirs.
+    axis or unit shows even where nothing is known in 3D. Lines and names keep their size whatever
+    the picture's, `width_px`.
     """
     room = shard.read_room(room_id)
     truth = _truth(shard, room_id) if boxes_3d else None
@@ -44,22 +40,27 @@ def draw_view(
     height, width = room.image_size
     zoom = width_px / width
     size = (width_px, max(1, round(height * zoom)))
-    lens = np.diag([zoom, zoom, 1.0]) @ room.intrinsics[view].astype(np.float64)
-    camera = room.world_to_camera[view]
     picture = Image.new("RGB", size, BACKGROUND)
     draw = ImageDraw.Draw(picture)
-    _draw_floor(draw, room, truth, camera, lens)
+    intrinsics = np.diag([zoom, zoom, 1.0]) @ room.intrinsics[view].astype(np.float64)
+    wires = _Wires(draw, room.world_to_camera[view], intrinsics)
+    wires.floor(room, truth)
     ids = Image.fromarray(shard.read_instance_ids(room_id, [view])[0].astype(np.int32))
     large = np.asarray(ids.resize(size, Image.Resampling.NEAREST))
     palette = class_colors(len(names))[room.object_class]
-    picture.paste(_mask_colors(large, palette), mask=Image.fromarray(large > 0))
+    # Halfway to white, so that wires and names stand out.
+    pale = (palette.astype(np.int32) + 255) // 2
+    painted = Image.fromarray(paint_ids(large, pale, BACKGROUND))
+    picture.paste(painted, mask=Image.fromarray(large > 0))
     for name, end in zip(AXES, np.eye(3) * _AXIS_M, strict=True):
-        _line(draw, np.stack([np.zeros(3), end]), camera, lens, AXES[name], 2)
-        for line in wire_pixels(np.stack([np.zeros(3), end]), [(0, 1)], camera, lens):
+        ends = np.stack([np.zeros(3), end])
+        wires.line(ends, AXES[name], 2)
+        for line in wires.pixels(ends, [(0, 1)]):
             draw.text(line[2:], name, fill=AXES[name], font=_font(12), anchor="mm")
     seen = np.flatnonzero(room.visible[view])
-    for k in seen if truth is not None else ():
-        _draw_box(draw, truth, k, camera, lens)  # type: ignore[arg-type]
+    if truth is not None:
+        for k in seen.tolist():
+            wires.box(truth, k)
     for k in seen:
         x1, y1, x2, y2 = (room.boxes[view, k] * np.array([*size, *size])).tolist()
         dark = _dark(palette[k])
@@ -114,34 +115,41 @@ def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 
     return picture
 
 
+@dataclass(frozen=True)
+class _Wires:
+    """Lines of the room drawn into one view."""
+
+    draw: ImageDraw.ImageDraw
+    world_to_camera: np.ndarray
+    intrinsics: np.ndarray
+
+    def pixels(self, points_m: np.ndarray, edges: Iterable[tuple[int, int]]) -> list[Segment]:
+        return wire_pixels(points_m, edges, self.world_to_camera, self.intrinsics)
+
+    def line(self, ends_m: np.ndarray, color: Color, width: int = 1) -> None:
+        if to_camera(ends_m, self.world_to_camera)[:, 2].max() > 0:
+            for line in self.pixels(ends_m, [(0, 1)]):
+                self.draw.line(line, fill=color, width=width)
+
+    def floor(self, room: RoomViews, truth: RoomGroundTruth | None) -> None:
+        for ends in _grid(*_floor_bounds(room, truth)):
+            self.line(np.asarray(ends), GRID)
+        if truth is not None and len(truth.floor_m) > 2:
+            outline = np.insert(truth.floor_m.astype(np.float64), 1, 0.0, axis=1)
+            for first, second in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+                self.line(np.stack([first, second]), OUTLINE, 2)
+
+    def box(self, truth: RoomGroundTruth, k: int) -> None:
+        lines = self.pixels(box_corners(truth.centers_m[k], truth.sizes_m[k]), BOX_EDGES)
+        for color, width in (("white", 3), ("black", 1)):
+            for line in lines:
+                self.draw.line(line, fill=color, width=width)
+        if truth.model_ids[k]:  # without a mesh no front is known
+            self.line(np.stack(_front(truth, k)), (0, 0, 0), 3)
+
+
 def _truth(shard: Shard, room_id: str) -> RoomGroundTruth | None:
     return shard.read_ground_truth(room_id) if shard.has_ground_truth(room_id) else None
-
-
-def _mask_colors(ids: np.ndarray, palette: np.ndarray) -> Image.Image:
-    # Halfway to white, so that wires and names stand out; a dark rim parts neighbours of a class.
-    pale = (palette.astype(np.int32) + 255) // 2
-    image = np.concatenate([[BACKGROUND], pale]).astype(np.uint8)[ids]
-    rim = np.zeros(ids.shape, dtype=bool)
-    rim[:, 1:] |= ids[:, 1:] != ids[:, :-1]
-    rim[1:] |= ids[1:] != ids[:-1]
-    image[rim] = image[rim] // 2
-    return Image.fromarray(image)
-
-
-def _draw_floor(
-    draw: ImageDraw.ImageDraw,
-    room: RoomViews,
-    truth: RoomGroundTruth | None,
-    camera: np.ndarray,
-    lens: np.ndarray,
-) -> None:
-    for ends in _grid(*_floor_bounds(room, truth)):
-        _line(draw, np.asarray(ends), camera, lens, GRID)
-    if truth is not None and len(truth.floor_m) > 2:
-        outline = np.insert(truth.floor_m.astype(np.float64), 1, 0.0, axis=1)
-        for first, second in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-            _line(draw, np.stack([first, second]), camera, lens, OUTLINE, 2)
 
 
 def _floor_bounds(room: RoomViews, truth: RoomGroundTruth | None) -> tuple[np.ndarray, np.ndarray]:
@@ -177,35 +185,6 @@ def _front(truth: RoomGroundTruth, k: int) -> tuple[np.ndarray, np.ndarray]:
     reach = min(half[0] / max(abs(ahead[0]), 1e-9), half[2] / max(abs(ahead[2]), 1e-9))
     foot = truth.centers_m[k].astype(np.float64) - (0, half[1], 0)
     return foot + reach * ahead, foot + (reach + _BAR_M) * ahead
-
-
-def _draw_box(
-    draw: ImageDraw.ImageDraw,
-    truth: RoomGroundTruth,
-    k: int,
-    camera: np.ndarray,
-    lens: np.ndarray,
-) -> None:
-    corners = box_corners(truth.centers_m[k], truth.sizes_m[k])
-    for line in wire_pixels(corners, BOX_EDGES, camera, lens):
-        draw.line(line, fill="white", width=3)
-    for line in wire_pixels(corners, BOX_EDGES, camera, lens):
-        draw.line(line, fill="black", width=1)
-    if truth.model_ids[k]:  # without a mesh no front is known
-        _line(draw, np.stack(_front(truth, k)), camera, lens, (0, 0, 0), 3)
-
-
-def _line(
-    draw: ImageDraw.ImageDraw,
-    ends_m: np.ndarray,
-    camera: np.ndarray,
-    lens: np.ndarray,
-    color: Color,
-    width: int = 1,
-) -> None:
-    if to_camera(ends_m, camera)[:, 2].max() > 0:
-        for line in wire_pixels(ends_m, [(0, 1)], camera, lens):
-            draw.line(line, fill=color, width=width)
 
 
 def _tag(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str, color: Color) -> None:

@@ -1,4 +1,4 @@
-"""Points and wires of a room in, pixels of one view out, in numpy: for pictures and checks."""
+"""Projects points and wires of a room into its views, in numpy: for pictures and checks."""
 
 from collections.abc import Iterable
 

@@ -1,4 +1,4 @@
-"""A folder of shards in, what is wrong with it out: checksums, shapes, ranges, boxes, masks, 3D."""
+"""Checks a folder of shards: checksums, shapes, ranges, boxes, masks, ground truth in 3D."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -55,7 +55,7 @@ class RoomCheck:
 
 
 @dataclass(frozen=True)
-class EvaluationResult:
+class FolderCheck:
     """What was found in a folder."""
 
     rooms: dict[str, list[RoomCheck]]
@@ -70,13 +70,10 @@ class EvaluationResult:
         return sum(every, Agreement())
 
 
-def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> EvaluationResult:
+def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> FolderCheck:
     """Read everything in a folder of shards and hold it against itself.
 
-    Args:
-        folder: Finished shards.
-        room_id: Only this room; the index's counts are then left alone.
-        workers: Processes.
+    With `room_id` only this room; the index's counts are then left alone.
 
     Raises:
         InputError: it is no finished folder of shards, or holds no such room.
@@ -123,7 +120,7 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Evalua
                     f"a mean 2D IoU of {np.mean(values):.2f}, expected at least {least}: is an "
                     "axis or a unit wrong?"
                 )
-    return EvaluationResult(rooms, tuple(problems))
+    return FolderCheck(rooms, tuple(problems))
 
 
 def _count_problems(
@@ -154,13 +151,9 @@ def _check_shard(
     checks: list[RoomCheck] = []
     try:
         with Shard(path) as shard:
-            problems: tuple[str, ...] = ()
             if shard.label_set != label_set_name:
-                problems = (
-                    f"the shard is labelled '{shard.label_set}', index.json says "
-                    f"'{label_set_name}'",
-                )
-                checks.append(RoomCheck(name, "", problems=problems))
+                said = f"the shard is labelled '{shard.label_set}', index.json says"
+                checks.append(RoomCheck(name, "", problems=(f"{said} '{label_set_name}'",)))
             for room_id in shard.room_ids:
                 if only is None or room_id == only:
                     checks.append(_check_room(shard, name, room_id, models))
@@ -194,16 +187,11 @@ def _check_room(shard: Shard, name: str, room_id: str, models: ModelPoints) -> R
         name, room_id, len(views.visible), len(views.object_class), tuple(problems), agreement,
         truth is not None, stored is not None,
     )  # fmt: skip
-    return _judge_overlap(check)
-
-
-def _judge_overlap(check: RoomCheck) -> RoomCheck:
-    sentences = list(check.problems)
     for kind, mean in check.mean_iou.items():
-        count = len(getattr(check.agreement, kind))
+        count = len(getattr(agreement, kind))
         if count >= _ROOM_OBJECTS and mean < ROOM_IOU_AT_LEAST[kind]:
-            sentences.append(
+            problems.append(
                 f"its ground truth projects onto its masks with a mean 2D IoU of {mean:.2f} only "
                 f"({count} unoccluded objects): is an axis or a unit wrong?"
             )
-    return replace(check, problems=tuple(sentences))
+    return replace(check, problems=tuple(problems))

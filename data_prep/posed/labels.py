@@ -1,4 +1,4 @@
-"""A table of instance ids and a label set in; the class of every id out."""
+"""Reads the user's label set, and a room's table of classes."""
 
 import json
 from pathlib import Path

@@ -1,15 +1,13 @@
 """Folders of posed pictures as a source of rooms: a folder with a transforms.json is a room."""
 
-import hashlib
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from data_prep.engine.plan import digest_of_files
-from data_prep.engine.selection import check_survey, house_may_match, is_asked_for
-from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
+from data_prep.engine.plan import digest, digest_of_files
+from data_prep.engine.selection import house_may_match, seeded_split, select
+from data_prep.engine.source import Expected, LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
 from data_prep.engine.workers import Run
 from data_prep.posed.labels import TABLES
 from data_prep.posed.transforms import FILE_NAME, INSTANCES, read_transforms, room_name
@@ -20,7 +18,6 @@ from data_prep.posed.views import (
     stored_size,
     usable_frames,
 )
-from data_prep.recipe import Expected
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.offscreen import Renderer
@@ -30,6 +27,10 @@ from sceneprior.offscreen import Renderer
 class PosedSource:
     """What `prep-posed` reads: a `Source` (data_prep/engine/source.py)."""
 
+    name: ClassVar = "posed"
+    room_type: ClassVar = "posed"
+    draws: ClassVar = False
+    expected: ClassVar[Expected | None] = None
     folder: Path
     """One room, or a folder of rooms."""
     label_set: str
@@ -41,25 +42,9 @@ class PosedSource:
     only: str | None = None
     """A room; the beginning of its name is enough."""
 
-    @property
-    def name(self) -> str:
-        return "posed"
-
-    @property
-    def room_type(self) -> str:
-        return "posed"
-
-    @property
-    def draws(self) -> bool:
-        return False
-
-    @property
-    def expected(self) -> Expected | None:
-        return None
-
     def settings(self, only: str | None) -> dict[str, Any]:
-        """See `Source.settings`. The files' names and sizes take part: whoever mends masks or
-        classes should not be handed the shards of before."""
+        """See `Source.settings`. The files' names and sizes take part, so that mended masks or
+        classes are not answered with the shards of before."""
         label_set(self.label_set)
         if not 0 <= self.val_share < 1:
             raise InputError(f"val_share is {self.val_share}; expected a share from 0 to below 1.")
@@ -77,7 +62,7 @@ class PosedSource:
             "recipe": {"label_set": self.label_set, **asdict(self.posed_settings)},
             "seed": self.seed,
             "val_share": self.val_share,
-            "rooms": hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:16],
+            "rooms": digest(repr(sorted(files.items()))),
         }
 
     def survey(self, run: Run) -> Survey:
@@ -85,9 +70,8 @@ class PosedSource:
         rooms = find_rooms(self.folder)
         sizes: dict[str, tuple[int, int]] = {}
         left_out: list[LeftOut] = []
-        for room, found in zip(
-            rooms, run(_look, [(self, room) for room in rooms], "reading rooms"), strict=True
-        ):
+        looked = run(_look, [(self, room) for room in rooms], "reading rooms")
+        for room, found in zip(rooms, looked, strict=True):
             name = room_name(room)
             if isinstance(found, str):
                 left_out.append(LeftOut(name, name, "failed", found))
@@ -103,18 +87,10 @@ class PosedSource:
                 )
                 left_out.append(LeftOut(name, name, "filtered", why, "image_size"))
         names = [name for name, size in sizes.items() if size == usual]
-        split_of = shared_split(names, self.val_share, self.seed)
-        survey = Survey(
-            tuple(
-                RoomTask(name, name, split_of[name])
-                for name in names
-                if is_asked_for(self.only, name, name)
-            ),
-            tuple(item for item in left_out if is_asked_for(self.only, item.room_id, item.house)),
-        )
-        if not survey.rooms:
-            check_survey(survey, f"{self.folder} can be prepared", self.only, "the rooms")
-        return survey
+        split_of = seeded_split(names, self.seed, self.val_share)
+        tasks = tuple(RoomTask(name, name, split_of[name]) for name in names)
+        survey = Survey(tasks, tuple(left_out))
+        return select(survey, self.only, f"{self.folder} can be prepared")
 
     def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
         """Read one room and label its views."""
@@ -180,15 +156,6 @@ def find_rooms(folder: Path) -> list[Path]:
     if not found:
         raise InputError(f"{folder} holds no {FILE_NAME}, and none of its sub-folders does.")
     return found
-
-
-def shared_split(names: Sequence[str], val_share: float, seed: int) -> dict[str, str]:
-    """Room -> train or test; a name keeps its place in the order whatever else is there."""
-    order = sorted(names, key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).digest())
-    tests = 0
-    if val_share > 0 and len(order) > 1:
-        tests = min(max(1, round(val_share * len(order))), len(order) - 1)
-    return {name: "test" if i < tests else "train" for i, name in enumerate(order)}
 
 
 def _look(source: PosedSource, room: Path) -> tuple[int, int] | str:

@@ -1,21 +1,21 @@
-"""A nerfstudio-style transforms.json in; frames with poses, intrinsics and the files beside them out.
+"""Reads a nerfstudio-style transforms.json: frames with poses, intrinsics, and the files beside it.
 
-Read, of the file: `frames`; lens keys (below) for all frames; `floor_m`, `floor_center_m`,
+Read, of the file: `frames`; camera keys (`Camera`) for all frames; `floor_m`, `floor_center_m`,
 `metres_per_unit`. Of a frame: `file_path`, `transform_matrix`, `instance_path`, `mask_path`, and
-lens keys, which win over the file's. Lens keys: `fl_x fl_y cx cy w h camera_angle_x
-camera_angle_y`; and `k1 k2 k3 k4 p1 p2 camera_model is_fisheye`, to refuse what is no pinhole. All
-others are passed over, and the pictures themselves are never opened.
+camera keys, which win over the file's. All others are passed over, and the pictures themselves are
+never opened.
 """
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from sceneprior.errors import InputError
+from sceneprior.files import read_json
 
 FILE_NAME = "transforms.json"
 INSTANCES = "instances"
@@ -26,8 +26,57 @@ _STRAIGHT = 1e-6
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _UNDISTORT = (
     "; undistort the pictures first (`colmap image_undistorter` does), draw the masks on those, "
-    "and write their pinhole lens"
+    "and write their pinhole intrinsics"
 )
+
+Number = Annotated[float, Field(gt=-1e12, lt=1e12)]
+PathText = Annotated[str, Field(min_length=1, pattern=r"^[^\x00]*$")]
+
+
+class Camera(BaseModel):
+    """The camera keys of a frame, or of a file for all its frames."""
+
+    model_config = ConfigDict(strict=True, frozen=True)
+
+    fl_x: Number | None = None
+    fl_y: Number | None = None
+    cx: Number | None = None
+    cy: Number | None = None
+    w: Number | None = None
+    h: Number | None = None
+    camera_angle_x: Number | None = None
+    camera_angle_y: Number | None = None
+    k1: Number = 0.0
+    k2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+    camera_model: Any = "PINHOLE"
+    is_fisheye: Any = False
+
+    @model_validator(mode="after")
+    def _is_a_pinhole(self) -> "Camera":
+        for key in _DISTORTION:
+            if abs(value := getattr(self, key)) > _STRAIGHT:
+                raise ValueError(f"its lens is distorted ({key} = {value:g}){_UNDISTORT}.")
+        if self.is_fisheye or str(self.camera_model).upper() not in _PINHOLES:
+            kind = "fisheye" if self.is_fisheye else str(self.camera_model)[:40]
+            raise ValueError(f"its camera_model is {kind}, not a pinhole{_UNDISTORT}.")
+        return self
+
+
+class _FrameEntry(Camera):
+    instance_path: PathText | None = None
+    mask_path: PathText | None = None
+
+
+class _FileEntry(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+    floor_m: Number | None = None
+    floor_center_m: Annotated[tuple[Number, Number], Field(strict=False)] | None = None
+    metres_per_unit: Annotated[Number, Field(gt=0)] | None = None
 
 
 @dataclass(frozen=True)
@@ -42,8 +91,8 @@ class PosedFrame:
     """PNG of tracked ids; it may be missing."""
     known: Path | None
     """PNG that is 0 where nothing is known, from `mask_path`."""
-    lens: dict[str, float]
-    """The lens keys that are given, the frame's own before the file's."""
+    camera: Camera
+    """The frame's own keys before the file's."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +116,7 @@ def read_transforms(folder: Path) -> Recording:
             lens is not a pinhole's; the message names the file, the frame and the key.
     """
     path = Path(folder) / FILE_NAME
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}).") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not JSON ({str(error)[:120]}).") from None
+    data = read_json(path)
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
         raise InputError(f"{path} has no list `frames` with a frame in it.")
     frames = tuple(_frame(path, data, number) for number in range(len(data["frames"])))
@@ -84,12 +128,8 @@ def read_transforms(folder: Path) -> Recording:
                 f"{path}: frames '{other}' and '{frame.name}' would share the ids in "
                 f"{frame.instances}; give each an `instance_path`."
             )
-    scale = _number(data, "metres_per_unit", str(path))
-    if scale is not None and scale <= 0:
-        raise InputError(f"{path}: metres_per_unit is {scale}; it must be above 0.")
-    return Recording(
-        path, frames, _number(data, "floor_m", str(path)), _center(path, data), scale
-    )  # fmt: skip
+    room = _checked(_FileEntry, data, str(path))
+    return Recording(path, frames, room.floor_m, room.floor_center_m, room.metres_per_unit)
 
 
 def room_name(folder: Path) -> str:
@@ -98,18 +138,14 @@ def room_name(folder: Path) -> str:
     return name if name not in ("", "..") else Path(folder).resolve().name
 
 
-def lens_matrix(
+def frame_intrinsics(
     frame: PosedFrame, mask_size: tuple[int, int]
 ) -> tuple[np.ndarray, tuple[int, int]]:
     """The pinhole of a frame and the size of the picture that it belongs to.
 
-    `w`, `h` default to the size of the mask; `cx`, `cy` to the middle; `fl_x` to what
-    `camera_angle_x` says; `fl_y` to `camera_angle_y`, else to square pixels. Pixel centres are at
-    i + 0.5, as in nerfstudio and COLMAP, and as here.
-
-    Args:
-        frame: Its lens.
-        mask_size: (height, width) of its PNG of ids.
+    `w`, `h` default to the (height, width) of the mask, `mask_size`; `cx`, `cy` to the middle;
+    `fl_x` to what `camera_angle_x` says; `fl_y` to `camera_angle_y`, else to square pixels. Pixel
+    centres are at i + 0.5, as in nerfstudio and COLMAP, and as here.
 
     Returns:
         (3, 3) float64 in pixels, and (height, width).
@@ -117,19 +153,21 @@ def lens_matrix(
     Raises:
         InputError: there is no focal length, or a value is out of range.
     """
-    lens = frame.lens
-    width, height = lens.get("w", mask_size[1]), lens.get("h", mask_size[0])
+    camera = frame.camera
+    width = mask_size[1] if camera.w is None else camera.w
+    height = mask_size[0] if camera.h is None else camera.h
     if width < 1 or height < 1 or width % 1 or height % 1:
         raise InputError(f"frame '{frame.name}': w, h are {width}, {height}; expected pixel counts")
-    fl_x = lens.get("fl_x") or _focal(lens.get("camera_angle_x"), width)
+    fl_x = camera.fl_x or _focal(camera.camera_angle_x, width)
     if fl_x is None:
         raise InputError(
             f"frame '{frame.name}' has no fl_x and no camera_angle_x, here or for the whole file"
         )
-    fl_y = lens.get("fl_y") or _focal(lens.get("camera_angle_y"), height) or fl_x
+    fl_y = camera.fl_y or _focal(camera.camera_angle_y, height) or fl_x
     if fl_x <= 0 or fl_y <= 0:
         raise InputError(f"frame '{frame.name}': fl_x, fl_y are {fl_x}, {fl_y}; expected above 0")
-    cx, cy = lens.get("cx", width / 2), lens.get("cy", height / 2)
+    cx = width / 2 if camera.cx is None else camera.cx
+    cy = height / 2 if camera.cy is None else camera.cy
     return np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1.0]]), (int(height), int(width))
 
 
@@ -145,23 +183,17 @@ def _frame(path: Path, data: dict[str, Any], number: int) -> PosedFrame:
         raise InputError(f"{path}, frame {number}: it has no `file_path`.")
     name = item["file_path"]
     where = f"{path}, frame '{name}'"
-    _refuse_bent(where, {**data, **item})
-    keys = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y")
-    lens = {}
-    for key in keys:
-        value = _number(item, key, where)
-        if value is None:
-            value = _number(data, key, str(path))
-        if value is not None:
-            lens[key] = value
+    own = {key: value for key, value in item.items() if value is not None}
+    of_file = {key: data[key] for key in Camera.model_fields if data.get(key) is not None}
+    entry = _checked(_FrameEntry, of_file | own, where)
     stem = Path(name)
     ids = f"{INSTANCES}/{stem.stem if stem.suffix.lower() in _PICTURES else stem.name}.png"
     return PosedFrame(
         name,
         _matrix(where, item.get("transform_matrix")),
-        path.parent / _text(item, "instance_path", where, ids),
-        path.parent / _text(item, "mask_path", where) if "mask_path" in item else None,
-        lens,
+        path.parent / (entry.instance_path or ids),
+        path.parent / entry.mask_path if entry.mask_path else None,
+        entry,
     )
 
 
@@ -178,41 +210,17 @@ def _matrix(where: str, value: Any) -> np.ndarray:
     return matrix
 
 
-def _refuse_bent(where: str, values: dict[str, Any]) -> None:
-    for key in _DISTORTION:
-        value = _number(values, key, where)
-        if value is not None and abs(value) > _STRAIGHT:
-            raise InputError(f"{where}: its lens is distorted ({key} = {value:g}){_UNDISTORT}.")
-    model = values.get("camera_model", "PINHOLE")
-    if values.get("is_fisheye") or str(model).upper() not in _PINHOLES:
-        kind = "fisheye" if values.get("is_fisheye") else str(model)[:40]
-        raise InputError(f"{where}: its camera_model is {kind}, not a pinhole{_UNDISTORT}.")
+_M = TypeVar("_M", bound=BaseModel)
 
 
-def _number(values: dict[str, Any], key: str, where: str) -> float | None:
-    value = values.get(key)
-    if value is None:
-        return None
-    # An int may be larger than any float.
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
-        raise InputError(f"{where}: {key} is {str(value)[:40]!r}; expected a number.")
-    return float(value)
-
-
-def _text(values: dict[str, Any], key: str, where: str, default: str = "") -> str:
-    value = values.get(key, default)
-    if not isinstance(value, str) or not value or "\0" in value:
-        raise InputError(f"{where}: {key} is {str(value)[:40]!r}; expected a path.")
-    return value
-
-
-def _center(path: Path, data: dict[str, Any]) -> tuple[float, float] | None:
-    value = data.get("floor_center_m")
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) != 2:
-        raise InputError(f"{path}: floor_center_m is {str(value)[:40]!r}; expected two numbers.")
-    first, second = (_number({"floor_center_m": v}, "floor_center_m", str(path)) for v in value)
-    if first is None or second is None:
-        raise InputError(f"{path}: floor_center_m holds null; expected two numbers.")
-    return first, second
+def _checked(model: type[_M], data: dict[str, Any], where: str) -> _M:
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        if first["type"] == "value_error":
+            raise InputError(f"{where}: {first['ctx']['error']}") from None
+        key, reason = ".".join(map(str, first["loc"])), first["msg"]
+        raise InputError(
+            f"{where}: {key} is {str(first['input'])[:40]!r}; {reason[:1].lower()}{reason[1:]}."
+        ) from None

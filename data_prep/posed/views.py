@@ -1,4 +1,4 @@
-"""One room's folder in; its labelled views, in the arrays that shards store, out."""
+"""Labels the views of one room of posed pictures, in the arrays that shards store."""
 
 import math
 from dataclasses import dataclass
@@ -14,12 +14,11 @@ from data_prep.frames import (
     sampled_lines,
 )
 from data_prep.posed.labels import read_classes
-from data_prep.posed.transforms import PosedFrame, Recording, lens_matrix, room_name
+from data_prep.posed.transforms import PosedFrame, Recording, frame_intrinsics, room_name
 from sceneprior.errors import InputError
 from sceneprior.instances.observations import observe
 from sceneprior.instances.pngs import mask_size, read_mask
 from sceneprior.instances.tables import IdTable
-from sceneprior.shards import RoomViews
 
 UP_AXES = ("z", "y")
 _GL_TO_CV = np.diag([1.0, -1, -1, 1])
@@ -88,9 +87,8 @@ def stored_size(frame: PosedFrame, settings: PosedSettings) -> tuple[int, int]:
 def prepare_posed(
     recording: Recording, label_set_name: str, settings: PosedSettings
 ) -> PreparedRoom | None:
-    """Label the views of one room; None if no view shows an object of the label set.
-
-    There is no ground truth: nobody knows the room in 3D.
+    """Label the views of one room, which has no ground truth in 3D; None if no view shows an
+    object of the label set.
 
     Raises:
         InputError: a file is missing, damaged, or does not fit the others.
@@ -118,7 +116,7 @@ def prepare_posed(
     for frame in chosen:
         try:
             values = _read(frame, first)
-            K, picture = lens_matrix(frame, first)
+            K, picture = frame_intrinsics(frame, first)
             # That function counts pixel centres in whole numbers, as ScanNet does.
             shifted = np.eye(4)
             shifted[:3, :3] = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
@@ -128,27 +126,14 @@ def prepare_posed(
         rows, columns = sampled_lines(first[0], size[0]), sampled_lines(first[1], size[1])
         images.append(table.ids(values[np.ix_(rows, columns)]))
     seen = observe(np.stack(images), table.is_object)
-    if table.strange:
-        listed = ", ".join(map(str, sorted(table.strange)[:20]))
+    if table.unlisted:
+        listed = ", ".join(map(str, sorted(table.unlisted)[:20]))
         notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
     if not len(seen.tracked):
         return None
     world_to_camera, said = cameras_in_room(recording, [*choice.frames], settings)
-    return PreparedRoom(
-        RoomViews(
-            room_id=room_name(folder),
-            object_class=table.classes[seen.tracked],
-            world_to_camera=world_to_camera.astype(np.float32),
-            intrinsics=np.stack(intrinsics).astype(np.float32),
-            boxes=seen.boxes,
-            visible=seen.visible,
-            mask_pixels=seen.mask_pixels,
-            sides_clear=seen.sides_clear,
-            instance_ids=seen.instance_ids,
-            image_size=size,
-        ),
-        notes=(*notes, *said),
-    )
+    views = seen.room_views(room_name(folder), table.classes, world_to_camera, np.stack(intrinsics))
+    return PreparedRoom(views, notes=(*notes, *said))
 
 
 def cameras_in_room(

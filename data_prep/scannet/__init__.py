@@ -1,1 +1,1 @@
-"""ScanNet's raw scan folders in (.sens, zips, JSON, PLY), labelled views of one room out."""
+"""ScanNet as a source of rooms: its raw scan folders (.sens, zips, JSON, PLY)."""

@@ -1,4 +1,4 @@
-"""A scan's `.txt`, JSONs and mesh in; its alignment, and each object's vertices, out."""
+"""Reads a scan's alignment and each object's vertices, from its `.txt`, JSONs and mesh."""
 
 import json
 import math
@@ -129,7 +129,7 @@ def read_vertices(path: Path) -> np.ndarray:
         raise _unreadable(path, FileNotFoundError("no such file"))
     try:
         # The arrays of the file, not a Trimesh: merged or dropped vertices would no longer be
-        # those of segs.json, and the triangles, which nobody needs, would double the memory.
+        # those of segs.json, and the triangles, which are not needed, would double the memory.
         with path.open("rb") as file:
             loaded = load_ply(file, fix_texture=False, skip_materials=True)
         vertices = np.array(loaded["vertices"], dtype=np.float64).reshape(-1, 3)
@@ -148,10 +148,7 @@ def object_bounds(
 ) -> list[tuple[np.ndarray, np.ndarray] | None]:
     """Lowest and highest corner (3,) of each group's axis-aligned box; None without vertices.
 
-    Args:
-        groups: What `read_groups` gave.
-        segments: (V,) segment of each vertex.
-        vertices_m: (V, 3) in the frame whose axes the boxes follow.
+    `segments` (V,) and `vertices_m` (V, 3) are of the mesh; boxes follow the axes of its frame.
     """
     order = np.argsort(segments, kind="stable")
     numbers, starts = np.unique(segments[order], return_index=True)

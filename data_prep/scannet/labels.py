@@ -1,4 +1,4 @@
-"""ScanNet's label table in, the class of every raw category out."""
+"""The class of every raw category of ScanNet, from its label table."""
 
 import csv
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A zip of instance masks in, one frame's object ids out; nothing is unpacked to disk."""
+"""Reads single instance masks out of a zip; nothing is unpacked to disk."""
 
 import contextlib
 import io
@@ -6,7 +6,6 @@ import re
 import zipfile
 import zlib
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from PIL import Image
@@ -54,12 +53,7 @@ class MaskArchive:
     def __enter__(self) -> "MaskArchive":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -67,10 +61,7 @@ class MaskArchive:
         self._zip.close()
 
     def read(self, frame: int) -> np.ndarray:
-        """The mask of one frame.
-
-        Returns:
-            (height, width) uint8: objectId + 1, 0 where no object is.
+        """The mask of one frame, (height, width) uint8: objectId + 1, 0 where no object is.
 
         Raises:
             InputError: there is no such frame; the member is damaged, not 8-bit grey, or of

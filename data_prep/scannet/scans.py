@@ -1,4 +1,4 @@
-"""One scan folder in; its objects in the room frame, and its cameras, out."""
+"""Reads one scan folder: its objects in the room frame, and its cameras."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,11 +110,6 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
     annotated floors are as ragged as what the camera happened to see. Where no object has a
     class, the whole mesh takes their place.
 
-    Args:
-        folder: `<scene>/` with `<scene>.sens`, `<scene>.txt` and so on.
-        labels: From `read_labels`.
-        settings: Which frames, masks and size; None: the defaults.
-
     Raises:
         InputError: a file is missing or damaged, files do not belong together, or no frame has
             both a pose and a mask. The message names the file and what to do.
@@ -161,7 +156,13 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
         corners = box[0] - origin, box[1] - origin
         instances.append(Instance(group.object_id, group.category, kind, is_shell, *corners))
     half = (upper - lower)[[0, 2]] / 2
-    cameras = _read_cameras(folder, room_from_scan, settings)
+    choice, world_to_camera, intrinsics, masks = _read_cameras(folder, room_from_scan, settings)
+    every = f"of {choice.candidates} frames (every {settings.frame_step})"
+    for count, why in (
+        (choice.bad_poses, "have no usable pose"),
+        (choice.without_mask, "have no mask"),
+    ):
+        notes += [f"{count} {every} {why}; skipped"] * bool(count)
     return Scan(
         folder=folder,
         scene_type=properties.get("sceneType", ""),
@@ -169,24 +170,19 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
         room_from_scan=room_from_scan,
         floor_m=np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half,
         height_m=float(whole[1][1] - origin[1]),
-        frames=cameras.choice.frames,
-        world_to_camera=cameras.world_to_camera,
-        intrinsics=cameras.intrinsics,
-        masks=cameras.masks,
+        frames=choice.frames,
+        world_to_camera=world_to_camera,
+        intrinsics=intrinsics,
+        masks=masks,
         settings=settings,
-        notes=(*notes, *_frame_notes(cameras.choice, settings)),
+        notes=tuple(notes),
     )
 
 
-@dataclass(frozen=True)
-class _Cameras:
-    choice: FrameChoice
-    world_to_camera: np.ndarray
-    intrinsics: np.ndarray
-    masks: Path
-
-
-def _read_cameras(folder: Path, room_from_scan: np.ndarray, settings: ScanSettings) -> _Cameras:
+def _read_cameras(
+    folder: Path, room_from_scan: np.ndarray, settings: ScanSettings
+) -> tuple[FrameChoice, np.ndarray, np.ndarray, Path]:
+    """Which frames, their world_to_camera, the intrinsics of all, and the archive of masks."""
     mask_path = _mask_path(folder, settings.masks)
     with SensFile(folder / f"{folder.name}.sens") as sens, MaskArchive(mask_path) as masks:
         choice = choose_frames(
@@ -206,7 +202,7 @@ def _read_cameras(folder: Path, room_from_scan: np.ndarray, settings: ScanSettin
         except InputError as error:
             raise InputError(f"{mask_path}: {error}") from None
         poses = sens.camera_to_world[list(choice.frames)]
-    return _Cameras(choice, room_cameras(poses, room_from_scan), intrinsics, mask_path)
+    return choice, room_cameras(poses, room_from_scan), intrinsics, mask_path
 
 
 def _mask_path(folder: Path, kind: str) -> Path:
@@ -222,15 +218,3 @@ def _mask_path(folder: Path, kind: str) -> Path:
         f"{path} is missing: the instance masks. Download it into the scan's folder"
         f"{''.join(others)}."
     )
-
-
-def _frame_notes(choice: FrameChoice, settings: ScanSettings) -> list[str]:
-    every = f"of {choice.candidates} frames (every {settings.frame_step}) "
-    return [
-        f"{count} {every}{why}; skipped"
-        for count, why in (
-            (choice.bad_poses, "have no usable pose"),
-            (choice.without_mask, "have no mask"),
-        )
-        if count
-    ]

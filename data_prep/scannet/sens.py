@@ -1,10 +1,9 @@
-"""A `.sens` recording in, its poses, lens and single colour frames out; the file stays on disk."""
+"""Reads poses, intrinsics and single colour frames of a `.sens` recording; it stays on disk."""
 
 import contextlib
 import struct
 from array import array
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO
 
 import numpy as np
@@ -66,12 +65,7 @@ class SensFile:
     def __enter__(self) -> "SensFile":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __len__(self) -> int:
@@ -82,10 +76,7 @@ class SensFile:
         self._file.close()
 
     def color(self, frame: int) -> np.ndarray:
-        """Read one colour frame.
-
-        Returns:
-            (height, width, 3) uint8, RGB.
+        """One colour frame, (height, width, 3) uint8, RGB.
 
         Raises:
             InputError: the picture is damaged or of another size than the header says.

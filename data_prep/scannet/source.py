@@ -3,13 +3,12 @@
 import functools
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from data_prep.engine.plan import digest
-from data_prep.engine.selection import check_survey, house_may_match, is_asked_for, seeded_split
-from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Survey
+from data_prep.engine.selection import house_may_match, seeded_split, select
+from data_prep.engine.source import Expected, LeftOut, PreparedRoom, RoomTask, Survey
 from data_prep.engine.workers import Run
-from data_prep.recipe import Expected
 from data_prep.scannet.labels import LABEL_SET, Labels, read_labels
 from data_prep.scannet.scans import ScanSettings, read_scan
 from data_prep.scannet.splits import find_scans, space_of, split_scans
@@ -27,6 +26,10 @@ _OFFICIAL = Expected(
 class ScanNetSource:
     """What `prep-scannet` reads: a `Source` (data_prep/engine/source.py)."""
 
+    name: ClassVar = "scannet"
+    label_set: ClassVar = LABEL_SET
+    room_type: ClassVar = "scannet"
+    draws: ClassVar = False
     scans: Path
     """Folder of scan folders."""
     labels: Path
@@ -39,22 +42,6 @@ class ScanNetSource:
     seed: int = 0
     only: str | None = None
     """A scan; the beginning of its name is enough."""
-
-    @property
-    def name(self) -> str:
-        return "scannet"
-
-    @property
-    def label_set(self) -> str:
-        return LABEL_SET
-
-    @property
-    def room_type(self) -> str:
-        return "scannet"
-
-    @property
-    def draws(self) -> bool:
-        return False
 
     @property
     def expected(self) -> Expected | None:
@@ -97,17 +84,10 @@ class ScanNetSource:
             # By space: the same room scanned again must not be in both halves.
             half = seeded_split(list(dict.fromkeys(map(space_of, names))), self.seed)
             split_of = {name: half[space_of(name)] for name in names}
-        survey = Survey(
-            tuple(
-                RoomTask(name, name, split)
-                for name, split in split_of.items()
-                if is_asked_for(self.only, name, name)
-            ),
-            tuple(item for item in left_out if is_asked_for(self.only, item.room_id, item.house)),
-        )
+        tasks = tuple(RoomTask(name, name, split) for name, split in split_of.items())
         hint = "the lists" if self.train or self.val else "that there is more than one space"
-        check_survey(survey, f"{self.scans} is to be prepared", self.only, hint)
-        return survey
+        where = f"{self.scans} is to be prepared"
+        return select(Survey(tasks, tuple(left_out)), self.only, where, hint)
 
     def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
         """Read one scan and label its views."""

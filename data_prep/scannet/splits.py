@@ -1,4 +1,4 @@
-"""A folder of scans and the official lists in; which scan is in which split, out."""
+"""Which scans of a folder are in which split, by the official lists."""
 
 import re
 from collections.abc import Sequence
@@ -58,12 +58,7 @@ def space_of(scan_id: str) -> str:
 def split_scans(
     folders: Sequence[Path], train: Path | None = None, val: Path | None = None
 ) -> ScanSplits:
-    """Sort scans by the official lists; those of `val` are the split `test`.
-
-    Args:
-        folders: From `find_scans`.
-        train: `scannetv2_train.txt`: one scan id a line.
-        val: `scannetv2_val.txt`.
+    """Sort scans by the official lists, one scan id a line; those of `val` are the split `test`.
 
     Raises:
         InputError: a list cannot be read, both name one scan, or no scan is in a list.
@@ -79,7 +74,8 @@ def split_scans(
         lists = " and ".join(str(path) for path in (train, val) if path is not None)
         raise InputError(
             f"None of the {len(names)} scans is in {lists or 'a list, as no list is given'}; "
-            "check that --train and --val are ScanNet's scannetv2_train.txt and scannetv2_val.txt."
+            "check that --train-list and --val-list are ScanNet's scannetv2_train.txt and "
+            "scannetv2_val.txt."
         )
     here = set(names)
     return ScanSplits(

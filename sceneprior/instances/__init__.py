@@ -1,1 +1,1 @@
-"""Images of instance ids: PNGs and tables of classes in, 2D boxes and tracks out."""
+"""Images of instance ids and tables of their classes, and the 2D boxes and tracks in them."""

@@ -1,4 +1,4 @@
-"""PNGs of tracked instance ids in, arrays out."""
+"""Reads PNGs of tracked instance ids."""
 
 import zlib
 from pathlib import Path

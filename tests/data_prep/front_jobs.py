@@ -8,8 +8,8 @@ from typing import Any
 from front_files import FrontFolder, bedroom
 
 from data_prep.engine.build import Job
+from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
-from data_prep.recipe import load_recipe
 from sceneprior.shards import Shard
 
 SMALL = ("views.image_size=[90, 120]", "views.per_m2=0.5", "views.min_object_pixels=20")

@@ -10,8 +10,8 @@ from front_files import FrontFolder
 
 from data_prep.front.furnished import Furniture, Room
 from data_prep.front.models import ModelBank
+from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import HouseRooms, read_house
-from data_prep.recipe import load_recipe
 from sceneprior.scene import Mesh
 
 

@@ -93,7 +93,10 @@ def test_pictures_and_wrong_words(front, tmp_path, prep, cli):
     assert len(list((tmp_path / "shards" / "rgb").glob("*/0000.png"))) == 6
     for words, said in (
         (("--room-type", "attic"), "No recipe is called 'front3d_attic'; there are front3d_all,"),
-        (("--rule", "max_floor_m=wide"), "max_floor_m is 'wide', but takes float | null"),
+        (
+            ("--rule", "max_floor_m=wide"),
+            "'max_floor_m': input should be a valid number (got 'wide')",
+        ),
         (("--room-type", "library"), "is of a type that front3d_library is about (library)"),
     ):
         result = cli(

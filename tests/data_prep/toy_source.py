@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from toy_rooms import LABEL_SET, make_toy_room
 
-from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Survey
-from data_prep.recipe import Expected
+from data_prep.engine.source import Expected, LeftOut, PreparedRoom, RoomTask, Survey
 from sceneprior.errors import InputError
 from sceneprior.scene import Mesh
 

@@ -12,7 +12,8 @@ from rich.console import Console
 from data_prep.engine.build import build_shards
 from data_prep.engine.report import Line, compare, make_report
 from data_prep.engine.report_tables import report_tables
-from data_prep.recipe import Expected, load_recipe
+from data_prep.engine.source import Expected
+from data_prep.front.recipe import load_recipe
 from sceneprior.errors import InputError
 from sceneprior.shards import read_index
 
@@ -72,7 +73,9 @@ def test_the_figures_are_those_of_the_rooms():
         Line("e", "g", "failed", reason="it has no floor"),
         Line("f", "g", "filtered", rule="max_objects", reason="15 objects"),
     ]  # fmt: skip
-    report = make_report(lines, {"source": "toy"}, Expected("a paper", rooms=3, test=2, views=12))
+    report = make_report(
+        lines, {"source": "toy"}, Expected(of="a paper", rooms=3, test=2, views=12)
+    )
     assert report["source"] == "toy" and report["found"] == 6 and report["with_notes"] == 1
     assert report["statuses"] == {"failed": 1, "filtered": 2, "prepared": 3}
     assert report["filtered"] == {"max_objects": {"rooms": 2, "room_ids": ["d", "f"]}}
@@ -107,16 +110,17 @@ def test_what_a_recipe_expects_is_compared_and_decides_nothing(front, tmp_path, 
     build_shards(job)
     assert "expected" not in json.loads((job.out / "report.json").read_text())
     assert "expected" not in read_index(job.out)["recipe"]
-    recipe = replace(job.source.recipe, expected=Expected("this test", rooms=7, train=5))
+    counts = Expected(of="this test", rooms=7, train=5)
+    recipe = job.source.recipe.model_copy(update={"expected": counts})
     summary = build_shards(replace(job, source=replace(job.source, recipe=recipe)))
     assert summary.shards_made == 0
     report = json.loads((job.out / "report.json").read_text())
     assert [row["difference"] for row in report["expected"]["rows"]] == [-1, 0]
     # From the recipe's file, where a wrong name is told.
-    monkeypatch.setattr("data_prep.recipe.FOLDER", tmp_path)
+    monkeypatch.setattr("data_prep.front.recipe.FOLDER", tmp_path)
     text = "label_set: front3d_bedroom\nclass_columns: [bedroom_class]\nroom_types: [bedroom]\n"
     (tmp_path / "mine.yaml").write_text(text + "expected: {of: me, rooms: 7}\n")
-    assert load_recipe("mine").expected == Expected("me", rooms=7)
+    assert load_recipe("mine").expected == Expected(of="me", rooms=7)
     (tmp_path / "mine.yaml").write_text(text + "expected: {chairs: 7}\n")
-    with pytest.raises(InputError, match=r"mine\.yaml has no rule 'chairs'; there are of, rooms"):
+    with pytest.raises(InputError, match=r"mine\.yaml: unknown key 'expected\.chairs'"):
         load_recipe("mine")

@@ -15,8 +15,8 @@ from front_jobs import front_job, rooms_of
 
 from data_prep.engine.build import build_shards
 from data_prep.front.models import ModelBank
+from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import read_house
-from data_prep.recipe import load_recipe
 from sceneprior.errors import InputError
 
 CASES = 400

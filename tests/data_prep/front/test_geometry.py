@@ -8,8 +8,8 @@ from front_files import bedroom, room, surface
 from front_reading import extent, only_room, read, shared_front, signed_volume
 
 from data_prep.front.models import ModelBank
+from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import read_house
-from data_prep.recipe import load_recipe
 
 
 def test_a_plain_room_by_hand(front):

@@ -14,9 +14,9 @@ from data_prep.engine.build import build_shards
 from data_prep.engine.source import Survey
 from data_prep.engine.workers import pool
 from data_prep.front.models import ModelBank
+from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import read_house
 from data_prep.front.source import FrontSource
-from data_prep.recipe import load_recipe
 from sceneprior.errors import InputError
 from sceneprior.shards import read_index
 

@@ -7,8 +7,8 @@ import pytest
 import shapely
 
 from data_prep.front.furnished import Room
-from data_prep.front.viewpoints import Viewpoints, intrinsics, look, sees_enough, view_counts
-from data_prep.recipe import ViewRules
+from data_prep.front.recipe import ViewRules
+from data_prep.front.viewpoints import Viewpoints, camera_pose, intrinsics, sees_enough, view_counts
 
 RULES = ViewRules()
 L_SHAPE = [(-2, -3), (2, -3), (2, 0), (0, 0), (0, 3), (-2, 3)]
@@ -44,7 +44,7 @@ def test_the_papers_lens():
 @pytest.mark.parametrize("pitch", [0.0, 0.3, -0.2])
 def test_look_is_a_rotation_that_sends_the_target_to_the_centre(yaw, pitch):
     eye = np.array([0.3, 1.6, -0.8])
-    turn = look(eye, yaw, pitch)
+    turn = camera_pose(eye, yaw, pitch)
     np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(turn[:3, :3]) == pytest.approx(1)
     ahead = eye + 2 * np.array(

@@ -5,7 +5,7 @@ import doctest
 import numpy as np
 import pytest
 
-from data_prep.front.viewpoints import look
+from data_prep.front.viewpoints import camera_pose
 from data_prep.inspection import projection
 from data_prep.inspection.projection import (
     box_iou_2d,
@@ -22,7 +22,7 @@ def test_examples():
 
 
 def test_wires_join_projected_points(numbers):
-    camera = look(np.array([0.3, 1.5, -3.0]), 0.2, 0.3)
+    camera = camera_pose(np.array([0.3, 1.5, -3.0]), 0.2, 0.3)
     points = box_corners(numbers.normal(size=3) * 0.2, np.array([1.0, 0.5, 0.8]))
     here = points @ camera[:3, :3].T + camera[:3, 3]
     assert here[:, 2].min() > 0.5

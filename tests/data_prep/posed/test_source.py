@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 
 from data_prep.cli import add_commands
 from data_prep.engine.build import Job, build_shards
+from data_prep.engine.selection import seeded_split
 from data_prep.engine.source import RoomTask
 from data_prep.engine.workers import pool
-from data_prep.posed.source import PosedSource, find_rooms, shared_split
+from data_prep.posed.source import PosedSource, find_rooms
 from data_prep.posed.views import PosedSettings
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
@@ -68,10 +69,10 @@ def test_shards_of_ones_own_classes_can_be_trained_on(source, tmp_path):
 def test_splits_are_seeded_shares_of_rooms(source):
     names = [f"r{k}" for k in range(20)]
     for share, tests in ((0.1, 2), (0.5, 10), (0.01, 1), (0.99, 19), (0.0, 0)):
-        split = shared_split(names, share, 0)
+        split = seeded_split(names, 0, share)
         assert sum(value == "test" for value in split.values()) == tests
-    assert shared_split(names, 0.5, 0) != shared_split(names, 0.5, 1)
-    assert shared_split(["one"], 0.5, 0) == {"one": "train"}
+    assert seeded_split(names, 0, 0.5) != seeded_split(names, 1, 0.5)
+    assert seeded_split(["one"], 0, 0.5) == {"one": "train"}
     everything = survey(PosedSource(source.folder, SET, val_share=0.0)).rooms
     assert {room.split for room in everything} == {"train"} and len(everything) == 4
     for share in (-0.1, 1.0, float("nan")):

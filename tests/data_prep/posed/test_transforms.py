@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from posed_files import PosedRoom
 
-from data_prep.posed.transforms import lens_matrix, read_transforms, room_name
+from data_prep.posed.transforms import frame_intrinsics, read_transforms, room_name
 from sceneprior.errors import InputError
 
 
@@ -19,7 +19,7 @@ def refusal(folder):
     with pytest.raises(InputError) as error:
         recording = read_transforms(folder)
         for frame in recording.frames:
-            lens_matrix(frame, (96, 128))
+            frame_intrinsics(frame, (96, 128))
     return str(error.value)
 
 
@@ -41,7 +41,7 @@ def test_frames_poses_and_their_files(room):
     np.testing.assert_array_equal(recording.frames[4].camera_to_world, room.poses[4])
     assert (recording.floor_m, recording.floor_center_m) == (-1.0, (1.0, 2.5))
     assert recording.metres_per_unit is None
-    K, size = lens_matrix(recording.frames[0], (1, 1))
+    K, size = frame_intrinsics(recording.frames[0], (1, 1))
     assert K.tolist() == [[80, 0, 64], [0, 80, 48], [0, 0, 1]] and size == (96, 128)
 
 
@@ -59,20 +59,23 @@ def test_room_names(tmp_path, monkeypatch):
         ({"frames": [3]}, "frame 0: it has no `file_path`."),
         ({"frames": [{"file_path": 3}]}, "frame 0: it has no `file_path`."),
         ({"frames": [{"file_path": "a"}]}, "frame 'a': `transform_matrix` is not a list of 4 rows"),
-        ({"fl_x": "wide"}, "fl_x is 'wide'; expected a number."),
+        ({"fl_x": "wide"}, "fl_x is 'wide'; input should be a valid number."),
         ({"fl_x": 10**400}, "fl_x is '1000"),
-        ({"cx": True}, "cx is 'True'; expected a number."),
-        ({"cy": float("nan")}, "cy is 'nan'; expected a number."),
+        ({"cx": True}, "cx is 'True'; input should be a valid number."),
+        ({"cy": float("nan")}, "cy is 'nan'; input should be "),
         ({"w": 12.5}, "frame 'images/frame_00000.jpg': w, h are 12.5, 96.0; expected pixel counts"),
         ({"fl_x": None}, "has no fl_x and no camera_angle_x, here or for the whole file"),
         ({"fl_x": -1}, "fl_x, fl_y are -1.0, 80.0; expected above 0"),
         ({"k2": 0.03}, "its lens is distorted (k2 = 0.03); undistort the pictures first"),
         ({"camera_model": "OPENCV_FISHEYE"}, "its camera_model is OPENCV_FISHEYE, not a pinhole;"),
         ({"is_fisheye": True}, "its camera_model is fisheye, not a pinhole; undistort the pict"),
-        ({"metres_per_unit": 0}, "metres_per_unit is 0.0; it must be above 0."),
-        ({"floor_center_m": [1]}, "floor_center_m is '[1]'; expected two numbers."),
-        ({"floor_center_m": [1, None]}, "floor_center_m holds null; expected two numbers."),
-        ({"floor_center_m": [1, "x"]}, "floor_center_m is 'x'; expected a number."),
+        ({"metres_per_unit": 0}, "metres_per_unit is '0'; input should be greater than 0."),
+        ({"floor_center_m": [1]}, "floor_center_m.1 is '[1]'; field required."),
+        (
+            {"floor_center_m": [1, None]},
+            "floor_center_m.1 is 'None'; input should be a valid number.",
+        ),
+        ({"floor_center_m": [1, "x"]}, "floor_center_m.1 is 'x'; input should be a valid number."),
     ],
 )
 def test_a_wrong_key_is_a_sentence(room, changes, said):
@@ -88,9 +91,9 @@ def test_a_wrong_key_is_a_sentence(room, changes, said):
         ({"transform_matrix": [[1, 2], [3, 4]]}, "`transform_matrix` is not a list of 4 rows of 4"),
         ({"transform_matrix": [[1, 2], [3]]}, "`transform_matrix` is not a list of 4 rows of 4"),
         ({"transform_matrix": "eye"}, "`transform_matrix` is not a list of 4 rows of 4 numbers."),
-        ({"instance_path": 3}, "instance_path is '3'; expected a path."),
+        ({"instance_path": 3}, "instance_path is '3'; input should be a valid string."),
         ({"instance_path": "a\0b"}, "instance_path is "),
-        ({"mask_path": ""}, "mask_path is ''; expected a path."),
+        ({"mask_path": ""}, "mask_path is ''; string should have at least 1 character."),
         ({"file_path": "other/frame_00000.png"}, "would share the ids in "),
         ({"k1": 1e-3}, "its lens is distorted (k1 = 0.001)"),
     ],
@@ -127,6 +130,6 @@ def test_nothing_random_is_a_traceback(room, numbers):
         room.write_transforms(data)
         try:
             for frame in read_transforms(room.folder).frames:
-                lens_matrix(frame, (96, 128))
+                frame_intrinsics(frame, (96, 128))
         except InputError as error:
             assert len(str(error)) > 30
