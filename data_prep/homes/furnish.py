@@ -139,5 +139,5 @@ def table_and_seat(angled: float) -> Rule:
 
 
 def opposite_the_anchor(furnisher: Furnisher, group: str) -> bool:
-    """A rule: one piece of the class that the group is named after, before the anchor's eyes."""
+    """A rule: one piece of the class that the group is named after, facing the bed or the sofa."""
     return furnisher.opposite(furnisher.anchor, furnisher.catalog[group]) is not None

@@ -41,16 +41,21 @@ DEEP_SOFA_M = 1.3
 DINING_WIDTH_M = 1.0
 """A table at least this wide is one to eat at; below, one beside a seat."""
 
+
+def _around(count: int, x: float, z: float) -> list[tuple[float, float]]:
+    turns = np.arange(count) * 2 * np.pi / count
+    return [(x * np.sin(turn), z * np.cos(turn)) for turn in turns]
+
+
 VOCABULARY: dict[str, Any] = {
     **PARTS,
     **{each: getattr(np, each) for each in ("arange", "array", "clip", "cos", "linspace", "sin")},
     "pi": np.pi,
     "product": product,
+    # The places of what stands left and right, in four corners, or in a ring.
     "both": lambda x: (-x, x),
     "corners": lambda x, z: ((-x, -z), (-x, z), (x, -z), (x, z)),
-    "around": lambda count, x, z: [
-        (x * np.sin(turn), z * np.cos(turn)) for turn in np.arange(count) * 2 * np.pi / count
-    ],
+    "around": _around,
     "DEEP_SOFA_M": DEEP_SOFA_M,
     "DINING_WIDTH_M": DINING_WIDTH_M,
 }

@@ -83,7 +83,7 @@ class Wall:
 
     def point(self, along: float, off: float) -> tuple[float, float]:
         """The floor point `along` metres from the wall's start and `off` metres from the wall."""
-        (run_x, run_z) = self.along
+        run_x, run_z = self.along
         return self.x + run_x * along - run_z * off, self.z + run_z * along + run_x * off
 
 
@@ -129,10 +129,10 @@ class Plan:
         if not self.notch:
             return corners
         x0, z0, x1, z1 = self.notch
-        bite = [(x0, z0), (x1, z0), (x1, z1), (x0, z1)]
-        hit = next(k for k, corner in enumerate(corners) if corner in bite)
+        notch = [(x0, z0), (x1, z0), (x1, z1), (x0, z1)]
+        hit = next(k for k, corner in enumerate(corners) if corner in notch)
         # Walk into the notch: the corner gives way to three, of which the middle is its far one.
-        inner = [bite[(hit + step) % 4] for step in (-1, 2, 1)]
+        inner = [notch[(hit + step) % 4] for step in (-1, 2, 1)]
         return [*corners[:hit], *inner, *corners[hit + 1 :]]
 
     @property

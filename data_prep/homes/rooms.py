@@ -28,11 +28,11 @@ def empty_room(
     width, depth = round(width, 2), round(depth, 2)
     notch = None
     if rng.random() < l_shaped_chance and short > sides_m[0] + 0.4:
-        bite_x = round(width * rng.uniform(0.15, 0.35), 2)
-        bite_z = round(depth * rng.uniform(0.15, 0.35), 2)
-        x0 = 0.0 if rng.random() < 0.5 else round(width - bite_x, 2)
-        z0 = 0.0 if rng.random() < 0.5 else round(depth - bite_z, 2)
-        notch = (x0, z0, round(x0 + bite_x, 2), round(z0 + bite_z, 2))
+        notch_x = round(width * rng.uniform(0.15, 0.35), 2)
+        notch_z = round(depth * rng.uniform(0.15, 0.35), 2)
+        x0 = 0.0 if rng.random() < 0.5 else round(width - notch_x, 2)
+        z0 = 0.0 if rng.random() < 0.5 else round(depth - notch_z, 2)
+        notch = (x0, z0, round(x0 + notch_x, 2), round(z0 + notch_z, 2))
     plan = Plan(width, depth, round(float(rng.uniform(2.6, 3.0)), 2), notch)
     plan.kept_clear.append(_door(plan, rng))
     return plan

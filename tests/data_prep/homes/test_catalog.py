@@ -16,8 +16,8 @@ def test_every_class_occurs_in_five_variants_or_more(rooms, room_type, label_set
         for piece in room["pieces"]:
             jids.setdefault(piece["class"], set()).add(piece["jid"])
     assert set(jids) == set(LABEL_SETS[label_set][1:])
-    shop = make_catalog(0, label_set)
-    assert all(len({model.jid for model in models}) >= 5 for models in shop.values())
+    catalog = make_catalog(0, label_set)
+    assert all(len({model.jid for model in models}) >= 5 for models in catalog.values())
 
 
 def test_sizes_keep_to_the_real_percentiles():

@@ -1,10 +1,14 @@
 """What is drawn for a room: how many pieces, and which groups of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from data_prep.homes.bedroom import BEDROOM
 from data_prep.homes.bedroom import COUNTS as BEDROOM_COUNTS
-from data_prep.homes.furnish import count_at, draw_basics, draw_extras
+from data_prep.homes.catalog import make_catalog
+from data_prep.homes.furnish import count_at, draw_basics, draw_extras, furnish
 from data_prep.homes.living import COUNTS as LIVING_COUNTS
 
 
@@ -45,3 +49,12 @@ def test_extras_use_up_all_pieces_and_repeat_only_what_may():
         assert sum({"desk and chair": 2}.get(group, 1) for group in groups[1:]) == 5
         assert sum(group.startswith("desk") for group in groups) == 1
         assert groups.count("lamp") == 2 and groups.count("sofa") <= 1
+
+
+def test_a_room_for_which_no_place_is_found_is_an_error():
+    hopeless = replace(BEDROOM, place_first=lambda furnisher, groups: None)
+    catalog = make_catalog(0, "front3d_bedroom")
+    with pytest.raises(
+        RuntimeError, match=r"No bedroom with 5 pieces found room in 400 tries: \['"
+    ):
+        furnish(hopeless, catalog, np.random.default_rng(0), 0.5)
