@@ -1,8 +1,7 @@
-"""The furniture shop: a seed and a label set in, variants of every class with real sizes out."""
+"""Makes the catalogue of furniture: for each class a dozen models with sizes like the real ones."""
 
 import csv
 import uuid
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib.resources import files
@@ -12,51 +11,59 @@ from zlib import crc32
 import numpy as np
 import trimesh
 
-from data_prep.homes import beds, lamps, seats, sofas, storage, tables
-from data_prep.homes.solids import Parts, fit_to
+from data_prep.homes.furniture import DEEP_SOFA_M, DINING_WIDTH_M, build
+from data_prep.homes.solids import Parts, Vector, fit_to
 from sceneprior.classes import label_set
-
-Family = Callable[[float, float, float, int, np.random.Generator], Parts]
-
-FAMILIES: dict[str, Family] = {
-    "armchair": seats.armchair,
-    "bookshelf": storage.bookshelf,
-    "cabinet": storage.cabinet,
-    "ceiling_lamp": lamps.ceiling_lamp,
-    "chair": seats.chair,
-    "children_cabinet": storage.children_cabinet,
-    "coffee_table": tables.coffee_table,
-    "desk": tables.desk,
-    "double_bed": beds.double_bed,
-    "dressing_chair": seats.dressing_chair,
-    "dressing_table": tables.dressing_table,
-    "kids_bed": beds.kids_bed,
-    "nightstand": storage.nightstand,
-    "pendant_lamp": lamps.pendant_lamp,
-    "shelf": storage.shelf,
-    "single_bed": beds.single_bed,
-    "sofa": sofas.sofa,
-    "stool": seats.stool,
-    "table": tables.table,
-    "tv_stand": storage.tv_stand,
-    "wardrobe": storage.wardrobe,
-}
 
 VARIANTS = 12
 """Models of each class in one data set; five is the least the demo promises."""
 
-ALIKE = {"stool": 0.4, "table": 0.75, "ceiling_lamp": 0.2}
-"""How strongly width, depth and height go together, where it is not 0.3."""
+HEIGHT_CORRELATION = {"stool": 0.4, "table": 0.75, "ceiling_lamp": 0.2}
+"""How strongly height (and depth, unless listed below) goes with width, where it is not 0.3."""
 
-DEPTH_ALIKE = {"table": 0.9, "stool": 0.8, "ceiling_lamp": 0.97, "sofa": 0.75, "armchair": 0.8,
-               "chair": 0.7, "dressing_chair": 0.8, "pendant_lamp": 0.6}  # fmt: skip
-"""How strongly width and depth go together, where it is not ALIKE."""
+DEPTH_CORRELATION = {
+    "table": 0.9, "stool": 0.8, "ceiling_lamp": 0.97, "sofa": 0.75, "armchair": 0.8, "chair": 0.7,
+    "dressing_chair": 0.8, "pendant_lamp": 0.6,
+}  # fmt: skip
+"""How strongly depth goes with width."""
+
+Percentiles = tuple[tuple[float, ...], ...]
+"""Percentiles 10, 50 and 90 of width, of height and of depth in metres."""
 
 # Half of the 41 real models filed as dressing chairs are wider than 2.29 m: no chair is, so we
 # take those for sets of table, mirror and seat (not checked). The seat alone is what a person
 # means by the name, and it lies near their 10th percentile.
-SIZES_OF_OURS: dict[str, tuple[tuple[float, ...], ...]] = {
+SIZES_OF_OURS: dict[str, Percentiles] = {
     "dressing_chair": ((0.50, 0.53, 0.62), (0.53, 0.68, 0.85), (0.50, 0.575, 0.64))
+}
+
+_LOUNGE_CHAIR = "Lounge Chair / Cafe Chair / Office Chair"
+
+# 3D-FUTURE's own spelling: super-category, then categories that models take in turn.
+_CATEGORIES = {
+    "armchair": ("Sofa", "armchair"),
+    "bookshelf": ("Cabinet/Shelf/Desk", "Bookcase / jewelry Armoire"),
+    "cabinet": (
+        "Cabinet/Shelf/Desk",
+        "Sideboard / Side Cabinet / Console Table",
+        "Drawer Chest / Corner cabinet",
+    ),
+    "ceiling_lamp": ("Lighting", "Ceiling Lamp"),
+    "chair": ("Chair", *3 * ("Dining Chair",), _LOUNGE_CHAIR, "Dining Chair", _LOUNGE_CHAIR),
+    "children_cabinet": ("Cabinet/Shelf/Desk", "Children Cabinet"),
+    "coffee_table": ("Table", "Coffee Table", "Tea Table"),
+    "desk": ("Cabinet/Shelf/Desk", "Desk"),
+    "double_bed": ("Bed", "King-size Bed", "Double Bed"),
+    "dressing_chair": ("Chair", "Dressing Chair"),
+    "dressing_table": ("Table", "Dressing Table"),
+    "kids_bed": ("Bed", "Kids Bed"),
+    "nightstand": ("Cabinet/Shelf/Desk", "Nightstand"),
+    "pendant_lamp": ("Lighting", "Pendant Lamp"),
+    "shelf": ("Cabinet/Shelf/Desk", "Shelf"),
+    "single_bed": ("Bed", "Single bed"),
+    "stool": ("Pier/Stool", "Footstool / Sofastool / Bed End Stool / Stool"),
+    "tv_stand": ("Cabinet/Shelf/Desk", "TV Stand"),
+    "wardrobe": ("Cabinet/Shelf/Desk", "Wardrobe"),
 }
 
 
@@ -70,7 +77,7 @@ class Model:
     category: str
     super_category: str
     style_name: str
-    size_m: tuple[float, float, float]
+    size_m: Vector
     """Width, height, depth: full extents along x, y, z."""
     style: int
     seed: tuple[int, ...]
@@ -79,8 +86,7 @@ class Model:
     def parts(self) -> Parts:
         """Closed solids that fill `size_m`, centred, bottom at y = 0."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed))
-        parts = FAMILIES[self.name](*self.size_m, self.style, rng)
-        return fit_to(parts, self.size_m)
+        return fit_to(build(self.name, self.size_m, self.style, rng), self.size_m)
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
@@ -91,12 +97,12 @@ class Model:
         return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
 
 
-Shop = dict[str, list[Model]]
+Catalog = dict[str, list[Model]]
 """Class -> its models."""
 
 
 @lru_cache(maxsize=4)  # meshes are built once a process
-def catalogue(seed: int, label_set_name: str) -> Shop:
+def make_catalog(seed: int, label_set_name: str) -> Catalog:
     """`VARIANTS` models for every class but void; a class looks the same in both label sets."""
     return {name: _variants(seed, name) for name in label_set(label_set_name)[1:]}
 
@@ -106,7 +112,7 @@ def _variants(seed: int, name: str) -> list[Model]:
     rng = np.random.default_rng(np.random.SeedSequence(own))
     models = []
     for index, size in enumerate(_sizes(name, rng)):
-        category, super_category = _category(name, size, index)
+        super_category, category = _category(name, size, index)
         models.append(
             Model(
                 jid=str(uuid.uuid5(uuid.NAMESPACE_OID, f"sceneprior homes {seed} {name} {index}")),
@@ -122,22 +128,35 @@ def _variants(seed: int, name: str) -> list[Model]:
     return models
 
 
-def _sizes(name: str, rng: np.random.Generator) -> list[tuple[float, float, float]]:
+def _category(name: str, size_m: Vector, index: int) -> tuple[str, str]:
+    """How 3D-FUTURE would file a model of this class and size: super-category, category."""
+    width, _, depth = size_m
+    if name == "sofa":
+        short = "Loveseat Sofa" if width < 1.9 else "Three-Seat / Multi-seat Sofa"
+        return "Sofa", "L-shaped Sofa" if depth > DEEP_SOFA_M else short
+    if name == "table":
+        small = "Corner/Side Table" if index % 5 else "Round End Table"
+        return "Table", "Dining Table" if width >= DINING_WIDTH_M else small
+    super_category, *categories = _CATEGORIES[name]
+    return super_category, categories[index % len(categories)]
+
+
+def _sizes(name: str, rng: np.random.Generator) -> list[Vector]:
     """Sizes whose three marginals meet the real 10th, 50th and 90th percentiles.
 
     Width, height and depth are correlated normal scores, each moved in order onto evenly
     spread quantiles, so that a dozen models cover the range as a thousand would.
     """
-    alike = ALIKE.get(name, 0.3)
-    deep_alike = DEPTH_ALIKE.get(name, alike)
+    high_with = HEIGHT_CORRELATION.get(name, 0.3)
+    deep_with = DEPTH_CORRELATION.get(name, high_with)
     even = [NormalDist().inv_cdf((k + 0.5) / VARIANTS) for k in range(VARIANTS)]
     wide = rng.permutation(even)
-    high = alike * wide + np.sqrt(1 - alike**2) * rng.normal(size=VARIANTS)
-    deep = deep_alike * wide + np.sqrt(1 - deep_alike**2) * rng.normal(size=VARIANTS)
+    high = high_with * wide + np.sqrt(1 - high_with**2) * rng.normal(size=VARIANTS)
+    deep = deep_with * wide + np.sqrt(1 - deep_with**2) * rng.normal(size=VARIANTS)
     sides = []
-    for (low, mid, high_end), scores in zip(real_sizes()[name], (wide, high, deep), strict=True):
+    for (p10, p50, p90), scores in zip(real_sizes()[name], (wide, high, deep), strict=True):
         ranks = np.argsort(np.argsort(scores))
-        sides.append([round(at_score(low, mid, high_end, even[rank]), 4) for rank in ranks])
+        sides.append([round(at_score(p10, p50, p90, even[rank]), 4) for rank in ranks])
     return list(zip(*sides, strict=True))
 
 
@@ -152,63 +171,13 @@ def at_score(low: float, middle: float, high: float, score: float) -> float:
 
 
 @lru_cache(maxsize=1)
-def real_sizes() -> dict[str, tuple[tuple[float, ...], ...]]:
-    """Class -> percentiles 10, 50, 90 of width, height and depth in metres."""
+def real_sizes() -> dict[str, Percentiles]:
+    """The percentiles of the sizes of every class."""
     text = files("data_prep.recipes").joinpath("furniture_sizes.csv").read_text()
-    sizes: dict[str, tuple[tuple[float, ...], ...]] = {}
+    sizes: dict[str, Percentiles] = {}
     for row in csv.DictReader(text.splitlines()):
         sizes[row["class"]] = tuple(
             tuple(float(row[f"{side}_{p}"]) for p in ("p10", "p50", "p90"))
             for side in ("width", "height", "depth")
         )
     return sizes | SIZES_OF_OURS
-
-
-# 3D-FUTURE's own spelling: category, then super-category.
-_SPELLINGS: dict[str, tuple[tuple[str, str], ...]] = {
-    "armchair": (("armchair", "Sofa"),),
-    "bookshelf": (("Bookcase / jewelry Armoire", "Cabinet/Shelf/Desk"),),
-    "cabinet": (
-        ("Sideboard / Side Cabinet / Console Table", "Cabinet/Shelf/Desk"),
-        ("Drawer Chest / Corner cabinet", "Cabinet/Shelf/Desk"),
-    ),
-    "ceiling_lamp": (("Ceiling Lamp", "Lighting"),),
-    "chair": (
-        ("Dining Chair", "Chair"),
-        ("Lounge Chair / Cafe Chair / Office Chair", "Chair"),
-    ),
-    "children_cabinet": (("Children Cabinet", "Cabinet/Shelf/Desk"),),
-    "coffee_table": (("Coffee Table", "Table"), ("Tea Table", "Table")),
-    "desk": (("Desk", "Cabinet/Shelf/Desk"),),
-    "double_bed": (("King-size Bed", "Bed"), ("Double Bed", "Bed")),
-    "dressing_chair": (("Dressing Chair", "Chair"),),
-    "dressing_table": (("Dressing Table", "Table"),),
-    "kids_bed": (("Kids Bed", "Bed"),),
-    "nightstand": (("Nightstand", "Cabinet/Shelf/Desk"),),
-    "pendant_lamp": (("Pendant Lamp", "Lighting"),),
-    "shelf": (("Shelf", "Cabinet/Shelf/Desk"),),
-    "single_bed": (("Single bed", "Bed"),),
-    "stool": (("Footstool / Sofastool / Bed End Stool / Stool", "Pier/Stool"),),
-    "tv_stand": (("TV Stand", "Cabinet/Shelf/Desk"),),
-    "wardrobe": (("Wardrobe", "Cabinet/Shelf/Desk"),),
-}
-
-
-def _category(name: str, size: tuple[float, float, float], index: int) -> tuple[str, str]:
-    """How 3D-FUTURE would file a model of this class and size."""
-    width, _, depth = size
-    if name == "sofa":
-        if depth > sofas.DEEP_M:
-            return "L-shaped Sofa", "Sofa"
-        kind = "Loveseat Sofa" if width < 1.9 else "Three-Seat / Multi-seat Sofa"
-        return kind, "Sofa"
-    if name == "table":
-        if width >= tables.DINING_WIDTH_M:
-            return "Dining Table", "Table"
-        return ("Round End Table" if index % 5 == 0 else "Corner/Side Table"), "Table"
-    if name == "chair" and index % 6 in (3, 5):
-        return "Lounge Chair / Cafe Chair / Office Chair", "Chair"
-    if name == "chair":
-        return "Dining Chair", "Chair"
-    spellings = _SPELLINGS[name]
-    return spellings[index % len(spellings)]

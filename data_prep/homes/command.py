@@ -1,4 +1,4 @@
-"""`sceneprior make-homes`: the command around `make_homes`."""
+"""The command `sceneprior make-homes`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +13,7 @@ def make_homes_command(
     seed: Annotated[int, typer.Option(help="The same seed writes the same bytes.")] = 0,
 ) -> None:
     """Make furnished homes in 3D-FRONT's on-disk format."""
-    from data_prep.homes import make_homes
+    from data_prep.homes.make import make_homes
 
     make_homes(out, rooms, room_type, seed)
     typer.echo(f"Wrote {rooms} {room_type} rooms to {out}")

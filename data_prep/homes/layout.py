@@ -1,17 +1,16 @@
-"""Where a piece may stand: a room and what is in it.
+"""The plan of a room: its walls, the pieces in it, and whether one more fits.
 
 Floor coordinates are x and z in metres, the room's outer rectangle from (0, 0). A yaw of a
 radians turns a piece's front from +z towards +x. No two boxes may overlap, seen along the
 room's own axes: stricter than a shopper's eye, and it keeps 3D ground truth free of overlap.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from data_prep.homes.catalog import Model
-
-Vector = tuple[float, float, float]
+from data_prep.homes.solids import Vector
 
 Rect = tuple[float, float, float, float]
 """x0, z0, x1, z1 on the floor."""
@@ -25,26 +24,26 @@ class Piece:
     """A model at its place: middle of its bottom, yaw, and a scale for each of its axes."""
 
     model: Model
-    x: float
-    z: float
-    yaw_rad: float
     scale: Vector
+    x: float = 0.0
+    z: float = 0.0
+    yaw_rad: float = 0.0
     y: float = 0.0
+
+    def at(self, x: float, z: float, yaw_rad: float, y: float = 0.0) -> "Piece":
+        """The same model and scale at another place."""
+        return replace(self, x=float(x), z=float(z), yaw_rad=float(yaw_rad), y=float(y))
 
     @property
     def size_m(self) -> Vector:
         """Width, height, depth after scaling, along the piece's own axes."""
-        return scaled(self.model, self.scale)
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Half extents of its box along the room's x and z."""
-        return half_extent(self.size_m, self.yaw_rad)
+        (w, h, d), (kx, ky, kz) = self.model.size_m, self.scale
+        return w * kx, h * ky, d * kz
 
     @property
     def rect(self) -> Rect:
         """Its box on the floor, along the room's axes."""
-        half_x, half_z = self.extent
+        half_x, half_z = self.half_extent(self.yaw_rad)
         return self.x - half_x, self.z - half_z, self.x + half_x, self.z + half_z
 
     @property
@@ -52,23 +51,23 @@ class Piece:
         """Height of its highest point."""
         return self.y + self.size_m[1]
 
+    def half_extent(self, yaw_rad: float) -> tuple[float, float]:
+        """Half extents of its box, turned by this yaw, along x and z."""
+        sin, cos = abs(np.sin(yaw_rad)), abs(np.cos(yaw_rad))
+        width, _, depth = self.size_m
+        return (width * cos + depth * sin) / 2, (width * sin + depth * cos) / 2
+
     def ahead(self, forward: float, sideways: float = 0.0) -> tuple[float, float]:
         """The floor point `forward` before its middle and `sideways` to its own +x."""
         sin, cos = np.sin(self.yaw_rad), np.cos(self.yaw_rad)
         return self.x + forward * sin + sideways * cos, self.z + forward * cos - sideways * sin
 
-
-def scaled(model: Model, scale: Vector) -> Vector:
-    """Width, height and depth of a model after scaling."""
-    (w, h, d), (kx, ky, kz) = model.size_m, scale
-    return w * kx, h * ky, d * kz
-
-
-def half_extent(size_m: Vector, yaw_rad: float) -> tuple[float, float]:
-    """Half extents along x and z of a box turned by a yaw."""
-    sin, cos = abs(np.sin(yaw_rad)), abs(np.cos(yaw_rad))
-    width, _, depth = size_m
-    return (width * cos + depth * sin) / 2, (width * sin + depth * cos) / 2
+    def clearance(self, reach: float) -> Rect:
+        """The floor before a piece that stands square to the room, as wide as it, `reach` deep."""
+        half_width, half_depth = self.size_m[0] / 2, self.size_m[2] / 2
+        xa, za = self.ahead(half_depth, -half_width)
+        xb, zb = self.ahead(half_depth + reach, half_width)
+        return min(xa, xb), min(za, zb), max(xa, xb), max(za, zb)
 
 
 @dataclass(frozen=True)
@@ -82,15 +81,10 @@ class Wall:
     yaw_rad: float
     """The yaw of a piece whose back is to this wall."""
 
-
-def apron_of(piece: Piece, reach: float) -> Rect:
-    """The floor before a piece that stands square to the room, as wide as it, `reach` deep."""
-    half_width, half_depth = piece.size_m[0] / 2, piece.size_m[2] / 2
-    (xa, za), (xb, zb) = (
-        piece.ahead(half_depth, -half_width),
-        piece.ahead(half_depth + reach, half_width),
-    )
-    return min(xa, xb), min(za, zb), max(xa, xb), max(za, zb)
+    def point(self, along: float, off: float) -> tuple[float, float]:
+        """The floor point `along` metres from the wall's start and `off` metres from the wall."""
+        run_x, run_z = self.along
+        return self.x + run_x * along - run_z * off, self.z + run_z * along + run_x * off
 
 
 def overlaps(a: Rect, b: Rect, gap: float = 0.0) -> bool:
@@ -115,11 +109,17 @@ class Plan:
     @property
     def area(self) -> float:
         """Floor area in square metres."""
-        lost = 0.0
-        if self.notch:
-            x0, z0, x1, z1 = self.notch
-            lost = (x1 - x0) * (z1 - z0)
-        return self.width * self.depth - lost
+        x0, z0, x1, z1 = self.notch or (0.0, 0.0, 0.0, 0.0)
+        return self.width * self.depth - (x1 - x0) * (z1 - z0)
+
+    @property
+    def beside_notch(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """The ranges of x and of z that the notch leaves; the whole room's without a notch."""
+        if self.notch is None:
+            return (0.0, self.width), (0.0, self.depth)
+        x0, z0, x1, z1 = self.notch
+        range_x = (x1, self.width) if x0 == 0 else (0.0, x0)
+        return range_x, (z1, self.depth) if z0 == 0 else (0.0, z0)
 
     @property
     def outline(self) -> list[tuple[float, float]]:
@@ -129,12 +129,11 @@ class Plan:
         if not self.notch:
             return corners
         x0, z0, x1, z1 = self.notch
-        bite = [(x0, z0), (x1, z0), (x1, z1), (x0, z1)]
-        hit = next(k for k, corner in enumerate(corners) if corner in bite)
+        notch = [(x0, z0), (x1, z0), (x1, z1), (x0, z1)]
+        hit = next(k for k, corner in enumerate(corners) if corner in notch)
         # Walk into the notch: the corner gives way to three, of which the middle is its far one.
-        far = bite[(hit + 2) % 4]
-        before, after = bite[(hit - 1) % 4], bite[(hit + 1) % 4]
-        return [*corners[:hit], before, far, after, *corners[hit + 1 :]]
+        inner = [notch[(hit + step) % 4] for step in (-1, 2, 1)]
+        return [*corners[:hit], *inner, *corners[hit + 1 :]]
 
     @property
     def walls(self) -> list[Wall]:
@@ -151,39 +150,34 @@ class Plan:
     def fits(self, piece: Piece, crowding: bool = False) -> bool:
         """Whether the piece stands free inside; `crowding` lets it block all but the door."""
         rect = piece.rect
-        if rect[0] < 0.004 or rect[1] < 0.004:
-            return False
-        if rect[2] > self.width - 0.004 or rect[3] > self.depth - 0.004:
-            return False
         hangs = piece.y > 0
-        if piece.top > self.height - (0.0 if hangs else CEILING_GAP_M):
-            return False
-        if self.notch and overlaps(rect, self.notch, 0.004):
+        if not self._holds(rect, 0.004) or piece.top > self.height - (
+            0 if hangs else CEILING_GAP_M
+        ):
             return False
         for other in self.pieces:
             apart = piece.y >= other.top or other.y >= piece.top
             if not apart and overlaps(rect, other.rect, 0.008):
                 return False
-        if hangs:
-            return True
         closed = self.kept_clear[:1] if crowding else self.kept_clear
-        return not any(overlaps(rect, clear) for clear in closed)
+        return hangs or not any(overlaps(rect, clear) for clear in closed)
 
-    def add(self, piece: Piece, apron: float = 0.0, crowding: bool = False) -> Piece | None:
-        """Stand the piece there if it fits, and keep `apron` metres before it clear."""
+    def add(self, piece: Piece, clearance: float = 0.0, crowding: bool = False) -> bool:
+        """Stand the piece there if it fits, and keep `clearance` metres before it clear."""
         if not self.fits(piece, crowding):
-            return None
-        clear = apron_of(piece, apron) if apron else None
-        if clear and not self._is_free_floor(clear):
-            return None
-        self.pieces.append(piece)
-        if clear:
+            return False
+        if clearance:
+            clear = piece.clearance(clearance)
+            standing = [other.rect for other in self.pieces if other.y == 0]
+            if not self._holds(clear) or any(overlaps(clear, other) for other in standing):
+                return False
             self.kept_clear.append(clear)
-        return piece
+        self.pieces.append(piece)
+        return True
 
-    def _is_free_floor(self, rect: Rect) -> bool:
-        if rect[0] < 0 or rect[1] < 0 or rect[2] > self.width or rect[3] > self.depth:
+    def _holds(self, rect: Rect, gap: float = 0.0) -> bool:
+        """Whether the rectangle lies inside the room, `gap` off its walls."""
+        x0, z0, x1, z1 = rect
+        if x0 < gap or z0 < gap or x1 > self.width - gap or z1 > self.depth - gap:
             return False
-        if self.notch and overlaps(rect, self.notch):
-            return False
-        return not any(piece.y == 0 and overlaps(rect, piece.rect) for piece in self.pieces)
+        return self.notch is None or not overlaps(rect, self.notch, gap)

@@ -1,4 +1,4 @@
-"""A seed in, a folder of homes out: draws houses, has them furnished, writes the data set."""
+"""Makes a data set of furnished homes from a seed."""
 
 import shutil
 import uuid
@@ -10,18 +10,15 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from data_prep.homes.bedroom import BEDS, furnish_bedroom
-from data_prep.homes.catalog import Shop, catalogue
+from data_prep.homes.bedroom import BEDROOM, BEDS
+from data_prep.homes.catalog import Catalog, make_catalog
+from data_prep.homes.furnish import furnish
 from data_prep.homes.layout import Plan
-from data_prep.homes.living import furnish_living_room
+from data_prep.homes.living import LIVING_ROOM
 from data_prep.homes.write import PlacedRoom, house_json, model_record, write_json, write_model
 from sceneprior.errors import InputError
 
-ROOM_TYPES = {
-    "bedroom": ("front3d_bedroom", furnish_bedroom),
-    "living": ("front3d_living", furnish_living_room),
-}
-"""Room type -> its label set, and who furnishes it."""
+ROOM_TYPES = {"bedroom": BEDROOM, "living": LIVING_ROOM}
 
 ROOMS_IN_HOUSE = {1: 0.75, 2: 0.13, 3: 0.08, 4: 0.04}
 """Rooms of a house -> share of the houses."""
@@ -31,8 +28,25 @@ TEST_SHARE = 0.1
 _GOLDEN = (5**0.5 - 1) / 2
 
 
-def write_homes(out: Path, rooms: int, room_type: str, seed: int) -> None:
-    """Write the data set into `out`; it appears there whole, or not at all."""
+def make_homes(out: Path, rooms: int, room_type: str, seed: int) -> None:
+    """Write furnished homes and their furniture as 3D-FRONT and 3D-FUTURE lay them out.
+
+        OUT/3D-FRONT/<house uid>.json
+        OUT/3D-FUTURE-model/<jid>/raw_model.obj, OUT/3D-FUTURE-model/model_info.json
+        OUT/splits/<room type>.csv    rows `<house uid>_<room instanceid>,train|test`
+
+    The same arguments write the same bytes, and room k does not depend on `rooms`. The folder
+    appears whole or not at all.
+
+    Args:
+        out: A folder that does not exist yet, or an empty one.
+        rooms: How many rooms, at least 2; nine in ten are for training.
+        room_type: "bedroom" or "living".
+        seed: 0 or more.
+
+    Raises:
+        InputError: an argument is out of its range, or `out` holds files or cannot be written.
+    """
     out = Path(out).expanduser().absolute()
     _check(out, rooms, room_type, seed)
     staging = out.with_name(f".{out.name}.{getpid()}.partial")
@@ -70,19 +84,21 @@ def _check(out: Path, rooms: int, room_type: str, seed: int) -> None:
 
 
 def _write(folder: Path, rooms: int, room_type: str, seed: int) -> None:
-    shop = catalogue(seed, ROOM_TYPES[room_type][0])
+    catalog = make_catalog(seed, ROOM_TYPES[room_type].label_set)
     for name in ("3D-FRONT", "3D-FUTURE-model", "splits"):
         (folder / name).mkdir()
-    models = [model for variants in shop.values() for model in variants]
+    models = [model for variants in catalog.values() for model in variants]
     console = Console(stderr=True)
     for model in track(models, "Building furniture", console=console, transient=True):
         write_model(folder / "3D-FUTURE-model", model)
     write_json(folder / "3D-FUTURE-model" / "model_info.json", [model_record(m) for m in models])
     contents: dict[str, list[str]] = {}
-    numbers = _house_numbers(rooms, room_type, seed)
-    for house, first, count in track(numbers, "Furnishing homes", console=console, transient=True):
+    houses = _houses(rooms, room_type, seed)
+    for house, numbers in enumerate(
+        track(houses, "Furnishing homes", console=console, transient=True)
+    ):
         uid = str(uuid.uuid5(uuid.NAMESPACE_OID, f"sceneprior homes {seed} {room_type} {house}"))
-        placed = _house(shop, room_type, seed, house, first, count)
+        placed = _house(catalog, room_type, seed, house, numbers)
         write_json(folder / "3D-FRONT" / f"{uid}.json", house_json(uid, placed))
         for room in placed:
             names = sorted(piece.model.name for piece in room.plan.pieces)
@@ -96,42 +112,35 @@ def _seeded(seed: int, *stream: int | str) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence([seed, *words]))
 
 
-def _house_numbers(rooms: int, room_type: str, seed: int) -> list[tuple[int, int, int]]:
-    """(number of the house, number of its first room, how many rooms) of each house."""
+def _houses(rooms: int, room_type: str, seed: int) -> list[range]:
+    """The numbers of the rooms of each house."""
     rng = _seeded(seed, room_type, "houses")
-    houses: list[tuple[int, int, int]] = []
+    houses: list[range] = []
     first = 0
     while first < rooms:
         count = int(rng.choice(list(ROOMS_IN_HOUSE), p=list(ROOMS_IN_HOUSE.values())))
-        count = min(count, rooms - first)
-        houses.append((len(houses), first, count))
+        houses.append(range(first, min(first + count, rooms)))
         first += count
     return houses
 
 
 def _house(
-    shop: Shop, room_type: str, seed: int, house: int, first: int, count: int
+    catalog: Catalog, room_type: str, seed: int, house: int, numbers: range
 ) -> list[PlacedRoom]:
     rng = _seeded(seed, room_type, "house", house)
     x, z = (round(float(value), 2) for value in rng.uniform(-4, 4, 2))
+    # Multiples of the golden ratio spread the rooms evenly over the histogram of counts, so
+    # that a few hundred follow it as closely as thousands of independent draws would.
+    start = _seeded(seed, room_type, "counts").random()
     placed: list[PlacedRoom] = []
-    for number in range(first, first + count):
-        plan = furnished(shop, room_type, seed, number)
+    for number in numbers:
+        share = (start + number * _GOLDEN) % 1.0
+        own = _seeded(seed, room_type, "room", number)
+        plan = furnish(ROOM_TYPES[room_type], catalog, own, share)
         kind = _kind(plan, {room.kind for room in placed})
         placed.append(PlacedRoom(plan, kind, f"{kind}-{1000 + number}", x, z))
         x = round(x + plan.width + float(rng.uniform(0.3, 1.0)), 2)
     return placed
-
-
-def furnished(shop: Shop, room_type: str, seed: int, number: int) -> Plan:
-    """Room `number` of a data set, in its own frame.
-
-    Multiples of the golden ratio spread the rooms evenly over the histogram of counts, so
-    that a few hundred follow it as closely as thousands of independent draws would.
-    """
-    start = _seeded(seed, room_type, "counts").random()
-    share = (start + number * _GOLDEN) % 1.0
-    return ROOM_TYPES[room_type][1](shop, _seeded(seed, room_type, "room", number), share)
 
 
 def _kind(plan: Plan, taken: set[str]) -> str:

@@ -1,4 +1,4 @@
-"""An empty room for so many pieces, and whether a furnished one can be lived in."""
+"""Draws an empty room, and says whether a furnished one can be lived in."""
 
 import numpy as np
 from shapely import box
@@ -17,32 +17,22 @@ SHOULDERS_M = 0.2
 """Half of how wide a passage must be."""
 
 
-def count_at(histogram: dict[int, int], share: float) -> int:
-    """The number of pieces below which this share in [0, 1) of the histogram lies."""
-    total = np.cumsum(list(histogram.values()))
-    return list(histogram)[int(np.searchsorted(total, share * total[-1], side="right"))]
-
-
 def empty_room(
-    rng: np.random.Generator,
-    area_m2: float,
-    least_side_m: float,
-    most_side_m: float,
-    l_shaped_chance: float,
+    rng: np.random.Generator, area_m2: float, sides_m: tuple[float, float], l_shaped_chance: float
 ) -> Plan:
-    """A rectangle of about this area, sometimes with a corner bitten off, and a door."""
+    """A rectangle of about this area with a door, sometimes L-shaped; no side beyond `sides_m`."""
     aspect = rng.uniform(1.0, 1.55)
-    long = float(np.clip(np.sqrt(area_m2 * aspect), least_side_m, most_side_m))
-    short = float(np.clip(area_m2 / long, least_side_m, most_side_m))
+    long = float(np.clip(np.sqrt(area_m2 * aspect), *sides_m))
+    short = float(np.clip(area_m2 / long, *sides_m))
     width, depth = (long, short) if rng.random() < 0.5 else (short, long)
     width, depth = round(width, 2), round(depth, 2)
     notch = None
-    if rng.random() < l_shaped_chance and short > least_side_m + 0.4:
-        bite_x = round(width * rng.uniform(0.15, 0.35), 2)
-        bite_z = round(depth * rng.uniform(0.15, 0.35), 2)
-        x0 = 0.0 if rng.random() < 0.5 else round(width - bite_x, 2)
-        z0 = 0.0 if rng.random() < 0.5 else round(depth - bite_z, 2)
-        notch = (x0, z0, round(x0 + bite_x, 2), round(z0 + bite_z, 2))
+    if rng.random() < l_shaped_chance and short > sides_m[0] + 0.4:
+        notch_x = round(width * rng.uniform(0.15, 0.35), 2)
+        notch_z = round(depth * rng.uniform(0.15, 0.35), 2)
+        x0 = 0.0 if rng.random() < 0.5 else round(width - notch_x, 2)
+        z0 = 0.0 if rng.random() < 0.5 else round(depth - notch_z, 2)
+        notch = (x0, z0, round(x0 + notch_x, 2), round(z0 + notch_z, 2))
     plan = Plan(width, depth, round(float(rng.uniform(2.6, 3.0)), 2), notch)
     plan.kept_clear.append(_door(plan, rng))
     return plan
@@ -55,8 +45,7 @@ def _door(plan: Plan, rng: np.random.Generator) -> Rect:
     middle = 0.1 + DOOR_M / 2
     if rng.random() < 0.5:
         middle = wall.length - middle
-    x = wall.x + wall.along[0] * middle - wall.along[1] * DOOR_M / 2
-    z = wall.z + wall.along[1] * middle + wall.along[0] * DOOR_M / 2
+    x, z = wall.point(middle, DOOR_M / 2)
     return x - DOOR_M / 2, z - DOOR_M / 2, x + DOOR_M / 2, z + DOOR_M / 2
 
 

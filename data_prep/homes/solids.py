@@ -1,7 +1,7 @@
-"""Plain closed solids, the bricks of all furniture: sizes in metres in, outward-facing meshes out.
+"""Closed solids with outward-facing triangles, which all furniture is made of; sizes in metres.
 
-Every solid stands on its own `y`: a piece is described from the floor up, as a joiner would.
-Most are a loft: rings of equally many points, joined ring to ring, capped at both ends.
+Every solid stands on its own `y`: furniture is described from the floor up. Most are a loft:
+rings of equally many points, joined ring to ring and capped at both ends.
 """
 
 import numpy as np
@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 
 Parts = list[trimesh.Trimesh]
 """A piece of furniture: closed solids, which may interpenetrate."""
+
+Vector = tuple[float, float, float]
 
 
 def loft(rings: ArrayLike) -> trimesh.Trimesh:
@@ -24,20 +26,15 @@ def loft(rings: ArrayLike) -> trimesh.Trimesh:
         faces.append(np.stack([low + here, low + after, high + after], axis=1))
         faces.append(np.stack([low + here, high + after, high + here], axis=1))
     fan = np.stack([np.zeros(points - 2, int), here[1:-1], here[2:]], axis=1)
-    faces.append(fan[:, ::-1])
-    faces.append(fan + (count - 1) * points)
-    return _outward(rings.reshape(-1, 3), np.concatenate(faces))
+    triangles = np.concatenate([*faces, fan[:, ::-1], fan + (count - 1) * points])
+    vertices = rings.reshape(-1, 3)
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    if np.einsum("ij,ij->", a, np.cross(b, c)) < 0:  # six times the volume: the faces look inwards
+        triangles = triangles[:, ::-1]
+    return trimesh.Trimesh(vertices, triangles, process=False)
 
 
-def _outward(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    signed_volume = np.einsum("ij,ij->", a, np.cross(b, c))
-    if signed_volume < 0:
-        faces = faces[:, ::-1]
-    return trimesh.Trimesh(vertices, faces, process=False)
-
-
-def block(
+def box(
     w: float, h: float, d: float, x: float = 0.0, y: float = 0.0, z: float = 0.0
 ) -> trimesh.Trimesh:
     """A box, w x h x d, that stands with the middle of its bottom at (x, y, z)."""
@@ -45,46 +42,36 @@ def block(
     return trimesh.creation.box(bounds=bounds)
 
 
-def _rounded_rectangle(half_x: float, half_z: float, radius: float, steps: int) -> np.ndarray:
-    angles = np.linspace(0, np.pi / 2, steps)
-    corners = []
-    for quarter, (sx, sz) in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)]):
-        turn = angles + quarter * np.pi / 2
-        corners.append(
-            np.stack(
-                [
-                    sx * (half_x - radius) + radius * np.cos(turn),
-                    sz * (half_z - radius) + radius * np.sin(turn),
-                ],
-                axis=1,
-            )
-        )
-    return np.concatenate(corners)
-
-
-def soft_block(
+def beveled_box(
     w: float,
     h: float,
     d: float,
     x: float = 0.0,
     y: float = 0.0,
     z: float = 0.0,
-    radius: float = 0.05,
+    bevel: float = 0.05,
     steps: int = 2,
 ) -> trimesh.Trimesh:
-    """A cushion: a box whose edges are rounded by `radius` (60 triangles for steps = 2)."""
-    radius = min(radius, 0.49 * min(w, h, d))
+    """A box whose edges are rounded off by `bevel` (60 triangles for steps = 2)."""
+    bevel = min(bevel, 0.49 * min(w, h, d))
     rings: list[np.ndarray] = []
     angles = np.linspace(0, 1.2, steps)
     for angle in [*(-angles[::-1]), *angles]:
-        inset = radius * (1 - np.cos(angle))
-        rise = np.sign(angle) * radius * np.sin(abs(angle)) / np.sin(1.2)
-        level = h / 2 + (h / 2 - radius) * (1 if len(rings) >= steps else -1) + rise
-        outline = _rounded_rectangle(w / 2 - inset, d / 2 - inset, max(radius - inset, 1e-3), steps)
+        inset = bevel * (1 - np.cos(angle))
+        rise = np.sign(angle) * bevel * np.sin(abs(angle)) / np.sin(1.2)
+        level = h / 2 + (h / 2 - bevel) * (1 if len(rings) >= steps else -1) + rise
+        outline = _rounded_rectangle(w / 2 - inset, d / 2 - inset, max(bevel - inset, 1e-3), steps)
         rings.append(np.insert(outline, 1, level, axis=1))
-    part = loft(rings)
-    part.apply_translation([x, y, z])
-    return part
+    return shifted(loft(rings), x, y, z)
+
+
+def _rounded_rectangle(half_x: float, half_z: float, radius: float, steps: int) -> np.ndarray:
+    corners = []
+    for quarter, (sx, sz) in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)]):
+        turn = np.linspace(0, np.pi / 2, steps) + quarter * np.pi / 2
+        x = sx * (half_x - radius) + radius * np.cos(turn)
+        corners.append(curve(x, sz * (half_z - radius) + radius * np.sin(turn)))
+    return np.concatenate(corners)
 
 
 def lathe(
@@ -95,19 +82,18 @@ def lathe(
     rings = []
     for radius, height in profile:
         radius = max(radius, 2e-3)  # a ring of one point would make empty triangles
-        ring = [x + radius * np.cos(turn), np.full(segments, height), z + radius * np.sin(turn)]
-        rings.append(np.stack(ring, axis=1))
+        rings.append(curve(x + radius * np.cos(turn), height, z + radius * np.sin(turn)))
     return loft(rings)
 
 
-def disc(
+def cylinder(
     radius: float, h: float, x: float = 0.0, y: float = 0.0, z: float = 0.0, segments: int = 20
 ) -> trimesh.Trimesh:
     """An upright cylinder that stands at (x, y, z)."""
     return lathe([(radius, y), (radius, y + h)], x, z, segments)
 
 
-def ball(
+def sphere(
     radius: float, x: float = 0.0, y: float = 0.0, z: float = 0.0, rows: int = 8
 ) -> trimesh.Trimesh:
     """A sphere that stands at (x, y, z)."""
@@ -116,11 +102,17 @@ def ball(
     return lathe(profile, x, z, 2 * rows)
 
 
+def torus(radius: float, thickness: float, y: float = 0.0) -> trimesh.Trimesh:
+    """A torus lying flat, standing on y; `radius` reaches to its outer edge."""
+    sections = {"major_sections": 28, "minor_sections": 8}
+    part = trimesh.creation.torus(radius - thickness / 2, thickness / 2, **sections)
+    return shifted(tilted(part, np.pi / 2), y=y + thickness / 2)
+
+
 def panel(outline_xy: ArrayLike, thickness: float, z: float = 0.0) -> trimesh.Trimesh:
     """A convex outline in the x-y plane, `thickness` deep along z, its middle at z."""
     outline = np.asarray(outline_xy, dtype=float)
-    ring = [np.insert(outline, 2, z + side * thickness / 2, axis=1) for side in (-1, 1)]
-    return loft(ring)
+    return loft([np.insert(outline, 2, z + side * thickness / 2, axis=1) for side in (-1, 1)])
 
 
 def slab(outline_xz: ArrayLike, h: float, y: float = 0.0) -> trimesh.Trimesh:
@@ -129,37 +121,15 @@ def slab(outline_xz: ArrayLike, h: float, y: float = 0.0) -> trimesh.Trimesh:
     return loft([np.insert(outline, 1, level, axis=1) for level in (y, y + h)])
 
 
-def oval(w: float, d: float, segments: int = 24, power: float = 2.0) -> np.ndarray:
-    """(segments, 2) outline of a (super)ellipse; a power above 2 squares its corners."""
-    turn = np.linspace(0, 2 * np.pi, segments, endpoint=False)
-    cos, sin = np.cos(turn), np.sin(turn)
-    stretch = 2 / power
-    x = w / 2 * np.sign(cos) * np.abs(cos) ** stretch
-    return np.stack([x, d / 2 * np.sign(sin) * np.abs(sin) ** stretch], axis=1)
-
-
-def arch(w: float, h: float, shoulder: float, steps: int = 10) -> np.ndarray:
-    """(steps + 2, 2) outline of a panel w wide whose top curves from `shoulder` up to h."""
-    turn = np.linspace(0, np.pi, steps)
-    top = np.stack([w / 2 * np.cos(turn), shoulder + (h - shoulder) * np.sin(turn)], axis=1)
-    return np.concatenate([top, [[-w / 2, 0.0], [w / 2, 0.0]]])
-
-
 def tube(points: ArrayLike, radius: float, segments: int = 8) -> trimesh.Trimesh:
     """A round bar along (points, 3), which must not double back."""
     points = np.asarray(points, dtype=float)
-    along = np.gradient(points, axis=0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    along = _directions(points)
     # One reference for the whole bar keeps its rings from twisting.
     reference = np.eye(3)[np.argmin(np.abs(along).max(axis=0))]
-    turn = np.linspace(0, 2 * np.pi, segments, endpoint=False)[:, None]
     rings = []
     for point, direction in zip(points, along, strict=True):
-        side = np.cross(direction, reference)
-        side /= np.linalg.norm(side)
-        rings.append(
-            point + radius * (np.cos(turn) * side + np.sin(turn) * np.cross(direction, side))
-        )
+        rings.append(point + radius * _circle(direction, np.cross(direction, reference), segments))
     return loft(rings)
 
 
@@ -169,59 +139,90 @@ def rod(
     """A straight round bar, tapering to `end_radius`; 6 sides."""
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     along = (end - start) / np.linalg.norm(end - start)
-    side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
-    side /= np.linalg.norm(side)
-    turn = np.linspace(0, 2 * np.pi, 6, endpoint=False)[:, None]
-    circle = np.cos(turn) * side + np.sin(turn) * np.cross(along, side)
+    circle = _circle(along, np.cross(along, np.eye(3)[np.argmin(np.abs(along))]), 6)
     return loft([start + radius * circle, end + (end_radius or radius) * circle])
+
+
+def _circle(axis: np.ndarray, side: np.ndarray, segments: int) -> np.ndarray:
+    """(segments, 3) points of the unit circle about an axis, the first one towards `side`."""
+    side = side / np.linalg.norm(side)
+    turn = np.linspace(0, 2 * np.pi, segments, endpoint=False)[:, None]
+    return np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
+
+
+def _directions(points: np.ndarray) -> np.ndarray:
+    """The unit direction of a path at each of its points."""
+    along = np.gradient(points, axis=0)
+    return along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
 def ribbon(path_xz: ArrayLike, y0: float, y1: ArrayLike, thickness: float) -> trimesh.Trimesh:
     """A wall that follows (points, 2) seen from above, from y0 up to y1 (one or one a point)."""
     path = np.asarray(path_xz, dtype=float)
-    tops = np.broadcast_to(np.asarray(y1, dtype=float), len(path))
-    along = np.gradient(path, axis=0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    across = np.stack([along[:, 1], -along[:, 0]], axis=1) * thickness / 2
-    rings = []
-    for point, side, top in zip(path, across, tops, strict=True):
-        outer, inner = point + side, point - side
-        rings.append([[*_at(outer, y0)], [*_at(inner, y0)], [*_at(inner, top)], [*_at(outer, top)]])
-    return loft(rings)
+    along = _directions(path)
+    across = curve(along[:, 1], -along[:, 0]) * thickness / 2
+    sides = ((path + across, y0), (path - across, y0), (path - across, y1), (path + across, y1))
+    return loft(np.stack([curve(at[:, 0], y, at[:, 1]) for at, y in sides], axis=1))
 
 
-def _at(point_xz: np.ndarray, y: float) -> tuple[float, float, float]:
-    return point_xz[0], y, point_xz[1]
+def curve(*coordinates: ArrayLike) -> np.ndarray:
+    """(points, 2 or 3) from one array for each coordinate; a number is the same at every point."""
+    return np.stack(np.broadcast_arrays(*coordinates), axis=1)
 
 
-def ring(radius: float, thickness: float, y: float = 0.0) -> trimesh.Trimesh:
-    """A hoop lying flat, standing on y; `radius` reaches to its outer edge."""
-    part = trimesh.creation.torus(
-        radius - thickness / 2, thickness / 2, major_sections=28, minor_sections=8
-    )
-    part.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
-    part.apply_translation([0, y + thickness / 2, 0])
+def oval(w: float, d: float, segments: int = 24, power: float = 2.0) -> np.ndarray:
+    """(segments, 2) outline of a (super)ellipse; a power above 2 squares its corners."""
+    turn = np.linspace(0, 2 * np.pi, segments, endpoint=False)
+    cos, sin = np.cos(turn), np.sin(turn)
+    x = w / 2 * np.sign(cos) * np.abs(cos) ** (2 / power)
+    return curve(x, d / 2 * np.sign(sin) * np.abs(sin) ** (2 / power))
+
+
+def arch(w: float, h: float, shoulder: float, steps: int = 10) -> np.ndarray:
+    """(steps + 2, 2) outline of a panel w wide whose top curves from `shoulder` up to h."""
+    turn = np.linspace(0, np.pi, steps)
+    top = curve(w / 2 * np.cos(turn), shoulder + (h - shoulder) * np.sin(turn))
+    return np.concatenate([top, [[-w / 2, 0.0], [w / 2, 0.0]]])
+
+
+def shifted(part: trimesh.Trimesh, x: float = 0.0, y: float = 0.0, z: float = 0.0):
+    """The part, or each part of a list, moved in place."""
+    for each in part if isinstance(part, list) else [part]:
+        each.apply_translation([x, y, z])
     return part
 
 
 def tilted(
-    part: trimesh.Trimesh, angle_rad: float, axis: ArrayLike, about: ArrayLike
+    part: trimesh.Trimesh, angle_rad: float, about: ArrayLike = (0.0, 0.0, 0.0)
 ) -> trimesh.Trimesh:
-    """The part, turned in place about an axis through a point."""
-    part.apply_transform(trimesh.transformations.rotation_matrix(angle_rad, axis, about))
-    return part
+    """The part, turned in place about the x axis through a point."""
+    return part.apply_transform(
+        trimesh.transformations.rotation_matrix(angle_rad, [1, 0, 0], about)
+    )
+
+
+def scaled(part: trimesh.Trimesh, factors: ArrayLike) -> trimesh.Trimesh:
+    """The part, stretched in place along x, y and z."""
+    return part.apply_scale(factors)
 
 
 def fit_to(parts: Parts, size_m: ArrayLike) -> Parts:
     """Stretch the parts together into a box of this size, centred, bottom at y = 0."""
-    size = np.asarray(size_m, dtype=float)
     low = np.min([part.vertices.min(axis=0) for part in parts], axis=0)
     high = np.max([part.vertices.max(axis=0) for part in parts], axis=0)
     anchor = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    stretch = size / (high - low)
-    fitted = []
-    for part in parts:
-        fitted.append(
-            trimesh.Trimesh((part.vertices - anchor) * stretch, part.faces, process=False)
-        )
-    return fitted
+    stretch = np.asarray(size_m, dtype=float) / (high - low)
+    return [
+        trimesh.Trimesh((part.vertices - anchor) * stretch, part.faces, process=False)
+        for part in parts
+    ]
+
+
+PARTS = {
+    part.__name__: part
+    for part in (
+        box, beveled_box, lathe, cylinder, sphere, torus, panel, slab, tube, rod, ribbon,
+        curve, oval, arch, shifted, tilted, scaled,
+    )
+}  # fmt: skip
+"""What a table of parts may use, by name."""

@@ -1,4 +1,4 @@
-"""Homes to disk, as 3D-FRONT and 3D-FUTURE lay them out: plans and models in, files out."""
+"""Writes homes and furniture to disk as 3D-FRONT and 3D-FUTURE lay them out."""
 
 import json
 import uuid
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from data_prep.homes.catalog import Model
-from data_prep.homes.layout import Piece, Plan
+from data_prep.homes.layout import Piece, Plan, Rect
 
 WALL_M = 0.12
 """How thick a wall is."""
@@ -100,29 +100,27 @@ def shell(plan: Plan) -> list[tuple[str, np.ndarray]]:
 
     Floor, ceiling and inner walls face the room, outer walls face away from it.
     """
-    tiles = np.concatenate([_rectangle(rect) for rect in _rectangles(plan)])
+    tiles = np.concatenate([_tile(rect) for rect in _rectangles(plan)])
     ceiling = tiles[:, ::-1] + np.array([0.0, plan.height, 0.0])
-    inner, outer = [], []
     corners = np.array(plan.outline)
     outside = _offset(corners, WALL_M)
-    for k in range(len(corners)):
-        following = (k + 1) % len(corners)
-        inner.append(_wall(corners[k], corners[following], plan.height))
-        outer.append(_wall(outside[following], outside[k], plan.height))
+    after = np.roll(corners, -1, axis=0), np.roll(outside, -1, axis=0)
+    inner = [_wall(*ends, plan.height) for ends in zip(corners, after[0], strict=True)]
+    outer = [_wall(*ends, plan.height) for ends in zip(after[1], outside, strict=True)]
     walls = [("WallInner", part) for part in inner] + [("WallOuter", part) for part in outer]
     return [("Floor", tiles), ("Ceiling", ceiling), *walls]
 
 
-def _rectangles(plan: Plan) -> list[tuple[float, float, float, float]]:
+def _rectangles(plan: Plan) -> list[Rect]:
+    """The floor as one rectangle, or as two where it is L-shaped."""
+    (x0, x1), (z0, z1) = plan.beside_notch
     if plan.notch is None:
-        return [(0.0, 0.0, plan.width, plan.depth)]
-    x0, z0, x1, z1 = plan.notch
-    whole = (0.0, z1, plan.width, plan.depth) if z0 == 0 else (0.0, 0.0, plan.width, z0)
-    rest = (x1, plan.width) if x0 == 0 else (0.0, x0)
-    return [whole, (rest[0], z0, rest[1], z1)]
+        return [(x0, z0, x1, z1)]
+    return [(0.0, z0, plan.width, z1), (x0, plan.notch[1], x1, plan.notch[3])]
 
 
-def _rectangle(rect: tuple[float, float, float, float]) -> np.ndarray:
+def _tile(rect: Rect) -> np.ndarray:
+    """Two triangles that face up."""
     x0, z0, x1, z1 = rect
     a, b, c, d = (x0, 0.0, z0), (x0, 0.0, z1), (x1, 0.0, z1), (x1, 0.0, z0)
     return np.array([[a, b, c], [a, c, d]])

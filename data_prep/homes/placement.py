@@ -1,0 +1,210 @@
+"""Ways to place one piece in a room: against a wall, before or beside another, free, or hung."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import inf
+
+import numpy as np
+
+from data_prep.homes.catalog import Catalog, Model
+from data_prep.homes.layout import Piece, Plan, Wall
+from data_prep.homes.solids import Vector
+
+
+def random_scale(rng: np.random.Generator) -> Vector:
+    """A few percent along each axis: no real cupboard is exactly the catalogue's."""
+    x, y, z = np.clip(rng.normal(1.0, 0.035, 3), 0.92, 1.08).round(4).tolist()
+    return x, y, z
+
+
+@dataclass
+class Furnisher:
+    """Furnishes one plan from a catalogue with its own random draws.
+
+    Each way of placing tries a few models, scales and places, and returns the piece that now
+    stands in the plan, or None.
+    """
+
+    plan: Plan
+    catalog: Catalog
+    rng: np.random.Generator
+    anchor: Piece = field(init=False)
+    """The piece that the others are arranged around: the bed, or the sofa."""
+
+    def models(self, name: str, below: float = inf, above: float = 0.0) -> list[Model]:
+        """The models of a class whose width in metres lies between these."""
+        return [model for model in self.catalog[name] if above < model.size_m[0] < below]
+
+    def pick(self, models: list[Model]) -> Piece:
+        """One of the models, scaled; it has no place yet."""
+        return Piece(models[self.rng.integers(len(models))], random_scale(self.rng))
+
+    def random_turn(self, chance: float) -> float:
+        """With this chance a turn by 10 to 40 degrees to either side, else none; in radians."""
+        if self.rng.random() >= chance:
+            return 0.0
+        return float(np.radians(self.rng.uniform(10, 40)) * self.rng.choice([-1, 1]))
+
+    def long_wall(self) -> Wall:
+        """One of the four longest walls."""
+        walls = sorted(self.plan.walls, key=lambda wall: -wall.length)[:4]
+        return walls[self.rng.integers(len(walls))]
+
+    def _try(
+        self,
+        models: list[Model],
+        tries: int,
+        propose: Callable[[Piece], Piece | None],
+        clearance: float = 0.0,
+        crowding: bool = False,
+    ) -> Piece | None:
+        for _ in range(tries):
+            piece = propose(self.pick(models))
+            if piece and self.plan.add(piece, clearance, crowding):
+                return piece
+        return None
+
+    def against_wall(
+        self,
+        models: list[Model],
+        clearance: float = 0.0,
+        walls: list[Wall] | None = None,
+        corner: float = 0.45,
+        tries: int = 40,
+        where: float | None = None,
+    ) -> Piece | None:
+        """A piece with its back to a wall; `corner` is the chance to try the wall's ends.
+
+        Args:
+            clearance: Metres that stay clear before it.
+            walls: Only these; all of the plan's if None.
+            where: Metres along the wall where its middle should come, give or take 0.3.
+        """
+        choice = self.plan.walls if walls is None else walls
+        lengths = np.array([wall.length for wall in choice])
+
+        def propose(piece: Piece) -> Piece | None:
+            wall = choice[self.rng.choice(len(choice), p=lengths / lengths.sum())]
+            width, _, depth = piece.size_m
+            slack = wall.length - width
+            if slack < 0.04:
+                return None
+            start = self.rng.uniform(0.01, slack - 0.01)
+            if where is not None:
+                start = np.clip(where - width / 2 + self.rng.normal(0, 0.15), 0.01, slack - 0.01)
+            elif self.rng.random() < corner:
+                start = self.rng.choice([0.02, slack - 0.02])
+            off = depth / 2 + self.rng.uniform(0.006, 0.025)
+            return piece.at(*wall.point(start + width / 2, off), wall.yaw_rad)
+
+        return self._try(models, tries, propose, clearance)
+
+    def opposite(self, anchor: Piece, models: list[Model]) -> Piece | None:
+        """A piece against the wall that the anchor looks at, on its axis."""
+        facing = [
+            wall
+            for wall in self.plan.walls
+            if np.cos(wall.yaw_rad - anchor.yaw_rad) < -0.9 and wall.length > 1.5
+        ]
+        if not facing:
+            return None
+        wall = max(facing, key=lambda wall: wall.length)
+        along_x, along_z = wall.along
+        where = abs(along_x) * abs(anchor.x - wall.x) + abs(along_z) * abs(anchor.z - wall.z)
+        return self.against_wall(models, walls=[wall], where=where, tries=15)
+
+    def before(
+        self,
+        anchor: Piece,
+        models: list[Model],
+        gap: tuple[float, float],
+        sideways: tuple[float, float] = (-0.1, 0.1),
+        angled: float = 0.0,
+        tries: int = 15,
+    ) -> Piece | None:
+        """A piece `gap` metres in front of another, looking back at it; `angled` may turn it."""
+
+        def propose(piece: Piece) -> Piece:
+            yaw = anchor.yaw_rad + np.pi + self.random_turn(angled)
+            reach = piece.half_extent(yaw - anchor.yaw_rad)[1]
+            off = anchor.size_m[2] / 2 + self.rng.uniform(*gap) + reach
+            return piece.at(*anchor.ahead(off, self.rng.uniform(*sideways)), yaw)
+
+        return self._try(models, tries, propose, crowding=True)
+
+    def beside(self, anchor: Piece, piece: Piece, side: int) -> Piece | None:
+        """The piece at the anchor's side (+1: its own +x), their backs on one line."""
+        width, _, depth = piece.size_m
+        for _ in range(4):
+            off = anchor.size_m[0] / 2 + width / 2 + self.rng.uniform(0.02, 0.12)
+            place = anchor.ahead((depth - anchor.size_m[2]) / 2, side * off)
+            placed = piece.at(*place, anchor.yaw_rad)
+            if self.plan.add(placed, crowding=True):
+                return placed
+        return None
+
+    def twins_beside(self, models: list[Model], count: int) -> bool:
+        """The same piece at both sides of the anchor, or at one if `count` is 1."""
+        piece = self.pick(models)
+        sides = [int(side) for side in self.rng.permutation([-1, 1])]
+        if count == 2:
+            return all([self.beside(self.anchor, piece, side) for side in sides])
+        return any(self.beside(self.anchor, piece, side) for side in sides)
+
+    def standing_free(
+        self, models: list[Model], angled: float, towards: tuple[float, float] | None = None
+    ) -> Piece | None:
+        """A light piece near a wall or a corner, turned to a point or along the room's axes."""
+
+        def propose(piece: Piece) -> Piece:
+            width, depth = self.plan.width, self.plan.depth
+            half = max(piece.model.size_m[0], piece.model.size_m[2]) / 2
+            along = self.rng.uniform(half, width - half), self.rng.uniform(half, depth - half)
+            edge = self.rng.integers(4)
+            near = half + self.rng.uniform(0.06, 0.35)
+            x = (near, width - near, along[0], along[0])[edge]
+            z = (along[1], along[1], near, depth - near)[edge]
+            yaw = float(self.rng.integers(4)) * np.pi / 2
+            if towards is not None:
+                exact = np.arctan2(towards[0] - x, towards[1] - z)
+                yaw = float(np.round(exact / (np.pi / 2)) * np.pi / 2)
+            return piece.at(x, z, yaw + self.random_turn(angled))
+
+        return self._try(models, 40, propose)
+
+    def hang(
+        self,
+        models: list[Model],
+        place: tuple[float, float],
+        lowest: float,
+        angled: float,
+        yaw_rad: float = 0.0,
+    ) -> Piece | None:
+        """A lamp that hangs from the ceiling above `place`, with nothing of it below `lowest`."""
+
+        def propose(piece: Piece) -> Piece | None:
+            bottom = self.plan.height - piece.size_m[1]
+            if bottom < lowest:
+                return None
+            yaw = yaw_rad + self.random_turn(angled)
+            x, z = place[0] + self.rng.normal(0, 0.05), place[1] + self.rng.normal(0, 0.05)
+            return piece.at(x, z, yaw, bottom)
+
+        return self._try(models, 20, propose)
+
+    def pair_along_wall(self, group: str, angled: float) -> bool:
+        """ "desk and chair": the first along a wall, the second before it, looking at it."""
+        first, _, seat = group.partition(" and ")
+        table = self.against_wall(self.catalog[first], clearance=0.75 if seat else 0.5)
+        if table is None or not seat:
+            return table is not None
+        seats = self.models(seat, below=0.75)
+        return self.before(table, seats, (0.02, 0.12), angled=angled) is not None
+
+    def lamp_position(self) -> tuple[float, float]:
+        """The middle of the largest rectangle of the floor."""
+        width, depth = self.plan.width, self.plan.depth
+        range_x, range_z = self.plan.beside_notch
+        if (range_x[1] - range_x[0]) * depth > (range_z[1] - range_z[0]) * width:
+            return sum(range_x) / 2, depth / 2
+        return width / 2, sum(range_z) / 2

@@ -1,0 +1,83 @@
+"""Whole data sets: reproducible, split nine to one, there whole or not at all."""
+
+import csv
+import hashlib
+from collections import Counter
+
+import pytest
+from homes_on_disk import TYPES
+
+from data_prep.homes.catalog import make_catalog
+from data_prep.homes.make import make_homes
+from sceneprior.errors import InputError
+
+
+@pytest.mark.parametrize("room_type", TYPES)
+def test_the_same_seed_writes_the_same_bytes(tmp_path, room_type):
+    digests = []
+    for name in ("first", "second"):
+        make_catalog.cache_clear()
+        make_homes(tmp_path / name, 25, room_type, seed=3)
+        digest = hashlib.sha256()
+        for path in sorted((tmp_path / name).rglob("*")):
+            digest.update(str(path.relative_to(tmp_path / name)).encode())
+            digest.update(path.read_bytes() if path.is_file() else b"")
+        digests.append(digest.hexdigest())
+    assert digests[0] == digests[1]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["first", "second"]
+
+
+def test_another_seed_writes_other_rooms_and_a_longer_run_the_same_first_rooms(homes, tmp_path):
+    make_homes(tmp_path / "short", 6, "bedroom", seed=0)
+    make_homes(tmp_path / "other", 6, "bedroom", seed=3)
+    short, long, other = (
+        {path.name: path.read_bytes() for path in (folder / "3D-FRONT").iterdir()}
+        for folder in (tmp_path / "short", homes["bedroom"], tmp_path / "other")
+    )
+    assert not set(long) & set(other)
+    # The last house of the short run may have been cut before its last room.
+    assert sum(long.get(name) == content for name, content in short.items()) >= len(short) - 1
+
+
+@pytest.mark.parametrize("room_type", TYPES)
+def test_split_lists_every_room_once_nine_to_one(homes, rooms, room_type):
+    text = (homes[room_type] / "splits" / f"{room_type}.csv").read_text()
+    listed = dict(csv.reader(text.splitlines()))
+    assert len(listed) == 400 == len(text.splitlines())
+    assert set(listed) == {room["id"] for room in rooms[room_type]}
+    assert Counter(listed.values()) == {"train": 360, "test": 40}
+    instance_ids = [name.split("_", 1)[1] for name in listed]
+    assert len(set(instance_ids)) == 400
+    several = Counter(Counter(room["house"] for room in rooms[room_type]).values())
+    assert set(several) == {1, 2, 3, 4}
+    share = 1 - several[1] / several.total()
+    assert 0.15 < share < 0.35  # a quarter of about 290 houses: three deviations are 0.08
+
+
+def test_bad_input_is_one_sentence_and_leaves_nothing(tmp_path):
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="already holds files; choose another folder"):
+        make_homes(full, 4, "bedroom", 0)
+    with pytest.raises(InputError, match="is a file; choose a new folder"):
+        make_homes(full / "notes.txt", 4, "bedroom", 0)
+    with pytest.raises(InputError, match="at least 2 rooms"):
+        make_homes(tmp_path / "new", 1, "bedroom", 0)
+    with pytest.raises(InputError, match="choose one of bedroom, living"):
+        make_homes(tmp_path / "new", 4, "kitchen", 0)
+    with pytest.raises(InputError, match="A seed is 0 or more"):
+        make_homes(tmp_path / "new", 4, "bedroom", -1)
+    with pytest.raises(InputError, match="Cannot write beside"):
+        make_homes(full / "notes.txt" / "new", 4, "bedroom", 0)
+    assert [path.name for path in tmp_path.iterdir()] == ["full"]
+
+
+def test_an_interrupted_run_leaves_nothing(tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("data_prep.homes.make._write_split", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        make_homes(tmp_path / "new", 2, "living", 0)
+    assert not list(tmp_path.iterdir())
