@@ -81,6 +81,11 @@ class TrainedSampler:
     remembers_rooms = False
 
 
+def stages_of(config: RunConfig) -> tuple[str, ...]:
+    """The stages that a run trains, in order."""
+    return STAGES_OF[config.stages]
+
+
 def checkpoint_extra(config: RunConfig, room_ids: tuple[str, ...]) -> dict[str, Any]:
     """What a checkpoint says of its run beside the weights."""
     return {"sceneprior": {"room_ids": list(room_ids), "label_set": config.label_set}}
