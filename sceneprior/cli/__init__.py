@@ -11,14 +11,7 @@ import typer
 
 from data_prep.cli import add_commands
 from sceneprior import __version__
-from sceneprior.cli import (
-    evaluating,
-    experiments,
-    generating,
-    reconstruction,
-    retrieval,
-    training,
-)
+from sceneprior.cli import evaluating, experiments, generating, reconstruction, retrieval, training
 from sceneprior.errors import InputError
 
 app = typer.Typer(
@@ -30,19 +23,12 @@ app = typer.Typer(
 )
 add_commands(app)
 for command in (
-    training.fit,
-    training.report,
-    generating.synthesize,
-    generating.interpolate,
-    generating.complete,
-    retrieval.retrieve,
-    reconstruction.reconstruct,
-    reconstruction.eval_svr,
-    evaluating.eval_fid,
-    evaluating.convert_boxes,
-    experiments.compare,
-    experiments.demo,
-):
+    training.fit, training.report,
+    generating.synthesize, generating.interpolate, generating.complete, retrieval.retrieve,
+    reconstruction.reconstruct, reconstruction.eval_svr,
+    evaluating.eval_fid, evaluating.convert_boxes,
+    experiments.compare, experiments.demo,
+):  # fmt: skip
     app.command()(command)
 
 

@@ -26,11 +26,7 @@ from sceneprior.errors import InputError
 from sceneprior.files import only_writer, read_json, write_json
 
 SAMPLE_EVERY_S = 0.5
-_COSTS: dict[str, Callable[[float, float], float]] = {
-    "cpu_s": add,
-    "wall_s": add,
-    "peak_memory_gib": max,
-}
+_COSTS: dict[str, Callable] = {"cpu_s": add, "wall_s": add, "peak_memory_gib": max}
 """What is noted of a command, and how it combines where a stopped one goes on."""
 
 
@@ -73,11 +69,8 @@ class StepRunner:
     ) -> None:
         """Run a step, note it in `folder`, and forget the steps after it, whose results are old.
 
-        Args:
-            step: What to run.
-            folder: Where its `steps.json` lies.
-            log: Takes what the command prints; None leaves that to the terminal.
-            unshown: Further arguments, neither printed nor noted.
+        What the command prints goes to `log`, or to the terminal; `unshown` are further arguments,
+        neither printed nor noted.
 
         Raises:
             InputError: the command failed; its own sentence, where it left one in `log`.
@@ -90,17 +83,14 @@ class StepRunner:
         if step.continues is not None and step.continues.exists():
             took = {cost: noted.get(step.name, {}).get(cost) for cost in _COSTS}
         earlier = dict(takewhile(lambda item: item[0] != step.name, noted.items()))
-        entry: dict[str, Any] = {
-            "arguments": step.arguments, "depends_on": step.depends_on, "finished": False,
-        }  # fmt: skip
+        entry: dict[str, Any] = {"arguments": step.arguments, "depends_on": step.depends_on}
         # Without costs, until it ends: those of a command that is killed are unknown.
         write_json(folder / "steps.json", {**earlier, step.name: entry})
         ended = self.call([*step.arguments, *unshown], log)
         status, costs = ended or (None, dict.fromkeys(_COSTS, 0.0))
         for cost, combine in _COSTS.items():
             entry[cost] = None if took[cost] is None else combine(took[cost], costs[cost])
-        entry["finished"] = status == 0
-        write_json(folder / "steps.json", {**earlier, step.name: entry})
+        write_json(folder / "steps.json", {**earlier, step.name: entry | {"finished": status == 0}})
         if status and not self.stopped:
             raise InputError(failure_reason(log, status))
 
