@@ -24,6 +24,7 @@ from sceneprior.files import only_writer
 from sceneprior.training.checkpoints import load_any_run
 
 SOFTWARE = CompareOptions("software")
+OTHER_WAYS_TO_STOP = (("SIGINT", False), ("SIGHUP", False), ("SIGTERM", True))
 METHODS = {
     "ours": {"title": "Ours", "group": "2D"},
     "lstm": {
@@ -274,7 +275,11 @@ def test_costs_of_a_run_add_up_and_are_unknown_after_a_kill(begun, toy_shards, c
 
 @pytest.mark.parametrize(
     ("name", "background"),
-    [("SIGINT", False), ("SIGTERM", False), ("SIGHUP", False), ("SIGTERM", True)],
+    [
+        ("SIGTERM", False),
+        # The runner's own tests hold these, without training.
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in OTHER_WAYS_TO_STOP),
+    ],
 )
 def test_a_signal_to_compare_alone_stops_its_commands_which_save_what_they_have(
     written, tmp_path, start, name, background

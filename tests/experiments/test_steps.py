@@ -3,6 +3,7 @@
 import json
 import signal
 import sys
+import time
 
 import pytest
 
@@ -49,13 +50,38 @@ def test_nothing_begins_once_the_runner_is_stopped(version, tmp_path):
     assert not (tmp_path / "steps.json").exists()
 
 
-def test_signals_are_answered_only_while_a_runner_is_open(tmp_path):
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_signals_are_answered_only_while_a_runner_is_open(tmp_path, name):
+    number = signal.Signals[name]
+    before = signal.signal(number, signal.SIG_DFL)
     with pytest.raises(KeyboardInterrupt), open_runner(tmp_path) as runner:
         with pytest.raises(InputError, match="Another run is writing to"), only_writer(tmp_path):
             pass
-        signal.raise_signal(signal.SIGTERM)
-    assert runner.stopped and signal.getsignal(signal.SIGTERM) == before
+        signal.raise_signal(number)
+    assert runner.stopped and signal.signal(number, before) == signal.SIG_DFL
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_a_stop_reaches_commands_even_in_the_background(tmp_path, monkeypatch, background):
+    """A stand-in for the interpreter: it waits, and ends as SIGINT wants it."""
+    script = tmp_path / "python"
+    script.write_text(f"#!{sys.executable}\nprint('on', flush=True)\nimport time; time.sleep(60)\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(script))
+    # A shell starts what runs in the background so, and children inherit it.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN if background else signal.SIG_DFL)
+    log = tmp_path / "log"
+    try:
+        with open_runner(tmp_path) as runner:
+            ended = runner.pool.submit(runner.call, [], log)
+            while not (log.exists() and log.read_text()):
+                time.sleep(0.01)
+            runner.stop()
+            status, costs = ended.result()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert status != 0 and costs["wall_s"] < 30
+    assert "KeyboardInterrupt" in log.read_text()
 
 
 def test_memory_is_that_of_a_command_with_its_descendants(tmp_path, monkeypatch):
