@@ -1,4 +1,4 @@
-"""The baselines with 3D supervision: they learn, stop, resume, and every verb takes their runs."""
+"""The baselines with 3D supervision: they learn, stop, resume, and all commands take their runs."""
 
 import csv
 import shutil

@@ -1,4 +1,4 @@
-"""The baselines with 2D supervision: they train, stop, resume, and every verb takes their runs."""
+"""The baselines with 2D supervision: they train, stop, resume, and all commands take their runs."""
 
 import csv
 import shutil
