@@ -1,5 +1,7 @@
 # Two commands: `make demo` and `make test`. Both set up .venv first.
 PYTHON ?= python3.11
+# Which tests: without those that take long, or `make test MARK=` for all, as CI does.
+MARK ?= not slow
 BIN := .venv/bin
 
 .PHONY: setup demo test lint clean
@@ -18,7 +20,7 @@ demo: setup
 	$(BIN)/sceneprior demo
 
 test: setup
-	$(BIN)/python -m pytest -n 2 --dist loadscope
+	$(BIN)/python -m pytest -n 2 --dist loadscope -m "$(MARK)"
 
 lint: setup
 	$(BIN)/ruff check .

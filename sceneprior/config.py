@@ -80,8 +80,7 @@ def load_any_run(run: Path, checkpoint: str = "final") -> Trained:
         InputError: the folder is no run, or its checkpoint is missing or damaged.
     """
     config = run_config(run)
-    names = [stage.name for stage in config.stages()]
-    return config.load(*find_checkpoint(Path(run), names, checkpoint))
+    return config.load(*find_checkpoint(Path(run), config.stage_names, checkpoint))
 
 
 def load_run(run: Path, checkpoint: str = "final") -> TrainedPrior:

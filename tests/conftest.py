@@ -1,7 +1,9 @@
 """What every test may use: toy rooms on disk, and a number generator."""
 
 import contextlib
+import fcntl
 import os
+import shutil
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
@@ -23,11 +25,30 @@ numba.config.THREADING_LAYER = os.environ["NUMBA_THREADING_LAYER"]
 
 
 @pytest.fixture(scope="session")
-def toy_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Makes a folder once for all processes of a test run: the first makes it, others wait."""
+    base = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        base = base.parent  # which the workers share
+
+    def made_once(name: str, make: Callable[[Path], None]) -> Path:
+        folder, done = base / "shared" / name, base / "shared" / f"{name}.done"
+        folder.parent.mkdir(exist_ok=True)
+        with (base / "shared" / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)  # of a worker that failed
+                make(folder)
+                done.touch()
+        return folder
+
+    return made_once
+
+
+@pytest.fixture(scope="session")
+def toy_shards(made_once: Callable[..., Path]) -> Path:
     """12 training and 4 test rooms of boxes, 8 views each. Tests read it and change nothing."""
-    folder = tmp_path_factory.mktemp("toy") / "shards"
-    write_toy_shards(folder)
-    return folder
+    return made_once("shards", write_toy_shards)
 
 
 @pytest.fixture
@@ -68,10 +89,9 @@ def torch_rng() -> torch.Generator:
 
 
 @pytest.fixture(scope="session")
-def toy_run(toy_shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def toy_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
     """Both stages trained on the toy rooms for a few epochs. Tests read it and change nothing."""
     from sceneprior.training.fit import fit
 
-    run = tmp_path_factory.mktemp("toy") / "run"
-    fit(tiny_config(toy_shards, layout__epochs=20), run, trainer_options={"accelerator": "cpu"})
-    return run
+    config = tiny_config(toy_shards, layout__epochs=20)
+    return made_once("run", lambda run: fit(config, run, trainer_options={"accelerator": "cpu"}))

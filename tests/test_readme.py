@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -16,10 +18,11 @@ def readme_commands(heading: str) -> list[str]:
     return [line.split("#")[0].strip() for line in block.group(1).splitlines() if line.strip()]
 
 
+@pytest.mark.slow
 def test_steps_run_as_printed(tmp_path):
     for command in readme_commands("Step by step"):
-        verb, *arguments = shlex.split(command)
-        assert verb == "sceneprior"
+        program, *arguments = shlex.split(command)
+        assert program == "sceneprior"
         done = subprocess.run(
             [sys.executable, "-m", "sceneprior", *arguments],
             cwd=tmp_path, capture_output=True, text=True, timeout=600,
@@ -39,11 +42,11 @@ def test_two_commands_are_targets_of_the_makefile():
         assert f"\n{command.split()[1]}: setup\n" in makefile
 
 
-def test_every_verb_is_in_the_table():
+def test_every_command_is_in_the_table():
     from typer.main import get_command
 
     from sceneprior.cli import app
 
     text = (ROOT / "README.md").read_text()
-    verbs = set(re.findall(r"^\| `([a-z-]+)` \|", text, re.MULTILINE))
-    assert verbs == set(get_command(app).commands)
+    commands = set(re.findall(r"^\| `([a-z-]+)` \|", text, re.MULTILINE))
+    assert commands == set(get_command(app).commands)

@@ -1,4 +1,7 @@
-"""The `sceneprior` command: verbs mounted, and every failure one sentence."""
+"""The `sceneprior` command: all its subcommands, and every failure as one sentence.
+
+A command's module imports what it needs only when the command is called, so that `--help` is fast.
+"""
 
 import os
 import sys
@@ -8,8 +11,7 @@ import typer
 
 from data_prep.cli import add_commands
 from sceneprior import __version__
-from sceneprior.cli import comparing, generating, reconstruction, retrieval, training
-from sceneprior.cli import evaluating as judging
+from sceneprior.cli import evaluating, experiments, generating, reconstruction, retrieval, training
 from sceneprior.errors import InputError
 
 app = typer.Typer(
@@ -20,8 +22,14 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 add_commands(app)
-for verbs in (training, generating, retrieval, reconstruction, judging, comparing):
-    verbs.add_commands(app)
+for command in (
+    training.fit, training.report,
+    generating.synthesize, generating.interpolate, generating.complete, retrieval.retrieve,
+    reconstruction.reconstruct, reconstruction.eval_svr,
+    evaluating.eval_fid, evaluating.convert_boxes,
+    experiments.compare, experiments.demo,
+):  # fmt: skip
+    app.command()(command)
 
 
 def _show_version(wanted: bool | None) -> None:
@@ -34,7 +42,9 @@ def _show_version(wanted: bool | None) -> None:
 def _options(
     version: Annotated[
         bool | None,
-        typer.Option("--version", callback=_show_version, is_eager=True, help="Say it."),
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Print the version and exit."
+        ),
     ] = None,
 ) -> None:
     pass
@@ -44,10 +54,7 @@ def main() -> None:
     """Run the command; whatever is wrong with the input is one sentence and exit status 2."""
     try:
         app()
-    except InputError as error:
-        typer.echo(f"Error: {error}", err=True)
-        sys.exit(2)
-    except FloatingPointError as error:
+    except (InputError, FloatingPointError) as error:
         typer.echo(f"Error: {error}", err=True)
         sys.exit(2)
     except Exception as error:

@@ -8,18 +8,13 @@ import typer
 from sceneprior.cli.options import (
     CheckpointOption,
     DistributionOption,
+    InceptionOption,
     OverwriteOption,
     RendererOption,
 )
 from sceneprior.errors import InputError
 
 GENERATED = 1000
-
-
-def add_commands(app: typer.Typer) -> None:
-    """Mount eval-fid and convert-boxes."""
-    app.command("eval-fid")(eval_fid)
-    app.command("convert-boxes")(convert_boxes)
 
 
 def eval_fid(
@@ -36,9 +31,7 @@ def eval_fid(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the rooms, folds and resamples.")] = 0,
-    inception: Annotated[
-        Path | None, typer.Option(help="inception-2015-12-05.pt (TorchScript), for FID proper.")
-    ] = None,
+    inception: InceptionOption = None,
     alexnet: Annotated[
         Path | None, typer.Option(help="alexnet-owt-7be5be79.pth, for the paper's SCA.")
     ] = None,

@@ -14,12 +14,6 @@ from sceneprior.cli.options import (
 )
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Mount synthesize, interpolate and complete."""
-    for verb in (synthesize, interpolate, complete):
-        app.command()(verb)
-
-
 def synthesize(
     run: RunOption,
     out: Annotated[Path, typer.Option(help="Folder for the scenes.")],

@@ -1,4 +1,4 @@
-"""Options that several verbs share."""
+"""Options that several commands share."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,3 +18,7 @@ CheckpointOption = Annotated[
     typer.Option(help="final, or best: what generated best while training (samples.every)."),
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+InceptionOption = Annotated[
+    Path | None, typer.Option(help="inception-2015-12-05.pt (TorchScript), for FID proper.")
+]
+AcceleratorOption = Annotated[str, typer.Option(help="cpu, gpu or auto; Lightning's option.")]

@@ -24,12 +24,6 @@ RefineOption = Annotated[
 ]
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Mount reconstruct and eval-svr."""
-    app.command()(reconstruct)
-    app.command("eval-svr")(eval_svr)
-
-
 def reconstruct(
     run: RunOption,
     out: Annotated[Path, typer.Option(help="Folder for the rooms.")],

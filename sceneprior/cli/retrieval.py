@@ -8,11 +8,6 @@ import typer
 from sceneprior.cli.options import OverwriteOption, RendererOption
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Mount retrieve."""
-    app.command()(retrieve)
-
-
 def retrieve(
     scenes: Annotated[Path, typer.Option(help="Folder of scene JSONs, with their GLBs.")],
     models: Annotated[Path, typer.Option(help="3D-FUTURE-model, or a folder like it.")],

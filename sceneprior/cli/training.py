@@ -1,18 +1,16 @@
-"""Verbs that train, and show what was learnt; what a verb needs it imports when called."""
+"""Commands that train a run and show what it learnt: fit and report."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from sceneprior.cli.options import CheckpointOption, RendererOption, RunOption
-
-
-def add_commands(app: typer.Typer) -> None:
-    """Mount fit, report and demo."""
-    app.command()(fit)
-    app.command()(report)
-    app.command()(demo)
+from sceneprior.cli.options import (
+    AcceleratorOption,
+    CheckpointOption,
+    RendererOption,
+    RunOption,
+)
 
 
 def fit(
@@ -28,7 +26,7 @@ def fit(
         list[str] | None, typer.Option(help="csv, tensorboard, wandb. Repeatable.")
     ] = None,
     devices: Annotated[str, typer.Option(help="How many, or which; Lightning's option.")] = "auto",
-    accelerator: Annotated[str, typer.Option(help="cpu, gpu, auto; Lightning's option.")] = "auto",
+    accelerator: AcceleratorOption = "auto",
     precision: Annotated[str, typer.Option(help="32-true, bf16-mixed; Lightning's option.")] = (
         "32-true"
     ),
@@ -36,7 +34,7 @@ def fit(
     """Train a run: the layout stage, then the shape stage; or a baseline (`method`)."""
     from sceneprior.config import load_config
 
-    settings = load_config(config, tuple(set_ or ()))
+    settings = load_config(config, tuple(set_ or ()))  # before what takes seconds to import
     folder = run or Path("runs") / Path(config).stem
     from sceneprior.experiments.evaluate_samples import SampleEvaluator
     from sceneprior.training.fit import fit as run_fit
@@ -76,18 +74,3 @@ def report(
         run, scores or run / "scores.json", target, seed, tuple(command or ()), renderer, checkpoint
     )
     typer.echo(f"Wrote {target}")
-
-
-def demo(
-    out: Annotated[Path, typer.Option(help="Folder for everything the demo makes.")] = Path(
-        "out/demo"
-    ),
-    config: Annotated[str, typer.Option(help="What to train.")] = "demo.yaml",
-    rooms: Annotated[int, typer.Option(min=20, help="Homes to make.")] = 480,
-    count: Annotated[int, typer.Option(min=2, help="Rooms to generate and judge.")] = 200,
-    renderer: RendererOption = "auto",
-) -> None:
-    """The whole path on homes made here: homes, shards, fit, new rooms, scores, a page."""
-    from sceneprior.experiments.demo import run_demo
-
-    run_demo(out, config, rooms, count, renderer)

@@ -1,35 +1,35 @@
-"""A comparison in; trained and judged runs, one table and a figure for each kind of room out.
+"""Trains and evaluates the runs of a comparison, and writes its tables and pictures.
 
-Each run is two commands of `sceneprior`, `fit` and `eval-fid`, in processes of their own: whoever
-doubts a figure types them again. What a run cost is noted beside it; finished runs are kept.
+A run is two steps, `fit` and `eval-fid`; what is done is kept.
 """
 
-import os
-import signal
-import threading
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
-from sceneprior.config import load_config
+from sceneprior.config import load_any_run, load_config
 from sceneprior.errors import InputError
 from sceneprior.evaluation.metrics.image_metrics import check_inception
 from sceneprior.experiments.comparison import Comparison, Run, runs_of
 from sceneprior.experiments.figure import write_figure
-from sceneprior.experiments.steps import (
-    Commands,
-    Manner,
-    costs_of,
-    is_judged,
-    is_trained,
-    read_result,
-)
+from sceneprior.experiments.steps import Step, is_done, open_runner, read_journal, read_result
 from sceneprior.experiments.table import Row, write_tables
-from sceneprior.files import only_writer
 from sceneprior.offscreen import open_renderer
 from sceneprior.shards import iterate_rooms
+from sceneprior.training.checkpoints import read_checkpoint
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """How all runs of a comparison are trained and evaluated."""
+
+    renderer: str = "auto"
+    inception: Path | None = None
+    """NVIDIA's `inception-2015-12-05.pt`; None leaves FID out."""
+    accelerator: str = "auto"
+    """That trains the runs, one device each: Lightning's word."""
+    jobs: int = 1
+    """Runs at a time."""
 
 
 @dataclass(frozen=True)
@@ -41,126 +41,150 @@ class Compared:
     failures: list[str]
     """A sentence for each run that failed; the table is written without it."""
     left_out: list[str]
-    """Runs that are done, but were judged otherwise than the table's."""
+    """Runs that are done, but were evaluated otherwise than the table's."""
 
 
 def compare(
-    comparison: Comparison,
-    part: Comparison,
-    out: Path,
-    jobs: int,
-    renderer: str,
-    inception: Path | None = None,
-    accelerator: str = "auto",
+    comparison: Comparison, part: Comparison, out: Path, options: CompareOptions
 ) -> Compared:
-    """Train and judge every run that is not done yet, then write `table.*` and the figures.
+    """Train and evaluate every run that is not done yet, then write `table.*` and the figures.
 
     Args:
         comparison: From `load_comparison`; the tables show all of it that is done.
         part: What to do now: from `part_of`, or the same.
         out: `<rooms>/<method>/seed<k>/` in it holds a run; the tables lie beside them.
-        jobs: Runs at a time.
-        renderer: A renderer's name, or `auto`.
-        inception: NVIDIA's `inception-2015-12-05.pt`; None leaves FID out.
-        accelerator: That trains the runs, one device each: Lightning's word.
+        options: Of all runs.
 
     Raises:
         InputError: shards are missing, another `compare` is writing to `out`, or the renderer or
             the weights cannot be used.
         KeyboardInterrupt: stopped by Ctrl-C, SIGTERM or SIGHUP; the same call goes on.
     """
-    if inception is not None:
-        check_inception(inception)
-    drawing = open_renderer(renderer)
-    counts = {key: _count(comparison, key) for key in part.rooms}
-    manner = Manner(comparison.sampling_seed, renderer, inception, accelerator)
-    # Threads of several jobs on one core wait for each other, spinning: each job has its share.
-    commands = Commands(max(1, (os.cpu_count() or 1) // jobs) if jobs > 1 else None)
-    failures: list[str | None] = []
-    with _alone_in(out), _ended_as_by_ctrl_c(), ThreadPoolExecutor(max_workers=jobs) as pool:
+    if options.inception is not None:
+        check_inception(options.inception)
+    renderer = open_renderer(options.renderer)
 
-        def work(run: Run) -> str | None:
-            return commands.train_and_judge(run, manner, counts[run.rooms])
+    @cache
+    def count(rooms: str) -> int:
+        """How many rooms each run generates."""
+        if comparison.count is not None:
+            return comparison.count
+        shards = Path(load_config(comparison.rooms[rooms].config).data.shards)
+        return sum(1 for _ in iterate_rooms(shards, "train"))
 
+    def scoring(run: Run) -> Step:
+        return scoring_step(run, count(run.rooms), comparison.sampling_seed, options)
+
+    def train_and_evaluate(run: Run) -> str | None:
         try:
-            failures = list(pool.map(work, runs_of(part, out)))
-        finally:
-            commands.stop()  # what still runs, after Ctrl-C or a fault of ours
-        judged = [run for run in runs_of(comparison, out) if is_judged(run) and _is_trained(run)]
-        counts |= {key: _count(comparison, key) for key in {run.rooms for run in judged}}
-        done = [run for run in judged if is_judged(run, manner.asked(counts[run.rooms]))]
+            if not keeps_settings(run):
+                raise InputError(
+                    f"{run.folder} holds a run of other settings than the comparison now asks "
+                    "for; delete it to train anew, or name another --out."
+                )
+            for step in (training_step(run, options), scoring(run)):
+                if not is_done(step, run.folder):
+                    runner.do(step, run.folder, run.folder / f"{step.name}.log")
+        except InputError as error:
+            return f"{run.title}: {error}"
+        except OSError as error:
+            where = error.filename or run.folder
+            return f"{run.title}: {where} cannot be written ({error.strerror})"
+        return None
+
+    for rooms in part.rooms:
+        count(rooms)
+    with open_runner(out, options.jobs) as runner:
+        failures = list(runner.pool.map(train_and_evaluate, runs_of(part, out)))
+        evaluated = [
+            run
+            for run in runs_of(comparison, out)
+            if (run.folder / "scores.json").is_file()
+            and keeps_settings(run)
+            and is_done(training_step(run, options), run.folder)
+            and is_done(scoring(run), run.folder, as_asked=False)
+        ]
+        done = [run for run in evaluated if is_done(scoring(run), run.folder)]
         if done:
-            write_tables(_rows(comparison, done), out)
+            write_tables([_row(comparison, run) for run in done], out)
         for key in comparison.rooms:
             first = {run.method: run for run in reversed(done) if run.rooms == key}
             if own := [first[method] for method in comparison.methods if method in first]:
-                write_figure(comparison, own, counts[key], out / f"{key}.png", drawing)
+                write_figure(comparison, own, count(key), out / f"{key}.png", renderer)
     return Compared(
         out / "table.md" if done else None,
         [failure for failure in failures if failure],
-        [f"{run.rooms}, {run.method}, seed {run.seed}" for run in judged if run not in done],
+        [run.title for run in evaluated if run not in done],
     )
 
 
-def _count(comparison: Comparison, rooms: str) -> int:
-    """How many rooms each run generates."""
-    if comparison.count is not None:
-        return comparison.count
-    shards = Path(load_config(comparison.rooms[rooms].config).data.shards)
-    return sum(1 for _ in iterate_rooms(shards, "train"))
+def training_step(run: Run, options: CompareOptions) -> Step:
+    """`fit` of a run; it is never redone for other settings, but refused (`keeps_settings`)."""
+    folder = run.folder / "run"
+    settings = [word for setting in run.settings for word in ("--set", setting)]
+    last = load_config(run.config, run.settings).stage_names[-1]
+    return Step(
+        "fit",
+        # One device: several would share each batch, or train on larger ones.
+        [
+            "fit", "--config", run.config, "--run", str(folder), *settings, "--logger", "csv",
+            "--accelerator", options.accelerator, "--devices", "1", "--resume",
+        ],
+        result=folder / last / "final.ckpt",
+        depends_on=[],
+        continues=folder / "config.yaml",
+    )  # fmt: skip
 
 
-def _is_trained(run: Run) -> bool:
+def scoring_step(run: Run, count: int, seed: int, options: CompareOptions) -> Step:
+    """`eval-fid` of a trained run; it depends on what the rows of one table have in common."""
+    weights = [] if options.inception is None else ["--inception", str(options.inception)]
+    # Some methods decode meshes and some have boxes alone: --boxes compares what all have.
+    alike = ["-n", str(count), "--seed", str(seed), "--boxes"]
+    alike += ["--renderer", options.renderer, *weights]
+    scores = run.folder / "scores.json"
+    paths = ["--run", str(run.folder / "run"), "--out", str(scores)]
+    return Step("scores", ["eval-fid", *paths, *alike], result=scores, depends_on=alike)
+
+
+def keeps_settings(run: Run) -> bool:
+    """Whether a run's folder is free, or holds a run of the settings that are wanted now."""
+    saved = run.folder / "run" / "config.yaml"
+    if not saved.is_file():
+        return True
+    wanted = load_config(run.config, run.settings)
     try:
-        return is_trained(run)
+        return load_config(str(saved)) == wanted
     except InputError:
-        return False  # of other settings: no row of this comparison
+        return False  # of another version, or damaged
 
 
-@contextmanager
-def _alone_in(out: Path) -> Iterator[None]:
-    with ExitStack() as until_done:
-        try:
-            until_done.enter_context(only_writer(out))
-        except OSError as error:
-            raise InputError(f"{out} cannot be written ({error.strerror}).") from None
-        yield
+def costs_of(run: Run) -> dict[str, float | None]:
+    """What training took: `cpu_s`, `steps` and `parameters`.
+
+    CPU seconds are None where training was killed on the way, or done by hand: nobody knows.
+    """
+    steps = 0
+    for final in (run.folder / "run").glob("*/final.ckpt"):
+        saved = read_checkpoint(final)
+        # Lightning counts updates; two networks that train each other make two a batch.
+        steps += saved["global_step"] // len(saved["optimizer_states"])
+    return {
+        "cpu_s": read_journal(run.folder).get("fit", {}).get("cpu_s"),
+        "steps": steps,
+        "parameters": sum(
+            item.numel() for item in load_any_run(run.folder / "run").prior.parameters()
+        ),
+    }
 
 
-@contextmanager
-def _ended_as_by_ctrl_c() -> Iterator[None]:
-    """Whatever asks this process to end: the commands, which it does not reach, must save."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # where no signal can be answered
-        return
-    names = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {name: signal.getsignal(name) for name in names}
-    for name, handler in before.items():
-        if handler is not signal.SIG_IGN:  # as nohup asks for
-            signal.signal(name, signal.default_int_handler)
-        elif name == signal.SIGINT:
-            # In the background. Commands inherit what is ignored, but not an answer, and have to
-            # hear the SIGINT by which `Commands.stop` ends them.
-            signal.signal(name, lambda number, frame: None)
-    try:
-        yield
-    finally:
-        for name, handler in before.items():
-            signal.signal(name, handler)
-
-
-def _rows(comparison: Comparison, done: Sequence[Run]) -> list[Row]:
-    rows = []
-    for run in done:
-        method = comparison.methods[run.method]
-        rows.append(
-            Row(
-                rooms=comparison.rooms[run.rooms].title,
-                group=method.group,
-                title=method.title,
-                seed=run.seed,
-                scores=read_result(run.folder / "scores.json"),
-                costs=vars(costs_of(run)),
-            )
-        )
-    return rows
+def _row(comparison: Comparison, run: Run) -> Row:
+    method = comparison.methods[run.method]
+    return Row(
+        rooms=comparison.rooms[run.rooms].title,
+        group=method.group,
+        title=method.title,
+        seed=run.seed,
+        scores=read_result(run.folder / "scores.json"),
+        costs=costs_of(run),
+    )

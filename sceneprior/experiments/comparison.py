@@ -1,7 +1,8 @@
-"""What `sceneprior compare` compares: its YAML in, one `Comparison` and its runs out."""
+"""What `sceneprior compare` compares: the settings in its YAML, and the runs that they ask for."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
@@ -17,7 +18,7 @@ class Rooms(Section):
     """A kind of room to compare on."""
 
     config: str
-    """The run config of our own method; every method's settings are changes to it."""
+    """The run config of our own method; it says which rooms all methods learn from."""
     title: str
     """Heading of its table."""
 
@@ -28,6 +29,9 @@ class Method(Section):
     title: str
     group: str
     """Methods of one group stand together, under this heading."""
+    config: str | None = None
+    """The method's own run config; None: that of the rooms. Label set, shards, seed and, where it
+    has the key, `model.max_objects` are the rooms' in either case."""
     set: dict[str, list[str]] = Field(default_factory=dict)
     """Changes to the config as `section.key=value`, by kind of room; those for `every` first."""
 
@@ -38,7 +42,7 @@ class Comparison(Section):
     seeds: tuple[int, ...] = Field(min_length=1, strict=False)
     """A run each; the seed of training."""
     count: int | None = Field(None, ge=2)
-    """Rooms that each run generates and is judged by. None: as many as there are training rooms,
+    """Rooms that each run generates and is evaluated by. None: as many as there are training rooms,
     the numbers at which Frechet distances compare with those of the reference rows."""
     sampling_seed: int = Field(0, ge=0)
     """Of the generated rooms, the same for every run."""
@@ -53,11 +57,17 @@ class Comparison(Section):
         return seeds
 
     @model_validator(mode="after")
-    def _titles_differ(self) -> "Comparison":
+    def _names_are_clear(self) -> "Comparison":
         for named in (self.rooms, self.methods):
             titles = [entry.title for entry in named.values()]
             if twice := [title for title in titles if titles.count(title) > 1]:
                 raise ValueError(f"the title '{twice[0]}' is given twice; a title names a row")
+        for key, method in self.methods.items():
+            if unlisted := sorted(set(method.set) - {EVERY, *self.rooms}):
+                raise ValueError(
+                    f"methods.{key}.set has '{unlisted[0]}'; expected {EVERY} or one of "
+                    f"{', '.join(self.rooms)}"
+                )
         return self
 
 
@@ -70,7 +80,12 @@ class Run:
     seed: int
     config: str
     settings: tuple[str, ...]
+    """Changes to the config, for `fit --set`."""
     folder: Path
+
+    @property
+    def title(self) -> str:
+        return f"{self.rooms}, {self.method}, seed {self.seed}"
 
 
 def load_comparison(name: str) -> Comparison:
@@ -78,17 +93,9 @@ def load_comparison(name: str) -> Comparison:
 
     Raises:
         ConfigError: not found, not YAML, an unknown key or a wrong value, in it or in a run.
-        InputError: a method has settings for rooms that the comparison does not know.
     """
     path, data = read_settings(name)
     comparison = check_settings(Comparison, data, str(path))
-    for key, method in comparison.methods.items():
-        strange = sorted(set(method.set) - {EVERY, *comparison.rooms})
-        if strange:
-            raise InputError(
-                f"{path}: methods.{key}.set has '{strange[0]}'; expected {EVERY} or one of "
-                f"{', '.join(comparison.rooms)}."
-            )
     for run in runs_of(comparison, Path()):
         load_config(run.config, run.settings)
     return comparison
@@ -128,17 +135,43 @@ def _chosen(what: str, given: str | None, known: tuple[str, ...]) -> tuple[str, 
 
 def runs_of(comparison: Comparison, out: Path) -> list[Run]:
     """Every run, seed by seed, so that a comparison that is stopped early is a whole one of fewer
-    seeds."""
+    seeds.
+
+    Raises:
+        ConfigError: the config of rooms or of a method is not found, or not YAML.
+    """
     return [
         Run(
             rooms=key,
             method=name,
             seed=seed,
-            config=rooms.config,
-            settings=(*method.set.get(EVERY, ()), *method.set.get(key, ()), f"seed={seed}"),
+            config=method.config or rooms.config,
+            settings=(
+                *_taken_over(rooms, method),
+                *method.set.get(EVERY, ()),
+                *method.set.get(key, ()),
+                f"seed={seed}",
+            ),
             folder=out / key / name / f"seed{seed}",
         )
         for seed in comparison.seeds
         for key, rooms in comparison.rooms.items()
         for name, method in comparison.methods.items()
     ]
+
+
+def _taken_over(rooms: Rooms, method: Method) -> list[str]:
+    """What a method with a config of its own shares with the others on the same rooms."""
+    if method.config is None:
+        return []
+    shared, own = read_settings(rooms.config)[1], read_settings(method.config)[1]
+    keys = ["label_set", "data.shards"]
+    if _value(own, "model.max_objects") is not None:
+        keys.append("model.max_objects")
+    return [f"{key}={_value(shared, key)}" for key in keys if _value(shared, key) is not None]
+
+
+def _value(data: Any, key: str) -> Any:
+    for part in key.split("."):
+        data = data.get(part) if isinstance(data, dict) else None
+    return data

@@ -200,7 +200,7 @@ def unfold(trained: TrainedPrior) -> list[Scene]:
 def read_curves(run: Path) -> dict[str, list[tuple[int, float]]]:
     """Loss curves of every stage from its metrics.csv, as `stage/term` -> (epoch, value)."""
     curves: dict[str, list[tuple[int, float]]] = {}
-    for stage in [stage.name for stage in run_config(run).stages()]:
+    for stage in run_config(run).stage_names:
         path = run / stage / "metrics.csv"
         if not path.is_file():
             continue

@@ -1,4 +1,4 @@
-"""Finished runs in; one picture out: a row of rooms from above for each method."""
+"""Draws a picture of a comparison: a row of rooms from above for each method."""
 
 import io
 from collections.abc import Sequence

@@ -71,6 +71,11 @@ class RunConfig(Section, ABC):
     def stages(self) -> tuple[Stage, ...]:
         """What is trained, in order."""
 
+    @property
+    def stage_names(self) -> tuple[str, ...]:
+        """Names of the stages, which are also their folders, in order."""
+        return tuple(stage.name for stage in self.stages())
+
     @abstractmethod
     def load(self, stage: str, path: Path) -> "Trained":
         """What a checkpoint of a stage holds, in evaluation mode.

@@ -1,4 +1,4 @@
-"""The command line: verbs that work on a toy run, and one sentence for everything that does not."""
+"""The command line: commands that work on a toy run, and one sentence for what does not."""
 
 import json
 import shutil
@@ -7,44 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from cli_helpers import everything_in, one_sentence
 from tiny_runs import write_tiny_config
 
-from sceneprior import cli, offscreen
+from sceneprior import offscreen
 from sceneprior.shards import list_shards
-
-
-@pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Run `sceneprior <arguments>` in this process: (exit status, stdout, stderr)."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["sceneprior", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        output = capsys.readouterr()
-        return int(end.value.code or 0), output.out, output.err
-
-    return run
-
-
-def one_sentence(result: tuple[int, str, str]) -> str:
-    """The whole story on one line of stderr, status 2, no traceback; the sentence itself."""
-    status, _, errors = result
-    assert status == 2, errors
-    lines = errors.strip().splitlines()
-    assert len(lines) == 1 and lines[0].startswith("Error: "), errors
-    assert "Traceback" not in errors and lines[0].count("Error:") == 1
-    assert lines[0][-1] in ".!" and len(lines[0]) > 40
-    return lines[0]
-
-
-def everything_in(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b""
-        for path in folder.rglob("*")
-    }
 
 
 def test_bad_shards_are_sentences_and_leave_no_run(command, toy_shards, tmp_path):
@@ -77,7 +44,7 @@ def test_bad_shards_are_sentences_and_leave_no_run(command, toy_shards, tmp_path
     assert "the nearest valid key is 'epochs'" in fit(toy_shards, "--set", "layout.epoch=3")
 
 
-def test_fit_keeps_the_best_sampler_and_other_verbs_take_it(command, toy_shards, tmp_path):
+def test_fit_keeps_the_best_sampler_and_other_commands_take_it(command, toy_shards, tmp_path):
     config = write_tiny_config(
         tmp_path / "tiny.yaml", toy_shards, layout__epochs=2, shape__epochs=1,
         samples={"every": 1, "count": 6},
@@ -108,12 +75,12 @@ def test_a_config_typo_names_key_file_and_nearest_key(command, toy_shards, tmp_p
 
 
 @pytest.mark.parametrize(
-    "verb",
+    "words",
     [("synthesize", "--out", "made"), ("eval-fid", "-n", "4"), ("report",)],
-    ids=lambda verb: verb[0],
+    ids=lambda words: words[0],
 )
-def test_folders_that_are_no_run_or_hold_no_checkpoint(command, toy_run, tmp_path, verb):
-    name, *rest = verb
+def test_folders_that_are_no_run_or_hold_no_checkpoint(command, toy_run, tmp_path, words):
+    name, *rest = words
     call = [name, "--run", "run", *rest, "--renderer", "software"]
     said = one_sentence(command(*call))
     assert "run is not a run folder (no config.yaml in it); train one with" in said

@@ -5,8 +5,8 @@ import shutil
 
 import numpy as np
 import pytest
+from cli_helpers import everything_in, one_sentence
 from PIL import Image
-from test_cli import command, everything_in, one_sentence  # noqa: F401
 
 from sceneprior.classes import label_set
 from sceneprior.reconstruction.fit import SCHEDULES, FitSchedule
@@ -39,7 +39,7 @@ def files_of(name: str) -> set[str]:
     return {f"{name}.json", f"{name}.glb", f"{name}.png", f"{name}_seen.png"}
 
 
-def test_reconstruct_a_view_and_a_split(command, toy_run, toy_shards, tmp_path):  # noqa: F811
+def test_reconstruct_a_view_and_a_split(command, toy_run, toy_shards, tmp_path):
     call = ["reconstruct", "--run", toy_run, "--shards", toy_shards, *SOFT]
     one = [*call, "--room", "toy/test_01", "--view", 3, "--out", "one", "--refine"]
     status, out, errors = command(*one)
@@ -63,7 +63,7 @@ def test_reconstruct_a_view_and_a_split(command, toy_run, toy_shards, tmp_path):
     assert len(list((tmp_path / "two").glob("*_seen.png"))) == 2
 
 
-def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):  # noqa: F811
+def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):
     call = ["reconstruct", "--run", toy_run, *own, *SOFT]
     status, out, errors = command(*call, "--pose", "pose.json", "--out", "posed")
     assert (status, out) == (0, "Wrote 1 room to posed\n"), errors
@@ -80,7 +80,7 @@ def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):  # noqa: F81
     assert (-pose[:3, :3].T @ pose[:3, 3])[1] == pytest.approx(1.4)
 
 
-def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_path):  # noqa: F811
+def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_path):
     call = ["reconstruct", "--run", toy_run, "--out", "none"]
     shards = ["--shards", toy_shards]
     way = "Say what to reconstruct from, in one way"
@@ -109,7 +109,7 @@ def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_pat
     assert not (tmp_path / "none").exists()
 
 
-def test_eval_svr_of_a_run_and_of_its_scenes(command, toy_run, toy_shards, tmp_path):  # noqa: F811
+def test_eval_svr_of_a_run_and_of_its_scenes(command, toy_run, toy_shards, tmp_path):
     call = ["eval-svr", "--shards", toy_shards, *SOFT]
     two = ["--limit", 2]
     status, out, errors = command(*call, "--run", toy_run, *two, "--out", "run.json")
@@ -129,7 +129,7 @@ def test_eval_svr_of_a_run_and_of_its_scenes(command, toy_run, toy_shards, tmp_p
     assert again["rows"]["nearest_room"] == scores["rows"]["nearest_room"]
 
 
-def test_scenes_that_answer_no_image(command, toy_run, toy_shards, tmp_path):  # noqa: F811
+def test_scenes_that_answer_no_image(command, toy_run, toy_shards, tmp_path):
     made = ["reconstruct", "--run", toy_run, "--shards", toy_shards, "--room", "toy/test_00", *SOFT]
     assert command(*made, "--out", "scenes")[0] == 0
     (path,) = (tmp_path / "scenes").glob("*.json")

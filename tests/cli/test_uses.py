@@ -3,8 +3,8 @@
 import json
 
 import pytest
+from cli_helpers import everything_in, one_sentence
 from model_folder import corner_sofa, write_models
-from test_cli import command, everything_in, one_sentence  # noqa: F401
 
 from sceneprior.config import load_run
 
@@ -12,13 +12,13 @@ SOFT = ("--renderer", "software")
 
 
 @pytest.fixture
-def rooms(command, toy_run, tmp_path):  # noqa: F811
+def rooms(command, toy_run, tmp_path):
     """Three generated rooms in `rooms/`."""
     assert command("synthesize", "--run", toy_run, "-n", 3, "--out", "rooms", *SOFT)[0] == 0
     return tmp_path / "rooms"
 
 
-def test_interpolate(command, toy_run, rooms, tmp_path):  # noqa: F811
+def test_interpolate(command, toy_run, rooms, tmp_path):
     first = load_run(toy_run).room_ids[0]
     call = ["interpolate", "--run", toy_run, "--from", first, *SOFT]
     end = "rooms/latents.npz:seed0_0002"
@@ -37,7 +37,7 @@ def test_interpolate(command, toy_run, rooms, tmp_path):  # noqa: F811
     assert everything_in(tmp_path) == before
 
 
-def test_retrieve(command, rooms, tmp_path):  # noqa: F811
+def test_retrieve(command, rooms, tmp_path):
     write_models(
         tmp_path / "models",
         {
@@ -67,7 +67,7 @@ def test_retrieve(command, rooms, tmp_path):  # noqa: F811
     assert "cache holds no scene JSON" in said and not (tmp_path / "new").exists()
 
 
-def test_complete(command, toy_run, rooms, tmp_path):  # noqa: F811
+def test_complete(command, toy_run, rooms, tmp_path):
     scene = json.loads((rooms / "seed0_0001.json").read_text())
     scene["objects"] = scene["objects"][:1]
     given = tmp_path / "given.json"

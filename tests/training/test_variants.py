@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 from sceneprior.baselines.lstm import SceneLstm
 from sceneprior.config import Model, load_run
+from sceneprior.evaluation.metrics.layout_metrics import match_scenes
 from sceneprior.experiments.evaluate import (
     UNFOLDING_STEPS,
     Judging,
@@ -136,7 +137,9 @@ def test_a_variant_is_judged(toy_shards, tmp_path, name):
     fit(tiny_config(toy_shards, **changes), run, trainer_options=CPU)
     scores = judge_run(run, 4, 0, None, run / "scores.json", None, Judging(renderer="software"))
     assert scores["protocol"]["stage"] == "shape"
-    assert 0 <= scores["box_iou_3d"] <= 1
+    matches = [match_scenes(*pair) for pair in decoded_and_true(load_run(run), toy_shards)]
+    overlap = sum(match.iou.sum() for match in matches) / sum(m.truth_count for m in matches)
+    assert scores["box_iou_3d"] == pytest.approx(overlap, abs=1e-9) and 0 < overlap < 1
 
 
 def test_one_stage_begins_with_fresh_weights_and_leaves_no_layout_folder(toy_shards, tmp_path):

@@ -112,7 +112,9 @@ def test_a_certain_decoder_is_believed(prior):
 def test_strangers_and_lone_objects_stay_where_they_are(prior):
     for rooms in (room((BED, 0.3, 0)), room((BED, 0, 0), (LAMP, 0.1, 0.1))):
         assert torch.equal(prior.refine(rooms, 20).boxes_m, rooms.boxes_m)
-    assert prior.refine(room((BED, 0, 0), (STAND, 1, 0)), 0) is not None
+    rooms = room((BED, 0, 0), (STAND, 0.9, 0.35))
+    assert torch.equal(prior.refine(rooms, 0).boxes_m, rooms.boxes_m)  # no step, no move
+    assert not torch.equal(prior.refine(rooms, 1).boxes_m, rooms.boxes_m)
 
 
 def test_rooms_do_not_depend_on_their_neighbours(prior, monkeypatch):

@@ -100,6 +100,7 @@ def runs(front, tmp_path):
     server.close()
 
 
+@pytest.mark.slow
 def test_ten_random_kills(runs, tmp_path):
     """kill -9 of main process and workers, or of the main process alone, at random moments."""
     out = tmp_path / "shards"

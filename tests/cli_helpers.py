@@ -1,0 +1,21 @@
+"""What tests of commands share: sentences on the error stream, and folders as they were."""
+
+from pathlib import Path
+
+
+def one_sentence(result: tuple[int, str, str]) -> str:
+    """The whole story on one line of stderr, status 2, no traceback; the sentence itself."""
+    status, _, errors = result
+    assert status == 2, errors
+    lines = errors.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("Error: "), errors
+    assert "Traceback" not in errors and lines[0].count("Error:") == 1
+    assert lines[0][-1] in ".!" and len(lines[0]) > 40
+    return lines[0]
+
+
+def everything_in(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b""
+        for path in folder.rglob("*")
+    }
