@@ -15,10 +15,11 @@ from statistics import mean
 import numpy as np
 
 from sceneprior.evaluation.metrics.layout_metrics import match_scenes
-from sceneprior.evaluation.metrics.mesh_metrics import chamfer, f_score, sample_surface
+from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface
 from sceneprior.evaluation.topdown import box_mesh
 from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.geometry.meshes import icosphere
+from sceneprior.geometry.surfaces import chamfer_sum
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.training.checkpoints import TrainedPrior, load_run, restore
 
@@ -55,7 +56,7 @@ def distances(
             assert target is not None, "asked for meshes"
             a = sample_surface(shape(decoded.objects[mine]), points, 0)
             b = sample_surface(target, points, 1)
-            found.append((chamfer(a, b).l2_m, f_score(a, b)))
+            found.append((chamfer_sum(a, b).l2_m, f_score(a, b)))
     return found
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import trimesh
 
 from data_prep.engine.cache import ByteCache
-from data_prep.inspection.projection import box_corners, box_iou_2d, boxes_around
+from data_prep.inspection.projection import box_iou_2d, boxes_around
 from sceneprior.errors import ShardError
+from sceneprior.geometry.corners import box_corners
 from sceneprior.shards import RoomGroundTruth, RoomViews
 
 _MODEL_BYTES = 256 << 20

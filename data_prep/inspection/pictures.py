@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from data_prep.inspection.projection import BOX_EDGES, box_corners, to_camera, wire_pixels
+from data_prep.inspection.projection import to_camera, wire_pixels
 from sceneprior.classes import class_colors, label_set
+from sceneprior.geometry.corners import BOX_EDGES, box_corners
 from sceneprior.shards import RoomGroundTruth, RoomViews, Shard
 
 BACKGROUND = (246, 246, 246)

@@ -4,19 +4,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-NEAR_M = 0.05
+WIRE_NEAR_M = 0.05
 """Lines are cut where they come nearer to the camera than this."""
 
-BOX_EDGES = tuple((a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit)
-"""The 12 edges of `box_corners`: they join corners that differ in one bit."""
-
 Segment = tuple[float, float, float, float]
-
-
-def box_corners(center_m: np.ndarray, size_m: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of an axis-aligned box; bits 0, 1, 2 of the row choose x, y, z."""
-    bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
-    return np.asarray(center_m) + (bits - 0.5) * np.asarray(size_m)
 
 
 def to_camera(points_m: np.ndarray, world_to_camera: np.ndarray) -> np.ndarray:
@@ -52,11 +43,11 @@ def wire_pixels(
     found = []
     for first, second in edges:
         a, b = camera[first], camera[second]
-        if max(a[2], b[2]) < NEAR_M:
+        if max(a[2], b[2]) < WIRE_NEAR_M:
             continue
-        if a[2] < NEAR_M:
+        if a[2] < WIRE_NEAR_M:
             a = _cut(a, b)
-        elif b[2] < NEAR_M:
+        elif b[2] < WIRE_NEAR_M:
             b = _cut(b, a)
         ends = (np.stack([a, b]) / [[a[2]], [b[2]]]) @ np.asarray(intrinsics, np.float64).T
         u1, v1, u2, v2 = np.round(ends[:, :2], 6).ravel().tolist()
@@ -66,7 +57,7 @@ def wire_pixels(
 
 def _cut(behind: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     """Where a line crosses the near plane."""
-    return behind + (ahead - behind) * (NEAR_M - behind[2]) / (ahead[2] - behind[2])
+    return behind + (ahead - behind) * (WIRE_NEAR_M - behind[2]) / (ahead[2] - behind[2])
 
 
 def boxes_around(
@@ -86,7 +77,7 @@ def boxes_around(
     boxes = np.full((len(world_to_camera), 4), np.nan)
     for view, (matrix, K) in enumerate(zip(world_to_camera, intrinsics, strict=True)):
         camera = to_camera(points_m, matrix)
-        if camera[:, 2].min() < NEAR_M:
+        if camera[:, 2].min() < WIRE_NEAR_M:
             continue
         pixels = (camera / camera[:, 2:]) @ np.asarray(K, dtype=np.float64).T
         boxes[view] = (*pixels[:, :2].min(axis=0), *pixels[:, :2].max(axis=0))

@@ -15,6 +15,7 @@ from torch.utils.data import Dataset
 
 from sceneprior.data.dataset import BLANK, TURNS
 from sceneprior.errors import ShardError
+from sceneprior.geometry.turns import turn_vectors
 from sceneprior.shards import iterate_rooms
 from sceneprior.views import RoomBoxes
 
@@ -117,12 +118,5 @@ def turned(
     boxes_m: Float[Tensor, "rooms objects 6"], quarters: Int[Tensor, " rooms"]
 ) -> Float[Tensor, "rooms objects 6"]:
     """Boxes of rooms turned about +y by so many quarters: x goes to -z, z to x."""
-    x, y, z, width, height, depth = boxes_m.unbind(dim=-1)
-    turns = [
-        (x, y, z, width, height, depth),
-        (z, y, -x, depth, height, width),
-        (-x, y, -z, width, height, depth),
-        (-z, y, x, depth, height, width),
-    ]
-    every = torch.stack([torch.stack(turn, dim=-1) for turn in turns])
-    return every[quarters, torch.arange(len(boxes_m), device=boxes_m.device)]
+    centers_m, sizes_m = boxes_m.split(3, dim=-1)
+    return torch.cat([turn_vectors(centers_m, quarters), turn_vectors(sizes_m, quarters).abs()], -1)

@@ -9,11 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Int16
 from torch import Tensor
 
+from sceneprior.geometry.turns import turn_vectors
 from sceneprior.shards import RoomViews
-
-# Turning a room by a quarter about +y moves two columns of world_to_camera and turns a sign.
-_COLUMNS = ((0, 1, 2, 3), (2, 1, 0, 3), (0, 1, 2, 3), (2, 1, 0, 3))
-_SIGNS = ((1.0, 1, 1, 1), (1.0, 1, -1, 1), (-1.0, 1, -1, 1), (-1.0, 1, 1, 1))
 
 
 @dataclass(frozen=True)
@@ -106,15 +103,14 @@ class FlatViews:
         at_sighting = (self.first_sighting[room][:, None] + view * count)[:, :, None] + slot
         at_sighting = at_sighting.where(is_object[:, None], len(self.visible) - 1)
         at_view = self.first_view[room][:, None] + view
-        columns = torch.tensor(_COLUMNS, device=self.device)[quarter][:, None, None]
-        signs = torch.tensor(_SIGNS, device=self.device)[quarter][:, None, None]
         poses = self.world_to_camera[at_view]
         return {
             "object_class": self.object_class[at_object].long(),
             "is_object": is_object,
-            # The room turns by +a, so a camera sees the turned room as it saw the plain one. Not
-            # a matrix product, which a GPU may round.
-            "world_to_camera": poses.gather(-1, columns.expand_as(poses)) * signs,
+            # A camera sees the turned room as it saw the plain one.
+            "world_to_camera": torch.cat(
+                [turn_vectors(poses[..., :3], quarter), poses[..., 3:]], dim=-1
+            ),
             "intrinsics": self.intrinsics[at_view],
             "boxes": self.boxes[at_sighting],
             "visible": self.visible[at_sighting],

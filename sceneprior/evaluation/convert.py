@@ -18,6 +18,7 @@ from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.evaluation.topdown import box_mesh
 from sceneprior.generation.export import write_scenes
+from sceneprior.geometry.turns import yaw_rotation
 from sceneprior.offscreen import SoftwareRenderer
 from sceneprior.scene import Mesh, Scene, SceneObject
 
@@ -231,8 +232,7 @@ def turned_box(
         >>> [round(float(side), 3) for side in turned.size_m]
         [1.414, 0.7, 1.414]
     """
-    sine, cosine = np.sin(yaw_rad), np.cos(yaw_rad)
-    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    turn = yaw_rotation(yaw_rad)
     width, height, depth = np.abs(turn) @ size
     place = tuple(float(value) for value in center)
     item = SceneObject(label, (place[0], place[1], place[2]), (width, height, depth))

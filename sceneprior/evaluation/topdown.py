@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 
 from sceneprior.classes import class_colors, label_set
 from sceneprior.errors import InputError
+from sceneprior.geometry.corners import box_corners
 from sceneprior.offscreen import Orthographic, Pinhole, Renderer
 from sceneprior.scene import Mesh, Scene
 
@@ -56,14 +57,13 @@ def topdown_protocol(label_set_name: str) -> TopDownProtocol:
 
 def box_mesh(center_m: Sequence[float], size_m: Sequence[float]) -> Mesh:
     """The box itself as 12 triangles that face outwards."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     faces = np.array(
         [
             [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
         ]
     )  # fmt: skip
-    return Mesh(np.asarray(center_m) + corners * np.asarray(size_m) / 2, faces)
+    return Mesh(box_corners(np.asarray(center_m), np.asarray(size_m)), faces)
 
 
 def scene_meshes(scene: Scene) -> list[Mesh]:

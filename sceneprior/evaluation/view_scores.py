@@ -11,13 +11,13 @@ from sceneprior.evaluation.metrics.layout_metrics import box_iou_3d
 from sceneprior.evaluation.metrics.mesh_metrics import (
     F_THRESHOLD_M,
     POINTS,
-    chamfer,
     f_score,
     oriented_box_iou_3d,
     oriented_boxes,
     sample_surface,
 )
 from sceneprior.evaluation.topdown import box_mesh
+from sceneprior.geometry.surfaces import chamfer_sum
 from sceneprior.scene import Mesh, SceneObject
 
 
@@ -56,7 +56,7 @@ def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairSco
         return PairScore(truth.label, 0.0, 0.0, None, None, 0.0, False)
     surfaces = [_mesh(truth), _mesh(found)]
     a, b = (sample_surface(mesh, points, 2 * seed + i) for i, mesh in enumerate(surfaces))
-    distance = chamfer(a, b)
+    distance = chamfer_sum(a, b)
     boxes = [
         np.array([[item.center_m], [item.size_m]], dtype=np.float64) for item in (truth, found)
     ]

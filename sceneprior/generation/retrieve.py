@@ -22,12 +22,12 @@ from torch import Tensor
 from sceneprior.errors import InputError
 from sceneprior.evaluation.topdown import box_mesh
 from sceneprior.generation.cad_bank import CadBank, Shelf
-from sceneprior.geometry.surfaces import surface_points
+from sceneprior.geometry.surfaces import chamfer_mean, surface_points
+from sceneprior.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.scene import Mesh, Scene, SceneObject
 
 STANDS_M = 1.0
 """A box whose centre is at most so high stands on the floor."""
-TURNS = 4
 STAGES = ((16, 1 / 3), (4, None))
 """(step, share): comparisons by every `step`-th point, and the share of the models that goes on."""
 KEEP = 16
@@ -44,7 +44,7 @@ class Retrieved:
     turn_deg: int
     """The yaw of the model in the room: 0, 90, 180 or 270; docs/conventions.md."""
     distance_m: float
-    """See `chamfer`."""
+    """See `geometry.surfaces.chamfer_mean`."""
 
 
 def retrieve(scene: Scene, bank: CadBank, keep: int | None = KEEP) -> Scene:
@@ -130,7 +130,7 @@ def extruded(item: SceneObject) -> SceneObject:
 
 def placed(unit: Mesh, item: SceneObject, turn_deg: int) -> Mesh:
     """A mesh that fills [-0.5, 0.5]^3, turned and scaled into an object's box."""
-    turned = unit.vertices_m @ _rotation(turn_deg // 90).T
+    turned = unit.vertices_m @ quarter_rotation(turn_deg // 90).T
     return Mesh(turned * np.asarray(item.size_m) + np.asarray(item.center_m), unit.faces)
 
 
@@ -138,7 +138,7 @@ def most_similar(item: SceneObject, shelf: Shelf, keep: int | None = KEEP) -> Re
     """The model of a shelf, and its turn, nearest to an object by Chamfer distance."""
     count = shelf.points.shape[1]
     views = _turned_views(_points_of(item, count) - np.asarray(item.center_m), item.size_m)
-    choices = np.arange(len(shelf.model_ids) * TURNS)
+    choices = np.arange(len(shelf.model_ids) * QUARTERS)
     for step, share in STAGES if keep is not None else ():
         going_on = max(keep or 0, int(len(choices) * share) if share else 0)
         if going_on < len(choices):
@@ -148,26 +148,12 @@ def most_similar(item: SceneObject, shelf: Shelf, keep: int | None = KEEP) -> Re
     trees = [cKDTree(points) for points, _ in views]
     distances = []
     for choice in choices:
-        model, turn = divmod(int(choice), TURNS)
+        model, turn = divmod(int(choice), QUARTERS)
         points, size = views[turn]
-        distances.append(_chamfer(points, trees[turn], shelf.points[model] * size))
+        distances.append(chamfer_mean(points, shelf.points[model] * size, trees[turn]))
     best = int(np.argmin(distances))
-    model, turn = divmod(int(choices[best]), TURNS)
+    model, turn = divmod(int(choices[best]), QUARTERS)
     return Retrieved(shelf.model_ids[model], 90 * turn, distances[best])
-
-
-def chamfer(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "m 3"]) -> float:
-    """Mean distance to the nearest point of the other set, averaged over both directions.
-
-    In the unit of the points; not squared.
-    """
-    return _chamfer(a, cKDTree(a), b)
-
-
-def _chamfer(a: np.ndarray, tree_of_a: cKDTree, b: np.ndarray) -> float:
-    there, _ = cKDTree(b).query(a)
-    back, _ = tree_of_a.query(b)
-    return float(there.mean() + back.mean()) / 2
 
 
 def _points_of(item: SceneObject, count: int) -> np.ndarray:
@@ -180,18 +166,12 @@ def _points_of(item: SceneObject, count: int) -> np.ndarray:
     return np.tile(np.asarray(item.center_m, dtype=np.float64), (count, 1))
 
 
-def _rotation(quarters: int) -> np.ndarray:
-    """Yaw by quarter turns: +z towards +x."""
-    cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters]
-    return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]], dtype=np.float64)
-
-
 def _turned_views(
     points: Float[np.ndarray, "points 3"], size_m: Sequence[float]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """What each turn of the models looks like to models that stand still: the object turned back,
     and the box's sides as they then lie. Distances are the same, and models stay as stored."""
-    back = [_rotation(quarters).T for quarters in range(TURNS)]
+    back = [quarter_rotation(quarters).T for quarters in range(QUARTERS)]
     return [(points @ turn.T, np.abs(turn @ np.asarray(size_m, dtype=np.float64))) for turn in back]
 
 
@@ -208,11 +188,11 @@ def _rough_distances(
         ours = torch.from_numpy(points[::step].astype(np.float32))
         # |a - b|^2 as one product: [b, 1, |b|^2] . [-2a, |a|^2, 1].
         right = torch.cat([-2 * ours, _squares(ours), torch.ones(len(ours), 1)], dim=1).T
-        rows = np.flatnonzero(choices % TURNS == turn)
+        rows = np.flatnonzero(choices % QUARTERS == turn)
         at_once = max(1, _BLOCK // right.shape[1] ** 2)
         for start in range(0, len(rows), at_once):
             part = rows[start : start + at_once]
-            theirs = torch.from_numpy(few[choices[part] // TURNS] * size.astype(np.float32))
+            theirs = torch.from_numpy(few[choices[part] // QUARTERS] * size.astype(np.float32))
             left = torch.cat([theirs, torch.ones(*theirs.shape[:2], 1), _squares(theirs)], dim=2)
             squared = left @ right
             there = squared.amin(dim=1).clamp(min=0).sqrt().mean(dim=1)

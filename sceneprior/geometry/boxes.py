@@ -1,22 +1,10 @@
-"""Axis-aligned boxes (centre, size) in, corners out."""
+"""Meshes that fill axis-aligned boxes: the beveled cube, and any canonical mesh in its box."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-
-def box_corners(
-    centers_m: Float[Tensor, "*batch 3"], sizes_m: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 8 3"]:
-    """The eight corners of axis-aligned boxes, in the order of `unit_corners`."""
-    corners = unit_corners(centers_m)
-    return centers_m.unsqueeze(-2) + corners * (sizes_m / 2).unsqueeze(-2)
-
-
-def unit_corners(like: Tensor) -> Float[Tensor, "8 3"]:
-    """The corners of the cube [-1, 1]^3; x changes slowest."""
-    side = torch.tensor([-1.0, 1.0], dtype=like.dtype, device=like.device)
-    return torch.cartesian_prod(side, side, side)
+from sceneprior.geometry.corners import CUBE_CORNERS
 
 
 def beveled_cube(bevels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 32 3"]:
@@ -27,7 +15,7 @@ def beveled_cube(bevels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 32 
             (0, 0) is the cube, (1, 0) a prism over a diamond, (1, 1) an octahedron.
     """
     upright, level = (1 - bevels).unsqueeze(-2).unbind(dim=-1)
-    x, y, z = unit_corners(bevels).unbind(dim=-1)
+    x, y, z = bevels.new_tensor(CUBE_CORNERS).unbind(dim=-1)
     rings = []
     for across, along in ((x, upright * z), (upright * x, z)):
         across, along = torch.broadcast_tensors(across, along)

@@ -142,16 +142,16 @@ class _PyrenderRenderer(Renderer):
         return images
 
     def _add_camera(self, scene: Any, camera: Camera, image_size: tuple[int, int]) -> Any:
-        from sceneprior.offscreen.zbuffer import NEAR_M
+        from sceneprior.offscreen.zbuffer import NEAR_PLANE_M
 
         if isinstance(camera, Pinhole):
             K = np.asarray(camera.intrinsics, dtype=np.float64)
             lens = self._pyrender.IntrinsicsCamera(
-                K[0, 0], K[1, 1], K[0, 2], K[1, 2], znear=NEAR_M, zfar=_FAR_M
+                K[0, 0], K[1, 1], K[0, 2], K[1, 2], znear=NEAR_PLANE_M, zfar=_FAR_M
             )
         else:
             half = camera.metres_per_pixel * image_size[0] / 2
-            lens = self._pyrender.OrthographicCamera(half, half, znear=NEAR_M, zfar=_FAR_M)
+            lens = self._pyrender.OrthographicCamera(half, half, znear=NEAR_PLANE_M, zfar=_FAR_M)
         to_world = np.linalg.inv(np.asarray(camera.world_to_camera, dtype=np.float64))
         opengl = to_world @ np.diag([1.0, -1.0, -1.0, 1.0])  # GL looks along -z, with y up
         return scene.add(lens, pose=opengl)

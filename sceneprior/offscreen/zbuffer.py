@@ -6,7 +6,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-NEAR_M = 0.01
+NEAR_PLANE_M = 0.01
 """Triangles are cut where they come nearer to the camera than this."""
 
 # Rounding must not open a crack where a pixel centre lies on the edge of two faces. It widens a
@@ -25,7 +25,7 @@ def rasterize(
     projection: tuple[float, float, float, float],
     image_size: tuple[int, int],
     perspective: bool = True,
-    near_m: float = NEAR_M,
+    near_m: float = NEAR_PLANE_M,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw triangles into a z-buffer, sampled at pixel centres.
 
@@ -72,7 +72,7 @@ def draw_labels(
     projection: tuple[float, float, float, float],
     image_size: tuple[int, int],
     perspective: bool = True,
-    near_m: float = NEAR_M,
+    near_m: float = NEAR_PLANE_M,
 ) -> np.ndarray:
     """Draw each triangle in its label: what `rasterize` draws, without the depth.
 

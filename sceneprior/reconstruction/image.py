@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sceneprior.errors import InputError
+from sceneprior.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.instances.observations import observe
 from sceneprior.instances.pngs import read_mask
 from sceneprior.instances.tables import IdTable, read_class_table
@@ -96,8 +97,7 @@ def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
         height_m: Above the floor.
         quarter: 0 stands on the +z side and looks along -z; each quarter goes on about +y.
     """
-    sine, cosine = ((0, 1), (1, 0), (0, -1), (-1, 0))[quarter % 4]
-    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]], dtype=np.float64)
+    turn = quarter_rotation(quarter)
     eye = turn @ np.array([0, height_m, CAMERA_DISTANCE_M])
     pose = np.eye(4)
     pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turn.T  # OpenCV: y down, z into the room
@@ -111,7 +111,7 @@ def sides_of_room(own: OwnImage, camera_height_m: float) -> list[ObservedImage]:
         return [own.image]
     return [
         replace(own.image, world_to_camera=level_camera(camera_height_m, quarter))
-        for quarter in range(4)
+        for quarter in range(QUARTERS)
     ]
 
 

@@ -13,8 +13,9 @@ from sceneprior.config import LossConfig
 from sceneprior.errors import InputError
 from sceneprior.evaluation.reference import reference_scene
 from sceneprior.evaluation.topdown import scene_meshes
-from sceneprior.geometry.boxes import box_corners
 from sceneprior.geometry.cameras import boxes_of_points
+from sceneprior.geometry.corners import box_corners
+from sceneprior.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.losses.matching import match_objects, matching_cost
 from sceneprior.offscreen import Pinhole, Renderer
 from sceneprior.reconstruction.fit import rows_of
@@ -29,7 +30,6 @@ CERTAIN_LOGIT = 30.0
 """Of a class that is known: its probability rounds to 1."""
 ABSENT_M = 1e4
 """Where padding stands: no camera sees it."""
-TURNS = 4
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class KnownRooms:
             ShardError: a model's file is missing or damaged.
         """
         scene = self.scenes[row]
-        with Shard(self.paths[row // TURNS]) as shard:
+        with Shard(self.paths[row // QUARTERS]) as shard:
             home = reference_scene(shard, scene.name, self.folder)
-        return turn_scene(home, row % TURNS)
+        return turn_scene(home, row % QUARTERS)
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
         (shard.path, reference_scene(shard, room_id, shards, meshes=False))
         for shard, room_id in iterate_rooms(shards, split)
     ]
-    turned = tuple(turn_scene(scene, quarter) for _, scene in rooms for quarter in range(TURNS))
+    turned = tuple(turn_scene(scene, quarter) for _, scene in rooms for quarter in range(QUARTERS))
     names = label_set(turned[0].label_set)
     counts = torch.tensor([len(scene.objects) for scene in turned])
     most = max(int(counts.max()), 1)
@@ -95,8 +95,7 @@ def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
 
 def turn_scene(scene: Scene, quarter: int) -> Scene:
     """The room turned by so many quarters about the vertical axis: +z goes towards +x."""
-    sine, cosine = ((0, 1), (1, 0), (0, -1), (-1, 0))[quarter % 4]
-    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]], dtype=np.float64)
+    turn = quarter_rotation(quarter)
 
     def turned(item: SceneObject) -> SceneObject:
         x, y, z = (float(value) for value in turn @ np.array(item.center_m))
@@ -109,7 +108,7 @@ def turn_scene(scene: Scene, quarter: int) -> Scene:
         scene,
         objects=tuple(turned(item) for item in scene.objects),
         floor_m=floor,
-        extra={**scene.extra, "turned_degrees": 90 * (quarter % 4)},
+        extra={**scene.extra, "turned_degrees": 90 * (quarter % QUARTERS)},
     )
 
 

@@ -12,7 +12,7 @@ from sceneprior.geometry.cameras import project
 from sceneprior.silhouettes.cpu.projection import project_in_threads
 from sceneprior.silhouettes.reference import Settings
 
-NEAR_M = 0.05
+NEAR_FACE_M = 0.05
 """A face with a corner nearer than this, or behind the camera, is left out of that view."""
 
 SIGMA_NDC = 1e-4
@@ -204,7 +204,9 @@ def render_scene(
         depths,
         faces,
         drawn.repeat_interleave(views, dim=0),
-        Settings((image_size[0], image_size[1]), sigma_px2, blur_px2, NEAR_M, mode, compositing),
+        Settings(
+            (image_size[0], image_size[1]), sigma_px2, blur_px2, NEAR_FACE_M, mode, compositing
+        ),
     )
     return RenderedScene(*(array.unflatten(0, (rooms, views)) for array in (masks, front, depth_m)))
 

@@ -9,8 +9,9 @@ from torch import Tensor, nn
 from torch import distributed as dist
 
 from sceneprior.config import LossConfig, RunConfig, ShapeConfig, StageConfig
-from sceneprior.geometry.boxes import beveled_cube, box_corners, place
+from sceneprior.geometry.boxes import beveled_cube, place
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
+from sceneprior.geometry.corners import box_corners
 from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.losses.layout import layout_losses

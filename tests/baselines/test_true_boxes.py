@@ -13,7 +13,7 @@ from tiny_runs import tiny_config
 from sceneprior.baselines.true_boxes import TruthDataset, turned
 from sceneprior.data.dataset import BLANK, ViewDataset
 from sceneprior.errors import ShardError
-from sceneprior.geometry.boxes import box_corners
+from sceneprior.geometry.corners import box_corners
 from sceneprior.shards import Shard, iterate_rooms
 
 PACKAGE = Path(__file__).parents[2] / "sceneprior"

@@ -10,8 +10,8 @@ from toy_rooms import make_toy_room
 from sceneprior.data.datamodule import DrawSampler, make_loader
 from sceneprior.data.dataset import BLANK, ViewDataset
 from sceneprior.errors import ShardError
-from sceneprior.geometry.boxes import box_corners
 from sceneprior.geometry.cameras import boxes_of_points
+from sceneprior.geometry.corners import box_corners
 from sceneprior.shards import RoomViews, Shard, list_shards, write_shard
 
 

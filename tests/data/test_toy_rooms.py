@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from toy_rooms import HALF_M, make_toy_room
 
-from sceneprior.geometry.boxes import box_corners
 from sceneprior.geometry.cameras import boxes_of_points
+from sceneprior.geometry.corners import box_corners
 from sceneprior.shards import Shard, list_shards
 
 

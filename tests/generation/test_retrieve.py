@@ -9,10 +9,8 @@ from model_folder import blocks, corner_sofa
 from sceneprior.errors import InputError
 from sceneprior.generation.cad_bank import CadBank, Shelf, unit_mesh
 from sceneprior.generation.retrieve import (
-    TURNS,
     _rough_distances,
     _turned_views,
-    chamfer,
     extruded,
     most_similar,
     placed,
@@ -21,6 +19,7 @@ from sceneprior.generation.retrieve import (
     retrieve_all,
 )
 from sceneprior.geometry.surfaces import surface_points
+from sceneprior.geometry.turns import QUARTERS
 from sceneprior.scene import Mesh, Scene, SceneObject
 
 POINTS = 256
@@ -64,22 +63,14 @@ def room(*objects: SceneObject) -> Scene:
     return Scene("room", "front3d_living", objects)
 
 
-def test_chamfer_is_its_definition(rng):
-    a, b = rng.normal(size=(70, 3)), rng.normal(size=(50, 3))
-    assert chamfer(a, b) == pytest.approx(brute_chamfer(a, b), rel=1e-12)
-    # Two parallel unit squares, sampled at the same places: nearer than neighbours are.
-    square = np.column_stack([rng.random((40, 2)), np.zeros(40)])
-    assert chamfer(square, square + np.array([0, 0, 0.01])) == pytest.approx(0.01, rel=1e-9)
-
-
 @pytest.mark.parametrize("step", [1, 4])
 def test_rough_distances_are_chamfer_distances_of_every_nth_point(rng, step):
     shelf = rng.uniform(-0.5, 0.5, (7, 64, 3)).astype(np.float32)
     points, size = rng.normal(size=(64, 3)), np.array([2.0, 0.7, 0.4])
-    choices = rng.permutation(7 * TURNS)[:19]
+    choices = rng.permutation(7 * QUARTERS)[:19]
     rough = _rough_distances(_turned_views(points, tuple(size)), shelf, choices, step)
     for choice, got in zip(choices, rough, strict=True):
-        model, turn = divmod(int(choice), TURNS)
+        model, turn = divmod(int(choice), QUARTERS)
         unit = Mesh(shelf[model].astype(np.float64), np.zeros((0, 3), np.int64))
         item = SceneObject("sofa", (0.0, 0.0, 0.0), tuple(size))
         in_room = placed(unit, item, 90 * turn).vertices_m

@@ -8,7 +8,6 @@ import torch
 from torch.testing import assert_close
 from toy_rooms import look_at
 
-from sceneprior.geometry.boxes import box_corners
 from sceneprior.geometry.cameras import (
     MIN_DEPTH_M,
     boxes_of_points,
@@ -16,6 +15,7 @@ from sceneprior.geometry.cameras import (
     pixel_rays,
     project,
 )
+from sceneprior.geometry.corners import box_corners
 
 LENS = torch.tensor([[50.0, 0, 40], [0, 60, 30], [0, 0, 1]], dtype=torch.float64)
 SIZE = (60, 80)

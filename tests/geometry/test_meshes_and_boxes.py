@@ -7,7 +7,8 @@ import torch
 from scipy.spatial import ConvexHull
 from torch.testing import assert_close
 
-from sceneprior.geometry.boxes import beveled_cube, box_corners, place, unit_corners
+from sceneprior.geometry.boxes import beveled_cube, place
+from sceneprior.geometry.corners import CUBE_CORNERS, box_corners
 from sceneprior.geometry.meshes import icosphere, to_cube
 
 
@@ -43,16 +44,7 @@ def test_to_cube_lands_on_the_cube_in_the_same_direction(level):
     assert_close(cube.amax(dim=0), torch.ones(3), rtol=0, atol=1e-6)
 
 
-def test_box_corners_are_center_plus_minus_half_a_size():
-    center, size = torch.tensor([1.0, 2, 3]), torch.tensor([0.2, 4, 6])
-    by_hand = [
-        [1 + x * 0.1, 2 + y * 2, 3 + z * 3] for x, y, z in itertools.product((-1, 1), repeat=3)
-    ]
-    assert_close(box_corners(center, size), torch.tensor(by_hand))
-    assert box_corners(torch.zeros(2, 5, 3), torch.ones(2, 5, 3)).shape == (2, 5, 8, 3)
-
-
-def test_a_chamfered_cube_without_chamfers_is_the_cube():
+def test_a_beveled_cube_without_bevels_is_the_cube():
     vertices = beveled_cube(torch.zeros(2, 5, 2))
     assert vertices.shape == (2, 5, 32, 3)
     assert {tuple(v) for v in vertices[1, 3].tolist()} == set(itertools.product((-1, 1), repeat=3))
@@ -68,7 +60,7 @@ def test_a_chamfered_cube_without_chamfers_is_the_cube():
         (0.4, 0.5, (4 - 2 * 0.4**2) * 2 * (0.5 + 0.5 * (1 + 0.5 + 0.25) / 3)),
     ],
 )
-def test_a_chamfered_cube_touches_all_six_sides_and_has_its_volume(upright, level, volume):
+def test_a_beveled_cube_touches_all_six_sides_and_has_its_volume(upright, level, volume):
     vertices = beveled_cube(torch.tensor([upright, level], dtype=torch.float64))
     one = torch.ones(3, dtype=torch.float64)
     assert_close(vertices.amax(dim=0), one)
@@ -76,7 +68,7 @@ def test_a_chamfered_cube_touches_all_six_sides_and_has_its_volume(upright, leve
     assert ConvexHull(vertices.numpy()).volume == pytest.approx(volume)
 
 
-def test_gradients_of_chamfers_in_double_precision():
+def test_gradients_of_bevels_in_double_precision():
     bevels = torch.tensor([[0.2, 0.7], [0.5, 0.1]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(beveled_cube, bevels)
 
@@ -84,5 +76,5 @@ def test_gradients_of_chamfers_in_double_precision():
 def test_place_puts_the_unit_cube_into_the_box():
     centers = torch.tensor([[[1.0, 2, 3], [0, 0.5, 0]]], dtype=torch.float64)
     sizes = torch.tensor([[[0.2, 4, 6], [1, 1, 2]]], dtype=torch.float64)
-    cube = unit_corners(centers).expand(1, 2, 8, 3)
+    cube = centers.new_tensor(CUBE_CORNERS).expand(1, 2, 8, 3)
     assert_close(place(cube, centers, sizes), box_corners(centers, sizes), rtol=0, atol=1e-15)

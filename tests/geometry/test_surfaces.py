@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
-from sceneprior.geometry.surfaces import surface_points
+from sceneprior.geometry.surfaces import chamfer_mean, surface_points
 
 
 def test_points_lie_on_the_mesh_and_go_by_their_seed():
@@ -38,7 +39,7 @@ def test_a_triangle_is_filled_evenly():
         np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]), 20000
     )
     assert (points[:, :2] >= 0).all() and (points.sum(axis=1) <= 1 + 1e-12).all()
-    # Moments of the uniform distribution on this triangle: mean 1/3, variance 1/18, covariance -1/36.
+    # Moments of a uniform point of this triangle: mean 1/3, variance 1/18, covariance -1/36.
     np.testing.assert_allclose(points.mean(axis=0), [1 / 3, 1 / 3, 0], atol=0.006)
     covariance = np.cov(points[:, :2].T)
     np.testing.assert_allclose(covariance, [[1 / 18, -1 / 36], [-1 / 36, 1 / 18]], atol=0.002)
@@ -51,3 +52,14 @@ def test_meshes_without_area_are_refused(scale):
         surface_points(mesh.vertices * scale, mesh.faces, 8)
     with pytest.raises(ValueError, match="no area"):
         surface_points(mesh.vertices, np.zeros((0, 3), np.int64), 8)
+
+
+def test_the_mean_chamfer_distance_is_its_definition(rng):
+    a, b = rng.normal(size=(70, 3)), rng.normal(size=(50, 3))
+    apart = np.linalg.norm(a[:, None] - b[None], axis=2)
+    by_hand = (apart.min(axis=1).mean() + apart.min(axis=0).mean()) / 2
+    assert chamfer_mean(a, b) == pytest.approx(by_hand, rel=1e-12)
+    assert chamfer_mean(a, b, cKDTree(a)) == chamfer_mean(a, b)
+    # Two parallel unit squares, sampled at the same places: nearer than neighbours are.
+    square = np.column_stack([rng.random((40, 2)), np.zeros(40)])
+    assert chamfer_mean(square, square + np.array([0, 0, 0.01])) == pytest.approx(0.01, rel=1e-9)

@@ -8,8 +8,8 @@ import torch
 from references import losses as by_hand
 from torch.testing import assert_close
 
-from sceneprior.geometry.boxes import box_corners
 from sceneprior.geometry.cameras import boxes_of_points
+from sceneprior.geometry.corners import box_corners
 from sceneprior.losses.layout import (
     box_loss,
     class_loss,

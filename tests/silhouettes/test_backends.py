@@ -20,7 +20,7 @@ from torch.testing import assert_close
 
 from sceneprior.geometry.cameras import project
 from sceneprior.geometry.meshes import icosphere
-from sceneprior.silhouettes.render import NEAR_M, render_scene, render_silhouettes
+from sceneprior.silhouettes.render import NEAR_FACE_M, render_scene, render_silhouettes
 
 
 @pytest.fixture(params=itertools.product(MODES, COMPOSITING), ids="-".join)
@@ -55,7 +55,7 @@ def backends_agree(scene: dict, **options) -> tuple:
 def test_objects_before_beside_behind_and_around_the_camera(seed, sigma_px2, how):
     scene = random_scene(seed, views=2, faces=6)
     seen = project(scene["vertices_m"], scene["world_to_camera"], scene["intrinsics"])
-    in_front = seen[..., 2] > NEAR_M
+    in_front = seen[..., 2] > NEAR_FACE_M
     assert (in_front.any(-1) & ~in_front.all(-1)).any()  # around the camera
     assert (~in_front.any(-1)).any()  # behind
     masks, front, depth_m, _ = backends_agree(scene, sigma_px2=sigma_px2, **how)

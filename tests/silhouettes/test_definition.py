@@ -19,7 +19,7 @@ from toy_rooms import look_at
 
 from sceneprior.geometry.cameras import project
 from sceneprior.silhouettes import reference
-from sceneprior.silhouettes.render import NEAR_M, render_scene, render_silhouettes
+from sceneprior.silhouettes.render import NEAR_FACE_M, render_scene, render_silhouettes
 
 BACKENDS = ("cpu", "reference")
 
@@ -30,7 +30,7 @@ def test_the_reference_is_the_definition_one_pixel_at_a_time(sigma_px2):
     seen = project(scene["vertices_m"], scene["world_to_camera"], scene["intrinsics"])[0]
     drawn = torch.tensor([[True, True, True], [True, False, True]])
     blur_px2 = math.log(1 / 1e-4 - 1) * sigma_px2
-    settings = reference.Settings(SIZE, sigma_px2, blur_px2, NEAR_M, "exact", "alone")
+    settings = reference.Settings(SIZE, sigma_px2, blur_px2, NEAR_FACE_M, "exact", "alone")
     by_hand = exact_loop(
         *(x.flatten(0, 1).numpy() for x in (seen[..., :2], seen[..., 2])),
         scene["faces"].numpy(),
@@ -78,7 +78,7 @@ def test_faces_that_reach_behind_the_near_plane_are_left_out_alone(mode, backend
     scene = random_scene(11, rooms=1, objects=1, views=1, corners=30, faces=10, spread=0)
     scene["world_to_camera"] = FRONT
     scene["faces"] = torch.arange(30).reshape(10, 3)
-    kept = (scene["vertices_m"][0, 0, :, 2].reshape(10, 3) > NEAR_M).all(dim=1)
+    kept = (scene["vertices_m"][0, 0, :, 2].reshape(10, 3) > NEAR_FACE_M).all(dim=1)
     assert 0 < kept.sum() < 10
     options = {"sigma_px2": 0.5, "mode": mode, "backend": backend}
     whole = render_scene(**scene, **options)
@@ -90,7 +90,11 @@ def test_faces_that_reach_behind_the_near_plane_are_left_out_alone(mode, backend
 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_face_at_the_near_plane_is_drawn_just_beyond_it(mode):
-    for z, drawn in ((NEAR_M * 1.001, True), (NEAR_M, False), (NEAR_M * 0.999, False)):
+    for z, drawn in (
+        (NEAR_FACE_M * 1.001, True),
+        (NEAR_FACE_M, False),
+        (NEAR_FACE_M * 0.999, False),
+    ):
         corners = torch.tensor([[-1.0, -1, 1], [1, -1, 1], [0, 1, 1]], dtype=torch.float64) * z
         for backend in BACKENDS:
             masks = render_silhouettes(**triangles(corners.tolist()), mode=mode, backend=backend)

@@ -5,14 +5,15 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from sceneprior.errors import InputError
+from sceneprior.geometry.surfaces import nearest_distances
+from sceneprior.geometry.turns import yaw_rotation
 from sceneprior.scene import Mesh
 
 POINTS = 10_000
 """Points an object's surface is compared by. Two samples of one sphere of radius 1 m are still
-35 mm apart by `Chamfer.l2_m`; with 1,000 points, 112 mm."""
+35 mm apart by `chamfer_sum(...).l2_m`; with 1,000 points, 112 mm."""
 F_THRESHOLD_M = 0.05
 """How near a point must have a neighbour on the other surface to count for the F-score."""
 
@@ -40,34 +41,6 @@ def sample_surface(mesh: Mesh, count: int, seed: int) -> Float[np.ndarray, "coun
     return np.asarray(points, dtype=np.float64)
 
 
-class Chamfer(NamedTuple):
-    """How far two surfaces are apart, both ways added; 0 for the same points."""
-
-    l2_m: float
-    """Mean distance from a to b plus mean distance from b to a, in metres: the paper's L2."""
-    squared_m2: float
-    """The same of squared distances, in square metres: what many others call CD."""
-
-
-def chamfer(a_points_m: Float[np.ndarray, "n 3"], b_points_m: Float[np.ndarray, "m 3"]) -> Chamfer:
-    """The Chamfer distance of two sets of points.
-
-        sum over both ways of mean_i min_j |p_i - q_j|**k,  k = 1 and 2
-
-    The two ways are added, as in PyTorch3D; authors who average them report half of it.
-
-    Raises:
-        InputError: a set is empty.
-
-    Example: two points, one metre apart.
-
-        >>> chamfer(np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]))
-        Chamfer(l2_m=2.0, squared_m2=2.0)
-    """
-    there, back = _nearest(a_points_m, b_points_m)
-    return Chamfer(float(there.mean() + back.mean()), float((there**2).mean() + (back**2).mean()))
-
-
 def f_score(
     a_points_m: Float[np.ndarray, "n 3"],
     b_points_m: Float[np.ndarray, "m 3"],
@@ -79,15 +52,9 @@ def f_score(
         InputError: a set is empty.
     """
     precision, recall = (
-        float((way <= threshold_m).mean()) for way in _nearest(a_points_m, b_points_m)
+        float((way <= threshold_m).mean()) for way in nearest_distances(a_points_m, b_points_m)
     )
     return 2 * precision * recall / max(precision + recall, 1e-12)
-
-
-def _nearest(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    if not len(a) or not len(b):
-        raise InputError(f"Surfaces are compared by points, but {len(a)} and {len(b)} came.")
-    return cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
 
 
 class OrientedBoxes(NamedTuple):
@@ -123,17 +90,10 @@ def _tightest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     if isinstance(rectangle, Polygon):
         x, z = np.diff(np.asarray(rectangle.exterior.coords)[:2], axis=0)[0]
         yaw = float(np.arctan2(x, z) % (np.pi / 2))
-    turn = _turn(np.array(yaw))
+    turn = yaw_rotation(yaw)
     own = points @ turn  # columns of `turn` are the box's axes
     low, high = own.min(axis=0), own.max(axis=0)
     return turn @ (low + high) / 2, high - low, yaw
-
-
-def _turn(yaw_rad: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) rotations about +y, from the box's own axes to the room's."""
-    cosine, sine, zero = np.cos(yaw_rad), np.sin(yaw_rad), np.zeros_like(yaw_rad)
-    rows = [[cosine, zero, sine], [zero, zero + 1, zero], [-sine, zero, cosine]]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
 def oriented_box_iou_3d(a: OrientedBoxes, b: OrientedBoxes) -> Float[np.ndarray, "n m"]:
@@ -166,7 +126,7 @@ def _footprints(boxes: OrientedBoxes) -> np.ndarray:
 
     corners = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) / 2
     own = corners * boxes.sizes_m[:, None]
-    room = own @ np.swapaxes(_turn(boxes.yaw_rad), 1, 2) + boxes.centers_m[:, None]
+    room = own @ np.swapaxes(yaw_rotation(boxes.yaw_rad), 1, 2) + boxes.centers_m[:, None]
     return shapely.polygons(room[:, :, [0, 2]])
 
 

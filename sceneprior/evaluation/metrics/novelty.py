@@ -7,6 +7,7 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
+from sceneprior.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.scene import Scene
 
 MISSING_M = 1.0
@@ -71,8 +72,9 @@ def nearest_distances(
     nearest = np.empty(len(scenes))
     for row, scene in enumerate(scenes):
         best = np.inf
-        for turned in _quarter_turns(_rows(scene)):
-            costs = np.minimum(cdist(turned, everything), MISSING_M)
+        placed = _rows(scene)
+        for quarters in range(QUARTERS):
+            costs = np.minimum(cdist(_turned(placed, quarters), everything), MISSING_M)
             bounds = _lower_bounds(costs, starts, counts)
             if own is not None:
                 bounds[own[row]] = np.inf
@@ -85,13 +87,9 @@ def nearest_distances(
     return nearest
 
 
-def _quarter_turns(rows: np.ndarray) -> list[np.ndarray]:
-    """About y: x, z become z, -x; widths and depths change places."""
-    turns = [rows]
-    for _ in range(3):
-        x, y, z, width, height, depth, label = turns[-1].T
-        turns.append(np.stack([z, y, -x, depth, height, width, label], axis=1))
-    return turns
+def _turned(rows: np.ndarray, quarters: int) -> np.ndarray:
+    turn = quarter_rotation(quarters).T
+    return np.hstack([rows[:, :3] @ turn, rows[:, 3:6] @ np.abs(turn), rows[:, 6:]])
 
 
 def _lower_bounds(costs: np.ndarray, starts: np.ndarray, counts: np.ndarray) -> np.ndarray:

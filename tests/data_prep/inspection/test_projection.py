@@ -8,25 +8,17 @@ import pytest
 from data_prep.front.viewpoints import look
 from data_prep.inspection import projection
 from data_prep.inspection.projection import (
-    BOX_EDGES,
-    box_corners,
     box_iou_2d,
     boxes_around,
     wire_pixels,
 )
+from sceneprior.geometry.corners import BOX_EDGES, box_corners
 
 K = np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]])
 
 
 def test_examples():
     assert doctest.testmod(projection).failed == 0
-
-
-def test_the_corners_and_edges_of_a_box():
-    corners = box_corners(np.array([1.0, 2, 3]), np.array([2.0, 4, 6]))
-    assert corners[0].tolist() == [0, 0, 0] and corners[7].tolist() == [2, 4, 6]
-    lengths = sorted(np.linalg.norm(corners[a] - corners[b]) for a, b in BOX_EDGES)
-    assert lengths == [2] * 4 + [4] * 4 + [6] * 4
 
 
 def test_wires_join_projected_points(numbers):
@@ -47,7 +39,7 @@ def test_a_line_through_the_camera_is_cut_where_it_becomes_visible(turned):
     line = np.array([[0.0, 0.1, -2.0], [0.0, 0.1, 2.0]])[:: -1 if turned else 1]
     ((u1, v1, u2, v2),) = wire_pixels(line, [(0, 1)], np.eye(4), K)
     ends = [(u1, v1), (u2, v2)][:: -1 if turned else 1]
-    assert ends[0] == pytest.approx((60, 45 + 100 * 0.1 / projection.NEAR_M))
+    assert ends[0] == pytest.approx((60, 45 + 100 * 0.1 / projection.WIRE_NEAR_M))
     assert ends[1] == pytest.approx((60, 50))
     assert wire_pixels(-np.abs(line), [(0, 1)], np.eye(4), K) == []
     assert np.isnan(boxes_around(line, np.eye(4)[None], K[None])).all()

@@ -10,7 +10,7 @@ from sceneprior.geometry.meshes import icosphere
 from sceneprior.silhouettes.cpu import faces, outline
 from sceneprior.silhouettes.cpu.windows import LANES, windows_of
 from sceneprior.silhouettes.reference import Settings
-from sceneprior.silhouettes.render import NEAR_M, render_silhouettes
+from sceneprior.silhouettes.render import NEAR_FACE_M, render_silhouettes
 
 
 def projected(scene: dict) -> tuple[np.ndarray, np.ndarray]:
@@ -23,7 +23,7 @@ def boxes_by_hand(pixels, depths, drawn, image_size, reach):
     """Pixels with their centre within reach of a mesh's box: (row0, row1, column0, column1)."""
     boxes = []
     for points, z, shown in zip(pixels, depths, drawn, strict=True):
-        points = points[z > NEAR_M]
+        points = points[z > NEAR_FACE_M]
         rows = columns = np.zeros(0, dtype=int)
         if shown and len(points):
             (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
@@ -42,7 +42,7 @@ def test_windows_are_the_boxes_by_hand_in_strips_of_eight(reach):
     scene = random_scene(0, rooms=2, objects=6, views=8)
     pixels, depths = projected(scene)
     drawn = np.arange(len(pixels)) % 7 != 3
-    windows = windows_of(pixels, depths, drawn, (24, 32), reach, NEAR_M)
+    windows = windows_of(pixels, depths, drawn, (24, 32), reach, NEAR_FACE_M)
     boxes = boxes_by_hand(pixels, depths, drawn, (24, 32), reach)
     assert 0 < (boxes[:, 1] == 0).sum() < len(boxes)
     wanted = np.column_stack([boxes[:, :2], boxes[:, 2] // 8, -(-boxes[:, 3] // 8)])
@@ -64,7 +64,7 @@ def test_memory_grows_with_visible_pixels_not_with_objects_x_views_x_image():
             np.ones(len(meshes), dtype=bool),
             size,
             2.0,
-            NEAR_M,
+            NEAR_FACE_M,
         )
         for meshes in ([ahead], [ahead, *unseen * 50])
     )
@@ -78,10 +78,10 @@ def test_memory_grows_with_visible_pixels_not_with_objects_x_views_x_image():
 def test_every_pixel_is_where_the_layout_says(engine, dtype):
     scene = random_scene(17, views=2)
     scene["image_size"] = (21, 29)
-    settings = Settings((21, 29), 0.5, 4.6, NEAR_M, "", "")
+    settings = Settings((21, 29), 0.5, 4.6, NEAR_FACE_M, "", "")
     pixels, depths = (array.astype(dtype) for array in projected(scene))
     drawn = np.ones(len(pixels), dtype=bool)
-    windows = windows_of(pixels, depths, drawn, (21, 29), 4.6**0.5, NEAR_M)
+    windows = windows_of(pixels, depths, drawn, (21, 29), 4.6**0.5, NEAR_FACE_M)
     triangles = scene["faces"].numpy()
     odds, order, _ = engine.cover(pixels, depths, triangles, windows, settings)
     assert odds.shape == order.shape == (windows.start[-1],) and odds.dtype == order.dtype == dtype

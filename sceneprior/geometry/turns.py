@@ -1,0 +1,44 @@
+"""Turns about the vertical axis, +z towards +x (docs/conventions.md); quarter turns are exact."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+QUARTERS = 4
+"""Quarter turns of a room, none among them: 0, 90, 180 and 270 degrees."""
+_COLUMNS = ((0, 1, 2), (2, 1, 0), (0, 1, 2), (2, 1, 0))
+_SIGNS = ((1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, 1.0, 1.0))
+
+
+def yaw_rotation(yaw_rad: float | Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Rotations about +y for column vectors; float64."""
+    cosine, sine, zero = np.cos(yaw_rad), np.sin(yaw_rad), np.zeros_like(yaw_rad)
+    rows = [[cosine, zero, sine], [zero, zero + 1, zero], [-sine, zero, cosine]]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def quarter_rotation(quarters: int) -> Float[np.ndarray, "3 3"]:
+    """`yaw_rotation` by so many quarter turns, of ones and zeros.
+
+    Example: what stood on the +z side stands on the +x side.
+
+        >>> (quarter_rotation(1) @ [0, 0, 1]).tolist()
+        [1.0, 0.0, 0.0]
+    """
+    sine, cosine = ((0, 1), (1, 0), (0, -1), (-1, 0))[quarters % QUARTERS]
+    return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]], dtype=np.float64)
+
+
+def turn_vectors(
+    vectors: Float[Tensor, "rooms *batch 3"], quarters: Int[Tensor, " rooms"]
+) -> Float[Tensor, "rooms *batch 3"]:
+    """Turn the vectors of every room by its own number of quarters, 0 to 3.
+
+    Rows of `world_to_camera[..., :3]` are vectors, too: a camera that is turned with its room sees
+    what it saw before. No matrix product, which a GPU may round.
+    """
+    many = (len(quarters), *[1] * (vectors.ndim - 2), 3)
+    columns = torch.tensor(_COLUMNS, device=vectors.device)[quarters].reshape(many)
+    signs = torch.tensor(_SIGNS, device=vectors.device)[quarters].reshape(many)
+    return vectors.gather(-1, columns.expand_as(vectors)) * signs
