@@ -1,11 +1,11 @@
-"""Files that are whole or absent (bytes in, one atomic rename out), JSON files, file names."""
+"""Writes files whole or not at all, reads JSON, and says which texts can be names of files."""
 
 import contextlib
 import fcntl
 import json
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,15 @@ PART = ".part"
 _LONGEST_NAME = 120
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_whole(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
     """Write a file so that no reader, and no crash, ever meets half of it.
 
-    The bytes go to `<name>.<random>.part` beside it, reach the disk, and are renamed. A process
-    that is killed leaves at most such a `.part` file; `remove_parts` clears them away.
+    The content goes to `<name>.<random>.part` beside it, reaches the disk, and is renamed. A
+    process that is killed leaves at most such a `.part` file; `remove_parts` clears them away.
+
+    Args:
+        path: Missing folders are made.
+        content: Bytes, a text (UTF-8), or a function that writes to the path it is given.
 
     Raises:
         OSError: it cannot be written; `filename` is set, and what was there before stays.
@@ -32,10 +36,12 @@ def write_whole(path: Path, data: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as undo:
             undo.callback(_remove, temporary)
-            with temporary.open("xb") as file:
-                file.write(data)
-                file.flush()
-                # Without this a power cut may keep the new name and lose the bytes.
+            if callable(content):
+                content(temporary)
+            else:
+                temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+            # Without this a power cut may keep the new name and lose the bytes.
+            with temporary.open("rb+") as file:
                 os.fsync(file.fileno())
             temporary.replace(path)
             undo.pop_all()
@@ -45,14 +51,26 @@ def write_whole(path: Path, data: bytes) -> None:
     _sync_folder(path.parent)
 
 
-def write_json(path: Path, data: Any) -> None:
-    """Write plain data as JSON, whole or not at all.
+def write_changed(path: Path, content: bytes | str) -> None:
+    """`write_whole`, unless the file says this already: a finished folder may be read-only."""
+    with contextlib.suppress(OSError):
+        if path.read_bytes() == (content.encode() if isinstance(content, str) else content):
+            return
+    write_whole(path, content)
+
+
+def json_text(data: Any, indent: int = 1) -> str:
+    """Plain data as every JSON file of ours is written.
 
     Raises:
         ValueError: a number is NaN or infinite, which JSON does not know.
-        OSError: see `write_whole`.
     """
-    write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
+    return json.dumps(data, indent=indent, allow_nan=False) + "\n"
+
+
+def write_json(path: Path, data: Any, indent: int = 1) -> None:
+    """Write plain data as JSON, whole or not at all; see `json_text` and `write_whole`."""
+    write_whole(path, json_text(data, indent))
 
 
 def remove_parts(folder: Path) -> None:

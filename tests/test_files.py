@@ -16,6 +16,20 @@ def test_written_in_new_folders_and_replaced(tmp_path):
     assert path.read_bytes() == b"two" and [p.name for p in path.parent.iterdir()] == ["file.bin"]
 
 
+def test_bytes_texts_and_functions_are_written_alike(tmp_path):
+    def write(path):
+        assert path.name.endswith(PART)
+        path.write_text("ä\n")
+
+    for name, content in {"bytes": "ä\n".encode(), "text": "ä\n", "function": write}.items():
+        write_whole(tmp_path / name, content)
+        assert (tmp_path / name).read_bytes() == b"\xc3\xa4\n"
+    with pytest.raises(ZeroDivisionError):
+        write_whole(tmp_path / "text", lambda path: path.write_text("half") / 0)
+    assert (tmp_path / "text").read_text() == "ä\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bytes", "function", "text"]
+
+
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 def test_what_was_there_stays_if_writing_fails(tmp_path, monkeypatch, step):
     path = tmp_path / "file.bin"

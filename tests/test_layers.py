@@ -14,6 +14,7 @@ ROWS = {
     "geometry": 0, "silhouettes": 0, "classes": 0, "errors": 0, "files": 0,
     "settings": 0, "config": 0,
     "scene": 1, "views": 1, "offscreen": 1, "shards": 1, "furniture": 1, "instances": 1,
+    "pictures": 1,
     "data": 2, "models": 2, "losses": 2,
     "data_prep": 3, "training": 3,
     "baselines": 4, "evaluation": 4,

@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from data_prep.engine.output import write_changed, write_json, writing
+from data_prep.engine.output import writing
 from data_prep.engine.plan import Plan
 from data_prep.engine.report import Line, count_splits, make_report, report_csv
 from data_prep.engine.source import SPLITS, Source
 from sceneprior.errors import InputError
+from sceneprior.files import json_text, write_changed
 from sceneprior.shards import INDEX_NAME
 
 REPORT_NAME = "report.json"
@@ -79,8 +80,8 @@ def finish(out: Path, plan: Plan, totals: Summary) -> None:
         # `--only` made the last missing part: the files are those of the whole.
         totals = replace(totals, source=_whole(totals.source))
     with writing(out):
-        write_json(out / REPORT_NAME, totals.report)
-        write_changed(out / TABLE_NAME, report_csv(totals.lines).encode())
+        write_changed(out / REPORT_NAME, json_text(totals.report))
+        write_changed(out / TABLE_NAME, report_csv(totals.lines))
     for split in SPLITS:
         planned = any(room.split == split for room in plan.rooms)
         if planned and plan.settings["only"] is None and not totals.counts[split]["rooms"]:
@@ -101,7 +102,7 @@ def finish(out: Path, plan: Plan, totals: Summary) -> None:
         "renderer": totals.renderer,
     }
     with writing(out):
-        write_json(out / INDEX_NAME, index)
+        write_changed(out / INDEX_NAME, json_text(index))
 
 
 def _whole(source: Any) -> Any:

@@ -1,14 +1,12 @@
-"""The folder that is written: one run at a time, nothing half-written, a sentence if it fails."""
+"""Guards the folder that a job writes: one run at a time, and a sentence if writing fails."""
 
 import contextlib
 import errno
-import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from sceneprior.errors import InputError
-from sceneprior.files import only_writer, remove_parts, write_whole
+from sceneprior.files import only_writer, remove_parts
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -58,24 +56,3 @@ def writing(out: Path, what: str = "") -> Iterator[None]:
             f"{where}{about} cannot be written ({error.strerror or error}). "
             f"Finished shards are kept: {advice}run the same command again to go on."
         ) from None
-
-
-def write_json(path: Path, data: Any) -> None:
-    """Write JSON, whole or not at all.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    write_changed(path, (json.dumps(data, indent=1) + "\n").encode())
-
-
-def write_changed(path: Path, data: bytes) -> None:
-    """Write a file unless it says this already: a finished folder may be read-only.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    with contextlib.suppress(OSError):
-        if path.read_bytes() == data:
-            return
-    write_whole(path, data)

@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from data_prep.engine.output import write_json
 from data_prep.engine.report import Line, read_line
 from data_prep.engine.source import SPLITS, RoomTask, Source
 from sceneprior.errors import InputError
+from sceneprior.files import write_json
 from sceneprior.shards import INDEX_NAME
 
 PLAN_NAME = "plan.json"

@@ -5,12 +5,12 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 
-from data_prep.engine.output import write_json, writing
+from data_prep.engine.output import writing
 from data_prep.engine.plan import PLAN_NAME, ShardPlan
 from data_prep.engine.report import Line, line_of, read_line
 from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Source, sentence_of
 from sceneprior.errors import InputError
-from sceneprior.files import write_whole
+from sceneprior.files import write_json, write_whole
 from sceneprior.offscreen import Renderer, open_renderer
 from sceneprior.scene import Mesh
 from sceneprior.shards import (

@@ -4,16 +4,15 @@ The room's floor, walls and ceiling are a backdrop only: as in the instance ids,
 piece, so that picture and masks of a view agree pixel by pixel.
 """
 
-import io
 from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from PIL import Image
 
 from data_prep.front.furnished import Room
 from sceneprior.classes import class_colors, label_set
 from sceneprior.offscreen import Pinhole, Renderer
+from sceneprior.pictures import png_bytes
 from sceneprior.scene import Mesh
 from sceneprior.shards import RoomViews
 
@@ -55,9 +54,8 @@ def rgb_files(
         camera = Pinhole(turn.astype(np.float64), K.astype(np.float64))
         behind = renderer.shaded(shell, shell_colors, camera, views.image_size, _OUTSIDE)
         picture = renderer.shaded(meshes, painted, camera, views.image_size, behind)
-        data = io.BytesIO()
-        Image.fromarray(picture).save(data, "PNG", compress_level=6)
-        files[f"{FOLDER}/{room.room_id}/{view:04d}.png"] = data.getvalue()
+        name = f"{FOLDER}/{room.room_id}/{view:04d}.png"
+        files[name] = png_bytes(picture, compress_level=6)
     return files
 
 

@@ -1,4 +1,4 @@
-"""`sceneprior inspect`: the command around inspection.py and verify.py."""
+"""`sceneprior inspect`: the command around contents.py and verify.py."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -36,7 +36,10 @@ def inspect_command(
     """
     from rich.console import Console
 
-    from data_prep.inspection.inspection import contact_sheet
+    from data_prep.inspection.contents import draw_sheet
+    from sceneprior.errors import InputError
+    from sceneprior.files import write_whole
+    from sceneprior.pictures import png_bytes
 
     console = Console()
     if verify:
@@ -46,13 +49,10 @@ def inspect_command(
             console.print(table)
     if png is not None or not verify:
         target = png or shards / SHEET_NAME
-        sheet = contact_sheet(shards, room, pictures, boxes_3d)
+        sheet = draw_sheet(shards, room, pictures, boxes_3d)
         try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            sheet.save(target, "PNG")
+            write_whole(target, png_bytes(sheet))
         except OSError as error:
-            from sceneprior.errors import InputError
-
             raise InputError(
                 f"{target} cannot be written ({error.strerror or error}); name another file with "
                 "--png."
@@ -63,7 +63,7 @@ def inspect_command(
 def _count_tables(shards: Path) -> "list[Table]":
     from rich.table import Table
 
-    from data_prep.inspection.inspection import count_shards
+    from data_prep.inspection.contents import count_shards
 
     counts = count_shards(shards)
     totals = Table(
@@ -93,7 +93,7 @@ def _count_tables(shards: Path) -> "list[Table]":
 def _room_table(shards: Path, room: str) -> "Table":
     from rich.table import Table
 
-    from data_prep.inspection.inspection import describe_room
+    from data_prep.inspection.contents import describe_room
 
     table = Table("object", "class", "views", "share of image", "centre, m", "size, m", title=room)
     for k, row in enumerate(describe_room(shards, room)):

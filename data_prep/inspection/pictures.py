@@ -8,6 +8,7 @@ from PIL import Image, ImageDraw, ImageFont
 from data_prep.inspection.projection import to_camera, wire_pixels
 from sceneprior.classes import class_colors, label_set
 from sceneprior.geometry.corners import BOX_EDGES, box_corners
+from sceneprior.pictures import paint_ids
 from sceneprior.shards import RoomGroundTruth, RoomViews, Shard
 
 BACKGROUND = (246, 246, 246)
@@ -52,7 +53,10 @@ def draw_view(
     ids = Image.fromarray(shard.read_instance_ids(room_id, [view])[0].astype(np.int32))
     large = np.asarray(ids.resize(size, Image.Resampling.NEAREST))
     palette = class_colors(len(names))[room.object_class]
-    picture.paste(_mask_colors(large, palette), mask=Image.fromarray(large > 0))
+    # Halfway to white, so that wires and names stand out.
+    pale = (palette.astype(np.int32) + 255) // 2
+    painted = Image.fromarray(paint_ids(large, pale, BACKGROUND))
+    picture.paste(painted, mask=Image.fromarray(large > 0))
     for name, end in zip(AXES, np.eye(3) * _AXIS_M, strict=True):
         _line(draw, np.stack([np.zeros(3), end]), camera, lens, AXES[name], 2)
         for line in wire_pixels(np.stack([np.zeros(3), end]), [(0, 1)], camera, lens):
@@ -116,17 +120,6 @@ def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 
 
 def _truth(shard: Shard, room_id: str) -> RoomGroundTruth | None:
     return shard.read_ground_truth(room_id) if shard.has_ground_truth(room_id) else None
-
-
-def _mask_colors(ids: np.ndarray, palette: np.ndarray) -> Image.Image:
-    # Halfway to white, so that wires and names stand out; a dark rim parts neighbours of a class.
-    pale = (palette.astype(np.int32) + 255) // 2
-    image = np.concatenate([[BACKGROUND], pale]).astype(np.uint8)[ids]
-    rim = np.zeros(ids.shape, dtype=bool)
-    rim[:, 1:] |= ids[:, 1:] != ids[:, :-1]
-    rim[1:] |= ids[1:] != ids[:-1]
-    image[rim] = image[rim] // 2
-    return Image.fromarray(image)
 
 
 def _draw_floor(

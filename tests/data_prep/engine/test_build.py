@@ -11,7 +11,7 @@ from front_jobs import digests, front_job, rooms_of, three_houses
 
 from data_prep.engine.build import Job, build_shards
 from data_prep.front.source import FrontSource
-from data_prep.inspection.inspection import contact_sheet, count_shards
+from data_prep.inspection.contents import count_shards, draw_sheet
 from data_prep.recipe import load_recipe
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
@@ -177,9 +177,9 @@ def test_inspection(front, tmp_path):
         np.mean([r.visible.sum(axis=1).mean() for r in
                  (shard.read_room(name) for shard, name in iterate_rooms(out, "train"))])
     )  # fmt: skip
-    assert contact_sheet(out, pictures=4).size == contact_sheet(out, pictures=4, boxes_3d=True).size
+    assert draw_sheet(out, pictures=4).size == draw_sheet(out, pictures=4, boxes_3d=True).size
     with pytest.raises(InputError, match="has no room 'attic'"):
-        contact_sheet(out, "attic")
+        draw_sheet(out, "attic")
 
 
 def shared_front() -> Path:

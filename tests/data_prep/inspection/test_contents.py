@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from data_prep.cli import add_commands
 from data_prep.engine.build import build_shards
-from data_prep.inspection.inspection import contact_sheet, count_shards, describe_room
+from data_prep.inspection.contents import count_shards, describe_room, draw_sheet
 from sceneprior.errors import InputError
 
 
@@ -37,13 +37,13 @@ def test_counts_say_what_is_known(shards):
 def test_a_sheet_of_a_folder_and_of_a_room(shards):
     # Tiles of 480 x 360 with 8 pixels between and 18 for the caption, under the legend.
     for pictures, columns, rows in ((1, 1, 1), (5, 4, 2), (8, 4, 2)):
-        sheet = contact_sheet(shards, pictures=pictures)
+        sheet = draw_sheet(shards, pictures=pictures)
         assert sheet.width == columns * 488 + 8
         assert (sheet.height - 8) // 386 == rows
-    room = contact_sheet(shards, "house0_Bedroom-0", pictures=3)
+    room = draw_sheet(shards, "house0_Bedroom-0", pictures=3)
     assert room.width == 4 * 488 + 8  # its plan comes first
     with pytest.raises(InputError, match=r"has no room 'attic'; its report\.csv lists the rooms"):
-        contact_sheet(shards, "attic")
+        draw_sheet(shards, "attic")
 
 
 def test_a_room_in_words(shards):

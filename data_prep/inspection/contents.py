@@ -1,4 +1,4 @@
-"""A folder of shards in, a table and a sheet of pictures out: to see with one's own eyes."""
+"""What a folder of shards holds: counts, a room's objects, and a sheet of pictures."""
 
 import textwrap
 from collections import Counter
@@ -12,6 +12,7 @@ from data_prep.engine.source import SPLITS
 from data_prep.inspection.pictures import draw_plan, draw_view
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
+from sceneprior.pictures import contact_sheet
 from sceneprior.shards import Shard, iterate_rooms, list_shards, read_index
 
 LEGEND = (
@@ -20,7 +21,7 @@ LEGEND = (
     "metres, with the room's axes x, y, z."
 )
 _TILE = (480, 360)
-_GAP, _CAPTION = 8, 18
+_GAP_PX, _LINE_PX = 8, 15
 
 
 def count_shards(folder: Path) -> dict[str, dict[str, Any]]:
@@ -83,7 +84,7 @@ def describe_room(folder: Path, room_id: str) -> list[dict[str, Any]]:
     return rows
 
 
-def contact_sheet(
+def draw_sheet(
     folder: Path, room_id: str | None = None, pictures: int = 24, boxes_3d: bool = True
 ) -> Image.Image:
     """Views of a folder, or of one room and its plan, on one sheet; `LEGEND` says what is drawn.
@@ -97,36 +98,24 @@ def contact_sheet(
     Raises:
         InputError: no room has this id.
     """
-    chosen = _choose(folder, room_id, pictures)
-    tiles: list[tuple[str, Image.Image]] = []
-    for path, name, view in chosen:
+    captions, tiles = [], []
+    for path, name, view in _choose(folder, room_id, pictures):
+        short = name if len(name) <= 56 else f"{name[:8]}...{name[-45:]}"
         with Shard(path) as shard:
             if room_id is not None and not tiles:
-                tiles.append((f"{_short(name)}  from above", draw_plan(shard, name, *_TILE)))
-            picture = draw_view(shard, name, view, boxes_3d, _TILE[0])
-        tiles.append((f"{_short(name)}  view {view}", picture))
-    columns = min(4, len(tiles))
-    width = _TILE[0]
-    height = max(tile.height for _, tile in tiles)
-    rows = -(-len(tiles) // columns)
-    sheet_width = columns * (width + _GAP) + _GAP
-    font, small = ImageFont.load_default(size=12), ImageFont.load_default(size=11)
-    legend = textwrap.wrap(LEGEND, max(40, sheet_width // 6))
-    top = _GAP + 15 * len(legend)
-    sheet = Image.new("RGB", (sheet_width, top + rows * (height + _CAPTION + _GAP) + _GAP), "white")
-    draw = ImageDraw.Draw(sheet)
+                captions.append(f"{short}  from above")
+                tiles.append(np.asarray(draw_plan(shard, name, *_TILE)))
+            captions.append(f"{short}  view {view}")
+            tiles.append(np.asarray(draw_view(shard, name, view, boxes_3d, _TILE[0])))
+    sheet = contact_sheet(tiles, min(4, len(tiles)), captions, _GAP_PX)
+    legend = textwrap.wrap(LEGEND, max(40, sheet.shape[1] // 6))
+    borders = ((_LINE_PX * len(legend), _GAP_PX), (0, 0), (0, 0))
+    picture = Image.fromarray(np.pad(sheet, borders, constant_values=255))
+    draw = ImageDraw.Draw(picture)
     for i, line in enumerate(legend):
-        draw.text((_GAP, 4 + 15 * i), line, fill="black", font=small)
-    for i, (caption, tile) in enumerate(tiles):
-        x = _GAP + (i % columns) * (width + _GAP)
-        y = top + (i // columns) * (height + _CAPTION + _GAP)
-        draw.text((x, y + 1), caption, fill="black", font=font)
-        sheet.paste(tile, (x, y + _CAPTION))
-    return sheet
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= 56 else f"{name[:8]}...{name[-45:]}"
+        place, font = (_GAP_PX, 4 + _LINE_PX * i), ImageFont.load_default(size=11)
+        draw.text(place, line, fill="black", font=font)
+    return picture
 
 
 def _choose(folder: Path, room_id: str | None, pictures: int) -> list[tuple[Path, str, int]]:

@@ -1,0 +1,73 @@
+"""Composes pictures: contact sheets, instance ids in colours, and the bytes of a PNG."""
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Integer, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+CAPTION_PX = 18
+
+
+def contact_sheet(
+    tiles: Sequence[UInt8[np.ndarray, "_ _ 3"]],
+    columns: int,
+    captions: Sequence[str] = (),
+    gap_px: int = 0,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Lay pictures out in rows on white, from left to right.
+
+    Args:
+        tiles: At least one; smaller ones stand at the upper left of the room of the largest.
+        columns: How many a row has room for, even if there are fewer tiles.
+        captions: One above each tile, or none at all.
+        gap_px: White around each tile.
+    """
+    height, width = (max(tile.shape[axis] for tile in tiles) for axis in (0, 1))
+    above = gap_px + (CAPTION_PX if captions else 0)
+    rows = -(-len(tiles) // columns)
+    shape = (rows * (above + height) + gap_px, columns * (gap_px + width) + gap_px, 3)
+    sheet = np.full(shape, 255, dtype=np.uint8)
+    places = [
+        (row * (above + height) + above, column * (gap_px + width) + gap_px)
+        for row, column in (divmod(index, columns) for index in range(len(tiles)))
+    ]
+    for (top, left), tile in zip(places, tiles, strict=True):
+        sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+    if not captions:
+        return sheet
+    picture, font = Image.fromarray(sheet), ImageFont.load_default(size=12)
+    draw = ImageDraw.Draw(picture)
+    for (top, left), caption in zip(places, captions, strict=True):
+        draw.text((left, top - CAPTION_PX + 1), caption, fill="black", font=font)
+    return np.array(picture)
+
+
+def paint_ids(
+    ids: Integer[np.ndarray, "height width"],
+    colors: UInt8[np.ndarray, "objects 3"] | Integer[np.ndarray, "objects 3"],
+    background: tuple[int, int, int],
+) -> UInt8[np.ndarray, "height width 3"]:
+    """An image of instance ids in one colour an object, with dark borders between them.
+
+    Args:
+        ids: 0 = nothing, k + 1 = object k.
+        colors: RGB of each object, 0 to 255.
+        background: RGB of nothing.
+    """
+    image = np.concatenate([[background], colors]).astype(np.uint8)[ids]
+    border = np.zeros(ids.shape, dtype=bool)
+    border[:, 1:] |= ids[:, 1:] != ids[:, :-1]
+    border[1:] |= ids[1:] != ids[:-1]
+    image[border] = image[border] // 2
+    return image
+
+
+def png_bytes(picture: UInt8[np.ndarray, "height width 3"] | Image.Image, **options: Any) -> bytes:
+    """A picture as a PNG; `options` are Pillow's (`compress_level`, `optimize`)."""
+    buffer = io.BytesIO()
+    image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
+    image.save(buffer, format="PNG", **options)
+    return buffer.getvalue()
