@@ -29,7 +29,7 @@ def test_gaps_and_captions_are_beside_the_tiles():
     for top, left in ((row - 30, 5), (row - 30, 50), (2 * row - 30, 5)):
         assert (sheet[top : top + 30, left : left + 40] == 10).all()
         assert (sheet[top - CAPTION_PX : top, left : left + 40] < 200).any()
-    assert (sheet[-5:] == 255).all() and (sheet[:, :5] == 255).all()
+    assert (sheet[-5:] == 255).all() and (sheet[:, :4] == 255).all()
 
 
 def test_ids_have_their_colours_and_dark_borders():

@@ -19,7 +19,6 @@ from sceneprior.errors import InputError
 from sceneprior.instances.observations import observe
 from sceneprior.instances.pngs import mask_size, read_mask
 from sceneprior.instances.tables import IdTable
-from sceneprior.shards import RoomViews
 
 UP_AXES = ("z", "y")
 _GL_TO_CV = np.diag([1.0, -1, -1, 1])
@@ -128,27 +127,14 @@ def prepare_posed(
         rows, columns = sampled_lines(first[0], size[0]), sampled_lines(first[1], size[1])
         images.append(table.ids(values[np.ix_(rows, columns)]))
     seen = observe(np.stack(images), table.is_object)
-    if table.strange:
-        listed = ", ".join(map(str, sorted(table.strange)[:20]))
+    if table.unlisted:
+        listed = ", ".join(map(str, sorted(table.unlisted)[:20]))
         notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
     if not len(seen.tracked):
         return None
     world_to_camera, said = cameras_in_room(recording, [*choice.frames], settings)
-    return PreparedRoom(
-        RoomViews(
-            room_id=room_name(folder),
-            object_class=table.classes[seen.tracked],
-            world_to_camera=world_to_camera.astype(np.float32),
-            intrinsics=np.stack(intrinsics).astype(np.float32),
-            boxes=seen.boxes,
-            visible=seen.visible,
-            mask_pixels=seen.mask_pixels,
-            sides_clear=seen.sides_clear,
-            instance_ids=seen.instance_ids,
-            image_size=size,
-        ),
-        notes=(*notes, *said),
-    )
+    views = seen.room_views(room_name(folder), table.classes, world_to_camera, np.stack(intrinsics))
+    return PreparedRoom(views, notes=(*notes, *said))
 
 
 def cameras_in_room(

@@ -10,9 +10,9 @@ from data_prep.frames import sampled_lines
 from data_prep.scannet.labels import LABEL_SET
 from data_prep.scannet.masks import MaskArchive
 from data_prep.scannet.scans import Scan
-from sceneprior.classes import label_set
+from sceneprior.classes import VOID, label_set
 from sceneprior.instances.observations import observe
-from sceneprior.shards import RoomGroundTruth, RoomViews
+from sceneprior.shards import RoomGroundTruth
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class LabelledView:
     ids: np.ndarray
     """(height, width): 0 = nothing or the room's shell, k + 1 = instance k of the scan, and
     len(instances) + 1 = an id that the aggregation does not have."""
-    unknown: tuple[int, ...]
+    unlisted: tuple[int, ...]
     """Such object ids."""
 
 
@@ -46,9 +46,9 @@ def labelled_views(scan: Scan) -> Iterator[LabelledView]:
         columns = sampled_lines(masks.image_size[1], width)
         for frame, world_to_camera in zip(scan.frames, scan.world_to_camera, strict=True):
             values = masks.read(frame)[np.ix_(rows, columns)]
-            strange = np.setdiff1d(np.unique(values), known)
+            unlisted = np.setdiff1d(np.unique(values), known)
             yield LabelledView(
-                frame, world_to_camera, table[values], tuple((strange.astype(int) - 1).tolist())
+                frame, world_to_camera, table[values], tuple((unlisted.astype(int) - 1).tolist())
             )
 
 
@@ -66,38 +66,23 @@ def prepare_scan(scan: Scan) -> PreparedRoom | None:
     """
     names = label_set(LABEL_SET)
     images: list[np.ndarray] = []
-    unknown: set[int] = set()
+    unlisted: set[int] = set()
     for view in labelled_views(scan):
         images.append(view.ids)
-        unknown.update(view.unknown)
+        unlisted.update(view.unlisted)
     # The last entry stands for ids without an object: they hide what is behind them.
-    is_object = np.array([item.label != "void" for item in scan.instances] + [False])
-    seen = observe(np.stack(images), is_object)
+    labels = [*(item.label for item in scan.instances), "void"]
+    classes = np.array([names.index(label) for label in labels], dtype=np.int16)
+    seen = observe(np.stack(images), classes != VOID)
     if not len(seen.tracked):
         return None
-    unseen = np.setdiff1d(np.flatnonzero(is_object), seen.tracked)
-    order = [*seen.tracked.tolist(), *unseen.tolist()]
-    classes = np.array([names.index(scan.instances[k].label) for k in order], dtype=np.int16)
     notes = scan.notes
-    if unknown:
-        listed = ", ".join(map(str, sorted(unknown)))
+    if unlisted:
+        listed = ", ".join(map(str, sorted(unlisted)))
         notes += (f"masks show objects that the aggregation does not have ({listed}): void",)
-    return PreparedRoom(
-        RoomViews(
-            room_id=scan.scan_id,
-            object_class=classes[: len(seen.tracked)],
-            world_to_camera=scan.world_to_camera.astype(np.float32),
-            intrinsics=np.repeat(scan.intrinsics.astype(np.float32)[None], len(images), axis=0),
-            boxes=seen.boxes,
-            visible=seen.visible,
-            mask_pixels=seen.mask_pixels,
-            sides_clear=seen.sides_clear,
-            instance_ids=seen.instance_ids,
-            image_size=scan.settings.image_size,
-        ),
-        _ground_truth(scan, order, classes),
-        notes=notes,
-    )
+    views = seen.room_views(scan.scan_id, classes, scan.world_to_camera, scan.intrinsics)
+    order = np.concatenate([seen.tracked, seen.unseen])
+    return PreparedRoom(views, _ground_truth(scan, order, classes[order]), notes=notes)
 
 
 def _ids_of_values(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
@@ -113,7 +98,7 @@ def _ids_of_values(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
     return table, np.array(known)
 
 
-def _ground_truth(scan: Scan, order: list[int], classes: np.ndarray) -> RoomGroundTruth:
+def _ground_truth(scan: Scan, order: np.ndarray, classes: np.ndarray) -> RoomGroundTruth:
     lower = np.array([scan.instances[k].lower_m for k in order])
     upper = np.array([scan.instances[k].upper_m for k in order])
     places = np.zeros((len(order), 4, 4))

@@ -1,10 +1,12 @@
-"""Label what each camera saw: instance-id images in, 2D boxes, visibility and tracks out."""
+"""2D boxes, visibility and tracks of the objects in images of instance ids."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+
+from sceneprior.shards import RoomViews
 
 MIN_BOX_SIDE_PX = 4
 """A mask whose box is this narrow, or narrower, is not visible in that view."""
@@ -19,6 +21,8 @@ class Observations:
 
     tracked: np.ndarray
     """(n,) which of the given objects these are, in their order."""
+    unseen: np.ndarray
+    """The given objects that no view shows."""
     instance_ids: np.ndarray
     """(T, H, W) uint8 (uint16 past 255 objects): 0 = nothing, k + 1 = tracked object k."""
     boxes: np.ndarray
@@ -30,6 +34,34 @@ class Observations:
     sides_clear: np.ndarray
     """(T, n, 4) bool: no other object touches the mask at the left, upper, right, lower side of
     its box. A side that is not clear may belong to what stands in front."""
+
+    def room_views(
+        self,
+        room_id: str,
+        classes: np.ndarray | Sequence[int],
+        world_to_camera: np.ndarray,
+        intrinsics: np.ndarray,
+    ) -> RoomViews:
+        """What a shard stores of these views.
+
+        Args:
+            classes: Class index of each given object.
+            world_to_camera: (T, 4, 4).
+            intrinsics: (T, 3, 3), or (3, 3) of all views.
+        """
+        views, height, width = self.instance_ids.shape
+        return RoomViews(
+            room_id=room_id,
+            object_class=np.asarray(classes, dtype=np.int16)[self.tracked],
+            world_to_camera=world_to_camera.astype(np.float32),
+            intrinsics=np.array(np.broadcast_to(intrinsics, (views, 3, 3)), dtype=np.float32),
+            boxes=self.boxes,
+            visible=self.visible,
+            mask_pixels=self.mask_pixels,
+            sides_clear=self.sides_clear,
+            instance_ids=self.instance_ids,
+            image_size=(height, width),
+        )
 
 
 def pixel_counts(image: np.ndarray, count: int) -> np.ndarray:
@@ -77,6 +109,7 @@ def observe(images: np.ndarray, is_object: np.ndarray | Sequence[bool]) -> Obser
     number[tracked + 1] = np.arange(1, len(tracked) + 1)
     return Observations(
         tracked=tracked,
+        unseen=np.setdiff1d(np.flatnonzero(is_object), tracked),
         instance_ids=number[images],
         boxes=boxes[:, tracked],
         visible=visible[:, tracked],
@@ -88,13 +121,8 @@ def observe(images: np.ndarray, is_object: np.ndarray | Sequence[bool]) -> Obser
 def clear_sides(
     image: np.ndarray, number: int, rows: slice, columns: slice
 ) -> tuple[bool, bool, bool, bool]:
-    """Whether nothing else touches a mask at the left, upper, right, lower side of its box.
-
-    Args:
-        image: (H, W) instance ids.
-        number: The mask's id.
-        rows, columns: Its box.
-    """
+    """Whether nothing else touches the mask of id `number` at the left, upper, right, lower side
+    of its box (`rows`, `columns`) in an (H, W) image."""
     top, left = max(rows.start - TOUCH_PX, 0), max(columns.start - TOUCH_PX, 0)
     around = image[top : rows.stop + TOUCH_PX, left : columns.stop + TOUCH_PX]
     mine = around == number

@@ -116,7 +116,7 @@ class IdTable:
             f"classes outside the label set are void: "
             f"{', '.join(f'{name} ({count})' for name, count in sorted(others.items()))}"
         ] * bool(others)
-        self.strange: set[int] = set()
+        self.unlisted: set[int] = set()
         self._unknown = len(objects) + 1
         # The last entry is that of -1.
         self._table = np.full(65_537, self._unknown, dtype=np.uint32)
@@ -126,5 +126,5 @@ class IdTable:
 
     def ids(self, values: np.ndarray) -> np.ndarray:
         """(H, W) uint32 for `observe`; remembers values that the table does not have."""
-        self.strange |= set(np.setdiff1d(values, self._listed).tolist())
+        self.unlisted |= set(np.setdiff1d(values, self._listed).tolist())
         return self._table[values]

@@ -63,10 +63,10 @@ def read_own_image(
             f"4 pixels. Its values are {_some(np.unique(values))}; {classes} says what they are."
         )
     notes = list(table.notes)
-    if table.strange - {0}:
+    if table.unlisted - {0}:
         notes.append(
             f"{mask} has values that {classes} does not list, taken for void: "
-            f"{_some(np.array(sorted(table.strange)))}"
+            f"{_some(np.array(sorted(table.unlisted)))}"
         )
     if pose is None:
         notes.append(

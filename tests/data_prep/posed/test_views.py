@@ -159,10 +159,10 @@ def test_what_hides_and_what_does_not(room):
     beside = base.copy()
     beside[left] = 9
     Image.fromarray(beside).save(room.png(0))
-    strange = prepared(room)
-    assert strange.views.sides_clear[0, 0].tolist() == [False, True, True, True]
-    assert "the table of classes does not have (9): void" in " ".join(strange.notes)
-    assert strange.views.instance_ids.max() == 1
+    unlisted = prepared(room)
+    assert unlisted.views.sides_clear[0, 0].tolist() == [False, True, True, True]
+    assert "the table of classes does not have (9): void" in " ".join(unlisted.notes)
+    assert unlisted.views.instance_ids.max() == 1
     (room.folder / "classes.json").write_text('{"3": "bed", "9": "backpack"}')
     assert not prepared(room).views.sides_clear[0, 0].all()
     (room.folder / "classes.json").write_text('{"3": "bed", "9": "Wall"}')

@@ -187,7 +187,7 @@ def test_ids_without_an_object_hide_and_are_told(scan, labels):
     image = picture((2, 5, 10, 30, 40), (90, 30, 20, 40, 30), (255, 70, 0, 80, 10))
     made = painted(scan, labels, {0: image})
     (view,) = labelled_views(made)
-    assert view.frame == 0 and view.unknown == (89, 254)
+    assert view.frame == 0 and view.unlisted == (89, 254)
     assert view.ids[20, 35] == 5 and view.ids[20, 10] == 2  # four instances
     room = prepare_scan(made)
     assert room.views.sides_clear.tolist() == [[[True, True, False, True]]]
