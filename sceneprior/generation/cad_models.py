@@ -65,12 +65,7 @@ def open_models(
 ) -> CadModels:
     """Read the models of a 3D-FUTURE folder that have a class in a label set.
 
-    Args:
-        folder: 3D-FUTURE-model.
-        label_set_name: Whose classes count.
-        cache: Folder for the file of points. Deleting it costs time, nothing else.
-        points: Points a model.
-        track: Shows progress.
+    Their points are kept in a file in the folder `cache`; deleting it costs time, nothing else.
 
     Raises:
         InputError: the folder is not 3D-FUTURE's, or has no model of these classes.

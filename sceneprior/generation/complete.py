@@ -58,8 +58,7 @@ def complete(
         scenes: The given objects of each room: classes, boxes, perhaps meshes. Without any, the
             answers are what the run generates.
         count: Answers a room.
-        seed: Of the latents that answers start from.
-        distribution: Of drawing them; None takes the config's.
+        seed, distribution: Of the latents that answers start from; see `draw_latents`.
         steps: Of the fit; 0 leaves the drawn latents as they are.
 
     Returns:

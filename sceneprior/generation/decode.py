@@ -114,11 +114,7 @@ def synthesize(
 ) -> list[Scene]:
     """New scenes, of a run of any kind; the same seed, the same scenes.
 
-    Args:
-        trained: From `load_any_run`.
-        count: How many.
-        seed: Of the draws.
-        distribution: Where latents come from; None takes the run's own.
+    `distribution` says where latents come from; None takes the run's own.
 
     Raises:
         InputError: a distribution for a method without latents, or one that does not exist.

@@ -38,12 +38,6 @@ def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> No
     `<index>_<class>`, in the class colour. An object without a mesh is written as its box.
     The PNG looks straight down; it is what scores compare, with borders between objects.
 
-    Args:
-        scene: The room.
-        folder: Made if it does not exist.
-        name: File name without ending.
-        renderer: From `sceneprior.offscreen.open_renderer`; draws the PNG.
-
     Raises:
         InputError: `name` is empty or holds a path separator.
     """

@@ -41,7 +41,6 @@ def interpolate(
     what has the same number in two rooms is the same object, moved.
 
     Args:
-        trained: The run's prior.
         start, end: As `read_latent` reads them.
         steps: Rooms, both ends included; at least 2.
 

@@ -53,11 +53,6 @@ def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
     `extra["retrieval"]` holds, in the order of the objects, {"model_id", "turn_deg", "distance_m"},
     or None where there is no model of the class: such an object keeps its own mesh.
 
-    Args:
-        scene: With meshes, or with boxes alone.
-        models: To choose from.
-        keep: See `KEEP`.
-
     Raises:
         InputError: a box or a mesh is no finite number.
     """

@@ -40,8 +40,6 @@ def sample_latents(
     Args:
         space: Turns logits into points.
         trained: The training rooms' logits.
-        count: How many to draw.
-        seed: Of the draws.
         distribution: `geodesic`: a point anywhere on the geodesic (in a cube: the straight line)
             between a training room drawn at random and one of its `NEIGHBOURS` nearest. The
             others: see `sample_logits`.
@@ -138,11 +136,9 @@ def write_latents(folder: Path, z: Float[Tensor, "rooms dimension"], names: list
 def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]:
     """The point of a run's latent space that a text names.
 
-    Args:
-        trained: The run's prior.
-        text: The id of a training room; `seed:7`, the room that `synthesize -n 1 --seed 7` makes;
-            or a file of latents: `FILE` (its first), `FILE:3` (counted from 0), `FILE:NAME`. Files
-            are `latents.npz`, an .npy of (D,) or (n, D) numbers, or a .json of such lists.
+    A name is the id of a training room; `seed:7`, the room that `synthesize -n 1 --seed 7` makes;
+    or a file of latents: `FILE` (its first), `FILE:3` (counted from 0), `FILE:NAME`. Files are
+    `latents.npz`, an .npy of (D,) or (n, D) numbers, or a .json of such lists.
 
     Raises:
         InputError: nothing is called so, or the file does not hold a latent of this run's size.
