@@ -3,7 +3,7 @@
 Run `python benchmarks/bench_reconstruct.py --run RUN --shards SHARDS`. Images are one view of each
 test room (training rooms after them, if there are too few). Few steps are timed (`--steps`) and
 scaled to the schedule's 1,000, without early stopping: every step of a schedule costs the same. The
-two ways take turns, round by round; figures are medians.
+two ways take turns, round by round; numbers are medians.
 
 Processor time is what is compared: on a machine that others use, it says what wall time hides.
 `--threads 1` makes the two the same thing on an idle machine.
@@ -19,8 +19,7 @@ import torch
 
 from sceneprior.config import load_run
 from sceneprior.reconstruction.fit import SCHEDULES, FitSchedule, fit_latents
-from sceneprior.reconstruction.observed import ObservedImage, as_views, images_of_split
-from sceneprior.reconstruction.reconstruct import MASK_COLUMNS
+from sceneprior.reconstruction.image import ObservedImage, as_views, images_of_split
 from sceneprior.training.method import TrainedPrior
 
 FULL = SCHEDULES["paper"].steps
@@ -28,7 +27,7 @@ FULL = SCHEDULES["paper"].steps
 
 def cpu_seconds(trained: TrainedPrior, images: list[ObservedImage], schedule: FitSchedule) -> float:
     """Processor time of fitting these images together, starts given."""
-    views = as_views(images, max(1, round(images[0].instance_ids.shape[1] / MASK_COLUMNS)))
+    views = as_views(images)
     start = trained.prior.latent_space(trained.logits[: len(images)])
     begin = time.process_time()
     fit_latents(trained, views, start, schedule)

@@ -5,7 +5,7 @@
 Made in memory by --seed: models are pieces of two to seven blocks, objects are spheres of 2,562
 vertices drawn onto other such pieces, much as the shape decoder's meshes lie on furniture. Models
 fall to the classes as 3D-FUTURE's do (the table that ships with the package), and so do objects, so
-that large shelves are asked most. Timed is the search alone, meshes in, meshes out: `retrieve_all`,
+that large classes are asked most. Timed is the search alone, meshes in, meshes out: `retrieve_all`,
 a thread a core. --checked objects are searched again the slow way, all models by all points.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sceneprior.furniture import CATEGORY_TABLE
-from sceneprior.generation.cad_bank import POINTS, CadBank, Shelf, unit_mesh
+from sceneprior.generation.cad_models import POINTS, CadModels, ClassModels, unit_mesh
 from sceneprior.generation.retrieve import extruded, most_similar, retrieve_all
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.geometry.surfaces import surface_points
@@ -48,11 +48,11 @@ def main() -> None:
     rng = np.random.default_rng(arguments.seed)
     shares = class_shares()
     start = time.perf_counter()
-    bank = make_bank(arguments.models, shares, rng)
+    cad_models = make_bank(arguments.models, shares, rng)
     made = time.perf_counter() - start
     scenes = [make_scene(f"scene_{k:04d}", shares, rng) for k in range(arguments.scenes)]
     wall, cpu = time.perf_counter(), time.process_time()
-    for _ in retrieve_all(scenes, bank):
+    for _ in retrieve_all(scenes, cad_models):
         pass
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     objects = arguments.scenes * OBJECTS
@@ -60,14 +60,14 @@ def main() -> None:
         "scenes": arguments.scenes,
         "objects": objects,
         "models": arguments.models,
-        "largest_shelf": max(len(shelf.model_ids) for shelf in bank.shelves.values()),
+        "largest_class": max(len(some.model_ids) for some in cad_models.by_class.values()),
         "points": POINTS,
         "cores": os.cpu_count(),
         "bank_s": round(made, 1),
         "wall_s": round(wall, 1),
         "cpu_s": round(cpu, 1),
         "cpu_ms_per_object": round(1000 * cpu / objects, 1),
-        **check(scenes, bank, arguments.checked),
+        **check(scenes, cad_models, arguments.checked),
     }
     print(json.dumps(figures, indent=1))
     if arguments.json:
@@ -86,18 +86,18 @@ def class_shares() -> dict[str, float]:
     return {label: count / total for label, count in counts.items()}
 
 
-def make_bank(models: int, shares: dict[str, float], rng: np.random.Generator) -> CadBank:
+def make_bank(models: int, shares: dict[str, float], rng: np.random.Generator) -> CadModels:
     labels = rng.choice(list(shares), models, p=list(shares.values()))
     meshes = {f"model_{k:05d}": piece(rng) for k in range(models)}
     points = np.stack(
         [surface_points(mesh.vertices_m, mesh.faces, POINTS) for mesh in meshes.values()]
     ).astype(np.float32)
     names = np.array(list(meshes))
-    shelves = {
-        label: Shelf(tuple(names[labels == label]), points[labels == label])
+    by_class = {
+        label: ClassModels(tuple(names[labels == label]), points[labels == label])
         for label in sorted(set(labels))
     }
-    return CadBank(shelves, meshes.__getitem__)
+    return CadModels(by_class, meshes.__getitem__)
 
 
 def piece(rng: np.random.Generator) -> Mesh:
@@ -124,13 +124,13 @@ def make_scene(name: str, shares: dict[str, float], rng: np.random.Generator) ->
     return Scene(name, LABEL_SET, tuple(objects))
 
 
-def check(scenes: list[Scene], bank: CadBank, count: int) -> dict[str, float]:
+def check(scenes: list[Scene], cad_models: CadModels, count: int) -> dict[str, float]:
     """How often the fast search finds the winner of the slow one, and by how much it is off."""
     items = [extruded(item) for scene in scenes for item in scene.objects][:count]
     pairs = []
     for item in items:
-        shelf = bank.shelves[item.label]
-        pairs.append((most_similar(item, shelf), most_similar(item, shelf, keep=None)))
+        some = cad_models.by_class[item.label]
+        pairs.append((most_similar(item, some), most_similar(item, some, keep=None)))
     return {
         "checked": len(pairs),
         "same_winner": sum(fast == slow for fast, slow in pairs),

@@ -38,7 +38,7 @@ from sceneprior.evaluation.metrics.layout_metrics import (
 )
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.generation.complete import STEPS, complete
-from sceneprior.generation.insert import put_into
+from sceneprior.generation.insert import insert
 from sceneprior.scene import Scene
 
 
@@ -53,7 +53,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     trained = load_run(arguments.run)
-    trained = replace(trained, stage="layout")  # boxes are judged; meshes would take time
+    trained = replace(trained, stage="layout")  # boxes are compared; meshes would take time
     most = trained.config.model.max_objects
     rooms = reference_scenes(arguments.shards, "test", arguments.rooms)
     tests = [without_meshes(room) for room in rooms if 2 <= len(room.objects) <= most]
@@ -68,17 +68,17 @@ def main() -> None:
     rows = {
         "completed": completed(STEPS),
         "untouched start": completed(0),
-        "nearest training room": [[put_into(nearest(training, one), one)] for one in given],
+        "nearest training room": [[insert(nearest(training, one), one)] for one in given],
         "test rooms": [[room] for room in tests],
     }
-    figures = {name: judge(answers, tests, given) for name, answers in rows.items()}
-    columns = list(next(iter(figures.values())))
+    scores = {name: evaluate(answers, tests, given) for name, answers in rows.items()}
+    columns = list(next(iter(scores.values())))
     print(f"{len(tests)} test rooms, {arguments.answers} answers each, seed {arguments.seed}")
     print("| rooms | " + " | ".join(columns) + " |\n|" + " --- |" * (len(columns) + 1))
-    for name, row in figures.items():
+    for name, row in scores.items():
         print(f"| {name} | " + " | ".join(str(value) for value in row.values()) + " |")
     if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
+        arguments.json.write_text(json.dumps(scores, indent=1) + "\n")
 
 
 def without_meshes(room: Scene) -> Scene:
@@ -112,7 +112,7 @@ def of_class(scene: Scene, label: str) -> Scene:
     return replace(scene, objects=tuple(item for item in scene.objects if item.label == label))
 
 
-def judge(
+def evaluate(
     answers: list[list[Scene]], tests: list[Scene], given: Sequence[Scene]
 ) -> dict[str, float | str]:
     every = [scene for scenes in answers for scene in scenes]

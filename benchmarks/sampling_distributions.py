@@ -1,9 +1,9 @@
-"""How far from the test rooms a run's decoded training rooms are, and new ones by several distributions.
+"""How far from the test rooms are a run's decoded training rooms, and new ones by distribution?
 
-Run `python benchmarks/sampling_distributions.py RUN [RUN ...]`. What a prior generates can hardly be nearer
-to test rooms than what it decodes from the latents it was trained with: the difference is what
-sampling costs, the rest is how well it decodes. Frechet distances of EfficientNet-Lite0 features
-(not FID), seed 0, as many rooms as training rooms; in brackets all rooms drawn as boxes.
+Run `python benchmarks/sampling_distributions.py RUN [RUN ...]`. What a prior generates can hardly
+be nearer to test rooms than what it decodes from the latents it was trained with: the difference is
+what sampling costs, the rest is how well it decodes. Frechet distances of EfficientNet-Lite0
+features (not FID), seed 0, as many rooms as training rooms; in brackets all rooms drawn as boxes.
 """
 
 import argparse

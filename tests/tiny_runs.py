@@ -58,18 +58,28 @@ def tiny_settings(shards: Path, **changes: Any) -> dict[str, Any]:
 
 TINY_BASELINES: dict[str, dict[str, Any]] = {
     "gan": {
-        "model": {**tiny_model(), "decoder": {**tiny_model()["decoder"], "step_mlps": True, "dropout": 0.1}},
+        "model": {
+            **tiny_model(),
+            "decoder": {**tiny_model()["decoder"], "step_mlps": True, "dropout": 0.1},
+        },
         "training": {"epochs": 4, "batch_size": 5, "views_per_room": 3},
     },
     "atiss": {
-        "model": {"max_objects": 6, "width": 16, "layers": 1, "heads": 2, "hidden": 16, "mixtures": 3},
+        "model": {
+            "max_objects": 6,
+            "width": 16,
+            "layers": 1,
+            "heads": 2,
+            "hidden": 16,
+            "mixtures": 3,
+        },
         "training": {"epochs": 6, "batch_size": 5, "learning_rate": 2e-3, "schedule": "cosine"},
     },
     "sync2gen": {
         "model": {"width": 32, "latent": 8, "slots": 2, "refine_steps": 5},
         "training": {"epochs": 6, "batch_size": 5, "learning_rate": 3e-3},
     },
-}  # fmt: skip
+}
 
 
 def tiny_baseline_settings(shards: Path, method: str, **changes: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Verbs that make new rooms from a run; what a verb needs it imports when called."""
+"""Commands that make new rooms from a run; what a command needs it imports when called."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +14,12 @@ from sceneprior.cli.options import (
 )
 
 
+def add_commands(app: typer.Typer) -> None:
+    """Mount synthesize, interpolate and complete."""
+    for command in (synthesize, interpolate, complete):
+        app.command()(command)
+
+
 def synthesize(
     run: RunOption,
     out: Annotated[Path, typer.Option(help="Folder for the scenes.")],
@@ -26,10 +32,10 @@ def synthesize(
 ) -> None:
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents where the method has them."""
     from sceneprior.config import load_any_run
-    from sceneprior.generation.decode import decode_latents, draw_latents
+    from sceneprior.generation.decode import decode_latents
     from sceneprior.generation.decode import synthesize as generate
     from sceneprior.generation.export import check_free, write_scenes
-    from sceneprior.generation.latents import write_latents
+    from sceneprior.generation.sample import draw_latents
     from sceneprior.offscreen import open_renderer
     from sceneprior.training.method import TrainedPrior
 
@@ -38,8 +44,7 @@ def synthesize(
     artist = open_renderer(renderer)
     if isinstance(trained, TrainedPrior):
         z, names = draw_latents(trained, count, seed, distribution)
-        write_scenes(decode_latents(trained, z, names), out, artist, overwrite)
-        write_latents(out, z, names)
+        write_scenes(decode_latents(trained, z, names), out, artist, overwrite, z)
     else:
         write_scenes(generate(trained, count, seed, distribution), out, artist, overwrite)
     typer.echo(f"Wrote {count} rooms to {out}")
@@ -59,19 +64,17 @@ def interpolate(
     renderer: RendererOption = "auto",
 ) -> None:
     """Walk from one room to another on the sphere: rooms, a strip and an animation."""
+    from sceneprior.config import load_run
     from sceneprior.generation.export import check_free, write_scenes
     from sceneprior.generation.interpolate import interpolate as walk
     from sceneprior.generation.interpolate import write_pictures
-    from sceneprior.generation.latents import write_latents
     from sceneprior.offscreen import open_renderer
-    from sceneprior.training.checkpoints import load_run
 
     check_free(out, overwrite)
     trained = load_run(run, checkpoint)
     z, scenes = walk(trained, start, end, steps)
     artist = open_renderer(renderer)
-    write_scenes(scenes, out, artist, overwrite)
-    write_latents(out, z, [scene.name for scene in scenes])
+    write_scenes(scenes, out, artist, overwrite, z)
     write_pictures(trained, z, out, artist)
     typer.echo(f"Wrote {steps} rooms, strip.png and animation.gif to {out}")
 
@@ -88,15 +91,13 @@ def complete(
     renderer: RendererOption = "auto",
 ) -> None:
     """Furnish the rest of a room of which some objects are given."""
+    from sceneprior.config import load_run
     from sceneprior.generation.complete import complete as furnish
     from sceneprior.generation.export import check_free, load_scene, write_scenes
-    from sceneprior.generation.latents import write_latents
     from sceneprior.offscreen import open_renderer
-    from sceneprior.training.checkpoints import load_run
 
     check_free(out, overwrite)
     scene = load_scene(given)
     z, scenes = furnish(load_run(run, checkpoint), [scene], count, seed, distribution)[0]
-    write_scenes(scenes, out, open_renderer(renderer), overwrite)
-    write_latents(out, z, [room.name for room in scenes])
+    write_scenes(scenes, out, open_renderer(renderer), overwrite, z)
     typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects to {out}")

@@ -1,5 +1,6 @@
-"""Verbs that reconstruct rooms from single images; what a verb needs it imports when called."""
+"""Commands that reconstruct rooms from single images; each imports what it needs when called."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,7 +9,7 @@ import typer
 from sceneprior.cli.options import CheckpointOption, OverwriteOption, RendererOption, RunOption
 
 if TYPE_CHECKING:
-    from sceneprior.reconstruction.observed import ObservedImage
+    from sceneprior.reconstruction.image import ObservedImage
     from sceneprior.reconstruction.reconstruct import FitOptions, Reconstruction
     from sceneprior.training.method import TrainedPrior
 
@@ -18,9 +19,6 @@ ScheduleOption = Annotated[
 RestartsOption = Annotated[int, typer.Option(min=1, help="Latents fitted; the best is kept.")]
 StartOption = Annotated[
     str, typer.Option(help="nearest (training rooms that look alike) or random.")
-]
-RefineOption = Annotated[
-    bool, typer.Option("--refine/--no-refine", help="Move the found boxes onto their masks.")
 ]
 
 
@@ -37,7 +35,7 @@ def reconstruct(
     mask: Annotated[Path | None, typer.Option(help="Your own image: a PNG of ids.")] = None,
     classes: Annotated[Path | None, typer.Option(help="Its table: CSV or JSON, id, class.")] = None,
     intrinsics: Annotated[
-        str | None, typer.Option(help="Its lens: fx,fy,cx,cy in pixels, or a JSON file.")
+        str | None, typer.Option(help="Its camera's: fx,fy,cx,cy in pixels, or a JSON file.")
     ] = None,
     pose: Annotated[Path | None, typer.Option(help="Its camera in the room frame, JSON.")] = None,
     camera_height: Annotated[
@@ -46,20 +44,19 @@ def reconstruct(
     schedule: ScheduleOption = "paper",
     restarts: RestartsOption = 1,
     start: StartOption = "nearest",
-    refine: RefineOption = False,
     seed: Annotated[int, typer.Option(min=0, help="Of drawn views and random starts.")] = 0,
     checkpoint: CheckpointOption = "final",
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "auto",
 ) -> None:
     """Reconstruct rooms from the instance masks of single images: JSON, GLB and pictures."""
+    from sceneprior.config import load_run
     from sceneprior.errors import InputError
     from sceneprior.generation.export import check_free
     from sceneprior.offscreen import open_renderer
-    from sceneprior.reconstruction.observed import image_from_shards, images_of_split
+    from sceneprior.reconstruction.export import write_reconstructions
+    from sceneprior.reconstruction.image import image_from_shards, images_of_split
     from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct
-    from sceneprior.reconstruction.reconstructions import write_reconstructions
-    from sceneprior.training.checkpoints import load_run
 
     ways = [mask is not None, room is not None, split is not None]
     if sum(ways) != 1 or (shards is None) != (mask is not None):
@@ -72,7 +69,7 @@ def reconstruct(
     if (limit is not None and split is None) or (view and room is None):
         raise InputError("--limit belongs to --split, and --view to --room.")
     check_free(out, overwrite)
-    options = FitOptions(schedule, restarts, start, refine, seed=seed)
+    options = FitOptions(schedule, restarts, start, seed=seed)
     trained = load_run(run, checkpoint)
     if mask is not None:
         found = [_own(trained, options, mask, classes, intrinsics, pose, camera_height)]
@@ -102,7 +99,7 @@ def _own(
     camera_height: float,
 ) -> "Reconstruction":
     from sceneprior.errors import InputError
-    from sceneprior.reconstruction.image import read_own_image, sides_of_room
+    from sceneprior.reconstruction.own_image import read_own_image
     from sceneprior.reconstruction.reconstruct import reconstruct
 
     if classes is None or intrinsics is None:
@@ -110,12 +107,12 @@ def _own(
     own = read_own_image(mask, classes, intrinsics, trained.config.label_set, pose, camera_height)
     for note in own.notes:
         typer.echo(f"Note: {note}.", err=True)
-    sides = reconstruct(trained, sides_of_room(own, camera_height), options)
-    _tell_unlearnt_classes(trained, [own.image])
+    sides = reconstruct(trained, own.images, options)
+    _tell_unlearnt_classes(trained, own.images[:1])
     return min(sides, key=lambda found: found.score)
 
 
-def _tell_unlearnt_classes(trained: "TrainedPrior", images: "list[ObservedImage]") -> None:
+def _tell_unlearnt_classes(trained: "TrainedPrior", images: "Sequence[ObservedImage]") -> None:
     from sceneprior.reconstruction.reconstruct import unlearnt_classes
 
     if unlearnt := unlearnt_classes(trained, images):
@@ -128,7 +125,7 @@ def _tell_unlearnt_classes(trained: "TrainedPrior", images: "list[ObservedImage]
 
 def eval_svr(
     shards: Annotated[Path, typer.Option(help="Shards with 3D ground truth.")],
-    run: Annotated[Path | None, typer.Option(help="A run: its fits are judged.")] = None,
+    run: Annotated[Path | None, typer.Option(help="A run: its fits are evaluated.")] = None,
     scenes: Annotated[
         Path | None, typer.Option(help="Instead: what reconstruct, or retrieve after it, wrote.")
     ] = None,
@@ -140,30 +137,36 @@ def eval_svr(
     schedule: ScheduleOption = "paper",
     restarts: RestartsOption = 1,
     start: StartOption = "nearest",
-    refine: RefineOption = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the views, random starts and rooms.")] = 0,
     checkpoint: CheckpointOption = "final",
     renderer: RendererOption = "auto",
 ) -> None:
-    """Judge single-view reconstruction against the true rooms, and against known ones."""
+    """Evaluate single-view reconstruction against the true rooms, and against known ones."""
     from sceneprior.errors import InputError
+    from sceneprior.files import write_json
     from sceneprior.reconstruction.reconstruct import FitOptions
-    from sceneprior.reconstruction.score import judge_scenes, judge_views, print_view_scores
+    from sceneprior.reconstruction.score import (
+        SvrProtocol,
+        evaluate_run,
+        evaluate_scenes,
+        print_view_scores,
+    )
 
+    protocol = SvrProtocol(shards, split, seed, renderer)
     if run is not None and scenes is None:
-        target = out or run / "svr.json"
-        options = FitOptions(schedule, restarts, start, refine, seed=seed)
-        scores = judge_views(run, shards, split, limit, options, target, renderer, checkpoint)
+        options = FitOptions(schedule, restarts, start, seed=seed)
+        target, scores = run, evaluate_run(run, protocol, options, limit, checkpoint)
     elif scenes is not None and run is None:
-        fitting = (schedule, restarts, start, refine, checkpoint)
-        if limit is not None or fitting != ("paper", 1, "nearest", False, "final"):
+        fitting = (limit, schedule, restarts, start, checkpoint)
+        if fitting != (None, "paper", 1, "nearest", "final"):
             raise InputError(
-                "--limit, --checkpoint, --schedule, --restarts, --start and --refine belong to "
-                "--run; scenes are judged as they are."
+                "--limit, --checkpoint, --schedule, --restarts and --start belong to --run; scenes "
+                "are evaluated as they are."
             )
-        target = out or scenes / "svr.json"
-        scores = judge_scenes(scenes, shards, split, target, seed, renderer)
+        target, scores = scenes, evaluate_scenes(scenes, protocol)
     else:
-        raise InputError("Say what to judge: either --run, or --scenes with reconstructions.")
+        raise InputError("Say what to evaluate: either --run, or --scenes with reconstructions.")
+    target = out or target / "svr.json"
+    write_json(target, scores)
     print_view_scores(scores)
     typer.echo(f"Wrote {target}")

@@ -1,4 +1,4 @@
-"""The verb that puts CAD models into rooms; what it needs it imports when called."""
+"""The command that puts CAD models into rooms; what it needs it imports when called."""
 
 from pathlib import Path
 from typing import Annotated
@@ -25,7 +25,7 @@ def retrieve(
 
     from sceneprior.evaluation.metrics.layout_metrics import common_label_set
     from sceneprior.files import write_json
-    from sceneprior.generation.cad_bank import default_cache, open_bank
+    from sceneprior.generation.cad_models import default_cache, open_models
     from sceneprior.generation.export import check_free, load_scene_folder, write_scenes
     from sceneprior.generation.retrieve import retrieval_report, retrieve_all
     from sceneprior.offscreen import open_renderer
@@ -33,14 +33,13 @@ def retrieve(
     check_free(out, overwrite)
     console = Console(stderr=True)
     rooms = load_scene_folder(scenes)
-    bank = open_bank(
+    cad_models = open_models(
         models, common_label_set(rooms), cache or default_cache(),
         track=lambda ids: track(ids, "Reading models", console=console, transient=True),
     )  # fmt: skip
-    made = list(
-        track(retrieve_all(rooms, bank), "Choosing models", total=len(rooms), console=console)
-    )
-    report = retrieval_report(made, bank)
+    chosen = retrieve_all(rooms, cad_models)
+    made = list(track(chosen, "Choosing models", total=len(rooms), console=console))
+    report = retrieval_report(made, cad_models)
     write_scenes(made, out, open_renderer(renderer), overwrite)
     write_json(out / "retrieval.json", report)
     typer.echo(f"Gave {report['objects_with_a_model']} of {report['objects']} objects a model")

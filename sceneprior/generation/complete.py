@@ -1,33 +1,33 @@
-"""Some objects of a room in, whole rooms round them out: latents fitted to what is given.
+"""Furnish the rest of a room of which some objects are given, by fitting latents to these.
 
-1. Latents are drawn by the run's distribution and decoded. Those whose rooms come nearest to the given
-   objects are where the answers start, each answer from others.
+1. Latents are drawn by the run's distribution and decoded. Those whose rooms come nearest to the
+   given objects are where the answers start, each answer from others.
 2. The network is frozen and each latent moves until its room holds the given classes and boxes,
    drawn back towards its start. Which prediction stands for which given object is found anew at
    each step, as in training, but in 3D.
-3. Of an answer's starts the one that ended best is taken, and the given objects are put into its
-   room (`sceneprior/generation/insert.py`).
+3. Of an answer's starts the one that ended best is taken, and the given objects are inserted into
+   its room (`sceneprior/generation/insert.py`).
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
 from sceneprior.classes import VOID, label_set
 from sceneprior.errors import InputError
-from sceneprior.generation.decode import decode_latents, draw_latents
-from sceneprior.generation.insert import put_into
+from sceneprior.generation.decode import decode_latents
+from sceneprior.generation.insert import insert
+from sceneprior.generation.sample import draw_latents
 from sceneprior.losses.layout import take
 from sceneprior.losses.matching import assign
 from sceneprior.scene import Scene
 from sceneprior.training.method import TrainedPrior
-from sceneprior.views import DecodedScenes
+from sceneprior.views import DecodedScenes, RoomBoxes
 
 DRAWN = 256
 """Latents that starts are chosen from."""
@@ -41,24 +41,6 @@ BOX_WEIGHT = 5.0
 START_WEIGHT = 2.0
 """Of half the squared distance from the start, which on a sphere is 1 - cosine. More leaves rooms
 as the distribution drew them; less fits the given objects better."""
-
-
-@dataclass(frozen=True)
-class Given:
-    """The given objects of a batch of rooms, padded to the largest number."""
-
-    labels: Int[Tensor, "rooms objects"]
-    boxes_m: Float[Tensor, "rooms objects 6"]
-    """Centre and size."""
-    is_object: Bool[Tensor, "rooms objects"]
-
-    def repeated(self, times: int) -> "Given":
-        """Every room so many times, one after the other."""
-        labels, boxes_m, is_object = (
-            part.repeat_interleave(times, dim=0)
-            for part in (self.labels, self.boxes_m, self.is_object)
-        )
-        return Given(labels, boxes_m, is_object)
 
 
 def complete(
@@ -76,38 +58,29 @@ def complete(
         scenes: The given objects of each room: classes, boxes, perhaps meshes. Without any, the
             answers are what the run generates.
         count: Answers a room.
-        seed: Of the latents that answers start from.
-        distribution: Of drawing them; None takes the config's.
+        seed, distribution: Of the latents that answers start from; see `draw_latents`.
         steps: Of the fit; 0 leaves the drawn latents as they are.
 
     Returns:
-        Of each room the answers' latents and the answers: see `put_into`.
+        Of each room the answers' latents and the answers: see `insert`.
 
     Raises:
         InputError: a given object cannot be used, or there are more than the run's rooms hold.
     """
     given = gather_given(trained, scenes)
     starts = _starts(trained, given, count * RESTARTS, seed, distribution)
-    z, loss = fit_latents(trained, starts, given.repeated(count * RESTARTS), steps)
+    z, loss = fit_latents(trained, starts, repeated(given, count * RESTARTS), steps)
     # Starts are in order of promise; dealt out in turn, every answer has good ones.
     best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
-    z = take_along(z.view(len(scenes), RESTARTS, count, -1), best)
-    answers = []
-    for scene, own in zip(scenes, z, strict=True):
-        rooms = decode_latents(trained, own, [f"complete_{k:02d}" for k in range(count)])
-        answers.append((own, [put_into(room, scene, {"seed": seed}) for room in rooms]))
-    return answers
+    z = z.view(len(scenes), RESTARTS, count, -1).take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
+    names = [f"complete_{k:02d}" for k in range(count)]
+    return [
+        (own, [insert(room, scene, seed=seed) for room in decode_latents(trained, own, names)])
+        for scene, own in zip(scenes, z, strict=True)
+    ]
 
 
-def take_along(
-    values: Float[Tensor, "rooms starts answers dimension"],
-    best: Int[Tensor, "rooms 1 answers"],
-) -> Float[Tensor, "rooms answers dimension"]:
-    """The chosen start of each answer."""
-    return values.take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
-
-
-def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> Given:
+def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> RoomBoxes:
     """Given objects as tensors.
 
     Raises:
@@ -140,20 +113,30 @@ def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> Given:
             labels[row, column] = names.index(item.label)
             boxes_m[row, column] = torch.from_numpy(box)
             is_object[row, column] = True
-    return Given(labels, boxes_m, is_object)
+    return RoomBoxes(labels, is_object, boxes_m)
+
+
+def repeated(rooms: RoomBoxes, times: int) -> RoomBoxes:
+    """Every room so many times, one after the other."""
+    labels, is_object, boxes_m = (
+        part.repeat_interleave(times, dim=0)
+        for part in (rooms.object_class, rooms.is_object, rooms.boxes_m)
+    )
+    return RoomBoxes(labels, is_object, boxes_m)
 
 
 @torch.no_grad()
 def _starts(
-    trained: TrainedPrior, given: Given, each: int, seed: int, distribution: str | None
+    trained: TrainedPrior, given: RoomBoxes, each: int, seed: int, distribution: str | None
 ) -> Float[Tensor, "starts dimension"]:
     """The `each` drawn latents for every room that come nearest to what is given, best first."""
     z, _ = draw_latents(trained, max(DRAWN, each), seed, distribution)
     decoded = trained.prior.decode(z, with_shape=False)
     chosen = []
-    for row in range(len(given.labels)):
-        one = Given(given.labels[[row]], given.boxes_m[[row]], given.is_object[[row]])
-        losses = given_loss(decoded, one.repeated(len(z)), trained.config.model.completeness_target)
+    for one in given.split(1):
+        losses = given_loss(
+            decoded, repeated(one, len(z)), trained.config.model.completeness_target
+        )
         chosen.append(z[losses.argsort(stable=True)[:each]])
     return torch.cat(chosen)
 
@@ -161,7 +144,7 @@ def _starts(
 def fit_latents(
     trained: TrainedPrior,
     starts: Float[Tensor, "rooms dimension"],
-    given: Given,
+    given: RoomBoxes,
     steps: int = STEPS,
 ) -> tuple[Float[Tensor, "rooms dimension"], Float[Tensor, " rooms"]]:
     """Move latents until their rooms hold what is given; the latents, and what is left to win."""
@@ -187,7 +170,7 @@ def fit_latents(
 
 
 def given_loss(
-    decoded: DecodedScenes, given: Given, completeness_target: str = "first_n"
+    decoded: DecodedScenes, given: RoomBoxes, completeness_target: str = "first_n"
 ) -> Float[Tensor, " rooms"]:
     """How far decoded rooms are from holding the given objects, mean over these; 0 without any.
 
@@ -198,16 +181,16 @@ def given_loss(
     boxes = torch.cat([decoded.centers_m, decoded.sizes_m], dim=-1)
     kept = -log_kept(decoded.completeness_logits, completeness_target)
     with torch.no_grad():
-        slots, objects = boxes.shape[1], given.labels.shape[1]
-        wanted = given.labels.unsqueeze(1).expand(-1, slots, -1)
+        predictions, objects = boxes.shape[1], given.object_class.shape[1]
+        wanted = given.object_class.unsqueeze(1).expand(-1, predictions, -1)
         cost = -decoded.class_logits.softmax(dim=-1).gather(-1, wanted)
         for side in range(6):
             apart = boxes[..., side].unsqueeze(2) - given.boxes_m[..., side].unsqueeze(1)
             cost += BOX_WEIGHT / 6 * apart.abs()
         cost += kept.unsqueeze(-1)
-        rows = assign(cost, [slots] * len(cost), given.is_object.sum(dim=1).tolist())
+        rows = assign(cost, [predictions] * len(cost), given.is_object.sum(dim=1).tolist())
     logits = take(decoded.class_logits, rows, dim=1)
-    each = F.cross_entropy(logits.flatten(0, 1), given.labels.flatten(), reduction="none")
+    each = F.cross_entropy(logits.flatten(0, 1), given.object_class.flatten(), reduction="none")
     each = each.view(-1, objects) + take(kept, rows, dim=1)
     each = each + BOX_WEIGHT * (take(boxes, rows, dim=1) - given.boxes_m).abs().mean(dim=-1)
     # Padding is no class: where void is ruled out, its cross entropy has no end.
@@ -216,8 +199,8 @@ def given_loss(
 
 
 def log_kept(
-    completeness_logits: Float[Tensor, "rooms slots"], completeness_target: str
-) -> Float[Tensor, "rooms slots"]:
+    completeness_logits: Float[Tensor, "rooms predictions"], completeness_target: str
+) -> Float[Tensor, "rooms predictions"]:
     """Logarithm of the probability that each prediction belongs to the room: that no prediction up
     to it ended the room (`first_n`), or none before it (`stop`)."""
     if completeness_target == "stop":

@@ -1,12 +1,15 @@
-"""Decoded batches or boxes in, single `Scene`s out; latents of training rooms and new ones."""
+"""Decode latents into scenes, of training rooms and of new ones; new rooms of every method."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.classes import VOID, label_set
 from sceneprior.errors import InputError
-from sceneprior.generation.sample import sample_latents
+from sceneprior.generation.sample import draw_latents, scene_names
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.training.method import TrainedPrior, TrainedSampler
@@ -15,82 +18,80 @@ from sceneprior.views import DecodedScenes, RoomBoxes
 BATCH = 64
 
 
-def to_scenes(
+@dataclass(frozen=True)
+class DecodedRoom:
+    """A decoded scene, and what the network said of each of its objects."""
+
+    scene: Scene
+    predictions: tuple[int, ...]
+    """Which of the network's N predictions each object is."""
+    class_logits: Float[Tensor, "objects classes"]
+
+
+def to_rooms(
     decoded: DecodedScenes,
-    faces: Tensor,
+    faces: Int[Tensor, "faces 3"],
     label_set_name: str,
-    names: list[str],
+    names: Sequence[str],
     completeness_target: str = "first_n",
-) -> list[Scene]:
+) -> list[DecodedRoom]:
     """Objects up to where completeness says that the scene ends; their likeliest classes.
 
     `void` is a class like any other to the network, but no furniture: such objects are left out.
     """
-    classes = label_set(label_set_name)
-    slots = furnished_slots(decoded, completeness_target)
-    labels = decoded.class_logits.argmax(dim=-1)
-    corners = faces.cpu().numpy()
-    scenes = []
-    for room, name in enumerate(names):
-        objects = []
-        for item in slots[room]:
-            label = classes[int(labels[room, item])]
-            mesh = None
-            if decoded.vertices_m is not None:
-                mesh = Mesh(decoded.vertices_m[room, item].cpu().numpy(), corners)
-            center = tuple(decoded.centers_m[room, item].tolist())
-            size = tuple(decoded.sizes_m[room, item].tolist())
-            objects.append(SceneObject(label, center, size, mesh))
-        scenes.append(Scene(name, label_set_name, tuple(objects)))
-    return scenes
-
-
-def furnished_slots(
-    decoded: DecodedScenes, completeness_target: str = "first_n"
-) -> list[list[int]]:
-    """Which of the N predictions of each room `to_scenes` makes objects of, in its order."""
     kept = kept_objects(decoded.completeness_logits, completeness_target)
     kept = kept & (decoded.class_logits.argmax(dim=-1) != VOID)
-    return [row.nonzero()[:, 0].tolist() for row in kept]
+    rooms = []
+    for row, name in enumerate(names):
+        predictions = kept[row].nonzero()[:, 0].tolist()
+        scene = scene_of(decoded, row, predictions, faces, label_set_name, name)
+        rooms.append(DecodedRoom(scene, tuple(predictions), decoded.class_logits[row, predictions]))
+    return rooms
 
 
-def boxes_to_scenes(rooms: RoomBoxes, label_set_name: str, names: list[str]) -> list[Scene]:
-    """Objects that have no mesh; they are drawn as boxes. Yaws, where known, are in `extra`."""
-    classes = label_set(label_set_name)
-    scenes = []
-    for room, name in enumerate(names):
-        there = rooms.is_object[room]
-        objects = tuple(
-            SceneObject(classes[label], tuple(box[:3]), tuple(box[3:]))
-            for label, box in zip(
-                rooms.object_class[room, there].tolist(),
-                rooms.boxes_m[room, there].tolist(),
-                strict=True,
-            )
-        )
-        yaws = None if rooms.yaw_rad is None else rooms.yaw_rad[room, there].tolist()
-        extra = {} if yaws is None else {"yaw_rad": yaws}
-        scenes.append(Scene(name, label_set_name, objects, extra=extra))
-    return scenes
+def scene_of(
+    decoded: DecodedScenes,
+    row: int,
+    predictions: Sequence[int],
+    faces: Int[Tensor, "faces 3"],
+    label_set_name: str,
+    name: str,
+) -> Scene:
+    """Some predictions for one room as a scene, in the given order; their likeliest classes but
+    void, meshes where they were decoded."""
+    classes, corners = label_set(label_set_name), faces.cpu().numpy()
+    objects = []
+    for item in predictions:
+        logits = decoded.class_logits[row, item].clone()
+        logits[VOID] = -torch.inf
+        center, size = (part[row, item].tolist() for part in (decoded.centers_m, decoded.sizes_m))
+        mesh = None
+        if decoded.vertices_m is not None:
+            mesh = Mesh(decoded.vertices_m[row, item].cpu().numpy(), corners)
+        objects.append(SceneObject(classes[int(logits.argmax())], tuple(center), tuple(size), mesh))
+    return Scene(name, label_set_name, tuple(objects))
 
 
 @torch.no_grad()
-def decode_latents(
-    trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: list[str]
-) -> list[Scene]:
-    """Scenes of latents; meshes once the shape stage has finished."""
-    scenes: list[Scene] = []
+def decode_rooms(
+    trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: Sequence[str]
+) -> list[DecodedRoom]:
+    """Rooms of latents; with meshes once the shape stage has finished."""
+    config, faces = trained.config, trained.prior.shape.faces
+    rooms: list[DecodedRoom] = []
     for start in range(0, len(z), BATCH):
         part = slice(start, start + BATCH)
         decoded = trained.prior.decode(z[part], with_shape=trained.stage != "layout")
-        scenes += to_scenes(
-            decoded,
-            trained.prior.shape.faces,
-            trained.config.label_set,
-            names[part],
-            trained.config.model.completeness_target,
-        )
-    return scenes
+        target = config.model.completeness_target
+        rooms += to_rooms(decoded, faces, config.label_set, names[part], target)
+    return rooms
+
+
+def decode_latents(
+    trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: Sequence[str]
+) -> list[Scene]:
+    """The scenes of `decode_rooms`."""
+    return [room.scene for room in decode_rooms(trained, z, names)]
 
 
 def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]:
@@ -105,48 +106,42 @@ def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]
             "none can be decoded; take a run of `method: ours`."
         )
     z = trained.prior.latent_space(trained.logits)
-    return decode_latents(trained, z, list(trained.room_ids))
-
-
-def draw_latents(
-    trained: TrainedPrior, count: int, seed: int, distribution: str | None = None
-) -> tuple[Float[Tensor, "count width"], list[str]]:
-    """Latents sampled by a distribution (None: the run's own), and the names of their rooms."""
-    z = sample_latents(
-        trained.prior.latent_space,
-        trained.logits,
-        count,
-        seed,
-        distribution or trained.distribution,
-    )
-    return z, scene_names(count, seed)
+    return decode_latents(trained, z, trained.room_ids)
 
 
 def synthesize(
     trained: TrainedPrior | TrainedSampler, count: int, seed: int, distribution: str | None = None
 ) -> list[Scene]:
-    """New scenes, of a run of any kind.
+    """New scenes, of a run of any kind; the same seed, the same scenes.
 
-    Args:
-        trained: From `sceneprior.config.load_any_run`.
-        count: How many.
-        seed: Same seed, same rooms.
-        distribution: Where latents come from; None takes the run's own.
+    `distribution` says where latents come from; None takes the run's own.
 
     Raises:
         InputError: a distribution for a method without latents, or one that does not exist.
     """
-    if isinstance(trained, TrainedSampler):
-        if distribution is not None:
-            raise InputError(
-                f"A distribution says where latents of rooms come from, but `method: "
-                f"{trained.config.method}` has none; leave out --distribution {distribution}."
-            )
-        rooms = trained.prior.sample(count, seed)
-        return boxes_to_scenes(rooms, trained.config.label_set, scene_names(count, seed))
-    return decode_latents(trained, *draw_latents(trained, count, seed, distribution))
+    if isinstance(trained, TrainedPrior):
+        return decode_latents(trained, *draw_latents(trained, count, seed, distribution))
+    if distribution is not None:
+        raise InputError(
+            f"A distribution says where latents of rooms come from, but `method: "
+            f"{trained.config.method}` has none; leave out --distribution {distribution}."
+        )
+    rooms = trained.prior.sample(count, seed)
+    return boxes_to_scenes(rooms, trained.config.label_set, scene_names(count, seed))
 
 
-def scene_names(count: int, seed: int) -> list[str]:
-    """What new rooms are called."""
-    return [f"seed{seed}_{index:04d}" for index in range(count)]
+def boxes_to_scenes(rooms: RoomBoxes, label_set_name: str, names: Sequence[str]) -> list[Scene]:
+    """Objects that have no mesh; they are drawn as boxes. Yaws, where known, are in `extra`."""
+    classes = label_set(label_set_name)
+    scenes = []
+    for row, name in enumerate(names):
+        real = rooms.is_object[row]
+        labels, boxes = rooms.object_class[row, real].tolist(), rooms.boxes_m[row, real].tolist()
+        objects = tuple(
+            SceneObject(classes[label], tuple(box[:3]), tuple(box[3:]))
+            for label, box in zip(labels, boxes, strict=True)
+        )
+        yaw_rad = rooms.yaw_rad
+        extra = {} if yaw_rad is None else {"yaw_rad": yaw_rad[row, real].tolist()}
+        scenes.append(Scene(name, label_set_name, objects, extra=extra))
+    return scenes

@@ -1,21 +1,24 @@
-"""Scenes to files (JSON, GLB, PNG) and back: a `Scene` in, a folder of them out, or reversed."""
+"""Write scenes to files (JSON, GLB, PNG), one or a folder of them, and read them back."""
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import UInt8
-from PIL import Image
+from jaxtyping import Float, UInt8
 from rich.console import Console
 from rich.progress import Progress
+from torch import Tensor
 
 from sceneprior.errors import InputError
 from sceneprior.evaluation.topdown import object_colors, perspective, scene_meshes, topdown
+from sceneprior.files import write_json, write_whole
+from sceneprior.generation.sample import LATENTS_FILE, write_latents
 from sceneprior.offscreen import Renderer
+from sceneprior.pictures import contact_sheet, png_bytes
 from sceneprior.scene import FORMAT, Mesh, Scene, read_scene, scene_to_json
 
 if TYPE_CHECKING:
@@ -35,24 +38,15 @@ def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> No
     `<index>_<class>`, in the class colour. An object without a mesh is written as its box.
     The PNG looks straight down; it is what scores compare, with borders between objects.
 
-    Args:
-        scene: The room.
-        folder: Made if it does not exist.
-        name: File name without ending.
-        renderer: From `sceneprior.offscreen.open_renderer`; draws the PNG.
-
     Raises:
         InputError: `name` is empty or holds a path separator.
     """
     if not name or Path(name).name != name:
         raise InputError(f"'{name}' cannot name a scene's files; use a plain name such as room_0.")
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    picture = Image.fromarray(topdown(scene, renderer, outlines=True))
-    text = json.dumps(scene_to_json(scene), indent=1) + "\n"
-    _write_whole(folder / f"{name}.glb", lambda path: path.write_bytes(scene_to_glb(scene)))
-    _write_whole(folder / f"{name}.png", lambda path: picture.save(path, format="PNG"))
-    _write_whole(folder / f"{name}.json", lambda path: path.write_text(text))
+    write_whole(folder / f"{name}.glb", scene_to_glb(scene))
+    write_whole(folder / f"{name}.png", png_bytes(topdown(scene, renderer, outlines=True)))
+    write_json(folder / f"{name}.json", scene_to_json(scene))
 
 
 def check_free(folder: Path, overwrite: bool = False) -> None:
@@ -70,18 +64,23 @@ def check_free(folder: Path, overwrite: bool = False) -> None:
 
 def clear_scenes(folder: Path) -> None:
     """Delete the scenes that a folder holds, with their GLBs, PNGs and latents, and nothing else:
-    whoever reads it next would take them for new ones."""
+    the next reader would take them for new ones."""
     for path in Path(folder).glob("*.json"):
         if _format_of(path) == FORMAT:
             for ending in (".glb", ".png", ".json"):
                 path.with_suffix(ending).unlink(missing_ok=True)
-    (Path(folder) / "latents.npz").unlink(missing_ok=True)
+    (Path(folder) / LATENTS_FILE).unlink(missing_ok=True)
 
 
 def write_scenes(
-    scenes: Sequence[Scene], folder: Path, renderer: Renderer, overwrite: bool = False
+    scenes: Sequence[Scene],
+    folder: Path,
+    renderer: Renderer,
+    overwrite: bool = False,
+    latents: Float[Tensor, "rooms dimension"] | None = None,
 ) -> None:
-    """Write scenes to a folder, each under its own name, and `overview.png` of the first few.
+    """Write scenes to a folder, each under its own name, `overview.png` of the first few, and
+    `latents.npz` where latents are given.
 
     Raises:
         InputError: the folder holds something and `overwrite` is false.
@@ -91,35 +90,16 @@ def write_scenes(
     with Progress(console=Console(stderr=True)) as progress:
         for scene in progress.track(scenes, description="Writing scenes"):
             write_scene(scene, folder, scene.name, renderer)
-    sheet = Image.fromarray(overview(scenes[:OVERVIEW_ROOMS], renderer))
-    _write_whole(Path(folder) / "overview.png", lambda path: sheet.save(path, format="PNG"))
+    sheet = overview(scenes[:OVERVIEW_ROOMS], renderer)
+    write_whole(Path(folder) / "overview.png", png_bytes(sheet))
+    if latents is not None:
+        write_latents(folder, latents, [scene.name for scene in scenes])
 
 
 def overview(scenes: Sequence[Scene], renderer: Renderer) -> UInt8[np.ndarray, "height width 3"]:
-    """Rooms seen from above a corner, in rows of four, coloured by class.
-
-    Args:
-        scenes: At least one room.
-        renderer: From `sceneprior.offscreen.open_renderer`.
-    """
-    height, width = OVERVIEW_TILE
-    columns = min(4, len(scenes))
-    rows = -(-len(scenes) // columns)
-    sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
-    for index, scene in enumerate(scenes):
-        row, column = divmod(index, columns)
-        tile = perspective(scene, renderer, OVERVIEW_TILE)
-        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = tile
-    return sheet
-
-
-def _write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    temporary = path.with_name(path.name + ".part")
-    try:
-        write(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    """Rooms (at least one) seen from above a corner, in rows of four, coloured by class."""
+    tiles = [perspective(scene, renderer, OVERVIEW_TILE) for scene in scenes]
+    return contact_sheet(tiles, min(4, len(tiles)))
 
 
 def scene_to_glb(scene: Scene) -> bytes:
@@ -128,11 +108,11 @@ def scene_to_glb(scene: Scene) -> bytes:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
+    if not scene.objects:
+        return _empty_glb()
     room = trimesh.Scene(base_frame="room")
-    for index, (item, mesh, color) in enumerate(
-        zip(scene.objects, scene_meshes(scene), object_colors(scene), strict=True)
-    ):
-        node = f"{index}_{item.label}"
+    meshes, colors = scene_meshes(scene), object_colors(scene)
+    for node, item, mesh, color in zip(_nodes(scene), scene.objects, meshes, colors, strict=True):
         material = PBRMaterial(
             name=item.label,
             baseColorFactor=_linear_rgba(color),
@@ -141,20 +121,19 @@ def scene_to_glb(scene: Scene) -> bytes:
             # A learned mesh may fold over itself; its back should not be a hole.
             doubleSided=True,
         )
-        room.add_geometry(
-            trimesh.Trimesh(
-                np.asarray(mesh.vertices_m, dtype=np.float64),
-                np.asarray(mesh.faces, dtype=np.int64),
-                process=False,
-                visual=TextureVisuals(material=material),
-            ),
-            node_name=node,
-            geom_name=node,
+        surface = trimesh.Trimesh(
+            np.asarray(mesh.vertices_m, dtype=np.float64),
+            np.asarray(mesh.faces, dtype=np.int64),
+            process=False,
+            visual=TextureVisuals(material=material),
         )
-    if not scene.objects:
-        return _empty_glb()
+        room.add_geometry(surface, node_name=node, geom_name=node)
     # Without normals viewers shade each triangle flat: boxes keep their edges.
     return bytes(room.export(file_type="glb", include_normals=False))
+
+
+def _nodes(scene: Scene) -> list[str]:
+    return [f"{index}_{item.label}" for index, item in enumerate(scene.objects)]
 
 
 def _linear_rgba(color: np.ndarray) -> list[float]:
@@ -210,12 +189,12 @@ def load_scene(path: Path) -> Scene:
     if not glb.is_file() or not scene.objects:
         return scene
     meshes = read_glb_meshes(glb)
-    wanted = [f"{index}_{item.label}" for index, item in enumerate(scene.objects)]
+    wanted = _nodes(scene)
     if set(meshes) != set(wanted):
-        strange = sorted(set(meshes) ^ set(wanted))
+        unlisted = sorted(set(meshes) ^ set(wanted))
         raise InputError(
             f"{glb.name} and {path.name} describe different objects (only in one of them: "
-            f"{', '.join(strange[:4])}); write both again with `sceneprior synthesize`."
+            f"{', '.join(unlisted[:4])}); write both again with `sceneprior synthesize`."
         )
     objects = tuple(
         replace(item, mesh=meshes[node]) for node, item in zip(wanted, scene.objects, strict=True)

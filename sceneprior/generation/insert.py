@@ -1,6 +1,7 @@
-"""A room and given objects in, the room with these objects in it out."""
+"""Insert given objects into a room, in place of those that stand for them or are in their way."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ BADLY = 0.25
 with a given one. A chair pushed under a table may stay, a wardrobe in a bed may not."""
 
 
-def put_into(room: Scene, given: Scene, extra: dict[str, object] | None = None) -> Scene:
+def insert(room: Scene, given: Scene, **extra: Any) -> Scene:
     """Given objects first and exactly as they came, then what the room adds to them.
 
     Of the room's own objects go
@@ -45,10 +46,9 @@ def put_into(room: Scene, given: Scene, extra: dict[str, object] | None = None) 
         "replaced": len(partners),
         "removed": len(clashing),
         "replaced_off_m": _mean_apart(room, given, partners),
+        **extra,
     }
-    return Scene(
-        room.name, room.label_set, (*placed, *added), given.floor_m, {**marks, **(extra or {})}
-    )
+    return Scene(room.name, room.label_set, (*placed, *added), given.floor_m, marks)
 
 
 def _partners(room: Scene, given: Scene) -> dict[int, int]:

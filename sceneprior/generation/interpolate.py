@@ -1,8 +1,8 @@
-"""Two latents in, the rooms on the geodesic between them out: scenes, a strip, an animation."""
+"""Rooms on the geodesic between two latents, as scenes, a strip of pictures and an animation."""
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +11,14 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from sceneprior.classes import VOID, class_colors, label_set
+from sceneprior.classes import VOID, class_colors
 from sceneprior.errors import InputError
-from sceneprior.evaluation.topdown import CornerView, corner_view, perspective
+from sceneprior.evaluation.topdown import corner_view, perspective
 from sceneprior.files import write_whole
-from sceneprior.generation.decode import BATCH, furnished_slots, to_scenes
-from sceneprior.generation.latents import read_latent
+from sceneprior.generation.decode import DecodedRoom, decode_rooms
+from sceneprior.generation.sample import read_latent
 from sceneprior.offscreen import Renderer
+from sceneprior.pictures import contact_sheet, png_bytes
 from sceneprior.scene import Scene
 from sceneprior.training.method import TrainedPrior
 
@@ -31,27 +32,15 @@ PAUSE_MS = 700
 """At both ends, where the animation turns round."""
 
 
-@dataclass(frozen=True)
-class PathRoom:
-    """A room on the way, its objects known by the prediction they come from."""
-
-    scene: Scene
-    slots: tuple[int, ...]
-    """Which of the N predictions each object is: the same object in the next room."""
-    colors: UInt8[np.ndarray, "objects 3"]
-    """The classes' colours, mixed by their probabilities: they change as gradually as the room."""
-
-
 def interpolate(
     trained: TrainedPrior, start: str, end: str, steps: int
 ) -> tuple[Float[Tensor, "steps dimension"], list[Scene]]:
     """Latents from one end to the other, and their rooms `step_00`, `step_01`, ...
 
     `extra` says how far along a room is, and in `slots` which prediction each object comes from:
-    what has the same slot in two rooms is the same object, moved.
+    what has the same number in two rooms is the same object, moved.
 
     Args:
-        trained: The run's prior.
         start, end: As `read_latent` reads them.
         steps: Rooms, both ends included; at least 2.
 
@@ -59,10 +48,11 @@ def interpolate(
         InputError: an end is unknown, or the two are opposite.
     """
     z = path_latents(trained, read_latent(trained, start), read_latent(trained, end), steps)
+    names = [f"step_{k:02d}" for k in range(steps)]
     scenes = []
-    for step, room in enumerate(decode_path(trained, z, [f"step_{k:02d}" for k in range(steps)])):
+    for step, room in enumerate(decode_rooms(trained, z, names)):
         along = round(step / (steps - 1), 6)
-        extra = {"from": start, "to": end, "along": along, "slots": list(room.slots)}
+        extra = {"from": start, "to": end, "along": along, "slots": list(room.predictions)}
         scenes.append(replace(room.scene, extra=extra))
     return z, scenes
 
@@ -89,55 +79,31 @@ def path_latents(
         ) from None
 
 
-@torch.no_grad()
-def decode_path(
-    trained: TrainedPrior, z: Float[Tensor, "steps dimension"], names: list[str]
-) -> list[PathRoom]:
-    """The rooms of latents on a path, with each object's prediction and mixed colour."""
-    config, target = trained.config, trained.config.model.completeness_target
-    palette = class_colors(len(label_set(config.label_set))).astype(np.float64)
-    rooms: list[PathRoom] = []
-    for start in range(0, len(z), BATCH):
-        part = slice(start, start + BATCH)
-        decoded = trained.prior.decode(z[part], with_shape=trained.stage != "layout")
-        scenes = to_scenes(
-            decoded, trained.prior.shape.faces, config.label_set, names[part], target
-        )
-        share = decoded.class_logits.softmax(dim=-1).double().numpy()
-        share[..., VOID] = 0
-        for row, slots in enumerate(furnished_slots(decoded, target)):
-            # An object's likeliest class is not void, so something is left to divide by.
-            mixed = share[row, slots] @ palette / share[row, slots].sum(axis=-1, keepdims=True)
-            colors = np.rint(mixed).astype(np.uint8)
-            rooms.append(PathRoom(scenes[row], tuple(slots), colors))
-    return rooms
+def mixed_colors(room: DecodedRoom) -> UInt8[np.ndarray, "objects 3"]:
+    """The classes' colours, mixed by their probabilities: they change as gradually as the room."""
+    share = room.class_logits.softmax(dim=-1).double().numpy()
+    share[:, VOID] = 0
+    # An object's likeliest class is not void, so something is left to divide by.
+    mixed = share @ class_colors(share.shape[1]).astype(np.float64)
+    return np.rint(mixed / share.sum(axis=-1, keepdims=True)).astype(np.uint8)
 
 
 def strip(
-    rooms: Sequence[PathRoom], view: CornerView, renderer: Renderer
-) -> UInt8[np.ndarray, "height width 3"]:
-    """The rooms side by side from one view, in rows of nine."""
-    height, width = view.image_size
-    columns = min(STRIP_COLUMNS, len(rooms))
-    lines = -(-len(rooms) // columns)
-    sheet = np.full((lines * height, columns * width, 3), 255, dtype=np.uint8)
-    for index, room in enumerate(rooms):
-        line, column = divmod(index, columns)
-        tile = perspective(room.scene, renderer, view=view, colors=room.colors)
-        sheet[line * height :, column * width :][:height, :width] = tile
-    return sheet
+    pictures: Sequence[UInt8[np.ndarray, "height width 3"]],
+) -> UInt8[np.ndarray, "strip_height strip_width 3"]:
+    """Pictures side by side, in rows of nine."""
+    return contact_sheet(pictures, min(STRIP_COLUMNS, len(pictures)))
 
 
-def animation(rooms: Sequence[PathRoom], view: CornerView, renderer: Renderer) -> bytes:
-    """A GIF that goes along the rooms and back, for ever, from one view."""
-    pictures = [
-        Image.fromarray(perspective(room.scene, renderer, view=view, colors=room.colors))
-        for room in rooms
-    ]
+def animation(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bytes:
+    """A GIF that goes along the pictures and back, for ever."""
     # One palette for all pictures: with one each, plain areas would shimmer.
-    samples = Image.fromarray(np.concatenate([np.asarray(image) for image in pictures]))
+    samples = Image.fromarray(np.concatenate(pictures))
     palette = samples.quantize(255, dither=Image.Dither.NONE)
-    frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in pictures]
+    frames = [
+        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
+        for picture in pictures
+    ]
     times = [FRAME_MS] * len(frames)
     times[0] = times[-1] = PAUSE_MS
     frames, times = frames + frames[-2:0:-1], times + times[-2:0:-1]
@@ -158,9 +124,10 @@ def write_pictures(
     """Write `strip.png` of the steps and `animation.gif`, which has pictures between them, too."""
     many = (len(path) - 1) * BETWEEN + 1
     z = path_latents(trained, path[0], path[-1], many)
-    rooms = decode_path(trained, z, [f"frame_{k:03d}" for k in range(many)])
+    rooms = decode_rooms(trained, z, [f"frame_{k:03d}" for k in range(many)])
     view = corner_view([room.scene for room in rooms], TILE)
-    buffer = io.BytesIO()
-    Image.fromarray(strip(rooms[::BETWEEN], view, renderer)).save(buffer, format="PNG")
-    write_whole(folder / "strip.png", buffer.getvalue())
-    write_whole(folder / "animation.gif", animation(rooms, view, renderer))
+    pictures = [
+        perspective(room.scene, renderer, view=view, colors=mixed_colors(room)) for room in rooms
+    ]
+    write_whole(folder / "strip.png", png_bytes(strip(pictures[::BETWEEN])))
+    write_whole(folder / "animation.gif", animation(pictures))

@@ -1,4 +1,4 @@
-"""Scenes in; the same scenes with a CAD model in every box out (supplement, shape retrieval).
+"""Put the most similar CAD model into every box of a scene (supplement, shape retrieval).
 
 A box whose centre is at most 1 m high is extruded to the floor. Every CAD model of the object's
 class is scaled into the box, turned by 0, 90, 180 and 270 degrees, and compared with the object's
@@ -21,14 +21,14 @@ from torch import Tensor
 
 from sceneprior.errors import InputError
 from sceneprior.evaluation.topdown import box_mesh
-from sceneprior.generation.cad_bank import CadBank, Shelf
+from sceneprior.generation.cad_models import CadModels, ClassModels
 from sceneprior.geometry.surfaces import chamfer_mean, surface_points
 from sceneprior.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.scene import Mesh, Scene, SceneObject
 
 STANDS_M = 1.0
 """A box whose centre is at most so high stands on the floor."""
-STAGES = ((16, 1 / 3), (4, None))
+ROUNDS = ((16, 1 / 3), (4, None))
 """(step, share): comparisons by every `step`-th point, and the share of the models that goes on."""
 KEEP = 16
 """Models with a turn that are compared by all points; None takes all of them: exact, and slow."""
@@ -44,19 +44,14 @@ class Retrieved:
     turn_deg: int
     """The yaw of the model in the room: 0, 90, 180 or 270; docs/conventions.md."""
     distance_m: float
-    """See `geometry.surfaces.chamfer_mean`."""
+    """See `chamfer_mean`."""
 
 
-def retrieve(scene: Scene, bank: CadBank, keep: int | None = KEEP) -> Scene:
+def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
     """The scene with the mesh of the most similar CAD model in every box.
 
     `extra["retrieval"]` holds, in the order of the objects, {"model_id", "turn_deg", "distance_m"},
-    or None where the bank has no model of the class: such an object keeps its own mesh.
-
-    Args:
-        scene: With meshes, or with boxes alone.
-        bank: Models to choose from.
-        keep: See `KEEP`.
+    or None where there is no model of the class: such an object keeps its own mesh.
 
     Raises:
         InputError: a box or a mesh is no finite number.
@@ -65,32 +60,25 @@ def retrieve(scene: Scene, bank: CadBank, keep: int | None = KEEP) -> Scene:
     objects: list[SceneObject] = []
     found: list[dict[str, object] | None] = []
     for item in scene.objects:
-        item = extruded(item)
-        shelf = bank.shelves.get(item.label)
-        if shelf is None:
-            objects.append(item)
-            found.append(None)
-            continue
-        best = most_similar(item, shelf, keep)
-        objects.append(replace(item, mesh=placed(bank.load(best.model_id), item, best.turn_deg)))
-        found.append({**vars(best), "distance_m": round(best.distance_m, 5)})
+        item, told = extruded(item), None
+        if of_class := models.by_class.get(item.label):
+            best = most_similar(item, of_class, keep)
+            item = replace(item, mesh=placed(models.load(best.model_id), item, best.turn_deg))
+            told = {**vars(best), "distance_m": round(best.distance_m, 5)}
+        objects.append(item)
+        found.append(told)
     return replace(scene, objects=tuple(objects), extra={**scene.extra, "retrieval": found})
 
 
-def retrieve_all(scenes: Sequence[Scene], bank: CadBank) -> Iterator[Scene]:
+def retrieve_all(scenes: Sequence[Scene], models: CadModels) -> Iterator[Scene]:
     """`retrieve` for many scenes, on all cores, in their order."""
     # A thread a core, each with one of torch's: the products are small.
     with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as p:
-        yield from p.map(lambda scene: retrieve(scene, bank), scenes)
+        yield from p.map(lambda scene: retrieve(scene, models), scenes)
 
 
-def retrieval_report(scenes: Sequence[Scene], bank: CadBank) -> dict[str, Any]:
-    """What `retrieve` did: models and objects by class, distances, broken models.
-
-    Args:
-        scenes: From `retrieve`.
-        bank: What they were chosen from.
-    """
+def retrieval_report(scenes: Sequence[Scene], models: CadModels) -> dict[str, Any]:
+    """What `retrieve` made of scenes: models and objects by class, distances, broken models."""
     pairs = [
         (item.label, found)
         for scene in scenes
@@ -100,10 +88,10 @@ def retrieval_report(scenes: Sequence[Scene], bank: CadBank) -> dict[str, Any]:
     for label in sorted({label for label, _ in pairs}):
         of_class = [found for name, found in pairs if name == label]
         given = [found["distance_m"] for found in of_class if found]
-        shelf = bank.shelves.get(label)
+        there = models.by_class.get(label)
         classes[label] = {
             "objects": len(of_class),
-            "models": len(shelf.model_ids) if shelf else 0,
+            "models": len(there.model_ids) if there else 0,
             "models_used": len({found["model_id"] for found in of_class if found}),
             "mean_distance_m": round(float(np.mean(given)), 5) if given else None,
         }
@@ -115,7 +103,7 @@ def retrieval_report(scenes: Sequence[Scene], bank: CadBank) -> dict[str, Any]:
         "objects_with_a_model": sum(found is not None for _, found in pairs),
         "classes": classes,
         "classes_without_models": [label for label in classes if not classes[label]["models"]],
-        "broken_models": dict(bank.broken),
+        "broken_models": dict(models.broken),
     }
 
 
@@ -134,15 +122,15 @@ def placed(unit: Mesh, item: SceneObject, turn_deg: int) -> Mesh:
     return Mesh(turned * np.asarray(item.size_m) + np.asarray(item.center_m), unit.faces)
 
 
-def most_similar(item: SceneObject, shelf: Shelf, keep: int | None = KEEP) -> Retrieved:
-    """The model of a shelf, and its turn, nearest to an object by Chamfer distance."""
-    count = shelf.points.shape[1]
+def most_similar(item: SceneObject, models: ClassModels, keep: int | None = KEEP) -> Retrieved:
+    """The model of a class, and its turn, nearest to an object by Chamfer distance."""
+    count = models.points.shape[1]
     views = _turned_views(_points_of(item, count) - np.asarray(item.center_m), item.size_m)
-    choices = np.arange(len(shelf.model_ids) * QUARTERS)
-    for step, share in STAGES if keep is not None else ():
+    choices = np.arange(len(models.model_ids) * QUARTERS)
+    for step, share in ROUNDS if keep is not None else ():
         going_on = max(keep or 0, int(len(choices) * share) if share else 0)
         if going_on < len(choices):
-            rough = _rough_distances(views, shelf.points, choices, step)
+            rough = _rough_distances(views, models.points, choices, step)
             # Stable: of equals the first model wins, whatever the machine.
             choices = choices[np.argsort(rough, kind="stable")[:going_on]]
     trees = [cKDTree(points) for points, _ in views]
@@ -150,10 +138,10 @@ def most_similar(item: SceneObject, shelf: Shelf, keep: int | None = KEEP) -> Re
     for choice in choices:
         model, turn = divmod(int(choice), QUARTERS)
         points, size = views[turn]
-        distances.append(chamfer_mean(points, shelf.points[model] * size, trees[turn]))
+        distances.append(chamfer_mean(points, models.points[model] * size, trees[turn]))
     best = int(np.argmin(distances))
     model, turn = divmod(int(choices[best]), QUARTERS)
-    return Retrieved(shelf.model_ids[model], 90 * turn, distances[best])
+    return Retrieved(models.model_ids[model], 90 * turn, distances[best])
 
 
 def _points_of(item: SceneObject, count: int) -> np.ndarray:
@@ -181,7 +169,7 @@ def _rough_distances(
     choices: Int[np.ndarray, " choices"],
     step: int,
 ) -> Float[np.ndarray, " choices"]:
-    """Chamfer distances by every `step`-th point: which models are worth a closer look."""
+    """`chamfer_mean` by every `step`-th point: which models are worth a closer comparison."""
     rough = np.empty(len(choices), dtype=np.float32)
     few = models[:, ::step]
     for turn, (points, size) in enumerate(views):
@@ -195,8 +183,7 @@ def _rough_distances(
             theirs = torch.from_numpy(few[choices[part] // QUARTERS] * size.astype(np.float32))
             left = torch.cat([theirs, torch.ones(*theirs.shape[:2], 1), _squares(theirs)], dim=2)
             squared = left @ right
-            there = squared.amin(dim=1).clamp(min=0).sqrt().mean(dim=1)
-            back = squared.amin(dim=2).clamp(min=0).sqrt().mean(dim=1)
+            there, back = (squared.amin(dim=dim).clamp(min=0).sqrt().mean(dim=1) for dim in (1, 2))
             rough[part] = ((there + back) / 2).numpy()
     return rough
 

@@ -1,39 +1,48 @@
-"""Latents of training rooms in, latents of new rooms out: the distribution that sampling follows."""
+"""Latents of rooms: drawn around the training rooms, read as the user names them, and written."""
 
+import io
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.errors import InputError
+from sceneprior.files import write_whole
 from sceneprior.models.latents import LatentSpace
+from sceneprior.training.method import TrainedPrior
 
 NEIGHBOURS = 20
 """Rooms that a geodesic may lead to; more reach further from the training rooms."""
-
 BANDWIDTH = 0.15
-"""Of the kernel distribution, in standard deviations of the training rooms' logits: 0 copies training rooms,
-1 is the gaussian distribution. Larger is newer, and more often a room without a bed or with two."""
-
+"""Of the kernel distribution, in standard deviations of the training rooms' logits: 0 copies
+training rooms, 1 is the gaussian distribution. Larger is newer, and more often a room without a
+bed or with two."""
 DISTRIBUTIONS = ("kernel", "geodesic", "gaussian", "paper")
+LATENTS_FILE = "latents.npz"
+_ENDINGS = (".npz", ".npy", ".json")
 
 
 def sample_latents(
-    sphere: LatentSpace,
+    space: LatentSpace,
     trained: Float[Tensor, "rooms anchors"],
     count: int,
     seed: int,
     distribution: str = "kernel",
 ) -> Float[Tensor, "count dimension"]:
-    """Draw points of the latent space.
+    """Draw points of the latent space; the same seed, the same points.
 
     Args:
-        sphere: Turns logits into points.
+        space: Turns logits into points.
         trained: The training rooms' logits.
-        count: How many to draw.
-        seed: Same seed, same rooms.
-        distribution: `geodesic`: a point anywhere on the geodesic (in a cube: the straight line) between a
-            training room drawn at random and one of its `NEIGHBOURS` nearest. The others: see
-            `sample_logits`.
+        distribution: `geodesic`: a point anywhere on the geodesic (in a cube: the straight line)
+            between a training room drawn at random and one of its `NEIGHBOURS` nearest. The
+            others: see `sample_logits`.
 
     Raises:
         InputError: an unknown distribution, or fewer than two training rooms to draw between.
@@ -44,20 +53,21 @@ def sample_latents(
         )
     if distribution != "paper" and len(trained) < 2:
         raise InputError(
-            f"The {distribution} distribution needs at least 2 training rooms; use --distribution paper."
+            f"The {distribution} distribution needs at least 2 training rooms; use --distribution "
+            "paper."
         )
     if distribution != "geodesic":
-        return sphere(sample_logits(trained, count, seed, distribution, sphere.shift_free))
+        return space(sample_logits(trained, count, seed, distribution, space.shift_free))
     generator = torch.Generator().manual_seed(seed)
     start = _rooms_in_turn(len(trained), count, generator)
-    z = sphere(trained)
-    closeness = sphere.nearness(z[start], z)
-    closeness[torch.arange(count), start] = -torch.inf  # nobody is their own neighbour
+    z = space(trained)
+    closeness = space.nearness(z[start], z)
+    closeness[torch.arange(count), start] = -torch.inf  # no room is its own neighbour
     nearest = closeness.topk(min(NEIGHBOURS, len(trained) - 1), dim=1).indices
     pick = torch.randint(nearest.shape[1], (count, 1), generator=generator)
     end = nearest.gather(1, pick)[:, 0]
     along = torch.rand(count, generator=generator).to(trained.dtype)
-    return sphere.between(z[start], z[end], along)
+    return space.between(z[start], z[end], along)
 
 
 def sample_logits(
@@ -67,16 +77,13 @@ def sample_logits(
     distribution: str,
     shift_free: bool = True,
 ) -> Float[Tensor, "count anchors"]:
-    """Draw logits of latent weights.
+    """Draw logits of latent weights, as `sample_latents`.
 
     Args:
-        trained: The training rooms' logits.
-        count: How many to draw.
-        seed: Same seed, same logits.
-        distribution: `paper`: N(0, 1), which is where training rooms' logits started, not where they
-            ended. `gaussian`: the mean and covariance of the training rooms' logits. `kernel`:
-            the same mean and covariance, as a mixture of Gaussians around the training rooms
-            (a smoothed bootstrap of width `BANDWIDTH`).
+        distribution: `paper`: N(0, 1), which is where training rooms' logits started, not where
+            they ended. `gaussian`: the mean and covariance of the training rooms' logits.
+            `kernel`: the same mean and covariance, as a mixture of Gaussians around the training
+            rooms (a smoothed bootstrap of width `BANDWIDTH`).
         shift_free: Whether a constant added to all logits of a room changes nothing, as where a
             softmax turns them into weights; that freedom is taken out first.
     """
@@ -103,3 +110,86 @@ def _rooms_in_turn(rooms: int, count: int, generator: torch.Generator) -> Int[Te
     """Rooms in random order, none a second time before each was there once."""
     rounds = [torch.randperm(rooms, generator=generator) for _ in range(-(-count // rooms))]
     return torch.cat(rounds)[:count]
+
+
+def draw_latents(
+    trained: TrainedPrior, count: int, seed: int, distribution: str | None = None
+) -> tuple[Float[Tensor, "count dimension"], list[str]]:
+    """Latents sampled by a distribution (None: the run's own), and the names of their rooms."""
+    space, distribution = trained.prior.latent_space, distribution or trained.distribution
+    z = sample_latents(space, trained.logits, count, seed, distribution)
+    return z, scene_names(count, seed)
+
+
+def scene_names(count: int, seed: int) -> list[str]:
+    """What new rooms are called."""
+    return [f"seed{seed}_{index:04d}" for index in range(count)]
+
+
+def write_latents(folder: Path, z: Float[Tensor, "rooms dimension"], names: list[str]) -> None:
+    """Write `latents.npz`: `latents`, one row a room, and `names`, those of the rooms' files."""
+    buffer = io.BytesIO()
+    np.savez(buffer, latents=z.numpy(), names=np.array(names))
+    write_whole(Path(folder) / LATENTS_FILE, buffer.getvalue())
+
+
+def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]:
+    """The point of a run's latent space that a text names.
+
+    A name is the id of a training room; `seed:7`, the room that `synthesize -n 1 --seed 7` makes;
+    or a file of latents: `FILE` (its first), `FILE:3` (counted from 0), `FILE:NAME`. Files are
+    `latents.npz`, an .npy of (D,) or (n, D) numbers, or a .json of such lists.
+
+    Raises:
+        InputError: nothing is called so, or the file does not hold a latent of this run's size.
+    """
+    space = trained.prior.latent_space
+    if text in trained.room_ids:
+        row = trained.room_ids.index(text)
+        return space(trained.logits[row : row + 1])[0]
+    if re.fullmatch(r"seed:\d{1,18}", text):
+        return draw_latents(trained, 1, int(text[5:]))[0][0]
+    file, colon, item = text.rpartition(":")
+    path, item = (Path(file), item) if colon and file.endswith(_ENDINGS) else (Path(text), "0")
+    if not path.is_file():
+        known = f"such as {trained.room_ids[0]}" if trained.room_ids else "which keeps none"
+        raise InputError(
+            f"'{text}' is neither a training room of this run ({known}), "
+            f"nor seed:NUMBER, nor a file of latents ({', '.join(_ENDINGS)})."
+        )
+    latents, names = _read_latents(path)
+    if item in names:
+        row = names.index(item)
+    elif item.isdecimal() and int(item) < len(latents):
+        row = int(item)
+    else:
+        known = f"names such as {names[0]}" if names else "no names"
+        raise InputError(f"{path} has no latent '{item}': it holds {len(latents)} and {known}.")
+    width = trained.config.model.width
+    if latents.shape[1] != width:
+        raise InputError(
+            f"{path} holds latents of {latents.shape[1]} numbers, but this run's have {width}; "
+            "take latents of the same run."
+        )
+    point = latents[row]
+    if not np.isfinite(point).all() or not point.any():
+        raise InputError(f"{path}: latent {row} is all zeros or holds no numbers; write it again.")
+    return space.onto(torch.from_numpy(point).to(trained.logits.dtype).unsqueeze(0))[0]
+
+
+def _read_latents(path: Path) -> tuple[np.ndarray, list[str]]:
+    try:
+        raw = path.read_bytes()
+        data: Any = json.loads(raw) if path.suffix == ".json" else np.load(io.BytesIO(raw))
+        names: list[str] = []
+        if isinstance(data, Mapping):
+            data, names = data["latents"], [str(name) for name in data.get("names", [])]
+        latents = np.atleast_2d(np.asarray(data, dtype=np.float64))
+        if latents.ndim != 2 or not latents.size:
+            raise ValueError(f"an array of shape {latents.shape}")
+    except Exception as error:  # what numpy raises depends on which byte is damaged
+        raise InputError(
+            f"{path} holds no latents ({type(error).__name__}: {error}); expected (n, D) numbers, "
+            "as in the latents.npz that `sceneprior synthesize` writes."
+        ) from None
+    return latents, names

@@ -1,9 +1,8 @@
-"""Masks of single images in, the latents that explain them out; the network is frozen (5.2)."""
+"""Fit latents to the masks of single images, with the network frozen (section 5.2)."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -11,7 +10,9 @@ from torch import Tensor
 from sceneprior.errors import InputError
 from sceneprior.losses.matching import Matches
 from sceneprior.losses.shape import mask_loss
+from sceneprior.reconstruction.image import rows_of
 from sceneprior.training.method import TrainedPrior
+from sceneprior.training.ours import OursConfig
 from sceneprior.training.objective import (
     check_finite,
     match_and_score,
@@ -19,11 +20,10 @@ from sceneprior.training.objective import (
     seen_masks,
     weighted_sum,
 )
-from sceneprior.training.ours import OursConfig
 from sceneprior.views import DecodedScenes, SceneViews
 
 CHECK_EVERY = 20
-"""Steps from one look at which images are done to the next."""
+"""Steps after which to find out, each time, which images are done."""
 SMOOTHING, EPSILON = 0.99, 1e-8
 """RMSProp's, as in PyTorch."""
 
@@ -55,7 +55,7 @@ SCHEDULES = {
 
 
 class ViewLoss(NamedTuple):
-    """What scenes are judged by from their images; one number an image."""
+    """How well scenes explain their images; one number an image."""
 
     total: Float[Tensor, " images"]
     """What is minimised: class, box, frustum and mask terms with the run's weights."""
@@ -94,12 +94,12 @@ def view_loss(
     masks: bool = True,
     matches: Matches | None = None,
 ) -> ViewLoss:
-    """The losses of training, per image and without completeness.
+    """The losses of training, per image (a room of `views`) and without completeness.
 
     Args:
         trained: Of the run. Scenes without meshes (before its shape stage) have no masks.
         scenes: At least as many objects a room as the fullest image shows.
-        views: One room an image, with instance ids.
+        views: With instance ids.
         masks: Whether masks are compared.
         matches: To keep; None matches anew.
     """
@@ -137,13 +137,6 @@ def fit_latents(
 
     Images do not know of each other: alone or among others, one takes the same steps, but for
     rounding, which grows over a thousand of them.
-
-    Args:
-        trained: The prior.
-        views: One room an image, with instance ids.
-        start: Points of the latent space to begin with.
-        schedule: Steps, rates and when to stop.
-        masks: Whether the mask loss takes part.
 
     Raises:
         InputError: an image shows more objects than the prior can generate.
@@ -197,11 +190,7 @@ def fit_latents(
 
 
 def refuse_crowds(trained: TrainedPrior, views: SceneViews) -> None:
-    """Say so where an image shows more objects than the prior can generate.
-
-    Raises:
-        InputError: it does.
-    """
+    """Raise an `InputError` where an image shows more objects than the prior can generate."""
     counts = views.is_object.sum(dim=-1)
     row = int(counts.argmax())
     if int(counts[row]) > trained.prior.max_objects:
@@ -210,19 +199,3 @@ def refuse_crowds(trained: TrainedPrior, views: SceneViews) -> None:
             f"objects, but the run generates at most {trained.prior.max_objects} "
             "(model.max_objects); leave out the smallest masks, or train with more."
         )
-
-
-def rows_of(views: SceneViews, rows: Tensor) -> SceneViews:
-    """Some rooms of a batch, padded to the fullest of them alone."""
-    chosen = {
-        item.name: getattr(views, item.name)[rows]
-        for item in fields(views)
-        if isinstance(getattr(views, item.name), Tensor)
-    }
-    most = max(int(chosen["is_object"].sum(dim=-1).max()), 1)
-    for name in ("object_class", "is_object"):
-        chosen[name] = chosen[name][:, :most]
-    for name in ("boxes", "visible", "sides_clear"):
-        chosen[name] = chosen[name][:, :, :most]
-    ids = np.array(views.room_ids)[rows.numpy()] if views.room_ids else ()
-    return replace(views, **chosen, room_ids=tuple(ids))

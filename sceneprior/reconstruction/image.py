@@ -1,204 +1,198 @@
-"""A user's own image: a PNG of ids, a table of classes and a lens in, an `ObservedImage` out."""
+"""Instance masks of single images: read from shards, and stacked into batches."""
 
-import json
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Bool, Float, Integer
+from torch import Tensor
 
 from sceneprior.errors import InputError
-from sceneprior.geometry.turns import QUARTERS, quarter_rotation
-from sceneprior.instances.observations import observe
-from sceneprior.instances.pngs import read_mask
-from sceneprior.instances.tables import IdTable, read_class_table
-from sceneprior.reconstruction.observed import ObservedImage
+from sceneprior.shards import RoomViews, iterate_rooms
+from sceneprior.views import SceneViews
 
-CAMERA_HEIGHT_M = 1.6
-"""Of a camera whose pose nobody gave: the middle of what the recipes draw from, 1.4 to 1.8 m."""
-CAMERA_DISTANCE_M = 1.5
-"""How far from the middle of the room it stands, which it looks at."""
+MASK_COLUMNS = 80
+"""About how many pixels wide masks are compared; training's 480 / 6."""
 
 
 @dataclass(frozen=True)
-class OwnImage:
-    """What a user gave, in the room frame."""
+class ObservedImage:
+    """Instance masks of one image, of the n objects that it shows, and its camera."""
 
-    image: ObservedImage
-    notes: tuple[str, ...]
-    """What was assumed, or left out: sentences to print."""
-    pose_known: bool
+    name: str
+    """What its files are called."""
+    label_set: str
+    object_class: Integer[np.ndarray, " n"]
+    """Index into the label set."""
+    instance_ids: Integer[np.ndarray, "height width"]
+    """0 = nothing, k + 1 = object k."""
+    boxes: Float[np.ndarray, "n 4"]
+    """x1, y1, x2, y2 relative to the image size."""
+    sides_clear: Bool[np.ndarray, "n 4"]
+    """Which sides of a box are the object's own; see `SceneViews`."""
+    world_to_camera: Float[np.ndarray, "4 4"]
+    """To the camera from the room frame that the scene is told in."""
+    intrinsics: Float[np.ndarray, "3 3"]
+    room_id: str = ""
+    view: int = 0
+    rows: tuple[int, ...] = ()
+    """Which of the room's tracked objects these are; () where there is no room."""
+
+    @property
+    def mask_step(self) -> int:
+        """Every how many pixels masks are compared, so that about `MASK_COLUMNS` are left."""
+        return max(1, round(self.instance_ids.shape[1] / MASK_COLUMNS))
+
+    def sampled_ids(self, step: int) -> Integer[np.ndarray, "rows columns"]:
+        """Every `step`-th instance id, from the middle of a block, as shards are for training."""
+        return self.instance_ids[step // 2 :: step, step // 2 :: step]
 
 
-def read_own_image(
-    mask: Path,
-    classes: Path,
-    intrinsics: str,
-    label_set: str,
-    pose: Path | None = None,
-    camera_height_m: float = CAMERA_HEIGHT_M,
-) -> OwnImage:
-    """Read an image's masks and camera.
-
-    Args:
-        mask: PNG of one channel; equal values are one object, 0 is nothing.
-        classes: JSON or CSV: the class of each value. Classes outside the label set are void.
-        intrinsics: `fx,fy,cx,cy` in pixels of the mask, or a JSON file; see `read_intrinsics`.
-        label_set: The run's.
-        pose: JSON; see `read_pose`. Without one the camera is level, `camera_height_m` above the
-            floor and `CAMERA_DISTANCE_M` before the middle of the room, looking along -z.
-        camera_height_m: Of a camera without a pose.
+def image_of_room(room: RoomViews, view: int, label_set: str) -> ObservedImage:
+    """One view of a room, read with its images; only what this view shows remains.
 
     Raises:
-        InputError: a file cannot be used, the sizes differ, or no object is seen.
+        InputError: the room has no such view, or the view shows no object.
     """
-    values = read_mask(mask)
-    height, width = values.shape
-    table = IdTable(read_class_table(classes), label_set, str(classes))
-    lens = read_intrinsics(intrinsics, (height, width))
-    seen = observe(table.ids(values)[None], table.is_object)
-    if not len(seen.tracked):
+    count = len(room.visible)
+    if not 0 <= view < count:
         raise InputError(
-            f"{mask} shows no object: none of its masks is of a class of the run and wider than "
-            f"4 pixels. Its values are {_some(np.unique(values))}; {classes} says what they are."
+            f"Room {room.room_id} has no view {view}; its {count} views are 0 to {count - 1}."
         )
-    notes = list(table.notes)
-    if table.unlisted - {0}:
-        notes.append(
-            f"{mask} has values that {classes} does not list, taken for void: "
-            f"{_some(np.array(sorted(table.unlisted)))}"
+    rows = np.flatnonzero(room.visible[view])
+    if not len(rows):
+        raise InputError(
+            f"View {view} of room {room.room_id} shows no object, so there is nothing to "
+            "reconstruct from; choose a view that does (`sceneprior inspect` shows them)."
         )
-    if pose is None:
-        notes.append(
-            f"without --pose the camera is level, {camera_height_m:g} m above the floor and "
-            f"{CAMERA_DISTANCE_M:g} m from the middle of the room, which it looks at"
-        )
-    image = ObservedImage(
-        name=mask.stem,
+    assert room.instance_ids is not None, "read_room(images=True)"
+    number = np.zeros(len(room.object_class) + 1, dtype=room.instance_ids.dtype)
+    number[rows + 1] = np.arange(1, len(rows) + 1)
+    return ObservedImage(
+        name=f"{room.room_id.replace('/', '_')}_view{view}",
         label_set=label_set,
-        object_class=table.classes[seen.tracked].astype(np.int64),
-        instance_ids=seen.instance_ids[0],
-        boxes=seen.boxes[0],
-        sides_clear=seen.sides_clear[0],
-        world_to_camera=level_camera(camera_height_m) if pose is None else read_pose(pose),
-        intrinsics=lens,
+        object_class=room.object_class[rows].astype(np.int64),
+        instance_ids=number[room.instance_ids[view]],
+        boxes=room.boxes[view, rows],
+        sides_clear=room.sides_clear[view, rows],
+        world_to_camera=room.world_to_camera[view],
+        intrinsics=room.intrinsics[view],
+        room_id=room.room_id,
+        view=view,
+        rows=tuple(rows.tolist()),
     )
-    return OwnImage(image, tuple(notes), pose is not None)
 
 
-def _some(values: np.ndarray) -> str:
-    return ", ".join(str(value) for value in values[:8]) + (", ..." if len(values) > 8 else "")
+def image_from_shards(folder: Path, room_id: str, view: int) -> ObservedImage:
+    """One view of a room of either split.
+
+    Raises:
+        InputError: neither split holds the room, or see `image_of_room`.
+        ShardError: a shard is missing or damaged.
+    """
+    found: list[str] = []
+    for split in ("test", "train"):
+        if not any((Path(folder) / split).glob("*.h5")):
+            continue
+        for shard, name in iterate_rooms(folder, split):
+            if name == room_id:
+                return image_of_room(shard.read_room(name, images=True), view, shard.label_set)
+            found.append(name)
+    raise InputError(
+        f"{folder} holds no room '{room_id}'; it has {len(found)} rooms"
+        + (f", such as {', '.join(found[:3])}." if found else ".")
+    )
 
 
-def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
-    """`world_to_camera` of a level camera that looks through the middle of the room.
+def images_of_split(
+    folder: Path, split: str, seed: int = 0, limit: int | None = None
+) -> tuple[list[ObservedImage], list[str]]:
+    """One view of each room (or the first `limit`), drawn at random from those that show an object.
+
+    The seed decides the view; another room more or less does not change it.
+
+    Returns:
+        The images, and the ids of rooms of which no view shows anything: those are left out.
+
+    Raises:
+        ShardError: a shard is missing or damaged.
+        InputError: no view of any room shows an object.
+    """
+    images: list[ObservedImage] = []
+    blank: list[str] = []
+    for number, (shard, room_id) in enumerate(iterate_rooms(folder, split)):
+        if limit is not None and number >= limit:
+            break
+        useful = np.flatnonzero(shard.read_room(room_id).visible.any(axis=1))
+        if not len(useful):
+            blank.append(room_id)
+            continue
+        view = int(np.random.default_rng([seed, *room_id.encode()]).choice(useful))
+        images.append(image_of_room(shard.read_room(room_id, images=True), view, shard.label_set))
+    if not images:
+        raise InputError(f"No view of the '{split}' rooms of {folder} shows an object.")
+    return images, blank
+
+
+def as_views(images: Sequence[ObservedImage], mask_step: int | None = None) -> SceneViews:
+    """The images as a batch: each a room with one view, objects padded to the fullest image's.
 
     Args:
-        height_m: Above the floor.
-        quarter: 0 stands on the +z side and looks along -z; each quarter goes on about +y.
-    """
-    turn = quarter_rotation(quarter)
-    eye = turn @ np.array([0, height_m, CAMERA_DISTANCE_M])
-    pose = np.eye(4)
-    pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turn.T  # OpenCV: y down, z into the room
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    return pose
-
-
-def sides_of_room(own: OwnImage, camera_height_m: float) -> list[ObservedImage]:
-    """The image itself; without a pose, as seen from each of the room's four sides."""
-    if own.pose_known:
-        return [own.image]
-    return [
-        replace(own.image, world_to_camera=level_camera(camera_height_m, quarter))
-        for quarter in range(QUARTERS)
-    ]
-
-
-def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
-    """A lens: `fx,fy,cx,cy`, or a JSON file with `K` (3 x 3), or `fx`, `fy`, `cx` and `cy`.
-
-    The file may say of which image (`width`, `height`), which is checked.
+        images: At least one, all of one size.
+        mask_step: Every how many pixels the instance ids are kept; None takes the images' own.
 
     Raises:
-        InputError: neither; not finite; or of an image of another size.
+        InputError: the images differ in size.
     """
-    expected = 'fx,fy,cx,cy in pixels, or a JSON file: {"fx": 240, "fy": 240, "cx": 240, "cy": 180}'
-    path = Path(text)
-    if path.suffix.lower() == ".json":
-        data = _read_json(path)
-        if not isinstance(data, dict):
-            data = {"K": data}
-        said = (data.get("height", image_size[0]), data.get("width", image_size[1]))
-        if said != image_size:
-            raise InputError(
-                f"{path} is of an image of {said[1]} x {said[0]} pixels, but the mask has "
-                f"{image_size[1]} x {image_size[0]}; scale fx, fy, cx and cy, or the mask."
-            )
-        try:
-            lens = np.array(
-                data["K"]
-                if "K" in data
-                else [[data["fx"], 0, data["cx"]], [0, data["fy"], data["cy"]], [0, 0, 1]],
-                dtype=np.float64,
-            )
-        except (KeyError, TypeError, ValueError):
-            raise InputError(f"{path} holds no lens; expected {expected}.") from None
-    else:
-        try:
-            fx, fy, cx, cy = (float(value) for value in text.split(","))
-        except ValueError:
-            raise InputError(f"--intrinsics {text} is no lens; expected {expected}.") from None
-        lens = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    plain = (
-        lens.shape == (3, 3)
-        and np.isfinite(lens).all()
-        and min(lens[0, 0], lens[1, 1]) > 0
-        and lens[0, 1] == 0
-        and np.allclose(lens[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1])
+    sizes = sorted({image.instance_ids.shape for image in images})
+    if len(sizes) > 1:
+        raise InputError(
+            f"Images that are fitted together have one size, but {sizes[0]} and {sizes[1]} pixels "
+            "(height, width) came; reconstruct each size on its own."
+        )
+    most = max(len(image.object_class) for image in images)
+    step = mask_step or images[0].mask_step
+
+    def padded(rows: Sequence[np.ndarray], dtype: type) -> Tensor:
+        stack = np.zeros((len(rows), most, *rows[0].shape[1:]), dtype=dtype)
+        for place, row in zip(stack, rows, strict=True):
+            place[: len(row)] = row
+        return torch.from_numpy(stack)
+
+    def stacked(matrices: Sequence[np.ndarray], dtype: type) -> Tensor:
+        return torch.from_numpy(np.stack(matrices).astype(dtype)[:, None])
+
+    is_object = padded([np.ones(len(image.object_class)) for image in images], bool)
+    return SceneViews(
+        room_index=torch.arange(len(images)),
+        object_class=padded([image.object_class for image in images], np.int64),
+        is_object=is_object,
+        world_to_camera=stacked([image.world_to_camera for image in images], np.float32),
+        intrinsics=stacked([image.intrinsics for image in images], np.float32),
+        boxes=padded([image.boxes for image in images], np.float32)[:, None],
+        visible=is_object[:, None],
+        sides_clear=padded([image.sides_clear for image in images], bool)[:, None],
+        image_size=sizes[0],
+        instance_ids=stacked([image.sampled_ids(step) for image in images], np.int32),
+        room_ids=tuple(image.name for image in images),
     )
-    if not plain:
-        raise InputError(
-            f"--intrinsics {text} is no pinhole lens (fx and fy above 0, no skew); "
-            f"expected {expected}."
-        )
-    return lens
 
 
-def read_pose(path: Path) -> np.ndarray:
-    """`world_to_camera` from a JSON file: that key, or `camera_to_world`; 4 x 4, OpenCV axes.
-
-    The world is the room frame: metres, y up, the floor y = 0 and its middle the origin.
-
-    Raises:
-        InputError: there is no such matrix, or it is no rotation with a translation.
-    """
-    data = _read_json(path)
-    found: list[str] = []
-    try:
-        found = [key for key in ("world_to_camera", "camera_to_world") if key in data]
-        matrix = np.array(data[found[0]], dtype=np.float64)
-        turn = matrix[:3, :3]
-        rigid = (
-            matrix.shape == (4, 4)
-            and np.isfinite(matrix).all()
-            and np.allclose(turn @ turn.T, np.eye(3), atol=1e-3)
-            and np.linalg.det(turn) > 0
-            and np.allclose(matrix[3], [0, 0, 0, 1])
-        )
-    except (IndexError, KeyError, TypeError, ValueError):
-        rigid = False
-    if not rigid:
-        raise InputError(
-            f'{path} holds no pose; expected {{"world_to_camera": 4 x 4}} or '
-            '{"camera_to_world": 4 x 4}, a rotation and a translation in metres, camera axes x '
-            "right, y down, z forward, in a room with y up and the floor at 0."
-        )
-    return matrix if found[0] == "world_to_camera" else np.linalg.inv(matrix)
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} cannot be read as JSON ({str(error)[:120]}).") from None
+def rows_of(
+    views: SceneViews, rows: Integer[Tensor, " rows"] | Bool[Tensor, " rows"]
+) -> SceneViews:
+    """Some rooms of a batch, padded to the fullest of them alone."""
+    values = {item.name: getattr(views, item.name) for item in fields(views)}
+    chosen: dict[str, Any] = {
+        name: value[rows] for name, value in values.items() if isinstance(value, Tensor)
+    }
+    most = max(int(chosen["is_object"].sum(dim=-1).max()), 1)
+    for name, axis in (
+        ("object_class", 1), ("is_object", 1), ("boxes", 2), ("visible", 2), ("sides_clear", 2),
+    ):  # fmt: skip
+        chosen[name] = chosen[name].narrow(axis, 0, most)
+    room_ids = tuple(np.array(views.room_ids)[rows.numpy()]) if views.room_ids else ()
+    return replace(views, **chosen, room_ids=room_ids)

@@ -1,4 +1,8 @@
-"""Baselines of reconstruction: images in, the training rooms in 3D that fit them best out."""
+"""Known rooms as answers to images: the nearest training room by its masks, and a random one.
+
+They are what reconstruction has to beat. Rooms are matched to images by one fixed cost, whatever is
+compared with them: a run's own weights take no part.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional as F
 
 from sceneprior.classes import label_set
-from sceneprior.config import LossConfig
 from sceneprior.errors import InputError
 from sceneprior.evaluation.reference import reference_scene
 from sceneprior.evaluation.topdown import scene_meshes
@@ -18,12 +23,14 @@ from sceneprior.geometry.corners import box_corners
 from sceneprior.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.losses.matching import match_objects, matching_cost
 from sceneprior.offscreen import Pinhole, Renderer
-from sceneprior.reconstruction.fit import rows_of
-from sceneprior.reconstruction.observed import ObservedImage, as_views
+from sceneprior.reconstruction.image import ObservedImage, as_views, rows_of
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.shards import Shard, iterate_rooms
 from sceneprior.views import DecodedScenes
 
+BOX_WEIGHT, OCCLUSION_SLACK = 5.0, 0.15
+"""Of the cost by which a room's objects are matched to masks (`match_objects`); boxes of whole
+objects reach behind what hides them in the image, hence the slack."""
 SHORTLIST = 16
 """Rooms, best by 2D boxes, whose masks are then compared."""
 CERTAIN_LOGIT = 30.0
@@ -113,23 +120,20 @@ def turn_scene(scene: Scene, quarter: int) -> Scene:
 
 
 def random_answers(
-    rooms: KnownRooms, images: Sequence[ObservedImage], weights: LossConfig, seed: int
+    rooms: KnownRooms, images: Sequence[ObservedImage], seed: int
 ) -> list[KnownAnswer]:
     """A room drawn at random for each image, not its own, matched to its masks."""
     rng = np.random.default_rng(seed)
     answers = []
     for image in images:
         row = int(rng.choice(_others(rooms, image)))
-        slots, _ = _matched(rooms, torch.tensor([row]), image, weights)
-        answers.append(_answer(rooms, row, slots[0]))
+        matched, _ = _matched(rooms, torch.tensor([row]), image)
+        answers.append(_answer(rooms, row, matched[0]))
     return answers
 
 
 def nearest_answers(
-    rooms: KnownRooms,
-    images: Sequence[ObservedImage],
-    weights: LossConfig,
-    renderer: Renderer,
+    rooms: KnownRooms, images: Sequence[ObservedImage], renderer: Renderer
 ) -> list[KnownAnswer]:
     """For each image the room, not its own, whose masks agree best: mean IoU over its masks.
 
@@ -138,22 +142,18 @@ def nearest_answers(
     answers = []
     for image in images:
         others = _others(rooms, image)
-        _, costs = _matched(rooms, others, image, weights)
-        best = others[costs.argsort()[:SHORTLIST]]
-        slots, _ = _matched(rooms, best, image, weights)
-        offered = [
-            _answer(rooms, row, matched) for row, matched in zip(best.tolist(), slots, strict=True)
-        ]
-        overlaps = [mask_overlap(one.scene, one.objects, image, renderer) for one in offered]
+        matched, costs = _matched(rooms, others, image)
+        best = costs.argsort()[:SHORTLIST]
+        offered = [_answer(rooms, int(others[at]), matched[at]) for at in best.tolist()]
+        overlaps = [mask_overlap(one, image, renderer) for one in offered]
         answers.append(offered[int(np.argmax(overlaps))])
     return answers
 
 
-def _answer(rooms: KnownRooms, row: int, slots: Sequence[int]) -> KnownAnswer:
+def _answer(rooms: KnownRooms, row: int, matched: Sequence[int]) -> KnownAnswer:
     scene = rooms.furnished(row)
     count = len(scene.objects)
-    objects = tuple(scene.objects[slot] if slot < count else None for slot in slots)
-    return KnownAnswer(scene, objects)
+    return KnownAnswer(scene, tuple(scene.objects[k] if k < count else None for k in matched))
 
 
 def _others(rooms: KnownRooms, image: ObservedImage) -> Tensor:
@@ -161,66 +161,48 @@ def _others(rooms: KnownRooms, image: ObservedImage) -> Tensor:
     if not rows:
         raise InputError(
             f"The shards' only training room is {image.room_id} itself, so there is no other to "
-            "compare its reconstruction with; judge with more training rooms."
+            "compare its reconstruction with; take shards with more training rooms."
         )
     return torch.tensor(rows)
 
 
 def _matched(
-    rooms: KnownRooms, rows: Tensor, image: ObservedImage, weights: LossConfig
-) -> tuple[list[list[int]], Tensor]:
+    rooms: KnownRooms, rows: Int[Tensor, " rooms"], image: ObservedImage
+) -> tuple[list[list[int]], Float[Tensor, " rooms"]]:
     """Which object each room offers for each mask, past its last for none; and the mean cost."""
     view = rows_of(as_views([image], 1), torch.zeros(len(rows), dtype=torch.int64))
     # As many empty places beside a room's objects as there are masks, lest they run out.
     masks = view.is_object.shape[1]
-    part = rooms.decoded
+
+    def padded(values: Tensor, value: float) -> Tensor:
+        return F.pad(values[rows], (0, 0, 0, masks), value=value)
+
+    known = rooms.decoded
+    centers_m, sizes_m = padded(known.centers_m, ABSENT_M), padded(known.sizes_m, 0.0)
     decoded = DecodedScenes(
-        *(
-            torch.cat([tensor[rows], fill.expand(len(rows), masks, *tensor.shape[2:])], dim=1)
-            for tensor, fill in (
-                (part.class_logits, torch.zeros(part.class_logits.shape[-1])),
-                (part.centers_m, torch.full((3,), ABSENT_M)),
-                (part.sizes_m, torch.zeros(3)),
-                (part.completeness_logits, torch.zeros(())),
-            )
-        )
+        padded(known.class_logits, 0.0), centers_m, sizes_m, torch.zeros(centers_m.shape[:2])
     )
     boxes = boxes_of_points(
-        box_corners(decoded.centers_m, decoded.sizes_m),
-        view.world_to_camera, view.intrinsics, view.image_size,
-    )  # fmt: skip
-    settings = (weights.match_box, weights.occlusion_slack)
+        box_corners(centers_m, sizes_m), view.world_to_camera, view.intrinsics, view.image_size
+    )
+    settings = (BOX_WEIGHT, OCCLUSION_SLACK)
     chosen = match_objects(decoded, boxes, view, *settings, first_n=False).prediction
     costs = matching_cost(decoded, boxes, view, *settings).gather(1, chosen.unsqueeze(1))
     return chosen.tolist(), costs[:, 0].mean(dim=1)
 
 
-def mask_overlap(
-    scene: Scene,
-    objects: Sequence[SceneObject | None],
-    image: ObservedImage,
-    renderer: Renderer,
-    columns: int = 80,
-) -> float:
-    """Mean IoU of an image's masks with those of the objects that answer for them.
-
-    Args:
-        scene: Everything that stands in the room, and may hide the objects.
-        objects: Some of the scene's, one a mask, in order; None where there is none.
-        image: The masks.
-        renderer: Draws the scene's.
-        columns: About how many pixels wide they are compared.
-    """
-    step = max(1, round(image.instance_ids.shape[1] / columns))
-    observed = image.instance_ids[step // 2 :: step, step // 2 :: step]
+def mask_overlap(answer: KnownAnswer, image: ObservedImage, renderer: Renderer) -> float:
+    """Mean IoU of an image's masks with those of the objects that answer for them."""
+    scene = answer.scene
+    observed = image.sampled_ids(image.mask_step)
     height, width = observed.shape
     full = image.instance_ids.shape
-    lens = np.diag([width / full[1], height / full[0], 1]) @ image.intrinsics
-    camera = Pinhole(np.asarray(image.world_to_camera, dtype=np.float64), lens)
+    intrinsics = np.diag([width / full[1], height / full[0], 1]) @ image.intrinsics
+    camera = Pinhole(np.asarray(image.world_to_camera, dtype=np.float64), intrinsics)
     drawn = renderer.instance_ids(scene_meshes(scene), camera, (height, width))
     number = {id(item): row + 1 for row, item in enumerate(scene.objects)}
     overlaps = []
-    for mask, item in enumerate(objects):
+    for mask, item in enumerate(answer.objects):
         mine = drawn == number[id(item)] if item is not None else np.zeros_like(drawn, dtype=bool)
         seen = observed == mask + 1
         overlaps.append((mine & seen).sum() / max((mine | seen).sum(), 1))

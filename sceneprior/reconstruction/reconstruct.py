@@ -1,24 +1,27 @@
-"""Images with instance masks in, furnished rooms that explain them out (section 5.2)."""
+"""Reconstruct rooms from instance masks of single images: starts, fits, the best as a scene."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from sceneprior.classes import VOID, label_set
+from sceneprior.classes import label_set
 from sceneprior.errors import InputError
-from sceneprior.reconstruction.fit import SCHEDULES, Fit, fit_latents, refuse_crowds, rows_of
-from sceneprior.reconstruction.observed import ObservedImage, as_views
-from sceneprior.reconstruction.refinement import refine
-from sceneprior.reconstruction.starts import starting_latents
-from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.generation.decode import scene_of
+from sceneprior.generation.sample import sample_latents
+from sceneprior.reconstruction.fit import SCHEDULES, fit_latents, refuse_crowds, view_loss
+from sceneprior.reconstruction.image import ObservedImage, as_views, rows_of
+from sceneprior.scene import Scene
 from sceneprior.training.method import TrainedPrior
-from sceneprior.views import DecodedScenes
+from sceneprior.views import SceneViews
 
 BATCH = 128
 """Latents fitted at once: images times restarts."""
-MASK_COLUMNS = 80
-"""About how many pixels wide masks are compared; training's 480 / 6."""
+STARTS = ("nearest", "random")
+START_BATCH = 256
+"""Training rooms decoded at once."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,6 @@ class FitOptions:
     """Latents fitted to each image; the one with the lowest score is kept."""
     start: str = "nearest"
     """Where they begin: see `starting_latents`."""
-    refine: bool = False
-    """Move the found boxes onto their masks afterwards."""
     masks: bool = True
     """False fits classes and 2D boxes alone."""
     seed: int = 0
@@ -56,18 +57,20 @@ class Reconstruction:
 def reconstruct(
     trained: TrainedPrior, images: Sequence[ObservedImage], options: FitOptions
 ) -> list[Reconstruction]:
-    """Reconstruct images, many at once.
+    """Reconstruct images of the run's label set, many at once.
 
-    Args:
-        trained: The prior; before its shape stage scenes are boxes, and masks are not compared.
-        images: Of the run's label set.
-        options: See there.
+    Before the run's shape stage scenes are boxes, and masks are not compared.
 
     Raises:
         InputError: unknown options, a run without latents of rooms, another label set, or more
             objects than the prior generates.
     """
-    check_options(options)
+    if options.schedule not in SCHEDULES:
+        raise InputError(
+            f"No schedule is called '{options.schedule}'; choose from {', '.join(SCHEDULES)}."
+        )
+    if options.restarts < 1:
+        raise InputError(f"restarts is {options.restarts}; an image needs at least one.")
     if not trained.remembers_rooms:
         raise InputError(
             f"Fitting starts from training rooms, and a run of `method: {trained.config.method}` "
@@ -84,20 +87,6 @@ def reconstruct(
         part = [images[row] for row in rows]
         found |= dict(zip(rows, _reconstruct_batch(trained, part, options), strict=True))
     return [found[row] for row in range(len(images))]
-
-
-def check_options(options: FitOptions) -> None:
-    """Refuse a schedule that does not exist, and fewer than one restart.
-
-    Raises:
-        InputError: either.
-    """
-    if options.schedule not in SCHEDULES:
-        raise InputError(
-            f"No schedule is called '{options.schedule}'; choose from {', '.join(SCHEDULES)}."
-        )
-    if options.restarts < 1:
-        raise InputError(f"restarts is {options.restarts}; an image needs at least one.")
 
 
 @torch.no_grad()
@@ -124,57 +113,75 @@ def _batches(images: Sequence[ObservedImage], most: int) -> Iterator[list[int]]:
 def _reconstruct_batch(
     trained: TrainedPrior, images: Sequence[ObservedImage], options: FitOptions
 ) -> list[Reconstruction]:
-    step = max(1, round(images[0].instance_ids.shape[1] / MASK_COLUMNS))
-    views = as_views(images, step)
+    views = as_views(images)
     refuse_crowds(trained, views)
     starts = starting_latents(trained, views, options.restarts, options.start, options.seed)
-    every = torch.arange(len(images)).repeat_interleave(options.restarts)
-    repeated = rows_of(views, every)
-    fit = fit_latents(
-        trained, repeated, starts.flatten(0, 1), SCHEDULES[options.schedule], options.masks
-    )
-    if options.refine:
-        fit = refine(trained, repeated, fit)
+    repeated = rows_of(views, torch.arange(len(images)).repeat_interleave(options.restarts))
+    schedule = SCHEDULES[options.schedule]
+    fit = fit_latents(trained, repeated, starts.flatten(0, 1), schedule, options.masks)
     best = fit.loss.score.reshape(len(images), -1).argmin(dim=1)
     rows = best + options.restarts * torch.arange(len(images))
-    return [
-        _reconstruction(trained, image, fit, row)
-        for image, row in zip(images, rows.tolist(), strict=True)
+    faces, labels = trained.prior.shape.faces, trained.config.label_set
+    found = []
+    for image, row in zip(images, rows.tolist(), strict=True):
+        predictions = fit.loss.matches.prediction[row, : len(image.object_class)].tolist()
+        found.append(
+            Reconstruction(
+                image=image,
+                scene=scene_of(fit.scenes, row, predictions, faces, labels, image.name),
+                score=float(fit.loss.score[row]),
+                mask_iou=float(fit.loss.mask_iou[row]),
+                steps=int(fit.steps[row]),
+            )
+        )
+    return found
+
+
+def starting_latents(
+    trained: TrainedPrior, views: SceneViews, count: int, kind: str = "nearest", seed: int = 0
+) -> Float[Tensor, "images count width"]:
+    """Several starts for each image.
+
+    `nearest` are the training rooms, as decoded, whose layout loss on the image is least; `random`
+    ones are drawn around the training rooms, as new rooms are (the kernel distribution), the same
+    for every image.
+
+    Raises:
+        InputError: an unknown kind, or more starts than training rooms.
+    """
+    if kind not in STARTS:
+        raise InputError(f"No start is called '{kind}'; choose from {', '.join(STARTS)}.")
+    if kind == "random":
+        drawn = sample_latents(trained.prior.latent_space, trained.logits, count, seed, "kernel")
+        return drawn.expand(len(views.is_object), -1, -1)
+    if count > len(trained.logits):
+        raise InputError(
+            f"{count} nearest training rooms were asked for, but the run has "
+            f"{len(trained.logits)}; ask for fewer restarts."
+        )
+    losses = layout_losses_of_rooms(trained, views)
+    nearest = losses.topk(count, dim=1, largest=False).indices
+    return trained.prior.latent_space(trained.logits)[nearest]
+
+
+@torch.no_grad()
+def layout_losses_of_rooms(
+    trained: TrainedPrior, views: SceneViews
+) -> Float[Tensor, "images rooms"]:
+    """What each decoded training room would cost as the answer to each image, by 2D boxes alone."""
+    z = trained.prior.latent_space(trained.logits)
+    every = torch.ones(len(z), views.is_object.shape[1], dtype=torch.bool)
+    batches = [
+        trained.prior.decode(z[at : at + START_BATCH], False, every[at : at + START_BATCH])
+        for at in range(0, len(z), START_BATCH)
     ]
 
+    def losses_of(image: int) -> Float[Tensor, " rooms"]:
+        repeated = [rows_of(views, torch.full((len(part.centers_m),), image)) for part in batches]
+        losses = [
+            view_loss(trained, part, view, masks=False).score
+            for part, view in zip(batches, repeated, strict=True)
+        ]
+        return torch.cat(losses)
 
-def _reconstruction(
-    trained: TrainedPrior, image: ObservedImage, fit: Fit, row: int
-) -> Reconstruction:
-    slots = fit.loss.matches.prediction[row, : len(image.object_class)].tolist()
-    return Reconstruction(
-        image=image,
-        scene=answer(trained, fit.scenes, row, slots, image.name),
-        score=float(fit.loss.score[row]),
-        mask_iou=float(fit.loss.mask_iou[row]),
-        steps=int(fit.steps[row]),
-    )
-
-
-def answer(
-    trained: TrainedPrior, scenes: DecodedScenes, row: int, slots: Sequence[int], name: str
-) -> Scene:
-    """The predictions that answer for an image's masks, as a scene, in the masks' order.
-
-    Classes are the prior's likeliest but void: an image is told what it shows.
-    """
-    names = label_set(trained.config.label_set)
-    faces = trained.prior.shape.faces.cpu().numpy()
-    objects = []
-    for slot in slots:
-        logits = scenes.class_logits[row, slot].clone()
-        logits[VOID] = -torch.inf
-        x, y, z = scenes.centers_m[row, slot].tolist()
-        width, height, depth = scenes.sizes_m[row, slot].tolist()
-        mesh = None
-        if scenes.vertices_m is not None:
-            mesh = Mesh(scenes.vertices_m[row, slot].cpu().numpy(), faces)
-        objects.append(
-            SceneObject(names[int(logits.argmax())], (x, y, z), (width, height, depth), mesh)
-        )
-    return Scene(name, trained.config.label_set, tuple(objects))
+    return torch.stack([losses_of(image) for image in range(len(views.is_object))])

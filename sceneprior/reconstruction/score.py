@@ -1,26 +1,24 @@
-"""A run, or scenes, and shards in; how well single views are reconstructed, and a table, out."""
+"""Score reconstructions from single views against the true rooms, and print the scores."""
 
-import json
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-from sceneprior.config import LossConfig, load_run
+from sceneprior.config import load_run
 from sceneprior.errors import InputError
 from sceneprior.evaluation.metrics.mesh_metrics import POINTS
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.score_table import wide_console
 from sceneprior.evaluation.view_scores import PROTOCOL, ObjectPair, score_views
-from sceneprior.files import write_whole
 from sceneprior.generation.export import load_scene_folder
 from sceneprior.offscreen import open_renderer
+from sceneprior.reconstruction.image import ObservedImage, image_of_room, images_of_split
 from sceneprior.reconstruction.known_rooms import known_rooms, nearest_answers, random_answers
-from sceneprior.reconstruction.observed import ObservedImage, image_of_room, images_of_split
 from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct
 from sceneprior.scene import Scene, SceneObject
 from sceneprior.shards import iterate_rooms
@@ -47,46 +45,51 @@ Answers = Sequence[Sequence[SceneObject | None]]
 """For each image, one object a mask; None where there is none."""
 
 
-def judge_views(
-    run: Path,
-    shards: Path,
-    split: str,
-    limit: int | None,
-    options: FitOptions,
-    out: Path,
-    renderer: str = "auto",
-    checkpoint: str = "final",
-    points: int = POINTS,
-) -> dict[str, Any]:
-    """Reconstruct one view of each room and score it, and known rooms, against the truth.
+@dataclass(frozen=True)
+class SvrProtocol:
+    """What single-view reconstructions are scored against, and how."""
 
-    Args:
-        run: A run's folder.
-        shards: With 3D ground truth; `train` is where known rooms come from.
-        split: Whose rooms are reconstructed.
-        limit: Only the first so many rooms.
-        options: Of the fit; the seed also draws the views and the random rooms.
-        out: JSON file to write.
-        renderer: Kind of renderer.
-        checkpoint: `final` or `best`.
-        points: Drawn from each surface.
+    shards: Path
+    """With 3D ground truth; `train` is where known rooms come from."""
+    split: str = "test"
+    """Whose rooms are reconstructed."""
+    seed: int = 0
+    """Of the random known rooms, and of the views where a run is evaluated."""
+    renderer: str = "auto"
+    points: int = POINTS
+    """Drawn from each surface."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """As it stands in a result file."""
+        told = {"shards": str(self.shards), "split": self.split, "points": self.points}
+        return {**told, **PROTOCOL}
+
+
+def evaluate_run(
+    run: Path,
+    protocol: SvrProtocol,
+    options: FitOptions,
+    limit: int | None = None,
+    checkpoint: str = "final",
+) -> dict[str, Any]:
+    """Reconstruct one view of each room (or the first `limit`) and score it against the truth.
 
     Raises:
         InputError: the run or the shards cannot be used.
     """
     trained = load_run(run, checkpoint)
+    shards, split = protocol.shards, protocol.split
     reference_scenes(shards, split, limit=1, meshes=False)  # refuses before any fit
-    images, blank = images_of_split(shards, split, options.seed, limit)
+    images, blank = images_of_split(shards, split, protocol.seed, limit)
     fitted = reconstruct(trained, images, options)
-    plain = reconstruct(trained, images, replace(options, masks=False, refine=False))
-    rows: dict[str, Answers] = {
+    plain = reconstruct(trained, images, replace(options, masks=False))
+    answers: dict[str, Answers] = {
         "fit": [one.scene.objects for one in fitted],
         "fit_boxes": [one.scene.without_meshes().objects for one in fitted],
         "layout_fit": [one.scene.without_meshes().objects for one in plain],
-        **known_answers(images, shards, trained.config.loss, options.seed, renderer),
     }
-    scores = {
-        "rows": _scored(images, rows, shards, split, points),
+    return {
+        "rows": score_answers(images, answers, protocol),
         "mask_iou": sum(one.mask_iou for one in fitted) / len(fitted),
         "protocol": {
             "run": Path(run).resolve().name,
@@ -95,61 +98,43 @@ def judge_views(
             "views": "one a room, drawn at random from those that show an object",
             "rooms_without_such_a_view": blank,
             "fit": asdict(options),
-            **_protocol(shards, split, points),
+            **protocol.as_dict(),
         },
     }
-    write_whole(out, (json.dumps(scores, indent=1) + "\n").encode())
-    return scores
 
 
-def judge_scenes(
-    folder: Path,
-    shards: Path,
-    split: str,
-    out: Path,
-    seed: int = 0,
-    renderer: str = "auto",
-    points: int = POINTS,
-) -> dict[str, Any]:
+def evaluate_scenes(folder: Path, protocol: SvrProtocol) -> dict[str, Any]:
     """Score a folder of reconstructions: as `reconstruct` wrote them, or with CAD models since.
 
     Args:
         folder: Scene JSONs, with GLBs where there are meshes. Each one's `extra` names its
             `room_id` and `view`; its objects are one a mask of that view, in the masks' order.
-        shards: The rooms, with 3D ground truth; `train` is where known rooms come from.
-        split: Where the scenes' rooms are.
-        out: JSON file to write.
-        seed: Of the random rooms.
-        renderer: Kind of renderer.
-        points: Drawn from each surface.
+        protocol: Where the scenes' rooms are, and how to score them.
 
     Raises:
         InputError: a scene does not say which view it answers, or has another number of objects.
         ShardError: a shard is missing or damaged.
     """
-    images, scenes = scenes_with_images(folder, shards, split)
-    rows: dict[str, Answers] = {
+    images, scenes = scenes_with_images(folder, protocol.shards, protocol.split)
+    answers: dict[str, Answers] = {
         "scenes": [scene.objects for scene in scenes],
         "scenes_boxes": [scene.without_meshes().objects for scene in scenes],
-        **known_answers(images, shards, LossConfig(), seed, renderer),
     }
-    scores = {
-        "rows": _scored(images, rows, shards, split, points),
+    return {
+        "rows": score_answers(images, answers, protocol),
         "protocol": {
             "scenes": str(folder),
             "views": {image.room_id: image.view for image in images},
-            "seed": seed,
-            **_protocol(shards, split, points),
+            "seed": protocol.seed,
+            **protocol.as_dict(),
         },
     }
-    write_whole(out, (json.dumps(scores, indent=1) + "\n").encode())
-    return scores
 
 
 def scenes_with_images(
     folder: Path, shards: Path, split: str
 ) -> tuple[list[ObservedImage], list[Scene]]:
-    """The scenes of a folder, each with the view that it answers; see `judge_scenes`."""
+    """The scenes of a folder, each with the view that it answers; see `evaluate_scenes`."""
     of_room: dict[str, list[Scene]] = defaultdict(list)
     for scene in load_scene_folder(folder):
         room, view = scene.extra.get("room_id"), scene.extra.get("view")
@@ -181,35 +166,24 @@ def scenes_with_images(
     return images, scenes
 
 
-def known_answers(
-    images: Sequence[ObservedImage], shards: Path, weights: LossConfig, seed: int, renderer: str
-) -> dict[str, Answers]:
-    """What training rooms, as they truly are, would score as answers."""
-    rooms = known_rooms(shards)
-    nearest = nearest_answers(rooms, images, weights, open_renderer(renderer))
-    drawn = random_answers(rooms, images, weights, seed)
-    return {
+def score_answers(
+    images: Sequence[ObservedImage], answers: dict[str, Answers], protocol: SvrProtocol
+) -> dict[str, Any]:
+    """Scores by row: of the answers, and of training rooms, as they truly are, beside them."""
+    rooms = known_rooms(protocol.shards)
+    nearest = nearest_answers(rooms, images, open_renderer(protocol.renderer))
+    drawn = random_answers(rooms, images, protocol.seed)
+    answers = {
+        **answers,
         "nearest_room": [one.objects for one in nearest],
         "random_room": [one.objects for one in drawn],
     }
-
-
-def _scored(
-    images: Sequence[ObservedImage],
-    rows: dict[str, Answers],
-    shards: Path,
-    split: str,
-    points: int,
-) -> dict[str, Any]:
-    truth = {scene.name: scene for scene in reference_scenes(shards, split, tracked_only=True)}
+    true_rooms = reference_scenes(protocol.shards, protocol.split, tracked_only=True)
+    truth = {scene.name: scene for scene in true_rooms}
     return {
-        name: score_views(pairs_of(images, truth, answers), points)
-        for name, answers in rows.items()
+        name: score_views(pairs_of(images, truth, some), protocol.points)
+        for name, some in answers.items()
     }
-
-
-def _protocol(shards: Path, split: str, points: int) -> dict[str, Any]:
-    return {"shards": str(shards), "split": split, "points": points, **PROTOCOL}
 
 
 def pairs_of(
@@ -228,12 +202,12 @@ def pairs_of(
 def print_view_scores(scores: dict[str, Any], console: Console | None = None) -> None:
     """Print both tables of a result: all objects by method, and the first method by class."""
     rows = {TITLES[name]: row["summary"] for name, row in scores["rows"].items()}
-    judged = next(iter(scores["rows"].values()))
-    summary = judged["summary"]
+    evaluated = next(iter(scores["rows"].values()))
+    summary = evaluated["summary"]
     title = f"{summary['objects']} objects in {summary['images']} single views"
     console = console or wide_console()
     console.print(_table(title, rows))
-    console.print(_table(f"{next(iter(rows)).capitalize()}, by class", judged["classes"]))
+    console.print(_table(f"{next(iter(rows)).capitalize()}, by class", evaluated["classes"]))
 
 
 def _table(title: str, rows: dict[str, dict[str, Any]]) -> Table:

@@ -1,6 +1,7 @@
-"""reconstruct and eval-svr as commands: files, figures, and sentences for what does not work."""
+"""reconstruct and eval-svr as commands: files, scores, and sentences for what does not work."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -10,7 +11,7 @@ from PIL import Image
 
 from sceneprior.classes import label_set
 from sceneprior.reconstruction.fit import SCHEDULES, FitSchedule
-from sceneprior.reconstruction.observed import image_from_shards
+from sceneprior.reconstruction.image import image_from_shards
 
 SOFT = ("--renderer", "software")
 
@@ -31,8 +32,8 @@ def own(toy_shards, tmp_path):
     (tmp_path / "pose.json").write_text(
         json.dumps({"world_to_camera": image.world_to_camera.tolist()})
     )
-    lens = ",".join(str(image.intrinsics[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return ["--mask", "mine.png", "--classes", "classes.csv", "--intrinsics", lens]
+    values = ",".join(str(image.intrinsics[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return ["--mask", "mine.png", "--classes", "classes.csv", "--intrinsics", values]
 
 
 def files_of(name: str) -> set[str]:
@@ -41,7 +42,7 @@ def files_of(name: str) -> set[str]:
 
 def test_reconstruct_a_view_and_a_split(command, toy_run, toy_shards, tmp_path):
     call = ["reconstruct", "--run", toy_run, "--shards", toy_shards, *SOFT]
-    one = [*call, "--room", "toy/test_01", "--view", 3, "--out", "one", "--refine"]
+    one = [*call, "--room", "toy/test_01", "--view", 3, "--out", "one"]
     status, out, errors = command(*one)
     assert (status, out) == (0, "Wrote 1 room to one\n"), errors
     name = "toy_test_01_view3"
@@ -99,10 +100,10 @@ def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_pat
     ):
         assert said in one_sentence(command(*call, *arguments)), arguments
     assert everything_in(tmp_path) == before
-    (tmp_path / "lens.json").write_text(
+    (tmp_path / "camera.json").write_text(
         '{"fx": 48, "fy": 48, "cx": 48, "cy": 36, "width": 97, "height": 72}'
     )
-    said = one_sentence(command(*call, *own[:-1], "lens.json"))
+    said = one_sentence(command(*call, *own[:-1], "camera.json"))
     assert "is of an image of 97 x 72 pixels, but the mask has 96 x 72" in said
     (tmp_path / "classes.csv").write_text("1,grand piano\n")
     assert "none of its classes (grand piano)" in one_sentence(command(*call, *own))
@@ -126,7 +127,25 @@ def test_eval_svr_of_a_run_and_of_its_scenes(command, toy_run, toy_shards, tmp_p
     for mine, theirs in (("scenes", "fit"), ("scenes_boxes", "fit_boxes")):
         one, two_ = again["rows"][mine]["summary"], scores["rows"][theirs]["summary"]
         assert one == pytest.approx(two_, abs=1e-3)
-    assert again["rows"]["nearest_room"] == scores["rows"]["nearest_room"]
+    for row in ("nearest_room", "random_room"):
+        assert again["rows"][row] == scores["rows"][row]
+
+
+def test_known_rooms_ignore_a_runs_weights(command, toy_run, toy_shards, tmp_path):
+    """They are the same rooms beside every method: a run's own matching has no say."""
+    other = shutil.copytree(toy_run, tmp_path / "other")
+    config = (other / "config.yaml").read_text()
+    for key in ("match_box", "occlusion_slack"):
+        config = re.sub(rf"{key}: [0-9.]+", f"{key}: 0.0", config)
+    (other / "config.yaml").write_text(config)
+    assert config.count(": 0.0\n") >= 2 and config != (toy_run / "config.yaml").read_text()
+    known = []
+    for run in (toy_run, other):
+        call = ["eval-svr", "--shards", toy_shards, "--run", run, "--limit", 2, *SOFT]
+        assert command(*call, "--out", "svr.json")[0] == 0
+        rows = json.loads((tmp_path / "svr.json").read_text())["rows"]
+        known.append((rows["nearest_room"], rows["random_room"]))
+    assert known[0] == known[1]
 
 
 def test_scenes_that_answer_no_image(command, toy_run, toy_shards, tmp_path):
@@ -146,7 +165,7 @@ def test_scenes_that_answer_no_image(command, toy_run, toy_shards, tmp_path):
     attic = {**whole["extra"], "room_id": "attic"}
     assert "The 'test' split of" in said(extra=attic) and "has no room attic" in said(extra=attic)
     assert "has no view 9" in said(extra={**whole["extra"], "view": 9})
-    assert "Say what to judge" in one_sentence(command(*call, "--run", toy_run))
-    assert "Say what to judge" in one_sentence(command("eval-svr", "--shards", toy_shards))
+    assert "Say what to evaluate" in one_sentence(command(*call, "--run", toy_run))
+    assert "Say what to evaluate" in one_sentence(command("eval-svr", "--shards", toy_shards))
     shutil.rmtree(tmp_path / "scenes")
     assert "No folder of scenes at scenes" in one_sentence(command(*call))

@@ -13,20 +13,20 @@ from sceneprior.config import load_run
 from sceneprior.errors import InputError
 from sceneprior.generation.complete import (
     BOX_WEIGHT,
-    Given,
     _starts,
     complete,
     fit_latents,
     gather_given,
     given_loss,
     log_kept,
+    repeated,
 )
-from sceneprior.generation.decode import draw_latents
+from sceneprior.generation.sample import draw_latents
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.models.latents import LatentSphere
 from sceneprior.models.prior import ScenePrior
 from sceneprior.scene import Scene, SceneObject
-from sceneprior.views import DecodedScenes
+from sceneprior.views import DecodedScenes, RoomBoxes
 
 BED = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
 FEW = 20
@@ -62,7 +62,7 @@ def test_the_loss_is_its_definition(target):
     labels = torch.tensor([[1, 2, 4], [3, 0, 0], [0, 0, 0]])
     is_object = torch.tensor([[True] * 3, [True, False, False], [False] * 3])
     boxes = torch.randn(3, 3, 6, dtype=torch.float64)
-    losses = given_loss(decoded, Given(labels, boxes, is_object), target)
+    losses = given_loss(decoded, RoomBoxes(labels, is_object, boxes), target)
     for room in range(3):
         count = int(is_object[room].sum())
         expected = loss_in_words(decoded, room, labels[room, :count], boxes[room], target)
@@ -119,12 +119,12 @@ def test_given_objects_are_in_every_answer_as_they_came(trained):
 def test_the_fit_comes_nearer_and_stays_on_the_sphere(trained):
     given = gather_given(trained, [scene(BED, DESK)])
     starts = _starts(trained, given, 4, 0, None)
-    each = given.repeated(4)
+    each = repeated(given, 4)
     with torch.no_grad():
         before = given_loss(trained.prior.decode(starts, with_shape=False), each)
         drawn, _ = draw_latents(trained, 100, 0)
         usual = given_loss(
-            trained.prior.decode(drawn, with_shape=False), given.repeated(100)
+            trained.prior.decode(drawn, with_shape=False), repeated(given, 100)
         ).mean()
     z, after = fit_latents(trained, starts, each, FEW)
     assert (before < usual).all() and (before.diff() >= 0).all()  # chosen, best first
@@ -152,9 +152,8 @@ class Dial(ScenePrior):
 def test_the_fit_finds_the_one_latent_that_fits_and_is_held_by_its_start(trained, monkeypatch):
     dial = replace(trained, prior=Dial(), stage="layout")
     wanted = torch.tensor([2.0, -1.0, 2.0]) / 3
-    given = gather_given(
-        dial, [scene(SceneObject("double_bed", tuple((3 * wanted).tolist()), (1.0, 1.0, 1.0)))]
-    ).repeated(3)
+    bed = SceneObject("double_bed", tuple((3 * wanted).tolist()), (1.0, 1.0, 1.0))
+    given = repeated(gather_given(dial, [scene(bed)]), 3)
     starts = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [0, 1, 0], [-1, -1, 1]]))
     monkeypatch.setattr("sceneprior.generation.complete.START_WEIGHT", 0.0)
     z, left = fit_latents(dial, starts, given)

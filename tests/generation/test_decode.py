@@ -14,8 +14,9 @@ from sceneprior.generation.decode import (
     decode_latents,
     decode_training_rooms,
     synthesize,
-    to_scenes,
+    to_rooms,
 )
+from sceneprior.scene import Scene
 from sceneprior.views import DecodedScenes
 
 NAMES = label_set("front3d_bedroom")
@@ -36,13 +37,20 @@ def decoded(torch_rng) -> DecodedScenes:
     )
 
 
+def scenes_of(*arguments) -> list[Scene]:
+    return [room.scene for room in to_rooms(*arguments)]
+
+
 def labels(scene) -> list[str]:
     return [item.label for item in scene.objects]
 
 
 def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded):
     faces = torch.tensor([[0, 1, 2], [3, 4, 5]])
-    first, second = to_scenes(decoded, faces, "front3d_bedroom", ["a", "b"])
+    rooms = to_rooms(decoded, faces, "front3d_bedroom", ["a", "b"])
+    assert [room.predictions for room in rooms] == [(0, 1, 3), (0,)]
+    assert torch.equal(rooms[0].class_logits, decoded.class_logits[0, [0, 1, 3]])
+    first, second = scenes_of(decoded, faces, "front3d_bedroom", ["a", "b"])
     assert (first.name, second.name) == ("a", "b")
     # void is decoded like any class, but is no furniture; what follows it stays.
     assert labels(first) == ["double_bed", "nightstand", "wardrobe"]
@@ -60,7 +68,7 @@ def test_a_stop_flag_ends_a_scene_after_the_object_that_has_it(decoded):
     stops = replace(
         decoded, completeness_logits=torch.tensor([[-2.0, 0.1, -5, 3], [-1, -1, -1, -1]])
     )
-    first, second = to_scenes(stops, faces, "front3d_bedroom", ["a", "b"], "stop")
+    first, second = scenes_of(stops, faces, "front3d_bedroom", ["a", "b"], "stop")
     assert labels(first) == ["double_bed", "nightstand"]
     assert labels(second) == ["double_bed", "nightstand", "wardrobe"]
 
@@ -68,12 +76,12 @@ def test_a_stop_flag_ends_a_scene_after_the_object_that_has_it(decoded):
 def test_nothing_complete_is_an_empty_room_and_no_vertices_are_boxes(decoded):
     none = replace(decoded, completeness_logits=-torch.ones(2, 4), vertices_m=None)
     faces = torch.tensor([[0, 1, 2]])
-    assert [scene.objects for scene in to_scenes(none, faces, "front3d_bedroom", ["a", "b"])] == [
+    assert [scene.objects for scene in scenes_of(none, faces, "front3d_bedroom", ["a", "b"])] == [
         (),
         (),
     ]
     boxes = replace(decoded, vertices_m=None)
-    assert to_scenes(boxes, faces, "front3d_bedroom", ["a", "b"])[0].objects[0].mesh is None
+    assert scenes_of(boxes, faces, "front3d_bedroom", ["a", "b"])[0].objects[0].mesh is None
 
 
 def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(toy_run, monkeypatch):

@@ -133,8 +133,8 @@ def test_a_folder_is_read_in_counting_order_and_other_json_is_passed_over(
 
 
 def test_a_failed_write_leaves_nothing_under_the_final_name(scene, tmp_path, renderer, monkeypatch):
-    def torn(picture, path, **_):
-        path.write_bytes(b"half of a PNG")
+    def torn(picture, file, **_):
+        file.write(b"half of a PNG")
         raise OSError("No space left on device")
 
     monkeypatch.setattr(Image.Image, "save", torn)

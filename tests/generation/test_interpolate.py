@@ -12,13 +12,13 @@ from torch import nn
 from sceneprior.classes import class_colors
 from sceneprior.config import load_run
 from sceneprior.errors import InputError
-from sceneprior.evaluation.topdown import corner_view
-from sceneprior.generation.decode import decode_latents
+from sceneprior.evaluation.topdown import corner_view, perspective
+from sceneprior.generation.decode import decode_latents, decode_rooms
 from sceneprior.generation.interpolate import (
     TILE,
     animation,
-    decode_path,
     interpolate,
+    mixed_colors,
     path_latents,
     strip,
     write_pictures,
@@ -105,12 +105,12 @@ class Decoder(ScenePrior):
 def test_objects_are_known_by_their_prediction_and_colours_never_jump(trained):
     path = replace(trained, prior=Decoder(22), stage="layout")
     z = torch.linspace(2, -2, 101).unsqueeze(1).expand(-1, 16)
-    rooms = decode_path(path, z, [str(k) for k in range(101)])
-    assert [room.slots for room in rooms[:50]] == [(0, 1)] * 50
-    assert [room.slots for room in rooms[51:]] == [(0,)] * 50
+    rooms = decode_rooms(path, z, [str(k) for k in range(101)])
+    assert [room.predictions for room in rooms[:50]] == [(0, 1)] * 50
+    assert [room.predictions for room in rooms[51:]] == [(0,)] * 50
     assert [item.label for item in rooms[0].scene.objects] == ["double_bed", "table"]
     # Void has no share in a colour; what is certain has its class's.
-    np.testing.assert_allclose(rooms[0].colors, class_colors(22)[[9, 19]], atol=2)
+    np.testing.assert_allclose(mixed_colors(rooms[0]), class_colors(22)[[9, 19]], atol=2)
 
     turning = Decoder(22)
     soft = torch.linspace(-3, 3, 61)
@@ -118,9 +118,9 @@ def test_objects_are_known_by_their_prediction_and_colours_never_jump(trained):
     decoded.class_logits[:, 1, 0] = -9.0
     decoded.class_logits[:, 1, 13] = 0.0  # a nightstand turns into a table
     turning.decode = lambda z, with_shape: decoded
-    turned = decode_path(replace(path, prior=turning), z[:61], [""] * 61)
+    turned = decode_rooms(replace(path, prior=turning), z[:61], [""] * 61)
     assert {room.scene.objects[1].label for room in turned} == {"nightstand", "table"}
-    colors = np.array([room.colors[1] for room in turned], dtype=int)
+    colors = np.array([mixed_colors(room)[1] for room in turned], dtype=int)
     ends = np.abs(colors[0] - colors[-1]).max()
     assert ends > 20 and np.abs(np.diff(colors, axis=0)).max() <= 0.04 * ends + 1
 
@@ -130,13 +130,14 @@ def test_pictures_are_taken_from_one_view(trained, renderer, tmp_path):
     write_pictures(trained, z, tmp_path, renderer)
     height, width = TILE
     assert Image.open(tmp_path / "strip.png").size == (3 * width, height)
-    rooms = decode_path(trained, z, ["a", "b", "c"])
+    rooms = decode_rooms(trained, z, ["a", "b", "c"])
     view = corner_view([room.scene for room in rooms], TILE)
-    sheet = strip(rooms * 4, view, renderer)  # more than a row
+    pictures = [perspective(r.scene, renderer, view=view, colors=mixed_colors(r)) for r in rooms]
+    sheet = strip(pictures * 4)  # more than a row
     assert sheet.shape == (2 * height, 9 * width, 3)
     np.testing.assert_array_equal(sheet[:height, :width], sheet[:height, 3 * width : 4 * width])
     assert (sheet[height:, 3 * width :] == 255).all()
-    gif = Image.open(io.BytesIO(animation(rooms, view, renderer)))
+    gif = Image.open(io.BytesIO(animation(pictures)))
     assert (gif.size, gif.n_frames, gif.info["loop"]) == ((width, height), 4, 0)  # there and back
     gif.seek(1)
     # Colours of one palette, within what 255 of them can tell apart.

@@ -7,7 +7,7 @@ import pytest
 from model_folder import blocks, corner_sofa
 
 from sceneprior.errors import InputError
-from sceneprior.generation.cad_bank import CadBank, Shelf, unit_mesh
+from sceneprior.generation.cad_models import CadModels, ClassModels, unit_mesh
 from sceneprior.generation.retrieve import (
     _rough_distances,
     _turned_views,
@@ -25,33 +25,33 @@ from sceneprior.scene import Mesh, Scene, SceneObject
 POINTS = 256
 
 
-def bank_of(points: int = POINTS, **models) -> CadBank:
+def cad_models(points: int = POINTS, **of_classes) -> CadModels:
     """label -> {model id: trimesh}."""
     meshes = {
         name: unit_mesh(Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
-        for shelf in models.values()
-        for name, mesh in shelf.items()
+        for of_class in of_classes.values()
+        for name, mesh in of_class.items()
     }
-    shelves = {
-        label: Shelf(
-            tuple(shelf),
+    by_class = {
+        label: ClassModels(
+            tuple(of_class),
             np.stack(
                 [
                     surface_points(meshes[name].vertices_m, meshes[name].faces, points)
-                    for name in shelf
+                    for name in of_class
                 ]
             ).astype(np.float32),
         )
-        for label, shelf in models.items()
+        for label, of_class in of_classes.items()
     }
-    return CadBank(shelves, meshes.__getitem__)
+    return CadModels(by_class, meshes.__getitem__)
 
 
 @pytest.fixture(scope="module")
-def bank():
+def models():
     plain = blocks(((0, 0.5, 0), (1, 1, 1)))
     table = blocks(((0, 0.7, 0), (1.2, 0.1, 0.8)), ((0.5, 0.35, 0), (0.1, 0.7, 0.7)))
-    return bank_of(sofa={"plain": plain, "corner": corner_sofa(), "table": table})
+    return cad_models(sofa={"plain": plain, "corner": corner_sofa(), "table": table})
 
 
 def brute_chamfer(a: np.ndarray, b: np.ndarray) -> float:
@@ -65,13 +65,13 @@ def room(*objects: SceneObject) -> Scene:
 
 @pytest.mark.parametrize("step", [1, 4])
 def test_rough_distances_are_chamfer_distances_of_every_nth_point(rng, step):
-    shelf = rng.uniform(-0.5, 0.5, (7, 64, 3)).astype(np.float32)
+    of_class = rng.uniform(-0.5, 0.5, (7, 64, 3)).astype(np.float32)
     points, size = rng.normal(size=(64, 3)), np.array([2.0, 0.7, 0.4])
     choices = rng.permutation(7 * QUARTERS)[:19]
-    rough = _rough_distances(_turned_views(points, tuple(size)), shelf, choices, step)
+    rough = _rough_distances(_turned_views(points, tuple(size)), of_class, choices, step)
     for choice, got in zip(choices, rough, strict=True):
         model, turn = divmod(int(choice), QUARTERS)
-        unit = Mesh(shelf[model].astype(np.float64), np.zeros((0, 3), np.int64))
+        unit = Mesh(of_class[model].astype(np.float64), np.zeros((0, 3), np.int64))
         item = SceneObject("sofa", (0.0, 0.0, 0.0), tuple(size))
         in_room = placed(unit, item, 90 * turn).vertices_m
         # Squared distances in float32, as a difference of squares of a few metres.
@@ -96,18 +96,18 @@ def test_low_boxes_are_extruded_to_the_floor(center_y, height, wanted):
 
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])
 @pytest.mark.parametrize("size", [(2.0, 0.8, 1.2), (0.7, 1.9, 1.5)])
-def test_a_model_in_disguise_is_found_with_its_turn(bank, turn, size):
+def test_a_model_in_disguise_is_found_with_its_turn(models, turn, size):
     """The corner sofa itself, turned and stretched into a box, has distance nearly 0."""
     item = SceneObject("sofa", (1.0, size[1] / 2, -2.0), size)
-    mesh = placed(bank.load("corner"), item, turn)
+    mesh = placed(models.load("corner"), item, turn)
     np.testing.assert_allclose(
         mesh.vertices_m.min(0), np.subtract(item.center_m, np.divide(size, 2))
     )
     np.testing.assert_allclose(mesh.vertices_m.max(0), np.add(item.center_m, np.divide(size, 2)))
-    best = most_similar(replace(item, mesh=mesh), bank.shelves["sofa"])
+    best = most_similar(replace(item, mesh=mesh), models.by_class["sofa"])
     assert (best.model_id, best.turn_deg) == ("corner", turn)
     assert best.distance_m < 0.15  # two samples of one surface
-    made = retrieve(room(replace(item, mesh=mesh)), bank)
+    made = retrieve(room(replace(item, mesh=mesh)), models)
     np.testing.assert_allclose(made.objects[0].mesh.vertices_m, mesh.vertices_m)
 
 
@@ -130,66 +130,66 @@ def random_furniture(rng):
 
 
 def test_the_fast_search_finds_the_winner_of_the_slow_one(rng):
-    bank = bank_of(1024, sofa={f"m{k:02d}": random_furniture(rng) for k in range(80)})
+    models = cad_models(1024, sofa={f"m{k:02d}": random_furniture(rng) for k in range(80)})
     for _ in range(8):
         size = tuple(rng.uniform(0.4, 2.2, 3))
         like = random_furniture(rng)
         item = SceneObject("sofa", (0.0, size[1] / 2, 0.0), size)
         unit = unit_mesh(Mesh(np.asarray(like.vertices), np.asarray(like.faces)))
         item = replace(item, mesh=placed(unit, item, 0))
-        slow = most_similar(item, bank.shelves["sofa"], keep=None)
-        assert most_similar(item, bank.shelves["sofa"]) == slow
+        slow = most_similar(item, models.by_class["sofa"], keep=None)
+        assert most_similar(item, models.by_class["sofa"]) == slow
 
 
-def test_without_a_mesh_the_box_is_compared(bank):
-    made = retrieve(room(SceneObject("sofa", (0.0, 0.9, 0.0), (1.0, 0.6, 1.0))), bank)
+def test_without_a_mesh_the_box_is_compared(models):
+    made = retrieve(room(SceneObject("sofa", (0.0, 0.9, 0.0), (1.0, 0.6, 1.0))), models)
     assert made.extra["retrieval"][0]["model_id"] == "plain"
     assert made.objects[0].size_m == pytest.approx((1.0, 1.2, 1.0))
 
 
-def test_classes_without_models_keep_their_objects_and_the_report_says_so(bank):
+def test_classes_without_models_keep_their_objects_and_the_report_says_so(models):
     own = Mesh(np.eye(3), np.array([[0, 1, 2]]))
     lamp = SceneObject("pendant_lamp", (0.0, 2.2, 0.0), (0.5, 0.5, 0.5), own)
     sofa = SceneObject("sofa", (0.0, 0.4, 0.0), (2.0, 0.8, 1.0))
-    made = retrieve(replace(room(lamp, sofa), extra={"seed": 3}), bank)
+    made = retrieve(replace(room(lamp, sofa), extra={"seed": 3}), models)
     assert made.objects[0] == lamp and made.extra["retrieval"][0] is None
     assert made.extra["seed"] == 3 and made.objects[1].mesh is not None
-    report = retrieval_report([made], replace(bank, broken={"x": "gone"}))
+    report = retrieval_report([made], replace(models, broken={"x": "gone"}))
     assert report["classes_without_models"] == ["pendant_lamp"]
     assert (report["objects"], report["objects_with_a_model"]) == (2, 1)
     assert report["classes"]["pendant_lamp"]["mean_distance_m"] is None
     assert report["classes"]["sofa"]["models"] == 3 and report["broken_models"] == {"x": "gone"}
 
 
-def test_rooms_without_objects_and_objects_without_volume_have_defined_answers(bank):
-    assert retrieve(room(), bank).extra["retrieval"] == []
+def test_rooms_without_objects_and_objects_without_volume_have_defined_answers(models):
+    assert retrieve(room(), models).extra["retrieval"] == []
     flat = SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
     point = SceneObject("sofa", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     collapsed = SceneObject(
         "sofa", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0), Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
     )
-    made = retrieve(room(flat, point, collapsed), bank)
+    made = retrieve(room(flat, point, collapsed), models)
     assert all(np.isfinite(found["distance_m"]) for found in made.extra["retrieval"])
     assert made.extra["retrieval"][2]["model_id"] == "plain"  # by its box
 
 
-def test_what_is_no_number_is_a_sentence(bank):
+def test_what_is_no_number_is_a_sentence(models):
     with pytest.raises(InputError, match=r"room: the box of object 0 \(sofa\) is .*nan"):
-        retrieve(room(SceneObject("sofa", (0.0, float("nan"), 0.0), (1.0, 1.0, 1.0))), bank)
+        retrieve(room(SceneObject("sofa", (0.0, float("nan"), 0.0), (1.0, 1.0, 1.0))), models)
     with pytest.raises(InputError, match="sides that are not negative"):
-        retrieve(room(SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, -1.0, 1.0))), bank)
+        retrieve(room(SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, -1.0, 1.0))), models)
     holed = Mesh(np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
     with pytest.raises(InputError, match=r"the mesh of object 0 .* no numbers"):
-        retrieve(room(SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), holed)), bank)
+        retrieve(room(SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), holed)), models)
 
 
-def test_many_scenes_are_the_same_as_one_by_one(bank, rng):
+def test_many_scenes_are_the_same_as_one_by_one(models, rng):
     scenes = [
         replace(
             room(SceneObject("sofa", (0.0, 0.4, 0.0), tuple(rng.uniform(0.3, 2, 3)))), name=str(k)
         )
         for k in range(6)
     ]
-    many = list(retrieve_all(scenes, bank))
+    many = list(retrieve_all(scenes, models))
     assert [scene.name for scene in many] == [str(k) for k in range(6)]
-    assert [m.extra for m in many] == [retrieve(scene, bank).extra for scene in scenes]
+    assert [m.extra for m in many] == [retrieve(scene, models).extra for scene in scenes]

@@ -1,12 +1,23 @@
-"""Where new latents come from: seeds, covariances, neighbours."""
+"""Latents of new rooms (seeds, covariances, neighbours), and by the names that users give them."""
 
+import json
+
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
+from sceneprior.config import load_run
 from sceneprior.errors import InputError
 from sceneprior.generation import sample as sampling
-from sceneprior.generation.sample import DISTRIBUTIONS, sample_latents, sample_logits
+from sceneprior.generation.sample import (
+    DISTRIBUTIONS,
+    draw_latents,
+    read_latent,
+    sample_latents,
+    sample_logits,
+    write_latents,
+)
 from sceneprior.models.latents import LatentCube, LatentSphere
 
 MANY = 20_000
@@ -33,7 +44,7 @@ def test_a_seed_gives_the_same_points_on_the_unit_sphere(sphere, trained, distri
     assert not torch.equal(one, sample_latents(sphere, trained, 9, 4, distribution))
 
 
-def test_the_gaussian_law_has_the_mean_and_covariance_of_the_training_rooms(trained):
+def test_the_gaussian_distribution_has_the_mean_and_covariance_of_the_training_rooms(trained):
     drawn = sample_logits(trained, MANY, 0, "gaussian").double()
     centred = trained.double() - trained.double().mean(dim=1, keepdim=True)
     wanted = centred.T.cov()
@@ -55,14 +66,14 @@ def test_few_rooms_are_never_left_behind(trained):
     )
 
 
-def test_the_gaussian_law_does_not_see_what_a_softmax_does_not(sphere, trained, torch_rng):
+def test_the_gaussian_distribution_does_not_see_what_a_softmax_does_not(sphere, trained, torch_rng):
     shifted = trained + 5 * torch.randn(40, 1, generator=torch_rng)
     plain = sphere.double()(sample_logits(trained.double(), 20, 0, "gaussian"))
     moved = sphere(sample_logits(shifted.double(), 20, 0, "gaussian"))
     assert_close(moved, plain, rtol=0, atol=1e-5)
 
 
-def test_the_papers_law_is_standard_normal_whatever_was_trained(trained):
+def test_the_papers_distribution_is_standard_normal_whatever_was_trained(trained):
     drawn = sample_logits(trained, MANY, 0, "paper")
     assert torch.equal(drawn, sample_logits(100 * trained, MANY, 0, "paper"))
     assert drawn.mean(dim=0).abs().max() < 0.04
@@ -87,7 +98,7 @@ def test_geodesics_lead_from_rooms_to_their_nearest_neighbours(sphere, trained, 
     assert len(used) > 80  # of 120
 
 
-def test_laws_that_cannot_be_followed_are_sentences(sphere, trained):
+def test_distributions_that_cannot_be_followed_are_sentences(sphere, trained):
     with pytest.raises(InputError) as error:
         sample_latents(sphere, trained, 3, 0, "guess")
     assert str(error.value) == (
@@ -97,7 +108,8 @@ def test_laws_that_cannot_be_followed_are_sentences(sphere, trained):
         with pytest.raises(InputError) as error:
             sample_latents(sphere, trained[:1], 3, 0, distribution)
         assert str(error.value) == (
-            f"The {distribution} distribution needs at least 2 training rooms; use --distribution paper."
+            f"The {distribution} distribution needs at least 2 training rooms; use --distribution "
+            "paper."
         )
     assert sample_latents(sphere, trained[:1], 3, 0, "paper").shape == (3, 12)
 
@@ -122,7 +134,7 @@ def test_kernel_keeps_mean_and_covariance():
 
 
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
-def test_every_law_stays_in_the_cube_and_goes_by_its_seed(trained, distribution):
+def test_every_distribution_stays_in_the_cube_and_goes_by_its_seed(trained, distribution):
     cube = LatentCube(7)
     one = sample_latents(cube, trained, 9, 3, distribution)
     assert one.shape == (9, 7) and one.abs().max() <= cube.half_edge
@@ -149,3 +161,64 @@ def test_in_the_cube_neighbours_are_joined_by_straight_lines(trained, monkeypatc
         to_all = (z - point).norm(dim=-1)
         detour = torch.stack([to_all[a] + to_all[b] - apart[a, b] for a, b in pairs])
         assert detour.min() < 1e-6
+
+
+@pytest.fixture(scope="module")
+def toy_prior(toy_run):
+    return load_run(toy_run)
+
+
+def test_rooms_and_seeds(toy_prior):
+    room = toy_prior.room_ids[3]
+    wanted = toy_prior.prior.latent_space(toy_prior.logits)[3]
+    torch.testing.assert_close(read_latent(toy_prior, room), wanted)
+    drawn, _ = draw_latents(toy_prior, 1, seed=7)
+    assert torch.equal(read_latent(toy_prior, "seed:7"), drawn[0])
+    assert not torch.equal(read_latent(toy_prior, "seed:8"), drawn[0])
+
+
+def test_files(toy_prior, tmp_path):
+    z, names = draw_latents(toy_prior, 4, seed=2)
+    write_latents(tmp_path, z, names)
+    npz = tmp_path / "latents.npz"
+    # Close: a file's vector is normalised once more.
+    torch.testing.assert_close(read_latent(toy_prior, str(npz)), z[0])
+    torch.testing.assert_close(read_latent(toy_prior, f"{npz}:2"), z[2])
+    torch.testing.assert_close(read_latent(toy_prior, f"{npz}:seed2_0003"), z[3])
+    np.save(tmp_path / "one.npy", 5 * z[1].numpy())  # brought back onto the sphere
+    torch.testing.assert_close(read_latent(toy_prior, str(tmp_path / "one.npy")), z[1])
+    (tmp_path / "a.json").write_text(json.dumps(z.tolist()))
+    torch.testing.assert_close(read_latent(toy_prior, f"{tmp_path}/a.json:1"), z[1])
+    (tmp_path / "b.json").write_text(json.dumps({"latents": z.tolist(), "names": list("wxyz")}))
+    torch.testing.assert_close(read_latent(toy_prior, f"{tmp_path}/b.json:y"), z[2])
+
+
+def test_what_is_no_latent_is_a_sentence(toy_prior, tmp_path):
+    def said(text: object) -> str:
+        with pytest.raises(InputError) as error:
+            read_latent(toy_prior, str(text))
+        return str(error.value)
+
+    assert said("house/room") == (
+        "'house/room' is neither a training room of this run (such as toy/train_00), nor "
+        "seed:NUMBER, nor a file of latents (.npz, .npy, .json)."
+    )
+    assert "neither a training room" in said("seed:-1") and "neither" in said(tmp_path)
+    write_latents(tmp_path, torch.eye(16)[:2], ["a", "b"])
+    npz = tmp_path / "latents.npz"
+    assert f"{npz} has no latent '2': it holds 2 and names such as a." == said(f"{npz}:2")
+    assert "has no latent 'c'" in said(f"{npz}:c")
+    np.save(tmp_path / "long.npy", np.ones(17))
+    assert "holds latents of 17 numbers, but this run's have 16" in said(tmp_path / "long.npy")
+    np.save(tmp_path / "zero.npy", np.zeros(16))
+    assert "all zeros or holds no numbers" in said(tmp_path / "zero.npy")
+    np.save(tmp_path / "nan.npy", np.full(16, np.nan))
+    assert "all zeros or holds no numbers" in said(tmp_path / "nan.npy")
+    np.save(tmp_path / "deep.npy", np.zeros((2, 2, 16)))
+    assert "holds no latents (ValueError: an array of shape (2, 2, 16))" in said(
+        tmp_path / "deep.npy"
+    )
+    (tmp_path / "bad.json").write_text('{"vectors": []}')
+    assert "holds no latents (KeyError" in said(tmp_path / "bad.json")
+    npz.write_bytes(npz.read_bytes()[:100])
+    assert "holds no latents (" in said(npz)

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.models.prior import ModelConfig
 from sceneprior.losses.completeness import completeness_targets, kept_objects, kept_share
+from sceneprior.models.prior import ModelConfig
 
 CONVENTIONS = ModelConfig.model_fields["completeness_target"].annotation.__args__
 

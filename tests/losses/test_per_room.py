@@ -4,11 +4,11 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from sceneprior.losses.averages import mean_of_objects
 from torch import Tensor
 from torch.testing import assert_close
 
 from sceneprior.geometry.cameras import Boxes2D
+from sceneprior.losses.averages import mean_of_objects
 from sceneprior.losses.layout import layout_losses
 from sceneprior.losses.matching import Matches, match_objects
 from sceneprior.losses.shape import mask_loss

@@ -16,11 +16,9 @@ from sceneprior.reconstruction.fit import (
     FitSchedule,
     decode_images,
     fit_latents,
-    rows_of,
     view_loss,
 )
-from sceneprior.reconstruction.observed import as_views, images_of_split
-from sceneprior.reconstruction.starts import layout_losses_of_rooms, starting_latents
+from sceneprior.reconstruction.image import as_views, images_of_split, rows_of
 
 SHORT = FitSchedule(steps=12, drop_at=8, patience=0)
 
@@ -154,33 +152,3 @@ def test_more_objects_than_the_prior_generates(trained, views, start):
     )
     with pytest.raises(InputError, match=r"toy_test_00_view\d shows 7 objects, but .* at most 6"):
         fit_latents(trained, crowded, start)
-
-
-def test_nearest_starts_are_the_rooms_of_least_layout_loss(trained, toy_shards):
-    views = as_views(images_of_split(toy_shards, "train", 0)[0], 4)
-    losses = layout_losses_of_rooms(trained, views)
-    assert losses.shape == (12, 12)
-    room = 5
-    first = rows_of(views, torch.tensor([room]))
-    own = trained.prior.latent_space(trained.logits[3:4])
-    scenes = replace(decode_images(trained, own, first), vertices_m=None)
-    assert_close(
-        losses[room, 3], view_loss(trained, scenes, first, masks=False).score[0],
-        rtol=1e-4, atol=1e-5,
-    )  # fmt: skip
-    starts = starting_latents(trained, views, 2)
-    best = trained.prior.latent_space(trained.logits)[losses[room].argmin()]
-    assert torch.equal(starts[room, 0], best)
-
-
-def test_starts_that_cannot_be(trained, views):
-    with pytest.raises(InputError, match="No start is called 'warm'; choose from nearest, random"):
-        starting_latents(trained, views, 1, "warm")
-    with pytest.raises(
-        InputError, match="13 nearest training rooms were asked for, but the run ha"
-    ):
-        starting_latents(trained, views, 13)
-    random = starting_latents(trained, views, 3, "random", seed=1)
-    assert random.shape == (4, 3, 16)
-    assert torch.equal(random, starting_latents(trained, views, 3, "random", seed=1))
-    assert not torch.equal(random, starting_latents(trained, views, 3, "random", seed=2))

@@ -1,143 +1,79 @@
-"""A user's own image: the same observation as from shards, and sentences for bad files."""
+"""Single images out of shards."""
 
-import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image
+import torch
 
-from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.reconstruction.image import (
-    CAMERA_DISTANCE_M,
-    level_camera,
-    read_intrinsics,
-    read_own_image,
-    read_pose,
-    sides_of_room,
+    as_views,
+    image_from_shards,
+    image_of_room,
+    images_of_split,
 )
-from sceneprior.reconstruction.observed import images_of_split
-
-LABELS = "front3d_bedroom"
-LENS = "48,48,48,36"
+from sceneprior.shards import RoomViews, Shard, list_shards
 
 
 @pytest.fixture(scope="module")
-def seen(toy_shards):
-    return images_of_split(toy_shards, "test", 0)[0][0]
+def room(toy_shards) -> RoomViews:
+    with Shard(list_shards(toy_shards, "test")[0]) as shard:
+        return shard.read_room(shard.room_ids[0], images=True)
 
 
-@pytest.fixture
-def own(seen, tmp_path):
-    """The view as three files, its ids times 10; (mask, classes, pose)."""
-    names = label_set(LABELS)
-    paths = [tmp_path / name for name in ("mask.png", "classes.json", "pose.json")]
-    Image.fromarray((seen.instance_ids * 10).astype(np.uint8)).save(paths[0])
-    classes = {str(10 * (k + 1)): names[index] for k, index in enumerate(seen.object_class)}
-    paths[1].write_text(json.dumps(classes))
-    paths[2].write_text(json.dumps({"world_to_camera": seen.world_to_camera.tolist()}))
-    return paths
+def test_only_what_the_view_shows_remains(room):
+    view = int(np.flatnonzero(~room.visible.all(axis=1) & room.visible.any(axis=1))[0])
+    image = image_of_room(room, view, "front3d_bedroom")
+    rows = np.flatnonzero(room.visible[view])
+    assert image.rows == tuple(rows)
+    for k, row in enumerate(rows):
+        mask = image.instance_ids == k + 1
+        np.testing.assert_array_equal(mask, room.instance_ids[view] == row + 1)
+        assert image.object_class[k] == room.object_class[row]
+        np.testing.assert_array_equal(image.boxes[k], room.boxes[view, row])
+    assert image.instance_ids.max() == len(rows)
 
 
-def test_it_is_what_the_shards_say_of_the_same_view(own, seen):
-    mask, classes, pose = own
-    read = read_own_image(mask, classes, LENS, LABELS, pose)
-    assert read.pose_known and read.notes == () and read.image.name == "mask"
-    np.testing.assert_array_equal(read.image.instance_ids, seen.instance_ids)
-    np.testing.assert_array_equal(read.image.object_class, seen.object_class)
-    np.testing.assert_allclose(read.image.boxes, seen.boxes, atol=1e-6)
-    np.testing.assert_allclose(read.image.world_to_camera, seen.world_to_camera)
-    np.testing.assert_allclose(read.image.intrinsics, seen.intrinsics)
-    assert [image is read.image for image in sides_of_room(read, 1.6)] == [True]
+def test_a_view_that_is_not_there_or_shows_nothing(room):
+    with pytest.raises(InputError, match=r"has no view 8; its 8 views are 0 to 7\."):
+        image_of_room(room, 8, "front3d_bedroom")
+    blank = replace(room, visible=np.zeros_like(room.visible))
+    with pytest.raises(InputError, match="View 2 of room toy/test_00 shows no object"):
+        image_of_room(blank, 2, "front3d_bedroom")
 
 
-def test_without_a_pose_the_camera_is_level_on_any_of_four_sides(own):
-    mask, classes, _ = own
-    read = read_own_image(mask, classes, LENS, LABELS, camera_height_m=1.5)
-    assert read.notes[0].startswith("without --pose the camera is level, 1.5 m above the floor")
-    eyes = []
-    for quarter, image in enumerate(sides_of_room(read, 1.5)):
-        pose = image.world_to_camera
-        np.testing.assert_array_equal(pose, level_camera(1.5, quarter))
-        eyes.append(tuple(np.round(-pose[:3, :3].T @ pose[:3, 3], 9) + 0.0))
-        middle = pose @ np.array([0, 1.5, 0, 1])  # straight ahead, at the camera's own height
-        np.testing.assert_allclose(middle, [0, 0, CAMERA_DISTANCE_M, 1], atol=1e-12)
-        above = pose @ np.array([0, 2.5, 0, 1])
-        np.testing.assert_allclose(above - middle, [0, -1, 0, 0], atol=1e-12)  # y down
-    d = CAMERA_DISTANCE_M
-    assert eyes == [(0, 1.5, d), (d, 1.5, 0), (0, 1.5, -d), (-d, 1.5, 0)]
+def test_rooms_are_found_in_either_split(toy_shards):
+    assert image_from_shards(toy_shards, "toy/test_01", 3).room_id == "toy/test_01"
+    assert image_from_shards(toy_shards, "toy/train_07", 3).name == "toy_train_07_view3"
+    with pytest.raises(InputError, match="holds no room 'attic'; it has 16 rooms, such as toy/te"):
+        image_from_shards(toy_shards, "attic", 0)
 
 
-def test_unknown_classes_and_values_are_void_and_told(own, seen):
-    mask, classes, pose = own
-    table = json.loads(classes.read_text())
-    first, last = min(table, key=int), max(table, key=int)
-    table[first] = "grand piano"
-    del table[last]
-    classes.write_text(json.dumps(table))
-    read = read_own_image(mask, classes, LENS, LABELS, pose)
-    assert read.notes == (
-        "classes outside the label set are void: grand piano (1)",
-        f"{mask} has values that {classes} does not list, taken for void: {last}",
-    )
-    np.testing.assert_array_equal(read.image.object_class, seen.object_class[1:-1])
+def test_views_are_drawn_by_the_seed_room_by_room(toy_shards):
+    images, blank = images_of_split(toy_shards, "test", 1)
+    again, _ = images_of_split(toy_shards, "test", 1, limit=2)
+    other, _ = images_of_split(toy_shards, "test", 2)
+    views = [image.view for image in images]
+    assert blank == [] and len(images) == 4
+    assert [image.view for image in again] == views[:2]
+    assert [image.view for image in other] != views
 
 
-def test_masks_of_nothing_known(own):
-    mask, classes, _ = own
-    size = Image.open(mask).size
-    Image.new("L", size).save(mask)
-    with pytest.raises(InputError, match=r"mask\.png shows no object: .*Its values are 0; "):
-        read_own_image(mask, classes, LENS, LABELS)
-    classes.write_text('{"10": "grand piano"}')
-    with pytest.raises(InputError, match=r"none of its classes \(grand piano\) is in the label s"):
-        read_own_image(mask, classes, LENS, LABELS)
+def test_a_batch_is_one_view_a_room(toy_shards):
+    images, _ = images_of_split(toy_shards, "test", 0)
+    views = as_views(images, 4)
+    counts = [len(image.object_class) for image in images]
+    assert views.is_object.sum(dim=1).tolist() == counts
+    assert views.visible.shape == (4, 1, max(counts))
+    assert views.instance_ids.shape == (4, 1, 18, 24)
+    for row, image in enumerate(images):
+        sampled = torch.from_numpy(image.instance_ids[2::4, 2::4].astype(np.int32))
+        assert torch.equal(views.instance_ids[row, 0], sampled)
 
 
-def test_lenses(tmp_path):
-    lens = tmp_path / "lens.json"
-    expected = np.array([[40, 0, 48], [0, 41, 36], [0, 0, 1]])
-    same = {"fx": 40, "fy": 41, "cx": 48, "cy": 36}
-    for data in (same, {"K": expected.tolist()}, expected.tolist(), {**same, "width": 96}):
-        lens.write_text(json.dumps(data))
-        np.testing.assert_array_equal(read_intrinsics(str(lens), (72, 96)), expected)
-    np.testing.assert_array_equal(read_intrinsics("40, 41,48,36", (72, 96)), expected)
-    lens.write_text(json.dumps({**same, "width": 640, "height": 480}))
-    with pytest.raises(InputError, match="is of an image of 640 x 480 pixels, but the mask has 96"):
-        read_intrinsics(str(lens), (72, 96))
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("40,40,48", "--intrinsics 40,40,48 is no lens; expected fx,fy,cx,cy in pixels"),
-        ("a,b,c,d", "is no lens"),
-        ("0,40,48,36", "is no pinhole lens"),
-        ("40,nan,48,36", "is no pinhole lens"),
-        ('{"fx": 40}', "holds no lens"),
-        ("3", "is no pinhole lens"),
-        ("[[40, 1, 48], [0, 40, 36], [0, 0, 1]]", "no skew"),
-        ("[[40, 0, 48], [0, 40, 36], [0, 0, 2]]", "is no pinhole lens"),
-        ("{", "cannot be read as JSON"),
-    ],
-)
-def test_lenses_that_are_none(tmp_path, text, said):
-    if text[0] in "{[3":
-        (tmp_path / "lens.json").write_text(text)
-        text = str(tmp_path / "lens.json")
-    with pytest.raises(InputError) as error:
-        read_intrinsics(text, (72, 96))
-    assert said in str(error.value)
-
-
-def test_poses(own, seen, tmp_path):
-    *_, pose = own
-    pose.write_text(json.dumps({"camera_to_world": np.linalg.inv(seen.world_to_camera).tolist()}))
-    np.testing.assert_allclose(read_pose(pose), seen.world_to_camera, atol=1e-5)
-    mirrored = np.diag([1, 1, -1, 1]).tolist()
-    for data in (3, [], {}, {"world_to_camera": [[1]]}, {"world_to_camera": mirrored}):
-        pose.write_text(json.dumps(data))
-        with pytest.raises(InputError, match=r"pose\.json holds no pose; expected"):
-            read_pose(pose)
-    with pytest.raises(InputError, match="cannot be read as JSON"):
-        read_pose(tmp_path / "nowhere.json")
+def test_images_of_two_sizes_are_no_batch(toy_shards):
+    images, _ = images_of_split(toy_shards, "test", 0, limit=2)
+    small = replace(images[1], instance_ids=images[1].instance_ids[::2])
+    with pytest.raises(InputError, match=r"\(36, 96\) and \(72, 96\) pixels"):
+        as_views([images[0], small], 4)

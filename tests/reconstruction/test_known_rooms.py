@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprior.training.settings import LossConfig
 from sceneprior.errors import InputError
 from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.offscreen import open_renderer
+from sceneprior.reconstruction.image import images_of_split
 from sceneprior.reconstruction.known_rooms import (
+    KnownAnswer,
     known_rooms,
     mask_overlap,
     nearest_answers,
     random_answers,
     turn_scene,
 )
-from sceneprior.reconstruction.observed import images_of_split
 
 
 @pytest.fixture(scope="module")
@@ -50,25 +50,22 @@ def test_every_room_is_there_in_four_turns(rooms):
 def test_the_image_of_a_known_room_finds_it_under_another_name(rooms, toy_shards, renderer):
     images = images_of_split(toy_shards, "train", 0, limit=4)[0]
     strangers = [replace(image, room_id="unknown") for image in images]
-    for image, answer in zip(
-        images, nearest_answers(rooms, strangers, LossConfig(), renderer), strict=True
-    ):
+    for image, answer in zip(images, nearest_answers(rooms, strangers, renderer), strict=True):
         assert answer.scene.name == image.room_id
         assert answer.scene.extra["turned_degrees"] == 0
-        assert mask_overlap(answer.scene, answer.objects, image, renderer) > 0.9
-    for image, answer in zip(
-        images, nearest_answers(rooms, images, LossConfig(), renderer), strict=True
-    ):
+        assert mask_overlap(answer, image, renderer) > 0.9
+    for image, answer in zip(images, nearest_answers(rooms, images, renderer), strict=True):
         assert answer.scene.name != image.room_id
 
 
 def test_overlap_is_one_for_the_room_itself_and_none_for_nothing(toy_shards, renderer):
     image = images_of_split(toy_shards, "test", 0, limit=1)[0][0]
     truth = reference_scenes(toy_shards, "test", 1, tracked_only=True)[0]
-    objects = [truth.objects[row] for row in image.rows]
+    objects = tuple(truth.objects[row] for row in image.rows)
+    nothing = KnownAnswer(truth, (None,) * len(objects))
     # Masks are compared on a coarser grid, whose pixel centres lie elsewhere.
-    assert mask_overlap(truth, objects, image, renderer) > 0.95
-    assert mask_overlap(truth, [None] * len(objects), image, renderer) == 0
+    assert mask_overlap(KnownAnswer(truth, objects), image, renderer) > 0.95
+    assert mask_overlap(nothing, image, renderer) == 0
 
 
 def names_of(answers) -> list[tuple[str, int]]:
@@ -77,8 +74,8 @@ def names_of(answers) -> list[tuple[str, int]]:
 
 def test_random_rooms_come_from_the_seed_and_are_never_the_images_own(rooms, toy_shards):
     images = images_of_split(toy_shards, "train", 0)[0]
-    drawn = [random_answers(rooms, images, LossConfig(), seed) for seed in range(3)]
-    again = random_answers(rooms, images, LossConfig(), 0)
+    drawn = [random_answers(rooms, images, seed) for seed in range(3)]
+    again = random_answers(rooms, images, 0)
     assert names_of(again) == names_of(drawn[0]) != names_of(drawn[1])
     for answers in drawn:
         for image, answer in zip(images, answers, strict=True):
@@ -91,4 +88,4 @@ def test_a_room_that_is_the_only_one_is_no_baseline(rooms, toy_shards):
     image = images_of_split(toy_shards, "train", 0, limit=1)[0][0]
     only = replace(rooms, scenes=tuple(s for s in rooms.scenes if s.name == image.room_id))
     with pytest.raises(InputError, match="The shards' only training room is toy/train_00 itself"):
-        random_answers(only, [image], LossConfig(), 0)
+        random_answers(only, [image], 0)

@@ -1,4 +1,4 @@
-"""Whole reconstructions on a toy run: options, refinement, answers in the masks' order."""
+"""Whole reconstructions on a toy run: options, starts, answers in the masks' order."""
 
 from dataclasses import replace
 
@@ -15,12 +15,16 @@ from sceneprior.reconstruction.fit import (
     SCHEDULES,
     FitSchedule,
     decode_images,
-    fit_latents,
     view_loss,
 )
-from sceneprior.reconstruction.observed import as_views, images_of_split
-from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct, unlearnt_classes
-from sceneprior.reconstruction.refinement import refine
+from sceneprior.reconstruction.image import as_views, images_of_split, rows_of
+from sceneprior.reconstruction.reconstruct import (
+    FitOptions,
+    layout_losses_of_rooms,
+    reconstruct,
+    starting_latents,
+    unlearnt_classes,
+)
 
 
 @pytest.fixture(scope="module")
@@ -97,48 +101,31 @@ def test_classes_that_the_run_never_generates(trained, images):
     assert unlearnt_classes(trained, [image]) == ["sofa"]
 
 
-def displaced(trained, views, by_m: float):
-    """What a fit finds, with every box and mesh moved along x."""
-    fit = fit_latents(
-        trained, views, trained.prior.latent_space(trained.logits[:1]).expand(4, -1),
-        FitSchedule(steps=40, drop_at=30),
+def test_nearest_starts_are_the_rooms_of_least_layout_loss(trained, toy_shards):
+    views = as_views(images_of_split(toy_shards, "train", 0)[0], 4)
+    losses = layout_losses_of_rooms(trained, views)
+    assert losses.shape == (12, 12)
+    room = 5
+    first = rows_of(views, torch.tensor([room]))
+    own = trained.prior.latent_space(trained.logits[3:4])
+    scenes = replace(decode_images(trained, own, first), vertices_m=None)
+    assert_close(
+        losses[room, 3], view_loss(trained, scenes, first, masks=False).score[0],
+        rtol=1e-4, atol=1e-5,
     )  # fmt: skip
-    step = torch.tensor([by_m, 0, 0])
-    scenes = replace(
-        fit.scenes,
-        centers_m=fit.scenes.centers_m + step,
-        vertices_m=fit.scenes.vertices_m + step,
-    )
-    with torch.no_grad():
-        return fit, replace(fit, scenes=scenes, loss=view_loss(trained, scenes, views))
+    starts = starting_latents(trained, views, 2)
+    best = trained.prior.latent_space(trained.logits)[losses[room].argmin()]
+    assert torch.equal(starts[room, 0], best)
 
 
-def test_refinement_never_worsens_and_brings_displaced_boxes_nearer(trained, views):
-    fit, aside = displaced(trained, views, 0.15)
-    found = refine(trained, views, aside, 60)
-    assert (found.loss.score <= aside.loss.score).all()
-    assert found.loss.score.mean() < (aside.loss.score.mean() + fit.loss.score.mean()) / 2
-    again = view_loss(trained, found.scenes, views, matches=found.loss.matches)
-    assert_close(again.score, found.loss.score, rtol=1e-5, atol=1e-6)
-    real = views.is_object
-    floor = (found.scenes.centers_m - found.scenes.sizes_m / 2)[..., 1][real]
-    before = (aside.scenes.centers_m - aside.scenes.sizes_m / 2)[..., 1][real]
-    assert (floor >= before.clamp(max=0) - 1e-5).all()  # none sinks into the floor
-
-
-def test_meshes_move_and_stretch_with_their_boxes(trained, views):
-    _, aside = displaced(trained, views, 0.15)
-    scenes = refine(trained, views, aside, 20).scenes
-    assert not torch.equal(scenes.sizes_m, aside.scenes.sizes_m)
-    real = views.is_object
-    low, high = scenes.vertices_m[real].amin(dim=1), scenes.vertices_m[real].amax(dim=1)
-    assert_close((low + high) / 2, scenes.centers_m[real], rtol=0, atol=1e-4)
-    assert_close(high - low, scenes.sizes_m[real], rtol=0, atol=1e-4)
-
-
-def test_without_steps_refinement_changes_nothing(trained, views):
-    start = trained.prior.latent_space(trained.logits[:1]).expand(4, -1)
-    fit = fit_latents(trained, views, start, FitSchedule(steps=2, drop_at=1))
-    found = refine(trained, views, fit, 0)
-    assert_close(found.scenes.centers_m, decode_images(trained, fit.z, views).centers_m)
-    assert torch.equal(found.loss.score, fit.loss.score)
+def test_starts_that_cannot_be(trained, views):
+    with pytest.raises(InputError, match="No start is called 'warm'; choose from nearest, random"):
+        starting_latents(trained, views, 1, "warm")
+    with pytest.raises(
+        InputError, match="13 nearest training rooms were asked for, but the run ha"
+    ):
+        starting_latents(trained, views, 13)
+    random = starting_latents(trained, views, 3, "random", seed=1)
+    assert random.shape == (4, 3, 16)
+    assert torch.equal(random, starting_latents(trained, views, 3, "random", seed=1))
+    assert not torch.equal(random, starting_latents(trained, views, 3, "random", seed=2))

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 from recorded_fit import record
-from sceneprior.losses.averages import share_of_batch
 from tiny_runs import tiny_config, write_tiny_config
 from torch.testing import assert_close
 from toy_rooms import write_toy_shards
 
+from sceneprior.losses.averages import share_of_batch
 from sceneprior.training.checkpoints import read_checkpoint
 
 ROOT = Path(__file__).parents[2]

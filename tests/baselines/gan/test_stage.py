@@ -22,7 +22,7 @@ from sceneprior.evaluation.protocol import without_void
 from sceneprior.experiments.evaluate import Judging, judge_run, read_curves, report_run
 from sceneprior.experiments.evaluate_samples import SampleEvaluator
 from sceneprior.generation.decode import decode_training_rooms, synthesize
-from sceneprior.generation.latents import read_latent
+from sceneprior.generation.sample import read_latent
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct
 from sceneprior.training import fit as train

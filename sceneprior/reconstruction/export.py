@@ -1,6 +1,8 @@
-"""A reconstruction in; one picture out: the masks, the room from the same camera, from above."""
+"""Write reconstructions: scenes, and pictures of the masks beside what was found for them."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
@@ -8,8 +10,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.classes import class_colors, label_set
 from sceneprior.evaluation.topdown import object_colors, scene_meshes, topdown, topdown_protocol
+from sceneprior.files import write_whole
+from sceneprior.generation.export import clear_scenes, write_scene
 from sceneprior.offscreen import Pinhole, Renderer
-from sceneprior.reconstruction.observed import ObservedImage
+from sceneprior.pictures import paint_ids, png_bytes
+from sceneprior.reconstruction.image import ObservedImage
 from sceneprior.reconstruction.reconstruct import Reconstruction
 from sceneprior.scene import Scene
 
@@ -19,6 +24,30 @@ GAP_PX, LINE_PX = 8, 24
 PAPER, INK, FRAME = (255, 255, 255), (40, 40, 40), (200, 200, 200)
 SIGHT_M = 0.8
 """How far the camera's sides are drawn in the plan."""
+
+
+def write_reconstructions(
+    found: Sequence[Reconstruction], folder: Path, renderer: Renderer
+) -> None:
+    """Write `<name>.json`, `.glb` and `.png`, and `<name>_seen.png`, for each image.
+
+    The JSON's `extra` says where the image is from, its camera, and how well its masks are met.
+    """
+    clear_scenes(folder)
+    for one in found:
+        image = one.image
+        extra = {
+            "room_id": image.room_id,
+            "view": image.view,
+            "world_to_camera": image.world_to_camera.tolist(),
+            "intrinsics": image.intrinsics.tolist(),
+            "image_size": list(image.instance_ids.shape),
+            "score": round(one.score, 5),
+            "mask_iou": round(one.mask_iou, 4),
+            "steps": one.steps,
+        }
+        write_whole(Path(folder) / f"{image.name}_seen.png", png_bytes(picture(one, renderer)))
+        write_scene(replace(one.scene, extra=extra), folder, image.name, renderer)
 
 
 def picture(found: Reconstruction, renderer: Renderer) -> UInt8[np.ndarray, "height width 3"]:
@@ -78,13 +107,7 @@ def _legend_rows(
 def masks_given(image: ObservedImage) -> UInt8[np.ndarray, "height width 3"]:
     """The image's masks in their class colours, with dark borders between them."""
     colors = class_colors(len(label_set(image.label_set)))[image.object_class]
-    ids = image.instance_ids.astype(np.int64)
-    picture = np.concatenate([[PAPER], colors]).astype(np.uint8)[ids]
-    border = np.zeros(ids.shape, dtype=bool)
-    border[:, 1:] |= ids[:, 1:] != ids[:, :-1]
-    border[1:] |= ids[1:] != ids[:-1]
-    picture[border] = picture[border] // 2
-    return picture
+    return paint_ids(image.instance_ids.astype(np.int64), colors, PAPER)
 
 
 def same_camera(

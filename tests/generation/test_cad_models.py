@@ -1,4 +1,4 @@
-"""Banks of CAD models: what is on which shelf, what is broken, and that points are drawn once."""
+"""CAD models by class: which there are, which are broken, and that points are drawn once."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ import trimesh
 from model_folder import blocks, corner_sofa, write_model, write_models
 
 from sceneprior.errors import InputError
-from sceneprior.generation import cad_bank
-from sceneprior.generation.cad_bank import default_cache, open_bank, unit_mesh
+from sceneprior.generation import cad_models
+from sceneprior.generation.cad_models import default_cache, open_models, unit_mesh
 from sceneprior.scene import Mesh
 
 
@@ -42,32 +42,32 @@ def folder(tmp_path):
 def drawn(monkeypatch):
     """Names of the folders whose OBJ was read."""
     reads = []
-    read = cad_bank.read_obj
+    read = cad_models.read_obj
     monkeypatch.setattr(
-        cad_bank, "read_obj", lambda path: reads.append(path.parent.name) or read(path)
+        cad_models, "read_obj", lambda path: reads.append(path.parent.name) or read(path)
     )
     return reads
 
 
 def open_here(folder, points=64):
-    return open_bank(folder, "front3d_bedroom", folder.parent / "cache", points)
+    return open_models(folder, "front3d_bedroom", folder.parent / "cache", points)
 
 
-def test_shelves_and_broken_models(folder):
-    bank = open_here(folder)
-    assert {label: shelf.model_ids for label, shelf in bank.shelves.items()} == {
+def test_models_by_class_and_broken_models(folder):
+    models = open_here(folder)
+    assert {label: some.model_ids for label, some in models.by_class.items()} == {
         "double_bed": ("bed", "huge"),
         "table": ("flat",),
     }
-    assert set(bank.broken) == {"nan", "faceless", "missing", "point"}
-    assert "no usable triangles" in bank.broken["nan"] and "no area" in bank.broken["point"]
-    assert "cannot be read" in bank.broken["missing"]
-    beds = bank.shelves["double_bed"].points
+    assert set(models.broken) == {"nan", "faceless", "missing", "point"}
+    assert "no usable triangles" in models.broken["nan"] and "no area" in models.broken["point"]
+    assert "cannot be read" in models.broken["missing"]
+    beds = models.by_class["double_bed"].points
     assert beds.shape == (2, 64, 3) and np.abs(beds).max() <= 0.5
     # A hundred times too large is the same model in its unit box.
     np.testing.assert_allclose(beds[0], beds[1], atol=1e-6)
-    assert (bank.shelves["table"].points[..., 1] == 0).all()  # flat stays flat
-    np.testing.assert_allclose(np.ptp(bank.load("huge").vertices_m, axis=0), 1)
+    assert (models.by_class["table"].points[..., 1] == 0).all()  # flat stays flat
+    np.testing.assert_allclose(np.ptp(models.load("huge").vertices_m, axis=0), 1)
 
 
 def test_a_unit_mesh_fills_its_box():
@@ -83,17 +83,17 @@ def test_points_are_drawn_once_and_again_where_a_file_changed(folder, drawn):
     again = open_here(folder)
     assert sorted(drawn) == ["faceless", "nan", "point"]  # broken ones may have been mended
     np.testing.assert_array_equal(
-        first.shelves["double_bed"].points, again.shelves["double_bed"].points
+        first.by_class["double_bed"].points, again.by_class["double_bed"].points
     )
     drawn.clear()
     write_model(folder, "bed", corner_sofa())
     changed = open_here(folder)
     assert "bed" in drawn and "huge" not in drawn
-    beds = changed.shelves["double_bed"].points
-    assert np.abs(beds[0] - first.shelves["double_bed"].points[0]).max() > 0.05
-    np.testing.assert_array_equal(beds[1], first.shelves["double_bed"].points[1])
+    beds = changed.by_class["double_bed"].points
+    assert np.abs(beds[0] - first.by_class["double_bed"].points[0]).max() > 0.05
+    np.testing.assert_array_equal(beds[1], first.by_class["double_bed"].points[1])
     drawn.clear()
-    assert open_here(folder, points=32).shelves["table"].points.shape == (1, 32, 3)
+    assert open_here(folder, points=32).by_class["table"].points.shape == (1, 32, 3)
     assert "huge" in drawn  # other settings, another file
     assert len(list((folder.parent / "cache").iterdir())) == 2
 
@@ -114,7 +114,7 @@ def test_what_was_drawn_before_an_interrupt_is_kept(folder, drawn):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        open_bank(folder, "front3d_bedroom", folder.parent / "cache", 64, stop_after_two)
+        open_models(folder, "front3d_bedroom", folder.parent / "cache", 64, stop_after_two)
     done = set(drawn)
     drawn.clear()
     open_here(folder)
@@ -123,9 +123,9 @@ def test_what_was_drawn_before_an_interrupt_is_kept(folder, drawn):
 
 def test_folders_without_a_usable_model_are_sentences(folder, tmp_path):
     with pytest.raises(InputError, match=r"No folder at .*none; --models names"):
-        open_bank(tmp_path / "none", "front3d_bedroom", tmp_path)
+        open_models(tmp_path / "none", "front3d_bedroom", tmp_path)
     with pytest.raises(InputError) as error:
-        open_bank(folder, "void,spaceship", tmp_path)
+        open_models(folder, "void,spaceship", tmp_path)
     assert "holds no usable model of a class of void,spaceship (8 models listed, 0" in str(
         error.value
     )
@@ -135,8 +135,8 @@ def test_ids_that_leave_the_folder_are_broken_models(tmp_path):
     write_models(tmp_path / "models", {"table": ("Dining Table", corner_sofa())})
     info = tmp_path / "models" / "model_info.json"
     info.write_text(info.read_text()[:-1] + ', {"model_id": "../x", "category": "Dining Table"}]')
-    bank = open_bank(tmp_path / "models", "front3d_bedroom", tmp_path / "cache", 16)
-    assert "cannot be a folder's name" in bank.broken["../x"]
+    models = open_models(tmp_path / "models", "front3d_bedroom", tmp_path / "cache", 16)
+    assert "cannot be a folder's name" in models.broken["../x"]
 
 
 def test_the_cache_goes_where_caches_go(monkeypatch, tmp_path):

@@ -1,4 +1,4 @@
-"""CAD models to choose from: a folder of 3D-FUTURE in, points of every model in its unit box out.
+"""Read the CAD models of a 3D-FUTURE folder by class, with points on each model's surface.
 
 Points are drawn once a model and kept in one file; where the file of a model changes, its points
 are drawn again.
@@ -31,14 +31,12 @@ _FLAT = 1e-9
 """A side shorter than this part of the longest has no thickness that scaling could bring out."""
 _MESHES_KEPT = 256
 
-
-def default_cache() -> Path:
-    """Where points are kept unless told otherwise: $XDG_CACHE_HOME/sceneprior, or ~/.cache/."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sceneprior"
+Track = Callable[[list[str]], Iterable[str]]
+"""Wraps the ids of models that are read, for a progress bar."""
 
 
 @dataclass(frozen=True)
-class Shelf:
+class ClassModels:
     """The models of one class."""
 
     model_ids: tuple[str, ...]
@@ -47,31 +45,27 @@ class Shelf:
 
 
 @dataclass(frozen=True)
-class CadBank:
+class CadModels:
     """Models by class, and where their meshes come from."""
 
-    shelves: Mapping[str, Shelf]
+    by_class: Mapping[str, ClassModels]
     load: Callable[[str], Mesh]
     """Model id -> its mesh, filling [-0.5, 0.5]^3."""
     broken: Mapping[str, str] = field(default_factory=dict)
     """Model id -> why it cannot be used."""
 
 
-def open_bank(
-    folder: Path,
-    label_set_name: str,
-    cache: Path,
-    points: int = POINTS,
-    track: Callable[[list[str]], Iterable[str]] = iter,
-) -> CadBank:
+def default_cache() -> Path:
+    """Where points are kept unless told otherwise: $XDG_CACHE_HOME/sceneprior, or ~/.cache/."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sceneprior"
+
+
+def open_models(
+    folder: Path, label_set_name: str, cache: Path, points: int = POINTS, track: Track = iter
+) -> CadModels:
     """Read the models of a 3D-FUTURE folder that have a class in a label set.
 
-    Args:
-        folder: 3D-FUTURE-model.
-        label_set_name: Whose classes count.
-        cache: Folder for the file of points. Deleting it costs time, nothing else.
-        points: Points a model.
-        track: Wraps the ids of the models whose points must be drawn, for a progress bar.
+    Their points are kept in a file in the folder `cache`; deleting it costs time, nothing else.
 
     Raises:
         InputError: the folder is not 3D-FUTURE's, or has no model of these classes.
@@ -85,12 +79,13 @@ def open_bank(
     wanted = [model_id for model_id, label in labels.items() if label != "void"]
     store = PointStore(folder, Path(cache), points)
     broken = store.draw(wanted, track)
-    shelves = {}
+    by_class = {}
     for label in names:
         of_class = [m for m in wanted if labels[m] == label and m not in broken]
         if of_class:
-            shelves[label] = Shelf(tuple(of_class), np.stack([store.points[m] for m in of_class]))
-    if not shelves:
+            stack = np.stack([store.points[m] for m in of_class])
+            by_class[label] = ClassModels(tuple(of_class), stack)
+    if not by_class:
         raise InputError(
             f"{folder} holds no usable model of a class of {label_set_name} ({len(labels)} models "
             f"listed, {len(broken)} of them broken); --models names a folder with the OBJ files."
@@ -99,7 +94,7 @@ def open_bank(
     def load(model_id: str) -> Mesh:
         return unit_mesh(read_obj(folder / model_id / MODEL_FILE))
 
-    return CadBank(shelves, lru_cache(_MESHES_KEPT)(load), broken)
+    return CadModels(by_class, lru_cache(_MESHES_KEPT)(load), broken)
 
 
 def unit_mesh(mesh: Mesh) -> Mesh:
@@ -116,50 +111,48 @@ def _into_unit_box(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 
 class PointStore:
-    """Points of models on disk: one npz a folder of models and settings, whole or absent.
-
-    Args:
-        folder: The models.
-        cache: Where the file lies.
-        count: Points a model.
-    """
+    """Points of the models of a folder, `count` each, kept in one npz in the folder `cache`."""
 
     def __init__(self, folder: Path, cache: Path, count: int):
         self.folder, self.count = folder, count
         settings = f"{folder.resolve()}|{count}|{SEED}|{FORMAT}"
-        name = f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
-        self.path = cache / name
+        self.path = cache / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
         self.points: dict[str, np.ndarray] = {}
         self._stamps: dict[str, tuple[int, int]] = {}
-        self._read()
+        try:
+            with np.load(self.path, allow_pickle=False) as file:
+                ids, stamps, points = file["ids"].tolist(), file["stamps"], file["points"]
+        except Exception:  # absent or damaged: drawn again, and written over
+            return
+        if points.shape == (len(ids), count, 3):
+            self.points = dict(zip(ids, points, strict=True))
+            self._stamps = {m: (int(a), int(b)) for m, (a, b) in zip(ids, stamps, strict=True)}
 
-    def draw(
-        self, model_ids: list[str], track: Callable[[list[str]], Iterable[str]]
-    ) -> dict[str, str]:
+    def draw(self, model_ids: list[str], track: Track) -> dict[str, str]:
         """Have points of these models; what was drawn is kept even if this is interrupted.
 
         Returns:
             Broken models, with the reason.
         """
         broken: dict[str, str] = {}
-        todo = []
+        todo: dict[str, tuple[int, int]] = {}
         for model_id in model_ids:
             try:
-                if self._stamps.get(model_id) != self._stamp(model_id):
-                    todo.append(model_id)
+                stamp = self._stamp(model_id)
+                if self._stamps.get(model_id) != stamp:
+                    todo[model_id] = stamp
             except InputError as error:
                 broken[model_id] = str(error)
-        drawn = 0
+        before = dict(self._stamps)
         try:
-            for model_id in track(todo):
+            for model_id in track(list(todo)):
                 try:
                     self.points[model_id] = self._draw_one(model_id)
-                    self._stamps[model_id] = self._stamp(model_id)
-                    drawn += 1
+                    self._stamps[model_id] = todo[model_id]
                 except (InputError, ValueError) as error:
                     broken[model_id] = str(error)
         finally:
-            if drawn:
+            if self._stamps != before:
                 self._write()
         return broken
 
@@ -175,21 +168,9 @@ class PointStore:
         points = surface_points(vertices, mesh.faces, self.count, SEED)
         return _into_unit_box(points, vertices).astype(np.float32)
 
-    def _read(self) -> None:
-        try:
-            with np.load(self.path, allow_pickle=False) as file:
-                ids, stamps, points = file["ids"].tolist(), file["stamps"], file["points"]
-        except Exception:  # absent or damaged: drawn again, and written over
-            return
-        if points.shape == (len(ids), self.count, 3):
-            self.points = dict(zip(ids, points, strict=True))
-            self._stamps = {m: (int(a), int(b)) for m, (a, b) in zip(ids, stamps, strict=True)}
-
     def _write(self) -> None:
-        ids = sorted(self._stamps)
-        buffer = io.BytesIO()
-        np.savez(
-            buffer, ids=np.array(ids), stamps=np.array([self._stamps[m] for m in ids], np.int64),
-            points=np.stack([self.points[m] for m in ids]),
-        )  # fmt: skip
+        ids, buffer = sorted(self._stamps), io.BytesIO()
+        stamps = np.array([self._stamps[m] for m in ids], np.int64)
+        points = np.stack([self.points[m] for m in ids])
+        np.savez(buffer, ids=np.array(ids), stamps=stamps, points=points)
         write_whole(self.path, buffer.getvalue())

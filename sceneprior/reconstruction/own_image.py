@@ -1,0 +1,188 @@
+"""Read a user's own image: a PNG of instance ids, a table of classes, and the camera."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sceneprior.errors import InputError
+from sceneprior.files import read_json
+from sceneprior.geometry.turns import QUARTERS, quarter_rotation
+from sceneprior.instances.observations import observe
+from sceneprior.instances.pngs import read_mask
+from sceneprior.instances.tables import IdTable, read_class_table
+from sceneprior.reconstruction.image import ObservedImage
+
+CAMERA_HEIGHT_M = 1.6
+"""Of a camera whose pose is not given: the middle of what the recipes draw from, 1.4 to 1.8 m."""
+CAMERA_DISTANCE_M = 1.5
+"""How far from the middle of the room it stands, which it looks at."""
+
+
+@dataclass(frozen=True)
+class OwnImage:
+    """What a user gave, in the room frame."""
+
+    images: tuple[ObservedImage, ...]
+    """The image; without a pose, as seen from each of the room's four sides."""
+    notes: tuple[str, ...]
+    """What was assumed, or left out: sentences to print."""
+
+
+def read_own_image(
+    mask: Path,
+    classes: Path,
+    intrinsics: str,
+    label_set: str,
+    pose: Path | None = None,
+    camera_height_m: float = CAMERA_HEIGHT_M,
+) -> OwnImage:
+    """Read an image's masks and camera.
+
+    Args:
+        mask: PNG of one channel; equal values are one object, 0 is nothing.
+        classes: JSON or CSV: the class of each value. Classes outside the label set are void.
+        intrinsics: `fx,fy,cx,cy` in pixels of the mask, or a JSON file; see `read_intrinsics`.
+        label_set: The run's.
+        pose: JSON; see `read_pose`. Without one the camera is level, `camera_height_m` above the
+            floor and `CAMERA_DISTANCE_M` before the middle of the room, looking along -z.
+        camera_height_m: Of a camera without a pose.
+
+    Raises:
+        InputError: a file cannot be used, the sizes differ, or no object is seen.
+    """
+    values = read_mask(mask)
+    height, width = values.shape
+    table = IdTable(read_class_table(classes), label_set, str(classes))
+    camera = read_intrinsics(intrinsics, (height, width))
+    seen = observe(table.ids(values)[None], table.is_object)
+    if not len(seen.tracked):
+        raise InputError(
+            f"{mask} shows no object: none of its masks is of a class of the run and wider than "
+            f"4 pixels. Its values are {_some(np.unique(values))}; {classes} says what they are."
+        )
+    notes = list(table.notes)
+    if table.unlisted - {0}:
+        notes.append(
+            f"{mask} has values that {classes} does not list, taken for void: "
+            f"{_some(np.array(sorted(table.unlisted)))}"
+        )
+    if pose is None:
+        notes.append(
+            f"without --pose the camera is level, {camera_height_m:g} m above the floor and "
+            f"{CAMERA_DISTANCE_M:g} m from the middle of the room, which it looks at"
+        )
+        poses = [level_camera(camera_height_m, quarter) for quarter in range(QUARTERS)]
+    else:
+        poses = [read_pose(pose)]
+    image = ObservedImage(
+        name=mask.stem,
+        label_set=label_set,
+        object_class=table.classes[seen.tracked].astype(np.int64),
+        instance_ids=seen.instance_ids[0],
+        boxes=seen.boxes[0],
+        sides_clear=seen.sides_clear[0],
+        world_to_camera=poses[0],
+        intrinsics=camera,
+    )
+    images = tuple(replace(image, world_to_camera=camera_pose) for camera_pose in poses)
+    return OwnImage(images, tuple(notes))
+
+
+def _some(values: np.ndarray) -> str:
+    return ", ".join(str(value) for value in values[:8]) + (", ..." if len(values) > 8 else "")
+
+
+def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
+    """`world_to_camera` of a level camera that looks through the middle of the room.
+
+    Args:
+        height_m: Above the floor.
+        quarter: 0 stands on the +z side and looks along -z; each quarter goes on about +y.
+    """
+    turn = quarter_rotation(quarter)
+    eye = turn @ np.array([0, height_m, CAMERA_DISTANCE_M])
+    pose = np.eye(4)
+    pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turn.T  # OpenCV: y down, z into the room
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return pose
+
+
+def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
+    """Intrinsics: `fx,fy,cx,cy`, or a JSON file with `K` (3 x 3), or `fx`, `fy`, `cx` and `cy`.
+
+    The file may say of which image (`width`, `height`), which is checked.
+
+    Raises:
+        InputError: neither; not finite; or of an image of another size.
+    """
+    expected = 'fx,fy,cx,cy in pixels, or a JSON file: {"fx": 240, "fy": 240, "cx": 240, "cy": 180}'
+    path = Path(text)
+    in_file = path.suffix.lower() == ".json"
+    try:
+        if in_file:
+            data = read_json(path)
+            data = data if isinstance(data, dict) else {"K": data}
+            said = (data.get("height", image_size[0]), data.get("width", image_size[1]))
+            if said != image_size:
+                raise InputError(
+                    f"{path} is of an image of {said[1]} x {said[0]} pixels, but the mask has "
+                    f"{image_size[1]} x {image_size[0]}; scale fx, fy, cx and cy, or the mask."
+                )
+        else:
+            values = (float(part) for part in text.split(","))
+            data = dict(zip(("fx", "fy", "cx", "cy"), values, strict=True))
+        if "K" not in data:
+            fx, fy, cx, cy = (data[key] for key in ("fx", "fy", "cx", "cy"))
+            data = {"K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]}
+        matrix = np.array(data["K"], dtype=np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        source = f"{path} holds" if in_file else f"--intrinsics {text} is"
+        raise InputError(f"{source} no intrinsics; expected {expected}.") from None
+    pinhole = (
+        matrix.shape == (3, 3)
+        and np.isfinite(matrix).all()
+        and min(matrix[0, 0], matrix[1, 1]) > 0
+        and matrix[0, 1] == 0
+        and np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1])
+    )
+    if not pinhole:
+        raise InputError(
+            f"--intrinsics {text} is no pinhole camera (fx and fy above 0, no skew); "
+            f"expected {expected}."
+        )
+    return matrix
+
+
+def read_pose(path: Path) -> np.ndarray:
+    """`world_to_camera` from a JSON file: that key, or `camera_to_world`; 4 x 4, OpenCV axes.
+
+    The world is the room frame: metres, y up, the floor y = 0 and its middle the origin.
+
+    Raises:
+        InputError: there is no such matrix, or it is no rotation with a translation.
+    """
+    data = read_json(path)
+    found: list[str] = []
+    try:
+        found = [key for key in ("world_to_camera", "camera_to_world") if key in data]
+        matrix = np.array(data[found[0]], dtype=np.float64)
+        turn = matrix[:3, :3]
+        rigid = (
+            matrix.shape == (4, 4)
+            and np.isfinite(matrix).all()
+            and np.allclose(turn @ turn.T, np.eye(3), atol=1e-3)
+            and np.linalg.det(turn) > 0
+            and np.allclose(matrix[3], [0, 0, 0, 1])
+        )
+    except (IndexError, KeyError, TypeError, ValueError):
+        rigid = False
+    if not rigid:
+        raise InputError(
+            f'{path} holds no pose; expected {{"world_to_camera": 4 x 4}} or '
+            '{"camera_to_world": 4 x 4}, a rotation and a translation in metres, camera axes x '
+            "right, y down, z forward, in a room with y up and the floor at 0."
+        )
+    return matrix if found[0] == "world_to_camera" else np.linalg.inv(matrix)

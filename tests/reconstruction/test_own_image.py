@@ -1,0 +1,142 @@
+"""A user's own image: the same observation as from shards, and sentences for bad files."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneprior.classes import label_set
+from sceneprior.errors import InputError
+from sceneprior.reconstruction.image import images_of_split
+from sceneprior.reconstruction.own_image import (
+    CAMERA_DISTANCE_M,
+    level_camera,
+    read_intrinsics,
+    read_own_image,
+    read_pose,
+)
+
+LABELS = "front3d_bedroom"
+INTRINSICS = "48,48,48,36"
+
+
+@pytest.fixture(scope="module")
+def seen(toy_shards):
+    return images_of_split(toy_shards, "test", 0)[0][0]
+
+
+@pytest.fixture
+def own(seen, tmp_path):
+    """The view as three files, its ids times 10; (mask, classes, pose)."""
+    names = label_set(LABELS)
+    paths = [tmp_path / name for name in ("mask.png", "classes.json", "pose.json")]
+    Image.fromarray((seen.instance_ids * 10).astype(np.uint8)).save(paths[0])
+    classes = {str(10 * (k + 1)): names[index] for k, index in enumerate(seen.object_class)}
+    paths[1].write_text(json.dumps(classes))
+    paths[2].write_text(json.dumps({"world_to_camera": seen.world_to_camera.tolist()}))
+    return paths
+
+
+def test_it_is_what_the_shards_say_of_the_same_view(own, seen):
+    mask, classes, pose = own
+    read = read_own_image(mask, classes, INTRINSICS, LABELS, pose)
+    (image,) = read.images
+    assert read.notes == () and image.name == "mask"
+    np.testing.assert_array_equal(image.instance_ids, seen.instance_ids)
+    np.testing.assert_array_equal(image.object_class, seen.object_class)
+    np.testing.assert_allclose(image.boxes, seen.boxes, atol=1e-6)
+    np.testing.assert_allclose(image.world_to_camera, seen.world_to_camera)
+    np.testing.assert_allclose(image.intrinsics, seen.intrinsics)
+
+
+def test_without_a_pose_the_camera_is_level_on_any_of_four_sides(own):
+    mask, classes, _ = own
+    read = read_own_image(mask, classes, INTRINSICS, LABELS, camera_height_m=1.5)
+    assert read.notes[0].startswith("without --pose the camera is level, 1.5 m above the floor")
+    eyes = []
+    for quarter, image in enumerate(read.images):
+        pose = image.world_to_camera
+        np.testing.assert_array_equal(pose, level_camera(1.5, quarter))
+        eyes.append(tuple(np.round(-pose[:3, :3].T @ pose[:3, 3], 9) + 0.0))
+        middle = pose @ np.array([0, 1.5, 0, 1])  # straight ahead, at the camera's own height
+        np.testing.assert_allclose(middle, [0, 0, CAMERA_DISTANCE_M, 1], atol=1e-12)
+        above = pose @ np.array([0, 2.5, 0, 1])
+        np.testing.assert_allclose(above - middle, [0, -1, 0, 0], atol=1e-12)  # y down
+    d = CAMERA_DISTANCE_M
+    assert eyes == [(0, 1.5, d), (d, 1.5, 0), (0, 1.5, -d), (-d, 1.5, 0)]
+
+
+def test_unknown_classes_and_values_are_void_and_told(own, seen):
+    mask, classes, pose = own
+    table = json.loads(classes.read_text())
+    first, last = min(table, key=int), max(table, key=int)
+    table[first] = "grand piano"
+    del table[last]
+    classes.write_text(json.dumps(table))
+    read = read_own_image(mask, classes, INTRINSICS, LABELS, pose)
+    assert read.notes == (
+        "classes outside the label set are void: grand piano (1)",
+        f"{mask} has values that {classes} does not list, taken for void: {last}",
+    )
+    np.testing.assert_array_equal(read.images[0].object_class, seen.object_class[1:-1])
+
+
+def test_masks_of_nothing_known(own):
+    mask, classes, _ = own
+    size = Image.open(mask).size
+    Image.new("L", size).save(mask)
+    with pytest.raises(InputError, match=r"mask\.png shows no object: .*Its values are 0; "):
+        read_own_image(mask, classes, INTRINSICS, LABELS)
+    classes.write_text('{"10": "grand piano"}')
+    with pytest.raises(InputError, match=r"none of its classes \(grand piano\) is in the label s"):
+        read_own_image(mask, classes, INTRINSICS, LABELS)
+
+
+def test_intrinsics(tmp_path):
+    path = tmp_path / "camera.json"
+    expected = np.array([[40, 0, 48], [0, 41, 36], [0, 0, 1]])
+    same = {"fx": 40, "fy": 41, "cx": 48, "cy": 36}
+    for data in (same, {"K": expected.tolist()}, expected.tolist(), {**same, "width": 96}):
+        path.write_text(json.dumps(data))
+        np.testing.assert_array_equal(read_intrinsics(str(path), (72, 96)), expected)
+    np.testing.assert_array_equal(read_intrinsics("40, 41,48,36", (72, 96)), expected)
+    path.write_text(json.dumps({**same, "width": 640, "height": 480}))
+    with pytest.raises(InputError, match="is of an image of 640 x 480 pixels, but the mask has 96"):
+        read_intrinsics(str(path), (72, 96))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("40,40,48", "--intrinsics 40,40,48 is no intrinsics; expected fx,fy,cx,cy in pixels"),
+        ("a,b,c,d", "is no intrinsics"),
+        ("0,40,48,36", "is no pinhole camera"),
+        ("40,nan,48,36", "is no pinhole camera"),
+        ('{"fx": 40}', "holds no intrinsics"),
+        ("3", "is no pinhole camera"),
+        ("[[40, 1, 48], [0, 40, 36], [0, 0, 1]]", "no skew"),
+        ("[[40, 0, 48], [0, 40, 36], [0, 0, 2]]", "is no pinhole camera"),
+        ("{", "camera.json is not JSON"),
+    ],
+)
+def test_intrinsics_that_are_none(tmp_path, text, said):
+    if text[0] in "{[3":
+        (tmp_path / "camera.json").write_text(text)
+        text = str(tmp_path / "camera.json")
+    with pytest.raises(InputError) as error:
+        read_intrinsics(text, (72, 96))
+    assert said in str(error.value)
+
+
+def test_poses(own, seen, tmp_path):
+    *_, pose = own
+    pose.write_text(json.dumps({"camera_to_world": np.linalg.inv(seen.world_to_camera).tolist()}))
+    np.testing.assert_allclose(read_pose(pose), seen.world_to_camera, atol=1e-5)
+    mirrored = np.diag([1, 1, -1, 1]).tolist()
+    for data in (3, [], {}, {"world_to_camera": [[1]]}, {"world_to_camera": mirrored}):
+        pose.write_text(json.dumps(data))
+        with pytest.raises(InputError, match=r"pose\.json holds no pose; expected"):
+            read_pose(pose)
+    with pytest.raises(InputError, match=r"nowhere\.json cannot be read"):
+        read_pose(tmp_path / "nowhere.json")
