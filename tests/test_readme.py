@@ -1,4 +1,4 @@
-"""What is written runs: the README's steps, in an empty folder, as they are printed."""
+"""README: its steps run as they are printed, in an empty folder; its table has every command."""
 
 import re
 import shlex
@@ -10,16 +10,19 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def readme_commands(heading: str) -> list[str]:
+    """The commands of a section's first block, a line each."""
     text = (ROOT / "README.md").read_text()
     section = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
     block = re.search(r"```bash\n(.*?)```", section, re.DOTALL)
-    return [line.split("#")[0].strip() for line in block.group(1).splitlines() if line.strip()]
+    assert block is not None
+    lines = block[1].replace("\\\n", "").splitlines()
+    return [line.split("#")[0].strip() for line in lines if line.strip()]
 
 
 def test_steps_run_as_printed(tmp_path):
     for command in readme_commands("Step by step"):
-        verb, *arguments = shlex.split(command)
-        assert verb == "sceneprior"
+        program, *arguments = shlex.split(command)
+        assert program == "sceneprior"
         done = subprocess.run(
             [sys.executable, "-m", "sceneprior", *arguments],
             cwd=tmp_path, capture_output=True, text=True, timeout=600,
@@ -39,11 +42,11 @@ def test_two_commands_are_targets_of_the_makefile():
         assert f"\n{command.split()[1]}: setup\n" in makefile
 
 
-def test_every_verb_is_in_the_table():
+def test_every_command_is_in_the_table():
     from typer.main import get_command
 
     from sceneprior.cli import app
 
     text = (ROOT / "README.md").read_text()
-    verbs = set(re.findall(r"^\| `([a-z-]+)` \|", text, re.MULTILINE))
-    assert verbs == set(get_command(app).commands)
+    named = set(re.findall(r"^\| `([a-z-]+)` \|", text, re.MULTILINE))
+    assert named == set(get_command(app).commands)
