@@ -1,4 +1,4 @@
-"""What is written runs: the README's steps, in an empty folder, as they are printed."""
+"""README: its steps run as they are printed, in an empty folder; its table has every command."""
 
 import re
 import shlex
@@ -12,10 +12,13 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def readme_commands(heading: str) -> list[str]:
+    """The commands of a section's first block, a line each."""
     text = (ROOT / "README.md").read_text()
     section = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
     block = re.search(r"```bash\n(.*?)```", section, re.DOTALL)
-    return [line.split("#")[0].strip() for line in block.group(1).splitlines() if line.strip()]
+    assert block is not None
+    lines = block[1].replace("\\\n", "").splitlines()
+    return [line.split("#")[0].strip() for line in lines if line.strip()]
 
 
 @pytest.mark.slow
@@ -48,5 +51,5 @@ def test_every_command_is_in_the_table():
     from sceneprior.cli import app
 
     text = (ROOT / "README.md").read_text()
-    commands = set(re.findall(r"^\| `([a-z-]+)` \|", text, re.MULTILINE))
-    assert commands == set(get_command(app).commands)
+    named = set(re.findall(r"^\| `([a-z-]+)` \|", text, re.MULTILINE))
+    assert named == set(get_command(app).commands)

@@ -29,7 +29,7 @@ def test_the_example_runs_as_printed(tmp_path, monkeypatch):
         views = [(pose, made.ids(view)) for view, pose in enumerate(made.poses)]
         code = lines.replace("attic", name)
         exec(code, {"Path": Path, "Image": Image, "np": np, "json": json, "views": views})
-    for command in block("bash").splitlines():
+    for command in block("bash").replace("\\\n", "").splitlines():
         verb, *arguments = shlex.split(command)
         assert verb == "sceneprior"
         done = subprocess.run(
