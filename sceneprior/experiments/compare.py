@@ -15,7 +15,7 @@ from pathlib import Path
 
 from sceneprior.config import load_config
 from sceneprior.errors import InputError
-from sceneprior.evaluation.metrics.image_metrics import check_inception
+from sceneprior.evaluation.networks import check_inception
 from sceneprior.experiments.comparison import Comparison, Run, runs_of
 from sceneprior.experiments.figure import write_figure
 from sceneprior.experiments.steps import (

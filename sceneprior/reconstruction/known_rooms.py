@@ -11,7 +11,7 @@ from torch import Tensor
 from sceneprior.classes import label_set
 from sceneprior.config import LossConfig
 from sceneprior.errors import InputError
-from sceneprior.evaluation.reference import reference_scene
+from sceneprior.evaluation.ground_truth import reference_scene
 from sceneprior.evaluation.topdown import scene_meshes
 from sceneprior.geometry.boxes import box_corners
 from sceneprior.geometry.cameras import boxes_of_points

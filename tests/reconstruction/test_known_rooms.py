@@ -7,7 +7,7 @@ import pytest
 
 from sceneprior.config import LossConfig
 from sceneprior.errors import InputError
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.offscreen import open_renderer
 from sceneprior.reconstruction.known_rooms import (
     known_rooms,
