@@ -1,7 +1,8 @@
 """Time the evaluation of rooms: synthesize, draw, read, score; where the seconds go.
 
 Run `python benchmarks/bench_evaluation.py --run RUN [--shards SHARDS] [-n 1000]`. CPU seconds
-of all threads are stated beside wall-clock seconds: on a busy machine only the former mean something.
+of all threads are stated beside wall-clock seconds: on a busy machine only the former mean
+something.
 """
 
 import argparse

@@ -56,11 +56,7 @@ class EvalOptions:
     """A renderer, or the name of one."""
 
     def check_weights(self) -> None:
-        """Read the files of weights, before hours of drawing lean on them.
-
-        Raises:
-            InputError: one is missing or holds something else.
-        """
+        """Raise InputError where a file of weights is missing or holds something else."""
         if self.inception is not None:
             check_inception(self.inception)
         if self.alexnet is not None:
@@ -103,7 +99,7 @@ def evaluate_synthesis(
         InputError: no rooms, fewer than two on a side, other label sets than the shards', or
             a file of weights or a reference that cannot be used.
     """
-    options.check_weights()
+    options.check_weights()  # before hours of drawing lean on them
     rooms = _rooms(generated, shards, options.seed)
     names = common_label_set(rooms.groups["test"])
     renderer = options.renderer
@@ -217,11 +213,11 @@ def _evaluate(sets: dict[str, RoomSet], options: EvalOptions) -> dict[str, dict[
     metrics = [metric for metric in METRICS if metric.applies(networks, options.boxes)]
     comparison = Comparison(sets["test"], sets["fair"], options.seed, options.alexnet)
     for name in ("test", *PICTURED):
-        comparison.columns[name] = {}
-        for metric in metrics:
-            if name in metric.sets:
-                estimate = metric.function(sets[name], comparison)
-                comparison.columns[name][metric.key] = estimate
+        comparison.columns[name] = {
+            metric.key: metric.function(sets[name], comparison)
+            for metric in metrics
+            if name in metric.sets
+        }
     return comparison.columns
 
 
