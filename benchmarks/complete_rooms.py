@@ -29,14 +29,10 @@ import numpy as np
 import torch
 
 from sceneprior.config import load_run
-from sceneprior.evaluation.metrics.layout_metrics import (
-    category_kl,
-    match_scenes,
-    object_counts,
-    overlap_pairs,
-    type_share,
-)
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.evaluation.metrics.contents import category_kl, object_counts, type_share
+from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
+from sceneprior.evaluation.metrics.overlaps import overlap_pairs
 from sceneprior.generation.complete import STEPS, complete
 from sceneprior.generation.insert import insert
 from sceneprior.scene import Scene

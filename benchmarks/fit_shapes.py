@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from sceneprior.data.dataset import ViewDataset
-from sceneprior.evaluation.metrics.layout_metrics import box_iou_3d
+from sceneprior.evaluation.metrics.decoded_rooms import box_iou_3d
 from sceneprior.geometry.boxes import place
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.losses.matching import Matches

@@ -22,8 +22,8 @@ from sceneprior.config import OursConfig, load_config
 from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.data.flat_views import FlatViews
-from sceneprior.evaluation.metrics.layout_metrics import reconstruction_scores
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.generation.decode import decode_training_rooms
 from sceneprior.training.layout import LayoutStage
 from sceneprior.training.method import TrainedPrior

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from sceneprior.config import load_run
-from sceneprior.evaluation.metrics.set_metrics import frechet_distance
-from sceneprior.evaluation.protocol import without_void
-from sceneprior.evaluation.reference import reference_scenes
-from sceneprior.evaluation.stated_protocol import drawing_of
+from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.evaluation.metrics.frechet import frechet_distance
+from sceneprior.evaluation.protocol import drawing_of
+from sceneprior.evaluation.synthesis import without_void
 from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import open_renderer

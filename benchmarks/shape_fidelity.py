@@ -15,7 +15,7 @@ from statistics import mean
 import numpy as np
 
 from sceneprior.config import load_run
-from sceneprior.evaluation.metrics.layout_metrics import match_scenes
+from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
 from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface
 from sceneprior.evaluation.topdown import box_mesh
 from sceneprior.experiments.evaluate import decoded_and_true

@@ -20,7 +20,7 @@ import torch
 from sceneprior.config import load_config, load_run
 from sceneprior.data.datamodule import make_loader
 from sceneprior.data.dataset import ViewDataset
-from sceneprior.evaluation.metrics.layout_metrics import reconstruction_scores
+from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.geometry.cameras import boxes_of_points
 from sceneprior.losses.matching import match_objects

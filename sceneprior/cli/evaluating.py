@@ -1,4 +1,4 @@
-"""Verbs that judge rooms; what a verb needs it imports when called."""
+"""The commands eval-fid and convert-boxes; what a command needs it imports when called."""
 
 from pathlib import Path
 from typing import Annotated
@@ -36,12 +36,12 @@ def eval_fid(
         Path | None, typer.Option(help="alexnet-owt-7be5be79.pth, for the paper's SCA.")
     ] = None,
     shards: Annotated[
-        Path | None, typer.Option(help="Shards to judge against (default: those of the run).")
+        Path | None, typer.Option(help="Shards to compare with (default: those of the run).")
     ] = None,
     reference: Annotated[
         Path | None,
         typer.Option(
-            help="Keep what real rooms' pictures say in this .npz, or take it from there."
+            help="Keep features of real rooms' pictures in this .npz, or take them from there."
         ),
     ] = None,
     boxes: Annotated[
@@ -57,35 +57,40 @@ def eval_fid(
     checkpoint: CheckpointOption = "final",
     renderer: RendererOption = "auto",
 ) -> None:
-    """Judge generated rooms against test rooms, with the whole protocol beside the figures."""
+    """Compare generated rooms with test rooms, by all metrics of docs/evaluation.md.
+
+    FID and KID are measured only with --inception, the user's Inception network: without it, the
+    Frechet and kernel distances are those of EfficientNet-Lite0 features, which are not FID and
+    have other sizes. The whole protocol stands beside the scores.
+    """
     from sceneprior.evaluation.score_table import print_scores
-    from sceneprior.experiments.evaluate import Judging, judge_folder, judge_run
+    from sceneprior.evaluation.synthesis import EvalOptions
+    from sceneprior.experiments.evaluate import evaluate_folder, evaluate_run
 
     if run is not None and scenes is not None:
         raise InputError(
-            "Both --run and --scenes came; give --run to judge what a run generates, or --scenes "
-            "to judge scenes that are there."
+            "Both --run and --scenes came; give --run to evaluate what a run generates, or "
+            "--scenes to evaluate scenes that are there."
         )
-    judging = Judging(inception, alexnet, reference, resamples, renderer, boxes)
+    options = EvalOptions(seed, inception, alexnet, reference, boxes, resamples, renderer)
     if run is not None:
         target = out or run / "scores.json"
-        scores = judge_run(
-            run, count or GENERATED, seed, shards, target, distribution, judging, checkpoint
-        )
+        rooms = count or GENERATED
+        found = evaluate_run(run, rooms, options, target, shards, distribution, checkpoint)
     elif scenes is not None:
         if shards is None:
             raise InputError("--scenes needs --shards: the folder with the test rooms.")
         if distribution is not None or checkpoint != "final":
             raise InputError(
-                "--distribution and --checkpoint belong to --run; scenes are judged as they are."
+                "--distribution and --checkpoint belong to --run; scenes are evaluated as they are."
             )
         target = out or scenes / "scores.json"
-        scores = judge_folder(scenes, count, seed, shards, target, judging)
+        found = evaluate_folder(scenes, count, options, target, shards)
     else:
         raise InputError(
-            "There is nothing to judge; give --run RUN, or --scenes DIR with --shards SHARDS."
+            "There is nothing to evaluate; give --run RUN, or --scenes DIR with --shards SHARDS."
         )
-    print_scores(scores)
+    print_scores(found)
     typer.echo(f"Wrote {target}")
 
 
@@ -104,8 +109,11 @@ def convert_boxes(
     ] = "half",
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Turn box lists of ATISS and its kin into scenes that eval-fid judges."""
-    from sceneprior.evaluation.convert import convert
+    """Turn box lists of ATISS and similar methods into scenes that eval-fid evaluates."""
+    from sceneprior.evaluation.box_lists import read_box_lists
+    from sceneprior.generation.export import write_scenes
+    from sceneprior.offscreen import SoftwareRenderer
 
-    count = convert(boxes, out, label_set, classes, sizes, overwrite)
-    typer.echo(f"Wrote {count} rooms to {out}")
+    rooms = read_box_lists(boxes, label_set, classes, sizes)
+    write_scenes(rooms, out, SoftwareRenderer(), overwrite)
+    typer.echo(f"Wrote {len(rooms)} rooms to {out}")

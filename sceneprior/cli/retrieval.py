@@ -23,7 +23,7 @@ def retrieve(
     from rich.console import Console
     from rich.progress import track
 
-    from sceneprior.evaluation.metrics.layout_metrics import common_label_set
+    from sceneprior.evaluation.metrics.contents import common_label_set
     from sceneprior.files import write_json
     from sceneprior.generation.cad_models import default_cache, open_models
     from sceneprior.generation.export import check_free, load_scene_folder, write_scenes

@@ -1,4 +1,4 @@
-"""The paper's classifier: small pictures in, who AlexNet takes for generated out."""
+"""AlexNet as the paper's classifier of pictures: generated, or real?"""
 
 from functools import lru_cache
 from pathlib import Path
@@ -43,16 +43,16 @@ def classify_pictures(
     path: Path,
     pictures: UInt8[np.ndarray, "rooms 224 224 3"],
     labels: Int[np.ndarray, " rooms"],
-    judged: UInt8[np.ndarray, "others 224 224 3"],
+    others: UInt8[np.ndarray, "others 224 224 3"],
     seed: int,
 ) -> Int[np.ndarray, " others"]:
-    """Fine-tune AlexNet on labelled pictures and judge others, on a GPU where there is one.
+    """Fine-tune AlexNet on labelled pictures and classify others, on a GPU where there is one.
 
     Args:
         path: `alexnet-owt-*.pth`, the state dict of torchvision's AlexNet.
         pictures: RGB in 0..255.
         labels: 1 generated, 0 real.
-        judged: Pictures to judge.
+        others: Pictures to classify.
         seed: Of the new layer and of the order of the pictures.
 
     Source:
@@ -62,7 +62,7 @@ def classify_pictures(
     import torch
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    # Whoever draws random numbers after us draws the same as before.
+    # Random numbers drawn after this stay the same as before.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = _network(_weights(Path(path))).to(device)
@@ -80,8 +80,8 @@ def classify_pictures(
             optimizer.step()
     with torch.no_grad():
         answers = [
-            network(_input(judged[start : start + BATCH], device))[:, 0].cpu().numpy() > 0
-            for start in range(0, len(judged), BATCH)
+            network(_input(others[start : start + BATCH], device))[:, 0].cpu().numpy() > 0
+            for start in range(0, len(others), BATCH)
         ]
     return np.concatenate(answers).astype(int)
 

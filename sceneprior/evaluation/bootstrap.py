@@ -1,15 +1,16 @@
-"""How far a figure would move with other rooms: figures with their resamples in, intervals out."""
+"""Estimates with bootstrap intervals: how far a metric would move with other rooms."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, Real
+from jaxtyping import Float, Int, Real, Shaped
 
 RESAMPLES = 200
 COVERAGE = 0.95
 METHOD = (
     f"{COVERAGE:.0%} bootstrap over rooms, both sets drawn anew with replacement; quantiles moved "
-    "so that the resamples' mean meets the figure"
+    "so that the resamples' mean meets the metric's value"
 )
 
 
@@ -22,28 +23,29 @@ def resample_counts(
 
 
 @dataclass(frozen=True)
-class Figure:
-    """A number, and the same number of every resample."""
+class Estimate:
+    """A metric's value, and its value on every resample."""
 
     value: float | None
-    """None where the figure does not exist."""
-    draws: Float[np.ndarray, " resamples"]
-    """Resamples in which the figure does not exist are left out."""
+    """None where it does not exist."""
+    resamples: Float[np.ndarray, " resamples"]
+    """Resamples in which it does not exist are left out."""
     low: float = -np.inf
     high: float = np.inf
-    """The range in which the figure lies by definition."""
+    """The range in which it lies by definition."""
 
     def interval(self) -> list[float] | None:
-        """[lower, upper] end; None without a figure or without resamples.
+        """[lower, upper] end; None without a value or without resamples.
 
         Drawing with replacement repeats rooms, and two sets of fewer different rooms lie farther
         apart: the resamples of a Frechet distance all lie above the distance itself. Their spread
         is what counts; so the quantiles are taken around the resamples' own mean.
         """
-        if self.value is None or len(self.draws) == 0:
+        if self.value is None or len(self.resamples) == 0:
             return None
         tail = (1 - COVERAGE) / 2
-        ends = self.value + np.quantile(self.draws, [tail, 1 - tail]) - self.draws.mean()
+        spread = np.quantile(self.resamples, [tail, 1 - tail])
+        ends = self.value + spread - self.resamples.mean()
         return [float(end) for end in np.clip(ends, self.low, self.high)]
 
 
@@ -52,17 +54,26 @@ def ratio(
     denominators: Real[np.ndarray, " rooms"],
     counts: Int[np.ndarray, "resamples rooms"],
     high: float = np.inf,
-) -> Figure:
+) -> Estimate:
     """A sum over rooms divided by another: a mean over rooms, or over what they hold.
 
     Args:
         numerators: What each room adds.
-        denominators: What each room weighs; 0 leaves a room out. If all are 0 there is no figure.
+        denominators: What each room weighs; 0 leaves a room out. If all are 0 there is no value.
         counts: From `resample_counts`.
         high: The largest value it can have; the smallest is 0.
     """
     total = denominators.sum()
     value = float(numerators.sum() / total) if total > 0 else None
     over = counts @ denominators
-    draws = (counts @ numerators)[over > 0] / over[over > 0]
-    return Figure(value, draws, 0.0, high)
+    return Estimate(value, (counts @ numerators)[over > 0] / over[over > 0], 0.0, high)
+
+
+def mean_of_rooms(
+    values: Sequence[float | int | None] | Shaped[np.ndarray, " rooms"],
+    counts: Int[np.ndarray, "resamples rooms"],
+    high: float = np.inf,
+) -> Estimate:
+    """The mean over rooms of numbers from 0 on; rooms with None are left out."""
+    known = np.array([value is not None for value in values], dtype=float)
+    return ratio(np.array([value or 0.0 for value in values], dtype=float), known, counts, high)

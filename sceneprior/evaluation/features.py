@@ -1,11 +1,11 @@
-"""Draw a set of rooms and keep what scores need: `Scene`s in, features and hashes out."""
+"""Features and digests of the top-down pictures of a set of rooms."""
 
 import hashlib
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import islice
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.metrics.image_metrics import (
+from sceneprior.evaluation.networks import (
     efficientnet_lite0_features,
     inception_features,
     single_threaded,
@@ -49,12 +49,18 @@ class SceneFeatures:
     def of(self, rows: Sequence[int]) -> "SceneFeatures":
         """The same of some of the rooms."""
         chosen = np.asarray(rows, dtype=np.int64)
-        return SceneFeatures(
-            self.effnet_lite0[chosen],
-            None if self.inception is None else self.inception[chosen],
-            None if self.small is None else self.small[chosen],
-            self.picture_sha256[chosen],
-        )
+        return _combine([self], lambda parts: parts[0][chosen])
+
+
+def _combine(
+    parts: Sequence[SceneFeatures], merge: Callable[[list[np.ndarray]], np.ndarray]
+) -> SceneFeatures:
+    """One array of each kind from those of the parts; what the parts lack stays None."""
+    arrays = {}
+    for kind in fields(SceneFeatures):
+        known = [getattr(part, kind.name) for part in parts]
+        arrays[kind.name] = None if known[0] is None else merge(known)
+    return SceneFeatures(**arrays)
 
 
 def scene_features(
@@ -71,8 +77,6 @@ def scene_features(
 
     Args:
         scenes: At least one; a stream is never held as a whole.
-        renderer: From `sceneprior.offscreen.open_renderer`.
-        protocol: What a picture shows.
         inception: NVIDIA's TorchScript file, or None.
         small: Keep small pictures, too.
         on_progress: Called with the number of scenes just done.
@@ -99,12 +103,7 @@ def scene_features(
             finish_first()
     if not parts:
         raise InputError("There is no scene to draw; give at least one.")
-    return SceneFeatures(
-        effnet_lite0=np.concatenate([part.effnet_lite0 for part in parts]),
-        inception=_joined([part.inception for part in parts]),
-        small=_joined([part.small for part in parts]),
-        picture_sha256=np.concatenate([part.picture_sha256 for part in parts]),
-    )
+    return _combine(parts, np.concatenate)
 
 
 def _processors() -> int:
@@ -128,8 +127,3 @@ def shrink(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "224
     """A picture at `SMALL_PX`, with Pillow's antialiased triangle filter."""
     small = Image.fromarray(image).resize((SMALL_PX, SMALL_PX), Image.Resampling.BILINEAR)
     return np.asarray(small)
-
-
-def _joined(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
-    known = [part for part in parts if part is not None]
-    return np.concatenate(known) if known else None

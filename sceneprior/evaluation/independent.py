@@ -1,4 +1,4 @@
-"""Real rooms in, rooms of objects that know nothing of each other out: what a prior must beat."""
+"""Rooms whose objects know nothing of each other, from real ones: what a prior must beat."""
 
 from collections.abc import Sequence
 

@@ -1,6 +1,6 @@
-"""The real rooms' pictures, drawn once: shards in, features of test and training rooms out.
+"""Features of the real rooms' pictures, drawn once and kept in a file.
 
-Drawing the same test rooms over and over is what judging costs. A reference file keeps what was
+Drawing the same test rooms over and over is what evaluation costs. A reference file keeps what was
 read from their pictures, with all that it depends on; a file that does not fit is refused.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from sceneprior.errors import InputError
 from sceneprior.evaluation.features import SceneFeatures, scene_features
-from sceneprior.evaluation.reference import split_fingerprint, stream_scenes
+from sceneprior.evaluation.ground_truth import split_fingerprint, stream_scenes
 from sceneprior.evaluation.topdown import TopDownProtocol
 from sceneprior.files import write_whole
 from sceneprior.offscreen import Renderer
@@ -62,11 +62,8 @@ def draw_reference(
     """Features of the test rooms and of some training rooms, from a file where there is one.
 
     Args:
-        shards: Folder of shards with ground truth.
-        drawing: How.
         rooms: How many rooms `test` and `train` hold.
         train_rows: The training rooms wanted.
-        progress: Told how far it is.
         path: Reference file. One that lies there is read; otherwise every room of both splits is
             drawn, so that any later choice of training rooms is in it, and the file is written.
 

@@ -1,4 +1,4 @@
-"""One page that shows a run: scenes, scores and curves in, a self-contained HTML file out."""
+"""The report page of a run: rooms, scores and curves in one self-contained HTML file."""
 
 import json
 from collections.abc import Sequence
@@ -11,8 +11,8 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from sceneprior import __version__
-from sceneprior.evaluation.metrics.layout_metrics import match_scenes
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
 from sceneprior.evaluation.report_pictures import (
     RoomPictures,
     curves_svg,
@@ -21,6 +21,7 @@ from sceneprior.evaluation.report_pictures import (
     room_pictures,
 )
 from sceneprior.evaluation.score_table import headings, score_rows
+from sceneprior.files import write_whole
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Scene
 
@@ -59,18 +60,15 @@ def write_report(
     so that it can be passed on.
 
     Args:
-        path: The HTML file; written under a temporary name, then moved into place.
-        title: Headline.
         shards: Folder of shards: input views come from `train`, real rooms from `test`.
         run: The run's folder or name.
         generated: Synthesized rooms; the first 8 are shown.
         scores: From `evaluate_synthesis`; class_accuracy, box_iou_3d, seconds and
             peak_memory_gib are shown too where they stand in it.
         commands: What was typed, in order.
-        curves: Points (step, value) by name; a panel each.
+        curves: Points (epoch, value) by name; a panel each.
         decoded: (decoded, true) training rooms; the first 5 are shown.
         unfolding: Rooms along a geodesic of the hypersphere, from one room to another.
-        renderer: From `sceneprior.offscreen.open_renderer`.
         from_boxes: Rooms come from a baseline that learnt from true boxes: it has no latent sphere,
             and saw no views.
 
@@ -105,14 +103,7 @@ def write_report(
         note=scores.get("note"),
         commands=commands,
     )
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    try:
-        temporary.write_text(page, encoding="utf-8")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_whole(path, page.encode())
 
 
 def _template() -> Any:
@@ -142,32 +133,31 @@ def _pair(decoded: Scene, truth: Scene, renderer: Renderer) -> _Pair:
     return _Pair(room_pictures(decoded, renderer), room_pictures(truth, renderer), summary)
 
 
+_TILES = (
+    ("type_share", "{0:.0%}", "hold their type's furniture",
+     "{type_share_test:.0%} of real test rooms"),
+    ("category_kl", "{0:.3f}", "category KL to test rooms",
+     "nats; real training rooms {train_rooms[category_kl]:.3f}"),
+    ("gap_closed_effnet_lite0", "{0:.0%}", "of the Frechet gap to real rooms closed",
+     "independent objects, drawn as boxes: 0; real training rooms: 1"),
+    ("mean_objects", "{0:.2f}", "objects in a generated room",
+     "real test rooms {mean_objects_test:.2f}"),
+    ("class_accuracy", "{0:.1%}", "of true classes right",
+     "decoded training rooms, matched by box"),
+    ("box_iou_3d", "{0:.2f}", "mean 3D box IoU", "decoded training rooms; 3D was never shown"),
+)  # fmt: skip
+"""Key, value, what it is, beside what."""
+
+
 def _tiles(scores: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """(figure, what it is, beside what) for the top of the page; only what is known."""
-    known = {key: value for key, value in scores.items() if isinstance(value, (int, float))}
-    train = scores.get("train_rooms", {})
-    tiles = []
-    if "type_share" in known:
-        beside = f"{known['type_share_test']:.0%} of real test rooms"
-        tiles.append((f"{known['type_share']:.0%}", "hold their type's furniture", beside))
-    if "category_kl" in known:
-        beside = f"nats; real training rooms {train['category_kl']:.3f}"
-        tiles.append((f"{known['category_kl']:.3f}", "category KL to test rooms", beside))
-    if "gap_closed_effnet_lite0" in known:
-        beside = "independent objects, drawn as boxes: 0; real training rooms: 1"
-        share = f"{known['gap_closed_effnet_lite0']:.0%}"
-        tiles.append((share, "of the Frechet gap to real rooms closed", beside))
-    if "mean_objects" in known:
-        beside = f"real test rooms {known['mean_objects_test']:.2f}"
-        tiles.append((f"{known['mean_objects']:.2f}", "objects in a generated room", beside))
-    if "class_accuracy" in known:
-        beside = "decoded training rooms, matched by box"
-        tiles.append((f"{known['class_accuracy']:.1%}", "of true classes right", beside))
-    if "box_iou_3d" in known:
-        beside = "decoded training rooms; 3D was never shown"
-        tiles.append((f"{known['box_iou_3d']:.2f}", "mean 3D box IoU", beside))
-    if "seconds" in known:
-        memory = known.get("peak_memory_gib")
+    """(value, what it is, beside what) for the top of the page; only what is known."""
+    tiles = [
+        (value.format(scores[key]), what, beside.format(**scores))
+        for key, value, what, beside in _TILES
+        if scores.get(key) is not None
+    ]
+    if "seconds" in scores:
+        memory = scores.get("peak_memory_gib")
         beside = "" if memory is None else f"{memory:.1f} GiB of memory at most"
-        tiles.append((f"{known['seconds'] / 60:.1f} min", "from homes to scores", beside))
+        tiles.append((f"{scores['seconds'] / 60:.1f} min", "from homes to scores", beside))
     return tiles

@@ -1,4 +1,4 @@
-"""Pictures for the report: scenes, input views and learning curves in, data URIs out."""
+"""Pictures of the report page, as data URIs: rooms, input views and learning curves."""
 
 import base64
 import io
@@ -134,7 +134,7 @@ def curves_svg(curves: dict[str, list[tuple[int, float]]]) -> str:
         axes.grid(color="#e9ecef", linewidth=0.8)
         axes.spines[:].set_visible(False)
         if index >= len(curves) - columns:
-            axes.set_xlabel("step", fontsize=8, color="#868e96")
+            axes.set_xlabel("epoch", fontsize=8, color="#868e96")
     page = io.BytesIO()
     # A fixed salt and no date: the same curves give the same bytes.
     with matplotlib.rc_context({"svg.hashsalt": "sceneprior"}):

@@ -1,4 +1,4 @@
-"""Draw scenes: a `Scene` in, the top-down picture that scores compare or an oblique view out."""
+"""Pictures of scenes: straight from above, as scores compare them, and from above a corner."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -46,7 +46,7 @@ def topdown_protocol(label_set_name: str) -> TopDownProtocol:
     """The protocol of a label set: 12.5 mm a pixel for bedrooms, 25 mm for the other sets.
 
     The windows hold the largest rooms that ATISS's filter lets through (6 x 6 m bedrooms,
-    12 x 12 m living rooms). A label set of one's own has the larger one.
+    12 x 12 m living rooms). The user's label sets have the larger one.
 
     Raises:
         InputError: no label set has this name.
@@ -92,7 +92,6 @@ def topdown(
 
     Args:
         scene: The room; its floor is not drawn.
-        renderer: From `sceneprior.offscreen.open_renderer`.
         protocol: None takes the one of the scene's label set.
         outlines: Darken the border between two objects: for people, never for scores.
 
@@ -155,7 +154,7 @@ def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480
     """From above a corner, outside: one view into which all these rooms just fit.
 
     The camera stands two diagonals away. The floor is the rectangle around the known outlines,
-    or, where nobody knows them, around the objects.
+    or, where they are not known, around the objects.
 
     Args:
         scenes: At least one room.
@@ -195,8 +194,6 @@ def perspective(
     """A shaded picture from above a corner, outside the room: for pages, not for scores.
 
     Args:
-        scene: The room.
-        renderer: From `sceneprior.offscreen.open_renderer`.
         image_size: (height, width) in pixels, where no view is given.
         view: None takes the room's own; one view for several rooms lets them be compared.
         colors: Of the objects; None takes those of their classes.

@@ -1,4 +1,4 @@
-"""Score reconstructions from single images: pairs of true and found objects in, figures out."""
+"""Scores of reconstructions from single images, from pairs of a true and a found object."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.metrics.layout_metrics import box_iou_3d
+from sceneprior.evaluation.metrics.decoded_rooms import box_iou_3d
 from sceneprior.evaluation.metrics.mesh_metrics import (
     F_THRESHOLD_M,
     POINTS,
@@ -46,10 +46,7 @@ class PairScore:
 def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairScore:
     """Compare two objects where they stand; an object without a mesh is its box.
 
-    Args:
-        pair: True and found.
-        points: Drawn from each surface, uniformly by area.
-        seed: Of the points; the two surfaces have different ones.
+    `points` are drawn from each surface, uniformly by area, different ones by the same seed.
     """
     truth, found = pair.truth, pair.found
     if found is None:
@@ -83,8 +80,6 @@ def score_views(
 
     Args:
         views: The objects of each image.
-        points: Drawn from each surface.
-        seed: Of the points.
 
     Returns:
         `summary` of all objects, and `classes`: the same of each true class.
@@ -108,23 +103,21 @@ def score_views(
 
 def summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
     """Means over objects; the distances over those for which something was found, else None."""
-    near = [score for score in scores if score.chamfer_l2_m is not None]
-    count = len(scores)
+
+    def mean(name: str) -> float | None:
+        known = [value for score in scores if (value := getattr(score, name)) is not None]
+        return sum(known) / len(known) if known else None
+
     return {
-        "objects": count,
-        "unmatched": count - len(near),
-        "box_iou_3d": sum(score.box_iou_3d for score in scores) / count,
-        "oriented_box_iou_3d": sum(score.oriented_box_iou_3d for score in scores) / count,
-        "chamfer_l2_m": _mean([score.chamfer_l2_m for score in near]),
-        "chamfer_squared_m2": _mean([score.chamfer_squared_m2 for score in near]),
-        "f_score": sum(score.f_score for score in scores) / count,
-        "class_accuracy": sum(score.class_right for score in scores) / count,
+        "objects": len(scores),
+        "unmatched": sum(score.chamfer_l2_m is None for score in scores),
+        "box_iou_3d": mean("box_iou_3d"),
+        "oriented_box_iou_3d": mean("oriented_box_iou_3d"),
+        "chamfer_l2_m": mean("chamfer_l2_m"),
+        "chamfer_squared_m2": mean("chamfer_squared_m2"),
+        "f_score": mean("f_score"),
+        "class_accuracy": mean("class_right"),
     }
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None
 
 
 PROTOCOL = {
@@ -138,4 +131,4 @@ PROTOCOL = {
     "chamfer_squared_m2": "the same of squared distances, in square metres",
     "f_score": f"at {F_THRESHOLD_M} m",
 }
-"""What the figures are, as it stands in result files."""
+"""What the metrics are, as it stands in result files."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sceneprior.config import load_any_run, load_config
 from sceneprior.errors import InputError
-from sceneprior.evaluation.metrics.image_metrics import check_inception
+from sceneprior.evaluation.networks import check_inception
 from sceneprior.experiments.comparison import Comparison, Run, runs_of
 from sceneprior.experiments.figure import write_figure
 from sceneprior.experiments.steps import Step, is_done, open_runner, read_journal, read_result

@@ -1,8 +1,7 @@
-"""A run, or anybody's scenes, in; scores and a report page out."""
+"""Evaluate a run, or a folder of the user's scenes, and write the report page of a run."""
 
 import csv
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +9,11 @@ import torch
 
 from sceneprior.config import load_any_run, run_config
 from sceneprior.errors import InputError
-from sceneprior.evaluation.bootstrap import RESAMPLES
-from sceneprior.evaluation.metrics.layout_metrics import reconstruction_scores
-from sceneprior.evaluation.protocol import evaluate_synthesis, seeded_rows, write_scores
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.evaluation.report import write_report
+from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis, seeded_rows
+from sceneprior.files import write_json
 from sceneprior.generation.decode import decode_latents, decode_training_rooms, synthesize
 from sceneprior.generation.export import load_scene_folder
 from sceneprior.offscreen import open_renderer
@@ -28,39 +27,25 @@ CURVES = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Judging:
-    """How rooms are judged, whoever made them; see `evaluate_synthesis`."""
-
-    inception: Path | None = None
-    alexnet: Path | None = None
-    reference: Path | None = None
-    resamples: int = RESAMPLES
-    renderer: str = "auto"
-    boxes: bool = False
-
-
-def judge_run(
+def evaluate_run(
     run: Path,
     count: int,
-    seed: int,
-    shards: Path | None,
+    options: EvalOptions,
     out: Path,
-    distribution: str | None,
-    judging: Judging,
+    shards: Path | None = None,
+    distribution: str | None = None,
     checkpoint: str = "final",
 ) -> dict[str, Any]:
-    """Score generated rooms against test rooms, and decoded training rooms, in runs that remember
-    them, against the truth.
+    """Score generated rooms against test rooms, and write the scores.
+
+    In runs that remember their training rooms, those are decoded and scored against the truth, too.
 
     Args:
         run: A run's folder, of any kind.
-        count: Rooms to generate.
-        seed: Of their latents, and of everything random in judging.
-        shards: Folder with the test rooms; None takes the run's own.
+        count: Rooms to generate; the options' seed draws their latents, too.
         out: JSON file to write.
-        distribution: Sampling distribution; None takes the config's.
-        judging: How.
+        shards: Folder with the test rooms; None takes the run's own.
+        distribution: Of the latents; None takes the config's.
         checkpoint: `final` or `best`.
 
     Raises:
@@ -70,55 +55,40 @@ def judge_run(
     folder = shards or Path(trained.config.data.shards)
     # First, because other shards than the run's are refused here.
     pairs = decoded_and_true(trained, folder) if trained.remembers_rooms else []
-    scores = _judge(synthesize(trained, count, seed, distribution), folder, seed, judging)
+    generated = synthesize(trained, count, options.seed, distribution)
+    scores = evaluate_synthesis(generated, folder, options)
     if pairs:
         scores |= reconstruction_scores(pairs)
-    scores["protocol"]["run"] = Path(run).resolve().name
-    scores["protocol"]["stage"] = trained.stage
-    scores["protocol"]["checkpoint"] = checkpoint
+    made = {"run": Path(run).resolve().name, "stage": trained.stage, "checkpoint": checkpoint}
     if isinstance(trained, TrainedPrior):
-        scores["protocol"]["sampling_distribution"] = distribution or trained.distribution
-    write_scores(scores, out)
+        made["sampling_distribution"] = distribution or trained.distribution
+    scores["protocol"] |= made
+    write_json(out, scores)
     return scores
 
 
-def judge_folder(
-    folder: Path, count: int | None, seed: int, shards: Path, out: Path, judging: Judging
+def evaluate_folder(
+    folder: Path, count: int | None, options: EvalOptions, out: Path, shards: Path
 ) -> dict[str, Any]:
-    """Score anybody's scenes against test rooms.
+    """Score the user's scenes, of any method, against test rooms, and write the scores.
 
     Args:
         folder: Scene JSONs (docs/conventions.md), perhaps with the GLBs of their meshes.
-        count: At most so many of them, drawn by `seed`; None takes all.
-        seed: Of everything random.
-        shards: Folder with the test rooms.
+        count: At most so many of them, drawn by the options' seed; None takes all.
         out: JSON file to write.
-        judging: How.
+        shards: Folder with the test rooms.
 
     Raises:
         InputError: the scenes, the shards or a file of weights cannot be used.
     """
     scenes = load_scene_folder(folder)
-    rows = seeded_rows(len(scenes), count or len(scenes), seed)
-    scores = _judge([scenes[row] for row in rows], shards, seed, judging)
-    scores["protocol"]["scenes"] = Path(folder).resolve().name
-    scores["protocol"]["n_scenes_available"] = len(scenes)
-    write_scores(scores, out)
+    rows = seeded_rows(len(scenes), count or len(scenes), options.seed)
+    scores = evaluate_synthesis([scenes[row] for row in rows], shards, options)
+    scores["protocol"] |= {
+        "scenes": Path(folder).resolve().name, "n_scenes_available": len(scenes)
+    }  # fmt: skip
+    write_json(out, scores)
     return scores
-
-
-def _judge(scenes: list[Scene], shards: Path, seed: int, judging: Judging) -> dict[str, Any]:
-    return evaluate_synthesis(
-        scenes,
-        shards,
-        inception=judging.inception,
-        alexnet=judging.alexnet,
-        seed=seed,
-        resamples=judging.resamples,
-        renderer=open_renderer(judging.renderer),
-        reference=judging.reference,
-        boxes=judging.boxes,
-    )
 
 
 def decoded_and_true(
@@ -126,7 +96,7 @@ def decoded_and_true(
 ) -> list[tuple[Scene, Scene]]:
     """Training rooms as decoded, each with what training never saw: the room in 3D.
 
-    Only tracked objects count: what no camera saw, nobody can know. Turned copies of a room
+    Only tracked objects count: what no camera saw cannot be known. Turned copies of a room
     are left out. `meshes` are for pictures; scores of boxes need none of the true ones.
     """
     real = reference_scenes(shards, "train", tracked_only=True, meshes=meshes)
@@ -157,7 +127,7 @@ def report_run(
     """
     trained = load_any_run(run, checkpoint)
     try:
-        figures = json.loads(scores.read_text())
+        found = json.loads(scores.read_text())
     except (OSError, ValueError) as error:
         raise InputError(
             f"{scores} holds no scores ({error}); write them with "
@@ -176,7 +146,7 @@ def report_run(
         shards=shards,
         run=run,
         generated=synthesize(trained, 8, seed),
-        scores=figures,
+        scores=found,
         commands=commands,
         curves=read_curves(run),
         decoded=decoded,

@@ -1,4 +1,4 @@
-"""A prior in training in; scores of what it generates, and a picture, out."""
+"""Evaluate a prior in training: scores and a picture of the rooms that it generates."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,14 +13,14 @@ from torch import Tensor
 from sceneprior.classes import VOID, label_set
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError, ShardError
-from sceneprior.evaluation.metrics.layout_metrics import (
+from sceneprior.evaluation.metrics.contents import (
     TYPE_CLASSES,
     class_frequencies,
     frequency_kl,
     object_counts,
-    overlap_pairs,
     type_share,
 )
+from sceneprior.evaluation.metrics.overlaps import overlap_pairs
 from sceneprior.evaluation.topdown import topdown, topdown_protocol
 from sceneprior.generation.decode import decode_latents, synthesize
 from sceneprior.generation.sample import sample_latents
@@ -46,7 +46,7 @@ VIEWS = 4
 
 
 class SampleEvaluator:
-    """Look at a prior in training: see `SampleMonitor`, which calls it, and `SamplesConfig`.
+    """Evaluate a prior in training; `SampleMonitor` calls it as `SamplesConfig` says.
 
     The scores, of `samples.count` rooms generated from always the same seed:
 
@@ -62,10 +62,7 @@ class SampleEvaluator:
     - `mask_iou`: of a few decoded training rooms, mean over the objects that their views see;
       hard masks of what is in front, in the layout stage of the undeformed template
 
-    Compared rooms count what cameras saw of them: a look never reads ground truth in 3D.
-
-    Args:
-        config: The run's.
+    Compared rooms count what cameras saw of them: ground truth in 3D is never read.
 
     Raises:
         InputError: `samples.metric` does not exist for the run's label set or stages.
@@ -197,7 +194,7 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
 
 def tile(scenes: Sequence[Scene]) -> UInt8[np.ndarray, "height width 3"]:
     """Rooms from straight above in rows of four, coloured by class."""
-    # Our own z-buffer: a look must not open GL in a process that trains on the GPU.
+    # Our own z-buffer: GL must not be opened in a process that trains on the GPU.
     renderer = SoftwareRenderer()
     rows = -(-len(scenes) // COLUMNS)
     picture = np.full((rows * TILE_PX, COLUMNS * TILE_PX, 3), 255, dtype=np.uint8)

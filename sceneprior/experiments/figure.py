@@ -8,9 +8,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.config import load_any_run
+from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.independent import independent_rooms
-from sceneprior.evaluation.protocol import without_void
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.synthesis import without_void
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.experiments.comparison import Comparison, Run
 from sceneprior.files import write_whole

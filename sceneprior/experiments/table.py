@@ -1,13 +1,15 @@
-"""Scores of many runs in; one table as Markdown, CSV and LaTeX out."""
+"""The table of a comparison, as Markdown, CSV and LaTeX, from the scores of its runs."""
 
 import csv
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from sceneprior.evaluation.metric import ARROWS, TableColumn
+from sceneprior.evaluation.registry import DECODED, METRICS
 from sceneprior.files import write_whole
 
 REFERENCES = {
@@ -15,7 +17,7 @@ REFERENCES = {
     "Independent objects, with meshes": "independent_meshes",
     "Real training rooms": "train_rooms",
 }
-"""Rows that need no training: (title, where a result keeps their figures)."""
+"""Rows that need no training: (title, where a result keeps their values)."""
 GAP = "–"
 
 
@@ -31,44 +33,20 @@ class Row:
     costs: dict[str, float | None]
 
 
-@dataclass(frozen=True)
-class Column:
-    """A figure of the table."""
-
-    title: str
-    key: str
-    digits: int
-    cost: bool = False
-    scale: float = 1.0
-
-
-COLUMNS = (
-    Column("FID ↓", "fid", 1),
-    Column("FD ↓", "fd_effnet_lite0", 1),
-    Column("gap closed ↑", "gap_closed_effnet_lite0_meshes", 2),
-    Column("FD, boxes ↓", "fd_effnet_lite0_boxes", 1),
-    Column("gap closed, boxes ↑", "gap_closed_effnet_lite0_boxes", 2),
-    Column("recall ↑", "recall_effnet_lite0", 2),
-    Column("SCA → 0.5", "sca_effnet_lite0", 2),
-    Column("category KL ↓", "category_kl", 3),
-    Column("objects", "mean_objects", 2),
-    Column("type ↑", "type_share", 2),
-    Column("overlaps ↓", "overlap_pairs", 2),
-    Column("nearest training room (m)", "nearest_training_m", 2),
-    Column("train box IoU ↑", "box_iou_3d", 2),
-    Column("steps", "steps", 0, cost=True),
-    Column("CPU min", "cpu_s", 1, cost=True, scale=1 / 60),
-    Column("parameters (M)", "parameters", 2, cost=True, scale=1e-6),
-)
+COSTS = {
+    "steps": (TableColumn("steps", 0), 1.0),
+    "cpu_s": (TableColumn("CPU min", 1), 1 / 60),
+    "parameters": (TableColumn("parameters (M)", 2), 1e-6),
+}
+"""Columns of what training took, and the factor from the journal's units."""
+COLUMNS = {
+    **{m.key: (replace(m.column, title=m.column.title + ARROWS[m.direction]), 1.0)
+       for m in (*METRICS, *DECODED) if m.column},
+    **COSTS,
+}  # fmt: skip
 CAPTION = (
-    "FD: Frechet distance of EfficientNet-Lite0 features, which is not FID; gap closed: share of "
-    "the way from independent objects with meshes to real training rooms, in FD; boxes: the same, "
-    "all rooms drawn as boxes, so that layouts alone count; recall: share of test rooms that lie "
-    "among the pictures of the row; SCA: accuracy of a classifier that tells generated from test "
-    "rooms; type: rooms that hold the furniture their type needs; overlaps: intersecting pairs a "
-    "room; nearest training room: how far, on average; near 0 a method has learnt them by heart; "
-    "train box IoU: decoded training rooms against the truth. A figure of several seeds is their "
-    "mean ± half their range."
+    "; ".join(column.note for column, _ in COLUMNS.values() if column.note)
+    + ". A value of several seeds is their mean ± half their range."
 )
 
 
@@ -85,11 +63,11 @@ def markdown(rows: Sequence[Row]) -> str:
     for rooms, own in _by(rows, lambda row: row.rooms).items():
         columns = _columns(own)
         lines = [f"### {rooms}", "", _say(own), ""]
-        lines.append("| method | " + " | ".join(column.title for column in columns) + " |")
+        lines.append("| method | " + " | ".join(COLUMNS[key][0].title for key in columns) + " |")
         lines.append("| --- |" + " ---: |" * len(columns))
-        for group, cells in _body(own, columns):
+        for cells in _body(own, columns):
             if len(cells) == 1:
-                lines.append(f"| *{group}* |" + " |" * len(columns))
+                lines.append(f"| *{cells[0]}* |" + " |" * len(columns))
             else:
                 lines.append("| " + " | ".join(cells) + " |")
         parts.append("\n".join(lines))
@@ -105,67 +83,60 @@ def latex(rows: Sequence[Row]) -> str:
             f"% {rooms}: {_say(own)}",
             r"\begin{tabular}{l" + "r" * len(columns) + "}",
             r"\toprule",
-            " & ".join(["method", *(_tex(column.title) for column in columns)]) + r" \\",
+            " & ".join(["method", *(_tex(COLUMNS[key][0].title) for key in columns)]) + r" \\",
         ]
-        for group, cells in _body(own, columns):
-            if len(cells) == 1:
-                lines.append(
-                    rf"\midrule \multicolumn{{{len(columns) + 1}}}{{l}}"
-                    rf"{{\emph{{{_tex(group)}}}}} \\"
-                )
+        for first, *cells in ([_tex(cell) for cell in line] for line in _body(own, columns)):
+            if cells:
+                lines.append(" & ".join([first, *cells]) + r" \\")
             else:
-                lines.append(" & ".join(_tex(cell) for cell in cells) + r" \\")
+                width = len(columns) + 1
+                lines.append(rf"\midrule \multicolumn{{{width}}}{{l}}{{\emph{{{first}}}}} \\")
         parts.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))
     return "\n\n".join([*parts, "% " + _tex(CAPTION)]) + "\n"
 
 
 def as_csv(rows: Sequence[Row]) -> str:
-    """A line a run, figures in full."""
+    """A line a run, numbers in full."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    keys = [column.key for column in COLUMNS]
-    writer.writerow(["rooms", "group", "method", "seed", *keys])
+    writer.writerow(["rooms", "group", "method", "seed", *COLUMNS])
     for row in rows:
-        values = [row.costs.get(key) if key in row.costs else row.scores.get(key) for key in keys]
+        values = [_value(row, key) for key in COLUMNS]
         told = ["" if value is None else repr(value) for value in values]
         writer.writerow([row.rooms, row.group, row.title, row.seed, *told])
     return text.getvalue()
 
 
-def _columns(rows: Sequence[Row]) -> list[Column]:
-    return [column for column in COLUMNS if any(_value(row, column) is not None for row in rows)]
+def _columns(rows: Sequence[Row]) -> list[str]:
+    return [key for key in COLUMNS if any(_value(row, key) is not None for row in rows)]
 
 
-def _body(rows: Sequence[Row], columns: Sequence[Column]) -> list[tuple[str, list[str]]]:
-    """(group, cells) of each line; the line of a group's own heading has one cell."""
-    lines: list[tuple[str, list[str]]] = [("reference", ["reference"])]
-    for title, column in REFERENCES.items():
-        lines.append(("reference", [title, *(_reference(rows[0], column, c) for c in columns)]))
+def _body(rows: Sequence[Row], columns: Sequence[str]) -> list[list[str]]:
+    """The cells of each line; the line of a group's own heading has one cell."""
+    lines = [["reference"]]
+    for title, name in REFERENCES.items():
+        values = rows[0].scores.get(name, {})
+        lines.append([title, *(_cell([values.get(key)], key) for key in columns)])
     for group, members in _by(rows, lambda row: row.group).items():
-        lines.append((group, [group]))
+        lines.append([group])
         for title, runs in _by(members, lambda row: row.title).items():
-            lines.append((group, [title, *(_cell(runs, column) for column in columns)]))
+            lines.append([title, *(_cell([_value(r, key) for r in runs], key) for key in columns)])
     return lines
 
 
-def _reference(row: Row, where: str, column: Column) -> str:
-    value = None if column.cost else row.scores.get(where, {}).get(column.key)
-    return GAP if value is None else f"{value * column.scale:.{column.digits}f}"
+def _value(row: Row, key: str) -> float | None:
+    return (row.costs if key in COSTS else row.scores).get(key)
 
 
-def _cell(runs: Sequence[Row], column: Column) -> str:
-    values = [value for run in runs if (value := _value(run, column)) is not None]
+def _cell(found: Sequence[float | None], key: str) -> str:
+    column, scale = COLUMNS[key]
+    values = [float(value) * scale for value in found if value is not None]
     if not values:
         return GAP
     middle = f"{mean(values):,.{column.digits}f}"
-    if len(values) == 1 or column.cost:
+    if len(values) == 1 or key in COSTS:
         return middle
     return f"{middle} ± {(max(values) - min(values)) / 2:.{column.digits}f}"
-
-
-def _value(row: Row, column: Column) -> float | None:
-    value = (row.costs if column.cost else row.scores).get(column.key)
-    return None if value is None else float(value) * column.scale
 
 
 def _say(rows: Sequence[Row]) -> str:

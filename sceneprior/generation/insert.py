@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from sceneprior.evaluation.metrics.layout_metrics import match_scenes, shared_of_smaller
+from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
+from sceneprior.evaluation.metrics.overlaps import shared_of_smaller
 from sceneprior.scene import Mesh, Scene, SceneObject
 
 BADLY = 0.25

@@ -12,7 +12,6 @@ from sceneprior.losses.matching import Matches
 from sceneprior.losses.shape import mask_loss
 from sceneprior.reconstruction.image import rows_of
 from sceneprior.training.method import TrainedPrior
-from sceneprior.training.ours import OursConfig
 from sceneprior.training.objective import (
     check_finite,
     match_and_score,
@@ -20,6 +19,7 @@ from sceneprior.training.objective import (
     seen_masks,
     weighted_sum,
 )
+from sceneprior.training.ours import OursConfig
 from sceneprior.views import DecodedScenes, SceneViews
 
 CHECK_EVERY = 20

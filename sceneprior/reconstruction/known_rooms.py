@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
-from sceneprior.evaluation.reference import reference_scene
+from sceneprior.evaluation.ground_truth import reference_scene
 from sceneprior.evaluation.topdown import scene_meshes
 from sceneprior.geometry.cameras import boxes_of_points
 from sceneprior.geometry.corners import box_corners

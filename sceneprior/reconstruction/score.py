@@ -11,8 +11,8 @@ from rich.table import Table
 
 from sceneprior.config import load_run
 from sceneprior.errors import InputError
+from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.mesh_metrics import POINTS
-from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.score_table import wide_console
 from sceneprior.evaluation.view_scores import PROTOCOL, ObjectPair, score_views
 from sceneprior.generation.export import load_scene_folder

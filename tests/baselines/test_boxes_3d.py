@@ -18,8 +18,8 @@ from sceneprior.baselines.sync2gen.stage import Sync2genStage
 from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.config import load_any_run, load_run
 from sceneprior.errors import ConfigError, InputError
-from sceneprior.evaluation.protocol import without_void
-from sceneprior.experiments.evaluate import Judging, judge_run, read_curves, report_run
+from sceneprior.evaluation.synthesis import EvalOptions
+from sceneprior.experiments.evaluate import evaluate_run, read_curves, report_run
 from sceneprior.experiments.evaluate_samples import SampleEvaluator
 from sceneprior.generation.decode import decode_training_rooms, synthesize
 from sceneprior.training import fit as train
@@ -226,9 +226,8 @@ def test_what_needs_a_latent_space_says_that_there_is_none(run, stage):
 
 
 def test_a_run_is_judged_and_reported(run, stage, tmp_path):
-    scores = judge_run(
-        run, 4, 0, None, tmp_path / "scores.json", None, Judging(renderer="software")
-    )
+    options = EvalOptions(renderer="software")
+    scores = evaluate_run(run, 4, options, tmp_path / "scores.json")
     assert (
         scores["protocol"]["stage"] == stage and "sampling_distribution" not in scores["protocol"]
     )

@@ -1,10 +1,15 @@
-"""Intervals: that they cover what they claim, and sit where the figure is."""
+"""Intervals: that they cover what they claim, and sit where the estimate is."""
 
 import numpy as np
 import pytest
 
-from sceneprior.evaluation.bootstrap import COVERAGE, Figure, ratio, resample_counts
-from sceneprior.evaluation.metrics.set_metrics import frechet_distance
+from sceneprior.evaluation.bootstrap import (
+    COVERAGE,
+    Estimate,
+    ratio,
+    resample_counts,
+)
+from sceneprior.evaluation.metrics.frechet import frechet_distance
 
 
 def test_every_resample_has_as_many_rooms_and_seeds_repeat():
@@ -34,30 +39,30 @@ def test_the_interval_of_a_mean_is_as_wide_as_theory_says(rng):
 
 def test_the_interval_of_a_distance_holds_the_distance_though_no_resample_does(rng):
     a, b = rng.normal(size=(30, 50)), rng.normal(size=(30, 50))
-    draws = np.array(
+    resamples = np.array(
         [
             frechet_distance(a, b, x, y)
             for x, y in zip(resample_counts(30, 60, 1), resample_counts(30, 60, 2), strict=True)
         ]
     )
     value = frechet_distance(a, b)
-    assert draws.min() > value  # repeated rooms: fewer different ones, farther apart
-    low, high = Figure(value, draws, 0.0).interval()
+    assert resamples.min() > value  # repeated rooms: fewer different ones, farther apart
+    low, high = Estimate(value, resamples, 0.0).interval()
     assert low < value < high
-    assert high - low == pytest.approx(np.diff(np.quantile(draws, [0.025, 0.975]))[0])
+    assert high - low == pytest.approx(np.diff(np.quantile(resamples, [0.025, 0.975]))[0])
 
 
 def test_ratios_leave_out_what_weighs_nothing_and_stay_in_their_range():
     counts = np.array([[2, 0, 0], [0, 0, 2], [1, 1, 0]])
-    figure = ratio(np.array([1.0, 0.0, 9.0]), np.array([1.0, 1.0, 0.0]), counts, 1.0)
-    assert figure.value == 5.0  # what weighs nothing should bring nothing
-    figure = ratio(np.array([1.0, 0.0, 0.0]), np.array([1.0, 1.0, 0.0]), counts, 1.0)
-    assert figure.value == 0.5 and figure.draws.tolist() == [1.0, 0.5]
-    assert figure.interval() == pytest.approx([0.2625, 0.7375])
-    assert Figure(0.9, np.array([0.0, 1.0]), 0.0, 1.0).interval() == pytest.approx([0.425, 1.0])
+    estimate = ratio(np.array([1.0, 0.0, 9.0]), np.array([1.0, 1.0, 0.0]), counts, 1.0)
+    assert estimate.value == 5.0  # what weighs nothing should bring nothing
+    estimate = ratio(np.array([1.0, 0.0, 0.0]), np.array([1.0, 1.0, 0.0]), counts, 1.0)
+    assert estimate.value == 0.5 and estimate.resamples.tolist() == [1.0, 0.5]
+    assert estimate.interval() == pytest.approx([0.2625, 0.7375])
+    assert Estimate(0.9, np.array([0.0, 1.0]), 0.0, 1.0).interval() == pytest.approx([0.425, 1.0])
 
 
-def test_nothing_to_weigh_is_no_figure_and_no_nan():
+def test_nothing_to_weigh_is_no_estimate_and_no_nan():
     nothing = ratio(np.zeros(3), np.zeros(3), resample_counts(3, 9, 0))
     assert nothing.value is None and nothing.interval() is None
-    assert Figure(1.0, np.zeros(0)).interval() is None
+    assert Estimate(1.0, np.zeros(0)).interval() is None

@@ -5,7 +5,7 @@ import pytest
 
 from sceneprior.errors import InputError
 from sceneprior.evaluation.independent import independent_rooms
-from sceneprior.evaluation.metrics.layout_metrics import class_frequencies, object_counts
+from sceneprior.evaluation.metrics.contents import class_frequencies, object_counts
 from sceneprior.scene import Mesh, Scene, SceneObject
 
 MESH = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))

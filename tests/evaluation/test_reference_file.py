@@ -8,12 +8,12 @@ import pytest
 
 from sceneprior.errors import InputError
 from sceneprior.evaluation import reference_file
-from sceneprior.evaluation.protocol import evaluate_synthesis
-from sceneprior.evaluation.reference import (
+from sceneprior.evaluation.ground_truth import (
     reference_scenes,
     split_fingerprint,
     stream_scenes,
 )
+from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.scene import Scene
 from sceneprior.shards import write_shard
 
@@ -26,21 +26,25 @@ def generated(shards) -> list[Scene]:
 @pytest.fixture(scope="module")
 def stored(shards, renderer, generated, tmp_path_factory) -> tuple[Path, dict]:
     path = tmp_path_factory.mktemp("reference") / "new" / "reference.npz"
-    scores = evaluate_synthesis(generated, shards, seed=1, renderer=renderer, reference=path)
+    scores = evaluate_synthesis(
+        generated, shards, EvalOptions(seed=1, renderer=renderer, reference=path)
+    )
     assert [item.name for item in path.parent.iterdir()] == ["reference.npz"]
     return path, scores
 
 
 def score(generated, shards, renderer, path, **options):
     return evaluate_synthesis(
-        generated, shards, renderer=renderer, reference=path, resamples=0, **options
+        generated, shards, EvalOptions(renderer=renderer, reference=path, resamples=0, **options)
     )
 
 
 def test_with_and_without_a_file_scores_are_the_same(stored, shards, renderer, generated):
     path, first = stored
-    assert first == evaluate_synthesis(generated, shards, seed=1, renderer=renderer)
-    assert first == evaluate_synthesis(generated, shards, seed=1, renderer=renderer, reference=path)
+    assert first == evaluate_synthesis(generated, shards, EvalOptions(seed=1, renderer=renderer))
+    assert first == evaluate_synthesis(
+        generated, shards, EvalOptions(seed=1, renderer=renderer, reference=path)
+    )
 
 
 def test_any_choice_of_training_rooms_is_in_it_and_nothing_real_is_drawn_again(

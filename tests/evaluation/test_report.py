@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 
 from sceneprior.classes import class_colors
-from sceneprior.evaluation.protocol import evaluate_synthesis
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.report import UNFOLDING_SHOWN, _spread, write_report
 from sceneprior.evaluation.report_pictures import curves_svg, input_views, legend, room_pictures
+from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.scene import Scene, SceneObject
 
 
@@ -28,7 +28,7 @@ def generated(shards) -> list[Scene]:
 def page(shards, renderer, generated, tmp_path_factory) -> str:
     path = tmp_path_factory.mktemp("report") / "new" / "report.html"
     truth = reference_scenes(shards, "train", limit=2, tracked_only=True)
-    scores = evaluate_synthesis(generated, shards, renderer=renderer)
+    scores = evaluate_synthesis(generated, shards, EvalOptions(renderer=renderer))
     scores |= {"class_accuracy": 0.991, "box_iou_3d": 0.74, "seconds": 600.0}
     write_report(
         path,

@@ -68,7 +68,7 @@ def test_every_object_weighs_the_same_and_nothing_found_is_no_number():
     assert scores["classes"]["desk"]["box_iou_3d"] == pytest.approx(0.5)
 
 
-def test_the_same_seed_gives_the_same_figures():
+def test_the_same_seed_gives_the_same_scores():
     views = [[ObjectPair(DESK, moved(DESK, 0.2))]]
     assert score_views(views, 200, 3) == score_views(views, 200, 3)
     assert score_views(views, 200, 3) != score_views(views, 200, 4)

@@ -1,4 +1,4 @@
-"""Looks at a prior in training, by hand: what is scored, against whom, and what is drawn."""
+"""Evaluation of a prior in training: what is scored, against which rooms, and what is drawn."""
 
 import shutil
 from dataclasses import replace
@@ -11,8 +11,9 @@ from tiny_runs import tiny_config
 from sceneprior.classes import class_colors, label_set
 from sceneprior.config import load_run
 from sceneprior.errors import InputError
-from sceneprior.evaluation.metrics.layout_metrics import category_kl, object_counts, overlap_pairs
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.evaluation.metrics.contents import category_kl, object_counts
+from sceneprior.evaluation.metrics.overlaps import overlap_pairs
 from sceneprior.evaluation.topdown import box_mesh
 from sceneprior.experiments.evaluate_samples import (
     TILE_PX,
@@ -30,23 +31,23 @@ def trained(toy_run):
     return load_run(toy_run)
 
 
-def test_a_look_scores_what_eval_would_score(trained, toy_shards):
+def test_samples_score_what_eval_would_score(trained, toy_shards):
     config = tiny_config(toy_shards, samples={"every": 1, "count": 12, "seed": 7})
-    verdict = SampleEvaluator(config)(trained)
+    result = SampleEvaluator(config)(trained)
     generated = synthesize(trained, 12, 7)
     tracked = reference_scenes(toy_shards, "test", tracked_only=True)
-    assert verdict.against == "test"
+    assert result.against == "test"
     counts, wanted = object_counts(generated).mean(), object_counts(tracked).mean()
-    assert verdict.scores["category_kl"] == pytest.approx(category_kl(generated, tracked))
-    assert verdict.scores["objects"] == counts
-    assert verdict.scores["objects_off"] == pytest.approx(abs(counts - wanted) / wanted)
-    assert verdict.scores["overlaps"] == overlap_pairs(generated).per_room
+    assert result.scores["category_kl"] == pytest.approx(category_kl(generated, tracked))
+    assert result.scores["objects"] == counts
+    assert result.scores["objects_off"] == pytest.approx(abs(counts - wanted) / wanted)
+    assert result.scores["overlaps"] == overlap_pairs(generated).per_room
     decoded = overlap_pairs(decode_training_rooms(trained)).per_room
-    assert verdict.scores["overlaps_decoded"] == decoded
-    assert 0 <= verdict.scores["mask_iou"] <= 1
-    assert verdict.picture.shape == (3 * TILE_PX, 4 * TILE_PX, 3)
+    assert result.scores["overlaps_decoded"] == decoded
+    assert 0 < result.scores["mask_iou"] < 1
+    assert result.picture.shape == (3 * TILE_PX, 4 * TILE_PX, 3)
     again = SampleEvaluator(config)(trained)
-    assert again.scores == verdict.scores and np.array_equal(again.picture, verdict.picture)
+    assert again.scores == result.scores and np.array_equal(again.picture, result.picture)
 
 
 def test_training_rooms_stand_in_where_there_are_no_test_rooms(trained, toy_shards, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.offscreen import open_renderer
 from sceneprior.reconstruction.image import images_of_split
 from sceneprior.reconstruction.known_rooms import (

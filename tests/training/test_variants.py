@@ -10,12 +10,12 @@ from torch.testing import assert_close
 
 from sceneprior.baselines.lstm import SceneLstm
 from sceneprior.config import Model, load_run
-from sceneprior.evaluation.metrics.layout_metrics import match_scenes
+from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
+from sceneprior.evaluation.synthesis import EvalOptions
 from sceneprior.experiments.evaluate import (
     UNFOLDING_STEPS,
-    Judging,
     decoded_and_true,
-    judge_run,
+    evaluate_run,
     read_curves,
     unfold,
 )
@@ -135,7 +135,7 @@ def test_a_variant_is_judged(toy_shards, tmp_path, name):
     changes = {**FAST, **VARIANTS[name], "layout__epochs": 1, "shape__epochs": 1}
     run = tmp_path / "run"
     fit(tiny_config(toy_shards, **changes), run, trainer_options=CPU)
-    scores = judge_run(run, 4, 0, None, run / "scores.json", None, Judging(renderer="software"))
+    scores = evaluate_run(run, 4, EvalOptions(renderer="software"), run / "scores.json")
     assert scores["protocol"]["stage"] == "shape"
     matches = [match_scenes(*pair) for pair in decoded_and_true(load_run(run), toy_shards)]
     overlap = sum(match.iou.sum() for match in matches) / sum(m.truth_count for m in matches)

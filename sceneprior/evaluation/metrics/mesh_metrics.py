@@ -70,7 +70,7 @@ class OrientedBoxes(NamedTuple):
 def oriented_boxes(meshes: Sequence[Mesh]) -> OrientedBoxes:
     """The tightest upright box around each mesh: over the footprint's rectangle of least area.
 
-    Which side is the front, nobody knows of a mesh alone, and no IoU asks: yaw is in [0, pi / 2).
+    A mesh alone does not say which side is its front, and no IoU asks: yaw is in [0, pi / 2).
     A mesh that is an upright box has that box.
     """
     rows = [_tightest(np.asarray(mesh.vertices_m, dtype=np.float64)) for mesh in meshes]
@@ -99,7 +99,7 @@ def _tightest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 def oriented_box_iou_3d(a: OrientedBoxes, b: OrientedBoxes) -> Float[np.ndarray, "n m"]:
     """Intersection over union of every box a with every box b: shared footprint x shared height.
 
-    Two boxes without volume have IoU 0. At yaw 0 this is `box_iou_3d` of layout_metrics.
+    Two boxes without volume have IoU 0. At yaw 0 this is `box_iou_3d` of decoded_rooms.
 
     Example: a cube and the same cube turned by 45 degrees share a regular octagon.
 

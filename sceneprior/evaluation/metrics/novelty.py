@@ -1,4 +1,4 @@
-"""How new a room is: layouts in, the distance of each to its nearest training room out."""
+"""How new a room is: the distance of its layout to the nearest training room."""
 
 from collections.abc import Sequence
 
@@ -7,6 +7,8 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
+from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms
+from sceneprior.evaluation.metric import Comparison, Metric, RoomSet, TableColumn
 from sceneprior.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.scene import Scene
 
@@ -61,7 +63,6 @@ def nearest_distances(
     ruled out by what each object would cost if it could choose freely.
 
     Args:
-        scenes: Rooms to judge.
         training: Every training room; at least one beside the room's own.
         own: Where the scenes are training rooms: the row of each, which is passed over.
     """
@@ -106,3 +107,33 @@ def _lower_bounds(costs: np.ndarray, starts: np.ndarray, counts: np.ndarray) -> 
     )
     # A hair lower: sums in another order must not rule out an equally near room.
     return np.asarray(least / np.maximum(np.maximum(counts, mine), 1) - 1e-12)
+
+
+def _nearest(rooms: RoomSet, comparison: Comparison) -> Estimate:
+    return mean_of_rooms(rooms.nearest_training_m, rooms.counts)
+
+
+def _near_copies(rooms: RoomSet, comparison: Comparison) -> Estimate:
+    return mean_of_rooms(rooms.nearest_training_m < NEAR_COPY_M, rooms.counts, 1.0)
+
+
+METRICS = (
+    Metric(
+        "nearest_training_m", "Distance to the nearest training room", "mean, metres", "none",
+        "Novelty: mean layout distance (below) to the nearest of all training rooms; a training "
+        "room passes itself over.",
+        _nearest,
+        protocol={
+            "nearest_training_m": f"boxes paired within classes, {MISSING_M} m for a missing one, "
+            f"four quarter turns; near copies: under {NEAR_COPY_M} m"
+        },
+        column=TableColumn(
+            "nearest training room (m)", 2,
+            "nearest training room: how far, on average; near 0 a method has learnt them by heart",
+        ),
+    ),
+    Metric(
+        "near_copy_share", "Near copies of a training room", "share of rooms", "lower",
+        "Rooms nearer than 0.15 m to a training room.", _near_copies,
+    ),
+)  # fmt: skip

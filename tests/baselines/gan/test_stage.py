@@ -18,8 +18,8 @@ from sceneprior.cli import app
 from sceneprior.config import check_config, load_run
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
-from sceneprior.evaluation.protocol import without_void
-from sceneprior.experiments.evaluate import Judging, judge_run, read_curves, report_run
+from sceneprior.evaluation.synthesis import EvalOptions
+from sceneprior.experiments.evaluate import evaluate_run, read_curves, report_run
 from sceneprior.experiments.evaluate_samples import SampleEvaluator
 from sceneprior.generation.decode import decode_training_rooms, synthesize
 from sceneprior.generation.sample import read_latent
@@ -167,9 +167,8 @@ def test_what_needs_latents_of_rooms_says_that_a_gan_has_none(gan_run):
 
 
 def test_a_gan_is_judged_and_reported_by_its_new_rooms_alone(gan_run, tmp_path):
-    scores = judge_run(
-        gan_run, 4, 0, None, tmp_path / "scores.json", None, Judging(renderer="software")
-    )
+    options = EvalOptions(renderer="software")
+    scores = evaluate_run(gan_run, 4, options, tmp_path / "scores.json")
     assert (
         scores["protocol"]["stage"] == "gan"
         and scores["protocol"]["sampling_distribution"] == "paper"

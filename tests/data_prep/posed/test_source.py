@@ -20,7 +20,7 @@ from data_prep.posed.source import PosedSource, find_rooms
 from data_prep.posed.views import PosedSettings
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.ground_truth import reference_scenes
 
 SET = "void,bed,chair"
 

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial.distance import cdist
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.metrics.layout_metrics import box_iou_3d
+from sceneprior.evaluation.metrics.decoded_rooms import box_iou_3d
 from sceneprior.evaluation.metrics.mesh_metrics import (
     OrientedBoxes,
     f_score,

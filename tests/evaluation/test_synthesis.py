@@ -11,20 +11,23 @@ import torch
 from rich.console import Console
 
 from sceneprior.errors import InputError, ShardError
-from sceneprior.evaluation import figures, protocol
+from sceneprior.evaluation import synthesis
+from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.independent import independent_rooms
-from sceneprior.evaluation.metrics.layout_metrics import category_kl
-from sceneprior.evaluation.metrics.set_metrics import frechet_distance, gap_closed
-from sceneprior.evaluation.protocol import (
+from sceneprior.evaluation.metrics import classifier
+from sceneprior.evaluation.metrics.contents import category_kl
+from sceneprior.evaluation.metrics.frechet import frechet_distance, gap_closed
+from sceneprior.evaluation.protocol import drawing_of
+from sceneprior.evaluation.registry import METRICS
+from sceneprior.evaluation.score_table import print_scores, score_rows
+from sceneprior.evaluation.synthesis import (
+    EvalOptions,
     evaluate_synthesis,
     seeded_rows,
     without_void,
-    write_scores,
 )
-from sceneprior.evaluation.reference import reference_scenes
-from sceneprior.evaluation.score_table import SCORE_ROWS, print_scores, score_rows
-from sceneprior.evaluation.stated_protocol import drawing_of
 from sceneprior.evaluation.topdown import topdown
+from sceneprior.files import write_json
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Mesh, Scene, SceneObject
 
@@ -38,7 +41,8 @@ def generated(shards) -> list[Scene]:
 @pytest.fixture(scope="module")
 def result(generated, shards, renderer, tmp_path_factory):
     out = tmp_path_factory.mktemp("scores") / "new" / "scores.json"
-    scores = evaluate_synthesis(generated, shards, seed=1, renderer=renderer, out=out)
+    scores = evaluate_synthesis(generated, shards, EvalOptions(seed=1, renderer=renderer))
+    write_json(out, scores)
     return scores, out
 
 
@@ -53,7 +57,7 @@ AGAINST = {
 }  # fmt: skip
 
 
-def test_every_figure_stands_beside_that_of_real_rooms(result, generated, shards):
+def test_every_metric_stands_beside_that_of_real_rooms(result, generated, shards):
     scores, _ = result
     assert scores["mean_objects"] == 2 and scores["mean_objects_test"] == 3
     assert scores["type_share"] == scores["type_share_test"] == 1
@@ -67,11 +71,11 @@ def test_every_figure_stands_beside_that_of_real_rooms(result, generated, shards
     # The same layouts: only their pictures differ.
     assert set(scores["independent_meshes"]) == AGAINST - {"category_kl"}
     assert {key for key in scores if key.endswith("_test")} == {f"{key}_test" for key in ALONE}
-    assert beside < {key for key, *_ in SCORE_ROWS}
+    assert beside < {metric.key for metric in METRICS}
     assert scores["train_rooms"]["category_kl"] == pytest.approx(0, abs=1e-12)
 
 
-def test_the_protocol_says_all_that_the_figures_depend_on(result, shards, renderer):
+def test_the_protocol_says_all_that_the_metrics_depend_on(result, shards, renderer):
     scores, out = result
     said = scores["protocol"]
     counts = {key: said[key] for key in said if key.startswith("n_")}
@@ -95,12 +99,14 @@ def test_the_protocol_says_all_that_the_figures_depend_on(result, shards, render
 
 
 def test_the_same_rooms_score_the_same(result, generated, shards, renderer):
-    again = evaluate_synthesis(generated, shards, seed=1, renderer=renderer)
+    again = evaluate_synthesis(generated, shards, EvalOptions(seed=1, renderer=renderer))
     assert again == result[0]
 
 
 def test_test_rooms_against_themselves_are_at_distance_zero(shards, renderer):
-    scores = evaluate_synthesis(reference_scenes(shards, "test"), shards, renderer=renderer)
+    scores = evaluate_synthesis(
+        reference_scenes(shards, "test"), shards, EvalOptions(renderer=renderer)
+    )
     assert scores["fd_effnet_lite0"] < 1e-8
     assert scores["category_kl"] == 0
     assert (
@@ -127,13 +133,15 @@ def test_as_boxes_only_layouts_count(generated, shards, renderer):
     """Meshes do not show: here they are much smaller than their boxes."""
     bare = [scene.without_meshes() for scene in generated]
     scores = [
-        evaluate_synthesis(scenes, shards, seed=1, renderer=renderer, boxes=True, resamples=20)
+        evaluate_synthesis(
+            scenes, shards, EvalOptions(seed=1, renderer=renderer, boxes=True, resamples=20)
+        )
         for scenes in ([shrunk(scene) for scene in generated], bare)
     ]
     assert scores[0]["fd_effnet_lite0"] != scores[1]["fd_effnet_lite0"]
     keys = {"fd_effnet_lite0_boxes", "gap_closed_effnet_lite0_boxes"}
     assert {key for key in scores[0] if key.endswith("_boxes")} == keys
-    assert keys < {key for key, *_ in SCORE_ROWS}
+    assert keys < {metric.key for metric in METRICS}
     for key in keys:
         assert scores[0][key] == scores[1][key]
         assert scores[0]["intervals"]["generated"][key] == scores[1]["intervals"]["generated"][key]
@@ -142,10 +150,16 @@ def test_as_boxes_only_layouts_count(generated, shards, renderer):
     real = reference_scenes(shards, "test", meshes=False)
     a, b = (view.features(scenes, lambda _: None).effnet_lite0 for scenes in (bare, real))
     assert scores[0]["fd_effnet_lite0_boxes"] == frechet_distance(a, b)
-    for column in ("train_rooms", "independent"):
-        assert scores[0][column]["fd_effnet_lite0_boxes"] >= 0
+    # Real rooms hold three pieces like the test rooms', generated ones two.
+    assert scores[0]["train_rooms"]["fd_effnet_lite0_boxes"] < scores[0]["fd_effnet_lite0_boxes"]
+    assert (
+        scores[0]["independent"]["fd_effnet_lite0_boxes"]
+        == scores[0]["independent"]["fd_effnet_lite0"]
+    )
     small = [shrunk(scene) for scene in reference_scenes(shards, "test")]
-    truth = evaluate_synthesis(small, shards, renderer=renderer, boxes=True, resamples=0)
+    truth = evaluate_synthesis(
+        small, shards, EvalOptions(renderer=renderer, boxes=True, resamples=0)
+    )
     assert truth["fd_effnet_lite0_boxes"] < 1e-8 < truth["fd_effnet_lite0"]
 
 
@@ -157,8 +171,14 @@ class StandIn(torch.nn.Module):
 def test_fid_appears_with_the_users_inception_file(generated, shards, renderer, tmp_path):
     path = tmp_path / "inception-2015-12-05.pt"
     torch.jit.script(StandIn()).save(str(path))
-    scores = evaluate_synthesis(generated, shards, inception=path, renderer=renderer, resamples=20)
-    assert scores["fid"] > 0 and scores["train_rooms"]["fid"] >= 0
+    scores = evaluate_synthesis(
+        generated, shards, EvalOptions(inception=path, renderer=renderer, resamples=20)
+    )
+    # By its definition: the stand-in's features are mean colours.
+    view = drawing_of(generated[0].label_set, renderer, path, None)
+    real = [scene for scene in reference_scenes(shards, "test")]
+    a, b = (view.features(scenes, lambda _: None).inception for scenes in (generated, real))
+    assert scores["fid"] == frechet_distance(a, b) > scores["train_rooms"]["fid"]
     assert scores["intervals"]["generated"]["fid"][0] <= scores["fid"]
     for key in ("kid", "precision_inception", "recall_inception"):
         assert np.isfinite(scores[key]) and np.isfinite(scores["train_rooms"][key])
@@ -197,7 +217,7 @@ def test_the_gap_closed_compares_equal_numbers_of_rooms(shards, renderer):
     train = reference_scenes(shards, "train")
     independent = independent_rooms(train, len(train), 0)
     for rooms, share in ((train, 1), (independent, 0)):
-        scores = evaluate_synthesis(rooms, shards, renderer=renderer, resamples=5)
+        scores = evaluate_synthesis(rooms, shards, EvalOptions(renderer=renderer, resamples=5))
         assert scores["gap_closed_effnet_lite0"] == pytest.approx(share, abs=1e-12)
         low, high = scores["intervals"]["generated"]["gap_closed_effnet_lite0"]
         assert low <= share <= high
@@ -210,11 +230,11 @@ def test_the_gap_closed_compares_equal_numbers_of_rooms(shards, renderer):
             assert scores[f"gap_closed_effnet_lite0{key}"] == pytest.approx(by_hand, abs=1e-12)
     # Twice as many rooms have a smaller distance, but enter the gap with as many as the others.
     twice = [replace(room, name=f"{room.name}_{k}") for room in train for k in range(2)]
-    scores = evaluate_synthesis(twice, shards, renderer=renderer, resamples=0)
+    scores = evaluate_synthesis(twice, shards, EvalOptions(renderer=renderer, resamples=0))
     assert scores["protocol"]["n_gap"] == 8
     rows = seeded_rows(16, 8, 0)
     chosen = evaluate_synthesis(
-        [twice[row] for row in rows], shards, renderer=renderer, resamples=0
+        [twice[row] for row in rows], shards, EvalOptions(renderer=renderer, resamples=0)
     )
     key = "gap_closed_effnet_lite0"
     assert scores[key] == pytest.approx(chosen[key], abs=1e-9)
@@ -226,26 +246,28 @@ def test_what_cannot_be_scored_is_refused_before_anything_is_drawn(
     renderer = open_renderer("software")
     monkeypatch.setattr(renderer, "instance_ids", None, raising=True)
     with pytest.raises(InputError, match="at least 2 generated rooms, but 1 came"):
-        evaluate_synthesis(generated[:1], shards, renderer=renderer)
+        evaluate_synthesis(generated[:1], shards, EvalOptions(renderer=renderer))
     with pytest.raises(InputError, match="scenes of one label set"):
-        evaluate_synthesis([Scene("a", "scannet")] * 2, shards, renderer=renderer)
+        evaluate_synthesis([Scene("a", "scannet")] * 2, shards, EvalOptions(renderer=renderer))
     with pytest.raises(ShardError, match="No folder of shards"):
-        evaluate_synthesis(generated, tmp_path / "absent", renderer=renderer)
+        evaluate_synthesis(generated, tmp_path / "absent", EvalOptions(renderer=renderer))
     with pytest.raises(InputError, match=r"absent\.pt"):
-        evaluate_synthesis(generated, shards, renderer=renderer, inception=tmp_path / "absent.pt")
+        evaluate_synthesis(
+            generated, shards, EvalOptions(renderer=renderer, inception=tmp_path / "absent.pt")
+        )
 
 
 def test_a_nan_never_reaches_a_result_file(tmp_path):
     with pytest.raises(ValueError):
-        write_scores({"category_kl": float(np.nan)}, tmp_path / "scores.json")
+        write_json(tmp_path / "scores.json", {"category_kl": float(np.nan)})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_odd_sets_of_rooms_have_figures_or_none_but_never_nan(shards, renderer):
+def test_odd_sets_of_rooms_have_metrics_or_none_but_never_nan(shards, renderer):
     bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
     empty, one = Scene("a", "front3d_bedroom"), Scene("b", "front3d_bedroom", (bed,))
     for rooms in ([empty] * 2, [one] * 5, [empty, one]):
-        scores = evaluate_synthesis(rooms, shards, renderer=renderer, resamples=10)
+        scores = evaluate_synthesis(rooms, shards, EvalOptions(renderer=renderer, resamples=10))
         json.dumps(scores, allow_nan=False)
         assert scores["overlap_pairs"] == scores["overlap_pair_share"] == 0
         # No floor, and no two pieces to walk between: there is no such share.
@@ -257,13 +279,16 @@ def test_odd_sets_of_rooms_have_figures_or_none_but_never_nan(shards, renderer):
         cells = {row[0]: row[2] for row in score_rows(scores)}
         assert cells["Pieces out of the floor's bounds"] == "–"
     assert (
-        evaluate_synthesis([empty] * 2, shards, renderer=renderer, resamples=0)["type_share"] == 0
+        evaluate_synthesis([empty] * 2, shards, EvalOptions(renderer=renderer, resamples=0))[
+            "type_share"
+        ]
+        == 0
     )
 
 
 def test_copies_of_training_rooms_are_told(shards, renderer):
     copies = [replace(scene, floor_m=None) for scene in reference_scenes(shards, "train")]
-    scores = evaluate_synthesis(copies, shards, renderer=renderer, resamples=0)
+    scores = evaluate_synthesis(copies, shards, EvalOptions(renderer=renderer, resamples=0))
     assert scores["nearest_training_m"] == pytest.approx(0, abs=1e-6)
     assert scores["near_copy_share"] == 1
     # Real rooms pass themselves over.
@@ -280,15 +305,17 @@ def test_the_papers_classifier_appears_with_its_weights(
 ):
     seen = []
 
-    def stand_in(path, pictures, labels, judged, seed):
+    def stand_in(path, pictures, labels, others, seed):
         seen.append((pictures.shape[1:], pictures.dtype))
-        return np.zeros(len(judged), dtype=int)
+        return np.zeros(len(others), dtype=int)
 
     path = tmp_path / "alexnet.pth"
     path.write_bytes(b"weights")
-    monkeypatch.setattr(protocol, "check_alexnet", lambda path: None)
-    monkeypatch.setattr(figures, "classify_pictures", stand_in)
-    scores = evaluate_synthesis(generated, shards, alexnet=path, renderer=renderer, resamples=5)
+    monkeypatch.setattr(synthesis, "check_alexnet", lambda path: None)
+    monkeypatch.setattr(classifier, "classify_pictures", stand_in)
+    scores = evaluate_synthesis(
+        generated, shards, EvalOptions(alexnet=path, renderer=renderer, resamples=5)
+    )
     assert scores["sca"] == scores["train_rooms"]["sca"] == 0.5
     assert set(seen) == {((224, 224, 3), np.dtype("uint8"))}
     assert scores["protocol"]["sca"]["sha256"] == hashlib.sha256(b"weights").hexdigest()

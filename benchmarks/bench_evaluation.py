@@ -1,7 +1,8 @@
-"""Time the judging of rooms: synthesize, draw, read, score; where the seconds go.
+"""Time the evaluation of rooms: synthesize, draw, read, score; where the seconds go.
 
-Run `python benchmarks/bench_judge.py --run RUN [--shards SHARDS] [-n 1000]`. CPU seconds of all
-threads are stated beside wall-clock seconds: on a busy machine only the former mean something.
+Run `python benchmarks/bench_evaluation.py --run RUN [--shards SHARDS] [-n 1000]`. CPU seconds
+of all threads are stated beside wall-clock seconds: on a busy machine only the former mean
+something.
 """
 
 import argparse
@@ -16,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sceneprior.config import load_run
-from sceneprior.evaluation.protocol import evaluate_synthesis
+from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import open_renderer
 
@@ -33,7 +34,7 @@ def measure(work: Callable[[], T]) -> tuple[T, dict[str, float]]:
     }
 
 
-def judge_seconds(run: Path, shards: Path | None, count: int, renderer: str) -> dict[str, Any]:
+def time_evaluation(run: Path, shards: Path | None, count: int, renderer: str) -> dict[str, Any]:
     """Seconds of synthesis and of scoring, without and with a reference file.
 
     Returns:
@@ -53,9 +54,13 @@ def judge_seconds(run: Path, shards: Path | None, count: int, renderer: str) -> 
     screen = open_renderer(renderer)
 
     def score(name: str, **options: Any) -> None:
-        timed(name, lambda: evaluate_synthesis(scenes, folder, renderer=screen, **options))
+        timed(
+            name,
+            lambda: evaluate_synthesis(scenes, folder, EvalOptions(renderer=screen, **options)),
+        )
 
-    evaluate_synthesis(scenes[:2], folder, renderer=screen, resamples=0)  # compiles, loads, warms
+    warm = EvalOptions(renderer=screen, resamples=0)
+    evaluate_synthesis(scenes[:2], folder, warm)  # compiles, loads, warms
     score("score")
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "reference.npz"
@@ -74,8 +79,8 @@ def main() -> None:
     parser.add_argument("--renderer", default="auto")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    seconds = judge_seconds(arguments.run, arguments.shards, arguments.count, arguments.renderer)
-    table = Table(title=f"Judging {arguments.count} rooms")
+    seconds = time_evaluation(arguments.run, arguments.shards, arguments.count, arguments.renderer)
+    table = Table(title=f"Evaluating {arguments.count} rooms")
     for heading in ("", "CPU s", "wall s"):
         table.add_column(heading, justify="right" if heading else "left")
     for name, taken in seconds.items():

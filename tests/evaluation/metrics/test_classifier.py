@@ -7,48 +7,56 @@ import torch
 from sceneprior.errors import InputError
 from sceneprior.evaluation.alexnet import _network, check_alexnet, classify_pictures
 from sceneprior.evaluation.bootstrap import resample_counts
-from sceneprior.evaluation.classifier import FOLDS, REPEATS, found_out, linear
+from sceneprior.evaluation.metrics.classifier import (
+    FOLDS,
+    REPEATS,
+    cross_validated_predictions,
+    linear,
+)
 
 
 def accuracy(told, resamples: int = 50):
-    generated = resample_counts(len(told.judged_generated), resamples, 0)
-    return told.accuracy(generated, resample_counts(len(told.judged_real), resamples, 1))
+    generated = resample_counts(len(told.asked_generated), resamples, 0)
+    return told.accuracy(generated, resample_counts(len(told.asked_real), resamples, 1))
 
 
 def test_sets_of_one_distribution_are_at_chance_and_far_ones_are_told_apart(rng):
     a, b = rng.normal(size=(60, 8)), rng.normal(size=(45, 8))
-    figure = accuracy(found_out(a, b, seed=0))
-    low, high = figure.interval()
-    assert low < 0.5 < high and 0.3 < figure.value < 0.7
-    figure = accuracy(found_out(a, b + 10, seed=0))
-    assert figure.value == 1 and figure.interval() == [1, 1]
+    estimate = accuracy(cross_validated_predictions(a, b, seed=0))
+    low, high = estimate.interval()
+    assert low < 0.5 < high and 0.3 < estimate.value < 0.7
+    estimate = accuracy(cross_validated_predictions(a, b + 10, seed=0))
+    assert estimate.value == 1 and estimate.interval() == [1, 1]
 
 
 def test_answers_are_those_of_folds_never_seen_with_equal_numbers_on_both_sides(rng):
     calls = []
 
-    def remember(inputs, labels, judged, seed):
-        assert set(inputs[:, 0]).isdisjoint(judged[:, 0])
+    def remember(inputs, labels, others, seed):
+        assert set(inputs[:, 0]).isdisjoint(others[:, 0])
         assert abs(2 * labels.sum() - len(labels)) <= 1
-        calls.append((len(inputs), len(judged), seed))
-        return np.ones(len(judged), dtype=int)  # all are generated, it says
+        calls.append((len(inputs), len(others), seed))
+        return np.ones(len(others), dtype=int)  # all are generated, it says
 
-    told = found_out(np.arange(20.0)[:, None], 100 + np.arange(7.0)[:, None], 1, remember)
+    told = cross_validated_predictions(
+        np.arange(20.0)[:, None], 100 + np.arange(7.0)[:, None], 1, remember
+    )
     assert len(calls) == FOLDS * REPEATS and len({seed for *_, seed in calls}) == len(calls)
-    assert told.judged_real.tolist() == [REPEATS] * 7 and not told.right_real.any()
-    assert told.judged_generated.sum() == 7 * REPEATS
-    np.testing.assert_array_equal(told.right_generated, told.judged_generated)
+    assert told.asked_real.tolist() == [REPEATS] * 7 and not told.right_real.any()
+    assert told.asked_generated.sum() == 7 * REPEATS
+    np.testing.assert_array_equal(told.right_generated, told.asked_generated)
     assert accuracy(told).value == 0.5
 
 
 def test_seeds_repeat_and_two_rooms_a_side_are_enough(rng):
     a, b = rng.normal(size=(9, 4)), rng.normal(size=(6, 4))
-    one, two = (found_out(a, b, seed=3) for _ in range(2))
+    one, two = (cross_validated_predictions(a, b, seed=3) for _ in range(2))
     np.testing.assert_array_equal(one.right_generated, two.right_generated)
-    figure = accuracy(found_out(a[:2], b[:2], seed=0))
-    assert 0 <= figure.value <= 1
+    estimate = accuracy(cross_validated_predictions(a[:2], b[:2], seed=0))
+    assert estimate.value * 4 * REPEATS == pytest.approx(round(estimate.value * 4 * REPEATS))
     same = np.ones((4, 3))
-    assert accuracy(found_out(same, same, seed=0)).value == 0.5  # identical pictures
+    told = cross_validated_predictions(same, same, seed=0)
+    assert accuracy(told).value == 0.5  # identical pictures
 
 
 def test_the_linear_classifier_is_a_penalised_fit_of_standardized_features(rng):

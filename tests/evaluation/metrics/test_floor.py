@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.metrics.free_space import AGENT_RADIUS_M, outside_count, walkable_share
+from sceneprior.evaluation.metrics.floor import AGENT_RADIUS_M, outside_count, walkable_share
 from sceneprior.scene import Scene, SceneObject
 
 FLOOR = np.array([[-2.0, -1], [2, -1], [2, 1], [-2, 1]])

@@ -1,14 +1,18 @@
-"""Judge the floor between furniture: a `Scene` in, what stands outside and what can be walked out.
+"""The floor between furniture: pieces that stand outside it, and what can be walked.
 
 Furniture is its axis-aligned box on the floor (x, z). All areas are exact (shapely), but for round
 corners, which are polygons of `ARC_SEGMENTS` sides a quarter turn.
 """
+
+from functools import partial
 
 import numpy as np
 import shapely
 
 from sceneprior.classes import VOID
 from sceneprior.errors import InputError
+from sceneprior.evaluation.bootstrap import Estimate, ratio
+from sceneprior.evaluation.metric import Comparison, Metric, RoomSet, mean_over_rooms
 from sceneprior.scene import Scene
 
 AGENT_RADIUS_M = 0.2
@@ -47,7 +51,7 @@ def floor_polygon(scene: Scene) -> shapely.Geometry | None:
 
 
 def outside_count(scene: Scene) -> tuple[int, int]:
-    """(pieces out of bounds, pieces judged); (0, 0) for a room whose floor nobody knows.
+    """(pieces out of bounds, pieces with a floor to stand on); (0, 0) without a known floor.
 
     A piece is out of bounds with more than 5% of its box beyond the outline.
 
@@ -74,7 +78,6 @@ def walkable_share(scene: Scene, within: str = "furniture") -> float | None:
     1.5 m. 1 means that all free floor hangs together, 0 that the agent fits nowhere.
 
     Args:
-        scene: The room.
         within: Where the walls are. `furniture`: the rectangle around all furniture, which every
             scene has, so that rooms with and without a floor compare. `floor`: the outline.
 
@@ -98,3 +101,44 @@ def walkable_share(scene: Scene, within: str = "furniture") -> float | None:
     )
     pieces = shapely.area(shapely.get_parts(shapely.difference(stand, blocked)))
     return float(pieces.max() / pieces.sum()) if pieces.sum() > 0 else 0.0
+
+
+def _out_of_bounds(rooms: RoomSet, comparison: Comparison) -> Estimate:
+    outside, pieces = np.array([outside_count(scene) for scene in rooms.scenes], dtype=float).T
+    return ratio(outside, pieces, rooms.counts, 1.0)
+
+
+METRICS = (
+    Metric(
+        "out_of_bounds_share", "Pieces out of the floor's bounds", "share; known floors alone",
+        "lower",
+        "Share of pieces with more than 5% of their box, seen from above, outside the floor's "
+        "outline; only rooms with `floor_m` count, null where none has one, as rooms of this "
+        "package's prior, which knows no floor.",
+        _out_of_bounds,
+        protocol={
+            "out_of_bounds_share": f"pieces with more than {OUTSIDE_SHARE:.0%} of their box "
+            "outside floor_m; rooms without floor_m are left out"
+        },
+    ),
+    Metric(
+        "walkable_share", "Walkable in one piece, between furniture", "share of free floor",
+        "higher",
+        "The largest area that a disc of 0.2 m can walk in one piece, over all area it can stand "
+        "on, mean over rooms; walls are the **rectangle around all furniture**, so that rooms "
+        "with and without a floor compare; pieces whose lower face is at 1.5 m or higher are "
+        "walked under; 0 where the disc fits nowhere, rooms with fewer than two pieces left out.",
+        mean_over_rooms(walkable_share, 1.0), source="Yang et al., CVPR 2024, in exact areas",
+        protocol={
+            "walkable_share": f"disc of {AGENT_RADIUS_M} m, {AGENT_HEIGHT_M} m high; exact areas; "
+            "_floor: within floor_m, else the rectangle around all furniture"
+        },
+    ),
+    Metric(
+        "walkable_share_floor", "Walkable in one piece, within the floor",
+        "share; known floors alone", "higher",
+        "`walkable_share` within `floor_m`; rooms without one are left out, null where none has "
+        "one.",
+        mean_over_rooms(partial(walkable_share, within="floor"), 1.0),
+    ),
+)  # fmt: skip

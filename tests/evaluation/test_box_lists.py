@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.convert import convert, read_boxes, turned_box
+from sceneprior.evaluation.box_lists import read_box_lists, read_boxes, turned_box
 from sceneprior.evaluation.topdown import topdown
-from sceneprior.generation.export import load_scene_folder
+from sceneprior.generation.export import load_scene_folder, write_scenes
 from sceneprior.offscreen import SoftwareRenderer
 from sceneprior.scene import Scene
 
@@ -109,9 +109,10 @@ def test_json_by_name_and_floor_plans_are_read(tmp_path):
 def test_a_folder_becomes_scenes_that_are_read_back(tmp_path):
     for name in ("uid_a", "uid_b"):
         save(tmp_path / "theirs", f"{name}/boxes.npz")
-    count = convert(tmp_path / "theirs", tmp_path / "ours", BEDROOM, None, "half", False)
+    found = read_box_lists(tmp_path / "theirs", BEDROOM)
+    write_scenes(found, tmp_path / "ours", SoftwareRenderer())
     scenes = load_scene_folder(tmp_path / "ours")
-    assert count == 2 and [scene.name for scene in scenes] == ["uid_a", "uid_b"]
+    assert len(found) == 2 and [scene.name for scene in scenes] == ["uid_a", "uid_b"]
     (direct,) = read_boxes(tmp_path / "theirs" / "uid_a" / "boxes.npz", "uid_a", BEDROOM)
     np.testing.assert_allclose(scenes[0].sizes_m, direct.sizes_m, atol=1e-5)
     np.testing.assert_array_equal(
@@ -147,6 +148,6 @@ def test_files_that_are_none_are_named(tmp_path):
     with pytest.raises(InputError, match="has no class_labels and no translations and no angles"):
         read_boxes(tmp_path / "c.json", "a", BEDROOM)
     with pytest.raises(InputError, match=r"holds no \.npz and no \.json"):
-        convert(tmp_path / "absent", tmp_path / "out", BEDROOM, None, "half", False)
+        read_box_lists(tmp_path / "absent", BEDROOM)
     with pytest.raises(InputError, match="No sizes 'third'"):
-        convert(tmp_path, tmp_path / "out", BEDROOM, None, "third", False)
+        read_box_lists(tmp_path, BEDROOM, sizes="third")

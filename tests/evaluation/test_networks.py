@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.metrics.image_metrics import (
+from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.evaluation.metrics.frechet import frechet_distance
+from sceneprior.evaluation.networks import (
     efficientnet_lite0_features,
     inception_features,
     single_threaded,
 )
-from sceneprior.evaluation.metrics.set_metrics import frechet_distance
-from sceneprior.evaluation.reference import reference_scenes
 from sceneprior.evaluation.topdown import topdown
 
 

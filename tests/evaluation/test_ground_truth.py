@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sceneprior.errors import ShardError
-from sceneprior.evaluation.reference import reference_scenes
+from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.shards import write_shard
 

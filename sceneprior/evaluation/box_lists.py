@@ -1,7 +1,4 @@
-"""Other people's rooms as ours: box lists of ATISS and its kin in, a folder of scenes out.
-
-Docs: docs/evaluation.md, "Scenes of other methods".
-"""
+"""Scenes from the box lists of other methods (docs/evaluation.md, "Scenes of other methods")."""
 
 import json
 import zipfile
@@ -17,9 +14,7 @@ from jaxtyping import Float
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.evaluation.topdown import box_mesh
-from sceneprior.generation.export import write_scenes
 from sceneprior.geometry.turns import yaw_rotation
-from sceneprior.offscreen import SoftwareRenderer
 from sceneprior.scene import Mesh, Scene, SceneObject
 
 NEEDED = ("class_labels", "translations", "sizes", "angles")
@@ -27,25 +22,21 @@ FLOOR = ("floor_plan_vertices", "floor_plan_faces", "floor_plan_centroid")
 NOT_FURNITURE = ("start", "empty", "void")
 """Columns of class_labels that stand for no object; `end` also ends the list."""
 SIZES = {"half": 2.0, "full": 1.0}
-_QUARTER_RAD = 1e-4  # closer than this to a quarter turn, a box stays a box
+_QUARTER_RAD = 1e-4
+"""Closer than this to a quarter turn, a box stays a box."""
 
 
-def convert(
-    boxes: Path, out: Path, label_set_name: str, classes: str | None, sizes: str, overwrite: bool
-) -> int:
-    """Write the rooms of box lists as scenes: JSON, GLB and PNG each.
+def read_box_lists(
+    boxes: Path, label_set_name: str, classes: str | None = None, sizes: str = "half"
+) -> list[Scene]:
+    """The rooms of box lists.
 
     Args:
         boxes: A `.npz` or `.json`, or a folder searched for them.
-        out: Folder for the scenes.
         label_set_name: Theirs; every class must be in it.
         classes: Comma-separated names of the columns (or indices) of `class_labels`; None takes
             the label set without void, and `start` and `end` after it where there are two more.
         sizes: `half` or `full`.
-        overwrite: Write into a folder that holds something.
-
-    Returns:
-        How many rooms.
 
     Raises:
         InputError: a file is no box list, or names a class that the label set lacks.
@@ -53,13 +44,11 @@ def convert(
     if sizes not in SIZES:
         raise InputError(f"No sizes '{sizes}'; they are half (extents, as ATISS has them) or full.")
     columns = None if classes is None else [name.strip() for name in classes.split(",")]
-    scenes = [
+    return [
         scene
         for path, name in _files(Path(boxes))
         for scene in read_boxes(path, name, label_set_name, columns, SIZES[sizes])
     ]
-    write_scenes(scenes, out, SoftwareRenderer(), overwrite)
-    return len(scenes)
 
 
 def _files(boxes: Path) -> list[tuple[Path, str]]:
@@ -82,18 +71,14 @@ def read_boxes(
     columns: Sequence[str] | None = None,
     size_factor: float = 2.0,
 ) -> list[Scene]:
-    """The rooms of one file.
+    """The rooms of one file; see `read_box_lists`.
 
     Args:
         path: `.npz` with one room (arrays over objects) or several (one more axis in front), or
             `.json` with one such object, or a list of them.
         name: Of the room; several get numbers.
-        label_set_name: Theirs.
-        columns: What the columns of `class_labels` mean; None as in `convert`.
+        columns: What the columns of `class_labels` mean.
         size_factor: From `sizes` to full extents.
-
-    Raises:
-        InputError: it is no box list, or names a class that the label set lacks.
     """
     rooms = [room for record in _records(path) for room in _one_by_one(path, record)]
     names = [name] if len(rooms) == 1 else [f"{name}_{row:04d}" for row in range(len(rooms))]
@@ -125,9 +110,7 @@ def _records(path: Path) -> list[dict[str, Any]]:
 def _one_by_one(path: Path, record: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Rooms of a record, with arrays over objects; several rooms lie along a first axis."""
     try:
-        centers = np.asarray(record["translations"], dtype=np.float64)
-        sizes = np.asarray(record["sizes"], dtype=np.float64)
-        angles = np.asarray(record["angles"], dtype=np.float64)
+        centers, sizes, angles = (np.asarray(record[key], dtype=np.float64) for key in NEEDED[1:])
     except (ValueError, TypeError):
         raise InputError(
             f"{path}: translations, sizes and angles must be arrays of numbers."
@@ -136,7 +119,6 @@ def _one_by_one(path: Path, record: dict[str, Any]) -> Iterator[dict[str, Any]]:
     if centers.size == 0:
         centers, sizes, angles = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
         labels = np.zeros(0, dtype=int)
-    several = centers.ndim == 3
     if angles.ndim == centers.ndim:
         angles = angles[..., 0]
     objects = centers.shape[:-1]
@@ -155,12 +137,12 @@ def _one_by_one(path: Path, record: dict[str, Any]) -> Iterator[dict[str, Any]]:
         )
     if not all(np.isfinite(array).all() for array in (centers, sizes, angles)):
         raise InputError(f"{path} holds numbers that are not finite; leave such rooms out.")
-    floor = {key: record[key] for key in FLOOR if key in record}
-    for row in range(len(centers)) if several else [...]:
-        yield {
-            "labels": labels[row], "centers": centers[row], "sizes": sizes[row],
-            "angles": angles[row], **({} if several else floor),
-        }  # fmt: skip
+    arrays = dict(zip(NEEDED, (labels, centers, sizes, angles), strict=True))
+    if centers.ndim == 3:
+        for row in range(len(centers)):
+            yield {key: array[row] for key, array in arrays.items()}
+    else:
+        yield arrays | {key: record[key] for key in FLOOR if key in record}
 
 
 def _scene(
@@ -171,12 +153,10 @@ def _scene(
     columns: Sequence[str] | None,
     size_factor: float,
 ) -> Scene:
-    known = label_set(label_set_name)
-    objects = []
-    labels = _label_names(path, room["labels"], known, columns)
-    for label, center, size, angle in zip(
-        labels, room["centers"], room["sizes"], room["angles"], strict=True
-    ):
+    known, objects = label_set(label_set_name), []
+    labels = _label_names(path, room["class_labels"], known, columns)
+    boxes = (room[key] for key in NEEDED[1:])
+    for label, center, size, angle in zip(labels, *boxes, strict=True):
         if label == "end":
             break
         if label in NOT_FURNITURE:

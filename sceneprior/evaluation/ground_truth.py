@@ -1,4 +1,4 @@
-"""Real rooms to compare with: a folder of shards in, `Scene`s with their meshes out."""
+"""The true rooms of shards, in 3D, as `Scene`s: what others are compared with."""
 
 import hashlib
 import json
@@ -26,7 +26,6 @@ def reference_scenes(
 
     Args:
         shards: Folder of view shards with ground truth; meshes lie in its `models/`.
-        split: `train` or `test`.
         limit: At most this many rooms; None reads all.
         tracked_only: Leave out furniture that no camera saw: what a decoded training room
             can be held against.
@@ -42,16 +41,7 @@ def reference_scenes(
 
 
 def stream_scenes(shards: Path, split: str, rows: Collection[int]) -> Iterator[Scene]:
-    """Rooms of a split with their meshes, one at a time, in the shards' own order.
-
-    Args:
-        shards: As `reference_scenes`.
-        split: `train` or `test`.
-        rows: Which rooms, as their places in `reference_scenes`.
-
-    Raises:
-        ShardError: as `reference_scenes`.
-    """
+    """Some rooms of `reference_scenes`, by their places there, with meshes and one at a time."""
     wanted = set(rows)
     for row, (shard, room_id) in enumerate(iterate_rooms(shards, split)):
         if row in wanted:
@@ -59,11 +49,7 @@ def stream_scenes(shards: Path, split: str, rows: Collection[int]) -> Iterator[S
 
 
 def split_fingerprint(shards: Path, split: str) -> str:
-    """SHA-256 over all that pictures of a split's rooms depend on: ids, pieces, model files.
-
-    Raises:
-        ShardError: as `reference_scenes`.
-    """
+    """SHA-256 over all that pictures of a split's rooms depend on: ids, pieces, model files."""
     digest = hashlib.sha256()
     models: set[str] = set()
     for shard, room_id in iterate_rooms(shards, split):
@@ -81,18 +67,7 @@ def split_fingerprint(shards: Path, split: str) -> str:
 def reference_scene(
     shard: Shard, room_id: str, shards: Path, tracked_only: bool = False, meshes: bool = True
 ) -> Scene:
-    """One room's ground truth as a scene; void furniture, which no label set names, is left out.
-
-    Args:
-        shard: An open shard that holds the room.
-        room_id: Which room.
-        shards: The folder that `models/` lies in.
-        tracked_only: Only objects that some camera saw.
-        meshes: Read the models, too.
-
-    Raises:
-        ShardError: the ground truth or a model's file is missing or damaged.
-    """
+    """One room of an open shard, see `reference_scenes`; void furniture is left out."""
     truth = shard.read_ground_truth(room_id)
     names = label_set(shard.label_set)
     count = len(truth.object_class)

@@ -1,4 +1,4 @@
-"""Read pictures: RGB images in, the features of a network out, one row each."""
+"""The networks that read pictures: EfficientNet-Lite0, and the user's Inception for FID."""
 
 import contextlib
 import threading
@@ -15,7 +15,7 @@ from sceneprior.errors import InputError
 CHUNK = 2
 """Images a network sees at once: what two cores' caches hold. The last chunk is filled up with a
 black image, so that every image passes through the same kernels and its features do not depend on
-its company."""
+the others."""
 
 _loading = threading.Lock()
 _NORMALISED = {

@@ -1,0 +1,131 @@
+"""What a metric is, and the sets of rooms that metrics compare."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms, resample_counts
+from sceneprior.evaluation.features import SceneFeatures
+from sceneprior.scene import Scene
+
+Direction = Literal["closer", "lower", "higher", "half", "none"]
+"""Which values are good; `closer` is a distance to the test rooms, the lower the closer."""
+ARROWS = {"closer": " ↓", "lower": " ↓", "higher": " ↑", "half": " → 0.5", "none": ""}
+IN_WORDS = {"closer": "lower is closer", "half": "0.5 is best"}
+
+AGAINST_TEST = ("train_rooms", "independent", "generated")
+"""The sets of rooms that are compared with the test rooms, by their names in a result."""
+PICTURED = ("train_rooms", "independent", "independent_meshes", "generated")
+"""Those, and independent rooms drawn with the real meshes: the same layouts, other pictures."""
+EACH_SET = ("test", *AGAINST_TEST)
+GENERATED = ("generated",)
+
+
+@dataclass(frozen=True)
+class RoomSet:
+    """A set of rooms with all that metrics need of it."""
+
+    scenes: Sequence[Scene]
+    pictures: SceneFeatures
+    """Features of pictures of the rooms, drawn with their meshes where they have some."""
+    box_pictures: SceneFeatures | None
+    """The same with every object drawn as its box; None where it was not asked for."""
+    nearest_training_m: Float[np.ndarray, " rooms"]
+    """Layout distance of each room to the nearest training room other than itself."""
+    counts: Int[np.ndarray, "resamples rooms"]
+    """How often each room is in each bootstrap resample."""
+
+    def of(self, rows: Sequence[int], seed: tuple[int, ...]) -> "RoomSet":
+        """Some of the rooms, with resamples of their own."""
+        return replace(
+            self,
+            scenes=[self.scenes[row] for row in rows],
+            pictures=self.pictures.of(rows),
+            box_pictures=self.box_pictures and self.box_pictures.of(rows),
+            nearest_training_m=self.nearest_training_m[list(rows)],
+            counts=resample_counts(len(rows), len(self.counts), seed),
+        )
+
+    def features(self, network: str, boxes: bool) -> Float[np.ndarray, "rooms dimensions"]:
+        """What a network reads in the pictures, or in those that show boxes."""
+        found = getattr(self.box_pictures if boxes else self.pictures, network)
+        return np.asarray(found)
+
+
+def mean_over_rooms(
+    of_room: Callable[[Scene], float | None], high: float = np.inf
+) -> Callable[[RoomSet, "Comparison"], Estimate]:
+    """The function of a metric that is a mean over rooms of a number from 0 to `high`.
+
+    Rooms for which `of_room` gives None are left out.
+    """
+
+    def function(rooms: RoomSet, comparison: Comparison) -> Estimate:
+        return mean_of_rooms([of_room(scene) for scene in rooms.scenes], rooms.counts, high)
+
+    return function
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What a set of rooms is compared with."""
+
+    test: RoomSet
+    fair: RoomSet
+    """As many of the generated rooms as there are training rooms: Frechet distances compare at
+    equal numbers alone."""
+    seed: int
+    """Of the classifiers' folds."""
+    alexnet: Path | None
+    columns: dict[str, dict[str, Estimate]] = field(default_factory=dict)
+    """What is known so far, by set and key; generated rooms come last."""
+
+
+@dataclass(frozen=True)
+class TableColumn:
+    """How a metric, or a cost, stands in the table of `sceneprior compare`."""
+
+    title: str
+    digits: int
+    note: str = ""
+    """Its part of the caption."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A number for a set of rooms, and everything that is said about it anywhere."""
+
+    key: str
+    """In result files."""
+    title: str
+    unit: str
+    direction: Direction
+    definition: str
+    """One sentence (Markdown), for docs/evaluation.md."""
+    function: Callable[..., Any]
+    """Its `Estimate` from a `RoomSet` and a `Comparison`. (Of decoded training rooms, see
+    metrics/decoded_rooms.py, a number from matched rooms.)"""
+    sets: tuple[str, ...] = EACH_SET
+    """The sets of rooms that have it; of test rooms it stands as `<key>_test`."""
+    source: str = ""
+    network: str | None = None
+    """What reads the pictures: `inception`, `alexnet`, `effnet_lite0`; None where nothing does."""
+    boxes: bool = False
+    """Whether the pictures show every object as its box (`--boxes`)."""
+    protocol: Mapping[str, Any] = field(default_factory=dict)
+    """What the protocol of a result file says about it."""
+    column: TableColumn | None = None
+    """None leaves it out of the table of `compare`."""
+
+    @property
+    def subtitle(self) -> str:
+        """Unit and direction, as they stand below the title."""
+        return ", ".join(filter(None, (self.unit, IN_WORDS.get(self.direction))))
+
+    def applies(self, networks: Sequence[str], boxes: bool) -> bool:
+        """Whether there is what it needs."""
+        return (self.network is None or self.network in networks) and (boxes or not self.boxes)

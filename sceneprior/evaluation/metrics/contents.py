@@ -1,0 +1,148 @@
+"""What rooms hold: class frequencies, numbers of objects, the furniture of a room type."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sceneprior.classes import LABEL_SETS, VOID, label_set
+from sceneprior.errors import InputError
+from sceneprior.evaluation.bootstrap import Estimate
+from sceneprior.evaluation.metric import (
+    AGAINST_TEST,
+    Comparison,
+    Metric,
+    RoomSet,
+    TableColumn,
+    mean_over_rooms,
+)
+from sceneprior.scene import Scene
+
+KL_EPSILON = 1e-6
+"""Added to both frequencies inside the logarithm, as ATISS does: a class never generated costs
+at most p * log(p / 1e-6) instead of infinity."""
+TYPE_CLASSES: dict[str, tuple[str, ...]] = {
+    "front3d_bedroom": ("double_bed", "single_bed", "kids_bed"),
+    "front3d_living": ("sofa", "armchair"),
+}
+"""What makes a room one of its type. ScanNet mixes room types and has no entry."""
+
+
+def common_label_set(*groups: Sequence[Scene]) -> str:
+    """The one label set that all these scenes use.
+
+    Raises:
+        InputError: there are no scenes, or more than one label set.
+    """
+    names = sorted({scene.label_set for scenes in groups for scene in scenes})
+    if len(names) != 1:
+        came = f"label sets {', '.join(names)}" if names else "no scenes"
+        raise InputError(
+            f"Scores compare scenes of one label set, but {came} came; give scenes whose classes "
+            f"are those of the shards ({' or '.join(LABEL_SETS)})."
+        )
+    return names[0]
+
+
+def class_counts(scenes: Sequence[Scene]) -> Int[np.ndarray, "scenes classes"]:
+    """Objects of each class in each scene, void left out (column 0 is 0).
+
+    Raises:
+        InputError: no scenes, or scenes of different label sets.
+    """
+    classes = len(label_set(common_label_set(scenes)))
+    table = np.stack([np.bincount(scene.class_indices, minlength=classes) for scene in scenes])
+    table[:, VOID] = 0
+    return table
+
+
+def class_frequencies(scenes: Sequence[Scene]) -> Float[np.ndarray, "classes"]:
+    """Share of each class among all objects of all scenes, void left out; 0 without objects.
+
+    Raises:
+        InputError: as `class_counts`.
+    """
+    return np.asarray(_shares(class_counts(scenes).sum(0)))
+
+
+def _shares(counts: np.ndarray) -> np.ndarray:
+    return np.asarray(counts / np.maximum(counts.sum(-1, keepdims=True), 1))
+
+
+def category_kl(generated: Sequence[Scene], test: Sequence[Scene]) -> float:
+    """KL divergence of the generated rooms' class frequencies from the test rooms', in nats.
+
+        KL = sum_c p_c * (log(p_c + 1e-6) - log(q_c + 1e-6))
+
+    p are the test rooms' frequencies, q the generated rooms', both without void.
+
+    Raises:
+        InputError: either list is empty, or their label sets differ.
+
+    Source:
+        Paschalidou et al., "ATISS", NeurIPS 2021, whose epsilon this is. Test rooms, not
+        training rooms: the training split flatters.
+    """
+    common_label_set(generated, test)
+    return frequency_kl(class_frequencies(test), class_frequencies(generated))
+
+
+def frequency_kl(p: Float[np.ndarray, " classes"], q: Float[np.ndarray, " classes"]) -> float:
+    """`category_kl` of class frequencies: of q, the generated rooms', from p."""
+    return float((p * (np.log(p + KL_EPSILON) - np.log(q + KL_EPSILON))).sum())
+
+
+def object_counts(scenes: Sequence[Scene]) -> Int[np.ndarray, "scenes"]:
+    """Number of objects in each scene, void left out."""
+    return np.array([_count(scene) for scene in scenes], dtype=np.int64)
+
+
+def _count(scene: Scene) -> int:
+    return int((scene.class_indices != VOID).sum())
+
+
+def type_share(scenes: Sequence[Scene]) -> float | None:
+    """Share of the scenes that hold what their room type stands for (`TYPE_CLASSES`).
+
+    None for a label set without a room type, and without scenes.
+    """
+    known = [holds for scene in scenes if (holds := _holds_its_type(scene)) is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _holds_its_type(scene: Scene) -> bool | None:
+    wanted = TYPE_CLASSES.get(scene.label_set)
+    return None if wanted is None else any(item.label in wanted for item in scene.objects)
+
+
+def _category_kl(rooms: RoomSet, comparison: Comparison) -> Estimate:
+    test = comparison.test
+    p = _shares(test.counts @ class_counts(test.scenes))
+    q = _shares(rooms.counts @ class_counts(rooms.scenes))
+    resamples = np.array([frequency_kl(*pair) for pair in zip(p, q, strict=True)])
+    return Estimate(category_kl(rooms.scenes, test.scenes), resamples, 0.0)
+
+
+METRICS = (
+    Metric(
+        "category_kl", "Category KL to test rooms", "nats", "closer",
+        "`sum_c p_c (log(p_c + 1e-6) - log(q_c + 1e-6))`, p the class frequencies of the test "
+        "rooms, q of the set.",
+        _category_kl, AGAINST_TEST, "Paschalidou et al., NeurIPS 2021",
+        protocol={
+            "category_kl": f"KL(test || generated) in nats, epsilon {KL_EPSILON}, without void"
+        },
+        column=TableColumn("category KL", 3),
+    ),
+    Metric(
+        "mean_objects", "Objects in a room", "mean", "none", "Mean number of objects in a room.",
+        mean_over_rooms(_count), column=TableColumn("objects", 2),
+    ),
+    Metric(
+        "type_share", "Rooms that hold their type's furniture", "share", "higher",
+        "Share of bedrooms with a double, single or kids' bed, of living rooms with a sofa or an "
+        "armchair; null for every other label set.",
+        mean_over_rooms(_holds_its_type, 1.0),
+        column=TableColumn("type", 2, "type: rooms that hold the furniture their type needs"),
+    ),
+)  # fmt: skip

@@ -1,0 +1,81 @@
+"""Improved precision and recall: which pictures lie among those of the other set."""
+
+from functools import partial
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.distance import cdist
+
+from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms
+from sceneprior.evaluation.metric import PICTURED, Comparison, Metric, RoomSet, TableColumn
+from sceneprior.evaluation.metrics.frechet import check_features
+
+NEIGHBOUR = 3
+"""A row's neighbourhood reaches to this nearest other row, as in the authors' settings; in a set
+of 3 or fewer to the farthest one."""
+
+
+def in_manifold(
+    features: Float[np.ndarray, "n dimensions"],
+    others: Float[np.ndarray, "m dimensions"],
+    neighbour: int = NEIGHBOUR,
+) -> Bool[np.ndarray, " n"]:
+    """Which rows of `features` lie in the manifold of `others`, in float64.
+
+    A set's manifold is the union of balls around its rows, each reaching to the row's
+    `neighbour`-th nearest other row of the same set. The border belongs to it, so equal pictures,
+    whose balls have no radius, lie in each other's. The mean over generated rows, with real
+    `others`, is precision; over real rows, with generated `others`, recall.
+
+    Source:
+        Kynkaanniemi et al., "Improved Precision and Recall Metric", NeurIPS 2019.
+    """
+    check_features(features, others)
+    features, others = features.astype(np.float64), others.astype(np.float64)
+    # Column 0 of the sorted distances is the row itself.
+    rank = min(neighbour, len(others) - 1)
+    radii = np.partition(cdist(others, others), rank, axis=1)[:, rank]
+    return np.asarray((cdist(features, others) <= radii).any(1))
+
+
+def _precision(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
+    inside = in_manifold(rooms.features(network, False), comparison.test.features(network, False))
+    return mean_of_rooms(inside, rooms.counts, 1.0)
+
+
+def _recall(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
+    test = comparison.test
+    covered = in_manifold(test.features(network, False), rooms.features(network, False))
+    return mean_of_rooms(covered, test.counts, 1.0)
+
+
+def _metrics_of(network: str, title: str, column: TableColumn | None) -> tuple[Metric, Metric]:
+    source = "Kynkaanniemi et al., NeurIPS 2019"
+    return (
+        Metric(
+            f"precision_{network}", f"Precision, {title}", "share of rooms", "higher",
+            f"Improved precision in {title} features: the share of rooms inside the test rooms' "
+            "manifold, the union of balls around its pictures that each reach to the 3rd nearest "
+            "other (in a set of 3 or fewer the farthest), border included.",
+            partial(_precision, network), PICTURED, source, network,
+            protocol={"precision_recall_k": NEIGHBOUR},
+        ),
+        Metric(
+            f"recall_{network}", f"Recall, {title}", "share of test rooms", "higher",
+            f"Improved recall in {title} features: the share of test rooms inside the other set's "
+            "manifold, which grows with the size of that set.",
+            partial(_recall, network), PICTURED, source, network, column=column,
+        ),
+    )  # fmt: skip
+
+
+METRICS = (
+    *_metrics_of("inception", "Inception", None),
+    *_metrics_of(
+        "effnet_lite0",
+        "EfficientNet-Lite0",
+        TableColumn(
+            "recall", 2, "recall: share of test rooms that lie among the pictures of the row"
+        ),
+    ),
+)

@@ -1,0 +1,254 @@
+"""Evaluate generated rooms against the test rooms of shards, beside real and independent ones."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from sceneprior.classes import VOID
+from sceneprior.errors import InputError
+from sceneprior.evaluation.alexnet import check_alexnet
+from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES, Estimate, resample_counts
+from sceneprior.evaluation.features import SceneFeatures
+from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.evaluation.independent import independent_rooms
+from sceneprior.evaluation.metric import PICTURED, Comparison, RoomSet
+from sceneprior.evaluation.metrics.contents import common_label_set
+from sceneprior.evaluation.metrics.novelty import nearest_distances
+from sceneprior.evaluation.networks import check_inception
+from sceneprior.evaluation.protocol import definitions, drawing_of, package_versions
+from sceneprior.evaluation.reference_file import Drawing, draw_reference
+from sceneprior.evaluation.registry import METRICS
+from sceneprior.offscreen import Renderer, open_renderer
+from sceneprior.scene import Scene
+
+FORMAT = "sceneprior-scores"
+VERSION = 2
+"""1 hashed all pictures of a set as one, and knew neither intervals nor distances but Frechet's."""
+NOTE = (
+    "Measured on the rooms of these shards. Where they come from `sceneprior make-homes`, they "
+    "are made-up homes: no number here can be compared with the paper's, which are on 3D-FRONT."
+)
+
+
+@dataclass(frozen=True)
+class EvalOptions:
+    """How rooms are evaluated, whichever method made them."""
+
+    seed: int = 0
+    """Chooses the training rooms, the classifiers' folds and the resamples."""
+    inception: Path | None = None
+    """NVIDIA's `inception-2015-12-05.pt`; None leaves `fid` and its kin out."""
+    alexnet: Path | None = None
+    """torchvision's AlexNet weights; None leaves `sca` out."""
+    reference: Path | None = None
+    """File that keeps what was read from the real rooms' pictures; None draws them."""
+    boxes: bool = False
+    """Also compare pictures of all rooms drawn as boxes: their layouts alone."""
+    resamples: int = RESAMPLES
+    """Of the bootstrap intervals; 0 leaves them out."""
+    renderer: Renderer | str = "auto"
+    """A renderer, or the name of one."""
+
+    def check_weights(self) -> None:
+        """Raise InputError where a file of weights is missing or holds something else."""
+        if self.inception is not None:
+            check_inception(self.inception)
+        if self.alexnet is not None:
+            check_alexnet(self.alexnet)
+
+
+@dataclass(frozen=True)
+class _Rooms:
+    """The rooms to compare, without meshes but for those of generated ones."""
+
+    groups: dict[str, Sequence[Scene]]
+    """`test`, `generated`, `train` and `independent`."""
+    every_train: Sequence[Scene]
+    train_rows: Sequence[int]
+    """Which of all training rooms `train` holds."""
+
+
+def evaluate_synthesis(
+    generated: Sequence[Scene], shards: Path, options: EvalOptions
+) -> dict[str, Any]:
+    """Compare generated rooms with the test rooms, and real and independent rooms with them too.
+
+    Void objects are left out everywhere, as the test rooms' are. The training rooms are as many
+    as the generated ones (all of them if there are fewer), drawn without replacement by the seed:
+    a Frechet distance depends on the number of images, so only equal numbers can be compared.
+    Independent rooms, see `independent_rooms`, are as many as real training rooms.
+
+    Args:
+        generated: Rooms with meshes, or boxes alone, which are drawn as boxes.
+        shards: Folder of shards with ground truth; its `test` and `train` splits are read.
+
+    Returns:
+        The metrics of the generated rooms, `<key>_test` for those that the test rooms have by
+        themselves, under `train_rooms` those of real training rooms, under `independent` those of
+        rooms of independent objects (and what their pictures say with real meshes under
+        `independent_meshes`), `intervals` by set of rooms, and under `protocol` all they depend
+        on. docs/evaluation.md defines each.
+
+    Raises:
+        InputError: no rooms, fewer than two on a side, other label sets than the shards', or
+            a file of weights or a reference that cannot be used.
+    """
+    options.check_weights()  # before hours of drawing lean on them
+    rooms = _rooms(generated, shards, options.seed)
+    names = common_label_set(rooms.groups["test"])
+    renderer = options.renderer
+    renderer = open_renderer(renderer) if isinstance(renderer, str) else renderer
+    drawing = drawing_of(names, renderer, options.inception, options.alexnet)
+    drawn, as_boxes = _draw(rooms, shards, drawing, options)
+    columns = _evaluate(_room_sets(rooms, drawn, as_boxes, options), options)
+    protocol = {
+        "label_set": names,
+        "shards": Path(shards).resolve().name,
+        "split": "test",
+        **{f"n_{group}": len(scenes) for group, scenes in rooms.groups.items() if group != "train"},
+        "n_train_rooms": len(rooms.train_rows),
+        "n_train_rooms_available": len(rooms.every_train),
+        "n_gap": len(rooms.train_rows),
+        "seed": options.seed,
+        "resamples": options.resamples,
+        "intervals": METHOD,
+        "render": drawing.render_protocol,
+        "renders_sha256": {group: features.sha256 for group, features in drawn.items()},
+        "networks": drawing.networks,
+        **definitions(names, options.alexnet),
+        "packages": package_versions(),
+    }
+    return _result(columns) | {"protocol": protocol}
+
+
+def _rooms(generated: Sequence[Scene], shards: Path, seed: int) -> _Rooms:
+    test = reference_scenes(shards, "test", meshes=False)
+    every_train = reference_scenes(shards, "train", meshes=False)
+    generated = [without_void(scene) for scene in generated]
+    common_label_set(generated, test)
+    rows = seeded_rows(len(every_train), len(generated), seed)
+    groups = {"test": test, "generated": generated, "train": [every_train[row] for row in rows]}
+    for group, scenes in groups.items():
+        if len(scenes) < 2:
+            raise InputError(
+                f"Scoring needs at least 2 {group} rooms, but {len(scenes)} came; synthesize or "
+                "prepare more."
+            )
+    independent = independent_rooms(every_train, len(rows), seed)
+    return _Rooms({**groups, "independent": independent}, every_train, rows)
+
+
+def _draw(
+    rooms: _Rooms, shards: Path, drawing: Drawing, options: EvalOptions
+) -> tuple[dict[str, SceneFeatures], dict[str, SceneFeatures]]:
+    """Features of every group's pictures (and of `independent_meshes`), and drawn as boxes."""
+    groups, count = rooms.groups, len(rooms.train_rows)
+    with Progress(console=Console(stderr=True)) as bars:
+
+        def progress(group: str, total: int) -> Callable[[int], object]:
+            return partial(bars.advance, bars.add_task(f"Drawing {group} rooms", total=total))
+
+        def draw(title: str, scenes: Sequence[Scene]) -> SceneFeatures:
+            return drawing.features(scenes, progress(title, len(scenes)))
+
+        splits = {"test": len(groups["test"]), "train": len(rooms.every_train)}
+        drawn = draw_reference(
+            shards, drawing, splits, rooms.train_rows, progress, options.reference
+        )
+        drawn["generated"] = draw("generated", groups["generated"])
+        drawn["independent"] = draw("independent", groups["independent"])
+        # The same rooms once more: meshes of all training rooms live no longer than this line.
+        furnished = independent_rooms(reference_scenes(shards, "train"), count, options.seed, True)
+        drawn["independent_meshes"] = draw("independent, furnished", furnished)
+        del furnished
+        if not options.boxes:
+            return drawn, {}
+        as_boxes = {"independent": drawn["independent"]}  # which have no meshes
+        for group in ("test", "generated", "train"):
+            plain = [scene.without_meshes() for scene in groups[group]]
+            as_boxes[group] = draw(f"boxed {group}", plain)
+    return drawn, as_boxes
+
+
+def _room_sets(
+    rooms: _Rooms,
+    drawn: dict[str, SceneFeatures],
+    as_boxes: dict[str, SceneFeatures],
+    options: EvalOptions,
+) -> dict[str, RoomSet]:
+    """The sets of rooms by their names in the result, and the `fair` share of generated ones."""
+    sets: dict[str, RoomSet] = {}
+    for number, (group, scenes) in enumerate(rooms.groups.items()):
+        own = rooms.train_rows if group == "train" else None
+        sets[group] = RoomSet(
+            scenes,
+            drawn[group],
+            as_boxes.get(group),
+            nearest_distances(scenes, rooms.every_train, own),
+            resample_counts(len(scenes), options.resamples, (options.seed, number)),
+        )
+    rows = seeded_rows(len(sets["generated"].scenes), len(rooms.train_rows), options.seed)
+    fair = sets["generated"].of(rows, (options.seed, len(sets)))
+    meshes = replace(sets["independent"], pictures=drawn["independent_meshes"])
+    return {
+        "test": sets["test"],
+        "train_rooms": sets["train"],
+        "independent": sets["independent"],
+        "independent_meshes": meshes,
+        "generated": sets["generated"],
+        "fair": fair,
+    }
+
+
+def _evaluate(sets: dict[str, RoomSet], options: EvalOptions) -> dict[str, dict[str, Estimate]]:
+    """Every metric that there is what it needs for, by set of rooms and key."""
+    given = {"inception": options.inception, "alexnet": options.alexnet}
+    networks = ["effnet_lite0", *(name for name, path in given.items() if path is not None)]
+    metrics = [metric for metric in METRICS if metric.applies(networks, options.boxes)]
+    comparison = Comparison(sets["test"], sets["fair"], options.seed, options.alexnet)
+    for name in ("test", *PICTURED):
+        comparison.columns[name] = {
+            metric.key: metric.function(sets[name], comparison)
+            for metric in metrics
+            if name in metric.sets
+        }
+    return comparison.columns
+
+
+def _result(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
+    values = {
+        name: {key: estimate.value for key, estimate in estimates.items()}
+        for name, estimates in columns.items()
+    }
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "note": NOTE,
+        **values.pop("generated"),
+        **{f"{key}_test": value for key, value in values.pop("test").items()},
+        **values,
+        "intervals": {
+            name: {key: estimate.interval() for key, estimate in estimates.items()}
+            for name, estimates in columns.items()
+        },
+    }
+
+
+def without_void(scene: Scene) -> Scene:
+    """The scene without furniture that no label names."""
+    known = zip(scene.objects, scene.class_indices, strict=True)
+    return replace(scene, objects=tuple(item for item, index in known if index != VOID))
+
+
+def seeded_rows(available: int, count: int, seed: int) -> list[int]:
+    """At most `count` of `available` rows, drawn without replacement, in order."""
+    if available <= count:
+        return list(range(available))
+    chosen = np.random.default_rng(seed).choice(available, size=count, replace=False)
+    return sorted(int(row) for row in chosen)

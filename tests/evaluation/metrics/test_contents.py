@@ -1,0 +1,48 @@
+"""What rooms hold, by hand."""
+
+import math
+
+import pytest
+from toy_metrics import of_classes
+
+from sceneprior.errors import InputError
+from sceneprior.evaluation.metrics.contents import (
+    category_kl,
+    class_frequencies,
+    object_counts,
+    type_share,
+)
+from sceneprior.scene import Scene
+
+
+def test_category_kl_by_hand():
+    test = [of_classes("double_bed", "nightstand"), of_classes("double_bed", "desk", "void")]
+    generated = [of_classes("double_bed", "nightstand", "nightstand", "desk"), of_classes("void")]
+    # test: bed 1/2, nightstand 1/4, desk 1/4; generated: 1/4, 1/2, 1/4
+    by_hand = 0.5 * math.log(2) + 0.25 * math.log(1 / 2) + 0.25 * math.log(1)
+    # The epsilon of 1e-6 moves each logarithm by at most 4e-6.
+    assert category_kl(generated, test) == pytest.approx(by_hand, abs=4e-6)
+    assert category_kl(test, test) == 0
+
+
+def test_a_class_never_generated_costs_the_epsilon_not_infinity():
+    test, generated = [of_classes("desk", "sofa")], [of_classes("desk")]
+    by_hand = 0.5 * math.log((0.5 + 1e-6) / (1 + 1e-6)) + 0.5 * math.log((0.5 + 1e-6) / 1e-6)
+    assert category_kl(generated, test) == pytest.approx(by_hand, abs=1e-12)
+    assert math.isfinite(category_kl([of_classes()], test))
+
+
+def test_scenes_of_different_label_sets_are_not_compared():
+    living = Scene("a", "front3d_living", ())
+    with pytest.raises(InputError, match="label sets front3d_bedroom, front3d_living came"):
+        category_kl([living], [of_classes("desk")])
+    with pytest.raises(InputError, match="no scenes came"):
+        class_frequencies([])
+
+
+def test_counts_and_type_share_leave_void_out():
+    scenes = [of_classes("kids_bed", "void"), of_classes("desk"), of_classes()]
+    assert object_counts(scenes).tolist() == [1, 1, 0]
+    assert type_share(scenes) == pytest.approx(1 / 3)
+    assert type_share([Scene("a", "scannet", ())]) is None
+    assert type_share([]) is None

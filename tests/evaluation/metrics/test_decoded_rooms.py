@@ -1,0 +1,76 @@
+"""IoU and matching of boxes: by hand, on a grid, and against trimesh."""
+
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+from toy_metrics import of_classes, room
+
+from sceneprior.evaluation.metrics.decoded_rooms import (
+    box_iou_3d,
+    match_scenes,
+    reconstruction_scores,
+)
+
+
+def test_iou_by_hand():
+    centers = np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0.5], [2, 0, 0], [0, 0, 0]])
+    sizes = np.array([[1.0, 1, 1]] * 4 + [[0.5, 0.5, 0.5]])
+    iou = box_iou_3d(centers[:1], sizes[:1], centers, sizes)
+    # same; half shared: 0.5 / 1.5; an eighth: 0.125 / 1.875; apart; inside: 0.125 / 1
+    np.testing.assert_allclose(iou, [[1, 1 / 3, 1 / 15, 0, 0.125]], atol=1e-15)
+    flat = np.array([[1.0, 0, 1]])
+    assert box_iou_3d(centers[:1], flat, centers[:1], flat)[0, 0] == 0
+
+
+def test_iou_agrees_with_volumes_counted_on_a_grid():
+    # Boxes on whole tenths of a metre: counting 10 cm cells is exact.
+    rng = np.random.default_rng(0)
+    low = rng.integers(0, 10, size=(12, 3))
+    high = low + rng.integers(1, 10, size=(12, 3))
+    cells = [
+        {*itertools.product(*(range(a, b) for a, b in zip(*corners, strict=True)))}
+        for corners in zip(low, high, strict=True)
+    ]
+    counted = [[len(a & b) / len(a | b) for b in cells] for a in cells]
+    centers, sizes = (low + high) / 20, (high - low) / 10
+    np.testing.assert_allclose(box_iou_3d(centers, sizes, centers, sizes), counted, atol=1e-12)
+
+
+def test_unions_agree_with_trimesh_volumes():
+    box = trimesh.creation.box(extents=(1.2, 0.7, 2.0))
+    center, size = np.zeros((1, 3)), box.extents[None]
+    shifted = box_iou_3d(center, size, center + 0.2, size)
+    shared = np.prod(box.extents - 0.2)
+    assert shifted[0, 0] == pytest.approx(shared / (2 * box.volume - shared), abs=1e-12)
+
+
+def test_matching_ignores_order_and_class():
+    truth = room(("desk", (0, 0.5, 0)), ("sofa", (3, 0.5, 0)), ("table", (6, 0.5, 0)))
+    decoded = room(("sofa", (6, 0.5, 0)), ("sofa", (3.5, 0.5, 0)), ("desk", (0, 0.5, 0)))
+    match = match_scenes(decoded, truth)
+    pairs = dict(zip(match.decoded.tolist(), match.truth.tolist(), strict=True))
+    assert pairs == {0: 2, 1: 1, 2: 0}
+    assert match.class_accuracy == pytest.approx(2 / 3)
+    assert match.mean_iou == pytest.approx((1 + 1 / 3 + 1) / 3)
+
+
+def test_unmatched_objects_count_as_wrong_and_far_ones_go_to_the_nearest():
+    truth = room(("desk", (0, 0.5, 0)), ("sofa", (9, 0.5, 0)))
+    match = match_scenes(room(("sofa", (7, 0.5, 0))), truth)
+    assert match.truth.tolist() == [1]
+    assert match.class_accuracy == 0.5 and match.mean_iou == 0
+    assert match_scenes(of_classes(), truth).class_accuracy == 0
+    assert match_scenes(truth, of_classes()).class_accuracy is None
+
+
+def test_reconstruction_scores_weigh_every_true_object_alike():
+    one = (of_classes("desk"), of_classes("desk"))
+    three = (of_classes("desk", "sofa"), of_classes("desk", "desk", "table"))
+    scores = reconstruction_scores([one, three])
+    assert scores["class_accuracy"] == pytest.approx(2 / 4)
+    assert scores["box_iou_3d"] == pytest.approx(3 / 4)
+    assert scores["count_accuracy"] == 0.5
+    assert (scores["rooms"], scores["objects"]) == (2, 4)
+    assert reconstruction_scores([])["box_iou_3d"] is None

@@ -1,0 +1,25 @@
+"""Intersections of boxes, by hand."""
+
+import pytest
+from toy_metrics import of_classes, room
+
+from sceneprior.evaluation.metrics.overlaps import overlap_pairs
+
+
+def test_overlaps_by_hand():
+    # Cubes at 0, 0.5 and 5; a fourth shares 0.5% with the third; a void one inside the first.
+    scene = room(
+        ("desk", (0, 0.5, 0)), ("chair", (0.5, 0.5, 0)), ("sofa", (5, 0.5, 0)),
+        ("stool", (5.995, 0.5, 0)), ("void", (0, 0.5, 0)),
+    )  # fmt: skip
+    overlaps = overlap_pairs([scene, of_classes("desk")])
+    assert overlaps.per_room == 0.5
+    assert overlaps.share == pytest.approx(1 / 6)
+
+
+def test_a_small_box_inside_a_large_one_intersects_and_touching_ones_do_not():
+    inside = room(("desk", (0, 1, 0)), ("stool", (0, 1, 0)), sizes=[(4, 2, 4), (0.1, 0.1, 0.1)])
+    assert overlap_pairs([inside]).per_room == 1
+    touching = room(("desk", (0, 0.5, 0)), ("stool", (1, 0.5, 0)))
+    assert overlap_pairs([touching]).per_room == 0
+    assert overlap_pairs([]).per_room == overlap_pairs([of_classes()]).share == 0
