@@ -13,9 +13,9 @@ from sceneprior.baselines.gan.losses import (
     SIZES_M,
     VARIED,
     contents,
-    implausible,
-    mistaken,
-    sameness,
+    bounds_penalty,
+    adversarial_loss,
+    diversity_loss,
 )
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.geometry.cameras import camera_centers
@@ -37,7 +37,7 @@ def test_the_loss_is_cross_entropy(torch_rng):
             )
             for score in (patches, rooms)
         )
-        assert_close(mistaken((patches, rooms), real), wanted, rtol=0, atol=1e-12)
+        assert_close(adversarial_loss((patches, rooms), real), wanted, rtol=0, atol=1e-12)
 
 
 def test_contents_are_counts_and_shares_of_the_views(torch_rng):
@@ -60,7 +60,7 @@ def test_what_is_plausible_costs_nothing_and_what_is_not_is_drawn_back(toy_shard
         camera_centers(views.world_to_camera).abs().flatten(0, 1).max(dim=0).values + MARGIN_M
     ).tolist()
     fine = torch.tensor([0.0, 0.5, 0, 1, 1, 1]).repeat(4, 2, 1)
-    assert implausible(scenes_of(fine), views) == 0
+    assert bounds_penalty(scenes_of(fine), views) == 0
     entries = fine.numel() / 2 * 3  # of each kind: out of the room, too small, too large
     for axis, value, cost in (
         (0, -reach_x, 0.5),  # half of it is out
@@ -73,7 +73,7 @@ def test_what_is_plausible_costs_nothing_and_what_is_not_is_drawn_back(toy_shard
         boxes = fine.clone()
         boxes[2, 1, axis] = value
         boxes.requires_grad_()
-        told = implausible(scenes_of(boxes), views)
+        told = bounds_penalty(scenes_of(boxes), views)
         assert told.item() * entries == pytest.approx(cost, abs=1e-4)
         told.backward()
         pulled = boxes.grad[2, 1, axis] * math.copysign(1, value - float(fine[2, 1, axis]))
@@ -89,10 +89,10 @@ def test_sameness_is_minus_the_mean_log_spread_and_never_without_a_slope(torch_r
     boxes = (numbers * spreads).requires_grad_()
 
     assert_close(
-        sameness(scenes_of(boxes)).item(), -math.log(0.5 / VARIED[0] * 0.1) / 5, rtol=0, atol=1e-3
+        diversity_loss(scenes_of(boxes)).item(), -math.log(0.5 / VARIED[0] * 0.1) / 5, rtol=0, atol=1e-3
     )
     one = torch.ones(3, 2, 6, requires_grad=True)
     expected = -sum(math.log(1e-3 / wanted) for wanted in VARIED) / 5
-    assert sameness(scenes_of(one)).item() == pytest.approx(expected, abs=1e-4)
-    sameness(scenes_of(one)).backward()
+    assert diversity_loss(scenes_of(one)).item() == pytest.approx(expected, abs=1e-4)
+    diversity_loss(scenes_of(one)).backward()
     assert one.grad.isfinite().all()

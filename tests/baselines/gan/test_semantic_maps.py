@@ -9,7 +9,7 @@ import trimesh
 from torch.testing import assert_close
 
 from sceneprior.baselines.gan.semantic_maps import (
-    LENS,
+    POOLING,
     choices,
     compose_maps,
     observed_counts,
@@ -57,15 +57,15 @@ def test_observed_maps_are_the_shares_of_classes_in_each_pixel(views):
     maps = observed_maps(views, CLASSES)
     ids = views.instance_ids
     rooms, seen, height, width = ids.shape
-    assert maps.shape == (rooms, seen, CLASSES, height // LENS, width // LENS)
+    assert maps.shape == (rooms, seen, CLASSES, height // POOLING, width // POOLING)
     wanted = torch.zeros_like(maps)
     for room in range(rooms):
         for view in range(seen):
-            for row in range(height // LENS * LENS):
-                for column in range(width // LENS * LENS):
+            for row in range(height // POOLING * POOLING):
+                for column in range(width // POOLING * POOLING):
                     item = int(ids[room, view, row, column])
                     label = int(views.object_class[room, item - 1]) if item else VOID
-                    wanted[room, view, label, row // LENS, column // LENS] += 1 / LENS**2
+                    wanted[room, view, label, row // POOLING, column // POOLING] += 1 / POOLING**2
     assert torch.equal(maps, wanted)
     assert 0 < maps[:, :, VOID].mean() < 1
 
@@ -115,7 +115,7 @@ def test_what_is_not_kept_hides_nothing(views, toy_shards):
 def test_the_maps_are_the_renderers_layers(views, toy_shards):
     """Independent of our own laying over: `compositing='layered'`, where no edge is soft."""
     scenes = true_scenes(toy_shards, 4)
-    size = (views.instance_ids.shape[-2] // LENS, views.instance_ids.shape[-1] // LENS)
+    size = (views.instance_ids.shape[-2] // POOLING, views.instance_ids.shape[-1] // POOLING)
     scale = torch.tensor([size[1] / views.image_size[1], size[0] / views.image_size[0], 1])
     layers = render_silhouettes(
         scenes.vertices_m, FACES, views.world_to_camera, views.intrinsics * scale[:, None],
