@@ -32,8 +32,10 @@ def make_batch(rooms: int, views: int, objects: int) -> tuple[Tensor, Tensor, Te
     cameras = torch.eye(4).repeat(rooms, views, 1, 1)
     cameras[..., :3, :3] = turn * torch.linalg.det(turn)[..., None, None]
     cameras[..., :3, 3] = torch.randn(rooms, views, 3, generator=generator)
-    lens = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]).expand(rooms, views, 3, 3)
-    return centers.requires_grad_(), sizes.requires_grad_(), cameras, lens
+    intrinsics = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]).expand(
+        rooms, views, 3, 3
+    )
+    return centers.requires_grad_(), sizes.requires_grad_(), cameras, intrinsics
 
 
 def boxes_ratio(
@@ -66,14 +68,14 @@ def boxes_ratio(
 def _boxes_ratio(
     repeats: int, rooms: int, views: int, objects: int, level: int
 ) -> dict[str, float]:
-    centers, sizes, cameras, lens = make_batch(rooms, views, objects)
+    centers, sizes, cameras, intrinsics = make_batch(rooms, views, objects)
     sphere = icosphere(level)[0].expand(rooms, objects, -1, -1)
 
     def closed() -> Boxes2D:
-        return boxes_of_ellipsoids(centers, sizes, cameras, lens, SIZE)
+        return boxes_of_ellipsoids(centers, sizes, cameras, intrinsics, SIZE)
 
     def points() -> Boxes2D:
-        return boxes_of_points(place(sphere, centers, sizes), cameras, lens, SIZE)
+        return boxes_of_points(place(sphere, centers, sizes), cameras, intrinsics, SIZE)
 
     def seconds(boxes_of: Callable[[], Boxes2D]) -> float:
         centers.grad = sizes.grad = None

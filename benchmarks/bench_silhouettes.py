@@ -42,12 +42,12 @@ def furnished_room(level: int, device: str = "cpu", rooms: int = 1) -> dict[str,
     vertices = sphere * torch.from_numpy(half)[:, :, None] + torch.from_numpy(place)[:, :, None]
     poses = [looking_in(2 * np.pi * view / VIEWS) for view in range(VIEWS)]
     height, width = SIZE
-    lens = torch.tensor([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
+    intrinsics = torch.tensor([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
     room = {
         "vertices_m": vertices.float(),
         "faces": faces,
         "world_to_camera": torch.from_numpy(np.array(poses)).float().expand(rooms, -1, -1, -1),
-        "intrinsics": lens.expand(rooms, VIEWS, 3, 3),
+        "intrinsics": intrinsics.expand(rooms, VIEWS, 3, 3),
     }
     return {key: value.to(device) for key, value in room.items()} | {"image_size": SIZE}
 

@@ -33,13 +33,13 @@ def disc(level: int, mode: str, radius_px: float) -> tuple[np.ndarray, np.ndarra
     """Coverage of a far small sphere, and each pixel's distance outside a circle of RADIUS_PX."""
     sphere, faces = icosphere(level)
     focal, depth = 1000.0, 100.0
-    lens = torch.tensor([[focal, 0, 20.13], [0, focal, 15.37], [0, 0, 1]]).double()
+    intrinsics = torch.tensor([[focal, 0, 20.13], [0, focal, 15.37], [0, 0, 1]]).double()
     vertices = sphere.double() * (radius_px * depth / focal) + torch.tensor([0, 0, depth])
     masks = render_silhouettes(
         vertices[None, None],
         faces,
         torch.eye(4).double()[None, None],
-        lens[None, None],
+        intrinsics[None, None],
         (30, 40),
         sigma_px2=0.2025,  # the paper's at 120 x 90
         mode=mode,

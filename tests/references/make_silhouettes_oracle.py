@@ -1,4 +1,4 @@
-"""Write tests/data/silhouettes.npz: what our float64 reference draws of one small scene.
+"""Write tests/golden/silhouettes.npz: what our float64 reference draws of one small scene.
 
     cd tests && python -m references.make_silhouettes_oracle
 
@@ -15,7 +15,7 @@ from toy_rooms import look_at
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.silhouettes.render import render_scene
 
-FILE = Path(__file__).resolve().parents[1] / "data" / "silhouettes.npz"
+FILE = Path(__file__).resolve().parents[1] / "golden" / "silhouettes.npz"
 MODES = ("exact", "fast")
 COMPOSITING = ("alone", "layered", "paper")
 SIGMA_PX2 = 0.4

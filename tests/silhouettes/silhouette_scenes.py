@@ -75,7 +75,7 @@ def cast(scene: dict, dtype: torch.dtype) -> dict:
     return scene | floats
 
 
-def render_and_pull(scene: dict, **options) -> tuple:
+def render_and_grad(scene: dict, **options) -> tuple:
     """Masks, front, depth and the gradient of a random weighing of the masks."""
     vertices = scene["vertices_m"].clone().requires_grad_()
     drawn = render_scene(**scene | {"vertices_m": vertices}, **options)

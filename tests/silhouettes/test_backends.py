@@ -11,7 +11,7 @@ from silhouette_scenes import (
     MODES,
     cast,
     random_scene,
-    render_and_pull,
+    render_and_grad,
     seen_ahead,
     sphere_scene,
     triangles,
@@ -30,24 +30,24 @@ def how(request) -> dict:
 
 def backends_agree(scene: dict, **options) -> tuple:
     """What `reference` draws in float64, after comparing `cpu` in both precisions."""
-    wanted = render_and_pull(scene, backend="reference", **options)
-    in_float64 = render_and_pull(scene, backend="cpu", **options)
-    in_float32 = render_and_pull(cast(scene, torch.float32), backend="cpu", **options)
-    # float64: sums in another order; seen 6e-15 in masks and 2e-14 of the largest pull.
+    wanted = render_and_grad(scene, backend="reference", **options)
+    in_float64 = render_and_grad(scene, backend="cpu", **options)
+    in_float32 = render_and_grad(cast(scene, torch.float32), backend="cpu", **options)
+    # float64: sums in another order; seen 6e-15 in masks and 2e-14 of the largest gradient.
     # float32: u and v are rounded, to 3e-5 px where a corner lies 400 px away, and sigma is as
-    # small as 0.02 px2; seen 8e-6 in masks and 1e-4 of the largest pull. No pixel of these scenes
-    # lies so near an edge that rounding moves it to the other side.
-    for drawn, masks_to, depth_to, pull_to in (
+    # small as 0.02 px2; seen 8e-6 in masks and 1e-4 of the largest gradient. No pixel of these
+    # scenes lies so near an edge that rounding moves it to the other side.
+    for drawn, masks_to, depth_to, grad_to in (
         (in_float64, 1e-12, 1e-12, 1e-9),
         (in_float32, 3e-5, 3e-5, 2e-4),
     ):
-        masks, front, depth_m, pull = drawn
-        assert masks.dtype == depth_m.dtype == pull.dtype and front.dtype == torch.int32
+        masks, front, depth_m, grad = drawn
+        assert masks.dtype == depth_m.dtype == grad.dtype and front.dtype == torch.int32
         assert_close(masks.double(), wanted[0], rtol=0, atol=masks_to)
         assert torch.equal(front, wanted[1])
         assert_close(depth_m.double(), wanted[2], rtol=depth_to, atol=0)
         largest = float(wanted[3].abs().max()) if wanted[3].numel() else 0.0
-        assert_close(pull.double(), wanted[3], rtol=0, atol=pull_to * max(largest, 1e-30))
+        assert_close(grad.double(), wanted[3], rtol=0, atol=grad_to * max(largest, 1e-30))
     return wanted
 
 
@@ -100,9 +100,9 @@ def test_faces_without_an_area_are_not_drawn(how):
         [[0, 0, 2], [1, 0.1, 2], [0.3, 1, 2]], [[-1, 0.2, 2], [0, 0.2, 2], [1, 0.2, 2]]
     )
     scene["faces"] = torch.tensor([[0, 1, 2], [0, 0, 1], [2, 2, 2]])
-    masks, front, _, pull = backends_agree(scene, sigma_px2=0.5, **how)
+    masks, front, _, grad = backends_agree(scene, sigma_px2=0.5, **how)
     assert masks[0, 0, 0].max() > 0.9 and masks[0, 0, 1].max() == 0
-    assert (front == 1).sum() == 0 and pull[0, 1].abs().max() == 0
+    assert (front == 1).sum() == 0 and grad[0, 1].abs().max() == 0
 
 
 @pytest.mark.parametrize("lacking", ["rooms", "objects", "views", "faces"])
@@ -118,19 +118,19 @@ def test_nothing_to_draw(lacking, how):
         scene["intrinsics"] = scene["intrinsics"][:, :0]
     else:
         scene["faces"] = scene["faces"][:0]
-    masks, front, depth_m, pull = backends_agree(scene, **how)
+    masks, front, depth_m, grad = backends_agree(scene, **how)
     (rooms, objects), views = scene["vertices_m"].shape[:2], scene["world_to_camera"].shape[1]
     assert masks.shape == (rooms, views, objects, 24, 32) and front.shape == (rooms, views, 24, 32)
     assert (masks == 0).all() and (front == -1).all() and (depth_m == torch.inf).all()
-    assert pull.shape == scene["vertices_m"].shape and (pull == 0).all()
+    assert grad.shape == scene["vertices_m"].shape and (grad == 0).all()
 
 
 def test_an_object_not_drawn_is_empty_hides_nothing_and_has_no_gradient(how):
     scene = sphere_scene()
     drawn = torch.tensor([[False, True]])
-    masks, front, _, pull = backends_agree(scene, drawn=drawn, **how)
+    masks, front, _, grad = backends_agree(scene, drawn=drawn, **how)
     alone = render_silhouettes(**scene, **how | {"compositing": "alone"})
-    assert masks[0, 0, 0].max() == 0 and pull[0, 0].abs().max() == 0
+    assert masks[0, 0, 0].max() == 0 and grad[0, 0].abs().max() == 0
     assert_close(masks[0, 0, 1], alone[0, 0, 1], rtol=0, atol=1e-12)
     assert set(front.unique().tolist()) == {-1, 1}
 
@@ -138,19 +138,19 @@ def test_an_object_not_drawn_is_empty_hides_nothing_and_has_no_gradient(how):
 def test_an_empty_view_is_zero_and_harmless(how):
     scene = sphere_scene()
     scene["vertices_m"] = scene["vertices_m"] * torch.tensor([1, 1, -1])
-    masks, front, depth_m, pull = backends_agree(scene, **how)
+    masks, front, depth_m, grad = backends_agree(scene, **how)
     assert (masks == 0).all() and (front == -1).all() and (depth_m == torch.inf).all()
-    assert (pull == 0).all()
+    assert (grad == 0).all()
 
 
 def test_vertices_and_faces_that_are_not_contiguous(how):
     sphere, faces = icosphere(0)
     scene = seen_ahead(sphere[None] * 0.5 + torch.tensor([0.1, 0.2, 2.0]), faces)
-    plain = render_and_pull(scene, backend="cpu", **how)
+    plain = render_and_grad(scene, backend="cpu", **how)
     faces = faces.T.contiguous().T
     strided = torch.stack([scene["vertices_m"], scene["vertices_m"] * 9], dim=-1)[..., 0]
     assert not (strided.is_contiguous() or faces.is_contiguous())
-    other = render_and_pull(scene | {"vertices_m": strided, "faces": faces}, backend="cpu", **how)
+    other = render_and_grad(scene | {"vertices_m": strided, "faces": faces}, backend="cpu", **how)
     for one, two in zip(plain, other, strict=True):
         assert torch.equal(one, two)
 
@@ -164,7 +164,7 @@ def test_the_number_of_threads_changes_no_bit(dtype, how):
     try:
         for count in (1, 2, 2, 1):
             numba.set_num_threads(count)
-            results.append(render_and_pull(scene, sigma_px2=1.0, **how))
+            results.append(render_and_grad(scene, sigma_px2=1.0, **how))
     finally:
         numba.set_num_threads(before)
     assert np.abs(results[0][3].numpy()).max() > 0.1

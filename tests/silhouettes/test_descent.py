@@ -15,7 +15,7 @@ LENS = torch.tensor([[26.0, 0, 24], [0, 26, 18], [0, 0, 1]])
 EYES = ([0, 1, 3.0], [2.5, 1.2, 1.0], [-2.4, 1.5, 0.5])
 AROUND = np.array([0, 0.5, 0])
 STEPS = (4.0,) * 30 + (0.5,) * 30 + (0.06,) * 40 + (0.01,) * 20
-"""sigma in px2: first felt from afar, then crisp, for the exact mode's soft masks are too large."""
+"""sigma in px2: first reaching far, then crisp, for the exact mode's soft masks are too large."""
 
 
 class Room:

@@ -1,4 +1,4 @@
-"""tests/data/silhouettes.npz: what the renderer meant when it was written, kept to the digit."""
+"""tests/golden/silhouettes.npz: what the renderer meant when it was written, kept to the digit."""
 
 from functools import lru_cache
 
@@ -34,10 +34,10 @@ def test_the_file_holds_the_scripts_scene_and_nothing_else():
 def test_both_backends_and_modes_draw_what_was_kept(mode, compositing, backend):
     arrays = {name: kept()[name] for name in scene_arrays()}
     drawn = draw(arrays, mode, compositing, backend)
-    masks, pull = (kept()[f"{name}_{mode}_{compositing}"] for name in ("masks", "gradient"))
-    assert masks.max() > 0.9 and np.abs(pull).max() > 1
+    masks, grad = (kept()[f"{name}_{mode}_{compositing}"] for name in ("masks", "gradient"))
+    assert masks.max() > 0.9 and np.abs(grad).max() > 1
     # float64 sums in another order; seen 2e-15 and 1e-14.
     np.testing.assert_allclose(drawn["masks"], masks, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(drawn["gradient"], pull, rtol=0, atol=1e-10 * np.abs(pull).max())
+    np.testing.assert_allclose(drawn["gradient"], grad, rtol=0, atol=1e-10 * np.abs(grad).max())
     np.testing.assert_array_equal(drawn["front"], kept()[f"front_{mode}"])
     np.testing.assert_allclose(drawn["depth_m"], kept()[f"depth_m_{mode}"], rtol=1e-12)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from sceneprior.silhouettes.cuda import kernels
+from sceneprior.silhouettes.cuda.window_kernels import bound_faces
 from sceneprior.silhouettes.reference import Settings
 
 TILE = kernels.TILE.value
@@ -71,7 +72,7 @@ def _bound(
     places = torch.empty((meshes, 4), dtype=torch.int32, device=pixels.device)
     # Without fused multiply-adds, whose rounding would lend an area to a face that has none.
     launch(
-        kernels.bound_faces, meshes, pixels, depths, faces, drawn, bounds, block_bounds,
+        bound_faces, meshes, pixels, depths, faces, drawn, bounds, block_bounds,
         places, vertices, len(faces), blocks, *settings.image_size, reach, settings.near_m,
         GROUP=8, num_warps=4, enable_fp_fusion=False,
     )  # fmt: skip

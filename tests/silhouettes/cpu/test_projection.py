@@ -31,12 +31,12 @@ def test_pixels_depths_and_gradients_are_the_plain_projections(dtype, to):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_camera_that_moves_has_a_gradient_in_both_backends(mode):
     scene = random_scene(17, views=2)
-    pulls = {}
+    gradients = {}
     for backend in ("cpu", "reference"):
         moving = {k: scene[k].clone().requires_grad_() for k in ("world_to_camera", "intrinsics")}
         masks = render_silhouettes(**scene | moving, mode=mode, sigma_px2=0.5, backend=backend)
         (masks * masks).sum().backward()
-        pulls[backend] = [camera.grad for camera in moving.values()]
-    for mine, wanted in zip(pulls["cpu"], pulls["reference"], strict=True):
+        gradients[backend] = [camera.grad for camera in moving.values()]
+    for mine, wanted in zip(gradients["cpu"], gradients["reference"], strict=True):
         assert wanted.abs().max() > 0.1
         assert_close(mine, wanted, rtol=0, atol=1e-9 * float(wanted.abs().max()))
