@@ -31,7 +31,7 @@ def fit(
         "32-true"
     ),
 ) -> None:
-    """Train a run: the layout stage, then the shape stage; or a baseline (`stages`)."""
+    """Train a run: the layout stage, then the shape stage; or the config's baseline."""
     from sceneprior.config import load_config
 
     settings = load_config(config, tuple(set_ or ()))  # before what takes seconds to import
