@@ -18,7 +18,7 @@ from sceneprior.baselines.sync2gen.stage import Sync2genStage
 from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.config import load_any_run, load_run
 from sceneprior.errors import ConfigError, InputError
-from sceneprior.evaluation.synthesis import EvalOptions
+from sceneprior.evaluation.synthesis import EvalOptions, without_void
 from sceneprior.experiments.evaluate import evaluate_run, read_curves, report_run
 from sceneprior.experiments.evaluate_samples import SampleEvaluator
 from sceneprior.generation.decode import decode_training_rooms, synthesize

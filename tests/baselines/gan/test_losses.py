@@ -12,9 +12,9 @@ from sceneprior.baselines.gan.losses import (
     MARGIN_M,
     SIZES_M,
     VARIED,
-    contents,
-    bounds_penalty,
     adversarial_loss,
+    bounds_penalty,
+    contents,
     diversity_loss,
 )
 from sceneprior.data.dataset import ViewDataset
