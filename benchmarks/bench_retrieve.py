@@ -56,7 +56,7 @@ def main() -> None:
         pass
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     objects = arguments.scenes * OBJECTS
-    figures = {
+    measured = {
         "scenes": arguments.scenes,
         "objects": objects,
         "models": arguments.models,
@@ -69,9 +69,9 @@ def main() -> None:
         "cpu_ms_per_object": round(1000 * cpu / objects, 1),
         **check(scenes, cad_models, arguments.checked),
     }
-    print(json.dumps(figures, indent=1))
+    print(json.dumps(measured, indent=1))
     if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
+        arguments.json.write_text(json.dumps(measured, indent=1) + "\n")
 
 
 def class_shares() -> dict[str, float]:

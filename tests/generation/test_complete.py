@@ -43,15 +43,15 @@ def scene(*objects: SceneObject) -> Scene:
     return Scene("mine", "front3d_bedroom", objects)
 
 
-def random_decoded(rooms: int, slots: int, seed: int = 0) -> DecodedScenes:
+def random_decoded(rooms: int, predictions: int, seed: int = 0) -> DecodedScenes:
     generator = torch.Generator().manual_seed(seed)
 
     def draw(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
     return DecodedScenes(
-        draw(rooms, slots, 5), draw(rooms, slots, 3), draw(rooms, slots, 3).exp(),
-        draw(rooms, slots),
+        draw(rooms, predictions, 5), draw(rooms, predictions, 3), draw(rooms, predictions, 3).exp(),
+        draw(rooms, predictions),
     )  # fmt: skip
 
 
@@ -74,15 +74,21 @@ def loss_in_words(decoded, room, labels, boxes, target):
     chance = decoded.class_logits[room].softmax(dim=-1)
     predicted = torch.cat([decoded.centers_m[room], decoded.sizes_m[room]], dim=-1)
 
-    def cost(slots, of_class):
+    def cost(predictions, of_class):
         total = torch.zeros((), dtype=torch.float64)
-        for k, slot in enumerate(slots):
-            kept = score[: slot + 1].prod() if target == "first_n" else (1 - score[:slot]).prod()
-            total += BOX_WEIGHT * (predicted[slot] - boxes[k]).abs().mean() - kept.log()
-            total += of_class(chance[slot, labels[k]])
+        for k, prediction in enumerate(predictions):
+            kept = (
+                score[: prediction + 1].prod()
+                if target == "first_n"
+                else (1 - score[:prediction]).prod()
+            )
+            total += BOX_WEIGHT * (predicted[prediction] - boxes[k]).abs().mean() - kept.log()
+            total += of_class(chance[prediction, labels[k]])
         return total
 
-    best = min(permutations(range(4), len(labels)), key=lambda slots: cost(slots, torch.neg))
+    best = min(
+        permutations(range(4), len(labels)), key=lambda predictions: cost(predictions, torch.neg)
+    )
     return cost(best, lambda p: -p.log()) / max(len(labels), 1)
 
 

@@ -90,7 +90,7 @@ def test_alone_or_among_others_an_image_has_the_same_answer(trained, views, star
 def test_images_that_do_not_move_stop_early_and_others_go_on(trained, views, start):
     hopeless = FitSchedule(steps=60, drop_at=50, patience=20, least_gain=2.0)
     fit = fit_latents(trained, views, start, hopeless)
-    # Nothing gains 200%: down at the first look, done at the second.
+    # Nothing gains 200%: down at the first check, done at the second.
     assert fit.steps.tolist() == [40] * len(start)
     eager = fit_latents(trained, views, start, replace(hopeless, patience=0))
     assert eager.steps.tolist() == [60] * len(start)

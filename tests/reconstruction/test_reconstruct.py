@@ -94,7 +94,7 @@ def test_classes_that_the_run_never_generates(trained, images):
     names = label_set(images[0].label_set)
     with torch.no_grad():
         rooms = [trained.prior(row.unsqueeze(0), False).class_logits[0] for row in trained.logits]
-    generated = {int(slot.argmax()) for room in rooms for slot in room}
+    generated = {int(logits.argmax()) for room in rooms for logits in room}
     assert names.index("sofa") not in generated  # no toy room has one
     learnt = [index for index in sorted(generated) if index]
     image = replace(images[0], object_class=np.array([names.index("sofa"), *learnt]))
