@@ -20,7 +20,7 @@ from sceneprior.offscreen import Pinhole, Renderer
 from sceneprior.reconstruction.fit import rows_of
 from sceneprior.reconstruction.observed import ObservedImage, as_views
 from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.shards import Shard, iterate_rooms
+from sceneprior.shards import Shard, iterate_rooms, thinned
 from sceneprior.views import DecodedScenes
 
 SHORTLIST = 16
@@ -213,7 +213,7 @@ def mask_overlap(
         columns: About how many pixels wide they are compared.
     """
     step = max(1, round(image.instance_ids.shape[1] / columns))
-    observed = image.instance_ids[step // 2 :: step, step // 2 :: step]
+    observed = image.instance_ids[thinned(step)]
     height, width = observed.shape
     full = image.instance_ids.shape
     lens = np.diag([width / full[1], height / full[0], 1]) @ image.intrinsics
