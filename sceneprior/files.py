@@ -74,7 +74,7 @@ def write_json(path: Path, data: Any, indent: int = 1) -> None:
 
 
 def remove_parts(folder: Path) -> None:
-    """Delete what killed writers left anywhere under a folder; nobody may be writing there.
+    """Delete what killed writers left anywhere under a folder; no process may be writing there.
 
     Raises:
         OSError: the folder cannot be changed.

@@ -264,8 +264,7 @@ class Shard:
         """Instance-id images of some views, every `step`-th pixel: (views, H/step, W/step)."""
         with self._group(room_id) as group:
             images = group["instance_ids"]
-            # Start in the middle of a block, so that the small image is not shifted.
-            return np.stack([images[view][step // 2 :: step, step // 2 :: step] for view in views])
+            return np.stack([images[view][thinned(step)] for view in views])
 
     def has_ground_truth(self, room_id: str) -> bool:
         """Whether the room is known in 3D; the user's posed pictures have none."""
@@ -293,6 +292,14 @@ class Shard:
                 height_m=float(hidden.attrs["height_m"]),
                 **{name: hidden[name][()] for name in _TRUTH_ARRAYS},
             )
+
+
+def thinned(step: int) -> tuple[slice, slice]:
+    """Indexes every `step`-th pixel of an image (height, width).
+
+    It starts in the middle of a block, so that the small image is not shifted.
+    """
+    return slice(step // 2, None, step), slice(step // 2, None, step)
 
 
 def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:

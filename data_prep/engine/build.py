@@ -88,7 +88,7 @@ def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
     missing = [shard for shard in _asked_for(source, plan, shards) if shard.name not in reports]
     if missing:
         with writing(out):
-            # Until the last shard is there again, nobody may take the folder for finished.
+            # Until the last shard is there again, the folder must not look finished.
             for name in REPORT_FILES:
                 (out / name).unlink(missing_ok=True)
     kind = plan.settings["renderer"]

@@ -1,4 +1,4 @@
-"""Worker processes on other machines: the same `run` as workers.py, on a Dask cluster."""
+"""Runs functions in worker processes on other machines, of a Dask cluster, as workers.py does."""
 
 import contextlib
 import os
@@ -25,7 +25,7 @@ def cluster(address: str) -> Iterator[Run]:
     another.
 
     Raises:
-        InputError: dask is not installed, nobody answers at `address`, there are no workers, they
+        InputError: dask is not installed, nothing answers at `address`, there are no workers, they
             lack this package or have another version of it, or the cluster is lost.
     """
     with contextlib.ExitStack() as stack:
@@ -106,9 +106,9 @@ def _connect(address: str) -> Iterator[Any]:
                 f"The workers of {address} cannot run this package ({type(error).__name__}: "
                 f"{error}); install sceneprior {__version__} where they run."
             ) from None
-        strangers = {worker: found for worker, found in versions.items() if found != __version__}
-        if strangers:
-            worker, found = next(iter(strangers.items()))
+        others = {worker: found for worker, found in versions.items() if found != __version__}
+        if others:
+            worker, found = next(iter(others.items()))
             raise InputError(
                 f"Worker {worker} has sceneprior {found}, and this is {__version__}: shards of two "
                 "releases would differ. Install the same on every machine."

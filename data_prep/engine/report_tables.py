@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 _FAILURES_SHOWN = 10
@@ -61,7 +61,7 @@ def _classes(report: dict[str, Any]) -> Table:
 
 
 def _failures(failed: list[dict[str, str]]) -> Table:
-    table = Table("failed", "why")
+    table = Table(Column("failed", overflow="fold"), "why")
     for item in failed[:_FAILURES_SHOWN]:
         # Text, not a string: rich reads [brackets] in strings as markup.
         table.add_row(Text(item["room_id"]), Text(item["reason"]))

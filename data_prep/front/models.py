@@ -20,11 +20,7 @@ _CACHE_BYTES = 512 * 2**20
 
 
 class ModelBank:
-    """3D-FUTURE: categories of all models, meshes on demand.
-
-    Args:
-        folder: 3D-FUTURE-model.
-        cache_bytes: Meshes used last are kept, up to so many bytes.
+    """3D-FUTURE: categories of all models, meshes on demand; `cache_bytes` of them are kept.
 
     Raises:
         InputError: the folder is missing, or is not 3D-FUTURE's.

@@ -30,12 +30,8 @@ def rgb_files(
 ) -> dict[str, bytes]:
     """`rgb/<room>/<view>.png` -> its bytes, for every view.
 
-    Args:
-        room: What stands in the room, void furniture too.
-        colors: Of each piece; None: its class's.
-        views: The cameras.
-        label_set_name: Of the classes.
-        renderer: Ours draws the same picture whatever its kind (`Renderer.shaded`).
+    Void furniture is drawn, too. `colors` has one of each piece; None: its class's. The renderer
+    draws the same picture whatever its kind (`Renderer.shaded`).
     """
     names = label_set(label_set_name)
     of_class = class_colors(len(names))

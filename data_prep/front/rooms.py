@@ -57,10 +57,9 @@ def read_house(
 
     Args:
         house: `<house uid>.json`, or what `parse_house` made of it.
-        models: Where furniture meshes come from.
+        models: The furniture's meshes; `load_models=False` leaves every mesh empty (a survey).
         recipe: Its classes (a category that is not listed is `void`) and rules about scales.
         wanted: Called with (room id, room type).
-        load_models: False leaves every mesh empty (a survey needs labels only).
 
     Raises:
         InputError: the file is not a house.

@@ -74,8 +74,6 @@ class Viewpoints:
         room: Its floor bounds where cameras stand.
         boxes_m: (objects, 2, 3) lower and upper corners of all furniture in the room frame.
         targets_m: (k, 3) centres of what is worth looking at.
-        rules: Heights, angles and margins.
-        rng: All randomness.
     """
 
     def __init__(

@@ -138,12 +138,9 @@ def _check_tables(found: "FolderCheck") -> "list[Table]":
         )
     every = [check for checks in found.rooms.values() for check in checks if check.mean_iou]
     worst = sorted(every, key=lambda check: (min(check.mean_iou.values()), check.room_id))
-    worst = worst[:_WORST_SHOWN]
-    # Ids without spaces would be cut off in a narrow terminal.
-    longest = max((len(check.room_id) for check in worst), default=0)
-    rooms_column = Column("worst rooms", min_width=longest)
-    table = Table(rooms_column, "unoccluded objects", "mean 2D IoU")
-    for check in worst:
+    # Folded, or a narrow terminal would cut off the end of an id, which is the room's name.
+    table = Table(Column("worst rooms", overflow="fold"), "unoccluded objects", "mean 2D IoU")
+    for check in worst[:_WORST_SHOWN]:
         count = len(check.agreement.mesh) + len(check.agreement.box)
         table.add_row(check.room_id, str(count), _mean_iou([check]))
     return [totals, table] if worst else [totals]

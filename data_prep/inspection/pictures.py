@@ -59,8 +59,8 @@ def draw_view(
             draw.text(line[2:], name, fill=AXES[name], font=_font(12), anchor="mm")
     seen = np.flatnonzero(room.visible[view])
     if truth is not None:
-        for k in seen.tolist():
-            wires.box(truth, k)
+        for number in seen.tolist():
+            wires.box(truth, number)
     for k in seen:
         x1, y1, x2, y2 = (room.boxes[view, k] * np.array([*size, *size])).tolist()
         dark = _dark(palette[k])
@@ -153,7 +153,7 @@ def _truth(shard: Shard, room_id: str) -> RoomGroundTruth | None:
 
 
 def _floor_bounds(room: RoomViews, truth: RoomGroundTruth | None) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest x, z of the floor, or of the cameras where nobody knows the floor."""
+    """Lowest and highest x, z of the floor, or of the cameras where the floor is unknown."""
     points = np.zeros((0, 2))
     if truth is not None:
         half = truth.sizes_m[:, (0, 2)] / 2

@@ -71,8 +71,7 @@ def boxes_around(
         intrinsics: (T, 3, 3), pixels.
 
     Returns:
-        (T, 4) x1, y1, x2, y2 in pixels; NaN where a point is nearer than the near plane, where
-        no box is right.
+        (T, 4) x1, y1, x2, y2 in pixels; NaN where a point is nearer than the near plane.
     """
     boxes = np.full((len(world_to_camera), 4), np.nan)
     for view, (matrix, K) in enumerate(zip(world_to_camera, intrinsics, strict=True)):

@@ -1,1 +1,1 @@
-"""Anybody's data: posed pictures with tracked instance masks (docs/posed_data.md)."""
+"""The user's own data: posed pictures with tracked instance masks (docs/posed_data.md)."""

@@ -72,13 +72,12 @@ def pixel_counts(image: np.ndarray, count: int) -> np.ndarray:
 def observe(images: np.ndarray, is_object: np.ndarray | Sequence[bool]) -> Observations:
     """Measure every mask, and number anew the objects that are ever visible.
 
+    A mask too narrow to count keeps its pixels in the image.
+
     Args:
         images: (T, H, W) unsigned ids, k + 1 for mesh k.
         is_object: (meshes,) false for furniture outside the label set, which hides what is
             behind it but is itself nothing: its pixels become 0.
-
-    Returns:
-        What was seen. A mask too narrow to count keeps its pixels in the image.
     """
     views, height, width = images.shape
     is_object = np.asarray(is_object, dtype=bool)

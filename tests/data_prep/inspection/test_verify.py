@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 from front_jobs import front_job, three_houses
+from rich.console import Console
 
 from data_prep.engine.build import build_shards
-from data_prep.inspection.verify import verify
+from data_prep.inspection.agreement import Agreement
+from data_prep.inspection.command import _check_tables
+from data_prep.inspection.verify import FolderCheck, RoomCheck, verify
 from sceneprior.errors import InputError, ShardError
 from sceneprior.shards import Shard, room_checksum
 
@@ -47,6 +50,15 @@ def test_a_prepared_folder_is_well(shards):
     index = json.loads((shards / "index.json").read_text())
     assert sum(room.views for room in verdict.rooms["train"]) == index["counts"]["train"]["views"]
     assert verify(shards, workers=2).agreement == verdict.agreement
+
+
+def test_the_worst_rooms_keep_their_names_in_a_narrow_terminal():
+    name = "2bc95aea-aa71-57ad-9ed2-3852b7420110_LivingDiningRoom-1010"
+    check = RoomCheck("train/a.h5", name, agreement=Agreement(mesh=[0.5] * 9))
+    console = Console(width=60, record=True)
+    console.print(_check_tables(FolderCheck({"train": [check]}, ()))[1])
+    said = "".join(line.split("│")[1].strip() for line in console.export_text().splitlines()[3:-1])
+    assert said == name
 
 
 def test_one_room(shards):
