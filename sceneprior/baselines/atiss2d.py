@@ -7,7 +7,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from sceneprior.models.prior import DecoderConfig
+from sceneprior.models.layers import DecoderConfig
 
 
 class Atiss2dConfig(DecoderConfig):

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sceneprior.models.prior import DecoderConfig
+from sceneprior.models.layers import DecoderConfig
 
 
 class LstmConfig(DecoderConfig):

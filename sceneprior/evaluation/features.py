@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -56,7 +57,7 @@ def _combine(
     parts: Sequence[SceneFeatures], merge: Callable[[list[np.ndarray]], np.ndarray]
 ) -> SceneFeatures:
     """One array of each kind from those of the parts; what the parts lack stays None."""
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for kind in fields(SceneFeatures):
         known = [getattr(part, kind.name) for part in parts]
         arrays[kind.name] = None if known[0] is None else merge(known)

@@ -1,6 +1,10 @@
-"""Multi-layer perceptrons of given layers."""
+"""What several modules share: multi-layer perceptrons, and the base of decoders' sections."""
+
+from abc import ABC, abstractmethod
 
 from torch import nn
+
+from sceneprior.settings import Section
 
 
 def mlp(*layers: nn.Module, slope: float = 0.0) -> nn.Sequential:
@@ -17,3 +21,16 @@ def mlp(*layers: nn.Module, slope: float = 0.0) -> nn.Sequential:
     """
     between = nn.LeakyReLU(slope) if slope else nn.ReLU()
     return nn.Sequential(*[part for layer in layers for part in (layer, between)][:-1])
+
+
+class DecoderConfig(Section, ABC):
+    """What makes object features x_k of a latent z: a section that builds its module.
+
+    The module takes (z of shape (rooms, D_z), N) to features of shape (rooms, N, D_z).
+    """
+
+    name: str
+
+    @abstractmethod
+    def build(self, width: int, max_objects: int) -> nn.Module:
+        """The module, for features of D_z = `width`, freshly initialised."""

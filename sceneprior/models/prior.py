@@ -1,6 +1,5 @@
 """The whole prior, f of Eq. 1: from logits or latents to decoded scenes."""
 
-from abc import ABC, abstractmethod
 from typing import Annotated, Literal
 
 import torch
@@ -11,23 +10,11 @@ from torch import Tensor, nn
 from sceneprior.geometry.boxes import place
 from sceneprior.models.bevels import ClassBevels
 from sceneprior.models.latents import CubeConfig, LatentSpace, SphereConfig
+from sceneprior.models.layers import DecoderConfig
 from sceneprior.models.layout_decoder import LayoutDecoder
 from sceneprior.models.shape_decoder import ShapeDecoder, ShapeDecoderConfig
 from sceneprior.settings import Section
 from sceneprior.views import DecodedScenes
-
-
-class DecoderConfig(Section, ABC):
-    """What makes object features x_k of a latent z: a section that builds its module.
-
-    The module takes (z of shape (rooms, D_z), N) to features of shape (rooms, N, D_z).
-    """
-
-    name: str
-
-    @abstractmethod
-    def build(self, width: int, max_objects: int) -> nn.Module:
-        """The module, for features of D_z = `width`, freshly initialised."""
 
 
 class ModelConfig(Section):

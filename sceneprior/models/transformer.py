@@ -8,11 +8,11 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sceneprior.models.layers import DecoderConfig
 from sceneprior.models.released import QuerySelfAttention, SharedOutput, StepOutputs
-from sceneprior.settings import Section
 
 
-class TransformerConfig(Section):
+class TransformerConfig(DecoderConfig):
     """Size of the transformer (supplement A), and the released code's parts by name."""
 
     name: Literal["transformer"] = "transformer"

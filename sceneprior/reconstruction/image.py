@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Integer
 from torch import Tensor
 
 from sceneprior.errors import InputError
-from sceneprior.shards import RoomViews, iterate_rooms
+from sceneprior.shards import RoomViews, iterate_rooms, thinned
 from sceneprior.views import SceneViews
 
 MASK_COLUMNS = 80
@@ -48,7 +48,7 @@ class ObservedImage:
 
     def sampled_ids(self, step: int) -> Integer[np.ndarray, "rows columns"]:
         """Every `step`-th instance id, from the middle of a block, as shards are for training."""
-        return self.instance_ids[step // 2 :: step, step // 2 :: step]
+        return self.instance_ids[thinned(step)]
 
 
 def image_of_room(room: RoomViews, view: int, label_set: str) -> ObservedImage:

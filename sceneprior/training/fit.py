@@ -176,6 +176,6 @@ class _Training:
 
 
 def _remembers_nothing(module: Any) -> bool:
-    """Whether no training room has a latent, though there is a latent space: a GAN."""
+    """Whether no training room has a latent, though there is a latent space."""
     latents = getattr(module, "latents", None)
     return latents is not None and not len(latents.weight)

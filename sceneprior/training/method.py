@@ -133,7 +133,7 @@ class TrainedPrior:
 
     @property
     def remembers_rooms(self) -> bool:
-        """Whether training rooms have latents of their own; a GAN's have none."""
+        """Whether training rooms have latents of their own."""
         return len(self.logits) > 0
 
     @property

@@ -4,8 +4,11 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from torch import nn
+
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
+from sceneprior.models.prior import ScenePrior
 from sceneprior.training.checkpoints import restore_prior
 from sceneprior.training.layout import LayoutStage
 from sceneprior.training.method import PriorConfig, Stage, TrainedPrior, check_rooms
@@ -36,11 +39,12 @@ class OursConfig(PriorConfig):
         return self.sampling.distribution
 
     def stages(self) -> tuple[Stage, ...]:
-        shape = Stage("shape", self.shape, self._open_masks, partial(self._build, ShapeStage))
+        shape = Stage("shape", self.shape, self._open_masks, self._build_shape)
         if self.layout is None:
             return (shape,)
         boxes = partial(open_views, self, self.data.views_per_room, None)
-        return Stage("layout", self.layout, boxes, partial(self._build, LayoutStage)), shape
+        build = partial(self._build_layout, self.layout)
+        return Stage("layout", self.layout, boxes, build), shape
 
     def load(self, stage: str, path: Path) -> TrainedPrior:
         prior, latents, room_ids = restore_prior(self, path)
@@ -51,22 +55,28 @@ class OursConfig(PriorConfig):
         views = self.shape.views_per_room or self.data.views_per_room
         return open_views(self, views, self.data.mask_step)
 
-    def _build(
-        self, module: type[LayoutStage | ShapeStage], rooms: ViewDataset, previous: Path | None
-    ) -> LayoutStage | ShapeStage:
+    def _build_layout(
+        self, stage: StageConfig, rooms: ViewDataset, previous: Path | None
+    ) -> LayoutStage:
+        prior, latents = self._start(rooms, previous)
+        target = self.model.completeness_target
+        return LayoutStage(prior, latents, stage, self.loss, target, self.seed)
+
+    def _build_shape(self, rooms: ViewDataset, previous: Path | None) -> ShapeStage:
+        prior, latents = self._start(rooms, previous)
+        target = self.model.completeness_target
+        return ShapeStage(prior, latents, self.shape, self.loss, target, self.seed)
+
+    def _start(self, rooms: ViewDataset, previous: Path | None) -> tuple[ScenePrior, nn.Embedding]:
         if previous is None:
-            prior, latents = self.build_prior(), self.build_latents(len(rooms))
-        else:
-            prior, latents, room_ids = restore_prior(self, previous)
-            if room_ids != rooms.room_ids:
-                raise InputError(
-                    f"{self.data.shards} no longer holds the rooms of {previous}; the shape stage "
-                    "needs the shards that the layout stage was trained on."
-                )
-        settings = self.layout if module is LayoutStage else self.shape
-        return module(
-            prior, latents, settings, self.loss, self.model.completeness_target, self.seed
-        )  # type: ignore[arg-type]
+            return self.build_prior(), self.build_latents(len(rooms))
+        prior, latents, room_ids = restore_prior(self, previous)
+        if room_ids != rooms.room_ids:
+            raise InputError(
+                f"{self.data.shards} no longer holds the rooms of {previous}; the shape stage "
+                "needs the shards that the layout stage was trained on."
+            )
+        return prior, latents
 
 
 def open_views(config: PriorConfig, views_per_room: int, mask_step: int | None) -> ViewDataset:

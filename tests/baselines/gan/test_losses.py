@@ -89,7 +89,10 @@ def test_sameness_is_minus_the_mean_log_spread_and_never_without_a_slope(torch_r
     boxes = (numbers * spreads).requires_grad_()
 
     assert_close(
-        diversity_loss(scenes_of(boxes)).item(), -math.log(0.5 / VARIED[0] * 0.1) / 5, rtol=0, atol=1e-3
+        diversity_loss(scenes_of(boxes)).item(),
+        -math.log(0.5 / VARIED[0] * 0.1) / 5,
+        rtol=0,
+        atol=1e-3,
     )
     one = torch.ones(3, 2, 6, requires_grad=True)
     expected = -sum(math.log(1e-3 / wanted) for wanted in VARIED) / 5

@@ -132,7 +132,8 @@ def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
     fit(config, tmp_path / "run", resume=True, trainer_options=CPU)
     # All of it: both opponents, the averaged generator, the optimisers' moments.
     wanted, reached = (
-        read_checkpoint(folder / STAGES[name][-1] / "final.ckpt") for folder in (run, tmp_path / "run")
+        read_checkpoint(folder / STAGES[name][-1] / "final.ckpt")
+        for folder in (run, tmp_path / "run")
     )
     assert wanted["state_dict"].keys() == reached["state_dict"].keys()
     for key, value in wanted["state_dict"].items():
