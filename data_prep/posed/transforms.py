@@ -1,6 +1,6 @@
 """Reads a nerfstudio-style transforms.json: frames with poses, intrinsics, and the files beside it.
 
-Read, of the file: `frames`; camera keys (`Camera`) for all frames; `floor_m`, `floor_center_m`,
+Read, of the file: `frames`; camera keys (see Camera) for all frames; `floor_m`, `floor_center_m`,
 `metres_per_unit`. Of a frame: `file_path`, `transform_matrix`, `instance_path`, `mask_path`, and
 camera keys, which win over the file's. All others are passed over, and the pictures themselves are
 never opened.

@@ -53,9 +53,10 @@ def test_every_key_that_is_read_is_in_the_document():
     from sceneprior.instances import tables
 
     text = DOCUMENT.read_text()
-    for key in re.findall(r"`([^`]+)`", transforms.__doc__):
-        for word in key.split():
-            spelt = word if not re.fullmatch(r"k[23]", word) else "`k1` to `k4`"
-            assert spelt in text, word
+    keys = {word for key in re.findall(r"`([^`]+)`", transforms.__doc__) for word in key.split()}
+    assert len(keys) == 8
+    for word in keys | set(transforms.Camera.model_fields):
+        spelt = f"`{word}`" if not re.fullmatch(r"k[23]", word) else "`k1` to `k4`"
+        assert spelt in text, word
     for name in tables.SHELL:
         assert f"`{name}`" in text
