@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from sceneprior.classes import class_colors, label_set
 from sceneprior.evaluation.topdown import perspective, topdown
 from sceneprior.offscreen import Renderer
+from sceneprior.pictures import paint_ids, png_bytes
 from sceneprior.scene import Scene
 from sceneprior.shards import Shard, iterate_rooms
 
@@ -82,12 +83,7 @@ def _input_view(shard: Shard, room_id: str, view: int) -> tuple[str, str]:
     ids = shard.read_instance_ids(room_id, [view])[0].astype(np.int64)
     names = label_set(shard.label_set)
     colors = class_colors(len(names))[room.object_class]
-    image = np.concatenate([[_EMPTY], colors]).astype(np.uint8)[ids]
-    edge = np.zeros(ids.shape, dtype=bool)
-    edge[:, 1:] |= ids[:, 1:] != ids[:, :-1]
-    edge[1:] |= ids[1:] != ids[:-1]
-    image[edge] = image[edge] // 2
-    picture = Image.fromarray(image)
+    picture = Image.fromarray(paint_ids(ids, colors, _EMPTY))
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size=11)
     height, width = ids.shape
     for row in np.flatnonzero(room.visible[view]):
@@ -143,9 +139,7 @@ def curves_svg(curves: dict[str, list[tuple[int, float]]]) -> str:
 
 
 def _png(image: Image.Image) -> str:
-    page = io.BytesIO()
-    image.save(page, format="PNG", optimize=True)
-    return _data_uri("image/png", page.getvalue())
+    return _data_uri("image/png", png_bytes(image, optimize=True))
 
 
 def _jpeg(image: Image.Image) -> str:

@@ -28,6 +28,7 @@ from sceneprior.geometry.boxes import place
 from sceneprior.geometry.cameras import boxes_of_points
 from sceneprior.losses.matching import match_objects
 from sceneprior.offscreen import SoftwareRenderer
+from sceneprior.pictures import contact_sheet
 from sceneprior.scene import Scene
 from sceneprior.shards import iterate_rooms, list_shards
 from sceneprior.silhouettes.render import render_scene
@@ -196,12 +197,14 @@ def tile(scenes: Sequence[Scene]) -> UInt8[np.ndarray, "height width 3"]:
     """Rooms from straight above in rows of four, coloured by class."""
     # Our own z-buffer: GL must not be opened in a process that trains on the GPU.
     renderer = SoftwareRenderer()
-    rows = -(-len(scenes) // COLUMNS)
-    picture = np.full((rows * TILE_PX, COLUMNS * TILE_PX, 3), 255, dtype=np.uint8)
-    for index, scene in enumerate(scenes):
-        protocol = replace(topdown_protocol(scene.label_set), image_size=(TILE_PX, TILE_PX))
-        row, column = divmod(index, COLUMNS)
-        place_at = slice(row * TILE_PX, (row + 1) * TILE_PX)
-        beside = slice(column * TILE_PX, (column + 1) * TILE_PX)
-        picture[place_at, beside] = topdown(scene, renderer, protocol, outlines=True)
-    return picture
+    size = (TILE_PX, TILE_PX)
+    tiles = [
+        topdown(
+            scene,
+            renderer,
+            replace(topdown_protocol(scene.label_set), image_size=size),
+            outlines=True,
+        )
+        for scene in scenes
+    ]
+    return contact_sheet(tiles, COLUMNS)

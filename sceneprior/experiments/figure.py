@@ -1,6 +1,5 @@
 """Draws a picture of a comparison: a row of rooms from above for each method."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from sceneprior.experiments.comparison import Comparison, Run
 from sceneprior.files import write_whole
 from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import Renderer
+from sceneprior.pictures import contact_sheet, png_bytes
 from sceneprior.scene import Scene
 
 SHOWN = 8
@@ -33,7 +33,7 @@ def write_figure(
     Args:
         comparison: Names the methods.
         runs: Finished ones on the same rooms, one a method.
-        count: Rooms that each of them was judged by; the first few are drawn.
+        count: Rooms that each of them was evaluated by; the first few are drawn.
         path: PNG to write.
         renderer: From `sceneprior.offscreen.open_renderer`.
     """
@@ -45,19 +45,17 @@ def write_figure(
         made = synthesize(prior, count, comparison.sampling_seed)
         rows[comparison.methods[run.method].title] = made[:SHOWN]
     sheet = np.concatenate([_row(title, scenes, renderer) for title, scenes in rows.items()])
-    buffer = io.BytesIO()
-    Image.fromarray(sheet).save(buffer, format="PNG", optimize=True)
-    write_whole(path, buffer.getvalue())
+    write_whole(path, png_bytes(sheet, optimize=True))
 
 
 def _row(title: str, scenes: Sequence[Scene], renderer: Renderer) -> np.ndarray:
     label = Image.new("RGB", (MARGIN_PX, TILE_PX), "white")
     font = ImageFont.load_default(size=16)
     ImageDraw.Draw(label).text((6, TILE_PX // 2), title, fill="black", anchor="lm", font=font)
-    tiles = [np.asarray(label)]
+    tiles = []
     for scene in scenes:
         picture = Image.fromarray(topdown(without_void(scene), renderer, outlines=True))
         tile = picture.resize((TILE_PX - 2, TILE_PX - 2), Image.Resampling.BOX)
         tiles.append(np.pad(np.asarray(tile), ((1, 1), (1, 1), (0, 0)), constant_values=200))
     blank = np.full((TILE_PX, TILE_PX, 3), 255, dtype=np.uint8)
-    return np.concatenate([*tiles, *[blank] * (SHOWN - len(scenes))], axis=1)
+    return np.concatenate([np.asarray(label), contact_sheet(tiles or [blank], SHOWN)], axis=1)

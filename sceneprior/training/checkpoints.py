@@ -17,6 +17,7 @@ import torch
 from torch import nn
 
 from sceneprior.errors import InputError
+from sceneprior.files import write_whole
 from sceneprior.models.prior import ScenePrior
 from sceneprior.training.method import PriorConfig
 
@@ -61,15 +62,11 @@ def find_checkpoint(
 
 
 def write_checkpoint(trainer: lightning.Trainer, folder: Path, name: str) -> None:
-    """Write to a temporary name and move into place; all processes call, the first writes."""
-    part = folder / f"{name}.part"
-    try:
-        trainer.save_checkpoint(part)
-        if trainer.is_global_zero:
-            part.replace(folder / name)
-    finally:
-        if trainer.is_global_zero:
-            part.unlink(missing_ok=True)
+    """Write a checkpoint whole or not at all; all processes call, the first writes."""
+    if trainer.is_global_zero:
+        write_whole(folder / name, trainer.save_checkpoint)
+    else:
+        trainer.save_checkpoint(folder / name)  # which takes part in saving, and writes nothing
     # Others may be about to read it.
     trainer.strategy.barrier()
 

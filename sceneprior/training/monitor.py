@@ -5,7 +5,6 @@ are above training (docs/architecture.md). `experiments/evaluate_samples.py` mak
 command uses.
 """
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,9 +16,10 @@ from jaxtyping import UInt8
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from numpy import ndarray
-from PIL import Image
 
 from sceneprior.errors import InputError
+from sceneprior.files import write_json, write_whole
+from sceneprior.pictures import png_bytes
 from sceneprior.training.checkpoints import write_checkpoint
 from sceneprior.training.method import RunConfig, Trained
 
@@ -119,9 +119,7 @@ class SampleMonitor(Callback):
         return score < self.best if metric in LOW_IS_BETTER else score > self.best
 
     def _show(self, trainer: lightning.Trainer, result: EvaluationResult, done: int) -> None:
-        folder = self.folder / "samples"
-        folder.mkdir(exist_ok=True)
-        Image.fromarray(result.picture).save(folder / f"{done:05d}.png")
+        write_whole(self.folder / "samples" / f"{done:05d}.png", png_bytes(result.picture))
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 logger.experiment.add_image(
@@ -138,6 +136,4 @@ class SampleMonitor(Callback):
             "compared_with": f"{result.against} rooms",
             "best": {"metric": metric, "score": self.best, "epoch": self.best_epoch},
         }
-        part = self.folder / "samples.json.part"
-        part.write_text(json.dumps(note, indent=2) + "\n")
-        part.replace(self.folder / "samples.json")
+        write_json(self.folder / "samples.json", note)

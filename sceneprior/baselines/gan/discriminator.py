@@ -16,7 +16,7 @@ GAIN = 10
 
 
 class MapDiscriminator(nn.Module):
-    """Judge maps patch by patch, and a room by all of its views together.
+    """Scores maps patch by patch, and a room by all of its views together.
 
     Every layer is spectrally normalised, so that the network is about 1-Lipschitz. There is no
     depth channel (supplement, Baselines).
