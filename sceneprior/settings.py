@@ -111,7 +111,7 @@ def dump_settings(settings: Section, path: Path) -> None:
 
 def _explain(model: type[Section], error: ValidationError, source: str) -> str:
     first, *others = error.errors(include_url=False)
-    location, section = _section_of(model, [str(part) for part in first["loc"]])
+    location, section, variants = _section_of(model, [str(part) for part in first["loc"]])
     key = ".".join(location)
     more = f" ({len(others)} more problem{'s' * (len(others) > 1)} after it)" if others else ""
     if first["type"] == "extra_forbidden":
@@ -120,23 +120,23 @@ def _explain(model: type[Section], error: ValidationError, source: str) -> str:
         return f"{source}: unknown key '{key}'; the nearest valid key is '{near[0]}'.{more}"
     if first["type"] == "missing":
         return f"{source}: '{key}' is missing and has no default; add it.{more}"
+    known_names = ", ".join(variants)
     if first["type"] == "union_tag_not_found":
-        return f"{source}: '{key}' has no name; add one of {_names(first)}.{more}"
+        return f"{source}: '{key}' has no name; add one of {known_names}.{more}"
     if first["type"] == "union_tag_invalid":
         tag = first["ctx"]["tag"]
-        return f"{source}: no '{key}' is named '{tag}'; choose from {_names(first)}.{more}"
+        return f"{source}: no '{key}' is named '{tag}'; choose from {known_names}.{more}"
     got = f" (got {first['input']!r})" if not isinstance(first["input"], dict) else ""
     reason = first["msg"].removeprefix("Value error, ")
     reason = reason[:1].lower() + reason[1:]
     return f"{source}: {f'{chr(39)}{key}{chr(39)}: ' if key else ''}{reason}{got}.{more}"
 
 
-def _names(error: Any) -> str:
-    return error["ctx"].get("expected_tags", "its variants").replace("'", "")
-
-
-def _section_of(model: type[BaseModel], location: list[str]) -> tuple[list[str], type[BaseModel]]:
-    """Where an error is, as the YAML has it, and the section that holds its last key.
+def _section_of(
+    model: type[BaseModel], location: list[str]
+) -> tuple[list[str], type[BaseModel], list[str]]:
+    """Where an error is, as the YAML has it, the section that holds its last key, and the names of
+    the variants that this key may have.
 
     Pydantic puts the name of a section's variant (`decoder: {name: lstm}`) after its key.
     """
@@ -152,4 +152,5 @@ def _section_of(model: type[BaseModel], location: list[str]) -> tuple[list[str],
         field = section.model_fields.get(part)
         types = (field.annotation, *get_args(field.annotation)) if field is not None else ()
         inner = [v for v in types if isinstance(v, type) and issubclass(v, BaseModel)]
-    return keys, section
+    names = [v.model_fields["name"].default for v in inner if "name" in v.model_fields]
+    return keys, section, names

@@ -50,8 +50,9 @@ class RoomSet:
             counts=resample_counts(len(rows), len(self.counts), seed),
         )
 
-    def features(self, network: str, boxes: bool) -> Float[np.ndarray, "rooms dimensions"]:
-        """What a network reads in the pictures, or in those that show boxes."""
+    def features(self, network: str, boxes: bool) -> np.ndarray:
+        """Of each room what a network reads in its picture, or in the one that shows boxes; what
+        the classifier learns from is the picture itself."""
         found = getattr(self.box_pictures if boxes else self.pictures, network)
         return np.asarray(found)
 

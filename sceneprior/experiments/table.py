@@ -30,7 +30,7 @@ class Row:
     title: str
     seed: int
     scores: dict[str, Any]
-    costs: dict[str, float | None]
+    costs: dict[str, int | float | None]
 
 
 COSTS = {
@@ -124,11 +124,11 @@ def _body(rows: Sequence[Row], columns: Sequence[str]) -> list[list[str]]:
     return lines
 
 
-def _value(row: Row, key: str) -> float | None:
+def _value(row: Row, key: str) -> int | float | None:
     return (row.costs if key in COSTS else row.scores).get(key)
 
 
-def _cell(found: Sequence[float | None], key: str) -> str:
+def _cell(found: Sequence[int | float | None], key: str) -> str:
     column, scale = COLUMNS[key]
     values = [float(value) * scale for value in found if value is not None]
     if not values:

@@ -126,7 +126,7 @@ def test_only_the_two_baselines_come_to_the_ground_truth():
                 and node.module == "sceneprior.baselines.true_boxes"
             ):
                 importers.add(name)
-    assert readers == {"baselines/true_boxes.py", "evaluation/reference.py"}
+    assert readers == {"baselines/true_boxes.py", "evaluation/ground_truth.py"}
     assert importers == {
         "baselines/atiss/stage.py", "baselines/box_training.py", "baselines/sync2gen/stage.py",
     }  # fmt: skip

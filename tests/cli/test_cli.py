@@ -67,7 +67,7 @@ def test_a_config_typo_names_key_file_and_nearest_key(command, toy_shards, tmp_p
     config.write_text(config.read_text().replace("  dropout:", "  droput:"))
     said = one_sentence(command("fit", "--config", config, "--run", "run"))
     assert said == (
-        f"Error: {config}: unknown key 'model.droput'; the nearest valid key is 'dropout'."
+        f"Error: {config}: unknown key 'model.decoder.droput'; the nearest valid key is 'dropout'."
     )
     said = one_sentence(command("fit", "--config", "dmeo.yaml", "--run", "run"))
     assert "No config 'dmeo.yaml'" in said and "demo.yaml" in said

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 from PIL import Image
-from tiny_runs import write_tiny_config
+from tiny_runs import tiny_baseline_settings, write_tiny_config
 
 from sceneprior.config import load_any_run, load_config
 from sceneprior.errors import InputError
@@ -29,7 +29,7 @@ METHODS = {
     "lstm": {
         "title": "LSTM",
         "group": "2D",
-        "set": {"every": ["model.decoder=lstm"], "toy": ["model.width=8"]},
+        "set": {"every": ["model.decoder={name: lstm}"], "toy": ["model.width=8"]},
     },
 }
 
@@ -61,27 +61,32 @@ def test_every_run_has_its_settings_its_seed_and_its_folder(written):
     assert [(run.method, run.seed) for run in runs] == [
         ("ours", 0), ("lstm", 0), ("ours", 1), ("lstm", 1),
     ]  # fmt: skip
-    assert runs[3].settings == ("model.decoder=lstm", "model.width=8", "seed=1")
+    assert runs[3].settings == ("model.decoder={name: lstm}", "model.width=8", "seed=1")
     assert runs[3].folder == Path("out/toy/lstm/seed1")
 
 
 def test_a_method_with_a_config_of_its_own_learns_from_the_same_rooms(written, tmp_path):
     own = tmp_path / "gan.yaml"
-    write_tiny_config(own, "elsewhere", stages="gan", label_set="void,bed", model__max_objects=3)
-    gan = {"title": "GAN", "group": "2D", "config": str(own), "set": {"every": ["gan.epochs=7"]}}
+    settings = tiny_baseline_settings(Path("elsewhere"), "gan", model__max_objects=3)
+    own.write_text(yaml.safe_dump(settings | {"label_set": "void,bed"}))
+    changes = {"every": ["training.epochs=7"]}
+    gan = {"title": "GAN", "group": "2D", "config": str(own), "set": changes}
     comparison = load_comparison(written(methods={"ours": METHODS["ours"], "gan": gan}))
     ours, other = runs_of(comparison, Path())
     assert (ours.config, ours.settings) == (str(tmp_path / "tiny.yaml"), ("seed=0",))
     assert other.config == str(own)
     theirs, mine = (load_config(run.config, run.settings) for run in (ours, other))
-    assert (mine.stages, mine.gan.epochs) == ("gan", 7)
+    assert (mine.method, mine.training.epochs) == ("gan", 7)
     for name in ("label_set", "seed", "model.max_objects", "data.shards"):
         assert attrgetter(name)(mine) == attrgetter(name)(theirs), name
     # No config but ours has to have room for a number of objects.
-    own.write_text("label_set: a\nseed: 1\nstages: gan\n")
+    own.write_text("method: sync2gen\nlabel_set: a\nseed: 1\n")
     assert runs_of(comparison, Path())[1].settings == (
-        "label_set=front3d_bedroom", f"data.shards={theirs.data.shards}", "gan.epochs=7", "seed=0",
-    )  # fmt: skip
+        "label_set=front3d_bedroom",
+        f"data.shards={theirs.data.shards}",
+        "training.epochs=7",
+        "seed=0",
+    )
     own.unlink()
     with pytest.raises(InputError, match=r"No config '.*gan\.yaml'"):
         load_comparison(str(tmp_path / "compare.yaml"))

@@ -184,14 +184,14 @@ def test_every_logger_gets_scores_and_pictures(toy_shards, tmp_path, monkeypatch
 
 
 def test_what_cannot_be_judged_is_a_sentence(toy_shards, tmp_path):
-    with pytest.raises(InputError, match=r"samples.every is 2, but nobody was given to judge"):
+    with pytest.raises(InputError, match=r"samples.every is 2, but nothing was given to eval"):
         fit(settings(toy_shards), tmp_path / "a", trainer_options=CPU)
     assert not (tmp_path / "a").exists()
     with pytest.raises(
-        InputError, match=r"samples.metric is category_kl, but a look gave only objects, ov"
+        InputError, match=r"samples.metric is category_kl, but there are only objects, ov"
     ):
         judge = Told(objects=[1], overlaps=[2])
         fit(settings(toy_shards), tmp_path / "b", trainer_options=CPU, evaluate=judge)
-    with pytest.raises(IndexError):  # the judge's own error comes out as it is
+    with pytest.raises(IndexError):  # its own error comes out as it is
         judge = Told(category_kl=[])
         fit(settings(toy_shards), tmp_path / "c", trainer_options=CPU, evaluate=judge)

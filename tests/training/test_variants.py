@@ -167,7 +167,7 @@ def test_the_ablations_change_their_module_and_no_other_module(toy_shards):
             if not name.startswith(without)
         }
 
-    assert shapes(cube, "sphere.") == shapes(plain, "sphere.")
+    assert shapes(cube, "latent_space.") == shapes(plain, "latent_space.")
     assert shapes(lstm, "decoder.") == shapes(plain, "decoder.")
 
 

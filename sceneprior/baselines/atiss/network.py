@@ -148,9 +148,7 @@ class Atiss(nn.Module):
             found[name] = log_prob * (next_class != END)
         return found
 
-    def _mixture(
-        self, name: str, context: Tensor, label: Tensor, unit: Tensor
-    ) -> LogisticMixture:
+    def _mixture(self, name: str, context: Tensor, label: Tensor, unit: Tensor) -> LogisticMixture:
         """Of one of `PARTS`, given the class and those of the numbers `unit` that come before."""
         start, end = PARTS[name]
         known = [context, self.class_embedding(label), fourier_features(unit[:, :start])]

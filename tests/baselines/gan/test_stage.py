@@ -96,8 +96,8 @@ def test_a_run_leaves_what_runs_py_promises(run, name):
     last = STAGES[name][-1]
     assert find_checkpoint(run, STAGES[name]) == (last, run / last / "final.ckpt")
     trained = load_run(run)
-    assert not trained.prior.training and trained.remembers_rooms == (name == "atiss")
-    assert isinstance(trained.prior.decoder, SceneAtiss) == (name == "atiss")
+    assert not trained.prior.training and trained.remembers_rooms == (name == "atiss2d")
+    assert isinstance(trained.prior.decoder, SceneAtiss) == (name == "atiss2d")
     boxes = [
         [
             [*item.center_m, *item.size_m]
