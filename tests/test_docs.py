@@ -35,11 +35,6 @@ BASES = [
 MADE_BY_USERS = {"config.yaml"}
 """Names of YAML files that are no part of the repository."""
 
-waits_for_methods = pytest.mark.skipif(
-    "\nstages:" in (ROOT / "configs" / "bedroom.yaml").read_text(),
-    reason="the pages describe configs that name a method",
-)
-
 
 class Block(NamedTuple):
     """A fenced block of a page."""
@@ -190,7 +185,6 @@ CHECKS = {
 }  # fmt: skip
 
 
-@waits_for_methods
 @pytest.mark.parametrize("block", BLOCKS, ids=block_id)
 def test_every_block_runs(block: Block, tmp_path: Path, toy_shards: Path, monkeypatch):
     (tmp_path / "out" / "demo").mkdir(parents=True)
@@ -248,7 +242,6 @@ def is_ours(path: str) -> bool:
     )  # fmt: skip
 
 
-@waits_for_methods
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_every_path_exists(page: Path):
     shown = {block.text.splitlines()[0].removeprefix("# ") for block in blocks_of(page)}
@@ -294,7 +287,6 @@ def rows_with_code(page: Path) -> list[list[str]]:
     return [re.findall(r"`([^`]+)`", " ".join(row[1:3])) for row in rows]
 
 
-@waits_for_methods
 @pytest.mark.parametrize("name", ["paper_map.md", "architecture.md"])
 def test_every_function_is_where_the_page_says(name: str):
     checked = 0
@@ -310,7 +302,6 @@ def test_every_function_is_where_the_page_says(name: str):
     assert checked >= {"paper_map.md": 30, "architecture.md": 3}[name]
 
 
-@waits_for_methods
 def test_every_key_of_the_paper_map_is_one():
     """`section.key: value`, in the form in which the page has it, changes a config."""
     sections = "data|model|loss|layout|shape|sampling|samples"
@@ -328,7 +319,6 @@ def test_every_key_of_the_paper_map_is_one():
             value = value[part]
 
 
-@waits_for_methods
 def test_the_tree_is_the_files():
     """Each folder of the drawing names all its modules, and no others."""
     drawn = tree_of(next(b for b in ALL_BLOCKS if block_id(b).startswith("docs/architecture.md")))
@@ -394,12 +384,7 @@ def test_every_experiment_is_in_the_index():
             assert day and page.read_text().startswith(f"# {day[0]}: ")
 
 
-LONG_LINES_YET = {"evaluation.md", "reconstruction.md", "silhouettes.md", "uses.md"}
-
-
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md"], ids=name_of)
 def test_lines_are_short(page: Path):
-    if page.name in LONG_LINES_YET:
-        pytest.skip("wrapped on another branch")
     lines = enumerate(page.read_text().splitlines(), start=1)
     assert [n for n, line in lines if len(line) > LONGEST_LINE and line[:1] != "|"] == []
