@@ -1,1 +1,1 @@
-"""Raw data sets in, view shards out."""
+"""Prepares view shards from raw data sets."""

@@ -1,3 +1,3 @@
-"""Learning 3D scene priors from 2D supervision: posed instance masks in, new rooms out."""
+"""Learns 3D scene priors from posed 2D instance masks."""
 
 __version__ = "0.1.0"

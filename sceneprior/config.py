@@ -1,11 +1,11 @@
-"""What a run is: every method's config by name, read from a YAML and written beside the run.
+"""The registry of methods, and the loading of configs and runs.
 
 A method is listed in `METHODS`, a decoder of object features in `Model`. Each section is defined
 beside what it configures; `training/method.py` says what a method's config has to offer.
 """
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field
 
@@ -20,7 +20,7 @@ from sceneprior.models.transformer import TransformerConfig
 from sceneprior.settings import check_settings, read_settings
 from sceneprior.training.checkpoints import find_checkpoint
 from sceneprior.training.method import RunConfig, Trained, TrainedPrior, TrainedSampler
-from sceneprior.training.ours import OursConfig as PaperConfig
+from sceneprior.training.ours import PaperConfig
 
 
 class Model(ModelConfig):
@@ -32,7 +32,6 @@ class Model(ModelConfig):
 class OursConfig(PaperConfig):
     """A run of the paper's method, whatever decodes object features."""
 
-    method: Literal["ours"] = "ours"
     model: Model
 
 
@@ -64,7 +63,7 @@ def check_config(data: dict[str, Any], source: str) -> RunConfig:
             "any more; train it again with a config of today, such as demo.yaml."
         )
     method = data.get("method", "ours")
-    if method not in METHODS:
+    if not isinstance(method, str) or method not in METHODS:
         raise ConfigError(
             f"{source}: no method is called '{method}'; choose from {', '.join(METHODS)}."
         )

@@ -126,10 +126,15 @@ def _explain(model: type[Section], error: ValidationError, source: str) -> str:
     if first["type"] == "union_tag_invalid":
         tag = first["ctx"]["tag"]
         return f"{source}: no '{key}' is named '{tag}'; choose from {known_names}.{more}"
+    if first["type"] == "model_attributes_type" and variants:
+        return (
+            f"{source}: '{key}' is a section; write {{name: ...}} with one of {known_names}.{more}"
+        )
     got = f" (got {first['input']!r})" if not isinstance(first["input"], dict) else ""
     reason = first["msg"].removeprefix("Value error, ")
     reason = reason[:1].lower() + reason[1:]
-    return f"{source}: {f'{chr(39)}{key}{chr(39)}: ' if key else ''}{reason}{got}.{more}"
+    where = f"'{key}': " if key else ""
+    return f"{source}: {where}{reason}{got}.{more}"
 
 
 def _section_of(

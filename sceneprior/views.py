@@ -70,7 +70,7 @@ class DecodedScenes:
     sizes_m: Float[Tensor, "rooms objects 3"]
     """Full extents of the axis-aligned boxes."""
     completeness_logits: Float[Tensor, "rooms objects"]
-    """Above 0 while the scene is still being filled (the paper's supplement B)."""
+    """Before the sigmoid; `losses/completeness.py` reads them (`kept_objects`)."""
     bevels: Float[Tensor, "rooms objects 2"] | None = None
     """How far the edges of the proxy `beveled_box` are cut off (`geometry.boxes`); None
     for rooms that no prior decoded."""

@@ -139,10 +139,20 @@ def test_a_variant_that_does_not_exist_lists_those_that_do(config):
     )
 
 
+def test_a_variant_without_its_section_is_a_sentence(config):
+    wanted = "write {name: ...} with one of transformer, lstm, atiss2d."
+    said = refusal(config, "model.decoder=lstm")
+    assert said == f"{config}: 'model.decoder' is a section; {wanted}"
+    assert "unknown key 'layout.epoch'; the nearest valid key is 'epochs'" in refusal(
+        config, "layout.epoch=3"
+    )
+
+
 def test_a_method_that_does_not_exist_and_a_config_of_before_are_sentences(config):
     assert refusal(config, "method=usl") == (
         f"{config}: no method is called 'usl'; choose from {', '.join(METHODS)}."
     )
+    assert "no method is called '['a']'" in refusal(config, "method=[a]")
     replaced(config, "method: ours", "stages: two")
     assert refusal(config).startswith(f"{config} was written before methods had names")
 

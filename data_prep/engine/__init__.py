@@ -1,0 +1,1 @@
+"""Plans, workers, shards and reports of preparing; knows no data set."""

@@ -1,4 +1,4 @@
-"""How a bedroom is furnished."""
+"""Draws the furniture of a bedroom and says where it is placed."""
 
 import numpy as np
 

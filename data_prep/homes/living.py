@@ -1,4 +1,4 @@
-"""How a living room is furnished."""
+"""Draws the furniture of a living room and says where it is placed."""
 
 from dataclasses import replace
 

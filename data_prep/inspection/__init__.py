@@ -1,0 +1,1 @@
+"""What `inspect` prints, draws and verifies of a folder of shards."""

@@ -1,0 +1,1 @@
+"""What the paper is compared with, in 2D and in 3D."""

@@ -1,1 +1,1 @@
-"""View shards in, batches of `SceneViews` out."""
+"""Loads view shards as batches of `SceneViews`."""

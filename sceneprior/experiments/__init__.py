@@ -1,0 +1,1 @@
+"""Commands in a row: evaluation of runs, comparisons of methods, the demo."""

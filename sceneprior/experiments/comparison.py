@@ -1,5 +1,6 @@
 """What `sceneprior compare` compares: the settings in its YAML, and the runs that they ask for."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -168,7 +169,9 @@ def _taken_over(rooms: Rooms, method: Method) -> list[str]:
     keys = ["label_set", "data.shards"]
     if _value(own, "model.max_objects") is not None:
         keys.append("model.max_objects")
-    return [f"{key}={_value(shared, key)}" for key in keys if _value(shared, key) is not None]
+    values = {key: _value(shared, key) for key in keys}
+    # As JSON, which YAML reads as it is: a folder may be called 2024.
+    return [f"{key}={json.dumps(v)}" for key, v in values.items() if v is not None]
 
 
 def _value(data: Any, key: str) -> Any:

@@ -89,8 +89,8 @@ def _run(steps: list[Step], runner: StepRunner, out: Path) -> None:
 
 
 def _add_costs(out: Path) -> None:
-    """Put what the steps took into scores.json; after a kill, nobody knows."""
-    noted = read_journal(out)
+    """Put what the finished steps took into scores.json, unless one was killed on the way."""
+    noted = {name: entry for name, entry in read_journal(out).items() if entry.get("finished")}
     scores = read_result(out / "scores.json")
     seconds = {name: entry["wall_s"] for name, entry in noted.items()}
     if None not in seconds.values():

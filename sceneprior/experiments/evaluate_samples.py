@@ -34,7 +34,7 @@ from sceneprior.shards import iterate_rooms, list_shards
 from sceneprior.silhouettes.render import render_scene
 from sceneprior.training.method import RunConfig, TrainedPrior, TrainedSampler
 from sceneprior.training.monitor import EvaluationResult
-from sceneprior.training.ours import OursConfig
+from sceneprior.training.ours import PaperConfig
 from sceneprior.views import SceneViews
 
 PICTURED = 16
@@ -165,7 +165,7 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
         views: Of training rooms, with instance ids.
     """
     config, prior = trained.config, trained.prior
-    assert isinstance(config, OursConfig), "a run that remembers rooms has a view loss"
+    assert isinstance(config, PaperConfig), "a run that remembers rooms has a view loss"
     weights = config.loss
     scenes = prior(trained.logits[views.room_index], with_shape=trained.stage != "layout")
     vertices = scenes.vertices_m

@@ -1,0 +1,1 @@
+"""New rooms from a trained prior: sampled, interpolated, completed, with CAD models."""

@@ -1,4 +1,4 @@
-"""Where a scene ends: what completeness scores should say, and what is read from them.
+"""Completeness scores: their targets, and which predictions they keep (section 3.4).
 
 The two conventions, for a room of n objects:
 

@@ -1,4 +1,4 @@
-"""Class, box, completeness and frustum losses of matched predictions (section 3.4)."""
+"""The layout loss: class, box, completeness and frustum terms (section 3.4, Eq. 7 and S4)."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -30,7 +30,11 @@ def layout_losses(
     completeness_target: str = "first_n",
     per_room: bool = False,
 ) -> dict[str, Float[Tensor, "*rooms"]]:
-    """The four terms of L_layout, each averaged over the objects it applies to.
+    """The four terms of the layout loss (Eq. 7), unweighted.
+
+        L_L = lambda_l L_l + lambda_box L_box + lambda_p L_p + lambda_f L_f
+
+    Each is averaged over the objects that it applies to.
 
     Where several processes train, over those of all processes: see `share_of_batch`.
 
@@ -116,7 +120,9 @@ def frustum_loss(
     counted: Bool[Tensor, "rooms views objects"],
     per_room: bool = False,
 ) -> Float[Tensor, "*rooms"]:
-    """1 - cosine between the ray to a prediction and the ray through its object's 2D centre.
+    """1 - cosine between the ray to a prediction and the ray through its object's 2D centre (S4).
+
+        L_f = 1/|T^o| sum_(q in T^o) 1 - cos(c_k - c_cam^q, ray_q)
 
     Only views that see the object but not its prediction count (supplement B).
     """

@@ -1,4 +1,4 @@
-"""Which prediction answers for which tracked object: Hungarian matching in 2D (supplement B)."""
+"""Hungarian matching of predictions to tracked objects (supplement B, Eq. S2 and S3)."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ class Matches(NamedTuple):
     """One entry a tracked object: the prediction that answers for it."""
 
     prediction: Int[Tensor, "rooms objects"]
-    """Index of the matched prediction; 0 where `valid` is false."""
+    """Index of the matched prediction; 0 for padding. Of an unseen object it means nothing."""
     valid: Bool[Tensor, "rooms objects"]
     """False for padding and for objects that no drawn view sees."""
 
@@ -31,10 +31,12 @@ def match_objects(
 ) -> Matches:
     """Find the cheapest one-to-one assignment of predictions to tracked objects.
 
-    cost = -p(class) + box_weight * mean over the object's visible views of |box - box|_1,
+        sigma = argmin sum_k L^l + lambda_B L^B                       (Eq. S2)
+        L^l = -p_k(l_j),    L^B = 1/|T_j| sum_p |b_k^p - b_j^p|_1     (Eq. S3)
+
     with 2D boxes relative to the image size. Of a room with n tracked objects only the first
-    n predictions take part. An object seen in none of the drawn views has no cost: it takes a
-    prediction that nobody needs, and the pair counts for nothing.
+    n predictions take part. An object seen in none of the drawn views has zero cost: its match is
+    arbitrary and enters no loss.
 
     Args:
         scenes: Predictions.

@@ -21,7 +21,9 @@ def mask_loss(
 ) -> tuple[Float[Tensor, "*rooms"], dict[str, Float[Tensor, "*rooms"]]]:
     """Binary cross entropy of visible masks, where prediction and observation overlap enough.
 
-        L_S = sum_(p in T_j) BCE(r_k^p, m_j^p) [IoU(r_k^p, m_j^p) > 0.5],    j = sigma(k)
+        L_S = 1/|T_j| sum_(p in T_j) BCE(r_k^p, m_j^p) [IoU(r_k^p, m_j^p) > iou_gate]
+
+    of each object j and its prediction k; the paper sums over views, with a gate of 0.5.
 
     Averaged over pixels, then over an object's views, then over objects; a mask whose IoU with
     its observation is not above `iou_gate` counts as zero, as in the paper.
@@ -30,7 +32,7 @@ def mask_loss(
         rendered: Visible soft masks of all predictions.
         views: What the cameras saw, with `instance_ids` of the same height and width.
         matches: Which prediction answers for which object.
-        iou_gate: The paper's 0.5. Below 0 every mask counts.
+        iou_gate: The paper's 0.5.
         per_room: Average over each room's objects alone; see `mean_of_objects`.
 
     Returns:

@@ -1,4 +1,4 @@
-"""How far the edges of each class's boxes are cut off, for the proxy `beveled_box`; learnt."""
+"""Learnt bevels of each class, for the proxy `beveled_box`."""
 
 import torch
 from jaxtyping import Float

@@ -49,7 +49,7 @@ class CubeConfig(Section):
 
 
 class LatentSphere(nn.Module):
-    """Weights w_i of M fixed unit vectors phi_i to a point z of the unit hypersphere (Eq. 2).
+    """Map weights w_i of M fixed unit vectors phi_i to a point z of the hypersphere (Eq. 2).
 
         z = sum_i w_i phi_i / |sum_i w_i phi_i|,    w = softmax(logits)
 
@@ -121,7 +121,7 @@ class LatentCube(nn.Module):
         self.half_edge = math.sqrt(3 / dimension)
 
     def forward(self, logits: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
-        """2 * Phi(x) - 1 is erf(x / sqrt(2))."""
+        """Points z of the cube; 2 Phi(x) - 1 = erf(x / sqrt(2))."""
         return self.half_edge * torch.erf(logits / math.sqrt(2))
 
     def onto(self, points: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:

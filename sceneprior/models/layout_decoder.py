@@ -81,7 +81,7 @@ class LayoutDecoder(nn.Module):
         """The layout, and MLP1's output, from which the shape decoder goes on.
 
         Sizes pass a SoftPlus; the box's lower side is ReLU(y), so c'_y = ReLU(y) + s_y / 2
-        and no object reaches below the floor (supplement A).
+        and no object reaches below the floor (supplement A, Eq. S1).
         """
         shared = self.mlp1(features)
         out = self.mlp2(shared)

@@ -18,7 +18,8 @@ from sceneprior.views import DecodedScenes
 
 
 class ModelConfig(Section):
-    """The network (section 3 and supplement A). Which decoders there are is for a run to say."""
+    """The network (section 3 and supplement A). `config.py` lists the choices of
+    `decoder`."""
 
     max_objects: int = Field(ge=1)
     """N: 13 for bedrooms, 28 for living rooms, 53 for ScanNet."""
@@ -69,7 +70,7 @@ class ScenePrior(nn.Module):
         self.shape = ShapeDecoder(2 * width, config.shape)
 
     def forward(
-        self, logits: Float[Tensor, "rooms anchors"], with_shape: bool = True
+        self, logits: Float[Tensor, "rooms logits"], with_shape: bool = True
     ) -> DecodedScenes:
         """Decode rooms from the logits of their latent weights."""
         return self.decode(self.latent_space(logits), with_shape)
@@ -82,12 +83,10 @@ class ScenePrior(nn.Module):
     ) -> DecodedScenes:
         """Decode rooms from points of the latent space; `with_shape` adds meshes.
 
-        `wanted` saves work where a room's first few objects are all that is looked at: as many
-        objects are unrolled as it has columns, and a mesh is made of those it marks; the others'
-        vertices all lie in the middle of their boxes. None wants all N.
+        `wanted` decodes as many objects as it has columns, and meshes only where it is true; the
+        other vertices lie at their box's centre. None: all N.
 
-        Under autocast the transformer and the shape decoder run in mixed precision. What is
-        said in metres does not: in bfloat16 3 m is followed by 3.02 m.
+        Layouts stay float32 under autocast: bfloat16 would round 3 m to steps of 2 cm.
         """
         count = self.max_objects if wanted is None else wanted.shape[1]
         features = self.decoder(z, count)

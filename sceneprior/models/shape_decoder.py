@@ -27,9 +27,11 @@ class ShapeDecoderConfig(Section):
 
 
 class ShapeDecoder(nn.Module):
-    """Offset every vertex v of a template by a point-wise MLP3 of [MLP1(x_k), v] (Eq. 6).
+    """Offset every vertex v of a template by a point-wise MLP3 (Eq. 6).
 
-        dv_k = MLP3([MLP1(x_k), v]),    S_k = {v + dv_k}
+        dv_k = MLP3([r(MLP1(x_k)), v]),    S_k = {v + dv_k}
+
+    r are two layers more on MLP1's output, as in the released code.
 
     Args:
         features: Size of MLP1's output.

@@ -54,7 +54,9 @@ class FeedForward(nn.Module):
 class SceneTransformer(nn.Module):
     """Generate N object features x_k, each from z and the unordered set of those before it.
 
-        P(x_1, ..., x_N | z) = P(x_1 | z) prod_k P(x_k | {x_1, ..., x_(k-1)}; z)
+        P(x_1, ..., x_N | z) = P(x_1 | z) prod_k P(x_k | {x_1, ..., x_(k-1)}; z)    (Eq. 3)
+
+    The order of x_1, ..., x_(k-1) does not matter (Eq. 4).
 
     Step k: one encoder layer (self attention among x_0 .. x_(k-1), no positional encoding) gives
     the scene context F_k; one decoder layer attends to it with z as the query. Both layers
@@ -129,7 +131,7 @@ class SceneTransformer(nn.Module):
 
         Coordinates of a unit vector are about 1 / sqrt(width), far below the normalised
         features they are added to, so z is scaled to about 1. Without it the class loss falls
-        far more slowly (docs/experiments/).
+        far more slowly (docs/experiments/2026-11-21-demo-settings.md).
         """
         return self.query(z * z.shape[-1] ** 0.5)
 

@@ -1,0 +1,1 @@
+"""Rooms from the instance masks of single images (section 5.2)."""

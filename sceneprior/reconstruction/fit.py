@@ -19,7 +19,7 @@ from sceneprior.training.objective import (
     seen_masks,
     weighted_sum,
 )
-from sceneprior.training.ours import OursConfig
+from sceneprior.training.ours import PaperConfig
 from sceneprior.views import DecodedScenes, SceneViews
 
 CHECK_EVERY = 20
@@ -104,7 +104,7 @@ def view_loss(
         matches: To keep; None matches anew.
     """
     config = trained.config
-    assert isinstance(config, OursConfig), "a run that remembers rooms has a view loss"
+    assert isinstance(config, PaperConfig), "a run that remembers rooms has a view loss"
     boxes = seen_boxes(scenes, views, config.shape)
     losses, matches = match_and_score(
         scenes, boxes, views, config.loss, config.model.completeness_target, True, matches

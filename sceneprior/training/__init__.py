@@ -1,0 +1,1 @@
+"""Training (sections 3.4 and 4): the two stages, their settings, checkpoints."""

@@ -1,4 +1,4 @@
-"""What happens beside the training step: progress, checkpoints and a clean stop."""
+"""Lightning callbacks: progress, a seed for each batch, `last.ckpt` after each epoch."""
 
 from pathlib import Path
 

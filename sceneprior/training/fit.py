@@ -9,6 +9,7 @@ import torch
 
 from sceneprior.data.datamodule import make_loader
 from sceneprior.errors import ConfigError, InputError
+from sceneprior.files import remove_parts
 from sceneprior.settings import check_settings, dump_settings, read_settings
 from sceneprior.training.callbacks import RollingCheckpoint, RunProgress, StepSeed
 from sceneprior.training.checkpoints import checkpoint_extra, write_checkpoint
@@ -75,7 +76,10 @@ def _check_run(config: RunConfig, run: Path, resume: bool) -> None:
     try:
         same = check_settings(type(config), read_settings(str(saved))[1], str(saved)) == config
     except ConfigError:
-        same = False  # of another method, or of another version
+        raise InputError(
+            f"{saved} is of another method or version than the settings given now, or damaged; "
+            "name another folder."
+        ) from None
     if not same:
         raise InputError(
             f"{saved} differs from the settings given now; resume with "
@@ -128,6 +132,7 @@ class _Training:
         # Only now: a run that is refused leaves nothing behind.
         if trainer.is_global_zero:
             self.folder.mkdir(parents=True, exist_ok=True)
+            remove_parts(self.folder)  # of a process that was killed while it saved
             dump_settings(config, self.run / "config.yaml")
         if rooms.masks is None:  # else worker processes may make the batches
             rooms.to(trainer.strategy.root_device)

@@ -20,7 +20,7 @@ from sceneprior.views import SceneViews
 
 
 class LayoutStage(lightning.LightningModule):
-    """The layout loss of section 3.4, without shape decoding.
+    """The layout loss L_L of section 3.4 (Eq. 7), without shape decoding.
 
     Args:
         prior: The network; its shape decoder is left alone.

@@ -1,4 +1,4 @@
-"""A name in, a logger of the stage's folder out; and Lightning kept quiet."""
+"""Loggers of a stage (CSV, TensorBoard, W&B); quietens Lightning."""
 
 import csv
 import logging

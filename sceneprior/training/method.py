@@ -1,4 +1,4 @@
-"""What a method is: a run's config that names its stages and reads what they trained.
+"""The protocol of a method (`RunConfig`), and what training gives back.
 
 `RunConfig` is the protocol. A method's config adds its own sections to it and implements `stages`
 (what `fit` trains), `load` (a checkpoint of a stage) and `trained` (a stage's networks, ready for
@@ -126,7 +126,7 @@ class TrainedPrior:
     """A prior with the latents of the rooms it was trained on, ready for use."""
 
     prior: ScenePrior
-    logits: Float[Tensor, "rooms anchors"]
+    logits: Float[Tensor, "rooms logits"]
     room_ids: tuple[str, ...]
     config: PriorConfig
     stage: str

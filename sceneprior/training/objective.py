@@ -106,7 +106,10 @@ def seen_masks(
 def weighted_sum(
     losses: dict[str, Float[Tensor, "*rooms"]], weights: LossConfig
 ) -> Float[Tensor, "*rooms"]:
-    """The total that is minimised: one number, or one a room."""
+    """sum_t lambda_t L_t: L_L (Eq. 7), and with the mask term L = L_L + lambda_S L_S.
+
+    One number, or one a room.
+    """
     by_name = weights.model_dump(by_alias=True)
     return torch.stack([by_name[name] * loss for name, loss in losses.items()]).sum(dim=0)
 
@@ -133,7 +136,7 @@ def check_finite(total: Tensor, views: SceneViews | RoomBoxes) -> None:
     if several:
         told = [told[0]] * dist.get_world_size()
         dist.all_gather_object(told, (total.item(), () if finite else views.room_ids))
-    value = next(value for value, rooms in told if rooms)
+    value = next((value for value, rooms in told if rooms), total.item())
     raise FloatingPointError(
         f"The loss is {value} on rooms {', '.join(room for _, rooms in told for room in rooms)}; "
         "lower the learning rate, or look at these rooms with `sceneprior inspect`."

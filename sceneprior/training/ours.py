@@ -22,7 +22,7 @@ from sceneprior.training.settings import (
 from sceneprior.training.shape import ShapeStage
 
 
-class OursConfig(PriorConfig):
+class PaperConfig(PriorConfig):
     """A run of the paper's method."""
 
     method: Literal["ours"] = "ours"

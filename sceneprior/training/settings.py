@@ -11,7 +11,7 @@ class DataConfig(Section):
     """Which shards, and how much of each room a step sees."""
 
     shards: str
-    """Folder that `sceneprior prep-front` wrote; relative to where the command runs."""
+    """Folder of view shards (any `prep-*` command); relative to where the command runs."""
     views_per_room: int = Field(20, ge=1)
     """Views drawn per room and step (paper: 20), where a stage does not say otherwise."""
     view_fraction: float = Field(1.0, gt=0, le=1)
@@ -30,7 +30,7 @@ class DataConfig(Section):
 
 
 class LossConfig(Section):
-    """Weights of the losses' terms (section 4)."""
+    """Weights of the losses (lambda_l, lambda_box, ...) and settings of matching (section 4)."""
 
     class_: float = Field(1.0, ge=0, alias="class")
     box: float = Field(5.0, ge=0)
@@ -45,7 +45,7 @@ class LossConfig(Section):
     part of a prediction that reaches further counts this much: 1 is the paper, which takes every
     side at its word; 0 lets objects go on behind others without end."""
     iou_gate: float = Field(0.5, ge=0, lt=1)
-    """Masks that overlap less than this teach no shape."""
+    """Masks whose IoU with their observation is not above this are left out of L_S."""
 
 
 class TrainConfig(Section):
@@ -68,7 +68,8 @@ class StageConfig(TrainConfig):
 
     learning_rate: float = Field(1e-4, gt=0)
     latent_learning_rate: float = Field(1e-4, gt=0)
-    """For the latent weights, which see one gradient an epoch; the paper uses one rate for all."""
+    """For the latent weights, which see one gradient an epoch, and for the bevels of `beveled_box`;
+    the paper uses one rate for all."""
     schedule: Literal["steps", "cosine"] = "steps"
     """`steps`: times `decay` after each milestone (paper); `cosine`: a short rise, then a
     cosine down to zero, which reaches the same loss in fewer epochs."""

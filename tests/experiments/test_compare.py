@@ -82,8 +82,8 @@ def test_a_method_with_a_config_of_its_own_learns_from_the_same_rooms(written, t
     # No config but ours has to have room for a number of objects.
     own.write_text("method: sync2gen\nlabel_set: a\nseed: 1\n")
     assert runs_of(comparison, Path())[1].settings == (
-        "label_set=front3d_bedroom",
-        f"data.shards={theirs.data.shards}",
+        'label_set="front3d_bedroom"',
+        f'data.shards="{theirs.data.shards}"',
         "training.epochs=7",
         "seed=0",
     )

@@ -1,0 +1,1 @@
+"""ATISS with 3D supervision."""

@@ -1,0 +1,1 @@
+"""A GAN on semantic maps, in place of the view loss."""

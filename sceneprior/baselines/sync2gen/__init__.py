@@ -1,0 +1,1 @@
+"""A Sync2Gen-style VAE with 3D supervision."""

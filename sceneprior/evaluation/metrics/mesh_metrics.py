@@ -1,4 +1,4 @@
-"""Compare surfaces and upright boxes: meshes in; distances in metres, F-scores and IoUs out."""
+"""Chamfer distance, F-score and box IoU of meshes and upright boxes."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

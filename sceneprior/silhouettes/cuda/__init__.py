@@ -1,0 +1,1 @@
+"""The GPU backend of the renderer, in Triton."""
