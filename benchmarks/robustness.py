@@ -25,8 +25,8 @@ from sceneprior.data.flat_views import FlatViews
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.generation.decode import decode_training_rooms
-from sceneprior.training.layout import LayoutStage
 from sceneprior.training.method import TrainedPrior
+from sceneprior.training.stages import LayoutStage
 from sceneprior.views import SceneViews
 
 BASE = Path(__file__).parents[1] / "configs" / "demo.yaml"

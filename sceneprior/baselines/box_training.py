@@ -1,6 +1,6 @@
-"""What the two methods that learn from true boxes in 3D share: their config, loss and optimiser."""
+"""What the two methods that learn from true boxes in 3D share: their config and their stage."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.losses.averages import share_of_batch
-from sceneprior.training.checkpoints import read_checkpoint, restore, saved_room_ids
-from sceneprior.training.method import RunConfig, Stage, TrainedSampler, check_rooms, ready_copy
+from sceneprior.settings import Section
+from sceneprior.training.method import RunConfig, Stage, TrainedSampler, ready_copy
 from sceneprior.training.objective import check_finite, log_losses, with_cosine
 from sceneprior.training.settings import TrainConfig
 from sceneprior.views import RoomBoxes
@@ -33,73 +33,79 @@ class BoxTraining(TrainConfig):
 class BoxConfig(RunConfig):
     """A run that learns from true boxes; its only stage has the method's name."""
 
+    model: Section
     training: BoxTraining
 
     @abstractmethod
-    def build_network(self) -> nn.Module:
-        """The network, freshly initialised from the seed; it has `sample` (see `BoxSampler`)."""
+    def make(self) -> "BoxStage":
+        """The module to train, with a fresh network that knows no rooms yet."""
 
-    @abstractmethod
-    def build(self, rooms: TruthDataset, previous: Path | None) -> lightning.LightningModule:
+    def build(self, rooms: TruthDataset, previous: Path | None) -> "BoxStage":
         """The module to train, with statistics of the training rooms."""
+        torch.manual_seed(self.seed)
+        stage = self.make()
+        stage.prior.fit_statistics(rooms.everything())
+        return stage
 
     def stages(self) -> tuple[Stage, ...]:
         return (Stage(self.method, self.training, self._open, self.build),)
 
-    def load(self, stage: str, path: Path) -> TrainedSampler:
-        saved = read_checkpoint(path)
-        network: Any = self.build_network()
-        restore({"prior": network}, saved, path)
-        network.eval().requires_grad_(False)
-        return TrainedSampler(network, saved_room_ids(saved, path), self, stage)
+    def networks(self, rooms: int) -> nn.ModuleDict:
+        torch.manual_seed(self.seed)
+        return nn.ModuleDict({"prior": self.make().prior})
 
-    def trained(
-        self, networks: lightning.LightningModule, stage: str, room_ids: tuple[str, ...]
-    ) -> TrainedSampler:
+    def trained(self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]) -> TrainedSampler:
         return TrainedSampler(ready_copy(networks.prior), room_ids, self, stage)
-
-    @property
-    def _most(self) -> int | None:
-        """Objects that a room can have."""
-        return None
 
     def _open(self) -> TruthDataset:
         rooms = TruthDataset(Path(self.data.shards), "train", self.data.rotations)
-        check_rooms(rooms, self, self._most)
+        self.check_rooms(rooms, getattr(self.model, "max_objects", None))
         return rooms
 
 
-def total_of_rooms(
-    stage: lightning.LightningModule,
-    rooms: RoomBoxes,
-    losses: dict[str, Float[Tensor, " rooms"]],
-    weights: dict[str, float],
-    beside: dict[str, Float[Tensor, ""]] | None = None,
-) -> Float[Tensor, ""]:
-    """Mean over rooms of the weighted sum of their terms; logged, term by term.
+class BoxStage(lightning.LightningModule, ABC):
+    """Minimises the mean over rooms of the weighted sum of their terms.
 
     Args:
-        stage: Logs under `train/`.
-        rooms: The batch; of several processes' batches, each room with an id counts the same.
-        losses: Of each room, by name.
-        weights: Of the terms; 1 where none is given.
-        beside: Logged, too, but not minimised.
-
-    Raises:
-        FloatingPointError: the total is NaN or infinite; names the rooms.
+        prior: The network: a `BoxSampler`, which has `fit_statistics(rooms)`.
+        settings: How it is trained.
+        seed: Of the run.
     """
-    count = len(rooms.room_ids)
-    share = share_of_batch(torch.tensor(count, device=rooms.boxes_m.device))
-    means = {name: share * loss.sum() / max(count, 1) for name, loss in losses.items()}
-    total = torch.stack([weights.get(name, 1.0) * mean for name, mean in means.items()]).sum()
-    check_finite(total, rooms)
-    log_losses(stage, means | (beside or {}), total, max(count, 1))
-    return total
 
+    def __init__(self, prior: Any, settings: BoxTraining, seed: int):
+        super().__init__()
+        self.prior, self.settings, self.seed = prior, settings, seed
 
-def build_box_optimizer(
-    network: nn.Module, settings: BoxTraining, steps: int
-) -> torch.optim.Optimizer | OptimizerLRSchedulerConfig:
-    """Adam with the stage's schedule over `steps` updates."""
-    optimizer = torch.optim.Adam(network.parameters(), lr=settings.learning_rate)
-    return optimizer if settings.schedule == "constant" else with_cosine(optimizer, steps)
+    @abstractmethod
+    def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
+        """The loss of a batch."""
+
+    def total(
+        self,
+        rooms: RoomBoxes,
+        losses: dict[str, Float[Tensor, " rooms"]],
+        weights: dict[str, float],
+        beside: dict[str, Float[Tensor, ""]],
+    ) -> Float[Tensor, ""]:
+        """The loss of a batch, checked and logged term by term; each room with an id counts the
+        same, of several processes' batches, too.
+
+        Args:
+            rooms: The batch.
+            losses: Of each room, by name.
+            weights: Of the terms; 1 where none is given.
+            beside: Logged, too, but not minimised.
+        """
+        count = len(rooms.room_ids)
+        share = share_of_batch(torch.tensor(count, device=self.device))
+        means = {name: share * loss.sum() / max(count, 1) for name, loss in losses.items()}
+        total = torch.stack([weights.get(name, 1.0) * mean for name, mean in means.items()]).sum()
+        check_finite(total, rooms)
+        log_losses(self, means | beside, total, max(count, 1))
+        return total
+
+    def configure_optimizers(self) -> torch.optim.Optimizer | OptimizerLRSchedulerConfig:
+        optimizer = torch.optim.Adam(self.prior.parameters(), lr=self.settings.learning_rate)
+        if self.settings.schedule == "constant":
+            return optimizer
+        return with_cosine(optimizer, int(self.trainer.estimated_stepping_batches))

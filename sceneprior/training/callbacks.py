@@ -1,6 +1,7 @@
 """Lightning callbacks: progress, a seed for each batch, `last.ckpt` after each epoch."""
 
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
@@ -48,16 +49,13 @@ class RunProgress(Callback):
             text = "" if loss is None else f"loss {float(loss):.4f}"
             self._progress.update(self._task, completed=trainer.current_epoch + 1, loss=text)
 
-    def _stop(self) -> None:
+    def on_train_end(self, *_: Any) -> None:
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
 
-    def on_train_end(self, trainer: lightning.Trainer, pl_module) -> None:
-        self._stop()
-
-    def on_exception(self, trainer: lightning.Trainer, pl_module, exception) -> None:
-        self._stop()
+    def on_exception(self, *_: Any) -> None:
+        self.on_train_end()
 
 
 class StepSeed(Callback):
@@ -75,11 +73,8 @@ class RollingCheckpoint(Callback):
     """Keep `last.ckpt` fresh: after every epoch, since only there a run can be taken up exactly.
 
     A stop by hand loses the epoch it falls into, and the resumed run draws that epoch's views
-    again: it ends at the same weights as one that was never stopped.
-
-    Args:
-        folder: Where it goes.
-        extra: Plain data stored under its own key.
+    again: it ends at the same weights as one that was never stopped. `extra`, plain data under
+    keys of its own, goes into every checkpoint.
     """
 
     def __init__(self, folder: Path, extra: dict):

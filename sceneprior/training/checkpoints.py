@@ -8,7 +8,7 @@ RUN/<stage>/samples.json   the newest evaluation and the best so far; pictures i
 RUN/<stage>/metrics.csv    one line an epoch; TensorBoard's files lie beside it
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,30 +18,20 @@ from torch import nn
 
 from sceneprior.errors import InputError
 from sceneprior.files import write_whole
-from sceneprior.models.prior import ScenePrior
-from sceneprior.training.method import PriorConfig
 
 CHECKPOINTS = ("final", "best")
-
-
-def checkpoint_extra(label_set: str, room_ids: tuple[str, ...]) -> dict[str, Any]:
-    """What a checkpoint says of its run beside the weights."""
-    return {"sceneprior": {"room_ids": list(room_ids), "label_set": label_set}}
 
 
 def find_checkpoint(
     run: Path, stages: Sequence[str], checkpoint: str = "final"
 ) -> tuple[str, Path]:
-    """The stage and path of the checkpoint that tasks use.
+    """The stage and path of the checkpoint that tasks use, of the `stages` in their order.
 
-    Args:
-        run: A run's folder.
-        stages: Names of its stages, in order.
-        checkpoint: `final`: the furthest finished stage's, else the furthest begun one's. `best`:
-            the one that generated best in the furthest stage that has one.
+    `final` is the furthest finished stage's, else the furthest begun one's; `best` the one that
+    generated best in the furthest stage that has one.
 
     Raises:
-        InputError: what was asked for was not saved in it yet.
+        InputError: what was asked for was not saved in the run yet.
     """
     if checkpoint not in CHECKPOINTS:
         raise InputError(f"No checkpoint '{checkpoint}'; choose from {', '.join(CHECKPOINTS)}.")
@@ -72,11 +62,7 @@ def write_checkpoint(trainer: lightning.Trainer, folder: Path, name: str) -> Non
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint's contents, tensors and plain data only.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """A checkpoint's contents, tensors and plain data only; InputError if it is damaged."""
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
@@ -86,50 +72,29 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         ) from None
 
 
-def restore(networks: dict[str, nn.Module], saved: dict[str, Any], path: Path) -> None:
-    """Load a checkpoint's weights into networks, by the names that its module has for them.
+def read_networks(
+    path: Path, build: Callable[[int], nn.ModuleDict]
+) -> tuple[nn.ModuleDict, tuple[str, ...]]:
+    """The networks of a checkpoint, and the ids of the rooms that it was trained on.
+
+    Args:
+        path: Of the checkpoint.
+        build: Makes the networks, freshly initialised, for so many rooms.
 
     Raises:
-        InputError: the checkpoint is of other networks.
-    """
-    holder = nn.ModuleDict(networks)
-    try:
-        # What helped in training alone, such as a discriminator, is not needed any more.
-        weights = {k: v for k, v in saved["state_dict"].items() if k.split(".")[0] in holder}
-        holder.load_state_dict(weights)
-    except (KeyError, RuntimeError) as error:
-        raise _misfit(path, error) from None
-
-
-def saved_room_ids(saved: dict[str, Any], path: Path) -> tuple[str, ...]:
-    """Ids of the rooms that a checkpoint was trained on.
-
-    Raises:
-        InputError: it does not say, so `fit` did not write it.
-    """
-    try:
-        return tuple(saved["sceneprior"]["room_ids"])
-    except KeyError as error:
-        raise _misfit(path, error) from None
-
-
-def restore_prior(
-    config: PriorConfig, path: Path, void: bool = True
-) -> tuple[ScenePrior, nn.Embedding, tuple[str, ...]]:
-    """Network, latents and room ids of a checkpoint of this config; `void` as in `build_prior`.
-
-    Raises:
-        InputError: the checkpoint is damaged, or of another network.
+        InputError: the checkpoint is damaged, of other networks, or not written by `fit`.
     """
     saved = read_checkpoint(path)
-    room_ids = saved_room_ids(saved, path)
-    prior, latents = config.build_prior(void), config.build_latents(len(room_ids))
-    restore({"prior": prior, "latents": latents}, saved, path)
-    return prior, latents, room_ids
-
-
-def _misfit(path: Path, error: Exception) -> InputError:
-    reason = " ".join(str(error).split())[:200]
-    return InputError(
-        f"{path} does not fit the run's config.yaml ({reason}); use the config it was trained with."
-    )
+    try:
+        room_ids = tuple(saved["sceneprior"]["room_ids"])
+        networks = build(len(room_ids))
+        # What helped in training alone, such as a discriminator, is not needed any more.
+        weights = {k: v for k, v in saved["state_dict"].items() if k.split(".")[0] in networks}
+        networks.load_state_dict(weights)
+    except (KeyError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"{path} does not fit the run's config.yaml ({reason}); use the config it was trained "
+            "with."
+        ) from None
+    return networks, room_ids

@@ -12,7 +12,7 @@ from sceneprior.errors import ConfigError, InputError
 from sceneprior.files import remove_parts
 from sceneprior.settings import check_settings, dump_settings, read_settings
 from sceneprior.training.callbacks import RollingCheckpoint, RunProgress, StepSeed
-from sceneprior.training.checkpoints import checkpoint_extra, write_checkpoint
+from sceneprior.training.checkpoints import write_checkpoint
 from sceneprior.training.loggers import LOGGERS, make_logger, quiet_lightning
 from sceneprior.training.method import RunConfig, Stage
 from sceneprior.training.monitor import Evaluate, SampleMonitor
@@ -58,8 +58,8 @@ def fit(
         for stage in config.stages():
             final = run / stage.name / "final.ckpt"
             if not final.is_file():
-                training = _Training(stage, config, run, resume, loggers, trainer_options or {})
-                training.run_from(previous, evaluate)
+                options = trainer_options or {}
+                _train(stage, config, final.parent, previous, resume, loggers, options, evaluate)
             previous = final
 
 
@@ -87,97 +87,94 @@ def _check_run(config: RunConfig, run: Path, resume: bool) -> None:
         )
 
 
-class _Training:
-    """One stage of one run: the Trainer it needs, and what is left in its folder."""
-
-    def __init__(
-        self,
-        stage: Stage,
-        config: RunConfig,
-        run: Path,
-        resume: bool,
-        loggers: tuple[str, ...],
-        options: dict[str, Any],
-    ):
-        self.stage, self.config, self.run = stage, config, run
-        self.resume, self.loggers, self.options = resume, loggers, options
-        self.folder = run / stage.name
-
-    def run_from(self, previous: Path | None, evaluate: Evaluate | None) -> None:
-        """Train to the end, or as far as Ctrl-C lets it."""
-        config, settings = self.config, self.stage.settings
-        rooms = self.stage.open_data()
-        module = self.stage.build(rooms, previous)
-        room_ids = () if _remembers_nothing(module) else rooms.room_ids
-        callbacks: list[lightning.Callback] = [
-            RunProgress(f"fit {self.stage.name} (epochs)"), StepSeed(config.seed)
-        ]  # fmt: skip
-        if evaluate is not None and config.samples.every:
-            # Before the rolling checkpoint, which holds the best so far.
-            monitor = SampleMonitor(self.folder, config, self.stage.name, room_ids, evaluate)
-            callbacks.append(monitor)
-        callbacks.append(
-            RollingCheckpoint(self.folder, checkpoint_extra(config.label_set, room_ids))
+def _train(
+    stage: Stage,
+    config: RunConfig,
+    folder: Path,
+    previous: Path | None,
+    resume: bool,
+    loggers: tuple[str, ...],
+    options: dict[str, Any],
+    evaluate: Evaluate | None,
+) -> None:
+    """Train one stage in its folder to the end, or as far as Ctrl-C lets it."""
+    settings = stage.settings
+    rooms = stage.open_data()
+    module = stage.build(rooms, previous)
+    room_ids = () if _remembers_nothing(module) else rooms.room_ids
+    callbacks: list[lightning.Callback] = [
+        RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed)
+    ]  # fmt: skip
+    if evaluate is not None and config.samples.every:
+        # Before the rolling checkpoint, which holds the best so far.
+        callbacks.append(SampleMonitor(folder, config, stage.name, room_ids, evaluate))
+    said = {"room_ids": list(room_ids), "label_set": config.label_set}
+    callbacks.append(RollingCheckpoint(folder, {"sceneprior": said}))
+    quiet_lightning()
+    lightning.seed_everything(config.seed, verbose=False)
+    if settings.cpu_threads is not None:
+        torch.set_num_threads(settings.cpu_threads)
+    trainer = _trainer(stage, folder, loggers, options, callbacks)
+    if stage.steps_itself and trainer.world_size > 1:
+        raise InputError(
+            f"method: {config.method} trains in one process, but {trainer.world_size} were "
+            "asked for; use --devices 1."
         )
-        quiet_lightning()
-        lightning.seed_everything(config.seed, verbose=False)
-        if settings.cpu_threads is not None:
-            torch.set_num_threads(settings.cpu_threads)
-        trainer = self._trainer(callbacks)
-        if self.stage.steps_itself and trainer.world_size > 1:
-            raise InputError(
-                f"method: {config.method} trains in one process, but {trainer.world_size} were "
-                "asked for; use --devices 1."
-            )
-        # Only now: a run that is refused leaves nothing behind.
-        if trainer.is_global_zero:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            remove_parts(self.folder)  # of a process that was killed while it saved
-            dump_settings(config, self.run / "config.yaml")
-        if rooms.masks is None:  # else worker processes may make the batches
-            rooms.to(trainer.strategy.root_device)
-        loader = make_loader(
-            rooms, settings.batch_size, config.seed, config.data.workers,
-            trainer.global_rank, trainer.world_size,
-        )  # fmt: skip
-        last = self.folder / "last.ckpt"
-        start = last if self.resume and last.is_file() else None
-        before = signal.getsignal(signal.SIGINT)
-        try:
-            trainer.fit(module, loader, ckpt_path=start, weights_only=True)
-        except SystemExit:
-            # Lightning answers Ctrl-C with sys.exit(1).
-            if not trainer.interrupted:
-                raise
-            signal.signal(signal.SIGINT, before)  # which Lightning left ignored
-            raise KeyboardInterrupt from None
-        write_checkpoint(trainer, self.folder, "final.ckpt")
+    # Only now: a run that is refused leaves nothing behind.
+    if trainer.is_global_zero:
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_parts(folder)  # of a process that was killed while it saved
+        dump_settings(config, folder.parent / "config.yaml")
+    if rooms.masks is None:  # else worker processes may make the batches
+        rooms.to(trainer.strategy.root_device)
+    loader = make_loader(
+        rooms, settings.batch_size, config.seed, config.data.workers,
+        trainer.global_rank, trainer.world_size,
+    )  # fmt: skip
+    last = folder / "last.ckpt"
+    start = last if resume and last.is_file() else None
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        trainer.fit(module, loader, ckpt_path=start, weights_only=True)
+    except SystemExit:
+        # Lightning answers Ctrl-C with sys.exit(1).
+        if not trainer.interrupted:
+            raise
+        signal.signal(signal.SIGINT, before)  # which Lightning left ignored
+        raise KeyboardInterrupt from None
+    write_checkpoint(trainer, folder, "final.ckpt")
 
-    def _trainer(self, callbacks: list[lightning.Callback]) -> lightning.Trainer:
-        settings = self.stage.settings
-        updates: dict[str, Any] = {
-            "gradient_clip_val": settings.clip_gradient or None,
-            "accumulate_grad_batches": settings.accumulate,
-        }
-        try:
-            return lightning.Trainer(
-                max_epochs=settings.epochs,
-                logger=[make_logger(name, self.folder) for name in self.loggers],
-                callbacks=callbacks,
-                plugins=slurm_plugins(),
-                default_root_dir=self.folder,
-                enable_checkpointing=False,
-                enable_progress_bar=False,
-                enable_model_summary=False,
-                use_distributed_sampler=False,
-                log_every_n_steps=1,
-                **({} if self.stage.steps_itself else updates),
-                **self.options,
-            )
-        except (ValueError, TypeError, RuntimeError) as error:
-            given = ", ".join(f"--{name} {value}" for name, value in self.options.items())
-            reason = " ".join(str(error).split())
-            raise InputError(f"Lightning cannot train with {given}: {reason}") from None
+
+def _trainer(
+    stage: Stage,
+    folder: Path,
+    loggers: tuple[str, ...],
+    options: dict[str, Any],
+    callbacks: list[lightning.Callback],
+) -> lightning.Trainer:
+    updates: dict[str, Any] = {
+        "gradient_clip_val": stage.settings.clip_gradient or None,
+        "accumulate_grad_batches": stage.settings.accumulate,
+    }
+    try:
+        return lightning.Trainer(
+            max_epochs=stage.settings.epochs,
+            logger=[make_logger(name, folder) for name in loggers],
+            callbacks=callbacks,
+            plugins=slurm_plugins(),
+            default_root_dir=folder,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            use_distributed_sampler=False,
+            log_every_n_steps=1,
+            **({} if stage.steps_itself else updates),
+            **options,
+        )
+    except (ValueError, TypeError, RuntimeError) as error:
+        given = ", ".join(f"--{name} {value}" for name, value in options.items())
+        reason = " ".join(str(error).split())
+        raise InputError(f"Lightning cannot train with {given}: {reason}") from None
 
 
 def _remembers_nothing(module: Any) -> bool:

@@ -1,8 +1,8 @@
 """The protocol of a method (`RunConfig`), and what training gives back.
 
-`RunConfig` is the protocol. A method's config adds its own sections to it and implements `stages`
-(what `fit` trains), `load` (a checkpoint of a stage) and `trained` (a stage's networks, ready for
-use). The paper's method is `training/ours.py`, baselines have theirs; `config.py` lists all.
+A method's config adds its own sections to `RunConfig` and implements `stages` (what `fit` trains),
+`networks` (what a checkpoint fills) and `trained` (a stage's networks, ready for use). The paper's
+method is `training/ours.py`, baselines have theirs; `config.py` lists all.
 """
 
 import copy
@@ -19,9 +19,11 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from sceneprior.classes import label_set
+from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.models.prior import ModelConfig, ScenePrior
 from sceneprior.settings import Section
+from sceneprior.training.checkpoints import read_networks
 from sceneprior.training.settings import DataConfig, SamplesConfig, TrainConfig
 from sceneprior.views import RoomBoxes
 
@@ -77,18 +79,40 @@ class RunConfig(Section, ABC):
         return tuple(stage.name for stage in self.stages())
 
     @abstractmethod
+    def networks(self, rooms: int) -> nn.ModuleDict:
+        """What tasks take out of a checkpoint of so many rooms, freshly initialised from the seed:
+        `prior`, and `latents` if any."""
+
+    @abstractmethod
+    def trained(self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]) -> "Trained":
+        """A copy of a module's networks as they stand, on the CPU and in evaluation mode."""
+
     def load(self, stage: str, path: Path) -> "Trained":
         """What a checkpoint of a stage holds, in evaluation mode.
 
         Raises:
             InputError: it is damaged, or of another network.
         """
+        networks, room_ids = read_networks(path, self.networks)
+        return self.trained(networks, stage, room_ids)
 
-    @abstractmethod
-    def trained(
-        self, networks: lightning.LightningModule, stage: str, room_ids: tuple[str, ...]
-    ) -> "Trained":
-        """A copy of a module's networks as they stand, on the CPU and in evaluation mode."""
+    def check_rooms(self, rooms: Any, max_objects: int | None) -> None:
+        """Refuse training rooms that do not fit.
+
+        Raises:
+            InputError: another label set, or more objects than the network generates.
+        """
+        shards = self.data.shards
+        if rooms.label_set != self.label_set:
+            raise InputError(
+                f"{shards} is labelled '{rooms.label_set}' but the config says "
+                f"'{self.label_set}'; set label_set or point data.shards elsewhere."
+            )
+        if max_objects is not None and rooms.max_objects > max_objects:
+            raise InputError(
+                f"A room of {shards} has {rooms.max_objects} {rooms.counted} but "
+                f"model.max_objects is {max_objects}; raise it."
+            )
 
 
 class PriorConfig(RunConfig):
@@ -96,15 +120,18 @@ class PriorConfig(RunConfig):
 
     model: ModelConfig
 
+    void: ClassVar[bool] = True
+    """Whether an object may be `void`; see `LayoutDecoder`."""
+
     @property
     def distribution(self) -> str:
         """Where new latents come from unless a task says otherwise."""
         return "paper"
 
-    def build_prior(self, void: bool = True) -> ScenePrior:
-        """The network, freshly initialised from the seed; `void` as in `LayoutDecoder`."""
+    def build_prior(self) -> ScenePrior:
+        """The network, freshly initialised from the seed."""
         torch.manual_seed(self.seed)
-        return ScenePrior(self.model, self.classes, self.seed, void)
+        return ScenePrior(self.model, self.classes, self.seed, self.void)
 
     def build_latents(self, rooms: int) -> nn.Embedding:
         """One row of latent logits a training room, drawn from N(0, 1)."""
@@ -112,13 +139,29 @@ class PriorConfig(RunConfig):
         logits = torch.randn(rooms, self.model.logits_per_room, generator=generator)
         return nn.Embedding.from_pretrained(logits, freeze=False)
 
-    def trained(
-        self, networks: lightning.LightningModule, stage: str, room_ids: tuple[str, ...]
-    ) -> "TrainedPrior":
+    def networks(self, rooms: int) -> nn.ModuleDict:
+        return nn.ModuleDict({"prior": self.build_prior(), "latents": self.build_latents(rooms)})
+
+    def trained(self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]) -> "TrainedPrior":
         prior, latents = networks.prior, networks.latents
         assert isinstance(prior, ScenePrior) and isinstance(latents, nn.Embedding)
         logits = latents.weight.detach().cpu().clone()
         return TrainedPrior(ready_copy(prior), logits, room_ids, self, stage)
+
+    def open_views(self, views_per_room: int, mask_step: int | None) -> ViewDataset:
+        """The training rooms; InputError if they do not fit the config."""
+        data = self.data
+        rooms = ViewDataset(
+            Path(data.shards),
+            "train",
+            views_per_room=views_per_room,
+            rotations=data.rotations,
+            view_fraction=data.view_fraction,
+            mask_step=mask_step,
+            seed=self.seed,
+        )
+        self.check_rooms(rooms, self.model.max_objects)
+        return rooms
 
 
 @dataclass(frozen=True)
@@ -171,22 +214,3 @@ Trained = TrainedPrior | TrainedSampler
 def ready_copy(network: Any) -> Any:
     """A copy of a network on the CPU, in evaluation mode and without gradients."""
     return copy.deepcopy(network).cpu().eval().requires_grad_(False)
-
-
-def check_rooms(dataset: Any, config: RunConfig, max_objects: int | None) -> None:
-    """Refuse training rooms that do not fit a config.
-
-    Raises:
-        InputError: another label set, or more objects than the network generates.
-    """
-    shards = config.data.shards
-    if dataset.label_set != config.label_set:
-        raise InputError(
-            f"{shards} is labelled '{dataset.label_set}' but the config says "
-            f"'{config.label_set}'; set label_set or point data.shards elsewhere."
-        )
-    if max_objects is not None and dataset.max_objects > max_objects:
-        raise InputError(
-            f"A room of {shards} has {dataset.max_objects} {dataset.counted} but "
-            f"model.max_objects is {max_objects}; raise it."
-        )

@@ -1,11 +1,13 @@
-"""The view loss of decoded scenes, and what else both stages share: latents, optimiser, seeds."""
+"""The view loss of decoded scenes; seeds, precision, checks and schedules of all methods."""
+
+import math
 
 import lightning
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
-from torch import Tensor, nn
+from torch import Tensor
 from torch import distributed as dist
 
 from sceneprior.geometry.boxes import beveled_cube, place
@@ -15,9 +17,8 @@ from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.losses.layout import layout_losses
 from sceneprior.losses.matching import Matches, match_objects
-from sceneprior.models.prior import ScenePrior
 from sceneprior.silhouettes.render import render_silhouettes
-from sceneprior.training.settings import LossConfig, ShapeConfig, StageConfig
+from sceneprior.training.settings import LossConfig, ShapeConfig
 from sceneprior.views import DecodedScenes, RoomBoxes, SceneViews
 
 POINTS_LEVEL = 2
@@ -50,16 +51,8 @@ def match_and_score(
     per_room: bool = False,
     matches: Matches | None = None,
 ) -> tuple[dict[str, Float[Tensor, "*rooms"]], Matches]:
-    """Match predictions to tracked objects by their 2D boxes and take the layout losses.
-
-    Args:
-        scenes, boxes: Predictions, and where the views would see them.
-        views: What the cameras saw.
-        weights: Of the run.
-        completeness_target: Of the model.
-        per_room: Losses of each room alone.
-        matches: To keep; None matches anew.
-    """
+    """Match predictions to tracked objects by their 2D boxes `boxes`, unless `matches` are given,
+    and take the layout losses: of the batch, or `per_room`."""
     if matches is None:
         matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
     losses = layout_losses(
@@ -122,21 +115,19 @@ def check_finite(total: Tensor, views: SceneViews | RoomBoxes) -> None:
     Raises:
         FloatingPointError: the loss is NaN or infinite, here or in another process.
     """
-    finite = torch.isfinite(total.detach())
-    several = dist.is_available() and dist.is_initialized()
-    if several:
-        worst = finite.to(torch.int32)
+    value = total.item()
+    finite = math.isfinite(value)
+    told = [(value, () if finite else views.room_ids)]
+    if dist.is_available() and dist.is_initialized():
+        worst = torch.tensor(int(finite), device=total.device)
         dist.all_reduce(worst, dist.ReduceOp.MIN)
-        all_finite = bool(worst)
-    else:
-        all_finite = bool(finite)
-    if all_finite:
+        finite = bool(worst)
+        if not finite:
+            told *= dist.get_world_size()
+            dist.all_gather_object(told, told[0])
+    if finite:
         return
-    told = [(total.item(), () if finite else views.room_ids)]
-    if several:
-        told = [told[0]] * dist.get_world_size()
-        dist.all_gather_object(told, (total.item(), () if finite else views.room_ids))
-    value = next((value for value, rooms in told if rooms), total.item())
+    value = next((bad for bad, rooms in told if rooms), value)
     raise FloatingPointError(
         f"The loss is {value} on rooms {', '.join(room for _, rooms in told for room in rooms)}; "
         "lower the learning rate, or look at these rooms with `sceneprior inspect`."
@@ -159,35 +150,6 @@ def step_seed(seed: int, batch: int, rank: int) -> int:
     return int(np.random.SeedSequence([seed, batch, rank]).generate_state(1, np.uint64)[0] >> 1)
 
 
-def training_latents(
-    module: lightning.LightningModule,
-    rows: Int[Tensor, " rooms"],
-    stage: StageConfig,
-    seed: int,
-    batch_idx: int,
-) -> Float[Tensor, "rooms width"]:
-    """The rooms' latents z, moved at random as far as the stage says.
-
-    Args:
-        module: Has `prior` and `latents`, and knows how far the training is.
-        rows: Which rooms.
-        stage: Says how far to move, at its start and end.
-        seed: Of the run.
-        batch_idx: Of the epoch.
-    """
-    prior, latents = module.prior, module.latents
-    assert isinstance(prior, ScenePrior) and isinstance(latents, nn.Embedding)
-    end = stage.latent_noise if stage.latent_noise_end is None else stage.latent_noise_end
-    done = module.current_epoch / stage.epochs
-    noise = stage.latent_noise + done * (end - stage.latent_noise)
-    with full_precision(rows.device):
-        z = prior.latent_space(latents(rows))
-        if not noise:
-            return z
-        batch = batch_number(module.trainer, batch_idx)
-        return prior.latent_space.step(z, noise, step_seed(seed, batch, module.global_rank))
-
-
 def log_losses(
     module: lightning.LightningModule, values: dict[str, Tensor], total: Tensor, rooms: int
 ) -> None:
@@ -196,39 +158,13 @@ def log_losses(
     module.log_dict(named, on_step=False, on_epoch=True, batch_size=rooms, sync_dist=True)
 
 
-def build_optimizer(
-    prior: ScenePrior,
-    latents: nn.Embedding,
-    stage: StageConfig,
-    steps: int,
-    shape_rate: float | None = None,
-) -> OptimizerLRSchedulerConfig:
-    """Adam with the stage's schedule over `steps` updates, in the shape Lightning takes.
-
-    `shape_rate` is the shape decoder's learning rate; None: that of the rest.
-    """
-    fresh = list(prior.shape.parameters())
-    tables = [*latents.parameters(), *prior.bevels.parameters()]
-    others = ("shape.", "bevels.")
-    trained = [item for name, item in prior.named_parameters() if not name.startswith(others)]
-    groups = [
-        {"params": trained, "lr": stage.learning_rate},
-        {"params": fresh, "lr": shape_rate or stage.learning_rate},
-        {"params": tables, "lr": stage.latent_learning_rate},
-    ]
-    optimizer = torch.optim.Adam(groups, fused=True)
-    if stage.schedule == "cosine":
-        return with_cosine(optimizer, steps)
-    drops = torch.optim.lr_scheduler.MultiStepLR(
-        optimizer, list(stage.milestones), gamma=stage.decay
-    )
-    return {"optimizer": optimizer, "lr_scheduler": drops}
-
-
 def with_cosine(optimizer: torch.optim.Optimizer, steps: int) -> OptimizerLRSchedulerConfig:
     """The optimiser with rates that rise for a twentieth of `steps`, then fall to 0 by a cosine."""
-    rates = [group["lr"] for group in optimizer.param_groups]
     rise = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, rates, total_steps=steps + 1, pct_start=0.05, cycle_momentum=False
+        optimizer,
+        [group["lr"] for group in optimizer.param_groups],
+        total_steps=steps + 1,
+        pct_start=0.05,
+        cycle_momentum=False,
     )
     return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rise, "interval": "step"}}

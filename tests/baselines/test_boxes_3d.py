@@ -13,7 +13,6 @@ from toy_rooms import write_toy_shards
 
 from sceneprior.baselines.atiss.network import END
 from sceneprior.baselines.atiss.stage import AtissStage, part_of_rooms
-from sceneprior.baselines.box_training import build_box_optimizer
 from sceneprior.baselines.sync2gen.stage import Sync2genStage
 from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.config import load_any_run, load_run
@@ -27,6 +26,7 @@ from sceneprior.training.callbacks import RollingCheckpoint
 from sceneprior.training.checkpoints import find_checkpoint, read_checkpoint
 from sceneprior.training.fit import fit
 from sceneprior.training.method import TrainedSampler
+from sceneprior.training.objective import with_cosine
 from sceneprior.views import RoomBoxes
 
 CPU = {"accelerator": "cpu", "devices": 1}
@@ -137,13 +137,13 @@ def test_an_atiss_learns_by_heart_which_furniture_goes_together(tmp_path):
     dataset = TruthDataset(tmp_path / "shards", "train")
     network = config.build(dataset, None).prior
     rooms = dataset.__getitems__([(row, 0) for row in [0, 1, 2] * 32])
-    built = build_box_optimizer(network, config.training, 500)
+    built = with_cosine(torch.optim.Adam(network.parameters(), lr=3e-3), 500)
     optimizer, schedule = built["optimizer"], built["lr_scheduler"]["scheduler"]
     for step in range(500):
-        part = part_of_rooms(rooms, step)
-        placed, coming = network.to_unit(part.placed), network.to_unit(part.coming)
-        context = network.context(part.placed.object_class, placed, part.placed.is_object)
-        log_probs = network.log_prob(context, part.coming.object_class[:, 0], coming[:, 0])
+        placed, coming = part_of_rooms(rooms, step)
+        unit, next_unit = network.to_unit(placed), network.to_unit(coming)
+        context = network.context(placed.object_class, unit, placed.is_object)
+        log_probs = network.log_prob(context, coming.object_class[:, 0], next_unit[:, 0])
         optimizer.zero_grad()
         (-sum(log_prob.mean() for log_prob in log_probs.values())).backward()
         optimizer.step()

@@ -20,7 +20,7 @@ from sceneprior.training import fit as train
 from sceneprior.training.callbacks import RollingCheckpoint
 from sceneprior.training.checkpoints import find_checkpoint, read_checkpoint
 from sceneprior.training.fit import fit
-from sceneprior.training.layout import LayoutStage
+from sceneprior.training.stages import LayoutStage
 
 CPU = {"accelerator": "cpu", "devices": 1}
 
@@ -90,7 +90,7 @@ def test_a_trained_run_is_ready_for_use(toy_run):
 def test_resuming_a_finished_run_trains_nothing(toy_run, toy_shards, tmp_path, monkeypatch):
     run = shutil.copytree(toy_run, tmp_path / "run")
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    monkeypatch.setattr(train, "_Training", None)  # calling it would fail
+    monkeypatch.setattr(train, "_train", None)  # calling it would fail
     fit(tiny_config(toy_shards, layout__epochs=20), run, resume=True)
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 

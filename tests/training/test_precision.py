@@ -6,7 +6,7 @@ from recorded_fit import record
 from tiny_runs import tiny_config
 from torch.testing import assert_close
 
-from sceneprior.training import layout, shape
+from sceneprior.training import stages
 from sceneprior.training.fit import fit
 
 
@@ -28,9 +28,8 @@ def watched(monkeypatch) -> list[tuple]:
         scenes, boxes = args[:2]
         return [scenes.class_logits, scenes.centers_m, scenes.sizes_m, boxes.boxes]
 
-    watch(layout, "match_and_score", predicted)
-    watch(shape, "match_and_score", predicted)
-    watch(shape, "seen_masks", lambda args: args[:1])
+    watch(stages, "match_and_score", predicted)
+    watch(stages, "seen_masks", lambda args: args[:1])
     return seen
 
 
@@ -74,14 +73,14 @@ def test_two_batches_make_one_step_as_one_twice_as_large(toy_shards, tmp_path):
 def test_a_loss_that_is_no_number_stops_mixed_precision_too(
     toy_shards, tmp_path, monkeypatch, precision
 ):
-    original = layout.LayoutStage.training_step
+    original = stages.LayoutStage.training_step
 
     def poisoned(self, views, batch_idx):
         with torch.no_grad():
             self.latents.weight[int(views.room_index[0])] = torch.nan
         return original(self, views, batch_idx)
 
-    monkeypatch.setattr(layout.LayoutStage, "training_step", poisoned)
+    monkeypatch.setattr(stages.LayoutStage, "training_step", poisoned)
     options = {"accelerator": "cpu", "devices": 1, "precision": precision}
     with pytest.raises(FloatingPointError, match="The loss is nan on rooms toy/train_"):
         fit(tiny_config(toy_shards), tmp_path / "run", trainer_options=options)

@@ -94,7 +94,7 @@ class Atiss(nn.Module):
             }
         )
 
-    def fit_bounds(self, rooms: RoomBoxes) -> None:
+    def fit_statistics(self, rooms: RoomBoxes) -> None:
         """Take the range of every coordinate and size from the training rooms."""
         boxes_m = rooms.boxes_m[rooms.is_object]
         self.low_m.copy_(boxes_m.amin(dim=0))

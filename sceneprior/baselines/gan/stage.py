@@ -2,8 +2,9 @@
 
 import copy
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import lightning
 import torch
@@ -31,10 +32,8 @@ from sceneprior.data.dataset import ViewDataset
 from sceneprior.models.layout_decoder import LayoutDecoder
 from sceneprior.models.prior import ModelConfig, ScenePrior
 from sceneprior.models.transformer import TransformerConfig
-from sceneprior.training.checkpoints import restore_prior
-from sceneprior.training.method import PriorConfig, Stage, TrainedPrior
+from sceneprior.training.method import PriorConfig, Stage
 from sceneprior.training.objective import check_finite, full_precision
-from sceneprior.training.ours import open_views
 from sceneprior.training.settings import TrainConfig
 from sceneprior.views import DecodedScenes, SceneViews
 
@@ -108,20 +107,15 @@ class GanConfig(PriorConfig):
     model: GanModel
     training: GanTraining = GanTraining()
 
+    void: ClassVar[bool] = False
+
     def stages(self) -> tuple[Stage, ...]:
-        return (Stage("gan", self.training, self._open, self._build, steps_itself=True),)
-
-    def load(self, stage: str, path: Path) -> TrainedPrior:
-        prior, latents, room_ids = restore_prior(self, path, void=False)
-        prior.eval().requires_grad_(False)
-        return TrainedPrior(prior, latents.weight.detach(), room_ids, self, stage)
-
-    def _open(self) -> ViewDataset:
-        return open_views(self, self.training.views_per_room, self.data.mask_step)
+        views = partial(self.open_views, self.training.views_per_room, self.data.mask_step)
+        return (Stage("gan", self.training, views, self._build, steps_itself=True),)
 
     def _build(self, rooms: ViewDataset, previous: Path | None) -> "GanStage":
         # A GAN pairs no point of the latent space with a room.
-        return GanStage(self.build_prior(void=False), self.build_latents(0), self)
+        return GanStage(self.build_prior(), self.build_latents(0), self)
 
 
 class GanStage(lightning.LightningModule):

@@ -56,7 +56,7 @@ class Sync2Gen(nn.Module):
     Args:
         config: Sizes.
         classes: Size of the label set, void included.
-        seed: Chooses the sparse connections.
+        seed: Chooses the sparse connections, and which offsets of frequent pairs are kept.
     """
 
     mean_m: Tensor
@@ -66,7 +66,7 @@ class Sync2Gen(nn.Module):
         super().__init__()
         slots, width, latent = config.slots, config.width, config.latent
         self.classes, self.slots, self.latent = classes, slots, latent
-        self.refine_steps = config.refine_steps
+        self.refine_steps, self.seed = config.refine_steps, seed
         cells = (classes - 1) * slots * ATTRIBUTES
         self.register_buffer("mean_m", torch.zeros(classes - 1, 1, 6))
         self.register_buffer("spread_m", torch.ones(classes - 1, 1, 6))
@@ -84,7 +84,7 @@ class Sync2Gen(nn.Module):
             nn.Linear(width, cells),
         )
 
-    def fit_statistics(self, rooms: RoomBoxes, seed: int) -> None:
+    def fit_statistics(self, rooms: RoomBoxes) -> None:
         """Take means and spreads per class, and how pairs of classes lie, from training rooms."""
         for label in range(1, self.classes):
             mine = rooms.boxes_m[rooms.is_object & (rooms.object_class == label)]
@@ -92,7 +92,7 @@ class Sync2Gen(nn.Module):
                 spread_m = mine.std(dim=0, correction=0)
                 self.mean_m[label - 1, 0] = mine.mean(dim=0)
                 self.spread_m[label - 1, 0] = spread_m.clamp(min=LEAST_SPREAD_M)
-        self.pairs.fit(rooms, seed)
+        self.pairs.fit(rooms, self.seed)
 
     def to_matrix(self, rooms: RoomBoxes) -> Float[Tensor, "rooms classes slots 7"]:
         """Rooms as matrices, bit for bit the same for every order of their objects."""

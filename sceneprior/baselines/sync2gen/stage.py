@@ -1,21 +1,13 @@
 """The Sync2Gen-style VAE with 3D supervision: its config and its training."""
 
-from pathlib import Path
 from typing import Literal
 
-import lightning
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from sceneprior.baselines.box_training import (
-    BoxConfig,
-    BoxTraining,
-    build_box_optimizer,
-    total_of_rooms,
-)
+from sceneprior.baselines.box_training import BoxConfig, BoxStage, BoxTraining
 from sceneprior.baselines.sync2gen.network import Sync2Gen, Sync2genModel
-from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.training.objective import full_precision
 from sceneprior.views import RoomBoxes
 
@@ -38,27 +30,16 @@ class Sync2genConfig(BoxConfig):
     model: Sync2genModel = Sync2genModel()
     training: Sync2genTraining = Sync2genTraining()
 
-    def build_network(self) -> Sync2Gen:
-        torch.manual_seed(self.seed)
-        return Sync2Gen(self.model, self.classes, self.seed)
-
-    def build(self, rooms: TruthDataset, previous: Path | None) -> "Sync2genStage":
-        network = self.build_network()
-        network.fit_statistics(rooms.everything(), self.seed)
-        return Sync2genStage(network, self.training)
+    def make(self) -> "Sync2genStage":
+        network = Sync2Gen(self.model, self.classes, self.seed)
+        return Sync2genStage(network, self.training, self.seed)
 
 
-class Sync2genStage(lightning.LightningModule):
-    """What a VAE minimises: reconstruction errors of rooms, and their latents' KL from N(0, 1).
+class Sync2genStage(BoxStage):
+    """What a VAE minimises: reconstruction errors of rooms, and their latents' KL from N(0, 1)."""
 
-    Args:
-        prior: The network, which knows the training rooms' statistics.
-        training: How it is trained.
-    """
-
-    def __init__(self, prior: Sync2Gen, training: Sync2genTraining):
-        super().__init__()
-        self.prior, self.training_settings = prior, training
+    prior: Sync2Gen
+    settings: Sync2genTraining
 
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
         matrix = self.prior.to_matrix(rooms)
@@ -71,14 +52,6 @@ class Sync2genStage(lightning.LightningModule):
             losses = self.prior.losses(matrix, decoded, mean.float(), log_variance.float())
             self.prior.note_errors(matrix, decoded)
             objects = rooms.is_object.sum()
-            return total_of_rooms(
-                self,
-                rooms,
-                losses,
-                weights={"kl": self.training_settings.kl_weight},
-                beside={"left_out": (objects - matrix[..., 0].sum()) / objects.clamp(min=1)},
-            )
-
-    def configure_optimizers(self):
-        steps = int(self.trainer.estimated_stepping_batches)
-        return build_box_optimizer(self.prior, self.training_settings, steps)
+            left_out = (objects - matrix[..., 0].sum()) / objects.clamp(min=1)
+            weights = {"kl": self.settings.kl_weight}
+            return self.total(rooms, losses, weights, beside={"left_out": left_out})

@@ -95,7 +95,7 @@ def test_metres_and_back(network, objects):
     assert (yaw_rad.abs() <= math.pi).all()
     plain = network.float()
     rooms = replace(rooms, boxes_m=boxes_m.float(), yaw_rad=yaw_rad.float())
-    plain.fit_bounds(rooms)
+    plain.fit_statistics(rooms)
     inside = plain.to_unit(rooms)[is_object][:, [0, 1, 2, 4, 5, 6]]
     assert_close(inside.amin(dim=0), -torch.ones(6), rtol=0, atol=1e-6)
     assert_close(inside.amax(dim=0), torch.ones(6), rtol=0, atol=1e-6)

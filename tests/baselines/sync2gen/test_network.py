@@ -23,7 +23,7 @@ def rooms(torch_rng) -> RoomBoxes:
 def network(rooms) -> Sync2Gen:
     torch.manual_seed(0)
     network = Sync2Gen(Sync2genModel(slots=2, width=16, refine_steps=0), classes=5, seed=0)
-    network.fit_statistics(rooms, 0)
+    network.fit_statistics(rooms)
     return network
 
 

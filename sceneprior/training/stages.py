@@ -1,0 +1,135 @@
+"""The paper's stages: layouts from 2D boxes (Eq. 7), then with shapes from masks (Eq. 8)."""
+
+from abc import ABC, abstractmethod
+
+import lightning
+import torch
+from jaxtyping import Float
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
+from torch import Tensor, nn
+
+from sceneprior.losses.shape import mask_loss
+from sceneprior.models.prior import ScenePrior
+from sceneprior.training.objective import (
+    batch_number,
+    check_finite,
+    full_precision,
+    log_losses,
+    match_and_score,
+    proxy_boxes,
+    seen_boxes,
+    seen_masks,
+    step_seed,
+    weighted_sum,
+    with_cosine,
+)
+from sceneprior.training.settings import LossConfig, ShapeConfig, StageConfig
+from sceneprior.views import SceneViews
+
+
+class PaperStage(lightning.LightningModule, ABC):
+    """What the stages share: latents of the batch's rooms, the end of a step, the optimiser.
+
+    Args:
+        prior: The network, as the stage before left it; a fresh one in the first.
+        latents: One row of logits a training room.
+        stage, loss: How it is trained, and the weights of the terms.
+        completeness_target: Of the model.
+        seed: Of the run.
+    """
+
+    def __init__(
+        self,
+        prior: ScenePrior,
+        latents: nn.Embedding,
+        stage: StageConfig,
+        loss: LossConfig,
+        completeness_target: str,
+        seed: int,
+    ):
+        super().__init__()
+        # Several processes agree on gradients only of what takes part.
+        prior.requires_grad_(True)
+        prior.shape.requires_grad_(isinstance(stage, ShapeConfig))
+        of_meshes = isinstance(stage, ShapeConfig) and stage.box_from == "mesh"
+        prior.bevels.requires_grad_(stage.proxy == "beveled_box" and not of_meshes)
+        self.prior, self.latents = prior, latents
+        self.stage, self.loss, self.seed = stage, loss, seed
+        self.completeness_target = completeness_target
+
+    @abstractmethod
+    def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+        """The loss of a batch."""
+
+    def room_latents(self, views: SceneViews, batch_idx: int) -> Float[Tensor, "rooms width"]:
+        """The rooms' latents z, moved at random as far as the stage says."""
+        stage, space = self.stage, self.prior.latent_space
+        end = stage.latent_noise if stage.latent_noise_end is None else stage.latent_noise_end
+        done = self.current_epoch / stage.epochs
+        noise = stage.latent_noise + done * (end - stage.latent_noise)
+        with full_precision(self.device):
+            z = space(self.latents(views.room_index))
+            if not noise:
+                return z
+            batch = batch_number(self.trainer, batch_idx)
+            return space.step(z, noise, step_seed(self.seed, batch, self.global_rank))
+
+    def total(
+        self, losses: dict[str, Tensor], views: SceneViews, beside: dict[str, Tensor] | None = None
+    ) -> Tensor:
+        """The weighted sum of the losses, checked and logged; `beside` is logged alone."""
+        total = weighted_sum(losses, self.loss)
+        check_finite(total, views)
+        log_losses(self, losses | (beside or {}), total, len(views.room_index))
+        return total
+
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
+        """Adam with the stage's schedule; the shape decoder and what each room or class has of its
+        own may have other rates."""
+        stage, others = self.stage, ("shape.", "bevels.")
+        trained = [p for name, p in self.prior.named_parameters() if not name.startswith(others)]
+        shape_rate = stage.decoder_learning_rate if isinstance(stage, ShapeConfig) else None
+        tables = [*self.latents.parameters(), *self.prior.bevels.parameters()]
+        groups = [
+            {"params": trained, "lr": stage.learning_rate},
+            {"params": self.prior.shape.parameters(), "lr": shape_rate or stage.learning_rate},
+            {"params": tables, "lr": stage.latent_learning_rate},
+        ]
+        optimizer = torch.optim.Adam(groups, fused=True)
+        if stage.schedule == "cosine":
+            return with_cosine(optimizer, int(self.trainer.estimated_stepping_batches))
+        drops = torch.optim.lr_scheduler.MultiStepLR(
+            optimizer, list(stage.milestones), gamma=stage.decay
+        )
+        return {"optimizer": optimizer, "lr_scheduler": drops}
+
+
+class LayoutStage(PaperStage):
+    """The layout loss L_L of section 3.4 (Eq. 7), without shape decoding."""
+
+    def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+        scenes = self.prior.decode(self.room_latents(views, batch_idx), with_shape=False)
+        with full_precision(self.device):
+            boxes = proxy_boxes(scenes, views, self.stage.proxy)
+            losses, _ = match_and_score(scenes, boxes, views, self.loss, self.completeness_target)
+            return self.total(losses, views)
+
+
+class ShapeStage(PaperStage):
+    """The layout loss, now of deformed meshes, plus the mask loss: L = L_L + lambda_S L_S."""
+
+    stage: ShapeConfig
+
+    def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+        scenes = self.prior.decode(self.room_latents(views, batch_idx))
+        with full_precision(self.device):
+            boxes = seen_boxes(scenes, views, self.stage)
+            losses, matches = match_and_score(
+                scenes, boxes, views, self.loss, self.completeness_target
+            )
+            # Before rendering, too, which refuses vertices that are not finite and knows no rooms.
+            check_finite(weighted_sum(losses, self.loss), views)
+            assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
+            masks = seen_masks(scenes.vertices_m, self.prior.shape.faces, views, self.stage)
+            losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
+            return self.total(losses, views, beside=overlap)
