@@ -33,8 +33,7 @@ import numpy as np
 import torch
 from torch.utils.data import default_collate
 
-from sceneprior.data.dataset import ViewDataset
-from sceneprior.data.flat_views import FlatViews
+from sceneprior.data.dataset import FlatViews, ViewDataset
 from sceneprior.shards import RoomViews, iterate_rooms, list_shards
 
 SCENES, VIEWS, STEP = 16, 20, 4

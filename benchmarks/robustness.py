@@ -20,8 +20,7 @@ from torch.utils.data import Dataset
 
 from sceneprior.config import OursConfig, load_config
 from sceneprior.data.datamodule import make_loader
-from sceneprior.data.dataset import ViewDataset
-from sceneprior.data.flat_views import FlatViews
+from sceneprior.data.dataset import FlatViews, ViewDataset
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.generation.decode import decode_training_rooms

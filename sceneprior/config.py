@@ -100,11 +100,7 @@ def load_run(run: Path, checkpoint: str = "final") -> TrainedPrior:
 
 
 def run_config(run: Path) -> RunConfig:
-    """The config that a run was trained with.
-
-    Raises:
-        InputError: the folder is no run.
-    """
+    """The config that a run was trained with; InputError if the folder is no run."""
     path = Path(run) / "config.yaml"
     if not path.is_file():
         raise InputError(

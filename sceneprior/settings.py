@@ -35,11 +35,7 @@ _S = TypeVar("_S", bound=Section)
 
 
 def find_config(name: str) -> Path:
-    """A path to a YAML, or the name of a config that ships with the package.
-
-    Raises:
-        ConfigError: neither exists.
-    """
+    """A path to a YAML, or the name of a config that ships with the package; else ConfigError."""
     path = Path(name)
     if path.is_file():
         return path
@@ -75,12 +71,8 @@ def read_settings(name: str, overrides: tuple[str, ...] = ()) -> tuple[Path, dic
 
 
 def check_settings(model: type[_S], data: dict[str, Any], source: str) -> _S:
-    """Plain data as the model it should be.
-
-    Raises:
-        ConfigError: an unknown key or a wrong value; the message names the source, the key and,
-            for a typo, the nearest key.
-    """
+    """Plain data as the model it should be; a ConfigError names the source and the key, and for a
+    typo the nearest key."""
     try:
         return model.model_validate(data)
     except ValidationError as error:

@@ -25,7 +25,6 @@ class Atiss2dConfig(DecoderConfig):
     at higher rates (docs/baselines_2d.md)."""
 
     def build(self, width: int, max_objects: int) -> "SceneAtiss":
-        """An encoder for features of D_z = `width`."""
         return SceneAtiss(width, self)
 
 
@@ -40,10 +39,6 @@ class SceneAtiss(nn.Module):
 
     Every token sees every other, so that a new object changes what all layers say of the old ones:
     each step encodes its set anew.
-
-    Args:
-        width: D_z, the size of z and of every object feature.
-        config: Sizes.
     """
 
     def __init__(self, width: int, config: Atiss2dConfig):

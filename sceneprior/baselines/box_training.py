@@ -66,10 +66,7 @@ class BoxConfig(RunConfig):
 class BoxStage(lightning.LightningModule, ABC):
     """Minimises the mean over rooms of the weighted sum of their terms.
 
-    Args:
-        prior: The network: a `BoxSampler`, which has `fit_statistics(rooms)`.
-        settings: How it is trained.
-        seed: Of the run.
+    `prior` is a `BoxSampler`, which has `fit_statistics(rooms)`.
     """
 
     def __init__(self, prior: Any, settings: BoxTraining, seed: int):
@@ -90,11 +87,7 @@ class BoxStage(lightning.LightningModule, ABC):
         """The loss of a batch, checked and logged term by term; each room with an id counts the
         same, of several processes' batches, too.
 
-        Args:
-            rooms: The batch.
-            losses: Of each room, by name.
-            weights: Of the terms; 1 where none is given.
-            beside: Logged, too, but not minimised.
+        A term weighs 1 where `weights` has none; `beside` is logged, too, but not minimised.
         """
         count = len(rooms.room_ids)
         share = share_of_batch(torch.tensor(count, device=self.device))

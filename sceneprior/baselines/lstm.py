@@ -15,7 +15,6 @@ class LstmConfig(DecoderConfig):
     name: Literal["lstm"] = "lstm"
 
     def build(self, width: int, max_objects: int) -> "SceneLstm":
-        """An LSTM for features of D_z = `width`."""
         return SceneLstm(width)
 
 
@@ -23,10 +22,8 @@ class SceneLstm(nn.Module):
     """x_k is the LSTM's output on x_(k-1), and x_0 is z.
 
     One layer whose state begins at zero. Unlike the transformer's, its output depends on the order
-    of the objects before, and z is an input of the first step alone.
-
-    Args:
-        width: D_z, the size of z, of the state and of every object feature.
+    of the objects before, and z is an input of the first step alone. `width` is D_z, and the
+    state's size.
     """
 
     def __init__(self, width: int):

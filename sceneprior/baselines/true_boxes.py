@@ -11,24 +11,18 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.utils.data import Dataset
 
-from sceneprior.data.dataset import BLANK, TURNS
+from sceneprior.data.dataset import BLANK, RoomDataset
 from sceneprior.errors import ShardError
 from sceneprior.geometry.turns import turn_vectors
-from sceneprior.shards import iterate_rooms
+from sceneprior.shards import RoomGroundTruth, Shard
 from sceneprior.views import RoomBoxes
 
 
-class TruthDataset(Dataset):
+class TruthDataset(RoomDataset):
     """Every furnished box of every room of a split, in memory; rows and turns are `ViewDataset`'s.
 
     All furniture that has a class counts, seen by a camera or not.
-
-    Args:
-        folder: Of shards with ground truth.
-        split: `train` or `test`.
-        rotations: 4 adds each room turned by 90, 180 and 270 degrees; 1 does not.
 
     Raises:
         ShardError: a shard is missing, damaged, without ground truth, or labelled otherwise than
@@ -36,53 +30,19 @@ class TruthDataset(Dataset):
     """
 
     counted = "objects"
-    """What `max_objects` counts, in words."""
-    masks = None
-    """No images are read: batches are made in the training process (data/datamodule.py)."""
 
     def __init__(self, folder: Path, split: str, rotations: int = 1):
-        self.rotations = rotations
-        self.label_set = ""
-        ids, classes, boxes, yaws = [], [], [], []
-        for shard, room_id in iterate_rooms(folder, split):
-            if self.label_set and shard.label_set != self.label_set:
-                raise ShardError(
-                    f"{shard.path} is labelled '{shard.label_set}' but its neighbours "
-                    f"'{self.label_set}'; keep one label set a folder."
-                )
-            self.label_set = shard.label_set
-            if not shard.has_ground_truth(room_id):
-                raise ShardError(
-                    f"{shard.path}, room {room_id} carries no 3D ground truth, which is what this "
-                    "stage learns from. Take shards of a data set that has it, or a stage that "
-                    "learns from masks (method: ours)."
-                )
-            truth = shard.read_ground_truth(room_id)
-            ids.append(room_id)
-            classes.append(torch.from_numpy(truth.object_class).long())
-            boxes.append(torch.from_numpy(np.hstack([truth.centers_m, truth.sizes_m])))
-            yaws.append(torch.from_numpy(truth.yaw_rad))
-        if not ids:
-            raise ShardError(f"The shards of {folder}/{split} hold no rooms; prepare them again.")
-        self._plain_ids = tuple(ids)
+        super().__init__(rotations)
+        rooms = self.read_rooms(folder, split, _read_truth)
+        classes = [torch.from_numpy(truth.object_class).long() for truth in rooms]
+        boxes = [torch.from_numpy(np.hstack([room.centers_m, room.sizes_m])) for room in rooms]
+        yaws = [torch.from_numpy(truth.yaw_rad) for truth in rooms]
         self._counts = torch.tensor([len(room) for room in classes])
-        self._classes = torch.nn.utils.rnn.pad_sequence(classes, batch_first=True)
-        self._boxes_m = torch.nn.utils.rnn.pad_sequence(boxes, batch_first=True)
-        self._yaw_rad = torch.nn.utils.rnn.pad_sequence(yaws, batch_first=True)
-
-    def __len__(self) -> int:
-        return len(self._plain_ids) * self.rotations
-
-    @property
-    def max_objects(self) -> int:
-        """Objects of the fullest room."""
-        return int(self._counts.max())
-
-    @property
-    def room_ids(self) -> tuple[str, ...]:
-        """One id a row: the room's, with `@90` and so on for its turned copies."""
-        turns = TURNS[: self.rotations]
-        return tuple(room_id + turn for room_id in self._plain_ids for turn in turns)
+        self.max_objects = int(self._counts.max())
+        self._classes, self._boxes_m, self._yaw_rad = (
+            torch.nn.utils.rnn.pad_sequence(parts, batch_first=True)
+            for parts in (classes, boxes, yaws)
+        )
 
     def to(self, device: torch.device | str) -> "TruthDataset":
         """Move all boxes to `device`, where batches are then made."""
@@ -110,9 +70,19 @@ class TruthDataset(Dataset):
             object_class=self._classes[rooms, :widest] * is_object,
             is_object=is_object,
             boxes_m=turned(self._boxes_m[rooms, :widest], quarters),
-            room_ids=tuple(self._plain_ids[room] for room in rooms[shown].tolist()),
+            room_ids=tuple(self.plain_ids[room] for room in rooms[shown].tolist()),
             yaw_rad=torch.remainder(yaw_rad + math.pi, 2 * math.pi) - math.pi,
         )
+
+
+def _read_truth(shard: Shard, room_id: str) -> RoomGroundTruth:
+    if not shard.has_ground_truth(room_id):
+        raise ShardError(
+            f"{shard.path}, room {room_id} carries no 3D ground truth, which is what this "
+            "stage learns from. Take shards of a data set that has it, or a stage that "
+            "learns from masks (method: ours)."
+        )
+    return shard.read_ground_truth(room_id)
 
 
 def turned(

@@ -15,12 +15,7 @@ class DrawSampler(Sampler[list[tuple[int, int]]]):
     Several processes together draw the batches that one process would draw with a `batch_size`
     as many times as large. A last batch with fewer rows than processes is filled up with draws
     of an epoch `BLANK`, which the data set answers with a room in which there is nothing.
-
-    Args:
-        rows: Size of the data set.
-        batch_size: Rows per batch and process; the last batch may be smaller.
-        seed: With the epoch, decides the order.
-        rank, world: This process and how many there are.
+    `rank` is this process, of `world`.
     """
 
     def __init__(self, rows: int, batch_size: int, seed: int, rank: int = 0, world: int = 1):

@@ -19,16 +19,11 @@ class MaskStore:
 
     Ids are large flat areas: at a quarter of 480 x 360 a view has 10,800 pixels, and takes about
     400 bytes packed, so that 100,000 views are 40 MB. Unpacking one takes a twentieth of the
-    time of reading its shard again.
-
-    Args:
-        rooms: The shard and the id of each room.
-        step: Every how many pixels the ids are kept.
+    time of reading its shard again. Of each image, every `step`-th pixel is kept.
     """
 
     def __init__(self, rooms: Sequence[tuple[Path, str]], step: int):
-        self.rooms = tuple(rooms)
-        self.step = step
+        self.rooms, self.step = tuple(rooms), step
         self._packed: dict[int, dict[int, bytes]] = {}
         self._forms: dict[int, tuple[tuple[int, ...], np.dtype]] = {}
         self._shards: OrderedDict[Path, Shard] = OrderedDict()

@@ -13,11 +13,8 @@ def mean_of_objects(
 ) -> Float[Tensor, "*rooms"]:
     """Mean over the objects that count; 0 where none does.
 
-    Args:
-        values: One number an object.
-        counted: Which objects count.
-        per_room: One mean a room, whatever else is in the batch: for rooms that are fitted each
-            on its own. Else one mean over all objects of the batch, and of all processes.
+    One over all objects of the batch, and of all processes; `per_room`, one a room, whatever else
+    is in the batch: for rooms that are fitted each on its own.
     """
     weights = counted.to(values.dtype)
     if per_room:
@@ -36,9 +33,6 @@ def share_of_batch(count: Tensor) -> Float[Tensor, ""]:
     is the one that a single process has on the whole batch. 1 where there is one process.
 
     Every process must call it, in the same order: it waits for the others.
-
-    Args:
-        count: How many things the process's own mean is over; 0-dimensional.
 
     Example: alone, a mean is taken as it is.
 

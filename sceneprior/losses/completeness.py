@@ -31,17 +31,3 @@ def kept_objects(
     if convention == "stop":
         return says_yes.cumsum(dim=-1) - says_yes == 0  # none before it said stop
     return says_yes.cumprod(dim=-1).bool()
-
-
-def kept_share(
-    scores: Float[Tensor, "rooms slots"], convention: str = "first_n"
-) -> Float[Tensor, "rooms slots"]:
-    """How likely each prediction belongs to the scene, if each score is the chance of a yes.
-
-    Of scores that are 0 or 1 these are the `kept_objects`, and the gradient of each score is what
-    its change would bring about: the end of the scene there, or some objects more.
-    """
-    if convention == "stop":
-        none_before = torch.cat([torch.ones_like(scores[:, :1]), 1 - scores[:, :-1]], dim=1)
-        return none_before.cumprod(dim=1)
-    return scores.cumprod(dim=1)

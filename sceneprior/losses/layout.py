@@ -16,9 +16,7 @@ def take(values: Tensor, index: Int[Tensor, "rooms objects"], dim: int) -> Tenso
     """Reorder predictions (axis `dim`, after a room axis) to the objects they answer for."""
     shape = [1] * values.dim()
     shape[0], shape[dim] = index.shape
-    expanded = list(values.shape)
-    expanded[dim] = index.shape[1]
-    return values.gather(dim, index.reshape(shape).expand(expanded))
+    return torch.take_along_dim(values, index.reshape(shape), dim)
 
 
 def layout_losses(
@@ -34,21 +32,10 @@ def layout_losses(
 
         L_L = lambda_l L_l + lambda_box L_box + lambda_p L_p + lambda_f L_f
 
-    Each is averaged over the objects that it applies to.
-
-    Where several processes train, over those of all processes: see `share_of_batch`.
-
-    Args:
-        scenes: Predictions.
-        boxes_2d: Their 2D boxes in the views.
-        views: What the cameras saw.
-        matches: Which prediction answers for which object.
-        occlusion_slack: See `side_distance`.
-        completeness_target: `first_n` or `stop`; see `losses/completeness.py`.
-        per_room: Average over each room's objects alone: rooms that are fitted, not learnt from.
-
-    Returns:
-        `class`, `box`, `completeness` and `frustum`; weights are the caller's.
+    Each is averaged over the objects that it applies to: of all processes (`share_of_batch`), or
+    of each room alone, where rooms are fitted and not learnt from (`per_room`). `boxes_2d` are the
+    predictions' in the views; `occlusion_slack` is that of `side_distance`, `completeness_target`
+    a convention of `losses/completeness.py`.
     """
     predicted = take(boxes_2d.boxes, matches.prediction, dim=2)
     inside = take(boxes_2d.in_frustum, matches.prediction, dim=2)
@@ -81,10 +68,7 @@ def box_loss(
     occlusion_slack: float = 1.0,
     per_room: bool = False,
 ) -> Float[Tensor, "*rooms"]:
-    """L1 distance of 2D boxes (summed over x1, y1, x2, y2): mean over visible views, then objects.
-
-    The same distance as in the matching cost (`side_distance`).
-    """
+    """`side_distance` of 2D boxes, summed over sides: mean over visible views, then objects."""
     apart = [
         side_distance(predicted[..., i], target[..., i], clear[..., i], i, occlusion_slack)
         for i in range(4)
@@ -95,22 +79,14 @@ def box_loss(
 def completeness_loss(
     scenes: DecodedScenes, views: SceneViews, target: str = "first_n", per_room: bool = False
 ) -> Float[Tensor, "*rooms"]:
-    """Binary cross entropy of the completeness scores of all predictions.
-
-    Args:
-        scenes: Predictions.
-        views: Whose rooms have how many objects.
-        target: What the scores should be; see `losses/completeness.py`.
-        per_room: One mean a room.
-    """
+    """Binary cross entropy of all predictions' completeness scores with a convention's targets."""
     logits = scenes.completeness_logits
     wanted = completeness_targets(views.is_object.sum(dim=-1), logits.shape[1], target)
+    wanted = wanted.to(logits.dtype)
     if per_room:
-        every = F.binary_cross_entropy_with_logits(
-            logits, wanted.to(logits.dtype), reduction="none"
-        )
+        every = F.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
         return every.mean(dim=1)
-    mean = F.binary_cross_entropy_with_logits(logits, wanted.to(logits.dtype))
+    mean = F.binary_cross_entropy_with_logits(logits, wanted)
     return mean * share_of_batch(views.is_object.any(dim=-1).sum())
 
 

@@ -39,8 +39,7 @@ def match_objects(
     arbitrary and enters no loss.
 
     Args:
-        scenes: Predictions.
-        boxes_2d: The predictions' 2D boxes in the views.
+        scenes, boxes_2d: Predictions, and their 2D boxes in the views.
         views: What the cameras saw.
         box_weight: lambda_B.
         occlusion_slack: See `side_distance`.
@@ -68,10 +67,8 @@ def assign(
 ) -> Int[Tensor, "rooms objects"]:
     """The prediction of each object, one to one, at the least total cost of each room.
 
-    Args:
-        cost: Of every pair; on any device.
-        predictions: How many predictions of each room take part, from the first on.
-        objects: How many objects each room has, no more than predictions; 0 stands for the rest.
+    Of each room, the first so many `predictions` take part, and its `objects`, which are no more;
+    0 stands for the rest.
     """
     prediction = torch.zeros(len(cost), cost.shape[2], dtype=torch.int64)
     # SciPy refuses what is not a number; the loss will be none either, and its check names rooms.

@@ -28,12 +28,8 @@ def mask_loss(
     Averaged over pixels, then over an object's views, then over objects; a mask whose IoU with
     its observation is not above `iou_gate` counts as zero, as in the paper.
 
-    Args:
-        rendered: Visible soft masks of all predictions.
-        views: What the cameras saw, with `instance_ids` of the same height and width.
-        matches: Which prediction answers for which object.
-        iou_gate: The paper's 0.5.
-        per_room: Average over each room's objects alone; see `mean_of_objects`.
+    `rendered` are the visible soft masks of all predictions, as large as the views' instance ids;
+    `per_room` averages as in `mean_of_objects`.
 
     Returns:
         The loss, and `mask_iou` (mean over all visible pairs) and `mask_used` (share gated in)

@@ -7,6 +7,7 @@ is. The hypersphere is the paper's; the cube is ablation c1.
 """
 
 import math
+from abc import ABC, abstractmethod
 from typing import Literal
 
 import torch
@@ -26,12 +27,7 @@ class SphereConfig(Section):
     """M fixed unit vectors that latents are mixed from; 100 in the authors' code."""
 
     def build(self, dimension: int, seed: int) -> "LatentSphere":
-        """A sphere of D_z = `dimension`."""
         return LatentSphere(self.anchors, dimension, seed)
-
-    def logits(self, dimension: int) -> int:
-        """How many numbers a room's latent is learnt as."""
-        return self.anchors
 
 
 class CubeConfig(Section):
@@ -40,25 +36,30 @@ class CubeConfig(Section):
     name: Literal["cube"] = "cube"
 
     def build(self, dimension: int, seed: int) -> "LatentCube":
-        """A cube of D_z = `dimension`; nothing in it is random."""
         return LatentCube(dimension)
 
-    def logits(self, dimension: int) -> int:
-        """How many numbers a room's latent is learnt as."""
-        return dimension
+
+class _Space(nn.Module, ABC):
+    @abstractmethod
+    def onto(self, points: Tensor) -> Tensor:
+        """The point of the latent space nearest to each point of the space around it."""
+
+    def step(
+        self, z: Float[Tensor, "rooms dimension"], length: float, seed: int
+    ) -> Float[Tensor, "rooms dimension"]:
+        """Move each point a random step of about `length`; the same seed, the same steps."""
+        generator = torch.Generator().manual_seed(seed)
+        steps = torch.randn(z.shape, generator=generator).to(z) * (length / z.shape[-1] ** 0.5)
+        return self.onto(z + steps)
 
 
-class LatentSphere(nn.Module):
+class LatentSphere(_Space):
     """Map weights w_i of M fixed unit vectors phi_i to a point z of the hypersphere (Eq. 2).
 
         z = sum_i w_i phi_i / |sum_i w_i phi_i|,    w = softmax(logits)
 
-    A constant added to all logits of a room changes nothing: `shift_free`.
-
-    Args:
-        anchors: M, the number of fixed vectors phi_i.
-        dimension: D_z.
-        seed: Draws the anchors; they are stored with the model.
+    A constant added to all logits of a room changes nothing: `shift_free`. `seed` draws the
+    anchors phi_i, which are stored with the model.
     """
 
     shift_free = True
@@ -76,7 +77,6 @@ class LatentSphere(nn.Module):
         return F.normalize(logits.softmax(dim=-1) @ self.anchors, dim=-1)
 
     def onto(self, points: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
-        """The point of the sphere nearest to each point of space."""
         return F.normalize(points, dim=-1)
 
     def nearness(
@@ -91,17 +91,24 @@ class LatentSphere(nn.Module):
         end: Float[Tensor, "pairs dimension"],
         along: Float[Tensor, " pairs"],
     ) -> Float[Tensor, "pairs dimension"]:
-        """One point a pair, on the geodesic; see `slerp`."""
-        return slerp(start, end, along)
+        """One point a pair of unit vectors, `along` (0 to 1) of the geodesic between them (5.3).
 
-    def step(
-        self, z: Float[Tensor, "rooms dimension"], length: float, seed: int
-    ) -> Float[Tensor, "rooms dimension"]:
-        """Move each point a random step of about `length`; the same seed, the same steps."""
-        return F.normalize(z + _random_steps(z, length, seed), dim=-1)
+        Raises:
+            ValueError: two vectors are opposite, so that no geodesic is the shortest.
+        """
+        # Not acos of the dot product, which in float32 knows no angle between pi - 3e-4 and pi.
+        apart, together = (start - end).norm(dim=-1), (start + end).norm(dim=-1)
+        angle = 2 * torch.atan2(apart, together).unsqueeze(-1)
+        if bool((angle > torch.pi - 1e-4).any()):
+            raise ValueError("The two latents are opposite points; any great circle joins them.")
+        t = along.unsqueeze(-1)
+        # Where the two all but coincide, sin(angle) vanishes and the chord is the geodesic.
+        straight = F.normalize(torch.lerp(start, end, t), dim=-1)
+        turned = torch.sin((1 - t) * angle) * start + torch.sin(t * angle) * end
+        return torch.where(angle < 1e-3, straight, turned / torch.sin(angle).clamp(min=1e-6))
 
 
-class LatentCube(nn.Module):
+class LatentCube(_Space):
     """Map one logit a coordinate to a point of a cube around the origin: ablation c1.
 
     z_i = a * (2 * Phi(logit_i) - 1), Phi the normal distribution function, so that logits from
@@ -109,9 +116,6 @@ class LatentCube(nn.Module):
     mean square length of such points 1: what follows sees numbers as large as the sphere's.
 
     The paper says 'uniform latent space parameterization' and no more; this is our reading.
-
-    Args:
-        dimension: D_z, which is also the number of logits a room has.
     """
 
     shift_free = False
@@ -125,7 +129,6 @@ class LatentCube(nn.Module):
         return self.half_edge * torch.erf(logits / math.sqrt(2))
 
     def onto(self, points: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
-        """The point of the cube nearest to each point of space."""
         return points.clamp(-self.half_edge, self.half_edge)
 
     def nearness(
@@ -143,39 +146,5 @@ class LatentCube(nn.Module):
         """One point a pair, on the straight line."""
         return torch.lerp(start, end, along.unsqueeze(-1))
 
-    def step(
-        self, z: Float[Tensor, "rooms dimension"], length: float, seed: int
-    ) -> Float[Tensor, "rooms dimension"]:
-        """Move each point a random step of about `length`, and no further than the cube's faces."""
-        moved = z + _random_steps(z, length, seed)
-        return moved.clamp(-self.half_edge, self.half_edge)
-
 
 LatentSpace = LatentSphere | LatentCube
-
-
-def _random_steps(z: Tensor, length: float, seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(z.shape, generator=generator).to(z) * (length / z.shape[-1] ** 0.5)
-
-
-def slerp(
-    start: Float[Tensor, "pairs dimension"],
-    end: Float[Tensor, "pairs dimension"],
-    along: Float[Tensor, " pairs"],
-) -> Float[Tensor, "pairs dimension"]:
-    """One point a pair of unit vectors, `along` (0 to 1) of the geodesic between them (5.3).
-
-    Raises:
-        ValueError: two vectors are opposite, so that no geodesic is the shortest.
-    """
-    # Not acos of the dot product, which in float32 knows no angle between pi - 3e-4 and pi.
-    apart, together = (start - end).norm(dim=-1), (start + end).norm(dim=-1)
-    angle = 2 * torch.atan2(apart, together).unsqueeze(-1)
-    if bool((angle > torch.pi - 1e-4).any()):
-        raise ValueError("The two latents are opposite points; any great circle joins them.")
-    t = along.unsqueeze(-1)
-    # Where the two all but coincide, sin(angle) vanishes and the chord is the geodesic.
-    straight = F.normalize(torch.lerp(start, end, t), dim=-1)
-    turned = torch.sin((1 - t) * angle) * start + torch.sin(t * angle) * end
-    return torch.where(angle < 1e-3, straight, turned / torch.sin(angle).clamp(min=1e-6))

@@ -1,4 +1,4 @@
-"""The layout decoder: class, box and completeness of each object (section 3.3, Eq. 5)."""
+"""The layout decoder: class, box and completeness of each object (section 3.3, Eq. 5); bevels."""
 
 from typing import NamedTuple
 
@@ -10,6 +10,9 @@ from torch.nn import functional as F
 from sceneprior.classes import VOID
 from sceneprior.models.layers import mlp
 from sceneprior.models.released import SeparateHeads
+
+INITIAL_SIZE_M = 0.7
+"""Edge of every box before training."""
 
 
 class Layout(NamedTuple):
@@ -40,19 +43,14 @@ class LayoutDecoder(nn.Module):
 
         {l_k, c_k, s_k, p_k} = MLP2(MLP1(x_k))
 
-    Args:
-        width: Size of an object feature.
-        classes: Size of the label set.
-        initial_size_m: Edge of every box before training.
-        heads: `joint` (paper) or `separate`: see `SeparateHeads`.
-        void: Whether an object may be `void`, a second way not to exist beside completeness.
+    `heads` are `joint` (paper) or `separate` (`SeparateHeads`); `void` lets an object be `void`, a
+    second way not to exist beside completeness.
     """
 
     def __init__(
         self,
         width: int,
         classes: int,
-        initial_size_m: float = 0.7,
         heads: str = "joint",
         void: bool = True,
     ):
@@ -63,12 +61,9 @@ class LayoutDecoder(nn.Module):
         self.mlp2 = (
             SeparateHeads(hidden, classes) if heads == "separate" else JointHead(hidden, classes)
         )
-        self._start_at_floor_center(initial_size_m)
-
-    def _start_at_floor_center(self, size_m: float) -> None:
         # Section 3.4: every object starts at the floor centre. Weights are small rather than
         # zero, so that objects can part; y starts a little above 0, where ReLU has a slope.
-        size = float(torch.log(torch.expm1(torch.tensor(size_m))))
+        size = float(torch.log(torch.expm1(torch.tensor(INITIAL_SIZE_M))))
         starts = (0.0, 0.1, 0.0, size, size, size, 0.0)
         with torch.no_grad():
             for (weight, bias), start in zip(self.mlp2.rows()[-7:], starts, strict=True):
@@ -94,3 +89,24 @@ class LayoutDecoder(nn.Module):
         y = F.relu(y) + sizes[..., 1] / 2
         centers = torch.stack([x, y, z], dim=-1)
         return Layout(logits, centers, sizes, complete[..., 0]), shared
+
+
+class ClassBevels(nn.Module):
+    """How far the edges of a class's boxes are cut off, in [0, 1]; see `beveled_cube`.
+
+    Furniture fills its box neither as an ellipsoid does nor to the corners, so the 2D box of
+    either misleads about its size. Chairs and round tables have much of their edges missing,
+    wardrobes nothing: what a class has, the views of all its objects tell.
+    """
+
+    def __init__(self, classes: int):
+        super().__init__()
+        # Nearly a box: 0.12 of half a side.
+        self.logits = nn.Parameter(torch.full((classes, 2), -2.0))
+
+    def forward(
+        self, class_logits: Float[Tensor, "rooms objects classes"]
+    ) -> Float[Tensor, "rooms objects 2"]:
+        """Bevels of upright and level edges: the mean over predicted classes, which learn nothing
+        from it."""
+        return class_logits.detach().softmax(dim=-1) @ self.logits.sigmoid()

@@ -8,18 +8,16 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from sceneprior.geometry.boxes import place
-from sceneprior.models.bevels import ClassBevels
 from sceneprior.models.latents import CubeConfig, LatentSpace, SphereConfig
 from sceneprior.models.layers import DecoderConfig
-from sceneprior.models.layout_decoder import LayoutDecoder
+from sceneprior.models.layout_decoder import ClassBevels, LayoutDecoder
 from sceneprior.models.shape_decoder import ShapeDecoder, ShapeDecoderConfig
 from sceneprior.settings import Section
 from sceneprior.views import DecodedScenes
 
 
 class ModelConfig(Section):
-    """The network (section 3 and supplement A). `config.py` lists the choices of
-    `decoder`."""
+    """The network (section 3 and supplement A). `config.py` lists the choices of `decoder`."""
 
     max_objects: int = Field(ge=1)
     """N: 13 for bedrooms, 28 for living rooms, 53 for ScanNet."""
@@ -46,17 +44,14 @@ class ModelConfig(Section):
     @property
     def logits_per_room(self) -> int:
         """How many numbers a room's latent is learnt as."""
-        return self.latent_space.logits(self.width)
+        space = self.latent_space
+        return space.anchors if isinstance(space, SphereConfig) else self.width
 
 
 class ScenePrior(nn.Module):
     """f of Eq. 1, s = f(z): from the latent space to scenes.
 
-    Args:
-        config: The network.
-        classes: Size of the label set.
-        seed: Draws the fixed anchors of the latent sphere.
-        void: Of the layout decoder.
+    `seed` draws the fixed anchors of the latent sphere; `void` is the layout decoder's.
     """
 
     def __init__(self, config: ModelConfig, classes: int, seed: int = 0, void: bool = True):

@@ -11,22 +11,10 @@ from torch.nn import functional as F
 from sceneprior.models.layers import mlp
 
 
-class SharedOutput(nn.Module):
-    """The paper: an object feature is what the transformer says, at every step."""
-
-    def forward(self, x: Float[Tensor, "rooms width"], step: int) -> Float[Tensor, "rooms width"]:
-        """The feature as it came."""
-        return x
-
-
 class StepOutputs(nn.Module):
     """Step k ends in a two-layer MLP of its own, whose weights tell the object that it is the kth.
 
-    What it gives is x_k, which later steps see, too.
-
-    Args:
-        steps: N, how many objects there can be.
-        width: Of a feature, inside and outside.
+    What it gives is x_k, which later steps see, too. `steps` is N, `width` a feature's size.
     """
 
     def __init__(self, steps: int, width: int):
@@ -36,7 +24,6 @@ class StepOutputs(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "rooms width"], step: int) -> Float[Tensor, "rooms width"]:
-        """x_k of step k = `step` + 1."""
         return self.mlps[step](x)
 
 
@@ -55,7 +42,6 @@ class QuerySelfAttention(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, z: Float[Tensor, "rooms width"]) -> Float[Tensor, "rooms width"]:
-        """The query that goes on to the scene context."""
         share = self.dropout(z.new_ones(len(z), self.heads, 1))  # one attention weight a head
         value = (share * self.value(z).unflatten(-1, (self.heads, -1))).flatten(1)
         return self.norm(z + self.dropout(self.out(value)))
@@ -64,9 +50,7 @@ class QuerySelfAttention(nn.Module):
 class SeparateHeads(nn.Module):
     """In place of MLP2: one linear layer for the classes, an MLP of its own for each coordinate.
 
-    Args:
-        hidden: Size of MLP1's output and of each coordinate's hidden layer.
-        classes: Size of the label set.
+    `hidden` is the size of MLP1's output and of each coordinate's hidden layer.
     """
 
     def __init__(self, hidden: int, classes: int):

@@ -31,11 +31,7 @@ class ShapeDecoder(nn.Module):
 
         dv_k = MLP3([r(MLP1(x_k)), v]),    S_k = {v + dv_k}
 
-    r are two layers more on MLP1's output, as in the released code.
-
-    Args:
-        features: Size of MLP1's output.
-        config: Template and size.
+    r are two layers more on MLP1's output, which has so many `features`, as in the released code.
     """
 
     def __init__(self, features: int, config: ShapeDecoderConfig):

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.models.layers import DecoderConfig
-from sceneprior.models.released import QuerySelfAttention, SharedOutput, StepOutputs
+from sceneprior.models.released import QuerySelfAttention, StepOutputs
 
 
 class TransformerConfig(DecoderConfig):
@@ -32,7 +32,6 @@ class TransformerConfig(DecoderConfig):
     at width 512, and the k-th object knows that it is the k-th."""
 
     def build(self, width: int, max_objects: int) -> "SceneTransformer":
-        """A transformer for features of D_z = `width`."""
         return SceneTransformer(width, self, max_objects)
 
 
@@ -66,12 +65,7 @@ class SceneTransformer(nn.Module):
     computed once and appended, and only the attention is taken anew, since old objects see
     new ones. In the decoder there is one query, z, for all steps: instead of projecting every
     context token to a key and a value, z's query is carried through the key projection once,
-    and the value projection is applied to the one weighted sum. Both are exact.
-
-    Args:
-        width: D_z, the size of z and of every object feature.
-        config: Sizes and released parts.
-        max_objects: N, where `step_mlps` needs it.
+    and the value projection is applied to the one weighted sum. Both are exact. `width` is D_z.
     """
 
     def __init__(self, width: int, config: TransformerConfig, max_objects: int):
@@ -95,7 +89,7 @@ class SceneTransformer(nn.Module):
         self.query: nn.Module = nn.Identity()
         if config.query_self_attention:
             self.query = QuerySelfAttention(width, config.heads, dropout)
-        self.output = StepOutputs(max_objects, width) if config.step_mlps else SharedOutput()
+        self.output = StepOutputs(max_objects, width) if config.step_mlps else None
 
     def forward(
         self, z: Float[Tensor, "rooms width"], objects: int
@@ -114,17 +108,6 @@ class SceneTransformer(nn.Module):
                 added = self._split(self.encoder_qkv(newest))
                 qkv = [torch.cat(pair, dim=2) for pair in zip(qkv, added, strict=True)]
         return torch.stack(features, dim=1)
-
-    def next_object(
-        self,
-        z: Float[Tensor, "rooms width"],
-        previous: Float[Tensor, "rooms objects width"],
-    ) -> Float[Tensor, "rooms width"]:
-        """The feature that follows a set of objects, in whatever order they are given."""
-        query = self._query(z)
-        tokens = torch.cat([self.start.expand(len(z), 1, -1), previous], dim=1)
-        qkv = self._split(self.encoder_qkv(tokens))
-        return self._next(query, self._key_query(query), tokens, qkv)
 
     def _query(self, z: Tensor) -> Tensor:
         """(rooms, width): z as the query of every step.
@@ -146,7 +129,7 @@ class SceneTransformer(nn.Module):
         context = self.encoder_end(self.encoder_ff(context))
         x = z_query + self._drop(self.decoder_out(self._cross_attend(key_query, context)))
         x = self.decoder_end(self.decoder_ff(self.decoder_norm(x)))
-        return self.output(x, step=tokens.shape[1] - 1)
+        return x if self.output is None else self.output(x, step=tokens.shape[1] - 1)
 
     def _key_query(self, z_query: Tensor) -> Tensor:
         """(rooms, heads, width): z's query of each head, carried through the key projection.

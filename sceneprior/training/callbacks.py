@@ -6,19 +6,11 @@ from typing import Any
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from sceneprior.training.checkpoints import write_checkpoint
-from sceneprior.training.objective import batch_number, step_seed
+from sceneprior.training.objective import batch_seed
 
 
 class RunProgress(Callback):
@@ -26,15 +18,16 @@ class RunProgress(Callback):
 
     def __init__(self, title: str):
         self.title = title
-        self._progress: Progress | None = None
-        self._task = TaskID(0)
+        self._progress: progress.Progress | None = None
+        self._task = progress.TaskID(0)
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module) -> None:
         if not trainer.is_global_zero:
             return
-        self._progress = Progress(
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-            TextColumn("{task.fields[loss]}"), TimeElapsedColumn(), TimeRemainingColumn(),
+        self._progress = progress.Progress(
+            progress.TextColumn("{task.description}"), progress.BarColumn(),
+            progress.MofNCompleteColumn(), progress.TextColumn("{task.fields[loss]}"),
+            progress.TimeElapsedColumn(), progress.TimeRemainingColumn(),
             console=Console(stderr=True),
         )  # fmt: skip
         self._progress.start()
@@ -65,8 +58,7 @@ class StepSeed(Callback):
         self.seed = seed
 
     def on_train_batch_start(self, trainer: lightning.Trainer, pl_module, batch, batch_idx) -> None:
-        batch = batch_number(trainer, batch_idx)
-        torch.manual_seed(step_seed(self.seed, batch, trainer.global_rank))
+        torch.manual_seed(batch_seed(self.seed, trainer, batch_idx))
 
 
 class RollingCheckpoint(Callback):

@@ -75,11 +75,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 def read_networks(
     path: Path, build: Callable[[int], nn.ModuleDict]
 ) -> tuple[nn.ModuleDict, tuple[str, ...]]:
-    """The networks of a checkpoint, and the ids of the rooms that it was trained on.
-
-    Args:
-        path: Of the checkpoint.
-        build: Makes the networks, freshly initialised, for so many rooms.
+    """The networks of a checkpoint, and the ids of the rooms that it was trained on; `build` makes
+    the networks, freshly initialised, for so many rooms.
 
     Raises:
         InputError: the checkpoint is damaged, of other networks, or not written by `fit`.

@@ -1,11 +1,16 @@
 """Train the stages of a run, one after the other, with Lightning."""
 
+import csv
+import logging
+import os
 import signal
+import warnings
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from sceneprior.data.datamodule import make_loader
 from sceneprior.errors import ConfigError, InputError
@@ -13,10 +18,11 @@ from sceneprior.files import remove_parts
 from sceneprior.settings import check_settings, dump_settings, read_settings
 from sceneprior.training.callbacks import RollingCheckpoint, RunProgress, StepSeed
 from sceneprior.training.checkpoints import write_checkpoint
-from sceneprior.training.loggers import LOGGERS, make_logger, quiet_lightning
 from sceneprior.training.method import RunConfig, Stage
 from sceneprior.training.monitor import Evaluate, SampleMonitor
 from sceneprior.training.slurm import first_process, requeue_on_signal, slurm_plugins
+
+LOGGERS = ("csv", "tensorboard", "wandb")
 
 
 def fit(
@@ -101,7 +107,9 @@ def _train(
     settings = stage.settings
     rooms = stage.open_data()
     module = stage.build(rooms, previous)
-    room_ids = () if _remembers_nothing(module) else rooms.room_ids
+    latents = getattr(module, "latents", None)
+    pairs_no_room = latents is not None and not len(latents.weight)  # with its latent space
+    room_ids = () if pairs_no_room else rooms.room_ids
     callbacks: list[lightning.Callback] = [
         RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed)
     ]  # fmt: skip
@@ -110,7 +118,7 @@ def _train(
         callbacks.append(SampleMonitor(folder, config, stage.name, room_ids, evaluate))
     said = {"room_ids": list(room_ids), "label_set": config.label_set}
     callbacks.append(RollingCheckpoint(folder, {"sceneprior": said}))
-    quiet_lightning()
+    _quiet_lightning()
     lightning.seed_everything(config.seed, verbose=False)
     if settings.cpu_threads is not None:
         torch.set_num_threads(settings.cpu_threads)
@@ -177,7 +185,32 @@ def _trainer(
         raise InputError(f"Lightning cannot train with {given}: {reason}") from None
 
 
-def _remembers_nothing(module: Any) -> bool:
-    """Whether no training room has a latent, though there is a latent space."""
-    latents = getattr(module, "latents", None)
-    return latents is not None and not len(latents.weight)
+def make_logger(name: str, folder: Path) -> Logger:
+    """One of `LOGGERS`, for a stage's folder; CSV goes on where a stopped run's ended."""
+    if name == "csv":
+        return _csv_logger(folder)
+    if name == "tensorboard":
+        return TensorBoardLogger(folder, name="", version="")
+    from lightning.pytorch.loggers import WandbLogger
+
+    key = os.environ.get("WANDB_API_KEY") or Path("~/.netrc").expanduser().is_file()
+    return WandbLogger(project="sceneprior", save_dir=folder, name=folder.name, offline=not key)
+
+
+def _csv_logger(folder: Path) -> CSVLogger:
+    # Lightning's deletes what it finds: hand it the rows of the epochs before the stop.
+    path = folder / "metrics.csv"
+    before = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
+    logger = CSVLogger(folder, name="", version="")
+    if before and first_process():
+        logger.experiment.metrics.extend(before)
+        logger.save()
+    return logger
+
+
+def _quiet_lightning() -> None:
+    """Leave out Lightning's hints, and let matrix products be fast where a GPU has such."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module="lightning")
+    torch.set_float32_matmul_precision("high")

@@ -50,13 +50,7 @@ class SampleMonitor(Callback):
 
     Of several processes the first evaluates; the others wait for its scores, or its error. The
     best so far is part of every checkpoint, so a resumed run goes on choosing where it stopped.
-
-    Args:
-        folder: Of the stage.
-        config: The run's; its section `samples` says when and by what.
-        stage: Its name.
-        room_ids: Of the training rooms.
-        evaluate: Scores a copy of what is being trained.
+    The config's section `samples` says when and by what.
     """
 
     def __init__(

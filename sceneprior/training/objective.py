@@ -140,14 +140,11 @@ def full_precision(device: torch.device) -> torch.autocast:
     return torch.autocast(device.type, enabled=False)
 
 
-def batch_number(trainer: lightning.Trainer, batch_idx: int) -> int:
-    """How many batches came before this one; `accumulate` makes several of them one step."""
-    return trainer.current_epoch * int(trainer.num_training_batches) + batch_idx
-
-
-def step_seed(seed: int, batch: int, rank: int) -> int:
+def batch_seed(seed: int, trainer: lightning.Trainer, batch_idx: int) -> int:
     """A seed of its own for each batch and process, the same when a run is resumed."""
-    return int(np.random.SeedSequence([seed, batch, rank]).generate_state(1, np.uint64)[0] >> 1)
+    batch = trainer.current_epoch * int(trainer.num_training_batches) + batch_idx
+    sequence = np.random.SeedSequence([seed, batch, trainer.global_rank])
+    return int(sequence.generate_state(1, np.uint64)[0] >> 1)
 
 
 def log_losses(

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from sceneprior.losses.shape import mask_loss
 from sceneprior.models.prior import ScenePrior
 from sceneprior.training.objective import (
-    batch_number,
+    batch_seed,
     check_finite,
     full_precision,
     log_losses,
@@ -19,7 +19,6 @@ from sceneprior.training.objective import (
     proxy_boxes,
     seen_boxes,
     seen_masks,
-    step_seed,
     weighted_sum,
     with_cosine,
 )
@@ -71,8 +70,7 @@ class PaperStage(lightning.LightningModule, ABC):
             z = space(self.latents(views.room_index))
             if not noise:
                 return z
-            batch = batch_number(self.trainer, batch_idx)
-            return space.step(z, noise, step_seed(self.seed, batch, self.global_rank))
+            return space.step(z, noise, batch_seed(self.seed, self.trainer, batch_idx))
 
     def total(
         self, losses: dict[str, Tensor], views: SceneViews, beside: dict[str, Tensor] | None = None

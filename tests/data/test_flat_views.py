@@ -3,7 +3,7 @@
 import torch
 from references.batches import rooms_with_images
 
-from sceneprior.data.flat_views import FlatViews
+from sceneprior.data.dataset import FlatViews
 
 
 def test_a_hundred_thousand_views_take_tens_of_megabytes(toy_shards):

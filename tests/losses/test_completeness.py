@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.losses.completeness import completeness_targets, kept_objects, kept_share
+from sceneprior.baselines.gan.semantic_maps import kept_share
+from sceneprior.losses.completeness import completeness_targets, kept_objects
 from sceneprior.models.prior import ModelConfig
 
 CONVENTIONS = ModelConfig.model_fields["completeness_target"].annotation.__args__

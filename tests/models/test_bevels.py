@@ -3,7 +3,7 @@
 import torch
 from torch.testing import assert_close
 
-from sceneprior.models.bevels import ClassBevels
+from sceneprior.models.layout_decoder import ClassBevels
 
 
 def test_a_sure_class_has_its_own_chamfers_and_an_unsure_one_the_mean():

@@ -12,7 +12,7 @@ from sceneprior.models.layout_decoder import LayoutDecoder
 @pytest.mark.parametrize("heads", ["joint", "separate"])
 def test_before_training_all_objects_stand_near_the_floor_centre(torch_rng, heads):
     torch.manual_seed(0)
-    model = LayoutDecoder(64, 22, initial_size_m=0.7, heads=heads)
+    model = LayoutDecoder(64, 22, heads=heads)
     # Features leave a LayerNorm: about N(0, 1).
     layout, shared = model(torch.randn(8, 13, 64, generator=torch_rng))
     assert layout.class_logits.shape == (8, 13, 22)

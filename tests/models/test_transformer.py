@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from references.scene_decoder import next_object_loop
+from references.scene_decoder import next_object, next_object_loop
 from torch.nn import functional as F
 from torch.testing import assert_close
 
@@ -32,14 +32,14 @@ def inputs(torch_rng, dtype=torch.float64, rooms=3, objects=6, width=24):
 def test_the_next_object_does_not_depend_on_the_order_of_those_before(torch_rng, dtype):
     model = decoder(dtype).eval()
     z, previous = inputs(torch_rng, dtype)
-    wanted = model.next_object(z, previous)
+    wanted = next_object(model, z, previous)
     for seed in range(5):
         order = torch.randperm(6, generator=torch.Generator().manual_seed(seed))
-        shuffled = model.next_object(z, previous[:, order])
+        shuffled = next_object(model, z, previous[:, order])
         assert_close(shuffled, wanted, rtol=0, atol=TOLERANCE[dtype])
     # ... but on what they are: one object more or another one changes the answer.
-    assert (model.next_object(z, previous[:, :5]) - wanted).abs().max() > 1e-3
-    assert (model.next_object(z, previous.flip(0)) - wanted).abs().max() > 1e-3
+    assert (next_object(model, z, previous[:, :5]) - wanted).abs().max() > 1e-3
+    assert (next_object(model, z, previous.flip(0)) - wanted).abs().max() > 1e-3
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)
@@ -49,7 +49,7 @@ def test_unrolling_with_a_cache_is_asking_step_by_step(torch_rng, dtype):
     unrolled = model(z, 7)
     features = z.new_zeros(3, 0, 24)
     for _ in range(7):
-        newest = model.next_object(z, features)
+        newest = next_object(model, z, features)
         features = torch.cat([features, newest.unsqueeze(1)], dim=1)
     assert unrolled.shape == (3, 7, 24)
     # An error of one step goes through all the later ones.
@@ -63,7 +63,7 @@ def test_the_slow_twin_says_the_same(torch_rng):
     key_bias = torch.randn(24, generator=torch_rng, dtype=torch.float64)
     with torch.no_grad():
         by_hand = next_object_loop(model, z, previous, key_bias)
-        assert_close(model.next_object(z, previous), by_hand, rtol=0, atol=1e-12)
+        assert_close(next_object(model, z, previous), by_hand, rtol=0, atol=1e-12)
         first = next_object_loop(model, z, previous[:, :0], key_bias)
         assert_close(model(z, 1)[:, 0], first, rtol=0, atol=1e-12)
 
@@ -107,7 +107,7 @@ def test_the_encoder_is_torchs_own_layer(torch_rng):
         wish = z * 24**0.5
         answer = wish + cross(wish.unsqueeze(1), context, context)[0][:, 0]
         wanted = model.decoder_ff(model.decoder_norm(answer))
-        assert_close(model.next_object(z, previous), wanted, rtol=0, atol=1e-12)
+        assert_close(next_object(model, z, previous), wanted, rtol=0, atol=1e-12)
 
 
 def test_each_room_is_decoded_by_itself(torch_rng):

@@ -5,8 +5,16 @@ import math
 import torch
 
 
+def next_object(model, z, previous):
+    """The feature that a SceneTransformer says follows a set of objects, in whatever order."""
+    query = model._query(z)
+    tokens = torch.cat([model.start.expand(len(z), 1, -1), previous], dim=1)
+    qkv = model._split(model.encoder_qkv(tokens))
+    return model._next(query, model._key_query(query), tokens, qkv)
+
+
 def next_object_loop(decoder, z, previous, key_bias):
-    """`SceneTransformer.next_object` in float64; `key_bias` is any (width,) bias of its keys.
+    """`next_object` in float64; `key_bias` is any (width,) bias of its keys.
 
     Args:
         decoder: A SceneTransformer in evaluation mode, in float64.

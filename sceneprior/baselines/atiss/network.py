@@ -59,11 +59,8 @@ class Atiss(nn.Module):
     A transformer encoder without positional encoding reads the objects there are and one learnt
     query. What it makes of the query gives the class of the next object, or the room's end; then,
     given the class, its position; then its angle, then its size, each given all before it. Every
-    number is a mixture of logistics of its own. An object is seven `numbers` in [-1, 1].
-
-    Args:
-        config: Sizes.
-        classes: Size of the label set, void included.
+    number is a mixture of logistics of its own. An object is seven `numbers` in [-1, 1]; `classes`
+    is the size of the label set, void included.
     """
 
     low_m: Tensor

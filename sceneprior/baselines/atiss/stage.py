@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sceneprior.baselines.atiss.network import END, Atiss, AtissModel
 from sceneprior.baselines.box_training import BoxConfig, BoxStage, BoxTraining
-from sceneprior.training.objective import batch_number, full_precision, step_seed
+from sceneprior.training.objective import batch_seed, full_precision
 from sceneprior.views import RoomBoxes
 
 
@@ -39,8 +39,7 @@ class AtissStage(BoxStage):
     prior: Atiss
 
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
-        batch = batch_number(self.trainer, batch_idx)
-        placed, coming = part_of_rooms(rooms, step_seed(self.seed, batch, self.global_rank))
+        placed, coming = part_of_rooms(rooms, batch_seed(self.seed, self.trainer, batch_idx))
         unit, next_unit = self.prior.to_unit(placed), self.prior.to_unit(coming)
         context = self.prior.context(placed.object_class, unit, placed.is_object)
         with full_precision(self.device):

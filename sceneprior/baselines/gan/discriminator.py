@@ -19,12 +19,8 @@ class MapDiscriminator(nn.Module):
     """Scores maps patch by patch, and a room by all of its views together.
 
     Every layer is spectrally normalised, so that the network is about 1-Lipschitz. There is no
-    depth channel (supplement, Baselines).
-
-    Args:
-        classes: Channels of a map.
-        width: Channels after the first of two layers that halve the sides; twice as many after the
-            second. A patch is then 18 x 18 pixels of a map.
+    depth channel (supplement, Baselines). Two layers halve the sides; the first has `width`
+    channels, the second twice as many. A patch is then 18 x 18 pixels of a map.
     """
 
     def __init__(self, classes: int, width: int = 32):

@@ -7,7 +7,6 @@ from torch.nn import functional as F
 
 from sceneprior.classes import VOID
 from sceneprior.geometry.cameras import project
-from sceneprior.losses.completeness import kept_share
 from sceneprior.silhouettes.render import render_scene
 from sceneprior.views import DecodedScenes, SceneViews
 
@@ -39,14 +38,10 @@ def rendered_maps(
     classes: Float[Tensor, "rooms objects classes"],
     mode: str = "fast",
 ) -> Float[Tensor, "rooms views classes height width"]:
-    """What the views would show of other scenes: theirs, drawn into the views' cameras.
+    """What the views would show of as many other scenes, drawn into the views' cameras.
 
-    Args:
-        scenes: Of as many rooms as `views`, with meshes.
-        faces: Of every mesh.
-        views: Cameras, and the size of the maps: that of `instance_ids`.
-        kept, classes: Of the scenes' objects: `choices`.
-        mode: Of `render_silhouettes`.
+    Maps are pooled as those of `instance_ids` are; `kept` and `classes` are `choices`, `mode` is
+    that of `render_silhouettes`.
     """
     assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
     height, width = (side / POOLING for side in views.observed_ids.shape[-2:])
@@ -91,6 +86,19 @@ def choices(
     return kept, _straight_through(likeliest, shares)
 
 
+def kept_share(
+    scores: Float[Tensor, "rooms slots"], convention: str = "first_n"
+) -> Float[Tensor, "rooms slots"]:
+    """How likely each prediction belongs to the scene, if each score is the chance of a yes.
+
+    Of scores that are 0 or 1 these are the `kept_objects`, and the gradient of each score is what
+    its change would bring about: the end of the scene there, or some objects more.
+    """
+    if convention == "stop":  # none before it said so
+        scores = F.pad(1 - scores[:, :-1], (1, 0), value=1.0)
+    return scores.cumprod(dim=1)
+
+
 def _straight_through(hard: Tensor, soft: Tensor) -> Tensor:
     return hard.to(soft) + soft - soft.detach()
 
@@ -107,14 +115,8 @@ def compose_maps(
 
     is what the pixel shows of object k, and what is left of it shows nothing: `void`.
 
-    Args:
-        coverage: Of each object alone, in [0, 1].
-        depth_m: Of each object at each pixel; orders them and carries no gradient.
-        kept: How far each object belongs to the scene, in [0, 1]; what does not hides nothing.
-        classes: What each object is; shares that sum to 1, none of them of `void`.
-
-    Returns:
-        Shares that sum to 1 over the classes.
+    a_k is in [0, 1], each object drawn alone; its depth carries no gradient. Of the classes, whose
+    shares sum to 1, none is `void`; those of the maps sum to 1, too.
     """
     alpha = coverage * kept[:, None, :, None, None]
     order = depth_m.argsort(dim=2)

@@ -30,7 +30,7 @@ from sceneprior.baselines.gan.semantic_maps import (
 )
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.models.layout_decoder import LayoutDecoder
-from sceneprior.models.prior import ModelConfig, ScenePrior
+from sceneprior.models.prior import ModelConfig
 from sceneprior.models.transformer import TransformerConfig
 from sceneprior.training.method import PriorConfig, Stage
 from sceneprior.training.objective import check_finite, full_precision
@@ -114,8 +114,7 @@ class GanConfig(PriorConfig):
         return (Stage("gan", self.training, views, self._build, steps_itself=True),)
 
     def _build(self, rooms: ViewDataset, previous: Path | None) -> "GanStage":
-        # A GAN pairs no point of the latent space with a room.
-        return GanStage(self.build_prior(), self.build_latents(0), self)
+        return GanStage(self)
 
 
 class GanStage(lightning.LightningModule):
@@ -128,23 +127,19 @@ class GanStage(lightning.LightningModule):
     `generator` is what plays; `prior`, which tasks take out of checkpoints, is a running average of
     its weights, in which the two opponents' circling cancels. `excess` is how much more
     of each class a generated room has than a real one, of late: objects, and pixels (`contents`).
-
-    Args:
-        prior: The network, freshly initialised.
-        latents: No rows; they make the run's checkpoints alike.
-        config: The run.
     """
 
-    def __init__(self, prior: ScenePrior, latents: nn.Embedding, config: GanConfig):
+    def __init__(self, config: GanConfig):
         super().__init__()
         self.automatic_optimization = False
         self.model, self.settings = config.model, config.training
         self.classes = config.classes
-        self.generator = prior
+        self.generator = prior = config.build_prior()
         spread_out(prior.layout, prior.decoder(self._latents(START_ROOMS), prior.max_objects))
         self.prior = copy.deepcopy(prior).requires_grad_(False)
         self.average = get_ema_multi_avg_fn(config.training.averaging)
-        self.latents = latents
+        # A GAN pairs no point of the latent space with a room; checkpoints of all priors are alike.
+        self.latents = config.build_latents(0)
         self.discriminator = MapDiscriminator(self.classes)
         self.excess: Tensor
         self.register_buffer("excess", torch.zeros(2 * self.classes))
@@ -241,11 +236,7 @@ def spread_out(layout: LayoutDecoder, features: Float[Tensor, "rooms objects wid
     discriminator would pull all of them the same way: they would never part. So its last layer is
     scaled and shifted until each output has the mean and the spread over these rooms and objects
     that `STARTS` names, and class logits 0 and 1 (after Salimans and Kingma, "Weight
-    normalization", NeurIPS 2016, section 3).
-
-    Args:
-        layout: Changed in place.
-        features: Of random rooms.
+    normalization", NeurIPS 2016, section 3). `features` are those of random rooms.
     """
     outputs = layout.mlp2(layout.mlp1(features)).flatten(0, 1)
     starts = [(0.0, 1.0)] * layout.classes + list(STARTS)

@@ -51,12 +51,8 @@ class Sync2Gen(nn.Module):
     Attributes are standardised per class. Objects of a class take its slots from left to right (by
     x, then z); of more than `slots`, the rightmost are left out. Layers are sparsely and fully
     connected in turn: a sparse one lets each output see few groups of inputs, chosen once by
-    `seed`, which holds overfitting down.
-
-    Args:
-        config: Sizes.
-        classes: Size of the label set, void included.
-        seed: Chooses the sparse connections, and which offsets of frequent pairs are kept.
+    `seed`, which holds overfitting down. It chooses which offsets of frequent pairs are kept, too.
+    `classes` is the size of the label set, void included.
     """
 
     mean_m: Tensor

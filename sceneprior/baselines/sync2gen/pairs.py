@@ -57,12 +57,8 @@ class PairPrior(nn.Module):
     def note_errors(
         self, squared: Float[Tensor, " labels"], count: Float[Tensor, " labels"]
     ) -> None:
-        """Let the running mean of squared errors of centres follow a batch's.
-
-        Args:
-            squared: Sum over a batch's objects, per class without void, in square metres.
-            count: How many objects it is over.
-        """
+        """Let the running mean of squared errors of centres follow a batch's: sums in square metres
+        over so many objects, per class without void."""
         newest = squared / count.clamp(min=1)
         weight = MOMENTUM * (count > 0)
         self.error_m2[1:] += weight * (newest - self.error_m2[1:])

@@ -221,7 +221,7 @@ def test_a_loss_that_is_no_number_names_its_rooms(toy_shards, tmp_path, monkeypa
 
 def fresh(shards: Path, **changes) -> GanStage:
     config = settings(shards, "gan", **changes)
-    return GanStage(config.build_prior(), config.build_latents(0), config)
+    return GanStage(config)
 
 
 def test_objects_start_all_over_the_floor_and_in_most_slots(toy_shards):
