@@ -72,7 +72,7 @@ def reconstruct(
             raise InputError("--mask needs --classes and --intrinsics beside it.")
         label_set = trained.config.label_set
         own = read_own_image(mask, classes, intrinsics, label_set, pose, camera_height)
-        images, notes = own.images, [f"{note}." for note in own.notes]
+        images, notes = list(own.images), [f"{note}." for note in own.notes]
     elif room is not None:
         images = [image_from_shards(shards, room, view)]
     else:
