@@ -9,9 +9,15 @@ import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+# Some are imported only to come before our modules: whatever these import first, jaxtyping's hook
+# has compiled from source, since it looks for .pyc files of a name of its own (2,600 modules).
+import beartype  # noqa: F401
+import lightning  # noqa: F401
 import numba
 import numpy as np
+import pydantic  # noqa: F401
 import pytest
+import scipy.stats  # noqa: F401
 import torch
 from tiny_runs import tiny_config
 from toy_rooms import write_toy_shards

@@ -16,7 +16,7 @@ from data_prep.scannet.annotations import (
 )
 from data_prep.scannet.labels import Labels
 from data_prep.scannet.masks import MASK_FILES, MaskArchive
-from data_prep.scannet.sens import SensFile
+from data_prep.scannet.sens import read_recording
 from sceneprior.errors import InputError
 
 FULL_SIZE = (968, 1296)
@@ -184,24 +184,25 @@ def _read_cameras(
 ) -> tuple[FrameChoice, np.ndarray, np.ndarray, Path]:
     """Which frames, their world_to_camera, the intrinsics of all, and the archive of masks."""
     mask_path = _mask_path(folder, settings.masks)
-    with SensFile(folder / f"{folder.name}.sens") as sens, MaskArchive(mask_path) as masks:
-        choice = choose_frames(
-            sens.camera_to_world, masks.frames, settings.frame_step, settings.max_views
+    sens_path = folder / f"{folder.name}.sens"
+    sens = read_recording(sens_path)
+    with MaskArchive(mask_path) as masks:
+        frames, mask_size = masks.frames, masks.image_size
+    choice = choose_frames(sens.camera_to_world, frames, settings.frame_step, settings.max_views)
+    if not choice.frames:
+        raise InputError(
+            f"{sens_path} gives no view: of {choice.candidates} frames (every "
+            f"{settings.frame_step}), {choice.bad_poses} have no usable pose and "
+            f"{choice.without_mask} no mask in {mask_path.name}. Download the scan again, or "
+            "leave it out."
         )
-        if not choice.frames:
-            raise InputError(
-                f"{sens.path} gives no view: of {choice.candidates} frames (every "
-                f"{settings.frame_step}), {choice.bad_poses} have no usable pose and "
-                f"{choice.without_mask} no mask in {mask_path.name}. Download the scan again, or "
-                "leave it out."
-            )
-        try:
-            intrinsics = mask_intrinsics(
-                sens.intrinsic_color, sens.color_size, masks.image_size, settings.image_size
-            )
-        except InputError as error:
-            raise InputError(f"{mask_path}: {error}") from None
-        poses = sens.camera_to_world[list(choice.frames)]
+    try:
+        intrinsics = mask_intrinsics(
+            sens.intrinsic_color, sens.color_size, mask_size, settings.image_size
+        )
+    except InputError as error:
+        raise InputError(f"{mask_path}: {error}") from None
+    poses = sens.camera_to_world[list(choice.frames)]
     return choice, room_cameras(poses, room_from_scan), intrinsics, mask_path
 
 

@@ -11,7 +11,7 @@ import typer
 
 from data_prep.cli import add_commands
 from sceneprior import __version__
-from sceneprior.cli import evaluating, experiments, generating, reconstruction, retrieval, training
+from sceneprior.cli import evaluating, experiments, generating, reconstruction, training
 from sceneprior.errors import InputError
 
 app = typer.Typer(
@@ -24,7 +24,7 @@ app = typer.Typer(
 add_commands(app)
 for command in (
     training.fit, training.report,
-    generating.synthesize, generating.interpolate, generating.complete, retrieval.retrieve,
+    generating.synthesize, generating.interpolate, generating.complete, generating.retrieve,
     reconstruction.reconstruct, reconstruction.eval_svr,
     evaluating.eval_fid, evaluating.convert_boxes,
     experiments.compare, experiments.demo,

@@ -1,17 +1,11 @@
 """Commands that reconstruct rooms from single images; each imports what it needs when called."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from sceneprior.cli.options import CheckpointOption, OverwriteOption, RendererOption, RunOption
-
-if TYPE_CHECKING:
-    from sceneprior.reconstruction.image import ObservedImage
-    from sceneprior.reconstruction.reconstruct import FitOptions, Reconstruction
-    from sceneprior.training.method import TrainedPrior
 
 ScheduleOption = Annotated[
     str, typer.Option(help="paper (1,000 steps) or released (the authors' code: 2,000).")
@@ -56,7 +50,8 @@ def reconstruct(
     from sceneprior.offscreen import open_renderer
     from sceneprior.reconstruction.export import write_reconstructions
     from sceneprior.reconstruction.image import image_from_shards, images_of_split
-    from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct
+    from sceneprior.reconstruction.own_image import read_own_image
+    from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct, unlearnt_classes
 
     ways = [mask is not None, room is not None, split is not None]
     if sum(ways) != 1 or (shards is None) != (mask is not None):
@@ -71,56 +66,31 @@ def reconstruct(
     check_free(out, overwrite)
     options = FitOptions(schedule, restarts, start, seed=seed)
     trained = load_run(run, checkpoint)
-    if mask is not None:
-        found = [_own(trained, options, mask, classes, intrinsics, pose, camera_height)]
+    notes = []
+    if shards is None:
+        if mask is None or classes is None or intrinsics is None:
+            raise InputError("--mask needs --classes and --intrinsics beside it.")
+        label_set = trained.config.label_set
+        own = read_own_image(mask, classes, intrinsics, label_set, pose, camera_height)
+        images, notes = list(own.images), [f"{note}." for note in own.notes]
+    elif room is not None:
+        images = [image_from_shards(shards, room, view)]
     else:
-        assert shards is not None
-        if room is not None:
-            images = [image_from_shards(shards, room, view)]
-        else:
-            images, blank = images_of_split(shards, split or "test", seed, limit)
-            for name in blank:
-                typer.echo(
-                    f"Note: no view of room {name} shows an object; it is left out.", err=True
-                )
-        found = reconstruct(trained, images, options)
-        _tell_unlearnt_classes(trained, images)
-    write_reconstructions(found, out, open_renderer(renderer))
-    typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
-
-
-def _own(
-    trained: "TrainedPrior",
-    options: "FitOptions",
-    mask: Path,
-    classes: Path | None,
-    intrinsics: str | None,
-    pose: Path | None,
-    camera_height: float,
-) -> "Reconstruction":
-    from sceneprior.errors import InputError
-    from sceneprior.reconstruction.own_image import read_own_image
-    from sceneprior.reconstruction.reconstruct import reconstruct
-
-    if classes is None or intrinsics is None:
-        raise InputError("--mask needs --classes and --intrinsics beside it.")
-    own = read_own_image(mask, classes, intrinsics, trained.config.label_set, pose, camera_height)
-    for note in own.notes:
-        typer.echo(f"Note: {note}.", err=True)
-    sides = reconstruct(trained, own.images, options)
-    _tell_unlearnt_classes(trained, own.images[:1])
-    return min(sides, key=lambda found: found.score)
-
-
-def _tell_unlearnt_classes(trained: "TrainedPrior", images: "Sequence[ObservedImage]") -> None:
-    from sceneprior.reconstruction.reconstruct import unlearnt_classes
-
+        images, blank = images_of_split(shards, split or "test", seed, limit)
+        notes = [f"no view of room {name} shows an object; it is left out." for name in blank]
+    for note in notes:
+        typer.echo(f"Note: {note}", err=True)
+    found = reconstruct(trained, images, options)
     if unlearnt := unlearnt_classes(trained, images):
         typer.echo(
             f"Note: the run never generates these classes, so expect little of them: "
             f"{', '.join(unlearnt)}.",
             err=True,
         )
+    if mask is not None:  # the same picture, from each side of the room
+        found = [min(found, key=lambda side: side.score)]
+    write_reconstructions(found, out, open_renderer(renderer))
+    typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
 
 
 def eval_svr(

@@ -5,12 +5,7 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.cli.options import (
-    AcceleratorOption,
-    CheckpointOption,
-    RendererOption,
-    RunOption,
-)
+from sceneprior.cli.options import AcceleratorOption, CheckpointOption, RendererOption, RunOption
 
 
 def fit(

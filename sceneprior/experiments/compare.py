@@ -50,14 +50,12 @@ def compare(
     """Train and evaluate every run that is not done yet, then write `table.*` and the figures.
 
     Args:
-        comparison: From `load_comparison`; the tables show all of it that is done.
+        comparison: The tables show all of it that is done.
         part: What to do now: from `part_of`, or the same.
         out: `<rooms>/<method>/seed<k>/` in it holds a run; the tables lie beside them.
-        options: Of all runs.
 
     Raises:
-        InputError: shards are missing, another `compare` is writing to `out`, or the renderer or
-            the weights cannot be used.
+        InputError: of shards, renderer or weights, or another `compare` is writing to `out`.
         KeyboardInterrupt: stopped by Ctrl-C, SIGTERM or SIGHUP; the same call goes on.
     """
     if options.inception is not None:
@@ -67,10 +65,8 @@ def compare(
     @cache
     def count(rooms: str) -> int:
         """How many rooms each run generates."""
-        if comparison.count is not None:
-            return comparison.count
         shards = Path(load_config(comparison.rooms[rooms].config).data.shards)
-        return sum(1 for _ in iterate_rooms(shards, "train"))
+        return comparison.count or sum(1 for _ in iterate_rooms(shards, "train"))
 
     def scoring(run: Run) -> Step:
         return scoring_step(run, count(run.rooms), comparison.sampling_seed, options)

@@ -40,13 +40,7 @@ def evaluate_run(
 
     In runs that remember their training rooms, those are decoded and scored against the truth, too.
 
-    Args:
-        run: A run's folder, of any kind.
-        count: Rooms to generate; the options' seed draws their latents, too.
-        out: JSON file to write.
-        shards: Folder with the test rooms; None takes the run's own.
-        distribution: Of the latents; None takes the config's.
-        checkpoint: `final` or `best`.
+    The options' seed draws the latents, too; `shards` and `distribution` are by default the run's.
 
     Raises:
         InputError: the run, the shards or a file of weights cannot be used.
@@ -59,10 +53,11 @@ def evaluate_run(
     scores = evaluate_synthesis(generated, folder, options)
     if pairs:
         scores |= reconstruction_scores(pairs)
-    made = {"run": Path(run).resolve().name, "stage": trained.stage, "checkpoint": checkpoint}
+    scores["protocol"] |= {
+        "run": run.resolve().name, "stage": trained.stage, "checkpoint": checkpoint
+    }  # fmt: skip
     if isinstance(trained, TrainedPrior):
-        made["sampling_distribution"] = distribution or trained.distribution
-    scores["protocol"] |= made
+        scores["protocol"]["sampling_distribution"] = distribution or trained.distribution
     write_json(out, scores)
     return scores
 
@@ -75,8 +70,6 @@ def evaluate_folder(
     Args:
         folder: Scene JSONs (docs/conventions.md), perhaps with the GLBs of their meshes.
         count: At most so many of them, drawn by the options' seed; None takes all.
-        out: JSON file to write.
-        shards: Folder with the test rooms.
 
     Raises:
         InputError: the scenes, the shards or a file of weights cannot be used.
@@ -84,9 +77,7 @@ def evaluate_folder(
     scenes = load_scene_folder(folder)
     rows = seeded_rows(len(scenes), count or len(scenes), options.seed)
     scores = evaluate_synthesis([scenes[row] for row in rows], shards, options)
-    scores["protocol"] |= {
-        "scenes": Path(folder).resolve().name, "n_scenes_available": len(scenes)
-    }  # fmt: skip
+    scores["protocol"] |= {"scenes": folder.resolve().name, "n_scenes_available": len(scenes)}
     write_json(out, scores)
     return scores
 

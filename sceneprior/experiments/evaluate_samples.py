@@ -137,16 +137,12 @@ class SampleEvaluator:
     @cached_property
     def _views(self) -> SceneViews:
         data = self.config.data
+        # The seed chose the share of the views, too.
         rooms = ViewDataset(
-            Path(data.shards),
-            "train",
-            views_per_room=VIEWS,
-            rotations=data.rotations,
-            mask_step=data.mask_step,
-            view_fraction=data.view_fraction,
-            seed=self.config.seed,  # which chose the share of the views, too
+            Path(data.shards), "train", views_per_room=VIEWS, rotations=data.rotations,
+            mask_step=data.mask_step, view_fraction=data.view_fraction, seed=self.config.seed,
             limit=REMEMBERED,
-        )
+        )  # fmt: skip
         return rooms.__getitems__([(row, 0) for row in range(0, len(rooms), rooms.rotations)])
 
 
@@ -178,14 +174,9 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
     height, width = ids.shape[-2:]
     counts = views.is_object.sum(dim=-1, keepdim=True)
     front = render_scene(
-        vertices,
-        prior.shape.faces,
-        views.world_to_camera,
-        views.intrinsics_at(height, width),
-        (height, width),
-        mode="fast",
-        drawn=torch.arange(vertices.shape[1]) < counts,
-    ).front
+        vertices, prior.shape.faces, views.world_to_camera, views.intrinsics_at(height, width),
+        (height, width), mode="fast", drawn=torch.arange(vertices.shape[1]) < counts,
+    ).front  # fmt: skip
     room, view, item = (views.visible & matches.valid.unsqueeze(1)).nonzero(as_tuple=True)
     mine = front[room, view] == matches.prediction[room, item][:, None, None]
     seen = ids[room, view] == (item + 1)[:, None, None]
@@ -197,14 +188,6 @@ def tile(scenes: Sequence[Scene]) -> UInt8[np.ndarray, "height width 3"]:
     """Rooms from straight above in rows of four, coloured by class."""
     # Our own z-buffer: GL must not be opened in a process that trains on the GPU.
     renderer = SoftwareRenderer()
-    size = (TILE_PX, TILE_PX)
-    tiles = [
-        topdown(
-            scene,
-            renderer,
-            replace(topdown_protocol(scene.label_set), image_size=size),
-            outlines=True,
-        )
-        for scene in scenes
-    ]
+    protocol = replace(topdown_protocol(scenes[0].label_set), image_size=(TILE_PX, TILE_PX))
+    tiles = [topdown(scene, renderer, protocol, outlines=True) for scene in scenes]
     return contact_sheet(tiles, COLUMNS)

@@ -54,7 +54,7 @@ def test_fit_keeps_the_best_sampler_and_other_commands_take_it(command, toy_shar
     draw = ["--run", "run", "-n", 2, "--renderer", "software"]
     status, _, errors = command("synthesize", *draw, "--out", "rooms", "--checkpoint", "best")
     assert status == 0 and (tmp_path / "rooms" / "overview.png").is_file(), errors
-    status, _, errors = command("eval-fid", *draw, "--checkpoint", "best")
+    status, _, errors = command("eval-fid", *draw, "--checkpoint", "best", "--resamples", 0)
     assert status == 0, errors
     protocol = json.loads((tmp_path / "run" / "scores.json").read_text())["protocol"]
     assert protocol["checkpoint"] == "best"
@@ -158,17 +158,8 @@ def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
 
 
 def test_eval_fid_scores_a_tiny_run(command, toy_run, tmp_path):
-    call = [
-        "eval-fid",
-        "--run",
-        toy_run,
-        "-n",
-        "4",
-        "--out",
-        "scores.json",
-        "--renderer",
-        "software",
-    ]
+    call = ["eval-fid", "--run", toy_run, "-n", 4, "--out", "scores.json", "--renderer", "software"]
+    call += ["--resamples", 5]
     status, out, _ = command(*call)
     assert status == 0 and out.endswith("Wrote scores.json\n")
     scores = json.loads((tmp_path / "scores.json").read_text())
@@ -206,7 +197,7 @@ def test_the_module_is_the_command(tmp_path):
     answer = subprocess.run([*call, "--version"], capture_output=True, text=True, cwd=tmp_path)
     assert answer.returncode == 0 and answer.stdout.startswith("sceneprior 0.")
     answer = subprocess.run(
-        [*call, "synthesize", "--run", "none", "--out", "made"],
+        [*call, "prep-front", "--front", "none", "--future", "none", "--out", "made"],
         capture_output=True, text=True, cwd=tmp_path,
     )  # fmt: skip
     one_sentence((answer.returncode, answer.stdout, answer.stderr))

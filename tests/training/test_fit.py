@@ -48,12 +48,12 @@ class Stop(RollingCheckpoint):
             raise KeyboardInterrupt
 
 
-def interrupted(monkeypatch, config, run: Path, stage: str, epoch: int) -> None:
+def interrupted(monkeypatch, config, run: Path, stage: str, epoch: int, resume=False) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(Stop, "when", (stage, epoch))
         patch.setattr(train, "RollingCheckpoint", Stop)
         with pytest.raises(KeyboardInterrupt):
-            fit(config, run, trainer_options=CPU)
+            fit(config, run, resume, trainer_options=CPU)
 
 
 def test_both_stages_learn_and_leave_what_runs_py_promises(toy_run, toy_shards):
@@ -95,7 +95,6 @@ def test_resuming_a_finished_run_trains_nothing(toy_run, toy_shards, tmp_path, m
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize(("stage", "epoch"), [("layout", 4), ("shape", 2)])
 @pytest.mark.parametrize(
     "extra",
     [
@@ -106,20 +105,21 @@ def test_resuming_a_finished_run_trains_nothing(toy_run, toy_shards, tmp_path, m
     ids=["plain", "dropout", "cosine"],
 )
 def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
-    toy_shards, tmp_path, monkeypatch, stage, epoch, extra
+    toy_shards, tmp_path, monkeypatch, extra
 ):
+    """Stopped in the layout stage, gone on with, stopped in the shape stage, and finished."""
     config = tiny_config(toy_shards, **extra)
-    fit(config, tmp_path / "whole", trainer_options=CPU)
-    run = tmp_path / "stopped"
-    interrupted(monkeypatch, config, run, stage, epoch)
-    assert (run / stage / "last.ckpt").is_file() and not (run / stage / "final.ckpt").exists()
-    assert read_checkpoint(run / stage / "last.ckpt")["epoch"] == epoch - 1
+    whole, run = tmp_path / "whole", tmp_path / "stopped"
+    fit(config, whole, trainer_options=CPU)
+    for stage, epoch, resume in (("layout", 4, False), ("shape", 2, True)):
+        interrupted(monkeypatch, config, run, stage, epoch, resume)
+        assert (run / stage / "last.ckpt").is_file() and not (run / stage / "final.ckpt").exists()
+        assert read_checkpoint(run / stage / "last.ckpt")["epoch"] == epoch - 1
     fit(config, run, resume=True, trainer_options=CPU)
-    for name in ("layout", "shape"):
-        assert same(
-            weights(tmp_path / "whole" / name / "final.ckpt"), weights(run / name / "final.ckpt")
-        ), name
-    assert len(curve(run, stage)) == len(curve(tmp_path / "whole", stage))
+    for stage in ("layout", "shape"):
+        final = Path(stage, "final.ckpt")
+        assert same(weights(whole / final), weights(run / final)), stage
+        assert len(curve(run, stage)) == len(curve(whole, stage))
 
 
 def test_a_stop_in_the_first_epoch_leaves_a_run_that_can_go_on(toy_shards, tmp_path, monkeypatch):
