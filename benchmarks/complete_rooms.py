@@ -122,7 +122,7 @@ def evaluate(
     ]
     return {
         "category_kl": round(category_kl(every, tests), 3),
-        "overlaps": round(overlap_pairs(every).per_room, 2),
+        "overlaps": round(overlap_pairs(every), 2),
         "beds": round(type_share(every) or 0.0, 3),
         "objects": round(float(object_counts(every).mean()), 2),
         "found": round(sum(extra["replaced"] for extra in marked) / asked, 2) if marked else "-",

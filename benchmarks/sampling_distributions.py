@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from sceneprior.config import load_run
+from sceneprior.evaluation.features import Drawing
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.frechet import frechet_distance
-from sceneprior.evaluation.protocol import drawing_of
 from sceneprior.evaluation.synthesis import without_void
 from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.generation.decode import synthesize
@@ -31,11 +31,11 @@ def main() -> None:
     for name in parser.parse_args().runs:
         trained = load_run(name)
         shards = Path(trained.config.data.shards)
-        drawing = drawing_of(trained.config.label_set, open_renderer("auto"), None, None)
+        drawing = Drawing(trained.config.label_set, open_renderer("auto"))
 
         def features(scenes: Sequence[Scene], drawing=drawing) -> np.ndarray:
             known = [without_void(scene) for scene in scenes]
-            return drawing.features(known, lambda _: None).effnet_lite0
+            return drawing.features(known)["effnet_lite0"]
 
         test = reference_scenes(shards, "test")
         real = features(test), features([scene.without_meshes() for scene in test])

@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Int, UInt8
+from torch import Tensor, nn
 
 from sceneprior.errors import InputError
 
@@ -24,19 +26,11 @@ ALEXNET: dict[str, Any] = {
 """How SCA is measured with AlexNet, for the result file."""
 
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-_LAYERS = ((0, 3, 64, 11, 4, 2), (3, 64, 192, 5, 1, 2), (6, 192, 384, 3, 1, 1),
-           (8, 384, 256, 3, 1, 1), (10, 256, 256, 3, 1, 1))  # fmt: skip
-"""Number in the file, channels in and out, kernel, stride, padding of each convolution."""
-_POOLED_AFTER = (0, 3, 10)
 
 
 def check_alexnet(path: Path) -> None:
-    """Read the file, before hours of drawing lean on it.
-
-    Raises:
-        InputError: it is missing or holds something else.
-    """
-    _weights(Path(path))
+    """Raise InputError where the file is missing or holds something else."""
+    _weights(path)
 
 
 def classify_pictures(
@@ -50,22 +44,18 @@ def classify_pictures(
 
     Args:
         path: `alexnet-owt-*.pth`, the state dict of torchvision's AlexNet.
-        pictures: RGB in 0..255.
         labels: 1 generated, 0 real.
-        others: Pictures to classify.
         seed: Of the new layer and of the order of the pictures.
 
     Source:
-        The paper's classifier is ATISS's: ImageNet AlexNet, 10 epochs, Adam at 1e-4, batches of
-        256. Training changes with the processor in the last digits, and so may a close call.
+        The paper's classifier is ATISS's. Training changes with the processor in the last digits,
+        and so may a close call.
     """
-    import torch
-
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     # Random numbers drawn after this stay the same as before.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = _network(_weights(Path(path))).to(device)
+        network = _network(_weights(path)).to(device)
     order = np.random.default_rng(seed)
     optimizer = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE)
     for _ in range(EPOCHS):
@@ -74,7 +64,7 @@ def classify_pictures(
             batch = rows[start : start + BATCH]
             target = torch.as_tensor(labels[batch], dtype=torch.float32, device=device)
             logits = network(_input(pictures[batch], device))[:, 0]
-            loss = torch.nn.functional.binary_cross_entropy_with_logits(logits, target)
+            loss = nn.functional.binary_cross_entropy_with_logits(logits, target)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -86,35 +76,33 @@ def classify_pictures(
     return np.concatenate(answers).astype(int)
 
 
-def _input(pictures: np.ndarray, device: Any) -> Any:
-    import torch
-
+def _input(pictures: np.ndarray, device: torch.device) -> Tensor:
     images = torch.from_numpy(pictures).to(device).permute(0, 3, 1, 2).float() / 255
-    mean, deviation = (
-        torch.tensor(rgb, device=device)[:, None, None] for rgb in (_MEAN, _DEVIATION)
-    )
+    mean, deviation = torch.tensor((_MEAN, _DEVIATION), device=device)[..., None, None]
     return (images - mean) / deviation
 
 
-def _network(weights: dict[str, Any]) -> Any:
-    from torch import nn
+def _convolutions() -> nn.Sequential:
+    """torchvision's `features`, by the numbers that its file has."""
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2),
+        nn.Conv2d(64, 192, 5, 1, 2), nn.ReLU(), nn.MaxPool2d(3, 2),
+        nn.Conv2d(192, 384, 3, 1, 1), nn.ReLU(),
+        nn.Conv2d(384, 256, 3, 1, 1), nn.ReLU(),
+        nn.Conv2d(256, 256, 3, 1, 1), nn.ReLU(), nn.MaxPool2d(3, 2),
+    )  # fmt: skip
 
-    layers: list[Any] = []
-    for number, inside, outside, kernel, stride, padding in _LAYERS:
-        convolution = nn.Conv2d(inside, outside, kernel, stride, padding)
-        convolution.load_state_dict(
-            {part: weights[f"features.{number}.{part}"] for part in ("weight", "bias")}
-        )
-        layers += [convolution, nn.ReLU()]
-        if number in _POOLED_AFTER:
-            layers.append(nn.MaxPool2d(3, 2))
-    return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(6), nn.Flatten(), nn.Linear(256 * 36, 1))
+
+def _network(weights: dict[str, Tensor]) -> nn.Sequential:
+    convolutions = _convolutions()
+    convolutions.load_state_dict(weights)
+    return nn.Sequential(
+        *convolutions, nn.AdaptiveAvgPool2d(6), nn.Flatten(), nn.Linear(256 * 36, 1)
+    )
 
 
 @lru_cache(maxsize=1)
-def _weights(path: Path) -> dict[str, Any]:
-    import torch
-
+def _weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise InputError(
             f"No AlexNet at {path}. The paper's SCA needs torchvision's file "
@@ -122,17 +110,17 @@ def _weights(path: Path) -> dict[str, Any]:
             "no download."
         )
     try:
-        weights = torch.load(path, map_location="cpu", weights_only=True)
-        for number, inside, outside, kernel, _, _ in _LAYERS:
-            came = tuple(weights[f"features.{number}.weight"].shape)
-            if came != (outside, inside, kernel, kernel):
-                raise ValueError(f"features.{number}.weight has shape {came}")
-            if tuple(weights[f"features.{number}.bias"].shape) != (outside,):
-                raise ValueError(f"features.{number}.bias has another shape")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        with torch.device("meta"):  # no numbers are drawn
+            expected = _convolutions().state_dict()
+        weights = {name: state[f"features.{name}"] for name in expected}
+        for name, tensor in weights.items():
+            if tensor.shape != expected[name].shape:
+                raise ValueError(f"features.{name} has shape {tuple(tensor.shape)}")
     except Exception as error:  # what torch raises depends on which byte is odd
         reason = str(error).strip().splitlines()[0][:200] if str(error) else type(error).__name__
         raise InputError(
             f"{path} is not the state dict of torchvision's AlexNet ({reason}); give "
             "`alexnet-owt-7be5be79.pth`, or leave the option out."
         ) from None
-    return {name: weights[name] for name in weights if name.startswith("features.")}
+    return weights

@@ -58,7 +58,6 @@ def ratio(
     """A sum over rooms divided by another: a mean over rooms, or over what they hold.
 
     Args:
-        numerators: What each room adds.
         denominators: What each room weighs; 0 leaves a room out. If all are 0 there is no value.
         counts: From `resample_counts`.
         high: The largest value it can have; the smallest is 0.

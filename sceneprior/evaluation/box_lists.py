@@ -36,7 +36,7 @@ def read_box_lists(
         label_set_name: Theirs; every class must be in it.
         classes: Comma-separated names of the columns (or indices) of `class_labels`; None takes
             the label set without void, and `start` and `end` after it where there are two more.
-        sizes: `half` or `full`.
+        sizes: `half` or `full` extents.
 
     Raises:
         InputError: a file is no box list, or names a class that the label set lacks.
@@ -71,21 +71,22 @@ def read_boxes(
     columns: Sequence[str] | None = None,
     size_factor: float = 2.0,
 ) -> list[Scene]:
-    """The rooms of one file; see `read_box_lists`.
+    """The rooms of one file; see `read_box_lists`. Several get numbers after the name.
 
     Args:
         path: `.npz` with one room (arrays over objects) or several (one more axis in front), or
             `.json` with one such object, or a list of them.
-        name: Of the room; several get numbers.
         columns: What the columns of `class_labels` mean.
         size_factor: From `sizes` to full extents.
     """
     rooms = [room for record in _records(path) for room in _one_by_one(path, record)]
-    names = [name] if len(rooms) == 1 else [f"{name}_{row:04d}" for row in range(len(rooms))]
-    return [
-        _scene(path, room, name, label_set_name, columns, size_factor)
-        for room, name in zip(rooms, names, strict=True)
-    ]
+    scenes = []
+    for row, room in enumerate(rooms):
+        own = name if len(rooms) == 1 else f"{name}_{row:04d}"
+        objects = _objects(path, room, label_set_name, columns, size_factor)
+        come_from = {"converted_from": path.name}
+        scenes.append(Scene(own, label_set_name, tuple(objects), _floor(path, room), come_from))
+    return scenes
 
 
 def _records(path: Path) -> list[dict[str, Any]]:
@@ -107,7 +108,7 @@ def _records(path: Path) -> list[dict[str, Any]]:
     return records
 
 
-def _one_by_one(path: Path, record: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def _one_by_one(path: Path, record: dict[str, Any]) -> list[dict[str, Any]]:
     """Rooms of a record, with arrays over objects; several rooms lie along a first axis."""
     try:
         centers, sizes, angles = (np.asarray(record[key], dtype=np.float64) for key in NEEDED[1:])
@@ -138,22 +139,19 @@ def _one_by_one(path: Path, record: dict[str, Any]) -> Iterator[dict[str, Any]]:
     if not all(np.isfinite(array).all() for array in (centers, sizes, angles)):
         raise InputError(f"{path} holds numbers that are not finite; leave such rooms out.")
     arrays = dict(zip(NEEDED, (labels, centers, sizes, angles), strict=True))
-    if centers.ndim == 3:
-        for row in range(len(centers)):
-            yield {key: array[row] for key, array in arrays.items()}
-    else:
-        yield arrays | {key: record[key] for key in FLOOR if key in record}
+    if centers.ndim == 2:
+        return [arrays | {key: record[key] for key in FLOOR if key in record}]
+    return [{key: array[row] for key, array in arrays.items()} for row in range(len(centers))]
 
 
-def _scene(
+def _objects(
     path: Path,
     room: dict[str, Any],
-    name: str,
     label_set_name: str,
     columns: Sequence[str] | None,
     size_factor: float,
-) -> Scene:
-    known, objects = label_set(label_set_name), []
+) -> Iterator[SceneObject]:
+    known = label_set(label_set_name)
     labels = _label_names(path, room["class_labels"], known, columns)
     boxes = (room[key] for key in NEEDED[1:])
     for label, center, size, angle in zip(labels, *boxes, strict=True):
@@ -168,10 +166,7 @@ def _scene(
             )
         if (size <= 0).any():
             raise InputError(f"{path}: a {label} has size {size.tolist()}; sizes are above 0.")
-        objects.append(turned_box(label, center, size_factor * size, float(angle)))
-    return Scene(
-        name, label_set_name, tuple(objects), _floor(path, room), {"converted_from": path.name}
-    )
+        yield turned_box(label, center, size_factor * size, float(angle))
 
 
 def _label_names(
@@ -196,10 +191,7 @@ def _label_names(
 
 
 def turned_box(
-    label: str,
-    center: Float[np.ndarray, "3"],
-    size: Float[np.ndarray, "3"],
-    yaw_rad: float,
+    label: str, center: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"], yaw_rad: float
 ) -> SceneObject:
     """A box turned about +y, +z towards +x, as an object of ours.
 
@@ -214,8 +206,8 @@ def turned_box(
     """
     turn = yaw_rotation(yaw_rad)
     width, height, depth = np.abs(turn) @ size
-    place = tuple(float(value) for value in center)
-    item = SceneObject(label, (place[0], place[1], place[2]), (width, height, depth))
+    x, y, z = map(float, center)
+    item = SceneObject(label, (x, y, z), (width, height, depth))
     if abs(yaw_rad - np.round(yaw_rad / (np.pi / 2)) * (np.pi / 2)) < _QUARTER_RAD:
         return item
     own = box_mesh((0.0, 0.0, 0.0), size.tolist())

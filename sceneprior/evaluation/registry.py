@@ -1,7 +1,10 @@
 """Every metric, in the order of tables; a new one is a file in metrics/ and its name here."""
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
+from sceneprior.evaluation.alexnet import ALEXNET
 from sceneprior.evaluation.metric import Metric
 from sceneprior.evaluation.metrics import (
     classifier,
@@ -14,6 +17,8 @@ from sceneprior.evaluation.metrics import (
     overlaps,
     precision_recall,
 )
+from sceneprior.evaluation.metrics.contents import TYPE_CLASSES
+from sceneprior.evaluation.networks import file_digest
 
 _MODULES = (
     frechet, kernel_distance, precision_recall, classifier, contents, overlaps, floor, novelty,
@@ -33,16 +38,26 @@ DECODED: tuple[Metric, ...] = decoded_rooms.METRICS
 _BETTER = {"closer": "lower", "lower": "lower", "higher": "higher", "half": "0.5", "none": "–"}
 
 
+def definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
+    """What the metrics mean, whether or not there was what they need."""
+    stated: dict[str, Any] = {} if alexnet is None else {"sca": {**ALEXNET, **file_digest(alexnet)}}
+    for metric in METRICS:
+        stated |= metric.protocol
+    return stated | {
+        "independent": "objects of training rooms put together at random (independent_rooms), as "
+        "many rooms as real training rooms; drawn as boxes, _meshes: with the real meshes",
+        "type_share": list(TYPE_CLASSES.get(names, ())),
+    }
+
+
 def as_markdown() -> str:
     """The lists of docs/evaluation.md, which a test compares with this."""
-    against = [metric for metric in METRICS if "test" not in metric.sets]
-    alone = [metric for metric in METRICS if "test" in metric.sets]
-    parts = (
-        ("### Against test rooms", against),
-        ("### Of a set by itself", alone),
-        ("### Of decoded training rooms", DECODED),
-    )
-    return "\n\n".join(f"{heading}\n\n{_table(metrics)}" for heading, metrics in parts) + "\n"
+    parts: dict[str, Sequence[Metric]] = {
+        "Against test rooms": [metric for metric in METRICS if "test" not in metric.sets],
+        "Of a set by itself": [metric for metric in METRICS if "test" in metric.sets],
+        "Of decoded training rooms": DECODED,
+    }
+    return "\n\n".join(f"### {title}\n\n{_table(some)}" for title, some in parts.items()) + "\n"
 
 
 def _table(metrics: Sequence[Metric]) -> str:

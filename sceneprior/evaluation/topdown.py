@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from sceneprior.classes import class_colors, label_set
-from sceneprior.errors import InputError
 from sceneprior.geometry.corners import box_corners
 from sceneprior.offscreen import Orthographic, Pinhole, Renderer
-from sceneprior.scene import Mesh, Scene
+from sceneprior.pictures import paint_ids
+from sceneprior.scene import Mesh, Scene, SceneObject
 
 BACKGROUND = (255, 255, 255)
 """White: no class colour comes near it, and a page prints it as paper."""
@@ -39,20 +39,14 @@ class TopDownProtocol:
         return {**asdict(self), "metres_per_pixel": self.metres_per_pixel}
 
 
-_WINDOWS_M = {"front3d_bedroom": 6.4, "front3d_living": 12.8, "scannet": 12.8}
-
-
 def topdown_protocol(label_set_name: str) -> TopDownProtocol:
-    """The protocol of a label set: 12.5 mm a pixel for bedrooms, 25 mm for the other sets.
+    """The protocol of a label set: 12.5 mm a pixel for bedrooms, 25 mm for all other sets.
 
     The windows hold the largest rooms that ATISS's filter lets through (6 x 6 m bedrooms,
-    12 x 12 m living rooms). The user's label sets have the larger one.
-
-    Raises:
-        InputError: no label set has this name.
+    12 x 12 m living rooms). A name of no label set is an InputError.
     """
     label_set(label_set_name)
-    return TopDownProtocol(window_m=_WINDOWS_M.get(label_set_name, 12.8))
+    return TopDownProtocol(window_m=6.4 if label_set_name == "front3d_bedroom" else 12.8)
 
 
 def box_mesh(center_m: Sequence[float], size_m: Sequence[float]) -> Mesh:
@@ -66,12 +60,14 @@ def box_mesh(center_m: Sequence[float], size_m: Sequence[float]) -> Mesh:
     return Mesh(box_corners(np.asarray(center_m), np.asarray(size_m)), faces)
 
 
+def object_mesh(item: SceneObject) -> Mesh:
+    """The object's mesh, or its box where it has none."""
+    return item.mesh if item.mesh is not None else box_mesh(item.center_m, item.size_m)
+
+
 def scene_meshes(scene: Scene) -> list[Mesh]:
-    """One mesh per object; an object without a mesh is drawn as its box."""
-    return [
-        item.mesh if item.mesh is not None else box_mesh(item.center_m, item.size_m)
-        for item in scene.objects
-    ]
+    """One mesh per object, see `object_mesh`."""
+    return [object_mesh(item) for item in scene.objects]
 
 
 def object_colors(scene: Scene) -> UInt8[np.ndarray, "objects 3"]:
@@ -91,7 +87,6 @@ def topdown(
     what is nearest to the ceiling wins.
 
     Args:
-        scene: The room; its floor is not drawn.
         protocol: None takes the one of the scene's label set.
         outlines: Darken the border between two objects: for people, never for scores.
 
@@ -99,41 +94,24 @@ def topdown(
         The paper, section 4.2: 512 x 512, orthographic, a colour per category.
     """
     protocol = protocol or topdown_protocol(scene.label_set)
-    ids = _instance_ids(scene, renderer, protocol)
-    palette = np.concatenate([[protocol.background], object_colors(scene)]).astype(np.uint8)
-    image = palette[ids]
+    ids = np.zeros(protocol.image_size, dtype=np.uint16)
+    if scene.objects:
+        height = protocol.camera_height_m
+        world_to_camera = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, height], [0, 0, 0, 1]])
+        camera = Orthographic(world_to_camera, protocol.metres_per_pixel)
+        ids = renderer.instance_ids(scene_meshes(scene), camera, protocol.image_size)
+    colors = object_colors(scene)
     if outlines:
-        border = np.zeros(ids.shape, dtype=bool)
-        border[:, 1:] |= ids[:, 1:] != ids[:, :-1]
-        border[1:] |= ids[1:] != ids[:-1]
-        image[border] = image[border] // 2
-    return image
-
-
-def _instance_ids(scene: Scene, renderer: Renderer, protocol: TopDownProtocol) -> np.ndarray:
-    if not scene.objects:
-        return np.zeros(protocol.image_size, dtype=np.uint16)
-    height = protocol.camera_height_m
-    world_to_camera = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, height], [0, 0, 0, 1]])
-    camera = Orthographic(world_to_camera, protocol.metres_per_pixel)
-    return renderer.instance_ids(scene_meshes(scene), camera, protocol.image_size)
+        return paint_ids(ids, colors, protocol.background)
+    return np.concatenate([[protocol.background], colors]).astype(np.uint8)[ids]
 
 
 def look_at(
     eye_m: Float[np.ndarray, "3"], target_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """`world_to_camera` of a camera at `eye_m` that looks at `target_m`, y up in the image.
-
-    Raises:
-        InputError: the camera would look straight up or down, or the points coincide.
-    """
+    """`world_to_camera` of a camera at `eye_m` that looks aslant at `target_m`, y up."""
     forward = target_m - eye_m
     right = np.cross(forward, [0.0, 1.0, 0.0])
-    if np.linalg.norm(right) < 1e-9:
-        raise InputError(
-            f"A camera at {eye_m.tolist()} cannot look at {target_m.tolist()} with y up; "
-            "move one of the points sideways."
-        )
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     matrix = np.eye(4)
@@ -155,10 +133,6 @@ def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480
 
     The camera stands two diagonals away. The floor is the rectangle around the known outlines,
     or, where they are not known, around the objects.
-
-    Args:
-        scenes: At least one room.
-        image_size: (height, width) in pixels.
     """
     floors = np.array([_floor_rectangle(scene) for scene in scenes])
     low, high = floors[:, 0].min(axis=0), floors[:, 1].max(axis=0)
@@ -174,13 +148,11 @@ def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480
     across, down = x / z, y / z
     height, width = image_size
     focal = 0.96 * min(width / np.ptp(across), height / np.ptp(down))  # 4% of air around it
-    intrinsics = np.array(
-        [
-            [focal, 0, width / 2 - focal * (across.min() + across.max()) / 2],
-            [0, focal, height / 2 - focal * (down.min() + down.max()) / 2],
-            [0, 0, 1],
-        ]
+    x_px, y_px = (
+        side / 2 - focal * (seen.min() + seen.max()) / 2
+        for side, seen in ((width, across), (height, down))
     )
+    intrinsics = np.array([[focal, 0, x_px], [0, focal, y_px], [0, 0, 1]])
     return CornerView(Pinhole(world_to_camera, intrinsics), image_size, floor)
 
 
@@ -194,7 +166,7 @@ def perspective(
     """A shaded picture from above a corner, outside the room: for pages, not for scores.
 
     Args:
-        image_size: (height, width) in pixels, where no view is given.
+        image_size: (height, width), where no view is given.
         view: None takes the room's own; one view for several rooms lets them be compared.
         colors: Of the objects; None takes those of their classes.
     """

@@ -12,13 +12,13 @@ from sceneprior.evaluation.metrics.mesh_metrics import (
     F_THRESHOLD_M,
     POINTS,
     f_score,
+    oriented_box,
     oriented_box_iou_3d,
-    oriented_boxes,
     sample_surface,
 )
-from sceneprior.evaluation.topdown import box_mesh
+from sceneprior.evaluation.topdown import object_mesh
 from sceneprior.geometry.surfaces import chamfer_sum
-from sceneprior.scene import Mesh, SceneObject
+from sceneprior.scene import SceneObject
 
 
 @dataclass(frozen=True)
@@ -44,24 +44,25 @@ class PairScore:
 
 
 def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairScore:
-    """Compare two objects where they stand; an object without a mesh is its box.
+    """Compare two objects where they stand (`object_mesh`).
 
     `points` are drawn from each surface, uniformly by area, different ones by the same seed.
     """
     truth, found = pair.truth, pair.found
     if found is None:
         return PairScore(truth.label, 0.0, 0.0, None, None, 0.0, False)
-    surfaces = [_mesh(truth), _mesh(found)]
+    surfaces = [object_mesh(truth), object_mesh(found)]
     a, b = (sample_surface(mesh, points, 2 * seed + i) for i, mesh in enumerate(surfaces))
     distance = chamfer_sum(a, b)
-    boxes = [
-        np.array([[item.center_m], [item.size_m]], dtype=np.float64) for item in (truth, found)
-    ]
-    turned = [oriented_boxes([mesh]) for mesh in surfaces]
+    boxes = (
+        np.array([part], dtype=np.float64)
+        for item in (truth, found)
+        for part in (item.center_m, item.size_m)
+    )
     return PairScore(
         label=truth.label,
-        box_iou_3d=float(box_iou_3d(*boxes[0], *boxes[1])[0, 0]),
-        oriented_box_iou_3d=float(oriented_box_iou_3d(turned[0], turned[1])[0, 0]),
+        box_iou_3d=float(box_iou_3d(*boxes)[0, 0]),
+        oriented_box_iou_3d=oriented_box_iou_3d(*map(oriented_box, surfaces)),
         chamfer_l2_m=distance.l2_m,
         chamfer_squared_m2=distance.squared_m2,
         f_score=f_score(a, b, F_THRESHOLD_M),
@@ -69,23 +70,13 @@ def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairSco
     )
 
 
-def _mesh(item: SceneObject) -> Mesh:
-    return item.mesh if item.mesh is not None else box_mesh(item.center_m, item.size_m)
-
-
 def score_views(
     views: Sequence[Sequence[ObjectPair]], points: int = POINTS, seed: int = 0
 ) -> dict[str, Any]:
     """Scores of single-view reconstructions, every true object with the same weight.
 
-    Args:
-        views: The objects of each image.
-
-    Returns:
-        `summary` of all objects, and `classes`: the same of each true class.
-
-    Raises:
-        InputError: there is no object.
+    `summary` is of all objects of all images, `classes` the same of each true class. No object at
+    all is an InputError.
     """
     scores = [
         score_pair(pair, points, seed + row)
@@ -111,11 +102,7 @@ def summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
     return {
         "objects": len(scores),
         "unmatched": sum(score.chamfer_l2_m is None for score in scores),
-        "box_iou_3d": mean("box_iou_3d"),
-        "oriented_box_iou_3d": mean("oriented_box_iou_3d"),
-        "chamfer_l2_m": mean("chamfer_l2_m"),
-        "chamfer_squared_m2": mean("chamfer_squared_m2"),
-        "f_score": mean("f_score"),
+        **{name: mean(name) for name in PROTOCOL if name != "objects"},
         "class_accuracy": mean("class_right"),
     }
 

@@ -99,7 +99,7 @@ class SampleEvaluator:
             plain = [row for row, name in enumerate(trained.room_ids) if "@" not in name]
             remembered = trained.prior.latent_space(trained.logits[plain[: settings.count]])
             decoded = _decode(trained, remembered, with_shape=False)
-            scores["overlaps_decoded"] = overlap_pairs(decoded).per_room
+            scores["overlaps_decoded"] = overlap_pairs(decoded)
             scores["mask_iou"] = mask_iou_of_rooms(trained, self._views)
         pictured = _decode(trained, z[:PICTURED], with_shape=trained.stage != "layout")
         return EvaluationResult(scores, tile(pictured), self._compared[0])
@@ -112,7 +112,7 @@ class SampleEvaluator:
             "objects": float(counts.mean()),
             "objects_off": float(abs(counts.mean() / mean_objects - 1)),
             "empty_share": float((counts == 0).mean()),
-            "overlaps": overlap_pairs(generated).per_room,
+            "overlaps": overlap_pairs(generated),
         }
         share = type_share(generated)
         return scores if share is None else scores | {"type_share": share}

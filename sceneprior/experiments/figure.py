@@ -6,8 +6,7 @@ from pathlib import Path
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from sceneprior.config import load_any_run
-from sceneprior.evaluation.ground_truth import reference_scenes
-from sceneprior.evaluation.independent import independent_rooms
+from sceneprior.evaluation.ground_truth import independent_rooms, reference_scenes
 from sceneprior.evaluation.synthesis import without_void
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.experiments.comparison import Comparison, Run

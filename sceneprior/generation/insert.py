@@ -33,8 +33,7 @@ def insert(room: Scene, given: Scene, **extra: Any) -> Scene:
     """
     given = replace(given, label_set=room.label_set)
     partners = _partners(room, given)
-    shared = shared_of_smaller(room.centers_m, room.sizes_m, given.centers_m, given.sizes_m)
-    clashing = set(np.flatnonzero((shared > BADLY).any(axis=1)).tolist())
+    clashing = set(np.flatnonzero((shared_of_smaller(room, given) > BADLY).any(axis=1)).tolist())
     clashing -= set(partners.values())
     placed = [
         _with_mesh(item, room.objects[partners[row]]) if row in partners else item

@@ -1,4 +1,4 @@
-"""Ground truth of the shards as scenes."""
+"""Ground truth of the shards as scenes; independent rooms keep every marginal, lose the rest."""
 
 import shutil
 from dataclasses import replace
@@ -6,10 +6,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprior.errors import ShardError
-from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.errors import InputError, ShardError
+from sceneprior.evaluation.ground_truth import independent_rooms, reference_scenes
+from sceneprior.evaluation.metrics.contents import class_frequencies, object_counts
 from sceneprior.evaluation.topdown import topdown
+from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.shards import write_shard
+
+MESH = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+
+
+def bedroom(name: str, others: int) -> Scene:
+    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (2.0, 0.6, 2.0), MESH)
+    stand = SceneObject("nightstand", (1.3, 0.2, float(others)), (0.4, 0.4, 0.4))
+    return Scene(name, "front3d_bedroom", (bed,) + (stand,) * others)
+
+
+REAL = [bedroom("a", 1), bedroom("b", 3)]
 
 
 def test_a_room_holds_its_named_objects_seen_or_not_and_no_void(shards):
@@ -62,3 +75,30 @@ def test_shards_without_ground_truth_say_so(tmp_path, toy_room):
     write_shard(tmp_path / "test" / "a.h5", "front3d_bedroom", [(views, None)])
     with pytest.raises(ShardError, match="carries no 3D ground truth"):
         reference_scenes(tmp_path, "test")
+
+
+def test_marginals_stay_and_bonds_go():
+    rooms = independent_rooms(REAL, 4000, 0)
+    assert set(object_counts(rooms)) == {2, 4}
+    assert object_counts(rooms).mean() == pytest.approx(3, abs=0.05)
+    assert class_frequencies(rooms) == pytest.approx(class_frequencies(REAL), abs=0.01)
+    # Every real room has one bed; of two draws at a third each, 4 in 9 rooms have none.
+    pairs = [room for room in rooms if len(room.objects) == 2]
+    without = np.mean([all(o.label != "double_bed" for o in room.objects) for room in pairs])
+    assert without == pytest.approx(4 / 9, abs=0.04)
+
+
+def test_objects_are_real_ones_with_meshes_where_asked():
+    pool = {id(item) for scene in REAL for item in scene.objects}
+    kept = independent_rooms(REAL, 20, 1, with_meshes=True)
+    assert all(id(item) in pool for room in kept for item in room.objects)
+    plain = independent_rooms(REAL, 20, 1)
+    assert [r.without_meshes() for r in kept] == plain == independent_rooms(REAL, 20, 1)
+    assert plain != independent_rooms(REAL, 20, 2)
+
+
+def test_empty_rooms_take_part_but_are_not_all():
+    rooms = independent_rooms([*REAL, Scene("empty", "front3d_bedroom")], 60, 0)
+    assert set(object_counts(rooms)) == {0, 2, 4}
+    with pytest.raises(InputError, match="none of the 1 rooms given"):
+        independent_rooms([Scene("empty", "front3d_bedroom")], 5, 0)

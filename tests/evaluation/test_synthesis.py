@@ -12,12 +12,11 @@ from rich.console import Console
 
 from sceneprior.errors import InputError, ShardError
 from sceneprior.evaluation import synthesis
-from sceneprior.evaluation.ground_truth import reference_scenes
-from sceneprior.evaluation.independent import independent_rooms
+from sceneprior.evaluation.features import Drawing
+from sceneprior.evaluation.ground_truth import independent_rooms, reference_scenes
 from sceneprior.evaluation.metrics import classifier
 from sceneprior.evaluation.metrics.contents import category_kl
 from sceneprior.evaluation.metrics.frechet import frechet_distance, gap_closed
-from sceneprior.evaluation.protocol import drawing_of
 from sceneprior.evaluation.registry import METRICS
 from sceneprior.evaluation.score_table import print_scores, score_rows
 from sceneprior.evaluation.synthesis import (
@@ -146,9 +145,9 @@ def test_as_boxes_only_layouts_count(generated, shards, renderer):
         assert scores[0][key] == scores[1][key]
         assert scores[0]["intervals"]["generated"][key] == scores[1]["intervals"]["generated"][key]
     # By its definition, from pictures of boxes.
-    view = drawing_of(generated[0].label_set, renderer, None, None)
+    view = Drawing(generated[0].label_set, renderer)
     real = reference_scenes(shards, "test", meshes=False)
-    a, b = (view.features(scenes, lambda _: None).effnet_lite0 for scenes in (bare, real))
+    a, b = (view.features(scenes)["effnet_lite0"] for scenes in (bare, real))
     assert scores[0]["fd_effnet_lite0_boxes"] == frechet_distance(a, b)
     # Real rooms hold three pieces like the test rooms', generated ones two.
     assert scores[0]["train_rooms"]["fd_effnet_lite0_boxes"] < scores[0]["fd_effnet_lite0_boxes"]
@@ -175,9 +174,9 @@ def test_fid_appears_with_the_users_inception_file(generated, shards, renderer, 
         generated, shards, EvalOptions(inception=path, renderer=renderer, resamples=20)
     )
     # By its definition: the stand-in's features are mean colours.
-    view = drawing_of(generated[0].label_set, renderer, path, None)
+    view = Drawing(generated[0].label_set, renderer, path)
     real = [scene for scene in reference_scenes(shards, "test")]
-    a, b = (view.features(scenes, lambda _: None).inception for scenes in (generated, real))
+    a, b = (view.features(scenes)["inception"] for scenes in (generated, real))
     assert scores["fid"] == frechet_distance(a, b) > scores["train_rooms"]["fid"]
     assert scores["intervals"]["generated"]["fid"][0] <= scores["fid"]
     for key in ("kid", "precision_inception", "recall_inception"):

@@ -41,8 +41,8 @@ def test_samples_score_what_eval_would_score(trained, toy_shards):
     assert result.scores["category_kl"] == pytest.approx(category_kl(generated, tracked))
     assert result.scores["objects"] == counts
     assert result.scores["objects_off"] == pytest.approx(abs(counts - wanted) / wanted)
-    assert result.scores["overlaps"] == overlap_pairs(generated).per_room
-    decoded = overlap_pairs(decode_training_rooms(trained)).per_room
+    assert result.scores["overlaps"] == overlap_pairs(generated)
+    decoded = overlap_pairs(decode_training_rooms(trained))
     assert result.scores["overlaps_decoded"] == decoded
     assert 0 < result.scores["mask_iou"] < 1
     assert result.picture.shape == (3 * TILE_PX, 4 * TILE_PX, 3)

@@ -9,6 +9,10 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
+from sklearn.linear_model import LogisticRegression
+from sklearn.model_selection import StratifiedKFold
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from sceneprior.evaluation.alexnet import classify_pictures
 from sceneprior.evaluation.bootstrap import Estimate, ratio
@@ -45,11 +49,23 @@ class CrossValidated:
         return Estimate((generated.value + real.value) / 2, resamples, 0.0, 1.0)
 
 
+def linear(
+    features: Float[np.ndarray, "rooms dimensions"],
+    labels: Int[np.ndarray, " rooms"],
+    others: Float[np.ndarray, "others dimensions"],
+    seed: int,
+) -> Int[np.ndarray, " others"]:
+    """Logistic regression on standardized features; `seed` changes nothing."""
+    model = make_pipeline(StandardScaler(), LogisticRegression(C=INVERSE_PENALTY, max_iter=300))
+    model.fit(features.astype(np.float64), labels)
+    return np.asarray(model.predict(others.astype(np.float64)), dtype=int)
+
+
 def cross_validated_predictions(
     generated: Shaped[np.ndarray, "n ..."],
     real: Shaped[np.ndarray, "m ..."],
     seed: int,
-    classify: Classify | None = None,
+    classify: Classify = linear,
     repeats: int = REPEATS,
 ) -> CrossValidated:
     """Classify rooms by classifiers trained on the other folds.
@@ -61,12 +77,7 @@ def cross_validated_predictions(
         generated: What is known of each generated room, features or small pictures; at least two
             rows, as in `real`.
         seed: Of the choice of rooms and of the folds.
-        classify: None takes `linear`.
-        repeats: How often rooms and folds are drawn.
     """
-    from sklearn.model_selection import StratifiedKFold
-
-    classify = classify or linear
     n, smaller = len(generated), min(len(generated), len(real))
     inputs = np.concatenate([generated, real])
     right, asked = np.zeros(len(inputs), dtype=int), np.zeros(len(inputs), dtype=int)
@@ -87,36 +98,25 @@ def cross_validated_predictions(
     return CrossValidated(right[:n], asked[:n], right[n:], asked[n:])
 
 
-def linear(
-    features: Float[np.ndarray, "rooms dimensions"],
-    labels: Int[np.ndarray, " rooms"],
-    others: Float[np.ndarray, "others dimensions"],
-    seed: int,
-) -> Int[np.ndarray, " others"]:
-    """Logistic regression on standardized features; `seed` changes nothing."""
-    from sklearn.linear_model import LogisticRegression
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-
-    model = make_pipeline(StandardScaler(), LogisticRegression(C=INVERSE_PENALTY, max_iter=300))
-    model.fit(features.astype(np.float64), labels)
-    return np.asarray(model.predict(others.astype(np.float64)), dtype=int)
+def _accuracy(
+    kind: str, rooms: RoomSet, comparison: Comparison, classify: Classify, repeats: int
+) -> Estimate:
+    test = comparison.test
+    told = cross_validated_predictions(
+        rooms.features(kind), test.features(kind), comparison.seed, classify, repeats
+    )
+    return told.accuracy(rooms.counts, test.counts)
 
 
 def _linear(rooms: RoomSet, comparison: Comparison) -> Estimate:
-    test = comparison.test
-    a, b = (group.features("effnet_lite0", False) for group in (rooms, test))
-    return cross_validated_predictions(a, b, comparison.seed).accuracy(rooms.counts, test.counts)
+    return _accuracy("effnet_lite0", rooms, comparison, linear, REPEATS)
 
 
 def _alexnet(rooms: RoomSet, comparison: Comparison) -> Estimate:
-    test = comparison.test
-    a, b = (group.features("small", False) for group in (rooms, test))
     assert comparison.alexnet is not None  # the metric applies only where it is given
     classify = partial(classify_pictures, comparison.alexnet)
     # Folds are drawn once: ten epochs of AlexNet, five times, are minutes.
-    answers = cross_validated_predictions(a, b, comparison.seed, classify, repeats=1)
-    return answers.accuracy(rooms.counts, test.counts)
+    return _accuracy("small", rooms, comparison, classify, repeats=1)
 
 
 METRICS = (

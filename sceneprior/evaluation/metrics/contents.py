@@ -47,8 +47,7 @@ def common_label_set(*groups: Sequence[Scene]) -> str:
 def class_counts(scenes: Sequence[Scene]) -> Int[np.ndarray, "scenes classes"]:
     """Objects of each class in each scene, void left out (column 0 is 0).
 
-    Raises:
-        InputError: no scenes, or scenes of different label sets.
+    Raises InputError like `common_label_set`.
     """
     classes = len(label_set(common_label_set(scenes)))
     table = np.stack([np.bincount(scene.class_indices, minlength=classes) for scene in scenes])
@@ -57,11 +56,7 @@ def class_counts(scenes: Sequence[Scene]) -> Int[np.ndarray, "scenes classes"]:
 
 
 def class_frequencies(scenes: Sequence[Scene]) -> Float[np.ndarray, "classes"]:
-    """Share of each class among all objects of all scenes, void left out; 0 without objects.
-
-    Raises:
-        InputError: as `class_counts`.
-    """
+    """Share of each class among all objects of all scenes, void left out; 0 without objects."""
     return np.asarray(_shares(class_counts(scenes).sum(0)))
 
 
@@ -76,12 +71,7 @@ def category_kl(generated: Sequence[Scene], test: Sequence[Scene]) -> float:
 
     p are the test rooms' frequencies, q the generated rooms', both without void.
 
-    Raises:
-        InputError: either list is empty, or their label sets differ.
-
-    Source:
-        Paschalidou et al., "ATISS", NeurIPS 2021, whose epsilon this is. Test rooms, not
-        training rooms: the training split flatters.
+    Test rooms, not training rooms: the training split flatters. Raises like `common_label_set`.
     """
     common_label_set(generated, test)
     return frequency_kl(class_frequencies(test), class_frequencies(generated))

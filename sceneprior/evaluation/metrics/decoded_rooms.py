@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from sceneprior.evaluation.metric import Metric, TableColumn
@@ -43,14 +43,13 @@ def box_iou_3d(
 class SceneMatch:
     """Which decoded object stands for which true one, decided by boxes alone."""
 
-    decoded: np.ndarray
-    """(pairs,) rows of the decoded scene."""
-    truth: np.ndarray
-    """(pairs,) rows of the true scene."""
-    iou: np.ndarray
-    """(pairs,) 3D IoU of each pair."""
-    correct: np.ndarray
-    """(pairs,) bool, the classes agree."""
+    decoded: Int[np.ndarray, " pairs"]
+    """Rows of the decoded scene."""
+    truth: Int[np.ndarray, " pairs"]
+    """Rows of the true scene."""
+    iou: Float[np.ndarray, " pairs"]
+    correct: Bool[np.ndarray, " pairs"]
+    """Whether the classes agree."""
     decoded_count: int
     truth_count: int
     """Objects of the scenes, matched or not."""
@@ -65,13 +64,16 @@ class SceneMatch:
 
 
 def _class_accuracy(matches: Sequence[SceneMatch]) -> float | None:
-    objects = sum(match.truth_count for match in matches)
-    return sum(int(match.correct.sum()) for match in matches) / objects if objects else None
+    return _over_objects([float(match.correct.sum()) for match in matches], matches)
 
 
 def _mean_iou(matches: Sequence[SceneMatch]) -> float | None:
+    return _over_objects([float(match.iou.sum()) for match in matches], matches)
+
+
+def _over_objects(of_rooms: Sequence[float], matches: Sequence[SceneMatch]) -> float | None:
     objects = sum(match.truth_count for match in matches)
-    return sum(float(match.iou.sum()) for match in matches) / objects if objects else None
+    return sum(of_rooms) / objects if objects else None
 
 
 def _count_accuracy(matches: Sequence[SceneMatch]) -> float | None:
@@ -104,13 +106,9 @@ def match_scenes(decoded: Scene, truth: Scene) -> SceneMatch:
 
 
 def reconstruction_scores(pairs: Sequence[tuple[Scene, Scene]]) -> dict[str, float | int | None]:
-    """Score decoded rooms against their true ones, every true object with the same weight.
+    """Scores of (decoded, true) rooms by key of `METRICS`, every true object of the same weight.
 
-    Args:
-        pairs: (decoded, truth) of each room.
-
-    Returns:
-        By key of `METRICS` (None where no room holds an object), and numbers of rooms and objects.
+    None where no room holds an object. With the numbers of rooms and objects.
     """
     matches = [match_scenes(decoded, truth) for decoded, truth in pairs]
     objects = sum(match.truth_count for match in matches)

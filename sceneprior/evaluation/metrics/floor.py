@@ -25,18 +25,13 @@ ARC_SEGMENTS = 8
 
 def footprints(scene: Scene, below_m: float = np.inf) -> np.ndarray:
     """The boxes of named furniture whose lower face is lower than `below_m`, as polygons."""
-    centers, halves = scene.centers_m, scene.sizes_m / 2
-    kept = (scene.class_indices != VOID) & (centers[:, 1] - halves[:, 1] < below_m)
-    low, high = (centers - halves)[kept], (centers + halves)[kept]
-    return np.asarray(shapely.box(low[:, 0], low[:, 2], high[:, 0], high[:, 2]))
+    low, high = scene.centers_m - scene.sizes_m / 2, scene.centers_m + scene.sizes_m / 2
+    kept = (scene.class_indices != VOID) & (low[:, 1] < below_m)
+    return np.asarray(shapely.box(*low[kept][:, [0, 2]].T, *high[kept][:, [0, 2]].T))
 
 
 def floor_polygon(scene: Scene) -> shapely.Geometry | None:
-    """The floor inside the scene's outline; None where it has none.
-
-    Raises:
-        InputError: the outline has no area.
-    """
+    """The floor inside the scene's outline, None where it has none; no area is an InputError."""
     if scene.floor_m is None:
         return None
     outline = np.asarray(scene.floor_m, dtype=np.float64)
@@ -84,9 +79,6 @@ def walkable_share(scene: Scene, within: str = "furniture") -> float | None:
     Returns:
         In [0, 1]; None for a room without a floor (`floor`), or with fewer than two pieces, which
         leave no room in a rectangle around themselves (`furniture`).
-
-    Source:
-        The measure of Yang et al., "PhyScene", CVPR 2024, in exact areas.
     """
     if within == "floor":
         walls = floor_polygon(scene)

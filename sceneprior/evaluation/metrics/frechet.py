@@ -1,6 +1,6 @@
 """Frechet distance of two sets of pictures in a network's features, and the gap it has closed."""
 
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -38,8 +38,8 @@ def frechet_distance(
     answers with rounding noise or complex numbers. It costs an SVD of min(n, d) x min(m, d).
 
     Args:
-        a: One feature vector per image; the sizes of the sets may differ.
-        counts_a: How often each row of `a` is in its set (see bootstrap.py); None: once.
+        a, b: One feature vector per image; the sizes of the sets may differ.
+        counts_a, counts_b: How often each row is in its set (see bootstrap.py); None: once.
 
     Returns:
         The squared distance (what "FID" reports), never below 0. It falls with n even for one
@@ -66,11 +66,7 @@ def frechet_distance(
 
 
 def check_features(*sets: np.ndarray) -> None:
-    """Refuse sets of features, (rows, dimensions) each, that have no distance.
-
-    Raises:
-        InputError: a set holds fewer than two rows, or numbers that are not finite.
-    """
+    """Raise InputError where a set of features, (rows, dimensions), has no distance."""
     for features in sets:
         if len(features) < 2:
             raise InputError(
@@ -117,35 +113,25 @@ def gap_closed(ours: float, independent: float, real: float) -> float:
     return (independent - ours) / (independent - real)
 
 
-def _distance(network: str, boxes: bool) -> Callable[[RoomSet, Comparison], Estimate]:
-    def estimate(rooms: RoomSet, comparison: Comparison) -> Estimate:
-        test = comparison.test
-        a, b = (group.features(network, boxes) for group in (rooms, test))
-        resamples = [
-            frechet_distance(a, b, *pair) for pair in zip(rooms.counts, test.counts, strict=True)
-        ]
-        return Estimate(frechet_distance(a, b), np.array(resamples), 0.0)
-
-    return estimate
+def _distance(network: str, boxes: bool, rooms: RoomSet, comparison: Comparison) -> Estimate:
+    a, b = rooms.features(network, boxes), comparison.test.features(network, boxes)
+    counts = zip(rooms.counts, comparison.test.counts, strict=True)
+    resamples = np.array([frechet_distance(a, b, *pair) for pair in counts])
+    return Estimate(frechet_distance(a, b), resamples, 0.0)
 
 
-def _gap(network: str, boxes: bool, furthest: str) -> Callable[[RoomSet, Comparison], Estimate]:
-    key = FRECHET[network] + ("_boxes" if boxes else "")
-
-    def estimate(rooms: RoomSet, comparison: Comparison) -> Estimate:
-        ours = _distance(network, boxes)(comparison.fair, comparison)
-        known = comparison.columns
-        distances = (ours, known[furthest][key], known["train_rooms"][key])
-        value = gap_closed(*(distance.value or 0.0 for distance in distances))
-        # A resample repeats rooms, which moves all distances up: each back to its own mean.
-        moved = [
-            (d.value or 0.0) + d.resamples - d.resamples.mean()
-            for d in distances
-            if len(d.resamples)
-        ]
-        return Estimate(value, np.array([gap_closed(*three) for three in zip(*moved, strict=True)]))
-
-    return estimate
+def _gap(
+    network: str, boxes: bool, furthest: str, rooms: RoomSet, comparison: Comparison
+) -> Estimate:
+    key, known = FRECHET[network] + ("_boxes" if boxes else ""), comparison.columns
+    ours = _distance(network, boxes, comparison.fair, comparison)
+    distances = (ours, known[furthest][key], known["train_rooms"][key])
+    value = gap_closed(*(distance.value or 0.0 for distance in distances))
+    # A resample repeats rooms, which moves all distances up: each back to its own mean.
+    moved = [
+        (d.value or 0.0) + d.resamples - d.resamples.mean() for d in distances if len(d.resamples)
+    ]
+    return Estimate(value, np.array([gap_closed(*three) for three in zip(*moved, strict=True)]))
 
 
 def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[Metric]:
@@ -159,7 +145,7 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
         Metric(
             key, title, "", "closer",
             f"Frechet distance in {where} features (below), in squared feature units.",
-            _distance(network, boxes=False), PICTURED, network=network,
+            partial(_distance, network, False), PICTURED, network=network,
             source="Heusel et al., NeurIPS 2017",
             column=TableColumn(
                 "FD", 1, "FD: Frechet distance of EfficientNet-Lite0 features, which is not FID"
@@ -171,7 +157,7 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
             "gone: `(D_independent - D_generated) / (D_independent - D_real)`, D the Frechet "
             f"distance `{key}` to the test rooms, {equal}; where `D_independent <= D_real` it is "
             "1 if `D_generated <= D_real`, else 0.",
-            _gap(network, False, "independent"), GENERATED, network=network,
+            partial(_gap, network, False, "independent"), GENERATED, network=network,
             protocol={
                 "gap_closed": "(independent - generated) / (independent - real training), Frechet "
                 "distances to the test rooms, n_gap rooms each; 1 or 0 where independent <= real",
@@ -181,7 +167,7 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
             f"{gap}_meshes", f"Gap closed, from independent furniture, {short}", ends, "higher",
             f"`{gap}` against `independent_meshes`: harder, because each piece's outline is real "
             "there, while a prior has to learn outlines, too.",
-            _gap(network, False, "independent_meshes"), GENERATED, network=network,
+            partial(_gap, network, False, "independent_meshes"), GENERATED, network=network,
             column=TableColumn(
                 "gap closed", 2,
                 "gap closed: share of the way from independent objects with meshes to real "
@@ -192,7 +178,7 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
             f"{key}_boxes", boxes_title, "", "closer",
             f"`{key}` with all rooms drawn as boxes (`--boxes`), the test rooms too: what layouts "
             "alone say, for methods that decode meshes beside methods that have none.",
-            _distance(network, boxes=True), AGAINST_TEST, network=network, boxes=True,
+            partial(_distance, network, True), AGAINST_TEST, network=network, boxes=True,
             protocol={
                 "_boxes": "the same metric, all rooms drawn as boxes, real ones too (--boxes)"
             },
@@ -205,7 +191,7 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
             f"{gap}_boxes", f"Gap closed, all rooms as boxes, {short}",
             "0: independent, 1: as near as real", "higher",
             f"`{gap}` with all rooms drawn as boxes (`--boxes`).",
-            _gap(network, True, "independent"), GENERATED, network=network, boxes=True,
+            partial(_gap, network, True, "independent"), GENERATED, network=network, boxes=True,
             column=TableColumn("gap closed, boxes", 2) if lite else None,
         ),
     ]  # fmt: skip

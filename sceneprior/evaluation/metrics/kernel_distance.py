@@ -1,7 +1,7 @@
 """Kernel distance (KID in Inception features): maximum mean discrepancy of two sets of pictures."""
 
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,8 +11,7 @@ from sceneprior.evaluation.metric import PICTURED, Comparison, Metric, RoomSet
 from sceneprior.evaluation.metrics.frechet import check_features
 
 
-@dataclass(frozen=True)
-class Kernels:
+class Kernels(NamedTuple):
     """Kernel values within and between two sets, made once for any number of resamples."""
 
     aa: np.ndarray
@@ -42,11 +41,7 @@ def kernel_distance(
     KID is often stated as the mean over random subsets; the mean over ALL subsets, of any size,
     is the estimate on the whole sets, which is computed here: it needs no seed.
 
-    Args:
-        counts_a: How often each row is in its set, a line per resample; None: once, one line.
-
-    Source:
-        Binkowski et al., "Demystifying MMD GANs", ICLR 2018.
+    `counts_*` say how often each row is in its set, a line per resample; None: once, one line.
     """
     counts_a = np.ones((1, len(of.aa)), int) if counts_a is None else counts_a
     counts_b = np.ones((1, len(of.bb)), int) if counts_b is None else counts_b
@@ -59,7 +54,7 @@ def kernel_distance(
 
 def _estimate(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
     test = comparison.test
-    pairs = kernels(rooms.features(network, False), test.features(network, False))
+    pairs = kernels(rooms.features(network), test.features(network))
     resamples = kernel_distance(pairs, rooms.counts, test.counts)
     return Estimate(float(kernel_distance(pairs)[0]), resamples)
 

@@ -8,13 +8,7 @@ from jaxtyping import Float
 
 from sceneprior.classes import VOID
 from sceneprior.evaluation.bootstrap import Estimate, ratio
-from sceneprior.evaluation.metric import (
-    Comparison,
-    Metric,
-    RoomSet,
-    TableColumn,
-    mean_over_rooms,
-)
+from sceneprior.evaluation.metric import Comparison, Metric, RoomSet, TableColumn, mean_over_rooms
 from sceneprior.scene import Scene
 
 OVERLAP_SHARE = 0.01
@@ -34,18 +28,13 @@ def intersection_volumes(
     return np.asarray(np.clip(high - low, 0, None).prod(2))
 
 
-def shared_of_smaller(
-    centers_a: Float[np.ndarray, "n 3"],
-    sizes_a: Float[np.ndarray, "n 3"],
-    centers_b: Float[np.ndarray, "m 3"],
-    sizes_b: Float[np.ndarray, "m 3"],
-) -> Float[np.ndarray, "n m"]:
-    """The part of the smaller box's volume that each box a shares with each box b, in [0, 1].
+def shared_of_smaller(a: Scene, b: Scene) -> Float[np.ndarray, "n m"]:
+    """The part of the smaller box's volume that each box of a shares with each of b, in [0, 1].
 
     0 where a box has no volume.
     """
-    shared = intersection_volumes(centers_a, sizes_a, centers_b, sizes_b)
-    smaller = np.minimum(sizes_a.prod(1)[:, None], sizes_b.prod(1)[None])
+    shared = intersection_volumes(a.centers_m, a.sizes_m, b.centers_m, b.sizes_m)
+    smaller = np.minimum(a.sizes_m.prod(1)[:, None], b.sizes_m.prod(1)[None])
     return np.divide(shared, smaller, out=np.zeros_like(shared), where=smaller > 0)
 
 
@@ -76,24 +65,13 @@ def room_overlaps(scene: Scene) -> RoomOverlaps:
     return RoomOverlaps(hits, len(first), float(shared.sum()))
 
 
-class Overlaps(NamedTuple):
-    """How often furniture stands in furniture."""
-
-    per_room: float
-    """Mean number of intersecting pairs in a room."""
-    share: float
-    """Intersecting pairs among all pairs of objects of the same room; 0 where there are none."""
-
-
-def overlap_pairs(scenes: Sequence[Scene]) -> Overlaps:
-    """Count pairs of objects whose boxes intersect, see `room_overlaps`.
+def overlap_pairs(scenes: Sequence[Scene]) -> float:
+    """Mean number of intersecting pairs in a room, see `room_overlaps`.
 
     A box is larger than the piece in it (a chair pushed under a table, a piece at an angle), so
     real rooms score above 0 too: read the number beside theirs.
     """
-    rooms = [room_overlaps(scene) for scene in scenes]
-    hits, pairs = sum(room.hits for room in rooms), sum(room.pairs for room in rooms)
-    return Overlaps(per_room=hits / max(len(scenes), 1), share=hits / max(pairs, 1))
+    return sum(room_overlaps(scene).hits for scene in scenes) / max(len(scenes), 1)
 
 
 def _pair_share(rooms: RoomSet, comparison: Comparison) -> Estimate:

@@ -26,9 +26,6 @@ def in_manifold(
     `neighbour`-th nearest other row of the same set. The border belongs to it, so equal pictures,
     whose balls have no radius, lie in each other's. The mean over generated rows, with real
     `others`, is precision; over real rows, with generated `others`, recall.
-
-    Source:
-        Kynkaanniemi et al., "Improved Precision and Recall Metric", NeurIPS 2019.
     """
     check_features(features, others)
     features, others = features.astype(np.float64), others.astype(np.float64)
@@ -39,13 +36,13 @@ def in_manifold(
 
 
 def _precision(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
-    inside = in_manifold(rooms.features(network, False), comparison.test.features(network, False))
+    inside = in_manifold(rooms.features(network), comparison.test.features(network))
     return mean_of_rooms(inside, rooms.counts, 1.0)
 
 
 def _recall(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
     test = comparison.test
-    covered = in_manifold(test.features(network, False), rooms.features(network, False))
+    covered = in_manifold(test.features(network), rooms.features(network))
     return mean_of_rooms(covered, test.counts, 1.0)
 
 
@@ -72,10 +69,9 @@ def _metrics_of(network: str, title: str, column: TableColumn | None) -> tuple[M
 METRICS = (
     *_metrics_of("inception", "Inception", None),
     *_metrics_of(
-        "effnet_lite0",
-        "EfficientNet-Lite0",
+        "effnet_lite0", "EfficientNet-Lite0",
         TableColumn(
             "recall", 2, "recall: share of test rooms that lie among the pictures of the row"
         ),
     ),
-)
+)  # fmt: skip

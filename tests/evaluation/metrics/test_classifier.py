@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.alexnet import _network, check_alexnet, classify_pictures
+from sceneprior.evaluation.alexnet import _network, _weights, check_alexnet, classify_pictures
 from sceneprior.evaluation.bootstrap import resample_counts
 from sceneprior.evaluation.metrics.classifier import (
     FOLDS,
@@ -94,7 +94,7 @@ def weights(tmp_path_factory):
 
 
 def test_alexnets_layers_give_torchvisions_sizes(weights):
-    network = _network(torch.load(weights, weights_only=True))
+    network = _network(_weights(weights))
     image = torch.zeros(1, 3, 224, 224)
     sizes = []
     for layer in network:

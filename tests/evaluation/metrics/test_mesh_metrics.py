@@ -1,5 +1,7 @@
 """Surfaces and turned boxes against closed forms, trimesh and brute force."""
 
+import itertools
+
 import numpy as np
 import pytest
 import trimesh
@@ -8,10 +10,10 @@ from scipy.spatial.distance import cdist
 from sceneprior.errors import InputError
 from sceneprior.evaluation.metrics.decoded_rooms import box_iou_3d
 from sceneprior.evaluation.metrics.mesh_metrics import (
-    OrientedBoxes,
+    OrientedBox,
     f_score,
+    oriented_box,
     oriented_box_iou_3d,
-    oriented_boxes,
     sample_surface,
 )
 from sceneprior.evaluation.topdown import box_mesh
@@ -24,18 +26,16 @@ def sphere(radius_m: float) -> Mesh:
     return Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))
 
 
-def random_boxes(rng: np.random.Generator, count: int) -> OrientedBoxes:
-    return OrientedBoxes(
-        rng.uniform(-0.5, 0.5, (count, 3)),
-        rng.uniform(0.3, 1.5, (count, 3)),
-        rng.uniform(-np.pi, np.pi, count),
-    )
+def random_boxes(rng: np.random.Generator, count: int) -> list[OrientedBox]:
+    centers, sizes = rng.uniform(-0.5, 0.5, (count, 3)), rng.uniform(0.3, 1.5, (count, 3))
+    yaws = rng.uniform(-np.pi, np.pi, count).tolist()
+    return [OrientedBox(*row) for row in zip(centers, sizes, yaws, strict=True)]
 
 
-def solid(boxes: OrientedBoxes, row: int) -> trimesh.Trimesh:
-    turn = trimesh.transformations.rotation_matrix(boxes.yaw_rad[row], [0, 1, 0])
-    turn[:3, 3] = boxes.centers_m[row]
-    return trimesh.creation.box(boxes.sizes_m[row], transform=turn)
+def solid(box: OrientedBox) -> trimesh.Trimesh:
+    turn = trimesh.transformations.rotation_matrix(box.yaw_rad, [0, 1, 0])
+    turn[:3, 3] = box.center_m
+    return trimesh.creation.box(box.size_m, transform=turn)
 
 
 def test_points_lie_on_the_surface_and_are_spread_by_area():
@@ -100,15 +100,14 @@ def test_empty_surfaces_are_refused():
 
 
 def test_turned_boxes_share_what_trimesh_says(rng):
-    a, b = random_boxes(rng, 6), random_boxes(rng, 5)
-    found = oriented_box_iou_3d(a, b)
-    for row in range(6):
-        for column in range(5):
-            one, other = solid(a, row), solid(b, column)
-            shared = shared_volume(one, other)
-            expected = shared / (one.volume + other.volume - shared)
-            assert found[row, column] == pytest.approx(expected, abs=1e-9)
-    assert (found > 0.1).sum() > 5
+    overlapping = 0
+    for a, b in itertools.product(random_boxes(rng, 6), random_boxes(rng, 5)):
+        one, other = solid(a), solid(b)
+        shared = shared_volume(one, other)
+        expected = shared / (one.volume + other.volume - shared)
+        assert oriented_box_iou_3d(a, b) == pytest.approx(expected, abs=1e-9)
+        overlapping += expected > 0.1
+    assert overlapping > 5
 
 
 def shared_volume(one: trimesh.Trimesh, other: trimesh.Trimesh) -> float:
@@ -123,30 +122,28 @@ def shared_volume(one: trimesh.Trimesh, other: trimesh.Trimesh) -> float:
 
 
 def test_at_yaw_zero_it_is_the_axis_aligned_iou(rng):
-    a, b = random_boxes(rng, 8), random_boxes(rng, 8)
-    a, b = a._replace(yaw_rad=np.zeros(8)), b._replace(yaw_rad=np.full(8, np.pi))
-    expected = box_iou_3d(a.centers_m, a.sizes_m, b.centers_m, b.sizes_m)
-    np.testing.assert_allclose(oriented_box_iou_3d(a, b), expected, atol=1e-12)
+    for a, b in itertools.product(random_boxes(rng, 8), random_boxes(rng, 8)):
+        expected = box_iou_3d(a.center_m[None], a.size_m[None], b.center_m[None], b.size_m[None])
+        found = oriented_box_iou_3d(a._replace(yaw_rad=0.0), b._replace(yaw_rad=np.pi))
+        assert found == pytest.approx(expected[0, 0], abs=1e-12)
 
 
 def test_boxes_without_volume_share_nothing():
-    flat = OrientedBoxes(np.zeros((2, 3)), np.array([[1.0, 0, 1], [0, 0, 0]]), np.zeros(2))
-    assert (oriented_box_iou_3d(flat, flat) == 0).all()
-    none = OrientedBoxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    assert oriented_box_iou_3d(none, flat).shape == (0, 2)
+    flat, none = (OrientedBox(np.zeros(3), np.array([side, 0, side]), 0.0) for side in (1.0, 0.0))
+    for a, b in itertools.product((flat, none), (flat, none)):
+        assert oriented_box_iou_3d(a, b) == 0
 
 
 def test_the_tightest_box_of_a_turned_box_is_itself(rng):
-    boxes = random_boxes(rng, 20)
-    meshes = [solid(boxes, row) for row in range(20)]
-    found = oriented_boxes([Mesh(np.asarray(m.vertices), np.asarray(m.faces)) for m in meshes])
-    np.testing.assert_allclose(np.diag(oriented_box_iou_3d(found, boxes)), 1, atol=1e-9)
-    assert (found.yaw_rad >= 0).all() and (found.yaw_rad < np.pi / 2).all()
+    for box in random_boxes(rng, 20):
+        mesh = solid(box)
+        found = oriented_box(Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
+        assert oriented_box_iou_3d(found, box) == pytest.approx(1, abs=1e-9)
+        assert 0 <= found.yaw_rad < np.pi / 2
 
 
 def test_the_tightest_box_of_a_flat_mesh_is_defined():
     wall = Mesh(np.array([[0.0, 0, 1], [0, 2, 1], [0, 2, 3]]), np.array([[0, 1, 2]]))
-    found = oriented_boxes([wall])
-    np.testing.assert_allclose(found.centers_m, [[0, 1, 2]])
-    np.testing.assert_allclose(found.sizes_m, [[0, 2, 2]])
-    assert len(oriented_boxes([]).yaw_rad) == 0
+    found = oriented_box(wall)
+    np.testing.assert_allclose(found.center_m, [0, 1, 2])
+    np.testing.assert_allclose(found.size_m, [0, 2, 2])
