@@ -34,21 +34,22 @@ def write_whole(path: Path, content: bytes | str | Callable[[Path], object]) -> 
     temporary = path.with_name(f"{path.name}.{secrets.token_hex(4)}{PART}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.ExitStack() as undo:
-            undo.callback(_remove, temporary)
-            if callable(content):
-                content(temporary)
-            else:
-                temporary.write_bytes(content.encode() if isinstance(content, str) else content)
-            # Without this a power cut may keep the new name and lose the bytes.
-            with temporary.open("rb+") as file:
-                os.fsync(file.fileno())
-            temporary.replace(path)
-            undo.pop_all()
-    except OSError as error:
-        error.filename = str(path)
+        if callable(content):
+            content(temporary)
+        else:
+            temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        # Without this a power cut may keep the new name and lose the bytes.
+        _sync(temporary)
+        temporary.replace(path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = str(path)
         raise
-    _sync_folder(path.parent)
+    # The rename itself reaches the disk, too: files appear in the order they were written.
+    with contextlib.suppress(OSError):  # some file systems sync no folders
+        _sync(path.parent)
 
 
 def write_changed(path: Path, content: bytes | str) -> None:
@@ -146,16 +147,9 @@ def is_name(text: Any) -> bool:
     )
 
 
-def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Let the rename itself reach the disk, so that files appear in the order they were written."""
-    with contextlib.suppress(OSError):  # some file systems sync no folders
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

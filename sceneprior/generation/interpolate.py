@@ -122,9 +122,8 @@ def write_pictures(
     renderer: Renderer,
 ) -> None:
     """Write `strip.png` of the steps and `animation.gif`, which has pictures between them, too."""
-    many = (len(path) - 1) * BETWEEN + 1
-    z = path_latents(trained, path[0], path[-1], many)
-    rooms = decode_rooms(trained, z, [f"frame_{k:03d}" for k in range(many)])
+    z = path_latents(trained, path[0], path[-1], (len(path) - 1) * BETWEEN + 1)
+    rooms = decode_rooms(trained, z, [""] * len(z))
     view = corner_view([room.scene for room in rooms], TILE)
     pictures = [
         perspective(room.scene, renderer, view=view, colors=mixed_colors(room)) for room in rooms

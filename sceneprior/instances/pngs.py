@@ -15,11 +15,7 @@ _KINDS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 
 
 def mask_size(path: Path) -> tuple[int, int]:
-    """(height, width), without reading the pixels.
-
-    Raises:
-        InputError: it is missing, no PNG, or has more than one channel.
-    """
+    """(height, width), without reading the pixels; see `read_mask`."""
     with _open(path) as picture:
         return picture.height, picture.width
 
@@ -33,9 +29,9 @@ def read_mask(path: Path) -> np.ndarray:
     try:
         with _open(path) as picture:
             return np.asarray(picture).astype(np.uint16)
+    except InputError:
+        raise
     except (OSError, ValueError, SyntaxError, EOFError, zlib.error) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path} is damaged ({str(error)[:120]}).") from None
 
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from toy_rooms import write_shard
 
 from sceneprior.errors import ShardError
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.topdown import topdown
-from sceneprior.shards import write_shard
 
 
 def test_a_room_holds_its_named_objects_seen_or_not_and_no_void(shards):
