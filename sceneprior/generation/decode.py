@@ -1,7 +1,7 @@
 """Decode latents into scenes, of training rooms and of new ones; new rooms of every method."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -18,8 +18,7 @@ from sceneprior.views import DecodedScenes, RoomBoxes
 BATCH = 64
 
 
-@dataclass(frozen=True)
-class DecodedRoom:
+class DecodedRoom(NamedTuple):
     """A decoded scene, and what the network said of each of its objects."""
 
     scene: Scene
@@ -105,8 +104,7 @@ def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]
             f"A run of `method: {trained.config.method}` keeps no latents of training rooms, so "
             "none can be decoded; take a run of `method: ours`."
         )
-    z = trained.prior.latent_space(trained.logits)
-    return decode_latents(trained, z, trained.room_ids)
+    return decode_latents(trained, trained.prior.latent_space(trained.logits), trained.room_ids)
 
 
 def synthesize(

@@ -149,8 +149,8 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
         return space(trained.logits[row : row + 1])[0]
     if re.fullmatch(r"seed:\d{1,18}", text):
         return draw_latents(trained, 1, int(text[5:]))[0][0]
-    file, colon, item = text.rpartition(":")
-    path, item = (Path(file), item) if colon and file.endswith(_ENDINGS) else (Path(text), "0")
+    file, _, item = text.rpartition(":")
+    path, item = (Path(file), item) if file.endswith(_ENDINGS) else (Path(text), "0")
     if not path.is_file():
         known = f"such as {trained.room_ids[0]}" if trained.room_ids else "which keeps none"
         raise InputError(
