@@ -63,9 +63,8 @@ def default_cache() -> Path:
 def open_models(
     folder: Path, label_set_name: str, cache: Path, points: int = POINTS, track: Track = iter
 ) -> CadModels:
-    """Read the models of a 3D-FUTURE folder that have a class in a label set.
-
-    Their points are kept in a file in the folder `cache`; deleting it costs time, nothing else.
+    """Read the models of a 3D-FUTURE folder that have a class in a label set. Their points are kept
+    in a file in the folder `cache`; deleting it costs time, nothing else.
 
     Raises:
         InputError: the folder is not 3D-FUTURE's, or has no model of these classes.

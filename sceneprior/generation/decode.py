@@ -22,7 +22,7 @@ class DecodedRoom(NamedTuple):
     """A decoded scene, and what the network said of each of its objects."""
 
     scene: Scene
-    predictions: tuple[int, ...]
+    predictions: list[int]
     """Which of the network's N predictions each object is."""
     class_logits: Float[Tensor, "objects classes"]
 
@@ -44,7 +44,7 @@ def to_rooms(
     for row, name in enumerate(names):
         predictions = kept[row].nonzero()[:, 0].tolist()
         scene = scene_of(decoded, row, predictions, faces, label_set_name, name)
-        rooms.append(DecodedRoom(scene, tuple(predictions), decoded.class_logits[row, predictions]))
+        rooms.append(DecodedRoom(scene, predictions, decoded.class_logits[row, predictions]))
     return rooms
 
 

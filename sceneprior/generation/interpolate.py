@@ -52,7 +52,7 @@ def interpolate(
     scenes = []
     for step, room in enumerate(decode_rooms(trained, z, names)):
         along = round(step / (steps - 1), 6)
-        extra = {"from": start, "to": end, "along": along, "slots": list(room.predictions)}
+        extra = {"from": start, "to": end, "along": along, "slots": room.predictions}
         scenes.append(replace(room.scene, extra=extra))
     return z, scenes
 

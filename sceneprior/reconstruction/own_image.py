@@ -37,15 +37,8 @@ def read_own_image(
     pose: Path | None = None,
     camera_height_m: float = CAMERA_HEIGHT_M,
 ) -> OwnImage:
-    """Read an image's masks and camera.
-
-    Args:
-        mask: See `read_mask`.
-        classes: See `read_class_table`. Classes outside the label set are void.
-        intrinsics: See `read_intrinsics`.
-        label_set: The run's.
-        pose: See `read_pose`; None: see `level_camera`.
-        camera_height_m: Of a camera without a pose.
+    """Read an image's masks (`read_mask`, `read_class_table`) and camera (`read_intrinsics`;
+    `read_pose`, or `level_camera` without one). Classes outside the run's label set are void.
 
     Raises:
         InputError: a file cannot be used, the sizes differ, or no object is seen.
