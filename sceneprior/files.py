@@ -61,11 +61,7 @@ def write_changed(path: Path, content: bytes | str) -> None:
 
 
 def json_text(data: Any, indent: int = 1) -> str:
-    """Plain data as every JSON file of ours is written.
-
-    Raises:
-        ValueError: a number is NaN or infinite, which JSON does not know.
-    """
+    """Plain data as every JSON file of ours is written; NaN and infinity are a `ValueError`."""
     return json.dumps(data, indent=indent, allow_nan=False) + "\n"
 
 
@@ -75,11 +71,7 @@ def write_json(path: Path, data: Any, indent: int = 1) -> None:
 
 
 def remove_parts(folder: Path) -> None:
-    """Delete what killed writers left anywhere under a folder; no process may be writing there.
-
-    Raises:
-        OSError: the folder cannot be changed.
-    """
+    """Delete what killed writers left anywhere under a folder; no process may be writing there."""
     for path in sorted(Path(folder).rglob(f"*{PART}")):
         path.unlink(missing_ok=True)
 
@@ -110,11 +102,7 @@ def only_writer(folder: Path) -> Iterator[None]:
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
-    """Time of change and size: what tells a changed file from the one that was read.
-
-    Raises:
-        InputError: there is no such file.
-    """
+    """Time of change and size: what tells a changed file from the one that was read."""
     try:
         status = path.stat()
     except OSError as error:
@@ -123,11 +111,7 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 
 def read_json(path: Path) -> Any:
-    """The JSON of a file.
-
-    Raises:
-        InputError: it cannot be read, or is none.
-    """
+    """The JSON of a file; an `InputError` where it cannot be read, or is none."""
     try:
         return json.loads(path.read_bytes())
     except OSError as error:

@@ -157,11 +157,8 @@ def _images(views: RoomViews) -> np.ndarray:
 
 
 def check_views(where: str, views: RoomViews) -> None:
-    """Compare the shapes of a room's arrays with each other, and its ids with its objects.
-
-    Raises:
-        ShardError: they disagree; begins with `where`.
-    """
+    """Compare the shapes of a room's arrays with each other, and its ids with its objects; the
+    `ShardError` begins with `where`."""
     where = f"{where}, room {views.room_id}"
     count, objects = views.visible.shape
     expected = {
@@ -185,11 +182,8 @@ def check_views(where: str, views: RoomViews) -> None:
 
 
 class Shard(contextlib.AbstractContextManager["Shard"]):
-    """One shard, open for reading; close it or use it in a `with` block.
-
-    Raises:
-        ShardError: the file is missing, damaged or of another format.
-    """
+    """One shard, open for reading; close it or use it in a `with` block. A file that is missing,
+    damaged or of another format is a `ShardError`."""
 
     def __init__(self, path: Path):
         self.path = Path(path)
@@ -289,11 +283,7 @@ def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:
 
 
 def list_shards(folder: Path, split: str) -> list[Path]:
-    """The shards of a split (`train` or `test`), sorted.
-
-    Raises:
-        ShardError: the folder is missing, or the split is empty.
-    """
+    """The shards of a split (`train` or `test`), sorted; at least one, or a `ShardError`."""
     folder = Path(folder)
     if not folder.is_dir():
         raise ShardError(f"No folder of shards at {folder}; make one with {PREPARE}.")

@@ -63,7 +63,9 @@ class SceneViews(_Batch):
             raise ValueError("These views have no instance ids; load the data with a mask_step.")
         return self.instance_ids
 
-    def intrinsics_at(self, height: float, width: float) -> Float[Tensor, "rooms views 3 3"]:
+    def intrinsics_at(
+        self, height: int | float, width: int | float
+    ) -> Float[Tensor, "rooms views 3 3"]:
         """The cameras' intrinsics in pixels of images of another size."""
         full_height, full_width = self.image_size
         scale = self.intrinsics.new_tensor([width / full_width, height / full_height, 1])

@@ -54,7 +54,6 @@ def complete(
     """Furnish the rest of rooms; all rooms and all answers in one batch.
 
     Args:
-        trained: The run's prior.
         scenes: The given objects of each room: classes, boxes, perhaps meshes. Without any, the
             answers are what the run generates.
         count: Answers a room.
@@ -63,9 +62,6 @@ def complete(
 
     Returns:
         Of each room the answers' latents and the answers: see `insert`.
-
-    Raises:
-        InputError: see `gather_given`.
     """
     given = gather_given(trained, scenes)
     starts = _starts(trained, given, count * RESTARTS, seed, distribution)

@@ -94,11 +94,8 @@ def decode_latents(
 
 
 def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]:
-    """The training rooms as the prior remembers them, named by their ids.
-
-    Raises:
-        InputError: training rooms have no latents in runs of this kind.
-    """
+    """The training rooms as the prior remembers them, named by their ids; an `InputError` for runs
+    that keep no latents of them."""
     if isinstance(trained, TrainedSampler) or not trained.remembers_rooms:
         raise InputError(
             f"A run of `method: {trained.config.method}` keeps no latents of training rooms, so "
@@ -112,10 +109,8 @@ def synthesize(
 ) -> list[Scene]:
     """New scenes, of a run of any kind; the same seed, the same scenes.
 
-    `distribution` says where latents come from; None takes the run's own.
-
-    Raises:
-        InputError: a distribution for a method without latents, or one that does not exist.
+    `distribution` says where latents come from: None takes the run's own. It is an `InputError` for
+    a method without latents.
     """
     if isinstance(trained, TrainedPrior):
         return decode_latents(trained, *draw_latents(trained, count, seed, distribution))

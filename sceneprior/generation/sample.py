@@ -35,14 +35,12 @@ def sample_latents(
     seed: int,
     distribution: str = "kernel",
 ) -> Float[Tensor, "count dimension"]:
-    """Draw points of the latent space; the same seed, the same points.
+    """Draw points of the latent space around training rooms, whose logits are `trained`; the same
+    seed, the same points.
 
-    Args:
-        space: Turns logits into points.
-        trained: The training rooms' logits.
-        distribution: `geodesic`: a point anywhere on the geodesic (in a cube: the straight line)
-            between a training room drawn at random and one of its `NEIGHBOURS` nearest. The
-            others: see `sample_logits`.
+    `geodesic` takes a point anywhere on the geodesic (in a cube: the straight line) between a
+    training room drawn at random and one of its `NEIGHBOURS` nearest. The other distributions: see
+    `sample_logits`.
 
     Raises:
         InputError: an unknown distribution, or fewer than two training rooms to draw between.

@@ -46,9 +46,8 @@ def pixel_counts(image: np.ndarray, count: int) -> np.ndarray:
 
 
 def observe(images: np.ndarray, classes: np.ndarray | Sequence[int]) -> Observations:
-    """Measure every mask, and number anew the objects that are ever visible.
-
-    A mask too narrow to count keeps its pixels in the image.
+    """Measure every mask, and number anew the objects that are ever visible. A mask too narrow to
+    count keeps its pixels in the image.
 
     Args:
         images: (T, H, W) unsigned ids, k + 1 for mesh k.

@@ -21,11 +21,8 @@ def mask_size(path: Path) -> tuple[int, int]:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """(height, width) uint16: the same value is the same object in all frames, 0 is nothing.
-
-    Raises:
-        InputError: it is missing, no PNG, has more than one channel, or is cut off.
-    """
+    """(height, width) uint16: the same value is the same object in all frames, 0 is nothing. A file
+    that is missing, no PNG, of more than one channel or cut off is an `InputError`."""
     try:
         with _open(path) as picture:
             return np.asarray(picture).astype(np.uint16)

@@ -130,10 +130,9 @@ def nearest_answers(
     for image in images:
         others = _others(rooms, image)
         matched, costs = _matched(rooms, others, image)
-        best = costs.argsort()[:SHORTLIST]
-        offered = [_answer(rooms, int(others[at]), matched[at]) for at in best.tolist()]
-        overlaps = [mask_overlap(one, image, renderer) for one in offered]
-        answers.append(offered[int(np.argmax(overlaps))])
+        best = costs.argsort()[:SHORTLIST].tolist()
+        offered = [_answer(rooms, int(others[at]), matched[at]) for at in best]
+        answers.append(max(offered, key=lambda one: mask_overlap(one, image, renderer)))
     return answers
 
 

@@ -58,9 +58,8 @@ class Reconstruction:
 def reconstruct(
     trained: TrainedPrior, images: Sequence[ObservedImage], options: FitOptions
 ) -> list[Reconstruction]:
-    """Reconstruct images of the run's label set, many at once.
-
-    Before the run's shape stage scenes are boxes, and masks are not compared.
+    """Reconstruct images of the run's label set, many at once. Before the run's shape stage scenes
+    are boxes, and masks are not compared.
 
     Raises:
         InputError: unknown options, a run without latents of rooms, another label set, or more
@@ -139,9 +138,6 @@ def starting_latents(
     `nearest` are the training rooms, as decoded, whose layout loss on the image is least; `random`
     ones are drawn around the training rooms, as new rooms are (the kernel distribution), the same
     for every image.
-
-    Raises:
-        InputError: an unknown kind, or more starts than training rooms.
     """
     if kind not in STARTS:
         raise InputError(f"No start is called '{kind}'; choose from {', '.join(STARTS)}.")
