@@ -84,11 +84,7 @@ def own_label_set(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def label_set_name(names: Sequence[str]) -> str:
-    """The name of a user's label set: the list itself, as `label_set` reads it.
-
-    Raises:
-        InputError: see `own_label_set`.
-    """
+    """The name of a user's label set: the list itself, checked by `own_label_set`."""
     return ",".join(own_label_set(names))
 
 
@@ -99,12 +95,9 @@ def class_colors(count: int) -> np.ndarray:
     takes turns, so that classes differ in a grey print too. Void is grey; black and white
     stay free for backgrounds.
     """
-    colors = np.empty((count, 3), dtype=np.uint8)
-    for index in range(count):
+    colors = np.full((count, 3), 128, dtype=np.uint8)
+    for index in range(VOID + 1, count):
         hue = (index * 0.6180339887498949) % 1.0
-        lightness = (0.42, 0.56, 0.70)[index % 3]
-        rgb = colorsys.hls_to_rgb(hue, lightness, 0.72)
+        rgb = colorsys.hls_to_rgb(hue, (0.42, 0.56, 0.70)[index % 3], 0.72)
         colors[index] = [round(255 * channel) for channel in rgb]
-    if count:
-        colors[VOID] = (128, 128, 128)
     return colors

@@ -34,21 +34,22 @@ def write_whole(path: Path, content: bytes | str | Callable[[Path], object]) -> 
     temporary = path.with_name(f"{path.name}.{secrets.token_hex(4)}{PART}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.ExitStack() as undo:
-            undo.callback(_remove, temporary)
-            if callable(content):
-                content(temporary)
-            else:
-                temporary.write_bytes(content.encode() if isinstance(content, str) else content)
-            # Without this a power cut may keep the new name and lose the bytes.
-            with temporary.open("rb+") as file:
-                os.fsync(file.fileno())
-            temporary.replace(path)
-            undo.pop_all()
-    except OSError as error:
-        error.filename = str(path)
+        if callable(content):
+            content(temporary)
+        else:
+            temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        # Without this a power cut may keep the new name and lose the bytes.
+        _sync(temporary)
+        temporary.replace(path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = str(path)
         raise
-    _sync_folder(path.parent)
+    # The rename itself reaches the disk, too: files appear in the order they were written.
+    with contextlib.suppress(OSError):  # some file systems sync no folders
+        _sync(path.parent)
 
 
 def write_changed(path: Path, content: bytes | str) -> None:
@@ -60,11 +61,7 @@ def write_changed(path: Path, content: bytes | str) -> None:
 
 
 def json_text(data: Any, indent: int = 1) -> str:
-    """Plain data as every JSON file of ours is written.
-
-    Raises:
-        ValueError: a number is NaN or infinite, which JSON does not know.
-    """
+    """Plain data as every JSON file of ours is written; NaN and infinity are a `ValueError`."""
     return json.dumps(data, indent=indent, allow_nan=False) + "\n"
 
 
@@ -74,11 +71,7 @@ def write_json(path: Path, data: Any, indent: int = 1) -> None:
 
 
 def remove_parts(folder: Path) -> None:
-    """Delete what killed writers left anywhere under a folder; no process may be writing there.
-
-    Raises:
-        OSError: the folder cannot be changed.
-    """
+    """Delete what killed writers left anywhere under a folder; no process may be writing there."""
     for path in sorted(Path(folder).rglob(f"*{PART}")):
         path.unlink(missing_ok=True)
 
@@ -109,11 +102,7 @@ def only_writer(folder: Path) -> Iterator[None]:
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
-    """Time of change and size: what tells a changed file from the one that was read.
-
-    Raises:
-        InputError: there is no such file.
-    """
+    """Time of change and size: what tells a changed file from the one that was read."""
     try:
         status = path.stat()
     except OSError as error:
@@ -122,11 +111,7 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 
 def read_json(path: Path) -> Any:
-    """The JSON of a file.
-
-    Raises:
-        InputError: it cannot be read, or is none.
-    """
+    """The JSON of a file; an `InputError` where it cannot be read, or is none."""
     try:
         return json.loads(path.read_bytes())
     except OSError as error:
@@ -146,16 +131,9 @@ def is_name(text: Any) -> bool:
     )
 
 
-def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Let the rename itself reach the disk, so that files appear in the order they were written."""
-    with contextlib.suppress(OSError):  # some file systems sync no folders
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

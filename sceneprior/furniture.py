@@ -9,7 +9,6 @@ Preparing rooms and putting CAD models into generated ones read the same files; 
 import csv
 import functools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,11 +21,7 @@ CATEGORY_TABLE = Path(__file__).with_name("front3d_categories.csv")
 
 
 def model_info_path(folder: Path, option: str = "--future") -> Path:
-    """3D-FUTURE's list of models; `option` is what the user named the folder with, for errors.
-
-    Raises:
-        InputError: the folder is missing, or has none.
-    """
+    """3D-FUTURE's list of models; `option` is what the user named the folder with, for errors."""
     if not folder.is_dir():
         raise InputError(f"No folder at {folder}; {option} names the folder of 3D-FUTURE models.")
     for name in ("model_info.json", "model_info_revised.json"):
@@ -39,31 +34,25 @@ def model_info_path(folder: Path, option: str = "--future") -> Path:
 
 
 def model_categories(folder: Path, option: str = "--future") -> dict[str, str]:
-    """Model id -> category: lower case, "a / b" as "a/b"; "others" where the release says null.
-
-    Raises:
-        InputError: the folder is missing, or is not 3D-FUTURE's.
-    """
+    """Model id -> category: lower case, "a / b" as "a/b"; "others" where the release says null."""
     path = model_info_path(folder, option)
     data = read_json(path)
     try:
-        return {str(row["model_id"]): _category(row.get("category")) for row in data}
+        categories = {str(row["model_id"]): row.get("category") for row in data}
     except (TypeError, KeyError, AttributeError) as error:
         raise InputError(
             f"{path} is not 3D-FUTURE's list of models ({type(error).__name__}: {error})."
         ) from None
-
-
-def _category(text: Any) -> str:
-    return "others" if text is None else str(text).strip().lower().replace(" / ", "/")
+    return {
+        model_id: "others" if text is None else str(text).strip().lower().replace(" / ", "/")
+        for model_id, text in categories.items()
+    }
 
 
 @functools.cache
 def category_classes(columns: tuple[str, ...]) -> dict[str, str]:
-    """3D-FUTURE's category strings -> class names, from front3d_categories.csv.
-
-    Args:
-        columns: `bedroom_class`, `living_room_class`: the first that is not void decides.
+    """3D-FUTURE's category strings -> class names, from front3d_categories.csv. Of the `columns`
+    (`bedroom_class`, `living_room_class`) the first that is not void decides.
 
     Raises:
         InputError: there is no such column.

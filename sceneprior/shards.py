@@ -13,7 +13,6 @@ import numpy as np
 
 from sceneprior.classes import label_set
 from sceneprior.errors import ShardError
-from sceneprior.files import write_whole
 
 FORMAT = "sceneprior-views"
 VERSION = 1
@@ -24,19 +23,11 @@ MODELS_FOLDER = "models"
 
 
 @dataclass(frozen=True)
-class RoomViews:
-    """What cameras saw of one room: all that training may know.
+class Sightings:
+    """T views of n tracked objects, each seen in at least one of them, in H x W pixels."""
 
-    Shapes: T views, n tracked objects (each seen in at least one view), H x W pixels.
-    """
-
-    room_id: str
     object_class: np.ndarray
-    """(n,) int16, index into the shard's label set."""
-    world_to_camera: np.ndarray
-    """(T, 4, 4) float32, OpenCV axes, metres."""
-    intrinsics: np.ndarray
-    """(T, 3, 3) float32, pixels of the H x W image."""
+    """(n,) int16, index into the label set."""
     boxes: np.ndarray
     """(T, n, 4) float32: x1, y1, x2, y2 in [0, 1] of the visible mask; zeros where not visible."""
     visible: np.ndarray
@@ -48,6 +39,17 @@ class RoomViews:
     the object's own rather than an occluder's."""
     instance_ids: np.ndarray | None
     """(T, H, W) uint8 (uint16 past 255 objects), 0 = nothing, k + 1 = object k; None: not read."""
+
+
+@dataclass(frozen=True)
+class RoomViews(Sightings):
+    """What cameras saw of one room: all that training may know."""
+
+    room_id: str
+    world_to_camera: np.ndarray
+    """(T, 4, 4) float32, OpenCV axes, metres."""
+    intrinsics: np.ndarray
+    """(T, 3, 3) float32, pixels of the H x W image."""
     image_size: tuple[int, int]
     """(H, W)."""
 
@@ -81,21 +83,11 @@ _VIEW_ARRAYS = (
 _TRUTH_ARRAYS = ("object_class", "centers_m", "sizes_m", "yaw_rad", "model_to_room", "floor_m")
 
 
-Rooms = Iterable[tuple[RoomViews, RoomGroundTruth | None]]
-
-
-def write_shard(path: Path, label_set_name: str, rooms: Rooms) -> None:
-    """Write rooms to one shard, whole or not at all; the same rooms give the same bytes.
-
-    Raises:
-        ShardError: a room's arrays disagree with each other.
-        OSError: the file cannot be written.
-    """
-    write_whole(path, shard_bytes(path.name, label_set_name, rooms))
-
-
-def shard_bytes(name: str, label_set_name: str, rooms: Rooms) -> bytes:
-    """A shard as it would lie on disk. `rooms` may be a generator: one is held at a time.
+def shard_bytes(
+    name: str, label_set_name: str, rooms: Iterable[tuple[RoomViews, RoomGroundTruth | None]]
+) -> bytes:
+    """A shard as it would lie on disk; the same rooms give the same bytes. `rooms` may be a
+    generator: one is held at a time.
 
     Built in memory, where a shard is a few MB: HDF5 does not recover from a disk that fills up.
 
@@ -109,14 +101,11 @@ def shard_bytes(name: str, label_set_name: str, rooms: Rooms) -> bytes:
         file.attrs["classes"] = json.dumps(label_set(label_set_name))
         for views, truth in rooms:
             check_views(name, views)
-            _write_room(file.create_group(f"rooms/{_key(views.room_id)}"), views, truth)
+            # HDF5 reads "/" as a folder; ids such as <house>/<room> stay one name.
+            key = views.room_id.replace("/", "|")
+            _write_room(file.create_group(f"rooms/{key}"), views, truth)
         file.flush()
         return file.id.get_file_image()
-
-
-def _key(room_id: str) -> str:
-    # HDF5 reads "/" as a folder; ids such as <house>/<room> stay one name.
-    return room_id.replace("/", "|")
 
 
 def _write_room(group: h5py.Group, views: RoomViews, truth: RoomGroundTruth | None) -> None:
@@ -142,20 +131,20 @@ def _write_room(group: h5py.Group, views: RoomViews, truth: RoomGroundTruth | No
 
 def room_checksum(views: RoomViews, truth: RoomGroundTruth | None) -> str:
     """SHA-256 over all that a shard stores of a room; docs/shard_format.md spells it out."""
-    parts: list[tuple[str, Any]] = [("room_id", views.room_id), ("image_size", views.image_size)]
-    parts += [(name, getattr(views, name)) for name in _VIEW_ARRAYS]
-    parts.append(("instance_ids", _images(views)))
+    size = [int(side) for side in views.image_size]
+    parts: dict[str, Any] = {"room_id": views.room_id, "image_size": size}
+    parts |= {name: getattr(views, name) for name in _VIEW_ARRAYS}
+    parts["instance_ids"] = _images(views)
     if truth is not None:
-        parts += [(f"ground_truth/{name}", getattr(truth, name)) for name in _TRUTH_ARRAYS]
-        parts += [("model_ids", truth.model_ids), ("height_m", float(truth.height_m))]
+        parts |= {f"ground_truth/{name}": getattr(truth, name) for name in _TRUTH_ARRAYS}
+        parts |= {"model_ids": truth.model_ids, "height_m": float(truth.height_m)}
     summary = hashlib.sha256()
-    for name, value in parts:
+    for name, value in parts.items():
         if isinstance(value, np.ndarray):
             summary.update(f"{name} {value.dtype.str} {value.shape}\n".encode())
             summary.update(np.ascontiguousarray(value).data)
         else:
-            plain = [int(side) for side in value] if name == "image_size" else value
-            summary.update(f"{name} {json.dumps(plain)}\n".encode())
+            summary.update(f"{name} {json.dumps(value)}\n".encode())
     return summary.hexdigest()
 
 
@@ -168,11 +157,9 @@ def _images(views: RoomViews) -> np.ndarray:
 
 
 def check_views(where: str, views: RoomViews) -> None:
-    """Compare the shapes of a room's arrays with each other, and its ids with its objects.
-
-    Raises:
-        ShardError: they disagree; begins with `where`.
-    """
+    """Compare the shapes of a room's arrays with each other, and its ids with its objects; the
+    `ShardError` begins with `where`."""
+    where = f"{where}, room {views.room_id}"
     count, objects = views.visible.shape
     expected = {
         "object_class": (objects,),
@@ -184,26 +171,19 @@ def check_views(where: str, views: RoomViews) -> None:
         "instance_ids": (count, *views.image_size),
     }
     for name, shape in expected.items():
-        array = getattr(views, name)
-        came = None if array is None else array.shape
+        came = getattr(getattr(views, name), "shape", None)
         if came != shape:
-            raise ShardError(
-                f"{where}, room {views.room_id}: {name} has shape {came}, expected {shape}."
-            )
+            raise ShardError(f"{where}: {name} has shape {came}, expected {shape}.")
     highest = int(_images(views).max(initial=0))
     if highest > objects:
         raise ShardError(
-            f"{where}, room {views.room_id}: an instance id is {highest}, "
-            f"but the room has {objects} objects."
+            f"{where}: an instance id is {highest}, but the room has {objects} objects."
         )
 
 
-class Shard:
-    """One shard, open for reading; close it or use it in a `with` block.
-
-    Raises:
-        ShardError: the file is missing, damaged or of another format.
-    """
+class Shard(contextlib.AbstractContextManager["Shard"]):
+    """One shard, open for reading; close it or use it in a `with` block. A file that is missing,
+    damaged or of another format is a `ShardError`."""
 
     def __init__(self, path: Path):
         self.path = Path(path)
@@ -212,15 +192,12 @@ class Shard:
         try:
             self._file = h5py.File(self.path, "r")
             form, version = self._file.attrs.get("format"), self._file.attrs.get("version")
-        except OSError as error:
-            raise _damaged(self.path, error) from None
-        if form != FORMAT or version != VERSION:
-            self._file.close()
-            raise ShardError(
-                f"{path} says format '{form}' version {version}, expected '{FORMAT}' version "
-                f"{VERSION}. Prepare the data again with this release's {PREPARE}."
-            )
-        try:
+            if form != FORMAT or version != VERSION:
+                self._file.close()
+                raise ShardError(
+                    f"{path} says format '{form}' version {version}, expected '{FORMAT}' version "
+                    f"{VERSION}. Prepare the data again with this release's {PREPARE}."
+                )
             self.label_set = str(self._file.attrs["label_set"])
             self._keys = {
                 str(group.attrs["room_id"]): key
@@ -229,15 +206,12 @@ class Shard:
         except (OSError, KeyError, RuntimeError) as error:
             raise _damaged(self.path, error) from None
 
-    def __enter__(self) -> "Shard":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def close(self) -> None:
         """Release the file."""
         self._file.close()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     @property
     def room_ids(self) -> tuple[str, ...]:
@@ -295,11 +269,9 @@ class Shard:
 
 
 def thinned(step: int) -> tuple[slice, slice]:
-    """Indexes every `step`-th pixel of an image (height, width).
-
-    It starts in the middle of a block, so that the small image is not shifted.
-    """
-    return slice(step // 2, None, step), slice(step // 2, None, step)
+    """Indexes every `step`-th pixel of an image (height, width), from the middle of a block, so
+    that the small image is not shifted."""
+    return (slice(step // 2, None, step),) * 2
 
 
 def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:
@@ -311,11 +283,7 @@ def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:
 
 
 def list_shards(folder: Path, split: str) -> list[Path]:
-    """The shards of a split (`train` or `test`), sorted.
-
-    Raises:
-        ShardError: the folder is missing, or the split is empty.
-    """
+    """The shards of a split (`train` or `test`), sorted; at least one, or a `ShardError`."""
     folder = Path(folder)
     if not folder.is_dir():
         raise ShardError(f"No folder of shards at {folder}; make one with {PREPARE}.")

@@ -2,15 +2,31 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor
 
+_B = TypeVar("_B", bound="_Batch")
+
 
 @dataclass(frozen=True)
-class SceneViews:
+class _Batch:
+    def changed(self: _B, change: Callable[[Tensor], Tensor]) -> _B:
+        """The same with every tensor changed."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return replace(
+            self, **{key: change(v) for key, v in values.items() if isinstance(v, Tensor)}
+        )
+
+    def to(self: _B, device: torch.device | str) -> _B:
+        """The same with every tensor on `device` (Lightning calls this)."""
+        return self.changed(lambda tensor: tensor.to(device))
+
+
+@dataclass(frozen=True)
+class SceneViews(_Batch):
     """What cameras saw of a batch of rooms; objects are padded to the largest room's count.
 
     Cameras are OpenCV pinholes (x right, y down, z forward); see docs/conventions.md.
@@ -47,10 +63,6 @@ class SceneViews:
             raise ValueError("These views have no instance ids; load the data with a mask_step.")
         return self.instance_ids
 
-    def to(self, device: torch.device | str) -> "SceneViews":
-        """The same views with every tensor on `device` (Lightning calls this)."""
-        return replace(self, **_tensors(self, lambda tensor: tensor.to(device)))
-
     def intrinsics_at(
         self, height: int | float, width: int | float
     ) -> Float[Tensor, "rooms views 3 3"]:
@@ -79,7 +91,7 @@ class DecodedScenes:
 
 
 @dataclass(frozen=True)
-class RoomBoxes:
+class RoomBoxes(_Batch):
     """A batch of rooms as labelled boxes in 3D: what supervision in 3D shows, and what methods that
     learn from it make. Objects are padded to the fullest room's count; their order means nothing.
     """
@@ -94,16 +106,12 @@ class RoomBoxes:
     yaw_rad: Float[Tensor, "rooms objects"] | None = None
     """Turn about +y that takes +z to each piece's front, in [-pi, pi]; None: nobody knows."""
 
-    def to(self, device: torch.device | str) -> "RoomBoxes":
-        """The same boxes with every tensor on `device` (Lightning calls this)."""
-        return replace(self, **_tensors(self, lambda tensor: tensor.to(device)))
-
     def split(self, rooms: int) -> list["RoomBoxes"]:
         """Batches of at most so many rooms, without ids."""
 
         def batch(start: int) -> "RoomBoxes":
-            tensors = _tensors(self, lambda tensor: tensor[start : start + rooms])
-            return replace(self, **tensors, room_ids=())
+            part = self.changed(lambda tensor: tensor[start : start + rooms])
+            return replace(part, room_ids=())
 
         return [batch(start) for start in range(0, len(self.is_object), rooms)]
 
@@ -114,9 +122,4 @@ class RoomBoxes:
             rows = order if tensor.ndim == 2 else order.unsqueeze(-1)
             return torch.take_along_dim(tensor, rows, dim=1)
 
-        return replace(self, **_tensors(self, taken))
-
-
-def _tensors(noun: SceneViews | RoomBoxes, change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-    values = {item.name: getattr(noun, item.name) for item in fields(noun)}
-    return {key: change(v) for key, v in values.items() if isinstance(v, Tensor)}
+        return self.changed(taken)

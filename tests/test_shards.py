@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import h5py
 import numpy as np
 import pytest
+from toy_rooms import write_shard
 
 from sceneprior.errors import ShardError
 from sceneprior.shards import (
@@ -15,7 +16,6 @@ from sceneprior.shards import (
     list_shards,
     read_index,
     room_checksum,
-    write_shard,
 )
 
 

@@ -11,9 +11,10 @@ import numpy as np
 import trimesh
 
 from sceneprior.classes import label_set
+from sceneprior.files import write_whole
 from sceneprior.offscreen import Pinhole, SoftwareRenderer
 from sceneprior.scene import Mesh
-from sceneprior.shards import RoomGroundTruth, RoomViews, write_shard
+from sceneprior.shards import RoomGroundTruth, RoomViews, shard_bytes
 
 LABEL_SET = "front3d_bedroom"
 IMAGE_SIZE = (72, 96)
@@ -27,6 +28,10 @@ SIZES_M = {
     "ceiling_lamp": (0.6, 0.4, 0.6),
     "desk": (1.1, 0.75, 0.55),
 }
+
+
+def write_shard(path: Path, label_set_name: str, rooms) -> None:
+    write_whole(path, shard_bytes(path.name, label_set_name, rooms))
 
 
 def write_toy_shards(folder: Path, train: int = 12, test: int = 4, seed: int = 0) -> None:

@@ -31,10 +31,10 @@ def prepare_room(
     is_object = classes != VOID
     spots = Viewpoints(room, boxes_m, boxes_m[is_object].mean(axis=1), recipe.views, rng)
     world_to_camera, images = _draw_views(spots, meshes, is_object, count, recipe.views, renderer)
-    seen = observe(images, is_object)
+    seen = observe(images, classes)
     if not len(seen.tracked):
         return None
-    views = seen.room_views(room.room_id, classes, world_to_camera, intrinsics(recipe.views))
+    views = seen.room_views(room.room_id, world_to_camera, intrinsics(recipe.views))
     order = np.concatenate([seen.tracked, seen.unseen])
     pieces = [room.furniture[k] for k in order]
     lower, upper = boxes_m[order, 0], boxes_m[order, 1]

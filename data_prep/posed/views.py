@@ -125,14 +125,14 @@ def prepare_posed(
             raise InputError(f"{recording.path}: {str(error).removesuffix('.')}.") from None
         rows, columns = sampled_lines(first[0], size[0]), sampled_lines(first[1], size[1])
         images.append(table.ids(values[np.ix_(rows, columns)]))
-    seen = observe(np.stack(images), table.is_object)
+    seen = observe(np.stack(images), table.classes)
     if table.unlisted:
         listed = ", ".join(map(str, sorted(table.unlisted)[:20]))
         notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
     if not len(seen.tracked):
         return None
     world_to_camera, said = cameras_in_room(recording, [*choice.frames], settings)
-    views = seen.room_views(room_name(folder), table.classes, world_to_camera, np.stack(intrinsics))
+    views = seen.room_views(room_name(folder), world_to_camera, np.stack(intrinsics))
     return PreparedRoom(views, notes=(*notes, *said))
 
 

@@ -10,7 +10,7 @@ from data_prep.frames import sampled_lines
 from data_prep.scannet.labels import LABEL_SET
 from data_prep.scannet.masks import MaskArchive
 from data_prep.scannet.scans import Scan
-from sceneprior.classes import VOID, label_set
+from sceneprior.classes import label_set
 from sceneprior.instances.observations import observe
 from sceneprior.shards import RoomGroundTruth
 
@@ -73,14 +73,14 @@ def prepare_scan(scan: Scan) -> PreparedRoom | None:
     # The last entry stands for ids without an object: they hide what is behind them.
     labels = [*(item.label for item in scan.instances), "void"]
     classes = np.array([names.index(label) for label in labels], dtype=np.int16)
-    seen = observe(np.stack(images), classes != VOID)
+    seen = observe(np.stack(images), classes)
     if not len(seen.tracked):
         return None
     notes = scan.notes
     if unlisted:
         listed = ", ".join(map(str, sorted(unlisted)))
         notes += (f"masks show objects that the aggregation does not have ({listed}): void",)
-    views = seen.room_views(scan.scan_id, classes, scan.world_to_camera, scan.intrinsics)
+    views = seen.room_views(scan.scan_id, scan.world_to_camera, scan.intrinsics)
     order = np.concatenate([seen.tracked, seen.unseen])
     return PreparedRoom(views, _ground_truth(scan, order, classes[order]), notes=notes)
 

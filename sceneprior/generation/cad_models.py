@@ -63,9 +63,8 @@ def default_cache() -> Path:
 def open_models(
     folder: Path, label_set_name: str, cache: Path, points: int = POINTS, track: Track = iter
 ) -> CadModels:
-    """Read the models of a 3D-FUTURE folder that have a class in a label set.
-
-    Their points are kept in a file in the folder `cache`; deleting it costs time, nothing else.
+    """Read the models of a 3D-FUTURE folder that have a class in a label set. Their points are kept
+    in a file in the folder `cache`; deleting it costs time, nothing else.
 
     Raises:
         InputError: the folder is not 3D-FUTURE's, or has no model of these classes.
@@ -77,13 +76,11 @@ def open_models(
         for model_id, category in sorted(model_categories(folder, "--models").items())
     }
     wanted = [model_id for model_id, label in labels.items() if label != "void"]
-    store = PointStore(folder, Path(cache), points)
-    broken = store.draw(wanted, track)
+    drawn, broken = _points_of_models(folder, wanted, Path(cache), points, track)
     by_class = {}
     for label in names:
-        of_class = [m for m in wanted if labels[m] == label and m not in broken]
-        if of_class:
-            stack = np.stack([store.points[m] for m in of_class])
+        if of_class := [m for m in wanted if labels[m] == label and m not in broken]:
+            stack = np.stack([drawn[m] for m in of_class])
             by_class[label] = ClassModels(tuple(of_class), stack)
     if not by_class:
         raise InputError(
@@ -110,67 +107,58 @@ def _into_unit_box(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     return (points - (low + high) / 2) * scale
 
 
-class PointStore:
-    """Points of the models of a folder, `count` each, kept in one npz in the folder `cache`."""
-
-    def __init__(self, folder: Path, cache: Path, count: int):
-        self.folder, self.count = folder, count
-        settings = f"{folder.resolve()}|{count}|{SEED}|{FORMAT}"
-        self.path = cache / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
-        self.points: dict[str, np.ndarray] = {}
-        self._stamps: dict[str, tuple[int, int]] = {}
+def _points_of_models(
+    folder: Path, model_ids: list[str], cache: Path, count: int, track: Track
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """`count` points of each model, and why broken models have none. What was drawn is kept in an
+    npz in the folder `cache`, even if this is interrupted."""
+    settings = f"{folder.resolve()}|{count}|{SEED}|{FORMAT}"
+    path = cache / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
+    points, stamps = _read_points(path, count)
+    todo: dict[str, tuple[int, int]] = {}
+    broken: dict[str, str] = {}
+    for model_id in model_ids:
         try:
-            with np.load(self.path, allow_pickle=False) as file:
-                ids, stamps, points = file["ids"].tolist(), file["stamps"], file["points"]
-        except Exception:  # absent or damaged: drawn again, and written over
-            return
-        if points.shape == (len(ids), count, 3):
-            self.points = dict(zip(ids, points, strict=True))
-            self._stamps = {m: (int(a), int(b)) for m, (a, b) in zip(ids, stamps, strict=True)}
-
-    def draw(self, model_ids: list[str], track: Track) -> dict[str, str]:
-        """Have points of these models; what was drawn is kept even if this is interrupted.
-
-        Returns:
-            Broken models, with the reason.
-        """
-        broken: dict[str, str] = {}
-        todo: dict[str, tuple[int, int]] = {}
-        for model_id in model_ids:
+            if not is_name(model_id):
+                raise InputError(f"{ascii(model_id)[:60]} cannot be a folder's name")
+            stamp = file_stamp(folder / model_id / MODEL_FILE)
+            if stamps.get(model_id) != stamp:
+                todo[model_id] = stamp
+        except InputError as error:
+            broken[model_id] = str(error)
+    before = dict(stamps)
+    try:
+        for model_id in track(list(todo)):
             try:
-                stamp = self._stamp(model_id)
-                if self._stamps.get(model_id) != stamp:
-                    todo[model_id] = stamp
-            except InputError as error:
+                mesh = read_obj(folder / model_id / MODEL_FILE)
+                vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
+                # Drawn on the model as it is: in a unit box thin sides would count as wide ones.
+                drawn = surface_points(vertices, mesh.faces, count, SEED)
+                points[model_id] = _into_unit_box(drawn, vertices).astype(np.float32)
+                stamps[model_id] = todo[model_id]
+            except (InputError, ValueError) as error:
                 broken[model_id] = str(error)
-        before = dict(self._stamps)
-        try:
-            for model_id in track(list(todo)):
-                try:
-                    self.points[model_id] = self._draw_one(model_id)
-                    self._stamps[model_id] = todo[model_id]
-                except (InputError, ValueError) as error:
-                    broken[model_id] = str(error)
-        finally:
-            if self._stamps != before:
-                self._write()
-        return broken
+    finally:
+        if stamps != before:
+            ids, buffer = sorted(stamps), io.BytesIO()
+            np.savez(
+                buffer,
+                ids=np.array(ids),
+                stamps=np.array([stamps[m] for m in ids], np.int64),
+                points=np.stack([points[m] for m in ids]),
+            )
+            write_whole(path, buffer.getvalue())
+    return points, broken
 
-    def _stamp(self, model_id: str) -> tuple[int, int]:
-        if not is_name(model_id):
-            raise InputError(f"{ascii(model_id)[:60]} cannot be a folder's name")
-        return file_stamp(self.folder / model_id / MODEL_FILE)
 
-    def _draw_one(self, model_id: str) -> np.ndarray:
-        mesh = read_obj(self.folder / model_id / MODEL_FILE)
-        vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
-        # Drawn on the model as it is: in a unit box thin sides would count as wide ones.
-        points = surface_points(vertices, mesh.faces, self.count, SEED)
-        return _into_unit_box(points, vertices).astype(np.float32)
-
-    def _write(self) -> None:
-        ids, buffer = sorted(self._stamps), io.BytesIO()
-        stamps = np.array([self._stamps[m] for m in ids], np.int64)
-        points = np.stack([self.points[m] for m in ids])
-        np.savez(buffer, ids=np.array(ids), stamps=stamps, points=points)
-        write_whole(self.path, buffer.getvalue())
+def _read_points(
+    path: Path, count: int
+) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, int]]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            ids, stamps, points = file["ids"].tolist(), file["stamps"].tolist(), file["points"]
+    except Exception:  # absent or damaged: drawn again, and written over
+        return {}, {}
+    if points.shape != (len(ids), count, 3):
+        return {}, {}
+    return dict(zip(ids, points, strict=True)), dict(zip(ids, map(tuple, stamps), strict=True))

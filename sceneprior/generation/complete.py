@@ -54,7 +54,6 @@ def complete(
     """Furnish the rest of rooms; all rooms and all answers in one batch.
 
     Args:
-        trained: The run's prior.
         scenes: The given objects of each room: classes, boxes, perhaps meshes. Without any, the
             answers are what the run generates.
         count: Answers a room.
@@ -63,9 +62,6 @@ def complete(
 
     Returns:
         Of each room the answers' latents and the answers: see `insert`.
-
-    Raises:
-        InputError: a given object cannot be used, or there are more than the run's rooms hold.
     """
     given = gather_given(trained, scenes)
     starts = _starts(trained, given, count * RESTARTS, seed, distribution)
@@ -88,10 +84,10 @@ def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> RoomBoxes:
     """
     config = trained.config
     names, most = label_set(config.label_set), config.model.max_objects
-    longest = max([1, *(len(scene.objects) for scene in scenes)])
-    labels = torch.zeros(len(scenes), longest, dtype=torch.int64)
-    boxes_m = torch.ones(len(scenes), longest, 6, dtype=trained.logits.dtype)
-    is_object = torch.zeros(len(scenes), longest, dtype=torch.bool)
+    counts = torch.tensor([len(scene.objects) for scene in scenes])
+    is_object = torch.arange(max(1, int(counts.max()))) < counts[:, None]
+    labels = torch.zeros(is_object.shape, dtype=torch.int64)
+    boxes_m = torch.ones(*is_object.shape, 6, dtype=trained.logits.dtype)
     for row, scene in enumerate(scenes):
         if len(scene.objects) > most:
             raise InputError(
@@ -112,17 +108,12 @@ def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> RoomBoxes:
                 )
             labels[row, column] = names.index(item.label)
             boxes_m[row, column] = torch.from_numpy(box)
-            is_object[row, column] = True
     return RoomBoxes(labels, is_object, boxes_m)
 
 
 def repeated(rooms: RoomBoxes, times: int) -> RoomBoxes:
     """Every room so many times, one after the other."""
-    labels, is_object, boxes_m = (
-        part.repeat_interleave(times, dim=0)
-        for part in (rooms.object_class, rooms.is_object, rooms.boxes_m)
-    )
-    return RoomBoxes(labels, is_object, boxes_m)
+    return rooms.changed(lambda tensor: tensor.repeat_interleave(times, dim=0))
 
 
 @torch.no_grad()
@@ -132,13 +123,9 @@ def _starts(
     """The `each` drawn latents for every room that come nearest to what is given, best first."""
     z, _ = draw_latents(trained, max(DRAWN, each), seed, distribution)
     decoded = trained.prior.decode(z, with_shape=False)
-    chosen = []
-    for one in given.split(1):
-        losses = given_loss(
-            decoded, repeated(one, len(z)), trained.config.model.completeness_target
-        )
-        chosen.append(z[losses.argsort(stable=True)[:each]])
-    return torch.cat(chosen)
+    target = trained.config.model.completeness_target
+    losses = [given_loss(decoded, repeated(one, len(z)), target) for one in given.split(1)]
+    return torch.cat([z[some.argsort(stable=True)[:each]] for some in losses])
 
 
 def fit_latents(

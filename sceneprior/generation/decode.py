@@ -1,7 +1,7 @@
 """Decode latents into scenes, of training rooms and of new ones; new rooms of every method."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -18,12 +18,11 @@ from sceneprior.views import DecodedScenes, RoomBoxes
 BATCH = 64
 
 
-@dataclass(frozen=True)
-class DecodedRoom:
+class DecodedRoom(NamedTuple):
     """A decoded scene, and what the network said of each of its objects."""
 
     scene: Scene
-    predictions: tuple[int, ...]
+    predictions: list[int]
     """Which of the network's N predictions each object is."""
     class_logits: Float[Tensor, "objects classes"]
 
@@ -45,7 +44,7 @@ def to_rooms(
     for row, name in enumerate(names):
         predictions = kept[row].nonzero()[:, 0].tolist()
         scene = scene_of(decoded, row, predictions, faces, label_set_name, name)
-        rooms.append(DecodedRoom(scene, tuple(predictions), decoded.class_logits[row, predictions]))
+        rooms.append(DecodedRoom(scene, predictions, decoded.class_logits[row, predictions]))
     return rooms
 
 
@@ -95,18 +94,14 @@ def decode_latents(
 
 
 def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]:
-    """The training rooms as the prior remembers them, named by their ids.
-
-    Raises:
-        InputError: training rooms have no latents in runs of this kind.
-    """
+    """The training rooms as the prior remembers them, named by their ids; an `InputError` for runs
+    that keep no latents of them."""
     if isinstance(trained, TrainedSampler) or not trained.remembers_rooms:
         raise InputError(
             f"A run of `method: {trained.config.method}` keeps no latents of training rooms, so "
             "none can be decoded; take a run of `method: ours`."
         )
-    z = trained.prior.latent_space(trained.logits)
-    return decode_latents(trained, z, trained.room_ids)
+    return decode_latents(trained, trained.prior.latent_space(trained.logits), trained.room_ids)
 
 
 def synthesize(
@@ -114,10 +109,8 @@ def synthesize(
 ) -> list[Scene]:
     """New scenes, of a run of any kind; the same seed, the same scenes.
 
-    `distribution` says where latents come from; None takes the run's own.
-
-    Raises:
-        InputError: a distribution for a method without latents, or one that does not exist.
+    `distribution` says where latents come from: None takes the run's own. It is an `InputError` for
+    a method without latents.
     """
     if isinstance(trained, TrainedPrior):
         return decode_latents(trained, *draw_latents(trained, count, seed, distribution))

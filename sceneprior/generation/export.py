@@ -5,7 +5,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -20,10 +19,6 @@ from sceneprior.generation.sample import LATENTS_FILE, write_latents
 from sceneprior.offscreen import Renderer
 from sceneprior.pictures import contact_sheet, png_bytes
 from sceneprior.scene import FORMAT, Mesh, Scene, read_scene, scene_to_json
-
-if TYPE_CHECKING:
-    import trimesh
-
 
 OVERVIEW_ROOMS = 12
 OVERVIEW_TILE = (240, 320)
@@ -50,11 +45,7 @@ def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> No
 
 
 def check_free(folder: Path, overwrite: bool = False) -> None:
-    """See that nothing would be written over unasked.
-
-    Raises:
-        InputError: it is a file, or holds something and `overwrite` is false.
-    """
+    """Refuse a folder in which something would be written over unasked."""
     folder = Path(folder)
     if folder.is_file():
         raise InputError(f"{folder} is a file; name a folder.")
@@ -79,12 +70,8 @@ def write_scenes(
     overwrite: bool = False,
     latents: Float[Tensor, "rooms dimension"] | None = None,
 ) -> None:
-    """Write scenes to a folder, each under its own name, `overview.png` of the first few, and
-    `latents.npz` where latents are given.
-
-    Raises:
-        InputError: the folder holds something and `overwrite` is false.
-    """
+    """Write scenes to a folder (see `check_free`), each under its own name, `overview.png` of the
+    first few, and `latents.npz` where latents are given."""
     check_free(folder, overwrite)
     clear_scenes(folder)
     with Progress(console=Console(stderr=True)) as progress:
@@ -152,29 +139,25 @@ def _empty_glb() -> bytes:
 
 
 def read_glb_meshes(path: Path) -> dict[str, Mesh]:
-    """The meshes of a GLB by node name, vertices in the room frame in metres.
-
-    Raises:
-        InputError: the file is missing or not a GLB.
-    """
+    """The meshes of a GLB by node name, vertices in the room frame in metres."""
     import trimesh
 
     try:
         # process=False keeps vertices and faces as they were written.
         loaded = trimesh.load_scene(Path(path), file_type="glb", process=False)
-        return {node: _node_mesh(loaded, node) for node in loaded.graph.nodes_geometry}
+        meshes = {}
+        for node in loaded.graph.nodes_geometry:
+            transform, name = loaded.graph[node]
+            mesh = loaded.geometry[name]
+            vertices = np.asarray(mesh.vertices, dtype=np.float64)
+            placed = vertices @ transform[:3, :3].T + transform[:3, 3]
+            meshes[node] = Mesh(placed, np.asarray(mesh.faces))
+        return meshes
     except Exception as error:  # what trimesh raises depends on which byte is damaged
         raise InputError(
             f"{path} cannot be read as a GLB ({type(error).__name__}: {error}); write the scene "
             "again with `sceneprior synthesize`, or delete the file to use the boxes alone."
         ) from None
-
-
-def _node_mesh(loaded: "trimesh.Scene", node: str) -> Mesh:
-    transform, name = loaded.graph[node]
-    mesh = loaded.geometry[name]
-    vertices = np.asarray(mesh.vertices, dtype=np.float64)
-    return Mesh(vertices @ transform[:3, :3].T + transform[:3, 3], np.asarray(mesh.faces))
 
 
 def load_scene(path: Path) -> Scene:
@@ -196,19 +179,16 @@ def load_scene(path: Path) -> Scene:
             f"{glb.name} and {path.name} describe different objects (only in one of them: "
             f"{', '.join(unlisted[:4])}); write both again with `sceneprior synthesize`."
         )
-    objects = tuple(
+    with_mesh = [
         replace(item, mesh=meshes[node]) for node, item in zip(wanted, scene.objects, strict=True)
-    )
-    return replace(scene, objects=objects)
+    ]
+    return replace(scene, objects=tuple(with_mesh))
 
 
 def load_scene_folder(folder: Path) -> list[Scene]:
     """Every scene of a folder, by name with numbers in counting order (room_2 before room_10).
 
-    JSON files of other formats (scores, say) are passed over; a damaged one is an error.
-
-    Raises:
-        InputError: the folder is missing, holds no scene, or a file in it is damaged.
+    JSON files of other formats (scores, say) are passed over; a damaged one is an `InputError`.
     """
     folder = Path(folder)
     if not folder.is_dir():

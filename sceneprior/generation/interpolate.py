@@ -43,16 +43,13 @@ def interpolate(
     Args:
         start, end: As `read_latent` reads them.
         steps: Rooms, both ends included; at least 2.
-
-    Raises:
-        InputError: an end is unknown, or the two are opposite.
     """
     z = path_latents(trained, read_latent(trained, start), read_latent(trained, end), steps)
     names = [f"step_{k:02d}" for k in range(steps)]
     scenes = []
     for step, room in enumerate(decode_rooms(trained, z, names)):
         along = round(step / (steps - 1), 6)
-        extra = {"from": start, "to": end, "along": along, "slots": list(room.predictions)}
+        extra = {"from": start, "to": end, "along": along, "slots": room.predictions}
         scenes.append(replace(room.scene, extra=extra))
     return z, scenes
 
@@ -122,9 +119,8 @@ def write_pictures(
     renderer: Renderer,
 ) -> None:
     """Write `strip.png` of the steps and `animation.gif`, which has pictures between them, too."""
-    many = (len(path) - 1) * BETWEEN + 1
-    z = path_latents(trained, path[0], path[-1], many)
-    rooms = decode_rooms(trained, z, [f"frame_{k:03d}" for k in range(many)])
+    z = path_latents(trained, path[0], path[-1], (len(path) - 1) * BETWEEN + 1)
+    rooms = decode_rooms(trained, z, [""] * len(z))
     view = corner_view([room.scene for room in rooms], TILE)
     pictures = [
         perspective(room.scene, renderer, view=view, colors=mixed_colors(room)) for room in rooms

@@ -10,8 +10,8 @@ All models and turns are compared by few points, the most promising ones by all 
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -36,8 +36,7 @@ _BLOCK = 2**16
 """Squared distances at a time: what stays in a core's cache."""
 
 
-@dataclass(frozen=True)
-class Retrieved:
+class Retrieved(NamedTuple):
     """A model in a box."""
 
     model_id: str
@@ -51,10 +50,8 @@ def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
     """The scene with the mesh of the most similar CAD model in every box.
 
     `extra["retrieval"]` holds, in the order of the objects, {"model_id", "turn_deg", "distance_m"},
-    or None where there is no model of the class: such an object keeps its own mesh.
-
-    Raises:
-        InputError: a box or a mesh is no finite number.
+    or None where there is no model of the class: such an object keeps its own mesh. A box or a mesh
+    that is no finite number is an `InputError`.
     """
     _check(scene)
     objects: list[SceneObject] = []
@@ -64,7 +61,7 @@ def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
         if of_class := models.by_class.get(item.label):
             best = most_similar(item, of_class, keep)
             item = replace(item, mesh=placed(models.load(best.model_id), item, best.turn_deg))
-            told = {**vars(best), "distance_m": round(best.distance_m, 5)}
+            told = best._asdict() | {"distance_m": round(best.distance_m, 5)}
         objects.append(item)
         found.append(told)
     return replace(scene, objects=tuple(objects), extra={**scene.extra, "retrieval": found})
@@ -86,14 +83,14 @@ def retrieval_report(scenes: Sequence[Scene], models: CadModels) -> dict[str, An
     ]
     classes = {}
     for label in sorted({label for label, _ in pairs}):
-        of_class = [found for name, found in pairs if name == label]
-        given = [found["distance_m"] for found in of_class if found]
+        given = [found for name, found in pairs if name == label and found]
+        distances = [found["distance_m"] for found in given]
         there = models.by_class.get(label)
         classes[label] = {
-            "objects": len(of_class),
+            "objects": sum(name == label for name, _ in pairs),
             "models": len(there.model_ids) if there else 0,
-            "models_used": len({found["model_id"] for found in of_class if found}),
-            "mean_distance_m": round(float(np.mean(given)), 5) if given else None,
+            "models_used": len({found["model_id"] for found in given}),
+            "mean_distance_m": round(float(np.mean(distances)), 5) if given else None,
         }
     return {
         "format": "sceneprior-retrieval",

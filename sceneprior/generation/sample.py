@@ -35,14 +35,12 @@ def sample_latents(
     seed: int,
     distribution: str = "kernel",
 ) -> Float[Tensor, "count dimension"]:
-    """Draw points of the latent space; the same seed, the same points.
+    """Draw points of the latent space around training rooms, whose logits are `trained`; the same
+    seed, the same points.
 
-    Args:
-        space: Turns logits into points.
-        trained: The training rooms' logits.
-        distribution: `geodesic`: a point anywhere on the geodesic (in a cube: the straight line)
-            between a training room drawn at random and one of its `NEIGHBOURS` nearest. The
-            others: see `sample_logits`.
+    `geodesic` takes a point anywhere on the geodesic (in a cube: the straight line) between a
+    training room drawn at random and one of its `NEIGHBOURS` nearest. The other distributions: see
+    `sample_logits`.
 
     Raises:
         InputError: an unknown distribution, or fewer than two training rooms to draw between.
@@ -149,8 +147,8 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
         return space(trained.logits[row : row + 1])[0]
     if re.fullmatch(r"seed:\d{1,18}", text):
         return draw_latents(trained, 1, int(text[5:]))[0][0]
-    file, colon, item = text.rpartition(":")
-    path, item = (Path(file), item) if colon and file.endswith(_ENDINGS) else (Path(text), "0")
+    file, _, item = text.rpartition(":")
+    path, item = (Path(file), item) if file.endswith(_ENDINGS) else (Path(text), "0")
     if not path.is_file():
         known = f"such as {trained.room_ids[0]}" if trained.room_ids else "which keeps none"
         raise InputError(

@@ -1,12 +1,13 @@
 """2D boxes, visibility and tracks of the objects in images of instance ids."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy import ndimage
 
-from sceneprior.shards import RoomViews
+from sceneprior.classes import VOID
+from sceneprior.shards import RoomViews, Sightings
 
 MIN_BOX_SIDE_PX = 4
 """A mask whose box is this narrow, or narrower, is not visible in that view."""
@@ -16,50 +17,25 @@ TOUCH_PX = 4
 
 
 @dataclass(frozen=True)
-class Observations:
-    """T views of the n objects that at least one view shows."""
+class Observations(Sightings):
+    """The given objects that at least one view shows, and which they are."""
 
+    instance_ids: np.ndarray
     tracked: np.ndarray
     """(n,) which of the given objects these are, in their order."""
     unseen: np.ndarray
     """The given objects that no view shows."""
-    instance_ids: np.ndarray
-    """(T, H, W) uint8 (uint16 past 255 objects): 0 = nothing, k + 1 = tracked object k."""
-    boxes: np.ndarray
-    """(T, n, 4) float32, x1, y1, x2, y2 in [0, 1]; zeros where not visible."""
-    visible: np.ndarray
-    """(T, n) bool."""
-    mask_pixels: np.ndarray
-    """(T, n) int32, 0 where not visible."""
-    sides_clear: np.ndarray
-    """(T, n, 4) bool: no other object touches the mask at the left, upper, right, lower side of
-    its box. A side that is not clear may belong to what stands in front."""
 
     def room_views(
-        self,
-        room_id: str,
-        classes: np.ndarray | Sequence[int],
-        world_to_camera: np.ndarray,
-        intrinsics: np.ndarray,
+        self, room_id: str, world_to_camera: np.ndarray, intrinsics: np.ndarray
     ) -> RoomViews:
-        """What a shard stores of these views.
-
-        Args:
-            classes: Class index of each given object.
-            world_to_camera: (T, 4, 4).
-            intrinsics: (T, 3, 3), or (3, 3) of all views.
-        """
+        """What a shard stores of these views; `intrinsics` may be (3, 3), of all views."""
         views, height, width = self.instance_ids.shape
         return RoomViews(
+            **{item.name: getattr(self, item.name) for item in fields(Sightings)},
             room_id=room_id,
-            object_class=np.asarray(classes, dtype=np.int16)[self.tracked],
             world_to_camera=world_to_camera.astype(np.float32),
             intrinsics=np.array(np.broadcast_to(intrinsics, (views, 3, 3)), dtype=np.float32),
-            boxes=self.boxes,
-            visible=self.visible,
-            mask_pixels=self.mask_pixels,
-            sides_clear=self.sides_clear,
-            instance_ids=self.instance_ids,
             image_size=(height, width),
         )
 
@@ -69,19 +45,18 @@ def pixel_counts(image: np.ndarray, count: int) -> np.ndarray:
     return np.bincount(image.ravel(), minlength=count + 1)[1 : count + 1]
 
 
-def observe(images: np.ndarray, is_object: np.ndarray | Sequence[bool]) -> Observations:
-    """Measure every mask, and number anew the objects that are ever visible.
-
-    A mask too narrow to count keeps its pixels in the image.
+def observe(images: np.ndarray, classes: np.ndarray | Sequence[int]) -> Observations:
+    """Measure every mask, and number anew the objects that are ever visible. A mask too narrow to
+    count keeps its pixels in the image.
 
     Args:
         images: (T, H, W) unsigned ids, k + 1 for mesh k.
-        is_object: (meshes,) false for furniture outside the label set, which hides what is
-            behind it but is itself nothing: its pixels become 0.
+        classes: Class index of each mesh. Void furniture hides what is behind it but is itself
+            nothing: its pixels become 0.
     """
     views, height, width = images.shape
-    is_object = np.asarray(is_object, dtype=bool)
-    meshes = len(is_object)
+    classes = np.asarray(classes, dtype=np.int16)
+    is_object, meshes = classes != VOID, len(classes)
     boxes = np.zeros((views, meshes, 4), dtype=np.float32)
     visible = np.zeros((views, meshes), dtype=bool)
     pixels = np.zeros((views, meshes), dtype=np.int32)
@@ -96,12 +71,8 @@ def observe(images: np.ndarray, is_object: np.ndarray | Sequence[bool]) -> Obser
                 continue
             visible[view, k] = True
             pixels[view, k] = counts[k]
-            boxes[view, k] = (
-                columns.start / width,
-                rows.start / height,
-                columns.stop / width,
-                rows.stop / height,
-            )
+            boxes[view, k, ::2] = columns.start / width, columns.stop / width
+            boxes[view, k, 1::2] = rows.start / height, rows.stop / height
             clear[view, k] = clear_sides(image, k + 1, rows, columns)
     tracked = np.flatnonzero(visible.any(axis=0))
     number = np.zeros(meshes + 1, dtype=np.uint8 if len(tracked) <= 255 else np.uint16)
@@ -109,6 +80,7 @@ def observe(images: np.ndarray, is_object: np.ndarray | Sequence[bool]) -> Obser
     return Observations(
         tracked=tracked,
         unseen=np.setdiff1d(np.flatnonzero(is_object), tracked),
+        object_class=classes[tracked],
         instance_ids=number[images],
         boxes=boxes[:, tracked],
         visible=visible[:, tracked],
@@ -139,7 +111,7 @@ def _clear(mine: np.ndarray, other: np.ndarray, last: int, outwards: int) -> boo
     if outwards < 0:
         rim, around = slice(last, last + 3), slice(max(last - TOUCH_PX, 0), last + 3)
     else:
-        inner = max(last - 2, 0)
-        rim, around = slice(inner, last + 1), slice(inner, last + 1 + TOUCH_PX)
+        rim = slice(max(last - 2, 0), last + 1)
+        around = slice(rim.start, rim.stop + TOUCH_PX)
     places = np.flatnonzero(mine[rim].any(axis=0))
     return not other[around, max(places[0] - TOUCH_PX, 0) : places[-1] + 1 + TOUCH_PX].any()

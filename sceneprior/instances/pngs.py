@@ -15,27 +15,20 @@ _KINDS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 
 
 def mask_size(path: Path) -> tuple[int, int]:
-    """(height, width), without reading the pixels.
-
-    Raises:
-        InputError: it is missing, no PNG, or has more than one channel.
-    """
+    """(height, width), without reading the pixels; see `read_mask`."""
     with _open(path) as picture:
         return picture.height, picture.width
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """(height, width) uint16: the same value is the same object in all frames, 0 is nothing.
-
-    Raises:
-        InputError: it is missing, no PNG, has more than one channel, or is cut off.
-    """
+    """(height, width) uint16: the same value is the same object in all frames, 0 is nothing. A file
+    that is missing, no PNG, of more than one channel or cut off is an `InputError`."""
     try:
         with _open(path) as picture:
             return np.asarray(picture).astype(np.uint16)
+    except InputError:
+        raise
     except (OSError, ValueError, SyntaxError, EOFError, zlib.error) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path} is damaged ({str(error)[:120]}).") from None
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprior.classes import label_set
+from sceneprior.classes import VOID, label_set
 from sceneprior.errors import InputError
 
 SHELL = frozenset(
@@ -53,10 +53,8 @@ def read_class_table(path: Path) -> dict[int, str]:
 def _json_rows(path: Path, content: str) -> Iterable[tuple[str, str]]:
     # As pairs, so that a repeated key is seen.
     data = json.loads(content, object_pairs_hook=list)
-    if (
-        not isinstance(data, list)
-        or not all(isinstance(row, tuple) for row in data)
-        or not all(isinstance(name, str) for _, name in data)
+    if not isinstance(data, list) or not all(
+        isinstance(row, tuple) and isinstance(row[1], str) for row in data
     ):
         raise InputError(
             f'{path} is not an object of ids and class names, as {{"1": "bed", "2": "chair"}} is.'
@@ -68,9 +66,8 @@ def _csv_rows(content: str) -> Iterable[tuple[str, str]]:
     rows = [row for row in csv.reader(io.StringIO(content)) if any(cell.strip() for cell in row)]
     if rows and not rows[0][0].strip().isdigit():
         rows = rows[1:]
-    for row in rows:
-        if len(row) < 2:
-            raise ValueError(f"a row '{row[0][:40]}' has no class")
+    if short := [row for row in rows if len(row) < 2]:
+        raise ValueError(f"a row '{short[0][0][:40]}' has no class")
     return [(row[0].strip(), row[1]) for row in rows]
 
 
@@ -98,28 +95,22 @@ class IdTable:
 
     def __init__(self, of_id: dict[int, str], label_set_name: str, where: str):
         names = {tidy(name): i for i, name in enumerate(label_set(label_set_name))}
-        shell = [
-            key for key, name in of_id.items() if tidy(name) in SHELL and tidy(name) not in names
-        ]
+        shell = [key for key, name in of_id.items() if tidy(name) in SHELL - set(names)]
         objects = sorted(set(of_id) - set(shell))
-        indices = [names.get(tidy(of_id[key]), 0) for key in objects]
-        self.classes = np.array([*indices, 0], dtype=np.int16)
-        self.is_object = self.classes > 0
-        if not self.is_object.any():
-            came = ", ".join(sorted({of_id[key] for key in of_id})[:10])
+        indices = [names.get(tidy(of_id[key]), VOID) for key in objects]
+        self.classes = np.array([*indices, VOID], dtype=np.int16)
+        if not self.classes.any():
+            came = ", ".join(sorted(set(of_id.values()))[:10])
             raise InputError(
                 f"{where}: none of its classes ({came}) is in the label set "
                 f"({', '.join(list(names)[1:11])}{', ...' if len(names) > 11 else ''})."
             )
         others = Counter(of_id[key] for key in objects if tidy(of_id[key]) not in names)
-        self.notes = [
-            f"classes outside the label set are void: "
-            f"{', '.join(f'{name} ({count})' for name, count in sorted(others.items()))}"
-        ] * bool(others)
+        told = ", ".join(f"{name} ({count})" for name, count in sorted(others.items()))
+        self.notes = [f"classes outside the label set are void: {told}"] if others else []
         self.unlisted: set[int] = set()
-        self._unknown = len(objects) + 1
         # The last entry is that of -1.
-        self._table = np.full(65_537, self._unknown, dtype=np.uint32)
+        self._table = np.full(LARGEST_ID + 2, len(objects) + 1, dtype=np.uint32)
         self._table[[0, *shell]] = 0
         self._table[objects] = np.arange(1, len(objects) + 1)
         self._listed = np.array([-1, 0, *of_id])

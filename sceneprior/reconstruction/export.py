@@ -52,10 +52,16 @@ def write_reconstructions(
 
 def picture(found: Reconstruction, renderer: Renderer) -> UInt8[np.ndarray, "height width 3"]:
     """Three panels with titles, coloured by class, and the classes' names under them."""
+    image, scene = found.image, found.scene
+    colors = class_colors(len(label_set(image.label_set)))[image.object_class]
+    camera = Pinhole(image.world_to_camera.astype(np.float64), image.intrinsics.astype(np.float64))
+    height, wide = image.instance_ids.shape
     panels = {
-        "masks given": masks_given(found.image),
-        "found, same camera": same_camera(found.scene, found.image, renderer),
-        "found, from above": from_above(found.scene, found.image, renderer),
+        "masks given": paint_ids(image.instance_ids.astype(np.int64), colors, PAPER),
+        "found, same camera": renderer.shaded(
+            scene_meshes(scene), object_colors(scene), camera, (height, wide)
+        ),
+        "found, from above": from_above(scene, image, renderer),
     }
     tiles = [_as_tile(panel) for panel in panels.values()]
     width = sum(tile.width for tile in tiles) + GAP_PX * (len(tiles) - 1)
@@ -102,21 +108,6 @@ def _legend_rows(
         rows[-1].append((x, name, (red, green, blue)))
         x += wide
     return rows
-
-
-def masks_given(image: ObservedImage) -> UInt8[np.ndarray, "height width 3"]:
-    """The image's masks in their class colours, with dark borders between them."""
-    colors = class_colors(len(label_set(image.label_set)))[image.object_class]
-    return paint_ids(image.instance_ids.astype(np.int64), colors, PAPER)
-
-
-def same_camera(
-    scene: Scene, image: ObservedImage, renderer: Renderer
-) -> UInt8[np.ndarray, "height width 3"]:
-    """The found objects as the image's camera would see them, shaded."""
-    camera = Pinhole(image.world_to_camera.astype(np.float64), image.intrinsics.astype(np.float64))
-    height, width = image.instance_ids.shape
-    return renderer.shaded(scene_meshes(scene), object_colors(scene), camera, (height, width))
 
 
 def from_above(

@@ -67,8 +67,7 @@ class ViewLoss(NamedTuple):
     matches: Matches
 
 
-@dataclass(frozen=True)
-class Fit:
+class Fit(NamedTuple):
     """What was found for each image."""
 
     z: Float[Tensor, "images width"]
@@ -97,10 +96,9 @@ def view_loss(
     """The losses of training, per image (a room of `views`) and without completeness.
 
     Args:
-        trained: Of the run. Scenes without meshes (before its shape stage) have no masks.
-        scenes: At least as many objects a room as the fullest image shows.
-        views: With instance ids.
-        masks: Whether masks are compared.
+        scenes: At least as many objects a room as the fullest image shows. Those without meshes
+            (before the shape stage) have no masks.
+        masks: Whether masks are compared; `views` needs instance ids then.
         matches: To keep; None matches anew.
     """
     config = trained.config
@@ -191,11 +189,10 @@ def fit_latents(
 
 def refuse_crowds(trained: TrainedPrior, views: SceneViews) -> None:
     """Raise an `InputError` where an image shows more objects than the prior can generate."""
-    counts = views.is_object.sum(dim=-1)
-    row = int(counts.argmax())
-    if int(counts[row]) > trained.prior.max_objects:
+    count, row = (int(value) for value in views.is_object.sum(dim=-1).max(dim=0))
+    if count > trained.prior.max_objects:
         raise InputError(
-            f"{views.room_ids[row] if views.room_ids else 'An image'} shows {int(counts[row])} "
-            f"objects, but the run generates at most {trained.prior.max_objects} "
-            "(model.max_objects); leave out the smallest masks, or train with more."
+            f"{views.room_ids[row]} shows {count} objects, but the run generates at most "
+            f"{trained.prior.max_objects} (model.max_objects); leave out the smallest masks, or "
+            "train with more."
         )

@@ -1,14 +1,15 @@
 """Instance masks of single images: read from shards, and stacked into batches."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool, Float, Float32, Int64, Integer
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from sceneprior.errors import InputError
 from sceneprior.shards import RoomViews, iterate_rooms, thinned
@@ -20,21 +21,17 @@ MASK_COLUMNS = 80
 
 @dataclass(frozen=True)
 class ObservedImage:
-    """Instance masks of one image, of the n objects that it shows, and its camera."""
+    """Instance masks of one image, of the n objects that it shows, and its camera; the arrays are
+    those of `RoomViews`."""
 
     name: str
     """What its files are called."""
     label_set: str
-    object_class: Integer[np.ndarray, " n"]
-    """Index into the label set."""
+    object_class: Int64[np.ndarray, " n"]
     instance_ids: Integer[np.ndarray, "height width"]
-    """0 = nothing, k + 1 = object k."""
-    boxes: Float[np.ndarray, "n 4"]
-    """x1, y1, x2, y2 relative to the image size."""
+    boxes: Float32[np.ndarray, "n 4"]
     sides_clear: Bool[np.ndarray, "n 4"]
-    """Which sides of a box are the object's own; see `SceneViews`."""
     world_to_camera: Float[np.ndarray, "4 4"]
-    """To the camera from the room frame that the scene is told in."""
     intrinsics: Float[np.ndarray, "3 3"]
     room_id: str = ""
     view: int = 0
@@ -57,8 +54,7 @@ def image_of_room(room: RoomViews, view: int, label_set: str) -> ObservedImage:
     Raises:
         InputError: the room has no such view, or the view shows no object.
     """
-    count = len(room.visible)
-    if not 0 <= view < count:
+    if not 0 <= view < (count := len(room.visible)):
         raise InputError(
             f"Room {room.room_id} has no view {view}; its {count} views are 0 to {count - 1}."
         )
@@ -91,7 +87,6 @@ def image_from_shards(folder: Path, room_id: str, view: int) -> ObservedImage:
 
     Raises:
         InputError: neither split holds the room, or see `image_of_room`.
-        ShardError: a shard is missing or damaged.
     """
     found: list[str] = []
     for split in ("test", "train"):
@@ -118,14 +113,11 @@ def images_of_split(
         The images, and the ids of rooms of which no view shows anything: those are left out.
 
     Raises:
-        ShardError: a shard is missing or damaged.
         InputError: no view of any room shows an object.
     """
     images: list[ObservedImage] = []
     blank: list[str] = []
-    for number, (shard, room_id) in enumerate(iterate_rooms(folder, split)):
-        if limit is not None and number >= limit:
-            break
+    for shard, room_id in islice(iterate_rooms(folder, split), limit):
         useful = np.flatnonzero(shard.read_room(room_id).visible.any(axis=1))
         if not len(useful):
             blank.append(room_id)
@@ -141,11 +133,8 @@ def as_views(images: Sequence[ObservedImage], mask_step: int | None = None) -> S
     """The images as a batch: each a room with one view, objects padded to the fullest image's.
 
     Args:
-        images: At least one, all of one size.
+        images: At least one, all of one size; others are an `InputError`.
         mask_step: Every how many pixels the instance ids are kept; None takes the images' own.
-
-    Raises:
-        InputError: the images differ in size.
     """
     sizes = sorted({image.instance_ids.shape for image in images})
     if len(sizes) > 1:
@@ -153,28 +142,24 @@ def as_views(images: Sequence[ObservedImage], mask_step: int | None = None) -> S
             f"Images that are fitted together have one size, but {sizes[0]} and {sizes[1]} pixels "
             "(height, width) came; reconstruct each size on its own."
         )
-    most = max(len(image.object_class) for image in images)
     step = mask_step or images[0].mask_step
 
-    def padded(rows: Sequence[np.ndarray], dtype: type) -> Tensor:
-        stack = np.zeros((len(rows), most, *rows[0].shape[1:]), dtype=dtype)
-        for place, row in zip(stack, rows, strict=True):
-            place[: len(row)] = row
-        return torch.from_numpy(stack)
+    def padded(rows: Sequence[np.ndarray]) -> Tensor:
+        return pad_sequence([torch.from_numpy(row) for row in rows], batch_first=True)
 
     def stacked(matrices: Sequence[np.ndarray], dtype: type) -> Tensor:
         return torch.from_numpy(np.stack(matrices).astype(dtype)[:, None])
 
-    is_object = padded([np.ones(len(image.object_class)) for image in images], bool)
+    is_object = padded([np.ones(len(image.object_class), bool) for image in images])
     return SceneViews(
         room_index=torch.arange(len(images)),
-        object_class=padded([image.object_class for image in images], np.int64),
+        object_class=padded([image.object_class for image in images]),
         is_object=is_object,
         world_to_camera=stacked([image.world_to_camera for image in images], np.float32),
         intrinsics=stacked([image.intrinsics for image in images], np.float32),
-        boxes=padded([image.boxes for image in images], np.float32)[:, None],
+        boxes=padded([image.boxes for image in images])[:, None],
         visible=is_object[:, None],
-        sides_clear=padded([image.sides_clear for image in images], bool)[:, None],
+        sides_clear=padded([image.sides_clear for image in images])[:, None],
         image_size=sizes[0],
         instance_ids=stacked([image.sampled_ids(step) for image in images], np.int32),
         room_ids=tuple(image.name for image in images),
@@ -185,14 +170,14 @@ def rows_of(
     views: SceneViews, rows: Integer[Tensor, " rows"] | Bool[Tensor, " rows"]
 ) -> SceneViews:
     """Some rooms of a batch, padded to the fullest of them alone."""
-    values = {item.name: getattr(views, item.name) for item in fields(views)}
-    chosen: dict[str, Any] = {
-        name: value[rows] for name, value in values.items() if isinstance(value, Tensor)
-    }
-    most = max(int(chosen["is_object"].sum(dim=-1).max()), 1)
-    for name, axis in (
-        ("object_class", 1), ("is_object", 1), ("boxes", 2), ("visible", 2), ("sides_clear", 2),
-    ):  # fmt: skip
-        chosen[name] = chosen[name].narrow(axis, 0, most)
-    room_ids = tuple(np.array(views.room_ids)[rows.numpy()]) if views.room_ids else ()
-    return replace(views, **chosen, room_ids=room_ids)
+    chosen = views.changed(lambda tensor: tensor[rows])
+    most = max(int(chosen.is_object.sum(dim=-1).max()), 1)
+    return replace(
+        chosen,
+        object_class=chosen.object_class[:, :most],
+        is_object=chosen.is_object[:, :most],
+        boxes=chosen.boxes[:, :, :most],
+        visible=chosen.visible[:, :, :most],
+        sides_clear=chosen.sides_clear[:, :, :most],
+        room_ids=tuple(np.array(views.room_ids)[rows.numpy()]) if views.room_ids else (),
+    )

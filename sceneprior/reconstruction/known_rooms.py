@@ -7,12 +7,14 @@ compared with them: a run's own weights take no part.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
+from torch.nn.utils.rnn import pad_sequence
 
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
@@ -41,7 +43,7 @@ ABSENT_M = 1e4
 
 @dataclass(frozen=True)
 class KnownRooms:
-    """Rooms in 3D, each in four turns, as what a prior decodes.
+    """Rooms in 3D, each in four turns, and their objects as a prior would decode them.
 
     They are boxes: a data set's meshes in four turns are many gigabytes. `furnished` reads those of
     a room that is wanted.
@@ -51,22 +53,19 @@ class KnownRooms:
     paths: tuple[Path, ...]
     """The shard of each room, before turns."""
     scenes: tuple[Scene, ...]
-    decoded: DecodedScenes
+    class_logits: Float[Tensor, "rooms objects classes"]
+    centers_m: Float[Tensor, "rooms objects 3"]
+    sizes_m: Float[Tensor, "rooms objects 3"]
 
     def furnished(self, row: int) -> Scene:
-        """`scenes[row]` with its meshes.
-
-        Raises:
-            ShardError: a model's file is missing or damaged.
-        """
+        """`scenes[row]` with its meshes."""
         scene = self.scenes[row]
         with Shard(self.paths[row // QUARTERS]) as shard:
             home = reference_scene(shard, scene.name, self.folder)
         return turn_scene(home, row % QUARTERS)
 
 
-@dataclass(frozen=True)
-class KnownAnswer:
+class KnownAnswer(NamedTuple):
     """A known room as the answer to an image."""
 
     scene: Scene
@@ -75,29 +74,23 @@ class KnownAnswer:
 
 
 def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
-    """The rooms of a split, turned by 0, 90, 180 and 270 degrees.
-
-    Raises:
-        ShardError: the shards or their ground truth cannot be read.
-    """
+    """The rooms of a split, turned by 0, 90, 180 and 270 degrees."""
     rooms = [
         (shard.path, reference_scene(shard, room_id, shards, meshes=False))
         for shard, room_id in iterate_rooms(shards, split)
     ]
     turned = tuple(turn_scene(scene, quarter) for _, scene in rooms for quarter in range(QUARTERS))
-    names = label_set(turned[0].label_set)
-    counts = torch.tensor([len(scene.objects) for scene in turned])
-    most = max(int(counts.max()), 1)
-    centers = torch.full((len(turned), most, 3), ABSENT_M)
-    sizes = torch.zeros(len(turned), most, 3)
-    logits = torch.zeros(len(turned), most, len(names))
-    for row, scene in enumerate(turned):
-        count = len(scene.objects)
-        centers[row, :count] = torch.from_numpy(scene.centers_m).float()
-        sizes[row, :count] = torch.from_numpy(scene.sizes_m).float()
-        logits[row, range(count), scene.class_indices] = CERTAIN_LOGIT
-    decoded = DecodedScenes(logits, centers, sizes, torch.zeros(centers.shape[:2]))
-    return KnownRooms(Path(shards), tuple(path for path, _ in rooms), turned, decoded)
+    certain = CERTAIN_LOGIT * torch.eye(len(label_set(turned[0].label_set)))
+    centers_m = [torch.from_numpy(scene.centers_m).float() for scene in turned]
+    sizes_m = [torch.from_numpy(scene.sizes_m).float() for scene in turned]
+    return KnownRooms(
+        Path(shards),
+        tuple(path for path, _ in rooms),
+        turned,
+        pad_sequence([certain[scene.class_indices] for scene in turned], True),
+        pad_sequence(centers_m, True, ABSENT_M),
+        pad_sequence(sizes_m, True),
+    )
 
 
 def turn_scene(scene: Scene, quarter: int) -> Scene:
@@ -105,18 +98,13 @@ def turn_scene(scene: Scene, quarter: int) -> Scene:
     turn = quarter_rotation(quarter)
 
     def turned(item: SceneObject) -> SceneObject:
-        x, y, z = (float(value) for value in turn @ np.array(item.center_m))
-        width, height, depth = (float(value) for value in np.abs(turn) @ np.array(item.size_m))
+        center_m, size_m = turn @ np.array(item.center_m), np.abs(turn) @ np.array(item.size_m)
         mesh = item.mesh and Mesh(item.mesh.vertices_m @ turn.T, item.mesh.faces)
-        return SceneObject(item.label, (x, y, z), (width, height, depth), mesh)
+        return SceneObject(item.label, tuple(center_m.tolist()), tuple(size_m.tolist()), mesh)
 
     floor = None if scene.floor_m is None else scene.floor_m @ turn[::2, ::2].T
-    return replace(
-        scene,
-        objects=tuple(turned(item) for item in scene.objects),
-        floor_m=floor,
-        extra={**scene.extra, "turned_degrees": 90 * (quarter % QUARTERS)},
-    )
+    extra = {**scene.extra, "turned_degrees": 90 * (quarter % QUARTERS)}
+    return replace(scene, objects=tuple(map(turned, scene.objects)), floor_m=floor, extra=extra)
 
 
 def random_answers(
@@ -124,12 +112,11 @@ def random_answers(
 ) -> list[KnownAnswer]:
     """A room drawn at random for each image, not its own, matched to its masks."""
     rng = np.random.default_rng(seed)
-    answers = []
-    for image in images:
-        row = int(rng.choice(_others(rooms, image)))
-        matched, _ = _matched(rooms, torch.tensor([row]), image)
-        answers.append(_answer(rooms, row, matched[0]))
-    return answers
+    rows = [int(rng.choice(_others(rooms, image))) for image in images]
+    return [
+        _answer(rooms, row, _matched(rooms, torch.tensor([row]), image)[0][0])
+        for row, image in zip(rows, images, strict=True)
+    ]
 
 
 def nearest_answers(
@@ -143,10 +130,9 @@ def nearest_answers(
     for image in images:
         others = _others(rooms, image)
         matched, costs = _matched(rooms, others, image)
-        best = costs.argsort()[:SHORTLIST]
-        offered = [_answer(rooms, int(others[at]), matched[at]) for at in best.tolist()]
-        overlaps = [mask_overlap(one, image, renderer) for one in offered]
-        answers.append(offered[int(np.argmax(overlaps))])
+        best = costs.argsort()[:SHORTLIST].tolist()
+        offered = [_answer(rooms, int(others[at]), matched[at]) for at in best]
+        answers.append(max(offered, key=lambda one: mask_overlap(one, image, renderer)))
     return answers
 
 
@@ -167,24 +153,21 @@ def _others(rooms: KnownRooms, image: ObservedImage) -> Tensor:
 
 
 def _matched(
-    rooms: KnownRooms, rows: Int[Tensor, " rooms"], image: ObservedImage
+    known: KnownRooms, rows: Int[Tensor, " rooms"], image: ObservedImage
 ) -> tuple[list[list[int]], Float[Tensor, " rooms"]]:
     """Which object each room offers for each mask, past its last for none; and the mean cost."""
     view = rows_of(as_views([image], 1), torch.zeros(len(rows), dtype=torch.int64))
     # As many empty places beside a room's objects as there are masks, lest they run out.
     masks = view.is_object.shape[1]
 
-    def padded(values: Tensor, value: float) -> Tensor:
+    def padded(values: Tensor, value: float = 0.0) -> Tensor:
         return F.pad(values[rows], (0, 0, 0, masks), value=value)
 
-    known = rooms.decoded
-    centers_m, sizes_m = padded(known.centers_m, ABSENT_M), padded(known.sizes_m, 0.0)
-    decoded = DecodedScenes(
-        padded(known.class_logits, 0.0), centers_m, sizes_m, torch.zeros(centers_m.shape[:2])
-    )
-    boxes = boxes_of_points(
-        box_corners(centers_m, sizes_m), view.world_to_camera, view.intrinsics, view.image_size
-    )
+    logits, sizes_m = padded(known.class_logits), padded(known.sizes_m)
+    centers_m = padded(known.centers_m, ABSENT_M)
+    decoded = DecodedScenes(logits, centers_m, sizes_m, torch.zeros(centers_m.shape[:2]))
+    corners = box_corners(centers_m, sizes_m)
+    boxes = boxes_of_points(corners, view.world_to_camera, view.intrinsics, view.image_size)
     settings = (BOX_WEIGHT, OCCLUSION_SLACK)
     chosen = match_objects(decoded, boxes, view, *settings, first_n=False).prediction
     costs = matching_cost(decoded, boxes, view, *settings).gather(1, chosen.unsqueeze(1))
@@ -203,7 +186,7 @@ def mask_overlap(answer: KnownAnswer, image: ObservedImage, renderer: Renderer) 
     number = {id(item): row + 1 for row, item in enumerate(scene.objects)}
     overlaps = []
     for mask, item in enumerate(answer.objects):
-        mine = drawn == number[id(item)] if item is not None else np.zeros_like(drawn, dtype=bool)
-        seen = observed == mask + 1
+        # No pixel is -1: nothing was drawn for a mask without an answer.
+        mine, seen = drawn == number.get(id(item), -1), observed == mask + 1
         overlaps.append((mine & seen).sum() / max((mine | seen).sum(), 1))
     return float(np.mean(overlaps))

@@ -1,7 +1,8 @@
 """Read a user's own image: a PNG of instance ids, a table of classes, and the camera."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,13 +20,12 @@ CAMERA_DISTANCE_M = 1.5
 """How far from the middle of the room it stands, which it looks at."""
 
 
-@dataclass(frozen=True)
-class OwnImage:
+class OwnImage(NamedTuple):
     """What a user gave, in the room frame."""
 
-    images: tuple[ObservedImage, ...]
+    images: list[ObservedImage]
     """The image; without a pose, as seen from each of the room's four sides."""
-    notes: tuple[str, ...]
+    notes: list[str]
     """What was assumed, or left out: sentences to print."""
 
 
@@ -37,35 +37,26 @@ def read_own_image(
     pose: Path | None = None,
     camera_height_m: float = CAMERA_HEIGHT_M,
 ) -> OwnImage:
-    """Read an image's masks and camera.
-
-    Args:
-        mask: PNG of one channel; equal values are one object, 0 is nothing.
-        classes: JSON or CSV: the class of each value. Classes outside the label set are void.
-        intrinsics: `fx,fy,cx,cy` in pixels of the mask, or a JSON file; see `read_intrinsics`.
-        label_set: The run's.
-        pose: JSON; see `read_pose`. Without one the camera is level, `camera_height_m` above the
-            floor and `CAMERA_DISTANCE_M` before the middle of the room, looking along -z.
-        camera_height_m: Of a camera without a pose.
+    """Read an image's masks (`read_mask`, `read_class_table`) and camera (`read_intrinsics`;
+    `read_pose`, or `level_camera` without one). Classes outside the run's label set are void.
 
     Raises:
         InputError: a file cannot be used, the sizes differ, or no object is seen.
     """
     values = read_mask(mask)
-    height, width = values.shape
     table = IdTable(read_class_table(classes), label_set, str(classes))
-    camera = read_intrinsics(intrinsics, (height, width))
-    seen = observe(table.ids(values)[None], table.is_object)
+    camera = read_intrinsics(intrinsics, values.shape)
+    seen = observe(table.ids(values)[None], table.classes)
     if not len(seen.tracked):
         raise InputError(
             f"{mask} shows no object: none of its masks is of a class of the run and wider than "
             f"4 pixels. Its values are {_some(np.unique(values))}; {classes} says what they are."
         )
     notes = list(table.notes)
-    if table.unlisted - {0}:
+    if table.unlisted:
         notes.append(
             f"{mask} has values that {classes} does not list, taken for void: "
-            f"{_some(np.array(sorted(table.unlisted)))}"
+            f"{_some(sorted(table.unlisted))}"
         )
     if pose is None:
         notes.append(
@@ -75,31 +66,30 @@ def read_own_image(
         poses = [level_camera(camera_height_m, quarter) for quarter in range(QUARTERS)]
     else:
         poses = [read_pose(pose)]
-    image = ObservedImage(
-        name=mask.stem,
-        label_set=label_set,
-        object_class=table.classes[seen.tracked].astype(np.int64),
-        instance_ids=seen.instance_ids[0],
-        boxes=seen.boxes[0],
-        sides_clear=seen.sides_clear[0],
-        world_to_camera=poses[0],
-        intrinsics=camera,
-    )
-    images = tuple(replace(image, world_to_camera=camera_pose) for camera_pose in poses)
-    return OwnImage(images, tuple(notes))
+    images = [
+        ObservedImage(
+            name=mask.stem,
+            label_set=label_set,
+            object_class=seen.object_class.astype(np.int64),
+            instance_ids=seen.instance_ids[0],
+            boxes=seen.boxes[0],
+            sides_clear=seen.sides_clear[0],
+            world_to_camera=world_to_camera,
+            intrinsics=camera,
+        )
+        for world_to_camera in poses
+    ]
+    return OwnImage(images, notes)
 
 
-def _some(values: np.ndarray) -> str:
+def _some(values: Sequence[int] | np.ndarray) -> str:
     return ", ".join(str(value) for value in values[:8]) + (", ..." if len(values) > 8 else "")
 
 
 def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
-    """`world_to_camera` of a level camera that looks through the middle of the room.
-
-    Args:
-        height_m: Above the floor.
-        quarter: 0 stands on the +z side and looks along -z; each quarter goes on about +y.
-    """
+    """`world_to_camera` of a level camera `height_m` above the floor and `CAMERA_DISTANCE_M` from
+    the middle of the room, which it looks through. Quarter 0 stands on the +z side and looks along
+    -z; each quarter goes on about +y."""
     turn = quarter_rotation(quarter)
     eye = turn @ np.array([0, height_m, CAMERA_DISTANCE_M])
     pose = np.eye(4)
@@ -120,7 +110,10 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
     path = Path(text)
     in_file = path.suffix.lower() == ".json"
     try:
-        if in_file:
+        if not in_file:
+            values = (float(part) for part in text.split(","))
+            data: Any = dict(zip(("fx", "fy", "cx", "cy"), values, strict=True))
+        else:
             data = read_json(path)
             data = data if isinstance(data, dict) else {"K": data}
             said = (data.get("height", image_size[0]), data.get("width", image_size[1]))
@@ -129,16 +122,13 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
                     f"{path} is of an image of {said[1]} x {said[0]} pixels, but the mask has "
                     f"{image_size[1]} x {image_size[0]}; scale fx, fy, cx and cy, or the mask."
                 )
-        else:
-            values = (float(part) for part in text.split(","))
-            data = dict(zip(("fx", "fy", "cx", "cy"), values, strict=True))
         if "K" not in data:
             fx, fy, cx, cy = (data[key] for key in ("fx", "fy", "cx", "cy"))
             data = {"K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]}
         matrix = np.array(data["K"], dtype=np.float64)
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError):
         source = f"{path} holds" if in_file else f"--intrinsics {text} is"
         raise InputError(f"{source} no intrinsics; expected {expected}.") from None
     pinhole = (
@@ -165,10 +155,9 @@ def read_pose(path: Path) -> np.ndarray:
         InputError: there is no such matrix, or it is no rotation with a translation.
     """
     data = read_json(path)
-    found: list[str] = []
     try:
-        found = [key for key in ("world_to_camera", "camera_to_world") if key in data]
-        matrix = np.array(data[found[0]], dtype=np.float64)
+        key = "world_to_camera" if "world_to_camera" in data else "camera_to_world"
+        matrix = np.array(data[key], dtype=np.float64)
         turn = matrix[:3, :3]
         rigid = (
             matrix.shape == (4, 4)
@@ -185,4 +174,4 @@ def read_pose(path: Path) -> np.ndarray:
             '{"camera_to_world": 4 x 4}, a rotation and a translation in metres, camera axes x '
             "right, y down, z forward, in a room with y up and the floor at 0."
         )
-    return matrix if found[0] == "world_to_camera" else np.linalg.inv(matrix)
+    return matrix if key == "world_to_camera" else np.linalg.inv(matrix)

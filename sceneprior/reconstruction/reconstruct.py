@@ -1,5 +1,6 @@
 """Reconstruct rooms from instance masks of single images: starts, fits, the best as a scene."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -57,9 +58,8 @@ class Reconstruction:
 def reconstruct(
     trained: TrainedPrior, images: Sequence[ObservedImage], options: FitOptions
 ) -> list[Reconstruction]:
-    """Reconstruct images of the run's label set, many at once.
-
-    Before the run's shape stage scenes are boxes, and masks are not compared.
+    """Reconstruct images of the run's label set, many at once. Before the run's shape stage scenes
+    are boxes, and masks are not compared.
 
     Raises:
         InputError: unknown options, a run without latents of rooms, another label set, or more
@@ -85,7 +85,7 @@ def reconstruct(
     found: dict[int, Reconstruction] = {}
     for rows in _batches(images, max(BATCH // options.restarts, 1)):
         part = [images[row] for row in rows]
-        found |= dict(zip(rows, _reconstruct_batch(trained, part, options), strict=True))
+        found |= zip(rows, _reconstruct_batch(trained, part, options), strict=True)
     return [found[row] for row in range(len(images))]
 
 
@@ -101,13 +101,11 @@ def unlearnt_classes(trained: TrainedPrior, images: Sequence[ObservedImage]) -> 
 
 def _batches(images: Sequence[ObservedImage], most: int) -> Iterator[list[int]]:
     """Images of one size together, and such of about as many objects: padding costs time."""
-    by_size: dict[tuple[int, ...], list[int]] = {}
-    for row, image in enumerate(images):
-        by_size.setdefault(image.instance_ids.shape, []).append(row)
+    by_size: dict[tuple[int, ...], list[int]] = defaultdict(list)
+    for row in sorted(range(len(images)), key=lambda row: len(images[row].object_class)):
+        by_size[images[row].instance_ids.shape].append(row)
     for rows in by_size.values():
-        rows.sort(key=lambda row: len(images[row].object_class))
-        for at in range(0, len(rows), most):
-            yield rows[at : at + most]
+        yield from (rows[at : at + most] for at in range(0, len(rows), most))
 
 
 def _reconstruct_batch(
@@ -122,19 +120,14 @@ def _reconstruct_batch(
     best = fit.loss.score.reshape(len(images), -1).argmin(dim=1)
     rows = best + options.restarts * torch.arange(len(images))
     faces, labels = trained.prior.shape.faces, trained.config.label_set
-    found = []
-    for image, row in zip(images, rows.tolist(), strict=True):
+
+    def answer(image: ObservedImage, row: int) -> Reconstruction:
         predictions = fit.loss.matches.prediction[row, : len(image.object_class)].tolist()
-        found.append(
-            Reconstruction(
-                image=image,
-                scene=scene_of(fit.scenes, row, predictions, faces, labels, image.name),
-                score=float(fit.loss.score[row]),
-                mask_iou=float(fit.loss.mask_iou[row]),
-                steps=int(fit.steps[row]),
-            )
-        )
-    return found
+        scene = scene_of(fit.scenes, row, predictions, faces, labels, image.name)
+        score, mask_iou = float(fit.loss.score[row]), float(fit.loss.mask_iou[row])
+        return Reconstruction(image, scene, score, mask_iou, int(fit.steps[row]))
+
+    return [answer(image, row) for image, row in zip(images, rows.tolist(), strict=True)]
 
 
 def starting_latents(
@@ -145,9 +138,6 @@ def starting_latents(
     `nearest` are the training rooms, as decoded, whose layout loss on the image is least; `random`
     ones are drawn around the training rooms, as new rooms are (the kernel distribution), the same
     for every image.
-
-    Raises:
-        InputError: an unknown kind, or more starts than training rooms.
     """
     if kind not in STARTS:
         raise InputError(f"No start is called '{kind}'; choose from {', '.join(STARTS)}.")
@@ -169,19 +159,17 @@ def layout_losses_of_rooms(
     trained: TrainedPrior, views: SceneViews
 ) -> Float[Tensor, "images rooms"]:
     """What each decoded training room would cost as the answer to each image, by 2D boxes alone."""
-    z = trained.prior.latent_space(trained.logits)
-    every = torch.ones(len(z), views.is_object.shape[1], dtype=torch.bool)
+    most = views.is_object.shape[1]
     batches = [
-        trained.prior.decode(z[at : at + START_BATCH], False, every[at : at + START_BATCH])
-        for at in range(0, len(z), START_BATCH)
+        trained.prior.decode(z, False, torch.ones(len(z), most, dtype=torch.bool))
+        for z in trained.prior.latent_space(trained.logits).split(START_BATCH)
     ]
 
     def losses_of(image: int) -> Float[Tensor, " rooms"]:
-        repeated = [rows_of(views, torch.full((len(part.centers_m),), image)) for part in batches]
-        losses = [
-            view_loss(trained, part, view, masks=False).score
-            for part, view in zip(batches, repeated, strict=True)
-        ]
+        losses = []
+        for rooms in batches:
+            repeated = rows_of(views, torch.full((len(rooms.centers_m),), image))
+            losses.append(view_loss(trained, rooms, repeated, masks=False).score)
         return torch.cat(losses)
 
     return torch.stack([losses_of(image) for image in range(len(views.is_object))])

@@ -72,11 +72,7 @@ def evaluate_run(
     limit: int | None = None,
     checkpoint: str = "final",
 ) -> dict[str, Any]:
-    """Reconstruct one view of each room (or the first `limit`) and score it against the truth.
-
-    Raises:
-        InputError: the run or the shards cannot be used.
-    """
+    """Reconstruct one view of each room (or the first `limit`) and score it against the truth."""
     trained = load_run(run, checkpoint)
     shards, split = protocol.shards, protocol.split
     reference_scenes(shards, split, limit=1, meshes=False)  # refuses before any fit
@@ -106,14 +102,11 @@ def evaluate_run(
 def evaluate_scenes(folder: Path, protocol: SvrProtocol) -> dict[str, Any]:
     """Score a folder of reconstructions: as `reconstruct` wrote them, or with CAD models since.
 
-    Args:
-        folder: Scene JSONs, with GLBs where there are meshes. Each one's `extra` names its
-            `room_id` and `view`; its objects are one a mask of that view, in the masks' order.
-        protocol: Where the scenes' rooms are, and how to score them.
+    Each scene's `extra` names its `room_id` and `view`; its objects are one a mask of that view, in
+    the masks' order.
 
     Raises:
         InputError: a scene does not say which view it answers, or has another number of objects.
-        ShardError: a shard is missing or damaged.
     """
     images, scenes = scenes_with_images(folder, protocol.shards, protocol.split)
     answers: dict[str, Answers] = {
@@ -137,8 +130,8 @@ def scenes_with_images(
     """The scenes of a folder, each with the view that it answers; see `evaluate_scenes`."""
     of_room: dict[str, list[Scene]] = defaultdict(list)
     for scene in load_scene_folder(folder):
-        room, view = scene.extra.get("room_id"), scene.extra.get("view")
-        if not isinstance(room, str) or not room or not isinstance(view, int):
+        room = scene.extra.get("room_id")
+        if not isinstance(room, str) or not room or not isinstance(scene.extra.get("view"), int):
             raise InputError(
                 f"Scene '{scene.name}' of {folder} does not say which image it answers: its "
                 "'extra' needs a 'room_id' of the shards and a 'view', as `sceneprior reconstruct "
@@ -179,24 +172,15 @@ def score_answers(
         "random_room": [one.objects for one in drawn],
     }
     true_rooms = reference_scenes(protocol.shards, protocol.split, tracked_only=True)
-    truth = {scene.name: scene for scene in true_rooms}
-    return {
-        name: score_views(pairs_of(images, truth, some), protocol.points)
-        for name, some in answers.items()
-    }
-
-
-def pairs_of(
-    images: Sequence[ObservedImage], truth: dict[str, Scene], answers: Answers
-) -> list[list[ObjectPair]]:
-    """Each object that an image shows, with what was found for its mask."""
-    return [
-        [
-            ObjectPair(truth[image.room_id].objects[row], item)
-            for row, item in zip(image.rows, objects, strict=True)
-        ]
-        for image, objects in zip(images, answers, strict=True)
-    ]
+    truth = {scene.name: scene.objects for scene in true_rooms}
+    rows = {}
+    for name, some in answers.items():
+        views = []
+        for image, objects in zip(images, some, strict=True):
+            shown = [truth[image.room_id][row] for row in image.rows]
+            views.append([ObjectPair(*pair) for pair in zip(shown, objects, strict=True)])
+        rows[name] = score_views(views, protocol.points)
+    return rows
 
 
 def print_view_scores(scores: dict[str, Any], console: Console | None = None) -> None:
@@ -204,19 +188,19 @@ def print_view_scores(scores: dict[str, Any], console: Console | None = None) ->
     rows = {TITLES[name]: row["summary"] for name, row in scores["rows"].items()}
     evaluated = next(iter(scores["rows"].values()))
     summary = evaluated["summary"]
-    title = f"{summary['objects']} objects in {summary['images']} single views"
+    tables = {
+        f"{summary['objects']} objects in {summary['images']} single views": rows,
+        f"{next(iter(rows)).capitalize()}, by class": evaluated["classes"],
+    }
     console = console or wide_console()
-    console.print(_table(title, rows))
-    console.print(_table(f"{next(iter(rows)).capitalize()}, by class", evaluated["classes"]))
-
-
-def _table(title: str, rows: dict[str, dict[str, Any]]) -> Table:
-    table = Table("", "objects", "unmatched", title=title)
-    for name, _ in COLUMNS.values():
-        table.add_column(name, justify="right")
-    for label, row in rows.items():
-        cells = [
-            "–" if row[key] is None else form.format(row[key]) for key, (_, form) in COLUMNS.items()
-        ]
-        table.add_row(label, str(row["objects"]), str(row["unmatched"]), *cells)
-    return table
+    for title, lines in tables.items():
+        table = Table("", "objects", "unmatched", title=title)
+        for name, _ in COLUMNS.values():
+            table.add_column(name, justify="right")
+        for label, row in lines.items():
+            cells = (
+                "–" if row[key] is None else form.format(row[key])
+                for key, (_, form) in COLUMNS.items()
+            )
+            table.add_row(label, str(row["objects"]), str(row["unmatched"]), *cells)
+        console.print(table)

@@ -5,14 +5,14 @@ import pytest
 import torch
 from references.batches import batch_room_by_room, rooms_with_images, turn_about_up
 from torch.testing import assert_close
-from toy_rooms import make_toy_room
+from toy_rooms import make_toy_room, write_shard
 
 from sceneprior.data.datamodule import DrawSampler, make_loader
 from sceneprior.data.dataset import BLANK, ViewDataset
 from sceneprior.errors import ShardError
 from sceneprior.geometry.cameras import boxes_of_points
 from sceneprior.geometry.corners import box_corners
-from sceneprior.shards import RoomViews, Shard, list_shards, write_shard
+from sceneprior.shards import RoomViews, Shard, list_shards
 
 
 def dataset(shards, **changes) -> ViewDataset:

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from toy_rooms import write_shard
 
 from sceneprior.errors import InputError, ShardError
 from sceneprior.evaluation.ground_truth import independent_rooms, reference_scenes
 from sceneprior.evaluation.metrics.contents import class_frequencies, object_counts
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.shards import write_shard
 
 MESH = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toy_rooms import write_shard
 
 from sceneprior.errors import InputError
 from sceneprior.evaluation import reference_file
@@ -15,7 +16,6 @@ from sceneprior.evaluation.ground_truth import (
 )
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.scene import Scene
-from sceneprior.shards import write_shard
 
 
 @pytest.fixture(scope="module")

@@ -48,7 +48,7 @@ def labels(scene) -> list[str]:
 def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded):
     faces = torch.tensor([[0, 1, 2], [3, 4, 5]])
     rooms = to_rooms(decoded, faces, "front3d_bedroom", ["a", "b"])
-    assert [room.predictions for room in rooms] == [(0, 1, 3), (0,)]
+    assert [room.predictions for room in rooms] == [[0, 1, 3], [0]]
     assert torch.equal(rooms[0].class_logits, decoded.class_logits[0, [0, 1, 3]])
     first, second = scenes_of(decoded, faces, "front3d_bedroom", ["a", "b"])
     assert (first.name, second.name) == ("a", "b")

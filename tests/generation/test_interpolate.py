@@ -106,8 +106,8 @@ def test_objects_are_known_by_their_prediction_and_colours_never_jump(trained):
     path = replace(trained, prior=Decoder(22), stage="layout")
     z = torch.linspace(2, -2, 101).unsqueeze(1).expand(-1, 16)
     rooms = decode_rooms(path, z, [str(k) for k in range(101)])
-    assert [room.predictions for room in rooms[:50]] == [(0, 1)] * 50
-    assert [room.predictions for room in rooms[51:]] == [(0,)] * 50
+    assert [room.predictions for room in rooms[:50]] == [[0, 1]] * 50
+    assert [room.predictions for room in rooms[51:]] == [[0]] * 50
     assert [item.label for item in rooms[0].scene.objects] == ["double_bed", "table"]
     # Void has no share in a colour; what is certain has its class's.
     np.testing.assert_allclose(mixed_colors(rooms[0]), class_colors(22)[[9, 19]], atol=2)

@@ -42,7 +42,7 @@ def test_values_become_ids_in_the_tables_order():
     ids = table.ids(np.array([[0, 7, 5], [9, 2, 4]]))
     # 2, 5 and 9 are instances; the wall is nothing; 4 is not in the table: one more than the last.
     np.testing.assert_array_equal(ids, [[0, 0, 2], [3, 1, 4]])
-    np.testing.assert_array_equal(table.is_object, [True, False, False, False])
+    np.testing.assert_array_equal(table.classes > 0, [True, False, False, False])
     assert table.unlisted == {4}
     assert table.notes == ["classes outside the label set are void: night_stand (1), teapot (1)"]
 

@@ -42,7 +42,7 @@ def test_it_is_what_the_shards_say_of_the_same_view(own, seen):
     mask, classes, pose = own
     read = read_own_image(mask, classes, INTRINSICS, LABELS, pose)
     (image,) = read.images
-    assert read.notes == () and image.name == "mask"
+    assert read.notes == [] and image.name == "mask"
     np.testing.assert_array_equal(image.instance_ids, seen.instance_ids)
     np.testing.assert_array_equal(image.object_class, seen.object_class)
     np.testing.assert_allclose(image.boxes, seen.boxes, atol=1e-6)
@@ -75,10 +75,10 @@ def test_unknown_classes_and_values_are_void_and_told(own, seen):
     del table[last]
     classes.write_text(json.dumps(table))
     read = read_own_image(mask, classes, INTRINSICS, LABELS, pose)
-    assert read.notes == (
+    assert read.notes == [
         "classes outside the label set are void: grand piano (1)",
         f"{mask} has values that {classes} does not list, taken for void: {last}",
-    )
+    ]
     np.testing.assert_array_equal(read.images[0].object_class, seen.object_class[1:-1])
 
 

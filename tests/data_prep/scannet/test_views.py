@@ -16,13 +16,14 @@ from scan_files import (
     sens_header,
     write_zip,
 )
+from toy_rooms import write_shard
 
 from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings, read_scan
 from data_prep.scannet.views import labelled_views, prepare_scan
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.offscreen.zbuffer import rasterize
-from sceneprior.shards import Shard, write_shard
+from sceneprior.shards import Shard
 
 BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 NAMES = label_set("scannet")
