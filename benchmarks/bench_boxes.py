@@ -15,10 +15,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sceneprior.geometry.boxes import place
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
-from sceneprior.geometry.meshes import icosphere
+from sceneprior.geometry.meshes import icosphere, place
 
 SIZE = (480, 640)
 

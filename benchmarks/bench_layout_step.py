@@ -24,9 +24,8 @@ from bench_boxes import SIZE, make_batch
 from torch import Tensor
 
 from sceneprior.config import OursConfig, load_config
-from sceneprior.geometry.boxes import place
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
-from sceneprior.geometry.meshes import icosphere
+from sceneprior.geometry.meshes import icosphere, place
 from sceneprior.models.prior import ScenePrior
 from sceneprior.training.objective import match_and_score, proxy_boxes, weighted_sum
 from sceneprior.views import DecodedScenes, SceneViews

@@ -22,8 +22,7 @@ import torch
 
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.evaluation.metrics.decoded_rooms import box_iou_3d
-from sceneprior.geometry.boxes import place
-from sceneprior.geometry.meshes import icosphere
+from sceneprior.geometry.meshes import icosphere, place
 from sceneprior.losses.matching import Matches
 from sceneprior.losses.shape import mask_loss
 from sceneprior.shards import iterate_rooms

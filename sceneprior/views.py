@@ -84,7 +84,7 @@ class DecodedScenes:
     completeness_logits: Float[Tensor, "rooms objects"]
     """Before the sigmoid; `losses/completeness.py` reads them (`kept_objects`)."""
     bevels: Float[Tensor, "rooms objects 2"] | None = None
-    """How far the edges of the proxy `beveled_box` are cut off (`geometry.boxes`); None
+    """How far the edges of the proxy `beveled_box` are cut off (`geometry.meshes`); None
     for rooms that no prior decoded."""
     vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
     """Mesh vertices in the room frame; None until the shape decoder ran."""

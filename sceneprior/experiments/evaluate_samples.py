@@ -24,8 +24,8 @@ from sceneprior.evaluation.metrics.overlaps import overlap_pairs
 from sceneprior.evaluation.topdown import topdown, topdown_protocol
 from sceneprior.generation.decode import decode_latents, synthesize
 from sceneprior.generation.sample import sample_latents
-from sceneprior.geometry.boxes import place
 from sceneprior.geometry.cameras import boxes_of_points
+from sceneprior.geometry.meshes import place
 from sceneprior.losses.matching import match_objects
 from sceneprior.offscreen import SoftwareRenderer
 from sceneprior.pictures import contact_sheet

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from sceneprior.geometry.boxes import place
+from sceneprior.geometry.meshes import place
 from sceneprior.models.latents import CubeConfig, LatentSpace, SphereConfig
 from sceneprior.models.layers import DecoderConfig
 from sceneprior.models.layout_decoder import ClassBevels, LayoutDecoder

@@ -7,6 +7,7 @@ draws nothing (prep-scannet) should not pay for.
 import abc
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,19 +74,9 @@ class Renderer(abc.ABC):
         Behind the meshes is a colour, or another picture of this size. Our z-buffer draws it for
         both kinds, so that pictures look the same everywhere.
         """
-        from sceneprior.offscreen.zbuffer import rasterize
-
         height, width = image_size
-        soup = join(meshes)
-        fine_size = (2 * height, 2 * width)
-        face_index, _ = rasterize(
-            soup.vertices,
-            soup.faces,
-            camera.world_to_camera,
-            projection(camera, fine_size, supersampling=2),
-            fine_size,
-            perspective=isinstance(camera, Pinhole),
-        )
+        soup = _join(meshes)
+        face_index = _draw(soup, camera, (2 * height, 2 * width), supersampling=2)
         light = _face_light(soup, camera)
         palette = np.asarray(colors, dtype=np.float64).reshape(-1, 3)[soup.mesh_of_face]
         palette = np.concatenate([palette * light[:, None], [(0, 0, 0)]])  # -1 is the last row
@@ -104,26 +95,14 @@ class SoftwareRenderer(Renderer):
     def instance_ids_of_views(
         self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
     ) -> np.ndarray:
-        from sceneprior.offscreen.zbuffer import draw_labels
-
-        soup = join(meshes)
-        id_of_face = (soup.mesh_of_face + 1).astype(np.int32)
+        soup = _join(meshes)
         images = np.empty((len(cameras), *image_size), dtype=np.uint16)
         for image, camera in zip(images, cameras, strict=True):
-            image[...] = draw_labels(
-                soup.vertices,
-                soup.faces,
-                id_of_face,
-                camera.world_to_camera,
-                projection(camera, image_size),
-                image_size,
-                perspective=isinstance(camera, Pinhole),
-            )[0]
+            image[...] = _draw(soup, camera, image_size, labels=soup.mesh_of_face) + 1
         return images
 
 
-@dataclass(frozen=True)
-class Soup:
+class _Soup(NamedTuple):
     """All meshes of a room as one."""
 
     vertices: np.ndarray
@@ -131,34 +110,42 @@ class Soup:
     mesh_of_face: np.ndarray
 
 
-def join(meshes: Sequence[Mesh]) -> Soup:
+def _join(meshes: Sequence[Mesh]) -> _Soup:
     starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
-    counts = [len(mesh.faces) for mesh in meshes]
-    return Soup(
+    faces = [
+        np.asarray(mesh.faces, np.int32).reshape(-1, 3) + np.int32(start)
+        for mesh, start in zip(meshes, starts, strict=False)
+    ]
+    return _Soup(
         np.concatenate([np.zeros((0, 3)), *(mesh.vertices_m for mesh in meshes)]),
-        np.concatenate(
-            [np.zeros((0, 3), np.int32)]
-            + [
-                np.asarray(mesh.faces, np.int32).reshape(-1, 3) + np.int32(start)
-                for mesh, start in zip(meshes, starts, strict=False)
-            ]
-        ),
-        np.repeat(np.arange(len(meshes)), counts),
+        np.concatenate([np.zeros((0, 3), np.int32), *faces]),
+        np.repeat(np.arange(len(meshes)), [len(part) for part in faces]),
     )
 
 
-def projection(
-    camera: Camera, image_size: tuple[int, int], supersampling: int = 1
-) -> tuple[float, float, float, float]:
-    """What the z-buffer asks for; `image_size` is the supersampled one."""
+def _draw(
+    soup: _Soup,
+    camera: Camera,
+    image_size: tuple[int, int],
+    supersampling: int = 1,
+    labels: np.ndarray | None = None,
+) -> np.ndarray:
+    """What `zbuffer.rasterize` draws; `image_size` is the supersampled one."""
+    from sceneprior.offscreen.zbuffer import rasterize
+
     if isinstance(camera, Pinhole):
         K = np.asarray(camera.intrinsics, dtype=np.float64) * supersampling
-        return K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    scale = supersampling / camera.metres_per_pixel
-    return scale, scale, image_size[1] / 2, image_size[0] / 2
+        projection = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    else:
+        scale = supersampling / camera.metres_per_pixel
+        projection = (scale, scale, image_size[1] / 2, image_size[0] / 2)
+    return rasterize(
+        soup.vertices, soup.faces, camera.world_to_camera, projection, image_size,
+        isinstance(camera, Pinhole), labels,
+    )[0]  # fmt: skip
 
 
-def _face_light(soup: Soup, camera: Camera) -> np.ndarray:
+def _face_light(soup: _Soup, camera: Camera) -> np.ndarray:
     """Brightness of each face in [0.4, 1]: ambient, and a lamp a little above the camera."""
     to_camera = np.asarray(camera.world_to_camera, dtype=np.float64)
     corners = (soup.vertices @ to_camera[:3, :3].T + to_camera[:3, 3])[soup.faces]

@@ -25,6 +25,7 @@ def rasterize(
     projection: tuple[float, float, float, float],
     image_size: tuple[int, int],
     perspective: bool = True,
+    labels: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw triangles into a z-buffer, sampled at pixel centres.
 
@@ -39,9 +40,10 @@ def rasterize(
             (orthographic, fx in pixels per metre); v likewise from y.
         image_size: (height, width) in pixels.
         perspective: False for an orthographic camera.
+        labels: (F,) what to draw of each triangle, from 0; None draws its index.
 
     Returns:
-        face_index: (height, width) int32, -1 where nothing is drawn.
+        label: (height, width) int32, -1 where nothing is drawn.
         depth: (height, width) float32, z in metres along the optical axis; inf where nothing is.
 
     Example: a wall 2 m away, left of the axis, fills the left half of the picture.
@@ -52,46 +54,23 @@ def rasterize(
         >>> depth[0].tolist()
         [2.0, 2.0, inf, inf]
     """
-    labels = np.arange(len(faces), dtype=np.int32)
-    face_index, nearness = draw_labels(
-        vertices, faces, labels, world_to_camera, projection, image_size, perspective, -1
-    )
-    with np.errstate(divide="ignore"):
-        depth = 1 / nearness if perspective else -nearness
-    depth[face_index < 0] = np.inf
-    return face_index, depth
-
-
-def draw_labels(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    labels: np.ndarray,
-    world_to_camera: np.ndarray,
-    projection: tuple[float, float, float, float],
-    image_size: tuple[int, int],
-    perspective: bool = True,
-    background: int = 0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """`rasterize` with a label of each triangle instead of its index.
-
-    Returns:
-        image: (height, width) int32 of labels, `background` where nothing is drawn.
-        nearness: (height, width) float32, 1 / z of what is drawn, -z of an orthographic camera:
-            both are straight lines across a triangle on screen.
-    """
     height, width = image_size
     pixels = height * width
     # Flat, and a few pixels longer than the image: `_fill` reads past a row's end.
-    image = np.full(pixels + _NARROW_PX - 1, background, dtype=np.int32)
+    image = np.full(pixels + _NARROW_PX - 1, -1, dtype=np.int32)
+    # 1 / z, -z of an orthographic camera: both are straight lines across a triangle on screen.
     nearness = np.full(pixels + _NARROW_PX - 1, -np.inf, dtype=np.float32)
     _draw(
         np.ascontiguousarray(vertices, dtype=np.float64),
         np.ascontiguousarray(faces, dtype=np.int32),
-        np.ascontiguousarray(labels, dtype=np.int32),
+        np.ascontiguousarray(np.arange(len(faces)) if labels is None else labels, dtype=np.int32),
         np.ascontiguousarray(world_to_camera, dtype=np.float64),
         *(float(value) for value in projection), perspective, height, width, image, nearness,
     )  # fmt: skip
-    return image[:pixels].reshape(image_size), nearness[:pixels].reshape(image_size)
+    with np.errstate(divide="ignore"):
+        depth = 1 / nearness if perspective else -nearness
+    depth[image < 0] = np.inf
+    return image[:pixels].reshape(image_size), depth[:pixels].reshape(image_size)
 
 
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.

@@ -10,11 +10,10 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from torch import distributed as dist
 
-from sceneprior.geometry.boxes import beveled_cube, place
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.geometry.corners import box_corners
 from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
-from sceneprior.geometry.meshes import icosphere
+from sceneprior.geometry.meshes import beveled_cube, icosphere, place
 from sceneprior.losses.layout import layout_losses
 from sceneprior.losses.matching import Matches, match_objects
 from sceneprior.silhouettes.render import render_silhouettes

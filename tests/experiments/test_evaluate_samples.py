@@ -22,7 +22,7 @@ from sceneprior.experiments.evaluate_samples import (
     tile,
 )
 from sceneprior.generation.decode import decode_training_rooms, synthesize
-from sceneprior.geometry.boxes import place
+from sceneprior.geometry.meshes import place
 from sceneprior.views import DecodedScenes
 
 

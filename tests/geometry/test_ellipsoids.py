@@ -7,10 +7,9 @@ import torch
 from references.ellipsoids import box_of_cloud, boxes_of_quadrics
 from torch.testing import assert_close
 
-from sceneprior.geometry.boxes import place
 from sceneprior.geometry.cameras import MIN_DEPTH_M, boxes_of_points
 from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
-from sceneprior.geometry.meshes import icosphere
+from sceneprior.geometry.meshes import icosphere, place
 
 SIZE = (60, 80)
 WIDE = 1e-5

@@ -7,9 +7,8 @@ import torch
 from scipy.spatial import ConvexHull
 from torch.testing import assert_close
 
-from sceneprior.geometry.boxes import beveled_cube, place
 from sceneprior.geometry.corners import CUBE_CORNERS, box_corners
-from sceneprior.geometry.meshes import icosphere, to_cube
+from sceneprior.geometry.meshes import beveled_cube, icosphere, place, to_cube
 
 
 @pytest.mark.parametrize("level", [0, 1, 2, 4])

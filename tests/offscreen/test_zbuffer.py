@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sceneprior.offscreen.zbuffer import draw_labels, rasterize
+from sceneprior.offscreen.zbuffer import rasterize
 
 IDENTITY = np.eye(4)
 LENS = (8.0, 8.0, 8.0, 8.0)
@@ -72,8 +72,8 @@ def test_narrow_and_wide_triangles_are_drawn_to_the_bit(width):
     with np.errstate(divide="ignore"):
         np.testing.assert_array_equal(depth[index >= 0], 1 / nearness[index >= 0])
     labels = rng.integers(1, 500, 70).astype(np.int32)
-    drawn, _ = draw_labels(vertices, faces, labels, IDENTITY, projection, (9, width))
-    np.testing.assert_array_equal(drawn, np.where(by_hand < 0, 0, labels[by_hand]))
+    drawn, _ = rasterize(vertices, faces, IDENTITY, projection, (9, width), labels=labels)
+    np.testing.assert_array_equal(drawn, np.where(by_hand < 0, -1, labels[by_hand]))
 
 
 def test_matches_ray_casting():

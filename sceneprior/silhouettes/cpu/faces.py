@@ -28,15 +28,6 @@ _LOOSE: Any = {"contract", "reassoc", "nsz", "arcp"}
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 @njit(inline="always")
 @no_type_check
-def _region(ax, ay, bx, by, cx, cy, reach, bounds):
-    """Rows and strips of the window that a face reaches."""
-    top, bottom = pixel_range(min(ay, by, cy) - reach, max(ay, by, cy) + reach, bounds[1])
-    left, right = pixel_range(min(ax, bx, cx) - reach, max(ax, bx, cx) + reach, bounds[3] * 8)
-    return max(top, bounds[0]), bottom, max(left >> 3, bounds[2]), (right + 7) >> 3
-
-
-@njit(inline="always")
-@no_type_check
 def _from_edge(px, py, ax, ay, bx, by, over_length2, zero, one):
     """From the nearest point of edge ab to p, how far along ab it lies, twice area (a, b, p)."""
     ux, uy, x, y = bx - ax, by - ay, px - ax, py - ay
@@ -44,56 +35,53 @@ def _from_edge(px, py, ax, ay, bx, by, over_length2, zero, one):
     return x - t * ux, y - t * uy, t, ux * y - uy * x
 
 
+@njit(inline="always")
+@no_type_check
+def _at_pixel(k, column, row, face, T):
+    """From the nearest point of each edge to the k-th pixel of a strip; the pixel's weights."""
+    ax, ay, bx, by, cx, cy, over_area, over1, over2, over3 = face
+    zero, one = T(0), T(1)
+    px = T(column + (np.int32(k) & 7)) + T(0.5)
+    py = T(row + (np.int32(k) >> 3)) + T(0.5)
+    x1, y1, t1, wc = _from_edge(px, py, ax, ay, bx, by, over1, zero, one)
+    x2, y2, t2, wa = _from_edge(px, py, bx, by, cx, cy, over2, zero, one)
+    x3, y3, t3, _ = _from_edge(px, py, cx, cy, ax, ay, over3, zero, one)
+    wa, wc = wa * over_area, wc * over_area
+    return x1, y1, t1, x2, y2, t2, x3, y3, t3, wa, one - wa - wc, wc
+
+
 @njit(fastmath=_LOOSE, error_model="numpy", nogil=True)
 @no_type_check
-def _draw_strip(
-    odds, order, start, count, column, row, ax, ay, bx, by, cx, cy,
-    over_area, over1, over2, over3, near_a, near_b, near_c, over_sigma, blur,
-):  # fmt: skip
+def _draw_strip(odds, order, start, count, column, row, face, nearness, over_sigma, blur):
     T = odds.dtype.type
-    zero, one, half, most, slack = T(0), T(1), T(0.5), T(80), T(-SLACK)
+    zero, one, most, slack = T(0), T(1), T(80), T(-SLACK)
     for k in range(count):
         j = np.uintp(start) + np.uintp(k)  # unsigned: Python's negative indices cost the vectors
-        px = T(column + (np.int32(k) & 7)) + half
-        py = T(row + (np.int32(k) >> 3)) + half
-        x1, y1, _, wc = _from_edge(px, py, ax, ay, bx, by, over1, zero, one)
-        x2, y2, _, wa = _from_edge(px, py, bx, by, cx, cy, over2, zero, one)
-        x3, y3, _, _ = _from_edge(px, py, cx, cy, ax, ay, over3, zero, one)
+        x1, y1, _, x2, y2, _, x3, y3, _, wa, wb, wc = _at_pixel(k, column, row, face, T)
         d = min(x1 * x1 + y1 * y1, min(x2 * x2 + y2 * y2, x3 * x3 + y3 * y3))
-        wa, wc = wa * over_area, wc * over_area
-        wb = one - wa - wc
         inside = min(wa, min(wb, wc)) > zero
         touched = inside | (d < blur)
         x = min(d * over_sigma, most)
         odds[j] *= one + vector_exp(x if inside else -x) if touched else one
         contained = min(wa, min(wb, wc)) > slack
         wa, wb, wc = max(wa, zero), max(wb, zero), max(wc, zero)
-        nearness = wa * near_a + wb * near_b + wc * near_c
-        here = nearness if contained else -(wa + wb + wc) / nearness
+        near = wa * nearness[0] + wb * nearness[1] + wc * nearness[2]
+        here = near if contained else -(wa + wb + wc) / near
         order[j] = max(order[j], here if touched | contained else T(-np.inf))
 
 
 @njit(fastmath=_LOOSE, error_model="numpy", nogil=True)
 @no_type_check
-def _strip_gradient(
-    upstream, start, count, column, row, ax, ay, bx, by, cx, cy,
-    over_area, over1, over2, over3, over_sigma, blur,
-):  # fmt: skip
+def _strip_gradient(upstream, start, count, column, row, face, over_sigma, blur):
     """What a strip's pixels add to the gradient of a face's three corners, times -1/2."""
     T = upstream.dtype.type
-    zero, one, half, most = T(0), T(1), T(0.5), T(80)
+    zero, one, most = T(0), T(1), T(80)
     gax, gay, gbx, gby, gcx, gcy = zero, zero, zero, zero, zero, zero
     for k in range(count):
         j = np.uintp(start) + np.uintp(k)
-        px = T(column + (np.int32(k) & 7)) + half
-        py = T(row + (np.int32(k) >> 3)) + half
-        x1, y1, t1, wc = _from_edge(px, py, ax, ay, bx, by, over1, zero, one)
-        x2, y2, t2, wa = _from_edge(px, py, bx, by, cx, cy, over2, zero, one)
-        x3, y3, t3, _ = _from_edge(px, py, cx, cy, ax, ay, over3, zero, one)
+        x1, y1, t1, x2, y2, t2, x3, y3, t3, wa, wb, wc = _at_pixel(k, column, row, face, T)
         d1, d2, d3 = x1 * x1 + y1 * y1, x2 * x2 + y2 * y2, x3 * x3 + y3 * y3
         d = min(d1, min(d2, d3))
-        wa, wc = wa * over_area, wc * over_area
-        wb = one - wa - wc
         inside = min(wa, min(wb, wc)) > zero
         touched = inside | (d < blur)
         x = min(d * over_sigma, most)
@@ -134,16 +122,25 @@ def _over_length2(ax, ay, bx, by, one, least):
 
 @njit(inline="always")
 @no_type_check
-def _drawn(pixels, depths, faces, mesh, f, near, least):
-    """Whether a face is in front of the camera and has an area; its corners, and twice its area."""
-    ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
-    za, zb, zc = depths[mesh, ia], depths[mesh, ib], depths[mesh, ic]
-    in_front = not (za <= near or zb <= near or zc <= near)
-    ax, ay = pixels[mesh, ia, 0], pixels[mesh, ia, 1]
-    bx, by = pixels[mesh, ib, 0], pixels[mesh, ib, 1]
-    cx, cy = pixels[mesh, ic, 0], pixels[mesh, ic, 1]
+def _region(pixels, depths, corners, bounds, reach, near, T):
+    """Rows and strips of the window that a face reaches, none of what is not drawn; the face."""
+    ia, ib, ic = corners
+    one, least = T(1), T(MIN_AREA_PX2)
+    za, zb, zc = depths[ia], depths[ib], depths[ic]
+    ax, ay, bx, by = pixels[ia, 0], pixels[ia, 1], pixels[ib, 0], pixels[ib, 1]
+    cx, cy = pixels[ic, 0], pixels[ic, 1]
     area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    return in_front and not abs(area) <= least, ax, ay, bx, by, cx, cy, area
+    face = (
+        ax, ay, bx, by, cx, cy, one / area, _over_length2(ax, ay, bx, by, one, least),
+        _over_length2(bx, by, cx, cy, one, least), _over_length2(cx, cy, ax, ay, one, least),
+    )  # fmt: skip
+    if za <= near or zb <= near or zc <= near or abs(area) <= least:
+        return 0, 0, 0, 0, face
+    top, bottom = pixel_range(min(ay, by, cy) - reach, max(ay, by, cy) + reach, bounds[1])
+    left, right = pixel_range(min(ax, bx, cx) - reach, max(ax, bx, cx) + reach, bounds[3] * 8)
+    top = max(top, bounds[0])
+    strip1 = (right + 7) >> 3 if top < bottom else 0
+    return top, bottom, max(left >> 3, bounds[2]), strip1, face
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -151,29 +148,24 @@ def _drawn(pixels, depths, faces, mesh, f, near, least):
 def _cover(first, last, pixels, depths, faces, bounds, starts, sigma, blur, near, odds, order):
     """Fill `odds` (from 1) and `order` (from -inf) of all windows."""
     T = pixels.dtype.type
-    one, least = T(1), T(MIN_AREA_PX2)
-    over_sigma, blur_, reach = T(1 / sigma), T(blur), np.sqrt(blur)
+    one, over_sigma, blur_, reach = T(1), T(1 / sigma), T(blur), np.sqrt(blur)
     for mesh in range(first, last):
         rows = bounds[mesh, 1] - bounds[mesh, 0]
         for f in range(faces.shape[0] if rows > 0 else 0):
-            drawn, ax, ay, bx, by, cx, cy, area = _drawn(
-                pixels, depths, faces, mesh, f, near, least
+            corners = faces[f, 0], faces[f, 1], faces[f, 2]
+            top, bottom, strip0, strip1, face = _region(
+                pixels[mesh], depths[mesh], corners, bounds[mesh], reach, near, T
             )
-            if not drawn:
-                continue
-            top, bottom, strip0, strip1 = _region(ax, ay, bx, by, cx, cy, reach, bounds[mesh])
-            if bottom <= top:
-                continue
-            over1 = _over_length2(ax, ay, bx, by, one, least)
-            over2 = _over_length2(bx, by, cx, cy, one, least)
-            over3 = _over_length2(cx, cy, ax, ay, one, least)
-            near_a, near_b = one / depths[mesh, faces[f, 0]], one / depths[mesh, faces[f, 1]]
+            nearness = (
+                one / depths[mesh, corners[0]],
+                one / depths[mesh, corners[1]],
+                one / depths[mesh, corners[2]],
+            )
             for strip in range(strip0, strip1):
                 start = ((strip - bounds[mesh, 2]) * rows + top - bounds[mesh, 0]) * 8
                 _draw_strip(
                     odds, order, starts[mesh] + start, (bottom - top) * 8, np.int32(strip * 8),
-                    np.int32(top), ax, ay, bx, by, cx, cy, one / area, over1, over2, over3,
-                    near_a, near_b, one / depths[mesh, faces[f, 2]], over_sigma, blur_,
+                    np.int32(top), face, nearness, over_sigma, blur_,
                 )  # fmt: skip
 
 
@@ -184,32 +176,23 @@ def _cover_backward(
 ):
     """Add to `gradient` what `upstream`, -dL/dlog(missed), does to `pixels`."""
     T = pixels.dtype.type
-    one, two, least = T(1), T(2), T(MIN_AREA_PX2)
-    over_sigma, blur_, reach = T(1 / sigma), T(blur), np.sqrt(blur)
+    two, over_sigma, blur_, reach = T(2), T(1 / sigma), T(blur), np.sqrt(blur)
     for mesh in range(first, last):
         rows = bounds[mesh, 1] - bounds[mesh, 0]
         for f in range(faces.shape[0] if rows > 0 else 0):
-            drawn, ax, ay, bx, by, cx, cy, area = _drawn(
-                pixels, depths, faces, mesh, f, near, least
+            corners = faces[f, 0], faces[f, 1], faces[f, 2]
+            top, bottom, strip0, strip1, face = _region(
+                pixels[mesh], depths[mesh], corners, bounds[mesh], reach, near, T
             )
-            if not drawn:
-                continue
-            top, bottom, strip0, strip1 = _region(ax, ay, bx, by, cx, cy, reach, bounds[mesh])
-            if bottom <= top:
-                continue
-            over1 = _over_length2(ax, ay, bx, by, one, least)
-            over2 = _over_length2(bx, by, cx, cy, one, least)
-            over3 = _over_length2(cx, cy, ax, ay, one, least)
             for strip in range(strip0, strip1):
                 start = ((strip - bounds[mesh, 2]) * rows + top - bounds[mesh, 0]) * 8
-                corners = _strip_gradient(
+                by_corner = _strip_gradient(
                     upstream, starts[mesh] + start, (bottom - top) * 8, np.int32(strip * 8),
-                    np.int32(top), ax, ay, bx, by, cx, cy, one / area, over1, over2, over3,
-                    over_sigma, blur_,
+                    np.int32(top), face, over_sigma, blur_,
                 )  # fmt: skip
                 for corner in range(3):
-                    gradient[mesh, faces[f, corner], 0] -= two * corners[2 * corner]
-                    gradient[mesh, faces[f, corner], 1] -= two * corners[2 * corner + 1]
+                    gradient[mesh, corners[corner], 0] -= two * by_corner[2 * corner]
+                    gradient[mesh, corners[corner], 1] -= two * by_corner[2 * corner + 1]
 
 
 def cover(pixels, depths, faces, windows, settings):

@@ -29,18 +29,10 @@ class Windows(NamedTuple):
 
 
 def windows_of(
-    pixels: np.ndarray,
-    depths: np.ndarray,
-    drawn: np.ndarray,
-    settings: Settings,
+    pixels: np.ndarray, depths: np.ndarray, drawn: np.ndarray, settings: Settings
 ) -> Windows:
-    """Windows of projected meshes.
-
-    Args:
-        pixels: (meshes, vertices, 2) u and v.
-        depths: (meshes, vertices) in metres.
-        drawn: (meshes,) bool; others get an empty window, as do meshes outside the image.
-    """
+    """Of (meshes, vertices, 2) pixels and (meshes, vertices) depths; empty where a mesh is not
+    drawn or outside the image."""
     bounds = np.zeros((len(pixels), 4), dtype=np.int32)
     reach_px = float(np.sqrt(settings.blur_px2))
     rest = (reach_px, float(settings.near_m), *settings.image_size, bounds)

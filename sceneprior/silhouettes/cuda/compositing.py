@@ -1,7 +1,7 @@
 """Triton kernels that composite the packed windows of all objects to images, and their gradient.
 
 One program per tile of an image. Few objects meet in a tile, so every pair of them is compared
-instead of sorting. `missed` and `order` are what `kernels.cover_tiles` wrote.
+instead of sorting. `missed` and `order` are what `faces.cover_tiles` wrote.
 """
 
 from typing import no_type_check

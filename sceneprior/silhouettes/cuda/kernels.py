@@ -1,19 +1,23 @@
-"""Triton kernels of the exact mode: what each pixel of a packed window sees of its mesh.
+"""What the Triton kernels share, and what each pixel of a packed window sees of its mesh.
 
 A mesh is one object in one image. Its window is the part of the image that its faces may touch,
 in whole tiles of TILE x TILE pixels; windows are packed one behind the other, row by row, so
 memory grows with what is seen. No kernel adds to a place that another program adds to: the same
 input gives the same bits.
 
-    window_kernels  bound_faces         per mesh          pixels that faces touch, and the window
-    kernels         cover_tiles         per packed tile   chance to miss, and the order value
-    compositing     composite_tiles     per image tile    masks, front, depth
-                    composite_backward  per image tile    gradient of packed pixels
-    gradients       corner_gradients    per few faces     gradient of each face's corners
-                    gather_vertices     per few vertices  gradient of each vertex
+    windows          bound_faces         per mesh          pixels that faces touch, and the window
+    kernels          cover_tiles         per packed tile   chance to miss, and the order value
+    faces            corner_gradients    per few faces     gradient of each face's corners
+                     gather_vertices     per few vertices  gradient of each vertex
+    outline_kernels  sum_layers          per few edges     where the number of faces changes
+                     certify_pieces      per few pieces    whether no face lies beyond a piece
+                     trace_tiles         per packed tile   chance to miss, order, nearest piece
+                     end_gradients       per few pieces    gradient of the ends of its edge
+    compositing      composite_tiles     per image tile    masks, front, depth
+                     composite_backward  per image tile    gradient of packed pixels
 
-`cover_tiles` and `corner_gradients` are the exact mode's; `outline_kernels` lists the fast mode's.
-Block shapes are chosen for an H200 by counting instructions, not yet by measuring.
+`cover_tiles` and `faces` are the exact mode, `outline_kernels` the fast one. Block shapes are
+chosen for an H200 by counting instructions and registers, not yet by measuring.
 """
 
 from typing import no_type_check
@@ -46,27 +50,29 @@ MIN_AREA, SLACK = tl.constexpr(reference.MIN_AREA_PX2), tl.constexpr(reference.S
 # no_type_check: the tests' type hook wraps every function, and Triton cannot compile a wrapper.
 @triton.jit
 @no_type_check
-def vertices_of(faces, face, first_vertex, mask):  # pragma: no cover - compiled
-    """The three vertices of faces, numbered through all meshes."""
+def corners_of(
+    pixels, faces, face, first_vertex, mask, real: tl.constexpr
+):  # pragma: no cover - compiled
+    """The three vertices of faces, numbered through all meshes, and u and v of each."""
     a = first_vertex + tl.load(faces + face * 3, mask=mask, other=0)
     b = first_vertex + tl.load(faces + face * 3 + 1, mask=mask, other=0)
-    return a, b, first_vertex + tl.load(faces + face * 3 + 2, mask=mask, other=0)
+    c = first_vertex + tl.load(faces + face * 3 + 2, mask=mask, other=0)
+    ax = tl.load(pixels + a * 2, mask=mask, other=0).to(real)
+    ay = tl.load(pixels + a * 2 + 1, mask=mask, other=0).to(real)
+    bx = tl.load(pixels + b * 2, mask=mask, other=0).to(real)
+    by = tl.load(pixels + b * 2 + 1, mask=mask, other=0).to(real)
+    cx = tl.load(pixels + c * 2, mask=mask, other=0).to(real)
+    cy = tl.load(pixels + c * 2 + 1, mask=mask, other=0).to(real)
+    return a, b, c, ax, ay, bx, by, cx, cy
 
 
 @triton.jit
 @no_type_check
-def vertex_at(pixels, vertex, mask):  # pragma: no cover - compiled
-    """u and v of a vertex."""
-    x = tl.load(pixels + vertex * 2, mask=mask, other=0)
-    return x, tl.load(pixels + vertex * 2 + 1, mask=mask, other=0)
-
-
-@triton.jit
-@no_type_check
-def vertex_at64(pixels, vertex, mask):  # pragma: no cover - compiled
-    """u and v of a vertex, in float64."""
-    x, y = vertex_at(pixels, vertex, mask)
-    return x.to(tl.float64), y.to(tl.float64)
+def are_drawn(depths, a, b, c, area, mask, near):  # pragma: no cover - compiled
+    """Whether faces are in front of the camera and have an area."""
+    za, zb = tl.load(depths + a, mask=mask, other=0), tl.load(depths + b, mask=mask, other=0)
+    nearest = tl.minimum(tl.minimum(za, zb), tl.load(depths + c, mask=mask, other=0))
+    return mask & (nearest > near) & (tl.abs(area) > MIN_AREA)
 
 
 @triton.jit
@@ -185,10 +191,9 @@ def cover_tiles(
             while found != 0:
                 face = first + first_bit(found)
                 found &= found - 1
-                a, b, c = vertices_of(faces, face, mesh * vertex_count, True)
-                ax, ay = vertex_at(pixels, a, True)
-                bx, by = vertex_at(pixels, b, True)
-                cx, cy = vertex_at(pixels, c, True)
+                a, b, c, ax, ay, bx, by, cx, cy = corners_of(
+                    pixels, faces, face, mesh * vertex_count, True, real
+                )
                 ia, ib = tl.load(inverse_depths + a), tl.load(inverse_depths + b)
                 ic = tl.load(inverse_depths + c)
                 rx, ry, _, wc = to_edge(px, py, ax, ay, bx, by)

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from sceneprior.silhouettes.cuda.edge_kernels import EDGES, PIECES, certify_pieces, sum_layers
+from sceneprior.silhouettes.cuda import outline_kernels as kernels
 from sceneprior.silhouettes.cuda.faces import sum_by_vertex
-from sceneprior.silhouettes.cuda.outline_kernels import PER_PROGRAM, end_gradients, trace_tiles
-from sceneprior.silhouettes.cuda.windows import TILE, Windows, launch, reach_of
+from sceneprior.silhouettes.cuda.windows import Windows, launch, reach_of
 from sceneprior.silhouettes.reference import ASIDE_PX, PIECE_PX, Settings
 from sceneprior.silhouettes.topology import topology_of
 
@@ -83,22 +82,21 @@ def cover(
     """The chance to miss and the order value of all windows, and what `cover_backward` needs."""
     meshes, vertices, tiles = len(windows.places), pixels.shape[2], len(windows.tile_meshes)
     layers = torch.empty(meshes, len(edges.ends), dtype=torch.int32, device=pixels.device)
-    programs = meshes * -(-len(edges.ends) // EDGES.value)
+    programs = meshes * -(-len(edges.ends) // kernels.EDGES.value)
     launch(
-        sum_layers, programs, pixels, depths, faces, windows.places, edges.first_faces, edges.faces,
-        edges.ways, layers, vertices, len(edges.ends), settings.near_m, num_warps=4,
-        enable_fp_fusion=False,
+        kernels.sum_layers, programs, pixels, depths, faces, windows.places,
+        edges.first_faces, edges.faces, edges.ways, layers, vertices, len(edges.ends),
+        settings.near_m, num_warps=4, enable_fp_fusion=False,
     )  # fmt: skip
     nearness = depths.double().reciprocal()
     pieces = _cut_edges(pixels, nearness, edges.ends, layers, settings)
-    missed = pixels.new_empty(tiles * TILE * TILE)
+    missed = pixels.new_empty(tiles * kernels.TILE.value**2)
     order = torch.empty_like(missed)
     nearest = torch.empty_like(missed, dtype=torch.int32)
     launch(
-        trace_tiles, tiles, pixels, nearness, faces, windows.face_bounds, windows.block_bounds,
-        windows.places, windows.first_tiles, windows.tile_meshes, pieces.shapes, pieces.clear,
-        _firsts(pieces.meshes, meshes), missed, order, nearest,
-        vertices, windows.block_bounds.shape[-1], len(pieces.meshes), settings.sigma_px2,
+        kernels.trace_tiles, tiles, pixels, nearness, faces, *windows, pieces.shapes, pieces.clear,
+        _firsts(pieces.meshes, meshes), missed, order, nearest, vertices,
+        windows.block_bounds.shape[-1], len(pieces.meshes), settings.sigma_px2,
         settings.blur_px2, reach_of(settings), num_warps=1,
     )  # fmt: skip
     return missed, order, (nearest, *pieces)
@@ -120,8 +118,8 @@ def _cut_edges(
     beside = start[line] + spans.mean(dim=0).unsqueeze(1) * along + aside
     clear = torch.empty(len(line), dtype=torch.uint8, device=pixels.device)
     launch(
-        certify_pieces, -(-len(line) // PIECES.value), beside.T.contiguous(), meshes[line].int(),
-        torch.cat([start, end], dim=1).T.contiguous(), layers,
+        kernels.certify_pieces, -(-len(line) // kernels.PIECES.value), beside.T.contiguous(),
+        meshes[line].int(), torch.cat([start, end], dim=1).T.contiguous(), layers,
         _firsts(meshes, pixels.shape[0] * pixels.shape[1]), clear, len(line), len(start),
         num_warps=4,
     )  # fmt: skip
@@ -173,8 +171,8 @@ def cover_backward(
     count = len(pieces.meshes)
     by_end = pixels.new_empty(count, 2, 2)
     launch(
-        end_gradients, -(-count // PER_PROGRAM.value), pieces.shapes, pieces.spans, pieces.meshes,
-        pieces.clear, *seen, missed, order, nearest, upstream, by_end, count,
+        kernels.end_gradients, -(-count // kernels.PER_PROGRAM.value), pieces.shapes, pieces.spans,
+        pieces.meshes, pieces.clear, *seen, missed, order, nearest, upstream, by_end, count,
         settings.sigma_px2, reach_of(settings), num_warps=1,
     )  # fmt: skip
     # All meshes as one: their vertices are numbered through.

@@ -1,13 +1,4 @@
-"""Triton kernels of the fast mode: packed windows from pieces of outlines, and their gradient.
-
-    edge_kernels     sum_layers      per few edges    where the number of faces changes
-                     certify_pieces  per few pieces   whether no face lies beyond a piece
-    outline_kernels  trace_tiles     per packed tile  chance to miss, order, nearest piece
-                     end_gradients   per few pieces   gradient of the ends of its edge
-
-As in `kernels`, no kernel adds to a place that another program adds to. Block shapes are
-chosen for an H200 by counting registers, not yet by measuring.
-"""
+"""Triton kernels of the fast mode: packed windows from pieces of outlines, and their gradient."""
 
 from typing import no_type_check
 
@@ -16,22 +7,97 @@ from sceneprior.silhouettes.cuda.kernels import (
     MIN_AREA,
     SLACK,
     TILE,
+    are_drawn,
     bits_of,
+    corners_of,
     first_bit,
     hits,
     tile_pixels,
     tl,
     triton,
-    vertex_at64,
-    vertices_of,
     window,
 )
+
+EDGES = tl.constexpr(128)
+"""Edges of one program of `sum_layers`."""
+
+PIECES, LINES = tl.constexpr(16), tl.constexpr(32)
+"""Pieces of one program of `certify_pieces`, and edges that each takes at once."""
 
 PER_PROGRAM, PIXELS = tl.constexpr(8), tl.constexpr(8)
 """Pieces of one program of `end_gradients`, and pixels of each that it takes at once."""
 
 
 # no_type_check: the tests' type hook wraps every function, and Triton cannot compile a wrapper.
+@triton.jit
+@no_type_check
+def _ends_of(lines, line, count, mask):  # pragma: no cover - compiled
+    """x and y of both ends of lines, which are stored as rows of `count`."""
+    x0 = tl.load(lines + line, mask=mask, other=0)
+    y0 = tl.load(lines + count + line, mask=mask, other=0)
+    x1 = tl.load(lines + 2 * count + line, mask=mask, other=0)
+    return x0, y0, x1, tl.load(lines + 3 * count + line, mask=mask, other=0)
+
+
+@triton.jit
+@no_type_check
+def sum_layers(
+    pixels, depths, faces, windows, first_faces, edge_faces, edge_ways, layers,
+    vertex_count, edge_count, near,
+):  # pragma: no cover - compiled  # fmt: skip
+    """How many faces more lie over the image to the left of each edge than to its right."""
+    programs = tl.cdiv(edge_count, EDGES)
+    mesh = tl.program_id(0).to(tl.int64) // programs
+    edge = (tl.program_id(0) % programs) * EDGES + tl.arange(0, EDGES)
+    exists = edge < edge_count
+    first = tl.load(first_faces + edge, mask=exists, other=0)
+    count = tl.load(first_faces + edge + 1, mask=exists, other=0) - first
+    seen = tl.load(windows + mesh * 4 + 2) > 0
+    most = tl.where(seen, tl.max(count, axis=0), 0)
+    total = tl.zeros((EDGES,), tl.int32)
+    for step in range(0, most):
+        here = step < count
+        face = tl.load(edge_faces + first + step, mask=here, other=0)
+        way = tl.load(edge_ways + first + step, mask=here, other=0)
+        a, b, c, ax, ay, bx, by, cx, cy = corners_of(
+            pixels, faces, face, mesh * vertex_count, here, tl.float64
+        )
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        keep = are_drawn(depths, a, b, c, area, here, near)
+        total += tl.where(keep, tl.where(area > 0, way, -way), 0)
+    tl.store(layers + mesh * edge_count + edge, total, mask=exists)
+
+
+@triton.jit
+@no_type_check
+def certify_pieces(
+    points, piece_meshes, lines, layers, first_lines, clear, piece_count, line_count
+):  # pragma: no cover - compiled
+    """Whether no face lies over a point: the edges to its right add up to nothing."""
+    piece = tl.program_id(0) * PIECES + tl.arange(0, PIECES)[:, None]
+    exists = piece < piece_count
+    mesh = tl.load(piece_meshes + piece, mask=exists, other=0)
+    first = tl.load(first_lines + mesh)
+    last = tl.where(exists, tl.load(first_lines + mesh + 1), first)
+    x = tl.load(points + piece, mask=exists, other=0)
+    y = tl.load(points + piece_count + piece, mask=exists, other=0)
+    over = tl.zeros((PIECES, LINES), tl.int32)
+    most = tl.max(tl.max(last - first, axis=1), axis=0)
+    for start in range(0, most, LINES):
+        line = first + start + tl.arange(0, LINES)[None, :]
+        here = line < last
+        ax, ay, bx, by = _ends_of(lines, line, line_count, here)
+        more = tl.load(layers + line, mask=here, other=0)
+        down = by > ay
+        # Going right, an edge that runs down the image is crossed from its left side.
+        beyond = ((y - ay) * (bx - ax) > (x - ax) * (by - ay)) == down
+        crossed = here & ((ay <= y) != (by <= y)) & beyond
+        over += tl.where(crossed, tl.where(down, more, -more), 0)
+    piece = tl.program_id(0) * PIECES + tl.arange(0, PIECES)
+    free = (tl.sum(over, axis=1) <= 0).to(tl.uint8)
+    tl.store(clear + piece, free, mask=piece < piece_count)
+
+
 @triton.jit
 @no_type_check
 def _pieces_near(
@@ -41,10 +107,7 @@ def _pieces_near(
     lane = tl.arange(0, BLOCK)
     piece = first + lane
     known = piece < last
-    x0 = tl.load(shapes + piece, mask=known, other=0)
-    y0 = tl.load(shapes + piece_count + piece, mask=known, other=0)
-    x1 = tl.load(shapes + 2 * piece_count + piece, mask=known, other=0)
-    y1 = tl.load(shapes + 3 * piece_count + piece, mask=known, other=0)
+    x0, y0, x1, y1 = _ends_of(shapes, piece, piece_count, known)
     hit = known & (tl.load(clear + piece, mask=known, other=0) != 0)
     hit &= (tl.minimum(x0, x1) - reach < left_column + TILE) & (
         tl.maximum(x0, x1) + reach > left_column
@@ -73,7 +136,7 @@ def trace_tiles(
 ):  # pragma: no cover - compiled  # fmt: skip
     """One mesh in one tile: the nearest face that contains a pixel centre, the nearest piece.
 
-    `nearness` is 1 / depth in float64. The order value is that of `kernels.cover_tiles`, and
+    `nearness` is 1 / depth in float64. The order value is that of `faces.cover_tiles`, and
     in the halo the outline's depth.
     """
     mesh, top_row, left_column, row, column, at = tile_pixels(windows, first_tiles, tile_meshes)
@@ -91,10 +154,9 @@ def trace_tiles(
             while found != 0:
                 face = first + first_bit(found)
                 found &= found - 1
-                a, b, c = vertices_of(faces, face, mesh * vertex_count, True)
-                ax, ay = vertex_at64(pixels, a, True)
-                bx, by = vertex_at64(pixels, b, True)
-                cx, cy = vertex_at64(pixels, c, True)
+                a, b, c, ax, ay, bx, by, cx, cy = corners_of(
+                    pixels, faces, face, mesh * vertex_count, True, tl.float64
+                )
                 ux, uy, vx, vy = bx - ax, by - ay, cx - ax, cy - ay
                 qx, qy, over = px - ax, py - ay, 1.0 / (ux * vy - uy * vx)
                 wb, wc = (qx * vy - qy * vx) * over, (qy * ux - qx * uy) * over
@@ -113,10 +175,9 @@ def trace_tiles(
         while found != 0:
             piece = start + first_bit(found)
             found &= found - 1
-            x0, y0 = tl.load(shapes + piece), tl.load(shapes + piece_count + piece)
-            shape = shapes + piece + 2 * piece_count
-            x1, y1 = tl.load(shape), tl.load(shape + piece_count)
-            i0, i1 = tl.load(shape + 2 * piece_count), tl.load(shape + 3 * piece_count)
+            x0, y0, x1, y1 = _ends_of(shapes, piece, piece_count, True)
+            i0 = tl.load(shapes + 4 * piece_count + piece)
+            i1 = tl.load(shapes + 5 * piece_count + piece)
             rx, ry, s = _to_piece(px, py, x0, y0, x1, y1)
             here = rx * rx + ry * ry
             nearer = here < distance
@@ -143,10 +204,7 @@ def end_gradients(
     piece = tl.program_id(0) * PER_PROGRAM + tl.arange(0, PER_PROGRAM)[:, None]
     exists = piece < piece_count
     mesh = tl.load(piece_meshes + piece, mask=exists, other=0).to(tl.int64)
-    x0 = tl.load(shapes + piece, mask=exists, other=0)
-    y0 = tl.load(shapes + piece_count + piece, mask=exists, other=0)
-    x1 = tl.load(shapes + 2 * piece_count + piece, mask=exists, other=0)
-    y1 = tl.load(shapes + 3 * piece_count + piece, mask=exists, other=0)
+    x0, y0, x1, y1 = _ends_of(shapes, piece, piece_count, exists)
     t0 = tl.load(spans + piece, mask=exists, other=0)
     t1 = tl.load(spans + piece_count + piece, mask=exists, other=0)
     base, stride = window(windows, first_tiles, mesh)

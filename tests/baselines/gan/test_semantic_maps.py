@@ -18,7 +18,7 @@ from sceneprior.baselines.gan.semantic_maps import (
 )
 from sceneprior.classes import VOID
 from sceneprior.data.dataset import ViewDataset
-from sceneprior.geometry.boxes import place
+from sceneprior.geometry.meshes import place
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.shards import iterate_rooms
 from sceneprior.silhouettes.render import render_silhouettes
