@@ -1,4 +1,4 @@
-"""Batches of rooms: `SceneViews` (what cameras saw), `DecodedScenes`, `RoomBoxes`."""
+"""Batches of rooms: `SceneViews`, `LiftedRooms`, `DecodedScenes`, `RoomBoxes`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -88,6 +88,31 @@ class DecodedScenes:
     for rooms that no prior decoded."""
     vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
     """Mesh vertices in the room frame; None until the shape decoder ran."""
+
+
+@dataclass(frozen=True)
+class LiftedRooms(_Batch):
+    """Tracked objects of a batch of rooms as `lifting` found them in 3D, from masks alone, and
+    perhaps rays through the masks; objects are padded to the fullest room's count."""
+
+    room_index: Int[Tensor, " rooms"]
+    """Row of each room in the data set: which latent vector is its own."""
+    object_class: Int[Tensor, "rooms objects"]
+    """Index into the label set; 0 where `is_object` is false."""
+    is_object: Bool[Tensor, "rooms objects"]
+    """False for padding; the first n entries of a room with n tracked objects are true."""
+    is_lifted: Bool[Tensor, "rooms objects"]
+    """Whether the box is known: some view showed the object."""
+    boxes_m: Float[Tensor, "rooms objects 6"]
+    """Centre x, y, z, then full extents; axis-aligned, in the room frame."""
+    ray_origins_m: Float[Tensor, "rooms objects rays 3"] | None = None
+    ray_directions: Float[Tensor, "rooms objects rays 3"] | None = None
+    """Unit vectors."""
+    ray_hits: Bool[Tensor, "rooms objects rays"] | None = None
+    """Whether the ray goes through a pixel of the object."""
+    ray_until_m: Float[Tensor, "rooms objects rays"] | None = None
+    """Up to where the object is met, or known not to be; 0 for a ray that tells nothing."""
+    room_ids: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

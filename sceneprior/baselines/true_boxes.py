@@ -9,12 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
 from sceneprior.data.dataset import BLANK, RoomDataset
 from sceneprior.errors import ShardError
-from sceneprior.geometry.turns import turn_vectors
+from sceneprior.geometry.turns import turn_boxes
 from sceneprior.shards import RoomGroundTruth, Shard
 from sceneprior.views import RoomBoxes
 
@@ -69,7 +67,7 @@ class TruthDataset(RoomDataset):
         return RoomBoxes(
             object_class=self._classes[rooms, :widest] * is_object,
             is_object=is_object,
-            boxes_m=turned(self._boxes_m[rooms, :widest], quarters),
+            boxes_m=turn_boxes(self._boxes_m[rooms, :widest], quarters),
             room_ids=tuple(self.plain_ids[room] for room in rooms[shown].tolist()),
             yaw_rad=torch.remainder(yaw_rad + math.pi, 2 * math.pi) - math.pi,
         )
@@ -83,11 +81,3 @@ def _read_truth(shard: Shard, room_id: str) -> RoomGroundTruth:
             "learns from masks (method: ours)."
         )
     return shard.read_ground_truth(room_id)
-
-
-def turned(
-    boxes_m: Float[Tensor, "rooms objects 6"], quarters: Int[Tensor, " rooms"]
-) -> Float[Tensor, "rooms objects 6"]:
-    """Boxes of rooms turned about +y by so many quarters: x goes to -z, z to x."""
-    centers_m, sizes_m = boxes_m.split(3, dim=-1)
-    return torch.cat([turn_vectors(centers_m, quarters), turn_vectors(sizes_m, quarters).abs()], -1)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Int16
+from jaxtyping import Bool, Float, Int, Int16, Int64
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -174,6 +174,13 @@ class FlatViews:
         }
 
 
+def allowed_views(seed: int, room: int, count: int, fraction: float) -> Int64[np.ndarray, " views"]:
+    """Which of a room's `count` views training may use: a share of them, chosen by the seed."""
+    keep = max(1, round(fraction * count))
+    order = np.random.default_rng([seed, room]).permutation(count)
+    return np.sort(order[:keep])
+
+
 class ViewDataset(RoomDataset):
     """Rooms of a split with their views; images are read only where masks are wanted.
 
@@ -215,14 +222,9 @@ class ViewDataset(RoomDataset):
         self._object_counts = np.array([len(room.object_class) for room in rooms])
         self.max_objects = int(self._object_counts.max())
         self._allowed = [
-            self._choose(index, len(room.visible), view_fraction)
+            allowed_views(seed, index, len(room.visible), view_fraction)
             for index, room in enumerate(rooms)
         ]
-
-    def _choose(self, index: int, count: int, fraction: float) -> np.ndarray:
-        keep = max(1, round(fraction * count))
-        order = np.random.default_rng([self.seed, index]).permutation(count)
-        return np.sort(order[:keep])
 
     def to(self, device: torch.device | str) -> "ViewDataset":
         """Move boxes and cameras to `device`, where batches are then made."""

@@ -42,3 +42,11 @@ def turn_vectors(
     columns = torch.tensor(_COLUMNS, device=vectors.device)[quarters].reshape(many)
     signs = torch.tensor(_SIGNS, device=vectors.device)[quarters].reshape(many)
     return vectors.gather(-1, columns.expand_as(vectors)) * signs
+
+
+def turn_boxes(
+    boxes_m: Float[Tensor, "rooms objects 6"], quarters: Int[Tensor, " rooms"]
+) -> Float[Tensor, "rooms objects 6"]:
+    """Boxes (centre, full extents) of rooms turned about +y by so many quarters."""
+    centers_m, sizes_m = boxes_m.split(3, dim=-1)
+    return torch.cat([turn_vectors(centers_m, quarters), turn_vectors(sizes_m, quarters).abs()], -1)

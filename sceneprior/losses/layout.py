@@ -9,7 +9,7 @@ from sceneprior.geometry.cameras import Boxes2D, camera_centers, pixel_rays
 from sceneprior.losses.averages import mean_of_objects, share_of_batch
 from sceneprior.losses.completeness import completeness_targets
 from sceneprior.losses.matching import Matches, side_distance
-from sceneprior.views import DecodedScenes, SceneViews
+from sceneprior.views import DecodedScenes, LiftedRooms, SceneViews
 
 
 def take(values: Tensor, index: Int[Tensor, "rooms objects"], dim: int) -> Tensor:
@@ -52,7 +52,10 @@ def layout_losses(
 
 
 def class_loss(
-    scenes: DecodedScenes, views: SceneViews, matches: Matches, per_room: bool = False
+    scenes: DecodedScenes,
+    views: SceneViews | LiftedRooms,
+    matches: Matches,
+    per_room: bool = False,
 ) -> Float[Tensor, "*rooms"]:
     """Cross entropy between each object's class and the prediction that answers for it."""
     logits = take(scenes.class_logits, matches.prediction, dim=1)
@@ -77,7 +80,10 @@ def box_loss(
 
 
 def completeness_loss(
-    scenes: DecodedScenes, views: SceneViews, target: str = "first_n", per_room: bool = False
+    scenes: DecodedScenes,
+    views: SceneViews | LiftedRooms,
+    target: str = "first_n",
+    per_room: bool = False,
 ) -> Float[Tensor, "*rooms"]:
     """Binary cross entropy of all predictions' completeness scores with a convention's targets."""
     logits = scenes.completeness_logits

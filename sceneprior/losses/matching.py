@@ -108,10 +108,7 @@ def matching_cost(
     occlusion_slack: float = 1.0,
 ) -> Float[Tensor, "rooms predictions objects"]:
     """Pairwise costs of all predictions and all tracked objects."""
-    probability = scenes.class_logits.softmax(dim=-1)
-    slots = probability.shape[1]
-    wanted = views.object_class.unsqueeze(1).expand(-1, slots, -1)
-    cost = -probability.gather(-1, wanted)
+    cost = class_cost(scenes, views.object_class)
     seen = views.visible.to(cost.dtype)
     distance = torch.zeros_like(cost)
     # Coordinate by coordinate: a quarter of the memory of the full pairwise difference.
@@ -124,3 +121,11 @@ def matching_cost(
     distance = distance / seen.sum(dim=1).clamp(min=1).unsqueeze(-2)
     cost = cost + box_weight * distance
     return cost * seen.any(dim=1).unsqueeze(-2)
+
+
+def class_cost(
+    scenes: DecodedScenes, object_class: Int[Tensor, "rooms objects"]
+) -> Float[Tensor, "rooms predictions objects"]:
+    """L^l of Eq. S3: minus the probability that each prediction has each object's class."""
+    probability = scenes.class_logits.softmax(dim=-1)
+    return -probability.gather(-1, object_class.unsqueeze(1).expand(-1, probability.shape[1], -1))

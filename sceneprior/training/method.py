@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from sceneprior.classes import label_set
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
+from sceneprior.lifting.dataset import LiftedDataset
 from sceneprior.models.prior import ModelConfig, ScenePrior
 from sceneprior.settings import Section
 from sceneprior.training.checkpoints import read_networks
@@ -158,6 +159,20 @@ class PriorConfig(RunConfig):
             rotations=data.rotations,
             view_fraction=data.view_fraction,
             mask_step=mask_step,
+            seed=self.seed,
+        )
+        self.check_rooms(rooms, self.model.max_objects)
+        return rooms
+
+    def open_lifted(self, rays_per_object: int = 0) -> LiftedDataset:
+        """The training rooms with 3D boxes found from their masks; InputError as above."""
+        data = self.data
+        rooms = LiftedDataset(
+            Path(data.shards),
+            "train",
+            rotations=data.rotations,
+            view_fraction=data.view_fraction,
+            rays_per_object=rays_per_object,
             seed=self.seed,
         )
         self.check_rooms(rooms, self.model.max_objects)

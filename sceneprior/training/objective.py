@@ -18,7 +18,7 @@ from sceneprior.losses.layout import layout_losses
 from sceneprior.losses.matching import Matches, match_objects
 from sceneprior.silhouettes.render import render_silhouettes
 from sceneprior.training.settings import LossConfig, ShapeConfig
-from sceneprior.views import DecodedScenes, RoomBoxes, SceneViews
+from sceneprior.views import DecodedScenes, LiftedRooms, RoomBoxes, SceneViews
 
 POINTS_LEVEL = 2
 """`ellipsoid_points` are 162: spheres 0.6% too small, 1.7% in the worst direction."""
@@ -106,7 +106,7 @@ def weighted_sum(
     return torch.stack([by_name[name] * loss for name, loss in losses.items()]).sum(dim=0)
 
 
-def check_finite(total: Tensor, views: SceneViews | RoomBoxes) -> None:
+def check_finite(total: Tensor, views: SceneViews | LiftedRooms | RoomBoxes) -> None:
     """Stop at the first loss that is not a number, and name the rooms that made it.
 
     Several processes stop together: one that stopped alone would leave the others waiting.

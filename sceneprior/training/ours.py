@@ -8,9 +8,16 @@ from torch import nn
 
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
+from sceneprior.lifting.dataset import LiftedDataset
 from sceneprior.training.method import PriorConfig, Stage, TrainedPrior
-from sceneprior.training.settings import LossConfig, SamplingConfig, ShapeConfig, StageConfig
-from sceneprior.training.stages import LayoutStage, PaperStage, ShapeStage
+from sceneprior.training.settings import (
+    LayoutConfig,
+    LossConfig,
+    SamplingConfig,
+    ShapeConfig,
+    StageConfig,
+)
+from sceneprior.training.stages import LayoutStage, LiftedStage, PaperStage, ShapeStage
 
 
 class PaperConfig(PriorConfig):
@@ -18,7 +25,7 @@ class PaperConfig(PriorConfig):
 
     method: Literal["ours"] = "ours"
     loss: LossConfig = LossConfig()
-    layout: StageConfig | None
+    layout: LayoutConfig | None
     """Null trains layout and shape together from the start (ablation c3)."""
     shape: ShapeConfig
     sampling: SamplingConfig = SamplingConfig()
@@ -35,6 +42,9 @@ class PaperConfig(PriorConfig):
         shape = Stage("shape", self.shape, masks, partial(self._build, ShapeStage, self.shape))
         if self.layout is None:
             return (shape,)
+        if self.layout.supervision == "lifted":
+            lifted = partial(self._build, LiftedStage, self.layout)
+            return Stage("layout", self.layout, self.open_lifted, lifted), shape
         boxes = partial(self.open_views, self.data.views_per_room, None)
         build = partial(self._build, LayoutStage, self.layout)
         return Stage("layout", self.layout, boxes, build), shape
@@ -43,7 +53,7 @@ class PaperConfig(PriorConfig):
         self,
         kind: type[PaperStage],
         stage: StageConfig,
-        rooms: ViewDataset,
+        rooms: ViewDataset | LiftedDataset,
         previous: Path | None,
     ) -> PaperStage:
         if previous is None:

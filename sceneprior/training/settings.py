@@ -82,15 +82,26 @@ class StageConfig(TrainConfig):
     latent_noise_end: float | None = Field(None, ge=0)
     """Where the noise ends, going there evenly over the stage; None keeps it as it is."""
     proxy: Literal["ellipsoid", "ellipsoid_points", "box", "beveled_box"] = "ellipsoid"
-    """What an object's 2D box is taken from where its mesh is not (see `box_from`): the smooth
-    ellipsoid that fills the 3D box, exactly; 162 of its points, which is slower and moves what is
-    behind the camera in front of it, as the authors do with 2,562; the 3D box's corners; or
-    `beveled_box`, the box with its edges cut off as far as its class has learnt to."""
+    """What an object's 2D box is taken from where its mesh is not (see `box_from`), in training
+    from views and where rooms are fitted to images: the smooth ellipsoid that fills the 3D box,
+    exactly; 162 of its points, which is slower and moves what is behind the camera in front of it,
+    as the authors do with 2,562; the 3D box's corners; or `beveled_box`, the box with its edges cut
+    off as far as its class has learnt to."""
+
+
+class LayoutConfig(StageConfig):
+    """How the layout stage is trained."""
+
+    supervision: Literal["views", "lifted"] = "views"
+    """`views`: 2D boxes of the views drawn in each step (paper); `lifted`: the 3D boxes that masks
+    and cameras imply, found once before training (`lifting/boxes.py`), which teach the same in a
+    fraction of the time. `loss.box` and `loss.match_box` then weigh metres."""
 
 
 class ShapeConfig(StageConfig):
-    """How the shape stage is trained: the layout terms go on beside the mask term."""
+    """How the shape stage of meshes is trained: the layout terms go on beside the mask term."""
 
+    supervision: Literal["masks"] = "masks"
     decoder_learning_rate: float | None = Field(None, gt=0)
     """For the shape decoder, which starts fresh where the rest is trained; None: the same rate."""
     views_per_room: int | None = Field(None, ge=1)
@@ -102,6 +113,21 @@ class ShapeConfig(StageConfig):
     compositing: Literal["layered", "paper"] = "paper"
     box_from: Literal["mesh", "proxy"] = "mesh"
     """Whether 2D boxes come from the deformed mesh (paper) or still from the proxy."""
+
+
+class RaysConfig(StageConfig):
+    """How the shape stage of occupancy grids is trained: lifted boxes go on teaching the layout
+    beside rays through the masks (`loss.mask` weighs them)."""
+
+    supervision: Literal["rays"] = "rays"
+    decoder_learning_rate: float | None = Field(None, gt=0)
+    """As in `ShapeConfig`."""
+    rays_per_object: int = Field(64, ge=1)
+    """Rays drawn through an object's masks in each step."""
+    samples: int = Field(24, ge=2)
+    """Places along each ray where the grid is asked."""
+    smoothness: float = Field(0.1, ge=0)
+    """Weight of the total variation of occupancies; without it surfaces are noise."""
 
 
 class SamplingConfig(Section):

@@ -1,6 +1,7 @@
 """The paper's stages: layouts from 2D boxes (Eq. 7), then with shapes from masks (Eq. 8)."""
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import lightning
 import torch
@@ -8,6 +9,7 @@ from jaxtyping import Float
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
+from sceneprior.losses.lifted import lifted_losses, match_lifted
 from sceneprior.losses.shape import mask_loss
 from sceneprior.models.prior import ScenePrior
 from sceneprior.training.objective import (
@@ -22,8 +24,8 @@ from sceneprior.training.objective import (
     weighted_sum,
     with_cosine,
 )
-from sceneprior.training.settings import LossConfig, ShapeConfig, StageConfig
-from sceneprior.views import SceneViews
+from sceneprior.training.settings import LayoutConfig, LossConfig, ShapeConfig, StageConfig
+from sceneprior.views import LiftedRooms, SceneViews
 
 
 class PaperStage(lightning.LightningModule, ABC):
@@ -49,18 +51,24 @@ class PaperStage(lightning.LightningModule, ABC):
         super().__init__()
         # Several processes agree on gradients only of what takes part.
         prior.requires_grad_(True)
-        prior.shape.requires_grad_(isinstance(stage, ShapeConfig))
-        of_meshes = isinstance(stage, ShapeConfig) and stage.box_from == "mesh"
-        prior.bevels.requires_grad_(stage.proxy == "beveled_box" and not of_meshes)
+        prior.shape.requires_grad_(not isinstance(stage, LayoutConfig))
+        prior.bevels.requires_grad_(stage.proxy == "beveled_box" and self.has_proxies(stage))
         self.prior, self.latents = prior, latents
         self.stage, self.loss, self.seed = stage, loss, seed
         self.completeness_target = completeness_target
 
+    @staticmethod
+    def has_proxies(stage: Any) -> bool:
+        """Whether 2D boxes of the stage's proxy take part in the loss."""
+        return True
+
     @abstractmethod
-    def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+    def training_step(self, views: Any, batch_idx: int) -> Tensor:
         """The loss of a batch."""
 
-    def room_latents(self, views: SceneViews, batch_idx: int) -> Float[Tensor, "rooms width"]:
+    def room_latents(
+        self, views: SceneViews | LiftedRooms, batch_idx: int
+    ) -> Float[Tensor, "rooms width"]:
         """The rooms' latents z, moved at random as far as the stage says."""
         stage, space = self.stage, self.prior.latent_space
         end = stage.latent_noise if stage.latent_noise_end is None else stage.latent_noise_end
@@ -73,7 +81,10 @@ class PaperStage(lightning.LightningModule, ABC):
             return space.step(z, noise, batch_seed(self.seed, self.trainer, batch_idx))
 
     def total(
-        self, losses: dict[str, Tensor], views: SceneViews, beside: dict[str, Tensor] | None = None
+        self,
+        losses: dict[str, Tensor],
+        views: SceneViews | LiftedRooms,
+        beside: dict[str, Tensor] | None = None,
     ) -> Tensor:
         """The weighted sum of the losses, checked and logged; `beside` is logged alone."""
         total = weighted_sum(losses, self.loss)
@@ -86,7 +97,7 @@ class PaperStage(lightning.LightningModule, ABC):
         own may have other rates."""
         stage, others = self.stage, ("shape.", "bevels.")
         trained = [p for name, p in self.prior.named_parameters() if not name.startswith(others)]
-        shape_rate = stage.decoder_learning_rate if isinstance(stage, ShapeConfig) else None
+        shape_rate = getattr(stage, "decoder_learning_rate", None)
         tables = [*self.latents.parameters(), *self.prior.bevels.parameters()]
         groups = [
             {"params": trained, "lr": stage.learning_rate},
@@ -113,10 +124,29 @@ class LayoutStage(PaperStage):
             return self.total(losses, views)
 
 
+class LiftedStage(PaperStage):
+    """The layout loss against lifted 3D boxes, which no camera has to be asked for again."""
+
+    @staticmethod
+    def has_proxies(stage: Any) -> bool:
+        return False
+
+    def training_step(self, rooms: LiftedRooms, batch_idx: int) -> Tensor:
+        scenes = self.prior.decode(self.room_latents(rooms, batch_idx), with_shape=False)
+        with full_precision(self.device):
+            matches = match_lifted(scenes, rooms, self.loss.match_box)
+            losses = lifted_losses(scenes, rooms, matches, self.completeness_target)
+            return self.total(losses, rooms)
+
+
 class ShapeStage(PaperStage):
     """The layout loss, now of deformed meshes, plus the mask loss: L = L_L + lambda_S L_S."""
 
     stage: ShapeConfig
+
+    @staticmethod
+    def has_proxies(stage: Any) -> bool:
+        return stage.box_from == "proxy"
 
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
         scenes = self.prior.decode(self.room_latents(views, batch_idx))

@@ -10,10 +10,11 @@ import pytest
 import torch
 from tiny_runs import tiny_baseline, tiny_config
 
-from sceneprior.baselines.true_boxes import TruthDataset, turned
+from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.data.dataset import BLANK, ViewDataset
 from sceneprior.errors import ShardError
 from sceneprior.geometry.corners import box_corners
+from sceneprior.geometry.turns import turn_boxes
 from sceneprior.shards import Shard, iterate_rooms
 
 PACKAGE = Path(__file__).parents[2] / "sceneprior"
@@ -83,10 +84,10 @@ def test_four_quarters_are_none(torch_rng):
     boxes_m = torch.rand(5, 3, 6, generator=torch_rng)
     again = boxes_m
     for _ in range(4):
-        again = turned(again, torch.ones(5, dtype=torch.long))
+        again = turn_boxes(again, torch.ones(5, dtype=torch.long))
     assert torch.equal(again, boxes_m)
-    assert torch.equal(turned(boxes_m, torch.full((5,), 3)), turned(
-        turned(boxes_m, torch.full((5,), 2)), torch.full((5,), 1)
+    assert torch.equal(turn_boxes(boxes_m, torch.full((5,), 3)), turn_boxes(
+        turn_boxes(boxes_m, torch.full((5,), 2)), torch.full((5,), 1)
     ))  # fmt: skip
 
 

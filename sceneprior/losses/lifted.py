@@ -1,0 +1,50 @@
+"""The layout loss against lifted 3D boxes: what Eq. 7 asks of views, asked once of a room.
+
+Not in the paper, which compares 2D boxes in every view at every step. `lifting` has found the 3D
+box that a piece's masks imply, so the distance is taken there, and no frustum term is needed.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneprior.losses.averages import mean_of_objects
+from sceneprior.losses.layout import class_loss, completeness_loss, take
+from sceneprior.losses.matching import Matches, assign, class_cost
+from sceneprior.views import DecodedScenes, LiftedRooms
+
+
+@torch.no_grad()
+def match_lifted(scenes: DecodedScenes, rooms: LiftedRooms, box_weight: float = 5.0) -> Matches:
+    """The cheapest one-to-one assignment of the first n predictions to a room's n objects.
+
+        sigma = argmin sum_k -p_k(l_j) + lambda_B |b_k - b_j|_1
+
+    with b a 3D box (centre and extents in metres). An object without a box costs nothing.
+    """
+    distance = torch.cdist(predicted_boxes(scenes), rooms.boxes_m, p=1)
+    cost = class_cost(scenes, rooms.object_class) + box_weight * distance
+    cost = cost * rooms.is_lifted.unsqueeze(1)
+    counts = rooms.is_object.sum(dim=-1).tolist()
+    return Matches(assign(cost, counts, counts), rooms.is_lifted)
+
+
+def lifted_losses(
+    scenes: DecodedScenes, rooms: LiftedRooms, matches: Matches, completeness_target: str
+) -> dict[str, Float[Tensor, ""]]:
+    """`class`, `box` and `completeness`, unweighted, as `layout_losses` has them of views.
+
+    L_box = mean over objects of |c_k - c_j|_1 + |s_k - s_j|_1, in metres
+    """
+    predicted = take(predicted_boxes(scenes), matches.prediction, dim=1)
+    apart = (predicted - rooms.boxes_m).abs().sum(dim=-1)
+    return {
+        "class": class_loss(scenes, rooms, matches),
+        "box": mean_of_objects(apart, matches.valid),
+        "completeness": completeness_loss(scenes, rooms, completeness_target),
+    }
+
+
+def predicted_boxes(scenes: DecodedScenes) -> Float[Tensor, "rooms objects 6"]:
+    """Centre and full extents of every prediction."""
+    return torch.cat([scenes.centers_m, scenes.sizes_m], dim=-1)
