@@ -1,8 +1,8 @@
-"""Batches of rooms: `SceneViews` (what cameras saw), `DecodedScenes`, `RoomBoxes`."""
+"""Batches of rooms: `SceneViews` (what cameras saw), `Rays`, `DecodedScenes`, `RoomBoxes`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Integer
@@ -72,6 +72,20 @@ class SceneViews(_Batch):
         return self.intrinsics * scale[:, None]
 
 
+class Rays(NamedTuple):
+    """What rays through pixels say of objects: of each object, whether they met it."""
+
+    origins_m: Float[Tensor, "objects rays 3"]
+    """The cameras' places, in the room frame."""
+    directions: Float[Tensor, "objects rays 3"]
+    """Of unit length."""
+    is_hit: Bool[Tensor, "objects rays"]
+    """Whether the ray ends on the object."""
+    until_m: Float[Tensor, "objects rays"]
+    """How far along the ray this is known: a miss meets nothing of the object before it, a hit
+    meets it somewhere before it. Infinite where nothing ends the ray, 0 where it says nothing."""
+
+
 @dataclass(frozen=True)
 class DecodedScenes:
     """A batch of decoded latents: N objects a room, in the order of generation."""
@@ -87,7 +101,13 @@ class DecodedScenes:
     """How far the edges of the proxy `beveled_box` are cut off (`geometry.meshes`); None
     for rooms that no prior decoded."""
     vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
-    """Mesh vertices in the room frame; None until the shape decoder ran."""
+    """Mesh vertices in the room frame; None until the shape decoder ran, or where it makes grids.
+    """
+    occupancy: Float[Tensor, "rooms objects x y z"] | None = None
+    """Logits, positive inside the object, of the centres of cells that fill the box times
+    `margin`; None until the shape decoder ran, or where it makes meshes."""
+    margin: float = 1.0
+    """The frame of `occupancy` over the box."""
 
 
 @dataclass(frozen=True)

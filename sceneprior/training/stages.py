@@ -127,7 +127,8 @@ class ShapeStage(PaperStage):
             )
             # Before rendering, too, which refuses vertices that are not finite and knows no rooms.
             check_finite(weighted_sum(losses, self.loss), views)
-            assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
-            masks = seen_masks(scenes.vertices_m, self.prior.shape.faces, views, self.stage)
+            faces = self.prior.faces
+            assert scenes.vertices_m is not None and faces is not None, "masks are of meshes"
+            masks = seen_masks(scenes.vertices_m, faces, views, self.stage)
             losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
             return self.total(losses, views, beside=overlap)
