@@ -89,7 +89,7 @@ def mask_iou(trained: TrainedPrior) -> float:
         drawn = torch.arange(scenes.centers_m.shape[1]) < views.is_object.sum(-1, keepdim=True)
         front = render_scene(
             scenes.vertices_m,
-            trained.prior.shape.faces,
+            trained.prior.faces,
             views.world_to_camera,
             views.intrinsics_at(height, width),
             (height, width),

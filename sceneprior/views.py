@@ -1,8 +1,8 @@
-"""Batches of rooms: `SceneViews`, `LiftedRooms`, `DecodedScenes`, `RoomBoxes`."""
+"""Batches of rooms: `SceneViews`, `LiftedRooms`, `Rays`, `DecodedScenes`, `RoomBoxes`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Integer
@@ -72,6 +72,20 @@ class SceneViews(_Batch):
         return self.intrinsics * scale[:, None]
 
 
+class Rays(NamedTuple):
+    """What rays through pixels say of objects: of each object, whether they met it."""
+
+    origins_m: Float[Tensor, "objects rays 3"]
+    """The cameras' places, in the room frame."""
+    directions: Float[Tensor, "objects rays 3"]
+    """Of unit length."""
+    is_hit: Bool[Tensor, "objects rays"]
+    """Whether the ray ends on the object."""
+    until_m: Float[Tensor, "objects rays"]
+    """How far along the ray this is known: a miss meets nothing of the object before it, a hit
+    meets it somewhere before it. Infinite where nothing ends the ray, 0 where it says nothing."""
+
+
 @dataclass(frozen=True)
 class DecodedScenes:
     """A batch of decoded latents: N objects a room, in the order of generation."""
@@ -87,7 +101,13 @@ class DecodedScenes:
     """How far the edges of the proxy `beveled_box` are cut off (`geometry.meshes`); None
     for rooms that no prior decoded."""
     vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
-    """Mesh vertices in the room frame; None until the shape decoder ran."""
+    """Mesh vertices in the room frame; None until the shape decoder ran, or where it makes grids.
+    """
+    occupancy: Float[Tensor, "rooms objects x y z"] | None = None
+    """Logits, positive inside the object, of the centres of cells that fill the box times
+    `margin`; None until the shape decoder ran, or where it makes meshes."""
+    margin: float = 1.0
+    """The frame of `occupancy` over the box."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +133,17 @@ class LiftedRooms(_Batch):
     ray_until_m: Float[Tensor, "rooms objects rays"] | None = None
     """Up to where the object is met, or known not to be; 0 for a ray that tells nothing."""
     room_ids: tuple[str, ...] = ()
+
+    def rays_of(self, room: Int[Tensor, " picked"], item: Int[Tensor, " picked"]) -> Rays:
+        """The rays of some objects.
+
+        Raises:
+            ValueError: the rooms were loaded without them.
+        """
+        parts = (self.ray_origins_m, self.ray_directions, self.ray_hits, self.ray_until_m)
+        if any(part is None for part in parts):
+            raise ValueError("These rooms have no rays; load the data with rays_per_object.")
+        return Rays(*(part[room, item] for part in parts if part is not None))
 
 
 @dataclass(frozen=True)

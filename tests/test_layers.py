@@ -46,6 +46,8 @@ OWNERS = {
     ],
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
+    "skimage": ["sceneprior/geometry/isosurface.py"],
+    "fast_simplification": ["sceneprior/geometry/isosurface.py"],
     "sklearn": ["sceneprior/evaluation/"],
     "scipy.optimize": ["sceneprior/losses/matching.py", "sceneprior/evaluation/"],
     "cv2": ["data_prep/"],

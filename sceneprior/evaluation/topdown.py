@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from sceneprior.classes import class_colors, label_set
-from sceneprior.geometry.corners import box_corners
+from sceneprior.geometry.corners import BOX_FACES, box_corners
 from sceneprior.offscreen import Orthographic, Pinhole, Renderer
 from sceneprior.pictures import paint_ids
 from sceneprior.scene import Mesh, Scene, SceneObject
@@ -51,13 +51,7 @@ def topdown_protocol(label_set_name: str) -> TopDownProtocol:
 
 def box_mesh(center_m: Sequence[float], size_m: Sequence[float]) -> Mesh:
     """The box itself as 12 triangles that face outwards."""
-    faces = np.array(
-        [
-            [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-            [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-        ]
-    )  # fmt: skip
-    return Mesh(box_corners(np.asarray(center_m), np.asarray(size_m)), faces)
+    return Mesh(box_corners(np.asarray(center_m), np.asarray(size_m)), BOX_FACES)
 
 
 def object_mesh(item: SceneObject) -> Mesh:

@@ -27,12 +27,13 @@ from sceneprior.generation.sample import sample_latents
 from sceneprior.geometry.cameras import boxes_of_points
 from sceneprior.geometry.meshes import place
 from sceneprior.losses.matching import match_objects
+from sceneprior.models.shape_decoder import ShapeDecoder
 from sceneprior.offscreen import SoftwareRenderer
 from sceneprior.pictures import contact_sheet
 from sceneprior.scene import Scene
 from sceneprior.shards import iterate_rooms, list_shards
 from sceneprior.silhouettes.render import render_scene
-from sceneprior.training.method import RunConfig, TrainedPrior, TrainedSampler
+from sceneprior.training.method import PriorConfig, RunConfig, TrainedPrior, TrainedSampler
 from sceneprior.training.monitor import EvaluationResult
 from sceneprior.training.ours import PaperConfig
 from sceneprior.views import SceneViews
@@ -61,7 +62,8 @@ class SampleEvaluator:
 
     - `overlaps_decoded`: pairs of decoded training rooms, below which generated ones seldom get
     - `mask_iou`: of a few decoded training rooms, mean over the objects that their views see;
-      hard masks of what is in front, in the layout stage of the undeformed template
+      hard masks of what is in front, in the layout stage of the undeformed template; not where
+      shapes are occupancy grids, of which no masks are drawn
 
     Compared rooms count what cameras saw of them: ground truth in 3D is never read.
 
@@ -80,6 +82,11 @@ class SampleEvaluator:
             raise InputError(
                 f"samples.metric is mask_iou, but `method: {config.method}` remembers no rooms; "
                 "choose category_kl, objects_off, overlaps or type_share."
+            )
+        if config.samples.metric == "mask_iou" and not _has_meshes(config):
+            raise InputError(
+                "samples.metric is mask_iou, which compares masks of meshes, but model.shape is "
+                "occupancy; choose category_kl, objects_off, overlaps or type_share."
             )
 
     def __call__(self, trained: TrainedPrior | TrainedSampler) -> EvaluationResult:
@@ -100,7 +107,8 @@ class SampleEvaluator:
             remembered = trained.prior.latent_space(trained.logits[plain[: settings.count]])
             decoded = _decode(trained, remembered, with_shape=False)
             scores["overlaps_decoded"] = overlap_pairs(decoded)
-            scores["mask_iou"] = mask_iou_of_rooms(trained, self._views)
+            if trained.prior.faces is not None:
+                scores["mask_iou"] = mask_iou_of_rooms(trained, self._views)
         pictured = _decode(trained, z[:PICTURED], with_shape=trained.stage != "layout")
         return EvaluationResult(scores, tile(pictured), self._compared[0])
 
@@ -146,6 +154,10 @@ class SampleEvaluator:
         return rooms.__getitems__([(row, 0) for row in range(0, len(rooms), rooms.rotations)])
 
 
+def _has_meshes(config: RunConfig) -> bool:
+    return isinstance(config, PriorConfig) and config.model.shape.name == "mesh"
+
+
 def _decode(trained: TrainedPrior, z: Tensor, with_shape: bool) -> list[Scene]:
     stage = "shape" if with_shape else "layout"
     names = [f"{row:04d}" for row in range(len(z))]
@@ -157,16 +169,17 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
     """Mean IoU of hard masks of decoded training rooms with the observed ones.
 
     Args:
-        trained: The prior; before the shape stage each box is filled with the plain template.
+        trained: A prior of meshes; before the shape stage each box has the plain template in it.
         views: Of training rooms, with instance ids.
     """
     config, prior = trained.config, trained.prior
     assert isinstance(config, PaperConfig), "a run that remembers rooms has a view loss"
     weights = config.loss
     scenes = prior(trained.logits[views.room_index], with_shape=trained.stage != "layout")
-    vertices = scenes.vertices_m
+    shape, vertices = prior.shape, scenes.vertices_m
+    assert isinstance(shape, ShapeDecoder), "masks are drawn of meshes"
     if vertices is None:
-        template = prior.shape.template.expand(*scenes.centers_m.shape[:2], -1, -1)
+        template = shape.template.expand(*scenes.centers_m.shape[:2], -1, -1)
         vertices = place(template, scenes.centers_m, scenes.sizes_m)
     boxes = boxes_of_points(vertices, views.world_to_camera, views.intrinsics, views.image_size)
     matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
@@ -174,7 +187,7 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
     height, width = ids.shape[-2:]
     counts = views.is_object.sum(dim=-1, keepdim=True)
     front = render_scene(
-        vertices, prior.shape.faces, views.world_to_camera, views.intrinsics_at(height, width),
+        vertices, shape.faces, views.world_to_camera, views.intrinsics_at(height, width),
         (height, width), mode="fast", drawn=torch.arange(vertices.shape[1]) < counts,
     ).front  # fmt: skip
     room, view, item = (views.visible & matches.valid.unsqueeze(1)).nonzero(as_tuple=True)

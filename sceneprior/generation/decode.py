@@ -10,6 +10,7 @@ from torch import Tensor
 from sceneprior.classes import VOID, label_set
 from sceneprior.errors import InputError
 from sceneprior.generation.sample import draw_latents, scene_names
+from sceneprior.geometry.isosurface import surface_of
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.training.method import TrainedPrior, TrainedSampler
@@ -29,7 +30,7 @@ class DecodedRoom(NamedTuple):
 
 def to_rooms(
     decoded: DecodedScenes,
-    faces: Int[Tensor, "faces 3"],
+    faces: Int[Tensor, "faces 3"] | None,
     label_set_name: str,
     names: Sequence[str],
     completeness_target: str = "first_n",
@@ -37,6 +38,7 @@ def to_rooms(
     """Objects up to where completeness says that the scene ends; their likeliest classes.
 
     `void` is a class like any other to the network, but no furniture: such objects are left out.
+    `faces` are those of decoded meshes (`ScenePrior.faces`).
     """
     kept = kept_objects(decoded.completeness_logits, completeness_target)
     kept = kept & (decoded.class_logits.argmax(dim=-1) != VOID)
@@ -52,23 +54,34 @@ def scene_of(
     decoded: DecodedScenes,
     row: int,
     predictions: Sequence[int],
-    faces: Int[Tensor, "faces 3"],
+    faces: Int[Tensor, "faces 3"] | None,
     label_set_name: str,
     name: str,
 ) -> Scene:
     """Some predictions for one room as a scene, in the given order; their likeliest classes but
-    void, meshes where they were decoded."""
-    classes, corners = label_set(label_set_name), faces.cpu().numpy()
+    void, meshes where shapes were decoded."""
+    classes = label_set(label_set_name)
     objects = []
     for item in predictions:
         logits = decoded.class_logits[row, item].clone()
         logits[VOID] = -torch.inf
         center, size = (part[row, item].tolist() for part in (decoded.centers_m, decoded.sizes_m))
-        mesh = None
-        if decoded.vertices_m is not None:
-            mesh = Mesh(decoded.vertices_m[row, item].cpu().numpy(), corners)
+        mesh = _mesh_of(decoded, row, item, faces)
         objects.append(SceneObject(classes[int(logits.argmax())], tuple(center), tuple(size), mesh))
     return Scene(name, label_set_name, tuple(objects))
+
+
+def _mesh_of(
+    decoded: DecodedScenes, row: int, item: int, faces: Int[Tensor, "faces 3"] | None
+) -> Mesh | None:
+    """A prediction's mesh: as decoded, or the surface of its grid; None before the shape stage."""
+    if decoded.vertices_m is not None and faces is not None:
+        return Mesh(decoded.vertices_m[row, item].cpu().numpy(), faces.cpu().numpy())
+    if decoded.occupancy is None:
+        return None
+    parts = (decoded.occupancy, decoded.centers_m, decoded.sizes_m)
+    logits, center_m, size_m = (part[row, item].detach().cpu().numpy() for part in parts)
+    return Mesh(*surface_of(logits, center_m, size_m, decoded.margin))
 
 
 @torch.no_grad()
@@ -76,7 +89,7 @@ def decode_rooms(
     trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: Sequence[str]
 ) -> list[DecodedRoom]:
     """Rooms of latents; with meshes once the shape stage has finished."""
-    config, faces = trained.config, trained.prior.shape.faces
+    config, faces = trained.config, trained.prior.faces
     rooms: list[DecodedRoom] = []
     for start in range(0, len(z), BATCH):
         part = slice(start, start + BATCH)

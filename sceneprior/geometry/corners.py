@@ -1,4 +1,4 @@
-"""The corners and edges of axis-aligned boxes, in numpy and in torch."""
+"""The corners, edges and faces of axis-aligned boxes, in numpy and in torch."""
 
 from itertools import product
 from typing import Any, TypeVar
@@ -12,6 +12,13 @@ CUBE_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 """(8, 3) corners of the cube [-1, 1]^3; x changes slowest, z fastest."""
 BOX_EDGES = tuple((a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit)
 """The 12 edges as pairs of rows of `CUBE_CORNERS`."""
+BOX_FACES = np.array(
+    [
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ]
+)  # fmt: skip
+"""12 triangles of rows of `CUBE_CORNERS`, which face outwards."""
 
 
 def box_corners(centers_m: Array, sizes_m: Array) -> Array:

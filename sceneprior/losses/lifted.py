@@ -13,6 +13,10 @@ from sceneprior.losses.layout import class_loss, completeness_loss, take
 from sceneprior.losses.matching import Matches, assign, class_cost
 from sceneprior.views import DecodedScenes, LiftedRooms
 
+PER_METRE = 1 / 6
+"""What a metre weighs: the share of an image's width that it spans 3 m before a camera that sees 90
+degrees. So lambda_box and lambda_B mean about the same for lifted boxes as for 2D boxes."""
+
 
 @torch.no_grad()
 def match_lifted(scenes: DecodedScenes, rooms: LiftedRooms, box_weight: float = 5.0) -> Matches:
@@ -20,10 +24,10 @@ def match_lifted(scenes: DecodedScenes, rooms: LiftedRooms, box_weight: float = 
 
         sigma = argmin sum_k -p_k(l_j) + lambda_B |b_k - b_j|_1
 
-    with b a 3D box (centre and extents in metres). An object without a box costs nothing.
+    with b a 3D box: centre and extents, a metre weighing `PER_METRE`. An object without a box costs nothing.
     """
     distance = torch.cdist(predicted_boxes(scenes), rooms.boxes_m, p=1)
-    cost = class_cost(scenes, rooms.object_class) + box_weight * distance
+    cost = class_cost(scenes, rooms.object_class) + box_weight * PER_METRE * distance
     cost = cost * rooms.is_lifted.unsqueeze(1)
     counts = rooms.is_object.sum(dim=-1).tolist()
     return Matches(assign(cost, counts, counts), rooms.is_lifted)
@@ -40,7 +44,7 @@ def lifted_losses(
     apart = (predicted - rooms.boxes_m).abs().sum(dim=-1)
     return {
         "class": class_loss(scenes, rooms, matches),
-        "box": mean_of_objects(apart, matches.valid),
+        "box": mean_of_objects(PER_METRE * apart, matches.valid),
         "completeness": completeness_loss(scenes, rooms, completeness_target),
     }
 

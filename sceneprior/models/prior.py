@@ -1,17 +1,19 @@
 """The whole prior, f of Eq. 1: from logits or latents to decoded scenes."""
 
-from typing import Annotated, Literal
+from dataclasses import replace
+from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Bool, Float
-from pydantic import Field, model_validator
+from jaxtyping import Bool, Float, Int
+from pydantic import Field, field_validator, model_validator
 from torch import Tensor, nn
 
 from sceneprior.geometry.meshes import place
 from sceneprior.models.latents import CubeConfig, LatentSpace, SphereConfig
 from sceneprior.models.layers import DecoderConfig
 from sceneprior.models.layout_decoder import ClassBevels, LayoutDecoder
-from sceneprior.models.shape_decoder import ShapeDecoder, ShapeDecoderConfig
+from sceneprior.models.occupancy import OccupancyConfig, OccupancyDecoder
+from sceneprior.models.shape_decoder import ShapeDecoderConfig
 from sceneprior.settings import Section
 from sceneprior.views import DecodedScenes
 
@@ -32,7 +34,15 @@ class ModelConfig(Section):
     """Of n objects, `first_n` wants ones for the first n predictions and zeros after (supplement
     B); `stop` wants ones from the last object on and ends a generated scene with the first object
     that has one (main text, released code). Decoding follows the same convention."""
-    shape: ShapeDecoderConfig = ShapeDecoderConfig()
+    shape: Annotated[ShapeDecoderConfig | OccupancyConfig, Field(discriminator="name")] = (
+        ShapeDecoderConfig()
+    )
+    """What a shape is: a deformed `mesh` (paper; also without a name), or an `occupancy` grid."""
+
+    @field_validator("shape", mode="before")
+    @classmethod
+    def _mesh_by_default(cls, shape: Any) -> Any:
+        return {"name": "mesh"} | shape if isinstance(shape, dict) else shape
 
     @model_validator(mode="after")
     def _heads_divide_width(self) -> "ModelConfig":
@@ -62,7 +72,12 @@ class ScenePrior(nn.Module):
         self.decoder = config.decoder.build(width, config.max_objects)
         self.layout = LayoutDecoder(width, classes, heads=config.layout_heads, void=void)
         self.bevels = ClassBevels(classes)
-        self.shape = ShapeDecoder(2 * width, config.shape)
+        self.shape = config.shape.build(2 * width)
+
+    @property
+    def faces(self) -> Int[Tensor, "faces 3"] | None:
+        """The triangles of all decoded meshes; None where shapes are occupancy grids."""
+        return None if isinstance(self.shape, OccupancyDecoder) else self.shape.faces
 
     def forward(
         self, logits: Float[Tensor, "rooms logits"], with_shape: bool = True
@@ -76,10 +91,10 @@ class ScenePrior(nn.Module):
         with_shape: bool = True,
         wanted: Bool[Tensor, "rooms wanted"] | None = None,
     ) -> DecodedScenes:
-        """Decode rooms from points of the latent space; `with_shape` adds meshes.
+        """Decode rooms from points of the latent space; `with_shape` adds meshes or grids.
 
-        `wanted` decodes as many objects as it has columns, and meshes only where it is true; the
-        other vertices lie at their box's centre. None: all N.
+        `wanted` decodes as many objects as it has columns, and shapes only where it is true; the
+        other vertices lie at their box's centre, and the other grids are empty. None: all N.
 
         Layouts stay float32 under autocast: bfloat16 would round 3 m to steps of 2 cm.
         """
@@ -87,15 +102,15 @@ class ScenePrior(nn.Module):
         features = self.decoder(z, count)
         with torch.autocast(z.device.type, enabled=False):
             layout, shared = self.layout(features.to(z.dtype))
-        vertices = None
-        if with_shape:
-            if wanted is None:
-                canonical = self.shape(shared).to(z.dtype)
-            else:
-                some = self.shape(shared[wanted].unsqueeze(0))[0].to(z.dtype)
-                canonical = some.new_zeros(*wanted.shape, *some.shape[1:])
-                canonical = canonical.index_put((wanted,), some)
-            vertices = place(canonical, layout.centers_m, layout.sizes_m)
-        return DecodedScenes(
-            **layout._asdict(), bevels=self.bevels(layout.class_logits), vertices_m=vertices
-        )
+        scenes = DecodedScenes(**layout._asdict(), bevels=self.bevels(layout.class_logits))
+        if not with_shape:
+            return scenes
+        if wanted is None:
+            shapes = self.shape(shared).to(z.dtype)
+        else:
+            some = self.shape(shared[wanted].unsqueeze(0))[0].to(z.dtype)
+            shapes = some.new_full((*wanted.shape, *some.shape[1:]), self.shape.nothing)
+            shapes = shapes.index_put((wanted,), some)
+        if isinstance(self.shape, OccupancyDecoder):
+            return replace(scenes, occupancy=shapes, margin=self.shape.margin)
+        return replace(scenes, vertices_m=place(shapes, layout.centers_m, layout.sizes_m))

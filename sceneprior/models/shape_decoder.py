@@ -1,6 +1,6 @@
 """The shape decoder: a template mesh deformed by a point-wise MLP (section 3.3, Eq. 6)."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from sceneprior.settings import Section
 class ShapeDecoderConfig(Section):
     """Template and size of the shape decoder."""
 
+    name: Literal["mesh"] = "mesh"
     width: int = Field(256, ge=8)
     """Hidden width; the paper's network has 256."""
     level: int = Field(4, ge=0, le=6)
@@ -25,6 +26,10 @@ class ShapeDecoderConfig(Section):
     """Scale each mesh to fill its box exactly, so that boxes stay the meshes' own. The paper leaves
     the two free to drift apart."""
 
+    def build(self, features: int) -> "ShapeDecoder":
+        """The module for object features of such a width, freshly initialised."""
+        return ShapeDecoder(features, self)
+
 
 class ShapeDecoder(nn.Module):
     """Offset every vertex v of a template by a point-wise MLP3 (Eq. 6).
@@ -33,6 +38,9 @@ class ShapeDecoder(nn.Module):
 
     r are two layers more on MLP1's output, which has so many `features`, as in the released code.
     """
+
+    nothing: ClassVar[float] = 0.0
+    """The canonical vertices of an object that was not decoded: the centre of its box."""
 
     def __init__(self, features: int, config: ShapeDecoderConfig):
         super().__init__()

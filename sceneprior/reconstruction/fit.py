@@ -20,6 +20,7 @@ from sceneprior.training.objective import (
     weighted_sum,
 )
 from sceneprior.training.ours import PaperConfig
+from sceneprior.training.settings import ShapeConfig
 from sceneprior.views import DecodedScenes, SceneViews
 
 CHECK_EVERY = 20
@@ -79,11 +80,18 @@ class Fit(NamedTuple):
 
 
 def decode_images(
-    trained: TrainedPrior, points: Float[Tensor, "images width"], views: SceneViews
+    trained: TrainedPrior,
+    points: Float[Tensor, "images width"],
+    views: SceneViews,
+    with_grids: bool = True,
 ) -> DecodedScenes:
-    """As many objects of each latent as the fullest image shows; meshes after the shape stage."""
+    """As many objects of each latent as the fullest image shows; shapes after the shape stage.
+
+    Without `with_grids` these are meshes alone: occupancy grids are compared with no mask.
+    """
     z = trained.prior.latent_space.onto(points)
-    return trained.prior.decode(z, trained.stage == "shape", wanted=views.is_object)
+    with_shape = trained.stage != "layout" and (with_grids or trained.prior.faces is not None)
+    return trained.prior.decode(z, with_shape, wanted=views.is_object)
 
 
 def view_loss(
@@ -97,7 +105,7 @@ def view_loss(
 
     Args:
         scenes: At least as many objects a room as the fullest image shows. Those without meshes
-            (before the shape stage) have no masks.
+            (before the shape stage, or with occupancy grids) have no masks.
         masks: Whether masks are compared; `views` needs instance ids then.
         matches: To keep; None matches anew.
     """
@@ -110,12 +118,14 @@ def view_loss(
     # An image does not tell how many objects there are beside those that it shows (supplement D).
     del losses["completeness"]
     total = weighted_sum(losses, config.loss)
-    if not masks or scenes.vertices_m is None:
+    faces = trained.prior.faces
+    if not masks or scenes.vertices_m is None or faces is None:
         return ViewLoss(total, total.detach(), torch.zeros_like(total), matches)
     layout = total.detach()
     # Before rendering, which refuses vertices that are not finite and knows no images.
     check_finite(layout.sum(), views)
-    seen = seen_masks(scenes.vertices_m, trained.prior.shape.faces, views, config.shape)
+    assert isinstance(config.shape, ShapeConfig), "meshes are learnt from masks"
+    seen = seen_masks(scenes.vertices_m, faces, views, config.shape)
     mask, overlap = mask_loss(seen, views, matches, config.loss.iou_gate, per_room=True)
     score = layout + config.loss.mask * (1 - overlap["mask_iou"])
     return ViewLoss(total + config.loss.mask * mask, score, overlap["mask_iou"], matches)
@@ -129,6 +139,9 @@ def fit_latents(
     masks: bool = True,
 ) -> Fit:
     """Fit one latent per image by RMSProp on its view loss; the best on the way is the answer.
+
+    Where shapes are occupancy grids, classes and 2D boxes alone are fitted: masks of grids are not
+    drawn.
 
     What moves is z itself, put back onto the sphere before it is decoded, rather than the logits
     that training moves: those reach only what is between the anchors, and reach it slowly.
@@ -154,10 +167,9 @@ def fit_latents(
             best.fill_(torch.inf)  # scores with and without masks do not compare
         x = points[active].requires_grad_()
         kept = matches if schedule.freeze_matching and step > schedule.masks_from else None
-        loss = view_loss(
-            trained, decode_images(trained, x, seen), seen, masks and step >= schedule.masks_from,
-            kept,
-        )  # fmt: skip
+        scenes = decode_images(trained, x, seen, with_grids=False)
+        with_masks = masks and step >= schedule.masks_from
+        loss = view_loss(trained, scenes, seen, with_masks, kept)
         check_finite(loss.total.sum(), seen)
         matches = loss.matches
         gains = loss.score < best[active] * (1 - schedule.least_gain)

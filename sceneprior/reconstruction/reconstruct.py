@@ -36,7 +36,7 @@ class FitOptions:
     start: str = "nearest"
     """Where they begin: see `starting_latents`."""
     masks: bool = True
-    """False fits classes and 2D boxes alone."""
+    """False fits classes and 2D boxes alone, as always where shapes are occupancy grids."""
     seed: int = 0
     """Of random starts."""
 
@@ -59,7 +59,7 @@ def reconstruct(
     trained: TrainedPrior, images: Sequence[ObservedImage], options: FitOptions
 ) -> list[Reconstruction]:
     """Reconstruct images of the run's label set, many at once. Before the run's shape stage scenes
-    are boxes, and masks are not compared.
+    are boxes, and masks are not compared; nor are they where shapes are occupancy grids.
 
     Raises:
         InputError: unknown options, a run without latents of rooms, another label set, or more
@@ -119,7 +119,7 @@ def _reconstruct_batch(
     fit = fit_latents(trained, repeated, starts.flatten(0, 1), schedule, options.masks)
     best = fit.loss.score.reshape(len(images), -1).argmin(dim=1)
     rows = best + options.restarts * torch.arange(len(images))
-    faces, labels = trained.prior.shape.faces, trained.config.label_set
+    faces, labels = trained.prior.faces, trained.config.label_set
 
     def answer(image: ObservedImage, row: int) -> Reconstruction:
         predictions = fit.loss.matches.prediction[row, : len(image.object_class)].tolist()

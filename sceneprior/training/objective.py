@@ -17,7 +17,7 @@ from sceneprior.geometry.meshes import beveled_cube, icosphere, place
 from sceneprior.losses.layout import layout_losses
 from sceneprior.losses.matching import Matches, match_objects
 from sceneprior.silhouettes.render import render_silhouettes
-from sceneprior.training.settings import LossConfig, ShapeConfig
+from sceneprior.training.settings import LossConfig, RaysConfig, ShapeConfig
 from sceneprior.views import DecodedScenes, LiftedRooms, RoomBoxes, SceneViews
 
 POINTS_LEVEL = 2
@@ -60,9 +60,15 @@ def match_and_score(
     return losses, matches
 
 
-def seen_boxes(scenes: DecodedScenes, views: SceneViews, settings: ShapeConfig) -> Boxes2D:
+def seen_boxes(
+    scenes: DecodedScenes, views: SceneViews, settings: ShapeConfig | RaysConfig
+) -> Boxes2D:
     """2D boxes of decoded objects: of their meshes where there are any (`ShapeConfig.box_from`)."""
-    if settings.box_from == "proxy" or scenes.vertices_m is None:
+    if (
+        scenes.vertices_m is None
+        or isinstance(settings, RaysConfig)
+        or settings.box_from == "proxy"
+    ):
         return proxy_boxes(scenes, views, settings.proxy)
     return boxes_of_points(
         scenes.vertices_m, views.world_to_camera, views.intrinsics, views.image_size

@@ -2,8 +2,9 @@
 
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
+from pydantic import Field, field_validator, model_validator
 from torch import nn
 
 from sceneprior.data.dataset import ViewDataset
@@ -13,11 +14,12 @@ from sceneprior.training.method import PriorConfig, Stage, TrainedPrior
 from sceneprior.training.settings import (
     LayoutConfig,
     LossConfig,
+    RaysConfig,
     SamplingConfig,
     ShapeConfig,
     StageConfig,
 )
-from sceneprior.training.stages import LayoutStage, LiftedStage, PaperStage, ShapeStage
+from sceneprior.training.stages import LayoutStage, LiftedStage, PaperStage, RaysStage, ShapeStage
 
 
 class PaperConfig(PriorConfig):
@@ -27,7 +29,7 @@ class PaperConfig(PriorConfig):
     loss: LossConfig = LossConfig()
     layout: LayoutConfig | None
     """Null trains layout and shape together from the start (ablation c3)."""
-    shape: ShapeConfig
+    shape: Annotated[ShapeConfig | RaysConfig, Field(discriminator="supervision")]
     sampling: SamplingConfig = SamplingConfig()
 
     remembers_rooms: ClassVar[bool] = True
@@ -36,10 +38,23 @@ class PaperConfig(PriorConfig):
     def distribution(self) -> str:
         return self.sampling.distribution
 
+    @field_validator("shape", mode="before")
+    @classmethod
+    def _masks_by_default(cls, shape: Any) -> Any:
+        return {"supervision": "masks"} | shape if isinstance(shape, dict) else shape
+
+    @model_validator(mode="after")
+    def _shapes_fit(self) -> "PaperConfig":
+        needed = "rays" if self.model.shape.name == "occupancy" else "masks"
+        if self.shape.supervision != needed:
+            raise ValueError(
+                f"model.shape is '{self.model.shape.name}', which is learnt from {needed}, but "
+                f"shape.supervision is '{self.shape.supervision}'; say {needed} there"
+            )
+        return self
+
     def stages(self) -> tuple[Stage, ...]:
-        views = self.shape.views_per_room or self.data.views_per_room
-        masks = partial(self.open_views, views, self.data.mask_step)
-        shape = Stage("shape", self.shape, masks, partial(self._build, ShapeStage, self.shape))
+        shape = self._shape_stage(self.shape)
         if self.layout is None:
             return (shape,)
         if self.layout.supervision == "lifted":
@@ -48,6 +63,14 @@ class PaperConfig(PriorConfig):
         boxes = partial(self.open_views, self.data.views_per_room, None)
         build = partial(self._build, LayoutStage, self.layout)
         return Stage("layout", self.layout, boxes, build), shape
+
+    def _shape_stage(self, stage: ShapeConfig | RaysConfig) -> Stage:
+        if isinstance(stage, RaysConfig):
+            rays = partial(self.open_lifted, stage.rays_per_object)
+            return Stage("shape", stage, rays, partial(self._build, RaysStage, stage))
+        views = stage.views_per_room or self.data.views_per_room
+        masks = partial(self.open_views, views, self.data.mask_step)
+        return Stage("shape", stage, masks, partial(self._build, ShapeStage, stage))
 
     def _build(
         self,

@@ -94,8 +94,7 @@ class LayoutConfig(StageConfig):
 
     supervision: Literal["views", "lifted"] = "views"
     """`views`: 2D boxes of the views drawn in each step (paper); `lifted`: the 3D boxes that masks
-    and cameras imply, found once before training (`lifting/boxes.py`), which teach the same in a
-    fraction of the time. `loss.box` and `loss.match_box` then weigh metres."""
+    and cameras imply, found once before training (`lifting/boxes.py`)."""
 
 
 class ShapeConfig(StageConfig):

@@ -10,6 +10,7 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
 from sceneprior.losses.lifted import lifted_losses, match_lifted
+from sceneprior.losses.rays import ray_loss, total_variation
 from sceneprior.losses.shape import mask_loss
 from sceneprior.models.prior import ScenePrior
 from sceneprior.training.objective import (
@@ -24,7 +25,13 @@ from sceneprior.training.objective import (
     weighted_sum,
     with_cosine,
 )
-from sceneprior.training.settings import LayoutConfig, LossConfig, ShapeConfig, StageConfig
+from sceneprior.training.settings import (
+    LayoutConfig,
+    LossConfig,
+    RaysConfig,
+    ShapeConfig,
+    StageConfig,
+)
 from sceneprior.views import LiftedRooms, SceneViews
 
 
@@ -157,7 +164,43 @@ class ShapeStage(PaperStage):
             )
             # Before rendering, too, which refuses vertices that are not finite and knows no rooms.
             check_finite(weighted_sum(losses, self.loss), views)
-            assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
-            masks = seen_masks(scenes.vertices_m, self.prior.shape.faces, views, self.stage)
+            faces = self.prior.faces
+            assert scenes.vertices_m is not None and faces is not None, "masks are of meshes"
+            masks = seen_masks(scenes.vertices_m, faces, views, self.stage)
             losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
             return self.total(losses, views, beside=overlap)
+
+
+class RaysStage(PaperStage):
+    """The layout loss against lifted boxes, plus the loss of rays through occupancy grids."""
+
+    stage: RaysConfig
+
+    @staticmethod
+    def has_proxies(stage: Any) -> bool:
+        return False
+
+    def training_step(self, rooms: LiftedRooms, batch_idx: int) -> Tensor:
+        count, slots = rooms.is_object.sum(dim=-1, keepdim=True), self.prior.max_objects
+        # Only the first n predictions are matched to a room's n objects: the rest needs no grid.
+        wanted = torch.arange(slots, device=count.device) < count
+        scenes = self.prior.decode(self.room_latents(rooms, batch_idx), wanted=wanted)
+        with full_precision(self.device):
+            matches = match_lifted(scenes, rooms, self.loss.match_box)
+            losses = lifted_losses(scenes, rooms, matches, self.completeness_target)
+            assert scenes.occupancy is not None, "decode() adds grids unless told not to"
+            room, item = matches.valid.nonzero(as_tuple=True)
+            prediction = matches.prediction[room, item]
+            grids = scenes.occupancy[room, prediction]
+            rays = rooms.rays_of(room, item)
+            crossing, seen = ray_loss(
+                grids,
+                scenes.centers_m[room, prediction],
+                scenes.sizes_m[room, prediction],
+                scenes.margin,
+                rays,
+                self.stage.samples,
+                torch.rand(rays.is_hit.shape, device=grids.device),
+            )
+            losses["mask"] = crossing + self.stage.smoothness * total_variation(grids)
+            return self.total(losses, rooms, beside=seen)

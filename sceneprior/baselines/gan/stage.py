@@ -31,6 +31,7 @@ from sceneprior.baselines.gan.semantic_maps import (
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.models.layout_decoder import LayoutDecoder
 from sceneprior.models.prior import ModelConfig
+from sceneprior.models.shape_decoder import ShapeDecoderConfig
 from sceneprior.models.transformer import TransformerConfig
 from sceneprior.training.method import PriorConfig, Stage
 from sceneprior.training.objective import check_finite, full_precision
@@ -95,9 +96,10 @@ class GanTraining(TrainConfig):
 
 
 class GanModel(ModelConfig):
-    """The paper's network."""
+    """The paper's network. Its maps are drawn from meshes, so no shape is an occupancy grid."""
 
     decoder: TransformerConfig = TransformerConfig()
+    shape: ShapeDecoderConfig = ShapeDecoderConfig()
 
 
 class GanConfig(PriorConfig):
@@ -203,7 +205,8 @@ class GanStage(lightning.LightningModule):
     def _draw(self, scenes: DecodedScenes, views: SceneViews) -> tuple[Tensor, Tensor]:
         """Maps, and how many objects of each class are in each room."""
         kept, classes = choices(scenes, self.model.completeness_target)
-        faces, mode = self.generator.shape.faces, self.settings.silhouettes
+        faces, mode = self.generator.faces, self.settings.silhouettes
+        assert faces is not None, "GanModel has meshes"
         maps = rendered_maps(scenes, faces, views, kept, classes, mode)
         return maps, (kept.unsqueeze(-1) * classes).sum(dim=1)
 
