@@ -24,7 +24,8 @@ def match_lifted(scenes: DecodedScenes, rooms: LiftedRooms, box_weight: float = 
 
         sigma = argmin sum_k -p_k(l_j) + lambda_B |b_k - b_j|_1
 
-    with b a 3D box: centre and extents, a metre weighing `PER_METRE`. An object without a box costs nothing.
+    with b a 3D box: centre and extents, a metre weighing `PER_METRE`. An object without a box
+    costs nothing.
     """
     distance = torch.cdist(predicted_boxes(scenes), rooms.boxes_m, p=1)
     cost = class_cost(scenes, rooms.object_class) + box_weight * PER_METRE * distance

@@ -38,6 +38,18 @@ RELEASED = {
     "model__completeness_target": "stop",
     "layout__proxy": "ellipsoid_points",
 }
+OCCUPANCY = {
+    "model__shape": {"name": "occupancy", "width": 8, "cells": 8},
+    "shape": {
+        "supervision": "rays",
+        "epochs": 3,
+        "batch_size": 6,
+        "learning_rate": 2e-3,
+        "latent_learning_rate": 2e-3,
+        "rays_per_object": 12,
+        "samples": 6,
+    },
+}
 VARIANTS = {
     "c1_uniform": {"model__latent_space": {"name": "cube"}, "layout__latent_noise": 0.1},
     "c2_lstm": {"model__decoder": {"name": "lstm"}},
@@ -48,6 +60,9 @@ VARIANTS = {
         "shape__proxy": "beveled_box",
     },
     "released": RELEASED,
+    "lifted": {"layout__supervision": "lifted"},
+    "occupancy": {"layout__supervision": "lifted", **OCCUPANCY},
+    "occupancy_one_stage": {"layout": None, **OCCUPANCY},
 }
 
 
@@ -74,9 +89,7 @@ def test_a_variant_learns(variant):
     assert [k.split("/")[0] for k in curves if k.endswith("/loss")] == (
         ["shape"] if config.layout is None else ["layout", "shape"]
     )
-    losses = [
-        value for _, value in curves["shape/loss" if name == "c3_one_stage" else "layout/loss"]
-    ]
+    losses = [value for _, value in curves["layout/loss" if config.layout else "shape/loss"]]
     assert losses[-1] < losses[0]
     assert all(torch.isfinite(torch.tensor(value)) for _, value in curves["shape/mask"])
 
