@@ -1,4 +1,4 @@
-"""Rays through occupancy grids against their loop, their gradients, and the rays that are special."""
+"""Rays through occupancy grids against their loop, their gradients, and special rays."""
 
 import math
 
