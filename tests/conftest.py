@@ -101,3 +101,21 @@ def toy_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
 
     config = tiny_config(toy_shards, layout__epochs=20)
     return made_once("run", lambda run: fit(config, run, trainer_options={"accelerator": "cpu"}))
+
+
+@pytest.fixture
+def grid_prior(toy_run: Path):
+    """The toy run's prior with occupancy grids for shapes, which are untrained."""
+    from sceneprior.config import load_run
+    from sceneprior.training.method import TrainedPrior
+
+    trained = load_run(toy_run)
+    shards = Path(trained.config.data.shards)
+    grids = {"name": "occupancy", "width": 8, "cells": 8}
+    config = tiny_config(shards, model__shape=grids)
+    prior = config.build_prior()
+    layout = trained.prior.state_dict()
+    kept = {name: value for name, value in layout.items() if not name.startswith("shape.")}
+    prior.load_state_dict(kept, strict=False)
+    prior.eval().requires_grad_(False)
+    return TrainedPrior(prior, trained.logits, trained.room_ids, config, "shape")

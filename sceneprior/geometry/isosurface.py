@@ -10,8 +10,8 @@ MOST_FACES = 2000
 SMALLEST_PIECE = 0.05
 """Pieces of fewer cells than this share of the largest are dropped: they float in the air."""
 SURE = 4.0
-"""Logits are cut off at plus and minus this; what is outside the grid has minus this. So a cell at
-the border that is surely occupied ends at its own face, half a cell from its centre."""
+"""Logits are cut off at plus and minus this, so that a surface lies about half way between a cell
+that is surely occupied and one that is surely empty."""
 
 
 def surface_of(
@@ -59,15 +59,13 @@ def surface_of(
     if not np.isfinite(logits).all():
         raise ValueError("An occupancy logit is not a finite number, so there is no surface.")
     center_m, size_m = (np.asarray(value, dtype=np.float64) for value in (center_m, size_m))
+    # One cell more on every side, all outside the box, closes the surface.
+    padded = np.pad(logits, 1, mode="edge").clip(-SURE, SURE)
     inside = inside_box(logits.shape, margin)
-    if not (logits > 0).any(where=inside > 0) or (logits > 0).all(where=inside > 0):
+    if not (padded > 0).any(where=inside > 0) or (padded > 0).all(where=inside > 0):
         return CUBE_CORNERS * size_m / 2 + center_m, BOX_FACES.copy()
-    field = np.minimum(logits.clip(-SURE, SURE), inside)
-    field = without_small_pieces(field)
-    padded = np.pad(field, 1, constant_values=-SURE)
-    vertices, faces, *_ = marching_cubes(
-        padded.astype(np.float32), 0.0, gradient_direction="ascent"
-    )
+    field = without_small_pieces(np.minimum(padded, inside))
+    vertices, faces, *_ = marching_cubes(field.astype(np.float32), 0.0, gradient_direction="ascent")
     if len(faces) > most_faces:
         vertices, faces = fast_simplification.simplify(vertices, faces, target_count=most_faces)
     # Vertex i of the padded grid is the centre of cell i - 1.
@@ -78,10 +76,10 @@ def surface_of(
 
 def inside_box(shape: tuple[int, ...], margin: float) -> Float[np.ndarray, "x y z"]:
     """How far inside the box each cell's centre is, as a logit: 0 on the box's nearest side, SURE
-    one cell from it."""
+    one cell from it; of a grid with one cell more on every side than `shape`."""
     depth = []
     for cells in shape:
-        from_middle = np.abs(np.arange(cells) + 0.5 - cells / 2)
+        from_middle = np.abs(np.arange(-1, cells + 1) + 0.5 - cells / 2)
         depth.append(cells / (2 * margin) - from_middle)
     x, y, z = np.ix_(*depth)
     return (SURE * np.minimum(np.minimum(x, y), z)).clip(-SURE, SURE)

@@ -16,6 +16,7 @@ from sceneprior.generation.decode import (
     synthesize,
     to_rooms,
 )
+from sceneprior.geometry.isosurface import surface_of
 from sceneprior.scene import Scene
 from sceneprior.views import DecodedScenes
 
@@ -82,6 +83,26 @@ def test_nothing_complete_is_an_empty_room_and_no_vertices_are_boxes(decoded):
     ]
     boxes = replace(decoded, vertices_m=None)
     assert scenes_of(boxes, faces, "front3d_bedroom", ["a", "b"])[0].objects[0].mesh is None
+
+
+def test_grids_become_meshes_in_the_boxes_of_objects_that_are_kept(decoded, monkeypatch):
+    grids = torch.full((2, 4, 8, 8, 8), -4.0)
+    grids[:, :, :, :4] = 4.0  # the lower half of every frame
+    asked = []
+
+    def counted(logits, center_m, size_m, margin):
+        asked.append(margin)
+        return surface_of(logits, center_m, size_m, margin)
+
+    monkeypatch.setattr(decode, "surface_of", counted)
+    filled = replace(decoded, vertices_m=None, occupancy=grids, margin=1.25)
+    scenes = scenes_of(filled, None, "front3d_bedroom", ["a", "b"])
+    assert asked == [1.25] * 4
+    for item in scenes[0].objects:
+        low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
+        bottom = np.subtract(item.center_m, np.divide(item.size_m, 2))
+        np.testing.assert_allclose(low, bottom, atol=1e-6)
+        np.testing.assert_allclose(high - low, np.multiply(item.size_m, [1, 0.5, 1]), atol=1e-6)
 
 
 def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(toy_run, monkeypatch):

@@ -1,4 +1,4 @@
-"""Rays through occupancy grids: against a loop, their gradients, and special rays."""
+"""Rays through occupancy grids against their loop, their gradients, and special rays."""
 
 import math
 
