@@ -24,6 +24,10 @@ _Loader.add_implicit_resolver(
 )
 
 
+TAGS = ("name", "supervision")
+"""Keys that tell a section of one kind from one of another."""
+
+
 class Section(BaseModel):
     # Strict: "yes" is no number and 3.5 no count. Unknown keys are errors that name a neighbour.
     model_config = ConfigDict(
@@ -113,11 +117,12 @@ def _explain(model: type[Section], error: ValidationError, source: str) -> str:
     if first["type"] == "missing":
         return f"{source}: '{key}' is missing and has no default; add it.{more}"
     known_names = ", ".join(variants)
+    what = "" if first["type"][:9] != "union_tag" else first["ctx"]["discriminator"].strip("'")
     if first["type"] == "union_tag_not_found":
-        return f"{source}: '{key}' has no name; add one of {known_names}.{more}"
+        return f"{source}: '{key}' has no {what}; add one of {known_names}.{more}"
     if first["type"] == "union_tag_invalid":
         tag = first["ctx"]["tag"]
-        return f"{source}: no '{key}' is named '{tag}'; choose from {known_names}.{more}"
+        return f"{source}: no {what} of '{key}' is '{tag}'; choose from {known_names}.{more}"
     if first["type"] == "model_attributes_type" and variants:
         return (
             f"{source}: '{key}' is a section; write {{name: ...}} with one of {known_names}.{more}"
@@ -140,7 +145,7 @@ def _section_of(
     section, keys, inner = model, list[str](), list[type[BaseModel]]()
     for part in location:
         if len(inner) > 1:  # the variants of a section; the next part names one
-            section = next(v for v in inner if v.model_fields["name"].default == part)
+            section = next(v for v in inner if _tag(v) == part)
             inner = []
             continue
         section = inner[0] if inner else section
@@ -149,5 +154,10 @@ def _section_of(
         field = section.model_fields.get(part)
         types = (field.annotation, *get_args(field.annotation)) if field is not None else ()
         inner = [v for v in types if isinstance(v, type) and issubclass(v, BaseModel)]
-    names = [v.model_fields["name"].default for v in inner if "name" in v.model_fields]
-    return keys, section, names
+    return keys, section, [str(_tag(v)) for v in inner if _tag(v)]
+
+
+def _tag(variant: type[BaseModel]) -> str | None:
+    """What tells a section from its alternatives, if it has any: `lstm` of {name: lstm}."""
+    fields = variant.model_fields
+    return next((fields[key].default for key in TAGS if key in fields), None)

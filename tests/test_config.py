@@ -132,7 +132,7 @@ def test_a_part_of_atiss_without_atiss_is_a_sentence(config):
 
 def test_a_variant_that_does_not_exist_lists_those_that_do(config):
     assert refusal(config, "model.decoder={name: gru}") == (
-        f"{config}: no 'model.decoder' is named 'gru'; choose from transformer, lstm, atiss2d."
+        f"{config}: no name of 'model.decoder' is 'gru'; choose from transformer, lstm, atiss2d."
     )
     assert refusal(config, "model.latent_space={anchors: 4}") == (
         f"{config}: 'model.latent_space' has no name; add one of sphere, cube."

@@ -93,7 +93,7 @@ def test_a_shape_without_a_name_is_a_mesh(tmp_path):
 @pytest.mark.parametrize(
     ("shape", "sentence"),
     [
-        ({"name": "cloud"}, "no 'model.shape' is named 'cloud'; choose from mesh, occupancy."),
+        ({"name": "cloud"}, "no name of 'model.shape' is 'cloud'; choose from mesh, occupancy."),
         ("occupancy", "'model.shape' is a section; write {name: ...} with one of mesh, occupancy."),
         ({"name": "occupancy", "level": 2}, "unknown key 'model.shape.level'; the nearest valid"),
         ({"name": "occupancy", "cells": 30}, "'model.shape.cells': input should be a multiple of"),

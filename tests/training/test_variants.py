@@ -84,7 +84,7 @@ def variant(request, toy_shards, tmp_path_factory):
 
 
 def test_a_variant_learns(variant):
-    name, config, run = variant
+    _, config, run = variant
     curves = read_curves(run)
     assert [k.split("/")[0] for k in curves if k.endswith("/loss")] == (
         ["shape"] if config.layout is None else ["layout", "shape"]
