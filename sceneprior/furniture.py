@@ -21,7 +21,11 @@ CATEGORY_TABLE = Path(__file__).with_name("front3d_categories.csv")
 
 
 def model_info_path(folder: Path, option: str = "--future") -> Path:
-    """3D-FUTURE's list of models; `option` is what the user named the folder with, for errors."""
+    """3D-FUTURE's list of models; `option` is what the user named the folder with, for errors.
+
+    Raises:
+        InputError: the folder is missing, or has none.
+    """
     if not folder.is_dir():
         raise InputError(f"No folder at {folder}; {option} names the folder of 3D-FUTURE models.")
     for name in ("model_info.json", "model_info_revised.json"):
@@ -34,7 +38,11 @@ def model_info_path(folder: Path, option: str = "--future") -> Path:
 
 
 def model_categories(folder: Path, option: str = "--future") -> dict[str, str]:
-    """Model id -> category: lower case, "a / b" as "a/b"; "others" where the release says null."""
+    """Model id -> category: lower case, "a / b" as "a/b"; "others" where the release says null.
+
+    Raises:
+        InputError: the folder is missing, or is not 3D-FUTURE's.
+    """
     path = model_info_path(folder, option)
     data = read_json(path)
     try:

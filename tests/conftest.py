@@ -18,13 +18,16 @@ import numpy as np
 import pydantic  # noqa: F401
 import pytest
 import scipy.stats  # noqa: F401
+import sklearn.linear_model  # noqa: F401
 import torch
+from threadpoolctl import threadpool_limits
 from tiny_runs import tiny_config
 from toy_rooms import write_toy_shards
 
 # Toy tensors gain nothing from a second thread, and wait for it where cores are shared: thirty
 # times as long. Numba's OpenMP layer would set torch's number of threads back to all cores.
 torch.set_num_threads(1)
+threadpool_limits(1)  # of BLAS, which was loaded with as many as there are cores
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("NUMBA_THREADING_LAYER", "workqueue")  # in processes that tests start
 numba.config.THREADING_LAYER = os.environ["NUMBA_THREADING_LAYER"]

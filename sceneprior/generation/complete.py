@@ -62,6 +62,9 @@ def complete(
 
     Returns:
         Of each room the answers' latents and the answers: see `insert`.
+
+    Raises:
+        InputError: a given object cannot be used, or there are more than the run's rooms hold.
     """
     given = gather_given(trained, scenes)
     starts = _starts(trained, given, count * RESTARTS, seed, distribution)

@@ -45,7 +45,11 @@ def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> No
 
 
 def check_free(folder: Path, overwrite: bool = False) -> None:
-    """Refuse a folder in which something would be written over unasked."""
+    """Refuse a folder in which something would be written over unasked.
+
+    Raises:
+        InputError: it is a file, or holds something and `overwrite` is false.
+    """
     folder = Path(folder)
     if folder.is_file():
         raise InputError(f"{folder} is a file; name a folder.")
@@ -71,7 +75,11 @@ def write_scenes(
     latents: Float[Tensor, "rooms dimension"] | None = None,
 ) -> None:
     """Write scenes to a folder (see `check_free`), each under its own name, `overview.png` of the
-    first few, and `latents.npz` where latents are given."""
+    first few, and `latents.npz` where latents are given.
+
+    Raises:
+        InputError: the folder holds something and `overwrite` is false.
+    """
     check_free(folder, overwrite)
     clear_scenes(folder)
     with Progress(console=Console(stderr=True)) as progress:
@@ -139,7 +147,11 @@ def _empty_glb() -> bytes:
 
 
 def read_glb_meshes(path: Path) -> dict[str, Mesh]:
-    """The meshes of a GLB by node name, vertices in the room frame in metres."""
+    """The meshes of a GLB by node name, vertices in the room frame in metres.
+
+    Raises:
+        InputError: the file is missing or not a GLB.
+    """
     import trimesh
 
     try:
@@ -188,7 +200,10 @@ def load_scene(path: Path) -> Scene:
 def load_scene_folder(folder: Path) -> list[Scene]:
     """Every scene of a folder, by name with numbers in counting order (room_2 before room_10).
 
-    JSON files of other formats (scores, say) are passed over; a damaged one is an `InputError`.
+    JSON files of other formats (scores, say) are passed over; a damaged one is an error.
+
+    Raises:
+        InputError: the folder is missing, holds no scene, or a file in it is damaged.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -43,6 +43,9 @@ def interpolate(
     Args:
         start, end: As `read_latent` reads them.
         steps: Rooms, both ends included; at least 2.
+
+    Raises:
+        InputError: an end is unknown, or the two are opposite.
     """
     z = path_latents(trained, read_latent(trained, start), read_latent(trained, end), steps)
     names = [f"step_{k:02d}" for k in range(steps)]

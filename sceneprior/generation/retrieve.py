@@ -50,8 +50,10 @@ def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
     """The scene with the mesh of the most similar CAD model in every box.
 
     `extra["retrieval"]` holds, in the order of the objects, {"model_id", "turn_deg", "distance_m"},
-    or None where there is no model of the class: such an object keeps its own mesh. A box or a mesh
-    that is no finite number is an `InputError`.
+    or None where there is no model of the class: such an object keeps its own mesh.
+
+    Raises:
+        InputError: a box or a mesh is no finite number.
     """
     _check(scene)
     objects: list[SceneObject] = []

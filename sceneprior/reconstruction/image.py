@@ -87,6 +87,7 @@ def image_from_shards(folder: Path, room_id: str, view: int) -> ObservedImage:
 
     Raises:
         InputError: neither split holds the room, or see `image_of_room`.
+        ShardError: a shard is missing or damaged.
     """
     found: list[str] = []
     for split in ("test", "train"):
@@ -113,6 +114,7 @@ def images_of_split(
         The images, and the ids of rooms of which no view shows anything: those are left out.
 
     Raises:
+        ShardError: a shard is missing or damaged.
         InputError: no view of any room shows an object.
     """
     images: list[ObservedImage] = []
@@ -133,8 +135,11 @@ def as_views(images: Sequence[ObservedImage], mask_step: int | None = None) -> S
     """The images as a batch: each a room with one view, objects padded to the fullest image's.
 
     Args:
-        images: At least one, all of one size; others are an `InputError`.
+        images: At least one, all of one size.
         mask_step: Every how many pixels the instance ids are kept; None takes the images' own.
+
+    Raises:
+        InputError: the images differ in size.
     """
     sizes = sorted({image.instance_ids.shape for image in images})
     if len(sizes) > 1:

@@ -138,6 +138,9 @@ def starting_latents(
     `nearest` are the training rooms, as decoded, whose layout loss on the image is least; `random`
     ones are drawn around the training rooms, as new rooms are (the kernel distribution), the same
     for every image.
+
+    Raises:
+        InputError: an unknown kind, or more starts than training rooms.
     """
     if kind not in STARTS:
         raise InputError(f"No start is called '{kind}'; choose from {', '.join(STARTS)}.")

@@ -72,7 +72,11 @@ def evaluate_run(
     limit: int | None = None,
     checkpoint: str = "final",
 ) -> dict[str, Any]:
-    """Reconstruct one view of each room (or the first `limit`) and score it against the truth."""
+    """Reconstruct one view of each room (or the first `limit`) and score it against the truth.
+
+    Raises:
+        InputError: the run or the shards cannot be used.
+    """
     trained = load_run(run, checkpoint)
     shards, split = protocol.shards, protocol.split
     reference_scenes(shards, split, limit=1, meshes=False)  # refuses before any fit
@@ -107,6 +111,7 @@ def evaluate_scenes(folder: Path, protocol: SvrProtocol) -> dict[str, Any]:
 
     Raises:
         InputError: a scene does not say which view it answers, or has another number of objects.
+        ShardError: a shard is missing or damaged.
     """
     images, scenes = scenes_with_images(folder, protocol.shards, protocol.split)
     answers: dict[str, Answers] = {

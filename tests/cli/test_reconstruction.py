@@ -18,7 +18,7 @@ SOFT = ("--renderer", "software")
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    monkeypatch.setitem(SCHEDULES, "paper", FitSchedule(steps=20, drop_at=10))
+    monkeypatch.setitem(SCHEDULES, "paper", FitSchedule(steps=6, drop_at=3))
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def test_reconstruct_a_view_and_a_split(command, toy_run, toy_shards, tmp_path):
     assert len(scene["objects"]) == len(seen.rows)
     extra = scene["extra"]
     assert (extra["room_id"], extra["view"], extra["image_size"]) == ("toy/test_01", 3, [72, 96])
-    assert 0 <= extra["mask_iou"] <= 1 and 0 < extra["steps"] <= 20
+    assert 0 <= extra["mask_iou"] <= 1 and 0 < extra["steps"] <= 6
     picture = Image.open(tmp_path / "one" / f"{name}_seen.png")
     assert picture.height > 360 and picture.width > 2 * 480 + 360  # two views and a plan
     before = everything_in(tmp_path)

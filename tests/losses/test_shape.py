@@ -77,10 +77,15 @@ def test_the_gate_is_strict_and_lets_no_gradient_through(batch):
 
 def test_mask_loss_passes_gradcheck(batch):
     rendered, matches = masks(batch)
-    rendered = rendered.clamp(0.02, 0.98).requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda x: mask_loss(x, batch.views, matches, 0.3)[0], (rendered,), eps=1e-7, atol=1e-6
-    )
+    rendered = rendered.clamp(0.02, 0.98)
+
+    def loss_of(corner):  # of every mask: all its pixels enter alike, and would take 7 s
+        whole = rendered.clone()
+        whole[..., :2, :3] = corner
+        return mask_loss(whole, batch.views, matches, 0.3)[0]
+
+    corner = rendered[..., :2, :3].clone().requires_grad_()
+    assert torch.autograd.gradcheck(loss_of, (corner,), eps=1e-7, atol=1e-6)
 
 
 def test_only_visible_pairs_count(batch):

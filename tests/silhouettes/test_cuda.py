@@ -2,7 +2,8 @@
 
 Triton decides when it is first imported whether its interpreter runs the kernels, and Lightning
 imports it early. So the checks below (`check_...`) are collected by a second pytest alone: on the
-GPU where there is one, else under the interpreter.
+GPU where there is one, else under the interpreter. There they take minutes: `make test` runs each
+kernel once, on a small image, and the slow tests run all.
 """
 
 import importlib
@@ -35,15 +36,22 @@ COMPOSITING = ("alone", "layered", "paper")
 SIZE = (11, 15)
 
 
-@pytest.mark.parametrize("where", ["interpreter", "device"])
-def test_the_kernels_in_a_process_of_their_own(where):
+@pytest.mark.parametrize(
+    ("where", "checks"),
+    [
+        ("interpreter", "check_each_kernel"),
+        pytest.param("interpreter", "check", marks=pytest.mark.slow),
+        ("device", "check"),
+    ],
+)
+def test_the_kernels_in_a_process_of_their_own(where, checks):
     if where == "device" and not torch.cuda.is_available():
         pytest.skip("no CUDA device: the kernels ran through Triton's interpreter alone")
     if where == "interpreter" and torch.cuda.is_available():
         pytest.skip("there is a CUDA device: the kernels ran on it, compiled")
     options = ["-q", "--noconftest", "-p", "no:cacheprovider", "-o", "python_functions=check_*"]
     run = subprocess.run(
-        [sys.executable, "-m", "pytest", __file__, *options],
+        [sys.executable, "-m", "pytest", __file__, "-k", checks, *options],
         cwd=ROOT,
         env=os.environ | {"TRITON_INTERPRET": "1" if where == "interpreter" else "0"},
         capture_output=True,
@@ -158,6 +166,22 @@ def agree(scene, how, dtype=torch.float64, masks_within=1e-12, grad_within=1e-7)
     scale = float(wanted[3].abs().max()) if wanted[3].numel() else 0.0
     assert_close(got[3].double(), wanted[3], rtol=0, atol=grad_within * scale)
     return got
+
+
+@pytest.mark.parametrize("mode", MODES)
+def check_each_kernel_on_a_small_image(mode):
+    # A quadrangle before another.
+    near = [[1.2, 0.9], [6.1, 1.3], [2.8, 4.9], [7.2, 4.4]]
+    far = [[0.3, 3.8], [8.4, 0.2], [5.1, 4.7], [8.9, 4.1]]
+    scene = (
+        torch.tensor([[near, far]], dtype=torch.float64),
+        torch.tensor([[[2.0, 2.5, 3, 2], [4, 3, 5, 4]]], dtype=torch.float64),
+        torch.tensor([[0, 1, 2], [2, 1, 3]]),
+        torch.ones(1, 2, dtype=torch.bool),
+    )
+    masks, front, _, gradient = agree(scene, settings(mode, "layered", (5, 8)))
+    assert set(front.unique().tolist()) == {-1, 0, 1}
+    assert (masks.amax((2, 3)) > 0.5).all() and gradient.abs().amax((2, 3)).all()
 
 
 @pytest.mark.parametrize("mode", MODES)

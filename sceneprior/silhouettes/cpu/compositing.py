@@ -30,14 +30,28 @@ ALONE, LAYERED, PAPER = range(3)
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 @njit(inline="always")
 @no_type_check
-def _in_strip(bounds, starts, origin, objects, row, strip, who, where):
-    """Objects whose window meets a row of a strip, and where in the buffers it begins."""
-    found = 0
+def _in_row(bounds, origin, objects, row, here):
+    """Objects whose window meets a row of the image."""
+    count = 0
     for k in range(objects):
-        row0, row1, strip0, strip1 = bounds[origin + k]
-        if row0 <= row < row1 and strip0 <= strip < strip1:
-            who[found] = k
-            where[found] = starts[origin + k] + ((strip - strip0) * (row1 - row0) + row - row0) * 8
+        if bounds[origin + k, 0] <= row < bounds[origin + k, 1]:
+            here[count] = k
+            count += 1
+    return count
+
+
+@njit(inline="always")
+@no_type_check
+def _in_strip(bounds, starts, origin, row, strip, here, count, who, where):
+    """Those of them whose window meets a strip, and where in the buffers its row begins."""
+    found = 0
+    for i in range(count):
+        mesh = origin + here[i]
+        if bounds[mesh, 2] <= strip < bounds[mesh, 3]:
+            rows = bounds[mesh, 1] - bounds[mesh, 0]
+            step = (strip - bounds[mesh, 2]) * rows + row - bounds[mesh, 0]
+            who[found] = here[i]
+            where[found] = starts[mesh] + step * 8
             found += 1
     return found
 
@@ -70,11 +84,13 @@ def _compose(first, last, odds, order, bounds, starts, mode, visible, front, fro
     one = T(1)
     for image in range(first, last):
         origin = image * objects
+        here = np.empty(objects, dtype=np.int64)
         who, where = np.empty(objects, dtype=np.int64), np.empty(objects, dtype=np.int64)
         sequence, depth = np.empty(objects, dtype=np.int64), np.empty(objects)
         for row in range(height):
-            for strip in range((width + 7) // 8):
-                found = _in_strip(bounds, starts, origin, objects, row, strip, who, where)
+            in_row = _in_row(bounds, origin, objects, row, here)
+            for strip in range((width + 7) // 8 if in_row > 0 else 0):
+                found = _in_strip(bounds, starts, origin, row, strip, here, in_row, who, where)
                 lanes = min(8, width - strip * 8)
                 for i in range(found):
                     for lane in range(lanes):
@@ -112,12 +128,14 @@ def _compose_backward(first, last, odds, order, bounds, starts, mode, upstream, 
     one, zero = T(1), T(0)
     for image in range(first, last):
         origin = image * objects
+        here = np.empty(objects, dtype=np.int64)
         who, where = np.empty(objects, dtype=np.int64), np.empty(objects, dtype=np.int64)
         sequence, depth = np.empty(objects, dtype=np.int64), np.empty(objects)
         before = np.empty(objects + 1, dtype=odds.dtype)
         for row in range(height):
-            for strip in range((width + 7) // 8):
-                found = _in_strip(bounds, starts, origin, objects, row, strip, who, where)
+            in_row = _in_row(bounds, origin, objects, row, here)
+            for strip in range((width + 7) // 8 if in_row > 0 else 0):
+                found = _in_strip(bounds, starts, origin, row, strip, here, in_row, who, where)
                 lanes = min(8, width - strip * 8)
                 if mode == ALONE or found == 1:
                     for i in range(found):

@@ -67,11 +67,12 @@ def test_a_disk_that_fills_up(tmp_path, monkeypatch, number, said, after):
 def test_the_kernel_refuses_large_files(front, tmp_path, workers):
     """A real limit in a real process: no file may grow beyond 20 kB, and shards do."""
     three_houses(front)
-    front.house("more", *(bedroom(f"Bedroom-{k}") for k in range(10)))
+    front.house("more", *(bedroom(f"Bedroom-{k}") for k in range(2)))
     out = tmp_path / "shards"
     command = [
         sys.executable, "-m", "sceneprior", "prep-front", "--front", front.front, "--out", out,
         "--future", front.future, "--workers", str(workers), "--renderer", "software",
+        "--views-per-m2", "0.5",
     ]  # fmt: skip
     limit = (20_000, 20_000)
     done = subprocess.run(
