@@ -74,7 +74,7 @@ def main() -> None:
 def fit_rooms(dataset, truths, rows, mode, compositing, arguments):
     """Mask IoUs (object, view) of views not fitted and box IoUs of some rooms' objects."""
     views = dataset.__getitems__([(row, 0) for row in rows])
-    counts = [len(dataset.rooms[row].object_class) for row in rows]
+    counts = views.is_object.sum(dim=1).tolist()
     centers, sizes = torch.zeros(2, len(rows), max(counts), 3)
     for slot, (row, count) in enumerate(zip(rows, counts, strict=True)):
         centers[slot, :count] = torch.from_numpy(truths[row].centers_m[:count])

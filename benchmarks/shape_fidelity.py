@@ -8,7 +8,6 @@ them are held against the same true meshes, which training never saw. Pairs are 
 
 import argparse
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from statistics import mean
 
@@ -22,7 +21,6 @@ from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.geometry.surfaces import chamfer_sum
 from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.training.checkpoints import restore
 from sceneprior.training.method import TrainedPrior
 
 SPHERE_LEVEL = 3
@@ -62,13 +60,6 @@ def distances(
     return found
 
 
-def after_layout(trained: TrainedPrior, run: Path) -> TrainedPrior:
-    """The same run as its layout stage left it."""
-    prior, latents, room_ids = restore(trained.config, run / "layout" / "final.ckpt")
-    prior.eval().requires_grad_(False)
-    return replace(trained, prior=prior, logits=latents.weight.detach(), room_ids=room_ids)
-
-
 def main() -> None:
     """Print a table in Markdown."""
     options = argparse.ArgumentParser(description=__doc__)
@@ -76,8 +67,10 @@ def main() -> None:
     options.add_argument("--points", type=int, default=2000, help="on each surface")
     given = options.parse_args()
     trained = load_run(given.run)
+    boxes = trained.config.load("layout", given.run / "layout" / "final.ckpt")
+    assert isinstance(boxes, TrainedPrior), "load_run refuses runs without latents"
     shards = Path(trained.config.data.shards)
-    layout = decoded_and_true(after_layout(trained, given.run), shards, meshes=True)
+    layout = decoded_and_true(boxes, shards, meshes=True)
     shaped = decoded_and_true(trained, shards, meshes=True)
     rows = {
         "layout stage, ellipsoids": distances(layout, ellipsoid, given.points),
