@@ -7,6 +7,7 @@ them are held against the same true meshes, which training never saw. Pairs are 
 """
 
 import argparse
+import json
 from collections.abc import Callable
 from pathlib import Path
 from statistics import mean
@@ -14,8 +15,10 @@ from statistics import mean
 import numpy as np
 
 from sceneprior.config import load_run
-from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
+from sceneprior.evaluation.metrics.decoded_rooms import match_scenes, reconstruction_scores
+from sceneprior.evaluation.metrics.frechet import FRECHET
 from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface
+from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.evaluation.topdown import box_mesh
 from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.geometry.meshes import icosphere
@@ -60,11 +63,28 @@ def distances(
     return found
 
 
+def figures(
+    pairs: list[tuple[Scene, Scene]], shards: Path, renderer: str
+) -> dict[str, float | None]:
+    """3D box IoU of decoded training rooms, and the Frechet distances (EfficientNet-Lite0) of their
+    pictures and of the true training rooms' to the test rooms'."""
+    options = EvalOptions(renderer=renderer, resamples=0)
+    scores = evaluate_synthesis([decoded for decoded, _ in pairs], shards, options)
+    key = FRECHET["effnet_lite0"]
+    return {
+        "box_iou_3d": reconstruction_scores(pairs)["box_iou_3d"],
+        "fd_decoded": scores[key],
+        "fd_real": scores["train_rooms"][key],
+    }
+
+
 def main() -> None:
     """Print a table in Markdown."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("run", type=Path)
     options.add_argument("--points", type=int, default=2000, help="on each surface")
+    options.add_argument("--json", type=Path, help="also writes four figures, see `figures`")
+    options.add_argument("--renderer", default="auto")
     given = options.parse_args()
     trained = load_run(given.run)
     boxes = trained.config.load("layout", given.run / "layout" / "final.ckpt")
@@ -87,6 +107,11 @@ def main() -> None:
         middle = mean(value for value, _ in found)
         score = mean(value for _, value in found)
         print(f"| {name} | {middle:.4f} | {middle / base - 1:+.0%} | {score:.3f} |")
+    if given.json:
+        ours = mean(value for value, _ in rows["shape stage, its meshes"])
+        found = {"chamfer_over_ellipsoid": ours / base} | figures(shaped, shards, given.renderer)
+        print(found)
+        given.json.write_text(json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":
