@@ -21,7 +21,7 @@ import scipy.stats  # noqa: F401
 import sklearn.linear_model  # noqa: F401
 import torch
 from threadpoolctl import threadpool_limits
-from tiny_runs import tiny_config
+from tiny_runs import OCCUPANCY, tiny_config
 from toy_rooms import write_toy_shards
 
 # Toy tensors gain nothing from a second thread, and wait for it where cores are shared: thirty
@@ -114,8 +114,7 @@ def grid_prior(toy_run: Path):
 
     trained = load_run(toy_run)
     shards = Path(trained.config.data.shards)
-    grids = {"name": "occupancy", "width": 8, "cells": 8}
-    config = tiny_config(shards, model__shape=grids)
+    config = tiny_config(shards, **OCCUPANCY)
     prior = config.build_prior()
     layout = trained.prior.state_dict()
     kept = {name: value for name, value in layout.items() if not name.startswith("shape.")}

@@ -8,6 +8,20 @@ import yaml
 
 from sceneprior.config import RunConfig, check_config
 
+OCCUPANCY: dict[str, Any] = {
+    "model__shape": {"name": "occupancy", "width": 8, "cells": 8},
+    "shape": {
+        "supervision": "rays",
+        "epochs": 3,
+        "batch_size": 6,
+        "learning_rate": 2e-3,
+        "latent_learning_rate": 2e-3,
+        "rays_per_object": 12,
+        "samples": 6,
+    },
+}
+"""Changes to a run whose shapes are occupancy grids."""
+
 
 def tiny_model() -> dict[str, Any]:
     """Plain data of the network."""

@@ -1,6 +1,6 @@
 """The layout decoder: class, box and completeness of each object (section 3.3, Eq. 5); bevels."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -44,7 +44,7 @@ class LayoutDecoder(nn.Module):
         {l_k, c_k, s_k, p_k} = MLP2(MLP1(x_k))
 
     `heads` are `joint` (paper) or `separate` (`SeparateHeads`); `void` lets an object be `void`, a
-    second way not to exist beside completeness.
+    second way not to exist beside completeness; `floor_gradient` as in `ModelConfig`.
     """
 
     def __init__(
@@ -53,9 +53,11 @@ class LayoutDecoder(nn.Module):
         classes: int,
         heads: str = "joint",
         void: bool = True,
+        floor_gradient: bool = False,
     ):
         super().__init__()
         hidden = 2 * width
+        self.floor_gradient = floor_gradient
         self.classes, self.void = classes, void
         self.mlp1 = mlp(nn.Linear(width, width), nn.Linear(width, hidden))
         self.mlp2 = (
@@ -86,9 +88,33 @@ class LayoutDecoder(nn.Module):
             logits = logits.masked_fill(is_void, -torch.inf)
         sizes = F.softplus(size)
         x, y, z = center.unbind(-1)
-        y = F.relu(y) + sizes[..., 1] / 2
+        bottom = above_floor(y) if self.floor_gradient else F.relu(y)
+        y = bottom + sizes[..., 1] / 2
         centers = torch.stack([x, y, z], dim=-1)
         return Layout(logits, centers, sizes, complete[..., 0]), shared
+
+
+class _AboveFloor(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, y: Tensor) -> Tensor:
+        ctx.save_for_backward(y)
+        return y.relu()
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
+        (y,) = ctx.saved_tensors
+        # Descent goes against the gradient: a negative one lifts.
+        return upstream[0].where((y > 0) | (upstream[0] < 0), 0.0)
+
+
+def above_floor(y: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """ReLU(y) whose gradient, where y is not above 0, is kept if descent would raise y with it.
+
+    What ReLU has once put on the floor stays there: most furniture stands on it, and takes lamps
+    along before the network can tell them apart.
+    """
+    lifted: Tensor = _AboveFloor.apply(y)
+    return lifted
 
 
 class ClassBevels(nn.Module):

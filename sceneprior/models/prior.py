@@ -30,6 +30,9 @@ class ModelConfig(Section):
     layout_heads: Literal["joint", "separate"] = "joint"
     """MLP2 is one MLP for all (`joint`), or a linear layer for the classes and an MLP of its own
     for each of x, y, z, width, height and depth (`separate`, released code)."""
+    floor_gradient: bool = False
+    """Whether an object that ReLU holds at the floor (Eq. S1) can learn to leave it. With the
+    paper's ReLU, false, it cannot: lamps may stay on the floor for good."""
     completeness_target: Literal["first_n", "stop"] = "first_n"
     """Of n objects, `first_n` wants ones for the first n predictions and zeros after (supplement
     B); `stop` wants ones from the last object on and ends a generated scene with the first object
@@ -70,7 +73,9 @@ class ScenePrior(nn.Module):
         self.max_objects = config.max_objects
         self.latent_space: LatentSpace = config.latent_space.build(width, seed)
         self.decoder = config.decoder.build(width, config.max_objects)
-        self.layout = LayoutDecoder(width, classes, heads=config.layout_heads, void=void)
+        self.layout = LayoutDecoder(
+            width, classes, config.layout_heads, void, config.floor_gradient
+        )
         self.bevels = ClassBevels(classes)
         self.shape = config.shape.build(2 * width)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_runs import tiny_config
+from tiny_runs import OCCUPANCY, tiny_config
 
 from sceneprior.classes import class_colors, label_set
 from sceneprior.config import load_run
@@ -107,13 +107,12 @@ def test_the_picture_has_a_tile_a_room_in_its_classes_colours(trained):
 
 
 def test_grids_have_no_masks_to_compare(grid_prior, toy_shards):
-    shape = {"name": "occupancy", "width": 8, "cells": 8}
-    config = tiny_config(toy_shards, samples={"every": 1, "count": 4}, model__shape=shape)
+    config = tiny_config(toy_shards, samples={"every": 1, "count": 4}, **OCCUPANCY)
     found = SampleEvaluator(config)(grid_prior)
     assert "overlaps_decoded" in found.scores and "mask_iou" not in found.scores
     samples = {"every": 1, "metric": "mask_iou"}
     with pytest.raises(InputError, match=r"compares masks of meshes, but model.shape is occupancy"):
-        SampleEvaluator(tiny_config(toy_shards, samples=samples, model__shape=shape))
+        SampleEvaluator(tiny_config(toy_shards, samples=samples, **OCCUPANCY))
 
 
 def test_a_metric_that_the_label_set_lacks_is_a_sentence(toy_shards):

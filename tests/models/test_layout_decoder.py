@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.models.layout_decoder import LayoutDecoder
+from sceneprior.models.layout_decoder import LayoutDecoder, above_floor
 
 
 @pytest.mark.parametrize("heads", ["joint", "separate"])
@@ -80,3 +80,29 @@ def test_the_layout_is_what_supplement_a_says(torch_rng):
                 layout.completeness_logits[room, item].item(),
             ]
             assert_close(torch.tensor(found), torch.tensor([*out[:4], *center, *sizes, out[10]]))
+
+
+def test_above_the_floor_is_relu_and_keeps_the_gradient_that_lifts():
+    y = torch.tensor([-1.0, -1.0, 0.0, 2.0, 2.0], requires_grad=True)
+    above = above_floor(y)
+    assert torch.equal(above, y.relu())
+    upstream = torch.tensor([-3.0, 3.0, -3.0, -3.0, 3.0])
+    (above * upstream).sum().backward()
+    assert y.grad.tolist() == [-3.0, 0.0, -3.0, -3.0, 3.0]
+
+
+@pytest.mark.parametrize("free", [True, False])
+def test_an_object_on_the_floor_leaves_it_only_if_it_may(free):
+    decoder = LayoutDecoder(8, 4, floor_gradient=free)
+    features = torch.randn(1, 2, 8, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        decoder.mlp2.rows()[-6][1].fill_(-1.0)
+    start = float(decoder(features)[0].centers_m[..., 1].detach().mean())
+    optimizer = torch.optim.Adam(decoder.parameters(), lr=1e-2)
+    for _ in range(200):
+        layout, _ = decoder(features)
+        bottom = layout.centers_m[..., 1] - layout.sizes_m[..., 1] / 2
+        optimizer.zero_grad()
+        (bottom - 2).abs().mean().backward()
+        optimizer.step()
+    assert (float(bottom.detach().mean()) > 1.5) == free and start > 0

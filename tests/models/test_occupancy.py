@@ -3,7 +3,7 @@
 import pytest
 import torch
 from scipy import ndimage
-from tiny_runs import tiny_baseline, tiny_config
+from tiny_runs import OCCUPANCY, tiny_baseline, tiny_config
 from torch.testing import assert_close
 
 from sceneprior.errors import ConfigError
@@ -12,11 +12,12 @@ from sceneprior.models.prior import ScenePrior
 from sceneprior.models.shape_decoder import ShapeDecoderConfig
 
 SMALL = {"name": "occupancy", "width": 8, "cells": 8, "margin": 1.2}
+GRIDS = {**OCCUPANCY, "model__shape": SMALL}
 
 
 @pytest.fixture
 def prior(tmp_path) -> ScenePrior:
-    return tiny_config(tmp_path, model__shape=SMALL).build_prior()
+    return tiny_config(tmp_path, **GRIDS).build_prior()
 
 
 def test_a_fresh_grid_is_undecided_everywhere(torch_rng):
@@ -87,7 +88,7 @@ def test_only_wanted_objects_have_grids_and_the_others_are_empty(prior, torch_rn
 def test_a_shape_without_a_name_is_a_mesh(tmp_path):
     shape = tiny_config(tmp_path, model__shape={"width": 8}).model.shape
     assert shape == ShapeDecoderConfig(name="mesh", width=8)
-    assert tiny_config(tmp_path, model__shape=SMALL).model.shape == OccupancyConfig(**SMALL)
+    assert tiny_config(tmp_path, **GRIDS).model.shape == OccupancyConfig(**SMALL)
 
 
 @pytest.mark.parametrize(
@@ -109,3 +110,9 @@ def test_wrong_shapes_are_sentences(tmp_path, shape, sentence):
 def test_the_gan_draws_meshes_alone(tmp_path):
     with pytest.raises(ConfigError, match=r"'model.shape.name': input should be 'mesh' \(got 'occ"):
         tiny_baseline(tmp_path, "gan", model__shape=SMALL)
+
+
+@pytest.mark.parametrize("changes", [{"model__shape": SMALL}, {"shape": OCCUPANCY["shape"]}])
+def test_a_shape_and_what_teaches_it_go_together(tmp_path, changes):
+    with pytest.raises(ConfigError, match=r"model.shape is '\w+', which is learnt from"):
+        tiny_config(tmp_path, **changes)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_runs import tiny_config
+from tiny_runs import OCCUPANCY, tiny_config
 from torch.testing import assert_close
 
 from sceneprior.baselines.lstm import SceneLstm
@@ -37,18 +37,6 @@ RELEASED = {
     "model__layout_heads": "separate",
     "model__completeness_target": "stop",
     "layout__proxy": "ellipsoid_points",
-}
-OCCUPANCY = {
-    "model__shape": {"name": "occupancy", "width": 8, "cells": 8},
-    "shape": {
-        "supervision": "rays",
-        "epochs": 3,
-        "batch_size": 6,
-        "learning_rate": 2e-3,
-        "latent_learning_rate": 2e-3,
-        "rays_per_object": 12,
-        "samples": 6,
-    },
 }
 VARIANTS = {
     "c1_uniform": {"model__latent_space": {"name": "cube"}, "layout__latent_noise": 0.1},
