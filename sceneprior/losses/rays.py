@@ -137,7 +137,7 @@ def _variation_of(logits: Tensor, slope: Tensor) -> Tensor:
     slope.zero_()
     for axis in (1, 2, 3):
         apart = occupancy.diff(dim=axis)
-        pairs, last = apart[0].numel(), apart.shape[axis]
+        pairs, last = math.prod(apart.shape[1:]), apart.shape[axis]
         apart.sign_()
         slope.narrow(axis, 1, last).add_(apart, alpha=1 / pairs)
         slope.narrow(axis, 0, last).sub_(apart, alpha=1 / pairs)

@@ -190,3 +190,17 @@ def test_a_box_that_stands_beside_its_rays_walks_back(torch_rng):
         loss.backward()
         optimizer.step()
     assert center.detach().abs().max() < 0.02 < start.abs().max()
+
+
+def test_a_batch_without_objects_has_no_loss_but_a_gradient():
+    """As where no view of a batch's rooms shows anything twice, or a process got a blank draw."""
+    logits = torch.zeros(0, 8, 8, 8, requires_grad=True)
+    rays = Rays(
+        torch.zeros(0, 4, 3), torch.zeros(0, 4, 3), torch.zeros(0, 4, dtype=torch.bool),
+        torch.zeros(0, 4),
+    )  # fmt: skip
+    boxes = torch.zeros(0, 3)
+    loss, seen = ray_loss(logits, boxes, boxes, 1.1, rays, 4, torch.zeros(0, 4))
+    total = loss + total_variation(logits)
+    total.backward()
+    assert total == 0 and seen["ray_accuracy"] == 0 and logits.grad.shape == logits.shape
