@@ -48,8 +48,9 @@ def lift_boxes(
         _lift(views, rows[views.visible[rows, item]], item, rng)
         for item in range(len(views.object_class))
     ]
-    lows, highs, explained = (np.array(part) for part in zip(*found, strict=True))
-    return LiftedBoxes((lows + highs) / 2, highs - lows, explained)
+    sides_m = np.array([sides for *sides, _ in found]).reshape(-1, 2, 3)
+    explained = np.array([share for *_, share in found])
+    return LiftedBoxes(sides_m.mean(axis=1), sides_m[:, 1] - sides_m[:, 0], explained)
 
 
 def _lift(
@@ -128,11 +129,11 @@ def own_rays(
     """
     each = max(4, RAYS // len(poses))
     origins, directions = [], []
-    for ids, pose, lens, clear in zip(seen.ids, poses, intrinsics, sides_clear, strict=True):
+    for ids, pose, camera, clear in zip(seen.ids, poses, intrinsics, sides_clear, strict=True):
         u, v = _pixels(ids == seen.own_id)
         outermost = np.array([u.argmin(), v.argmin(), u.argmax(), v.argmax()])[clear]
         picked = np.concatenate([rng.integers(len(u), size=each), outermost])
-        rays = pixel_directions(u[picked], v[picked], pose, lens)
+        rays = pixel_directions(u[picked], v[picked], pose, camera)
         directions.append(rays)
         origins.append(np.broadcast_to(-pose[:3, :3].T @ pose[:3, 3], rays.shape))
     return np.concatenate(origins).astype(np.float64), np.concatenate(directions)
@@ -170,8 +171,8 @@ def _where_to_look(
     cameras_m = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
     rays = np.concatenate(
         [
-            pixel_directions(pixel[:1], pixel[1:], pose, lens)
-            for pixel, pose, lens in zip(middle_px, poses, intrinsics, strict=True)
+            pixel_directions(pixel[:1], pixel[1:], pose, camera)
+            for pixel, pose, camera in zip(middle_px, poses, intrinsics, strict=True)
         ]
     )
     across = np.eye(3) - rays[:, :, None] * rays[:, None]

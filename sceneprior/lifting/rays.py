@@ -53,6 +53,9 @@ def draw_rays(
         _draw(views, boxes, rows[views.visible[rows, item]], item, count, rng)
         for item in range(len(views.object_class))
     ]
+    if not pools:
+        many = np.zeros((0, count, 3), np.float32)
+        return RayPool(many, many, many[..., 0] > 0, many[..., 0])
     return RayPool(*(np.stack(part) for part in zip(*pools, strict=True)))
 
 
@@ -76,8 +79,9 @@ def _draw(
     view, u, v = _pixels_round(views, rows, item, 6 * count, rng)
     ids = seen.ids[view, v, u].astype(np.int64)
     directions = np.empty((len(u), 3))
-    for row, (pose, lens) in enumerate(zip(poses, intrinsics, strict=True)):
-        directions[view == row] = pixel_directions(u[view == row], v[view == row], pose, lens)
+    for row, (pose, camera) in enumerate(zip(poses, intrinsics, strict=True)):
+        mine = view == row
+        directions[mine] = pixel_directions(u[mine], v[mine], pose, camera)
     cameras_m = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
     origins_m = cameras_m[view].astype(np.float64)
     until_m = np.full(len(u), FAR_M)

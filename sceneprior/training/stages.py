@@ -104,7 +104,9 @@ class PaperStage(lightning.LightningModule, ABC):
         own may have other rates."""
         stage, others = self.stage, ("shape.", "bevels.")
         trained = [p for name, p in self.prior.named_parameters() if not name.startswith(others)]
-        shape_rate = getattr(stage, "decoder_learning_rate", None)
+        shape_rate = (
+            stage.decoder_learning_rate if isinstance(stage, ShapeConfig | RaysConfig) else None
+        )
         tables = [*self.latents.parameters(), *self.prior.bevels.parameters()]
         groups = [
             {"params": trained, "lr": stage.learning_rate},

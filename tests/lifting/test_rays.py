@@ -84,3 +84,15 @@ def test_passing_a_box_from_outside_inside_beside_and_along_a_side():
     near, far = pass_through(origins, np.tile([1.0, 0, 0], (5, 1)), low, high)
     assert near[:2].tolist() == [1, 0] and far[:2].tolist() == [2, 0.5]
     assert far[2] <= near[2] and (near[3], far[3]) == (1, 2) and far[4] <= near[4]
+
+
+def test_a_room_without_tracked_objects_has_neither_boxes_nor_rays(room):
+    views, _ = room
+    bare = replace(
+        views, object_class=views.object_class[:0], boxes=views.boxes[:, :0],
+        visible=views.visible[:, :0], mask_pixels=views.mask_pixels[:, :0],
+        sides_clear=views.sides_clear[:, :0], instance_ids=views.instance_ids * 0,
+    )  # fmt: skip
+    boxes = lift_boxes(bare)
+    assert boxes.centers_m.shape == boxes.sizes_m.shape == (0, 3) and boxes.explained.shape == (0,)
+    assert draw_rays(bare, boxes, 5).until_m.shape == (0, 5)
