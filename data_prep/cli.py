@@ -46,9 +46,8 @@ def prep_front(
         str, typer.Option(help="bedroom, living, dining, library or all.")
     ] = "bedroom",
     splits: Annotated[
-        Path | None, typer.Option(help="CSV of `room id,split`; without it, a seeded 9:1.")
+        Path | None, typer.Option(help="CSV of `room id,split`; without it, a seeded 8:1:1.")
     ] = None,
-    val: Annotated[str, typer.Option(help="Where val rooms go: train, test or none.")] = "train",
     views_per_m2: Annotated[
         float | None,
         typer.Option(help="Views per square metre of floor (default: the recipe's: 2)."),
@@ -78,7 +77,7 @@ def prep_front(
     if views_per_m2 is not None:
         changes.append(f"views.per_m2={views_per_m2}")
     recipe = load_recipe(f"front3d_{room_type}", tuple(changes))
-    source = FrontSource(front, future, recipe, splits, seed, only, val, rgb)
+    source = FrontSource(front, future, recipe, splits, seed, only, rgb)
     run_job(source, out, workers, scheduler, renderer, strict, retry_failed)
 
 

@@ -1,8 +1,16 @@
 """What tests of metrics share: torchmetrics' side of a comparison, and rooms of unit boxes."""
 
+from collections.abc import Sequence
+
 import numpy as np
+import pytest
 import torch
 
+from sceneprior.classes import label_set
+from sceneprior.evaluation.bootstrap import resample_counts
+from sceneprior.evaluation.layout_distance import nearest_known
+from sceneprior.evaluation.metric import Comparison, RoomSet
+from sceneprior.evaluation.metrics import classifier, layout_classifier
 from sceneprior.scene import Scene, SceneObject
 
 UNIT = (1.0, 1.0, 1.0)
@@ -34,3 +42,32 @@ def room(*items: tuple[str, tuple[float, float, float]], sizes=None) -> Scene:
 
 def of_classes(*labels: str) -> Scene:
     return room(*((label, (3.0 * index, 0.5, 0.0)) for index, label in enumerate(labels)))
+
+
+def room_set(
+    scenes: Sequence[Scene],
+    training: Sequence[Scene],
+    decoded: Sequence[Scene] = (),
+    own: bool = False,
+) -> RoomSet:
+    """A set without pictures; `own`: the scenes are training rooms."""
+    nearest = nearest_known(scenes, training, decoded, own)
+    return RoomSet(scenes, {}, None, nearest, resample_counts(len(scenes), 20, 0))
+
+
+def without_classifiers(patch: pytest.MonkeyPatch) -> None:
+    """Where scores are not about classifiers, which are most of the time of an evaluation."""
+
+    def answer_one(features, labels, others, seed):
+        return np.ones(len(others), dtype=int)
+
+    patch.setattr(classifier, "linear", answer_one)
+    patch.setattr(layout_classifier, "boosted_trees", answer_one)
+
+
+def compared_with(test: RoomSet, **known) -> Comparison:
+    """A comparison with these test rooms; `known` is what the metric under test needs."""
+    classes = len(label_set("front3d_bedroom"))
+    plausible = np.zeros((classes, classes), dtype=bool)
+    given = {"plausible_pairs": plausible, "near_copy_m": 0.0} | known
+    return Comparison(test=test, fair=test, seed=0, alexnet=None, **given)

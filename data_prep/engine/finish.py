@@ -61,6 +61,7 @@ class Summary:
         parts = [
             f"{split} {count['rooms']} rooms, {count['views']} views, {count['objects']} objects"
             for split, count in self.counts.items()
+            if count["rooms"]
         ]
         left_out = ", ".join(
             f"{self.statuses[status]} {status}"

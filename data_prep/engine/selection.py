@@ -8,10 +8,11 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
-from data_prep.engine.source import SPLITS, LeftOut, Survey
+from data_prep.engine.source import LeftOut, Survey
 from sceneprior.errors import InputError
 
-VAL_CHOICES = ("train", "test", "none")
+NEEDED = ("train", "test")
+"""Splits that a whole data set must have; `val` may be empty: choose on training rooms then."""
 
 
 def house_may_match(only: str | None, house: str) -> bool:
@@ -35,23 +36,18 @@ def is_asked_for(only: str | None, room_id: str, house: str) -> bool:
     return house.startswith(start) or room_id == only
 
 
-def read_splits(path: Path, val: str) -> dict[str, str]:
-    """Room id -> split, from a CSV of `room id,split`.
-
-    Args:
-        path: The file; rows of other shapes (a header) are passed over.
-        val: Where rows `val` go: train, test, or none, which leaves those rooms out.
+def read_splits(path: Path) -> dict[str, str]:
+    """Room id -> split, from a CSV of `room id,split`; rows of other shapes (a header) are passed
+    over.
 
     Raises:
-        InputError: the file cannot be read, or has no such row; `val` is none of the three.
+        InputError: the file cannot be read, or has no such row.
     """
-    if val not in VAL_CHOICES:
-        raise InputError(f"'{val}' is not where val rooms can go; choose train, test or none.")
     try:
         rows = list(csv.reader(io.StringIO(Path(path).read_text())))
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"No split file can be read at {path} ({error}).") from None
-    meaning = {"train": "train", "test": "test", "val": val, "validation": val}
+    meaning = {"train": "train", "test": "test", "val": "val", "validation": "val"}
     found = {
         row[0].strip(): meaning[row[1].strip().lower()]
         for row in rows
@@ -62,16 +58,23 @@ def read_splits(path: Path, val: str) -> dict[str, str]:
     return found
 
 
-def seeded_split(room_ids: Iterable[str], seed: int, test_share: float = 0.1) -> dict[str, str]:
+def seeded_split(
+    room_ids: Iterable[str], seed: int, test_share: float = 0.1, val_share: float = 0.0
+) -> dict[str, str]:
     """Room id -> split; an id keeps its place in the order whatever else is there.
 
-    At least one of several rooms is in the split `test`, unless its share is 0.
+    A split whose share is not 0 has a room at least, as long as one is left to train on; `test`
+    comes first.
     """
     order = sorted(room_ids, key=lambda item: hashlib.sha256(f"{seed}:{item}".encode()).digest())
-    tests = 0
-    if test_share > 0:
-        tests = min(round(test_share * len(order)) or 1, len(order) - 1)
-    return {room_id: "test" if i < tests else "train" for i, room_id in enumerate(order)}
+    tests = _size(test_share, len(order), len(order))
+    vals = _size(val_share, len(order), len(order) - tests)
+    names = ["test"] * tests + ["val"] * vals
+    return dict(zip(order, names + ["train"] * (len(order) - len(names)), strict=True))
+
+
+def _size(share: float, rooms: int, left: int) -> int:
+    return min(round(share * rooms) or 1, left - 1) if share > 0 else 0
 
 
 def select(survey: Survey, only: str | None, where: str, empty_split: str = "") -> Survey:
@@ -93,7 +96,7 @@ def select(survey: Survey, only: str | None, where: str, empty_split: str = "") 
     if not rooms:
         about = f" for --only {only}" if only else ""
         raise InputError(f"No room of {where}{about} ({_in_words(left_out)}).")
-    for split in SPLITS if empty_split and only is None else ():
+    for split in NEEDED if empty_split and only is None else ():
         if not any(room.split == split for room in rooms):
             raise InputError(
                 f"The '{split}' split is empty: none of the {len(rooms)} usable rooms is in "

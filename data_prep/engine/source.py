@@ -16,7 +16,8 @@ from sceneprior.scene import Mesh
 from sceneprior.settings import Section
 from sceneprior.shards import RoomGroundTruth, RoomViews
 
-SPLITS = ("train", "test")
+SPLITS = ("train", "val", "test")
+"""Rooms to learn from, to choose settings and checkpoints on, and to report results on."""
 _DEBUG_VARIABLE = "SCENEPRIOR_DEBUG"
 
 
@@ -28,6 +29,7 @@ class Expected(Section):
     rooms: int | None = None
     """Prepared rooms."""
     train: int | None = None
+    val: int | None = None
     test: int | None = None
     """Prepared rooms of the split."""
     views: int | None = None

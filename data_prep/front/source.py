@@ -47,12 +47,10 @@ class FrontSource:
     """Folder of furniture models."""
     recipe: Recipe
     splits: Path | None = None
-    """CSV of `room id,split`; None: a seeded 9:1."""
+    """CSV of `room id,split`; None: a seeded 8:1:1 of train, val and test."""
     seed: int = 0
     only: str | None = None
     """HOUSE, HOUSE/ROOM or a room id; the beginning of a house's name is enough."""
-    val: str = "train"
-    """Which split the rows `val` of `splits` join: train, test or none."""
     rgb: bool = False
     """Also draw shaded pictures, `rgb/<room>/<view>.png` (rgb.py). The shards do not change."""
 
@@ -72,11 +70,10 @@ class FrontSource:
         """See `Source.settings`."""
         info = model_info_path(Path(self.future))
         if self.splits is not None:
-            read_splits(self.splits, self.val)
+            read_splits(self.splits)
         return {
             "recipe": self.recipe.model_dump(exclude={"expected"}),
             "seed": self.seed,
-            "val": self.val,
             "rgb": self.rgb,
             "splits": None if self.splits is None else digest(Path(self.splits).read_text()),
             "houses": digest_of_files(self._houses(only)),
@@ -99,9 +96,10 @@ class FrontSource:
                 f"No room of {self.front} is of a type that {self.recipe.name} is about ({kinds})."
             )
         if self.splits is None:
-            split_of_id = seeded_split([room_id for room_id, _, _ in found], self.seed)
+            room_ids = [room_id for room_id, _, _ in found]
+            split_of_id = seeded_split(room_ids, self.seed, val_share=0.1)
         else:
-            split_of_id = read_splits(self.splits, self.val)
+            split_of_id = read_splits(self.splits)
         tasks = []
         for room_id, house, views in found:
             bare = room_id.removeprefix(f"{house}_")

@@ -44,6 +44,9 @@ def eval_fid(
             help="Keep features of real rooms' pictures in this .npz, or take them from there."
         ),
     ] = None,
+    split: Annotated[
+        str, typer.Option(help="Rooms to compare with: test to report, val to choose settings by.")
+    ] = "test",
     boxes: Annotated[
         bool, typer.Option("--boxes", help="Also compare all rooms as boxes: layouts alone.")
     ] = False,
@@ -72,7 +75,7 @@ def eval_fid(
             "Both --run and --scenes came; give --run to evaluate what a run generates, or "
             "--scenes to evaluate scenes that are there."
         )
-    options = EvalOptions(seed, inception, alexnet, reference, boxes, resamples, renderer)
+    options = EvalOptions(seed, inception, alexnet, reference, split, boxes, resamples, renderer)
     if run is not None:
         target = out or run / "scores.json"
         rooms = count or GENERATED

@@ -48,6 +48,27 @@ class Estimate:
         ends = self.value + spread - self.resamples.mean()
         return [float(end) for end in np.clip(ends, self.low, self.high)]
 
+    def over(self, other: "Estimate") -> "Estimate":
+        """This metric in parts of another, from 0 on; no value where the other has none or is 0."""
+        if self.value is None or not other.value:
+            return Estimate(None, np.zeros(0))
+        ours, theirs = _paired(self, other)
+        known = theirs != 0
+        return Estimate(self.value / other.value, ours[known] / theirs[known], 0.0)
+
+    def minus(self, other: "Estimate") -> "Estimate":
+        """By how much it is larger than another; no value where one has none."""
+        if self.value is None or other.value is None:
+            return Estimate(None, np.zeros(0))
+        ours, theirs = _paired(self, other)
+        return Estimate(self.value - other.value, ours - theirs)
+
+
+def _paired(a: Estimate, b: Estimate) -> tuple[np.ndarray, np.ndarray]:
+    """The resamples of both, as many as both have."""
+    both = min(len(a.resamples), len(b.resamples))
+    return a.resamples[:both], b.resamples[:both]
+
 
 def ratio(
     numerators: Real[np.ndarray, " rooms"],

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -78,6 +79,29 @@ def independent_rooms(
         for index, size in enumerate(sizes)
     ]
     return rooms if with_meshes else [room.without_meshes() for room in rooms]
+
+
+def shuffled_rooms(real: Sequence[Scene], count: int, seed: int) -> list[Scene]:
+    """Right furniture at other rooms' places, as boxes: real rooms, each object of which stands
+    where an object drawn at random from all of them does (its own height, the other's x and z).
+
+    What a room holds is real, so only what relates its objects to each other is missing.
+
+    Args:
+        real: Rooms that hold an object at least, all in all.
+        count: How many; at most as many as there are real ones, drawn without replacement.
+    """
+    generator = np.random.default_rng(seed)
+    places = [item.center_m for scene in real for item in scene.objects]
+    rooms: list[Scene] = []
+    for row in generator.permutation(len(real))[:count]:
+        chosen = generator.integers(len(places), size=len(real[row].objects))
+        objects = tuple(
+            replace(item, center_m=(places[pick][0], item.center_m[1], places[pick][2]), mesh=None)
+            for item, pick in zip(real[row].objects, chosen, strict=True)
+        )
+        rooms.append(Scene(f"shuffled_{len(rooms):04d}", real[row].label_set, objects))
+    return rooms
 
 
 def split_fingerprint(shards: Path, split: str) -> str:

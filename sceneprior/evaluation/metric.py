@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Int
 
 from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms, resample_counts
 from sceneprior.evaluation.features import Features, rows_of
+from sceneprior.evaluation.layout_distance import Nearest
 from sceneprior.scene import Scene
 
 Direction = Literal["closer", "lower", "higher", "half", "none"]
@@ -17,9 +18,10 @@ Direction = Literal["closer", "lower", "higher", "half", "none"]
 ARROWS = {"closer": " ↓", "lower": " ↓", "higher": " ↑", "half": " → 0.5", "none": ""}
 IN_WORDS = {"closer": "lower is closer", "half": "0.5 is best"}
 
-AGAINST_TEST = ("train_rooms", "independent", "generated")
-"""The sets of rooms that are compared with the test rooms, by their names in a result."""
-PICTURED = ("train_rooms", "independent", "independent_meshes", "generated")
+AGAINST_TEST = ("train_rooms", "independent", "shuffled", "decoded_rooms", "generated")
+"""The sets of rooms that are compared with the test rooms, by their names in a result; decoded
+training rooms where there are some."""
+PICTURED = ("train_rooms", "independent", "independent_meshes", *AGAINST_TEST[2:])
 """Those, and independent rooms drawn with the real meshes: the same layouts, other pictures."""
 EACH_SET = ("test", *AGAINST_TEST)
 GENERATED = ("generated",)
@@ -34,8 +36,8 @@ class RoomSet:
     """Features of pictures of the rooms, drawn with their meshes where they have some."""
     box_pictures: Features | None
     """The same with every object drawn as its box; None where it was not asked for."""
-    nearest_training_m: Float[np.ndarray, " rooms"]
-    """Layout distance of each room to the nearest training room other than itself."""
+    nearest: Nearest
+    """Layout distances of each room to training rooms other than itself."""
     counts: Int[np.ndarray, "resamples rooms"]
     """How often each room is in each bootstrap resample."""
 
@@ -46,7 +48,7 @@ class RoomSet:
             scenes=[self.scenes[row] for row in rows],
             pictures=rows_of(self.pictures, rows),
             box_pictures=self.box_pictures and rows_of(self.box_pictures, rows),
-            nearest_training_m=self.nearest_training_m[list(rows)],
+            nearest=self.nearest.of(rows),
             counts=resample_counts(len(rows), len(self.counts), seed),
         )
 
@@ -83,6 +85,10 @@ class Comparison:
     seed: int
     """Of the classifiers' folds."""
     alexnet: Path | None
+    plausible_pairs: Bool[np.ndarray, "classes classes"]
+    """Which pairs of classes intersect in real rooms, too."""
+    near_copy_m: float
+    """Rooms nearer than this to a training room with the same furniture are copies of it."""
     columns: dict[str, dict[str, Estimate]] = field(default_factory=dict)
     """What is known so far, by set and key; generated rooms come last."""
 
@@ -109,7 +115,8 @@ class Metric:
     definition: str
     """One sentence (Markdown), for docs/evaluation.md."""
     function: Callable[..., Any]
-    """Its `Estimate` from a `RoomSet` and a `Comparison`. (Of decoded training rooms, see
+    """Its `Estimate` from a `RoomSet` and a `Comparison`, or None where there is not what it needs:
+    the result then leaves it out. (Of decoded training rooms against the truth, see
     metrics/decoded_rooms.py, a number from matched rooms.)"""
     sets: tuple[str, ...] = EACH_SET
     """The sets of rooms that have it; of test rooms it stands as `<key>_test`."""

@@ -7,7 +7,7 @@ read from their pictures, with all that it depends on; a file that does not fit 
 import io
 import json
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from sceneprior.files import write_whole
 
 FORMAT = "sceneprior-reference"
 VERSION = 1
-SPLITS = ("test", "train")
 _SMALL = "small pictures"
 
 Progress = Callable[[str, int], Callable[[int], object]]
@@ -35,10 +34,10 @@ def draw_reference(
     progress: Progress,
     path: Path | None = None,
 ) -> dict[str, Features]:
-    """Features of the test rooms and of some training rooms, from a file where there is one.
+    """Features of a split's rooms and of some training rooms, from a file where there is one.
 
     Args:
-        rooms: How many rooms `test` and `train` hold.
+        rooms: How many rooms the two splits hold: `test` or `val`, and `train`.
         train_rows: The training rooms wanted, in this order.
         path: Reference file. One that lies there is read; otherwise every room of both splits is
             drawn, so that any later choice of training rooms is in it, and the file is written.
@@ -48,21 +47,21 @@ def draw_reference(
     """
     drawn: dict[str, Features] = {}
     if path is not None and path.is_file():
-        drawn = _read_reference(path, _key(shards, drawing))
+        drawn = _read_reference(path, _key(shards, drawing, rooms), rooms)
     else:
-        for split in SPLITS:
-            every = path is not None or split == "test"
+        for split in rooms:
+            every = path is not None or split != "train"
             rows = range(rooms[split]) if every else train_rows
             scenes = stream_scenes(shards, split, rows)
             drawn[split] = drawing.features(scenes, progress(split, len(rows)))
         if path is not None:
-            _write_reference(path, _key(shards, drawing), drawn)
+            _write_reference(path, _key(shards, drawing, rooms), drawn)
     if path is not None:
         drawn["train"] = rows_of(drawn["train"], train_rows)
     return drawn
 
 
-def _key(shards: Path, drawing: Drawing) -> dict[str, Any]:
+def _key(shards: Path, drawing: Drawing, splits: Iterable[str]) -> dict[str, Any]:
     """All that stored features depend on."""
     key = {
         "format": FORMAT,
@@ -70,7 +69,7 @@ def _key(shards: Path, drawing: Drawing) -> dict[str, Any]:
         "networks": drawing.networks,
         _SMALL: drawing.small,
         **{f"render: {name}": value for name, value in drawing.protocol.items()},
-        **{f"{split} rooms": split_fingerprint(shards, split) for split in SPLITS},
+        **{f"{split} rooms": split_fingerprint(shards, split) for split in splits},
     }
     return dict(json.loads(json.dumps(key)))
 
@@ -87,7 +86,9 @@ def _write_reference(path: Path, key: dict[str, Any], drawn: dict[str, Features]
         raise InputError(f"The reference {path} cannot be written ({error.strerror}).") from None
 
 
-def _read_reference(path: Path, wanted: dict[str, Any]) -> dict[str, Features]:
+def _read_reference(
+    path: Path, wanted: dict[str, Any], splits: Iterable[str]
+) -> dict[str, Features]:
     try:
         with np.load(path, allow_pickle=False) as file:
             came = json.loads(str(file["key"]))
@@ -98,7 +99,7 @@ def _read_reference(path: Path, wanted: dict[str, Any]) -> dict[str, Features]:
                     for name in file.files
                     if name.startswith(f"{split}/")
                 }
-                for split in SPLITS
+                for split in splits
             }
     except InputError:
         raise

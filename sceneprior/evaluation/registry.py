@@ -13,6 +13,7 @@ from sceneprior.evaluation.metrics import (
     floor,
     frechet,
     kernel_distance,
+    layout_classifier,
     novelty,
     overlaps,
     precision_recall,
@@ -21,7 +22,8 @@ from sceneprior.evaluation.metrics.contents import TYPE_CLASSES
 from sceneprior.evaluation.networks import file_digest
 
 _MODULES = (
-    frechet, kernel_distance, precision_recall, classifier, contents, overlaps, floor, novelty,
+    frechet, kernel_distance, precision_recall, classifier, layout_classifier, contents, overlaps,
+    floor, novelty,
 )  # fmt: skip
 _NETWORKS = ("inception", "alexnet", "effnet_lite0", None)
 

@@ -9,26 +9,33 @@ from rich.text import Text
 
 from sceneprior.evaluation.registry import METRICS
 
-WIDTH = 110
+WIDTH = 150
 """Characters of a table that goes to a file: what fits without folding an interval."""
 
 COLUMNS = {
     "generated": "generated",
+    "decoded_rooms": "decoded training",
     "train_rooms": "real training",
+    "shuffled": "shuffled",
     "independent": "independent",
     "test": "real test",
 }
-"""Headings by the names of sets of rooms; `n_` and such a name counts its rooms in a protocol."""
+"""Headings by the names of sets of rooms; `n_` and such a name counts its rooms in a protocol, and
+a set that it does not count is no column."""
 
 
 def score_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
-    """The table of a result: (title, unit, a cell per column of `COLUMNS`).
+    """The table of a result: (title, unit, a cell per column of `headings`).
 
     A cell is the value and, on a line of its own, its interval. A metric that a column does not
     have is a dash; a key that the result lacks is no row.
     """
     return [
-        (metric.title, metric.subtitle, *(_cell(scores, column, metric.key) for column in COLUMNS))
+        (
+            metric.title,
+            metric.subtitle,
+            *(_cell(scores, name, metric.key) for name in _sets(scores)),
+        )
         for metric in METRICS
         if metric.key in scores
     ]
@@ -37,9 +44,12 @@ def score_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
 def headings(scores: dict[str, Any]) -> list[tuple[str, str]]:
     """(what a column holds, how many rooms stand behind it) of each of `COLUMNS`."""
     protocol = scores.get("protocol", {})
-    return [
-        (title, f"{protocol.get(f'n_{column}', '?')} rooms") for column, title in COLUMNS.items()
-    ]
+    titles = COLUMNS | {"test": f"real {protocol.get('split', 'test')}"}
+    return [(titles[name], f"{protocol[f'n_{name}']} rooms") for name in _sets(scores)]
+
+
+def _sets(scores: dict[str, Any]) -> list[str]:
+    return [name for name in COLUMNS if f"n_{name}" in scores.get("protocol", {})]
 
 
 def _cell(scores: dict[str, Any], column: str, key: str) -> str:
@@ -67,7 +77,9 @@ def print_scores(scores: dict[str, Any], console: Console | None = None) -> None
     """Print the table of a result, and the protocol's main entries below it."""
     console = console or wide_console()
     table = Table(
-        title="Synthesis against test rooms", box=box.SIMPLE_HEAD, caption=_caption(scores)
+        title=f"Synthesis against {scores.get('protocol', {}).get('split', 'test')} rooms",
+        box=box.SIMPLE_HEAD,
+        caption=_caption(scores),
     )
     table.add_column("", overflow="fold")
     for heading, rooms in headings(scores):
@@ -85,6 +97,7 @@ def _dim_below_first(cell: str) -> Text:
 def _caption(scores: dict[str, Any]) -> str:
     protocol = scores.get("protocol", {})
     parts = {
+        "latents": protocol.get("sampling_distribution"),
         "shards": protocol.get("shards"),
         "seed": protocol.get("seed"),
         "renderer": protocol.get("render", {}).get("renderer"),

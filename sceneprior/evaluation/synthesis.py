@@ -17,10 +17,16 @@ from sceneprior.errors import InputError
 from sceneprior.evaluation.alexnet import check_alexnet
 from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES, Estimate, resample_counts
 from sceneprior.evaluation.features import Drawing, Features
-from sceneprior.evaluation.ground_truth import independent_rooms, reference_scenes
+from sceneprior.evaluation.ground_truth import (
+    independent_rooms,
+    reference_scenes,
+    shuffled_rooms,
+)
+from sceneprior.evaluation.layout_distance import nearest_known
 from sceneprior.evaluation.metric import PICTURED, Comparison, RoomSet
 from sceneprior.evaluation.metrics.contents import common_label_set
-from sceneprior.evaluation.metrics.novelty import nearest_distances
+from sceneprior.evaluation.metrics.novelty import near_copy_threshold
+from sceneprior.evaluation.metrics.overlaps import plausible_pairs
 from sceneprior.evaluation.networks import check_inception
 from sceneprior.evaluation.reference_file import draw_reference
 from sceneprior.evaluation.registry import METRICS, definitions
@@ -53,6 +59,9 @@ class EvalOptions:
     """torchvision's AlexNet weights; None leaves `sca` out."""
     reference: Path | None = None
     """File that keeps what was read from the real rooms' pictures; None draws them."""
+    split: str = "test"
+    """The rooms to compare with: `val` to choose settings by, `test` to report. A result calls
+    either "test", and names the split in its protocol."""
     boxes: bool = False
     """Also compare pictures of all rooms drawn as boxes: their layouts alone."""
     resamples: int = RESAMPLES
@@ -60,35 +69,52 @@ class EvalOptions:
     renderer: Renderer | str = "auto"
     """A renderer, or the name of one."""
 
+    def __post_init__(self) -> None:
+        if self.split not in ("val", "test"):
+            raise InputError(
+                f"Generated rooms are compared with the split test, or with val to choose settings "
+                f"by, but '{self.split}' came."
+            )
+
 
 @dataclass(frozen=True)
 class _Rooms:
-    """The rooms to compare, without meshes but for those of generated ones."""
+    """The rooms to compare, without meshes but for those of generated and decoded ones."""
 
     groups: dict[str, Sequence[Scene]]
-    """`test`, `generated`, `train` and `independent`."""
+    """`test`, `generated`, `train`, `independent`, `shuffled` and, if any, `decoded_rooms`."""
     every_train: Sequence[Scene]
     train_rows: Sequence[int]
     """Which of all training rooms `train` holds."""
+    every_decoded: Sequence[Scene]
 
 
 def evaluate_synthesis(
-    generated: Sequence[Scene], shards: Path, options: EvalOptions
+    generated: Sequence[Scene],
+    shards: Path,
+    options: EvalOptions,
+    decoded: Sequence[Scene] = (),
 ) -> dict[str, Any]:
-    """Compare generated rooms with the test rooms, and real and independent rooms with them too.
+    """Compare generated rooms with the test rooms, and real and made-up rooms with them too.
 
     Void objects are left out everywhere, as the test rooms' are. The training rooms are as many
     as the generated ones (all of them if there are fewer), drawn without replacement by the seed:
     a Frechet distance depends on the number of images, so only equal numbers can be compared.
     Rooms without meshes are drawn as boxes.
-    Independent rooms, see `independent_rooms`, are as many as real training rooms.
+    Independent and shuffled rooms, see ground_truth.py, are as many as real training rooms.
+
+    Args:
+        decoded: Training rooms as the prior decodes them, named by their ids. Copies are sought
+            among them, too, and as many as real training rooms are a set of their own; without
+            any, what needs them is left out.
 
     Returns:
         The metrics of the generated rooms, `<key>_test` for those that the test rooms have by
         themselves, under `train_rooms` those of real training rooms, under `independent` those of
         rooms of independent objects (and what their pictures say with real meshes under
-        `independent_meshes`), `intervals` by set of rooms, and under `protocol` all they depend
-        on. docs/evaluation.md defines each.
+        `independent_meshes`), under `shuffled` those of shuffled furniture, under `decoded_rooms`
+        those of decoded training rooms, `intervals` by set of rooms, and under `protocol` all they
+        depend on. docs/evaluation.md defines each.
 
     Raises:
         InputError: no rooms, fewer than two on a side, other label sets than the shards', or
@@ -99,21 +125,31 @@ def evaluate_synthesis(
         check_inception(options.inception)
     if options.alexnet is not None:
         check_alexnet(options.alexnet)
-    rooms = _rooms(generated, shards, options.seed)
+    rooms = _rooms(generated, shards, options, decoded)
     names = common_label_set(rooms.groups["test"])
     renderer = options.renderer
     renderer = open_renderer(renderer) if isinstance(renderer, str) else renderer
     drawing = Drawing(names, renderer, options.inception, small=options.alexnet is not None)
     drawn, as_boxes = _draw(rooms, shards, drawing, options)
-    columns = _evaluate(_room_sets(rooms, drawn, as_boxes, options), options)
+    sets = _room_sets(rooms, drawn, as_boxes, options)
+    comparison = Comparison(
+        test=sets["test"],
+        fair=sets["fair"],
+        seed=options.seed,
+        alexnet=options.alexnet,
+        plausible_pairs=plausible_pairs(rooms.every_train),
+        near_copy_m=near_copy_threshold(rooms.every_train),
+    )
+    columns = _evaluate(sets, comparison, options)
     protocol = {
         "label_set": names,
         "shards": Path(shards).resolve().name,
-        "split": "test",
+        "split": options.split,
         **{f"n_{group}": len(scenes) for group, scenes in rooms.groups.items() if group != "train"},
         "n_train_rooms": len(rooms.train_rows),
         "n_train_rooms_available": len(rooms.every_train),
         "n_gap": len(rooms.train_rows),
+        "near_copy_m": comparison.near_copy_m,
         "seed": options.seed,
         "resamples": options.resamples,
         "intervals": METHOD,
@@ -130,21 +166,32 @@ def evaluate_synthesis(
     return _result(columns) | {"protocol": protocol}
 
 
-def _rooms(generated: Sequence[Scene], shards: Path, seed: int) -> _Rooms:
-    test = reference_scenes(shards, "test", meshes=False)
+def _rooms(
+    generated: Sequence[Scene], shards: Path, options: EvalOptions, decoded: Sequence[Scene]
+) -> _Rooms:
+    seed = options.seed
+    test = reference_scenes(shards, options.split, meshes=False)
     every_train = reference_scenes(shards, "train", meshes=False)
     generated = [without_void(scene) for scene in generated]
     common_label_set(generated, test)
     rows = seeded_rows(len(every_train), len(generated), seed)
-    groups = {"test": test, "generated": generated, "train": [every_train[row] for row in rows]}
+    groups: dict[str, Sequence[Scene]] = {
+        "test": test,
+        "generated": generated,
+        "train": [every_train[row] for row in rows],
+    }
     for group, scenes in groups.items():
         if len(scenes) < 2:
             raise InputError(
                 f"Scoring needs at least 2 {group} rooms, but {len(scenes)} came; synthesize or "
                 "prepare more."
             )
-    independent = independent_rooms(every_train, len(rows), seed)
-    return _Rooms({**groups, "independent": independent}, every_train, rows)
+    groups["independent"] = independent_rooms(every_train, len(rows), seed)
+    groups["shuffled"] = shuffled_rooms(every_train, len(rows), seed)
+    if len(decoded) > 1:
+        chosen = seeded_rows(len(decoded), len(rows), seed)
+        groups["decoded_rooms"] = [decoded[row] for row in chosen]
+    return _Rooms(groups, every_train, rows, decoded)
 
 
 def _draw(
@@ -160,20 +207,21 @@ def _draw(
         def draw(title: str, scenes: Sequence[Scene]) -> Features:
             return drawing.features(scenes, progress(title, len(scenes)))
 
-        splits = {"test": len(groups["test"]), "train": len(rooms.every_train)}
+        splits = {options.split: len(groups["test"]), "train": len(rooms.every_train)}
         drawn = draw_reference(
             shards, drawing, splits, rooms.train_rows, progress, options.reference
         )
-        drawn["generated"] = draw("generated", groups["generated"])
-        drawn["independent"] = draw("independent", groups["independent"])
+        drawn["test"] = drawn.pop(options.split)
+        for group in sorted(set(groups) - set(drawn)):
+            drawn[group] = draw(group.replace("_", " "), groups[group])
         # The same rooms once more: meshes of all training rooms live no longer than this line.
         furnished = independent_rooms(reference_scenes(shards, "train"), count, options.seed, True)
         drawn["independent_meshes"] = draw("independent, furnished", furnished)
         del furnished
         if not options.boxes:
             return drawn, {}
-        as_boxes = {"independent": drawn["independent"]}  # which have no meshes
-        for group in ("test", "generated", "train"):
+        as_boxes = {group: drawn[group] for group in ("independent", "shuffled")}  # boxes already
+        for group in sorted(set(groups) - set(as_boxes)):
             plain = [scene.without_meshes() for scene in groups[group]]
             as_boxes[group] = draw(f"boxed {group}", plain)
     return drawn, as_boxes
@@ -188,12 +236,11 @@ def _room_sets(
     """The sets of rooms by their names in the result, and the `fair` share of generated ones."""
     sets: dict[str, RoomSet] = {}
     for number, (group, scenes) in enumerate(rooms.groups.items()):
-        own = rooms.train_rows if group == "train" else None
         sets[group] = RoomSet(
             scenes,
             drawn[group],
             as_boxes.get(group),
-            nearest_distances(scenes, rooms.every_train, own),
+            nearest_known(scenes, rooms.every_train, rooms.every_decoded, group == "train"),
             resample_counts(len(scenes), options.resamples, (options.seed, number)),
         )
     rows = seeded_rows(len(sets["generated"].scenes), len(rooms.train_rows), options.seed)
@@ -203,18 +250,22 @@ def _room_sets(
     return sets | {"train_rooms": sets["train"]}
 
 
-def _evaluate(sets: dict[str, RoomSet], options: EvalOptions) -> dict[str, dict[str, Estimate]]:
+def _evaluate(
+    sets: dict[str, RoomSet], comparison: Comparison, options: EvalOptions
+) -> dict[str, dict[str, Estimate]]:
     """Every metric that there is what it needs for, by set of rooms and key."""
     given = {"inception": options.inception, "alexnet": options.alexnet, "effnet_lite0": "a wheel"}
     networks = [name for name, source in given.items() if source is not None]
     metrics = [metric for metric in METRICS if metric.applies(networks, options.boxes)]
-    comparison = Comparison(sets["test"], sets["fair"], options.seed, options.alexnet)
     for name in ("test", *PICTURED):
-        comparison.columns[name] = {
+        if name not in sets:
+            continue
+        found = {
             metric.key: metric.function(sets[name], comparison)
             for metric in metrics
             if name in metric.sets
         }
+        comparison.columns[name] = {key: value for key, value in found.items() if value is not None}
     return comparison.columns
 
 

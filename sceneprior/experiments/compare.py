@@ -1,9 +1,10 @@
 """Trains and evaluates the runs of a comparison, and writes its tables and pictures.
 
-A run is two steps, `fit` and `eval-fid`; what is done is kept.
+A run is a `fit` and an `eval-fid` for each distribution of latents; what is done is kept.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from sceneprior.experiments.comparison import Comparison, Run, runs_of
 from sceneprior.experiments.figure import write_figure
 from sceneprior.experiments.steps import Step, is_done, open_runner, read_journal, read_result
 from sceneprior.experiments.table import Row, write_tables
+from sceneprior.generation.sample import MARKS
 from sceneprior.offscreen import open_renderer
 from sceneprior.shards import iterate_rooms
 from sceneprior.training.checkpoints import read_checkpoint
@@ -68,8 +70,8 @@ def compare(
         shards = Path(load_config(comparison.rooms[rooms].config).data.shards)
         return comparison.count or sum(1 for _ in iterate_rooms(shards, "train"))
 
-    def scoring(run: Run) -> Step:
-        return scoring_step(run, count(run.rooms), comparison.sampling_seed, options)
+    def scoring(run: Run) -> list[Step]:
+        return scoring_steps(comparison, run, count(run.rooms), options)
 
     def train_and_evaluate(run: Run) -> str | None:
         try:
@@ -78,7 +80,7 @@ def compare(
                     f"{run.folder} holds a run of other settings than the comparison now asks "
                     "for; delete it to train anew, or name another --out."
                 )
-            for step in (training_step(run, options), scoring(run)):
+            for step in (training_step(run, options), *scoring(run)):
                 if not is_done(step, run.folder):
                     runner.do(step, run.folder, run.folder / f"{step.name}.log")
         except InputError as error:
@@ -98,11 +100,12 @@ def compare(
             if (run.folder / "scores.json").is_file()
             and keeps_settings(run)
             and is_done(training_step(run, options), run.folder)
-            and is_done(scoring(run), run.folder, as_asked=False)
+            and is_done(scoring(run)[0], run.folder, as_asked=False)
         ]
-        done = [run for run in evaluated if is_done(scoring(run), run.folder)]
+        done = [run for run in evaluated if all(is_done(step, run.folder) for step in scoring(run))]
         if done:
-            write_tables([_row(comparison, run) for run in done], out)
+            rows = [_rows(comparison, run, [step.result for step in scoring(run)]) for run in done]
+            write_tables([row for rows_of_run in rows for row in rows_of_run], out)
         for key in comparison.rooms:
             first = {run.method: run for run in reversed(done) if run.rooms == key}
             if own := [first[method] for method in comparison.methods if method in first]:
@@ -132,15 +135,26 @@ def training_step(run: Run, options: CompareOptions) -> Step:
     )  # fmt: skip
 
 
-def scoring_step(run: Run, count: int, seed: int, options: CompareOptions) -> Step:
-    """`eval-fid` of a trained run; it depends on what the rows of one table have in common."""
+def scoring_steps(
+    comparison: Comparison, run: Run, count: int, options: CompareOptions
+) -> list[Step]:
+    """`eval-fid` of a trained run, once for each distribution of its latents.
+
+    They depend on what the rows of one table have in common.
+    """
     weights = [] if options.inception is None else ["--inception", str(options.inception)]
     # Some methods decode meshes and some have boxes alone: --boxes compares what all have.
-    alike = ["-n", str(count), "--seed", str(seed), "--boxes"]
+    alike = ["-n", str(count), "--seed", str(comparison.sampling_seed), "--boxes"]
     alike += ["--renderer", options.renderer, *weights]
-    scores = run.folder / "scores.json"
-    paths = ["--run", str(run.folder / "run"), "--out", str(scores)]
-    return Step("scores", ["eval-fid", *paths, *alike], result=scores, depends_on=alike)
+    has_latents = load_config(run.config, run.settings).remembers_rooms
+    steps = []
+    for number, distribution in enumerate(comparison.distributions if has_latents else (None,)):
+        name = f"scores_{distribution}" if number else "scores"
+        scores = run.folder / f"{name}.json"
+        asked = alike if distribution is None else [*alike, "--distribution", distribution]
+        paths = ["--run", str(run.folder / "run"), "--out", str(scores)]
+        steps.append(Step(name, ["eval-fid", *paths, *asked], result=scores, depends_on=asked))
+    return steps
 
 
 def keeps_settings(run: Run) -> bool:
@@ -174,13 +188,28 @@ def costs_of(run: Run) -> dict[str, float | None]:
     }
 
 
-def _row(comparison: Comparison, run: Run) -> Row:
+def _rows(comparison: Comparison, run: Run, results: Sequence[Path]) -> list[Row]:
+    """A row for each distribution of latents, and one of decoded training rooms where there are
+    some; what training took stands in the first."""
     method = comparison.methods[run.method]
-    return Row(
+    first = Row(
         rooms=comparison.rooms[run.rooms].title,
         group=method.group,
         title=method.title,
+        latents="",
         seed=run.seed,
-        scores=read_result(run.folder / "scores.json"),
+        scores={},
         costs=costs_of(run),
     )
+    rows: list[Row] = []
+    for path in results:
+        scores = read_result(path)
+        name = scores["protocol"].get("sampling_distribution", "its own")
+        latents = ", ".join(filter(None, (name, MARKS.get(name))))
+        rows.append(
+            replace(first, latents=latents, scores=scores, costs={} if rows else first.costs)
+        )
+    if decoded := rows[0].scores.get("decoded_rooms"):
+        scores = {**decoded, "protocol": rows[0].scores["protocol"]}
+        rows.append(replace(first, latents="of training rooms, decoded", scores=scores, costs={}))
+    return rows

@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -47,6 +47,11 @@ class Comparison(Section):
     the numbers at which Frechet distances compare with those of the reference rows."""
     sampling_seed: int = Field(0, ge=0)
     """Of the generated rooms, the same for every run."""
+    distributions: tuple[Literal["paper", "gaussian", "geodesic", "kernel"], ...] = Field(
+        ("paper", "kernel"), min_length=1, strict=False
+    )
+    """Where the latents of priors that remember training rooms come from, a row each. Pictures show
+    the first. Methods without such latents have their own."""
     rooms: dict[str, Rooms] = Field(min_length=1)
     methods: dict[str, Method] = Field(min_length=1)
 

@@ -50,7 +50,7 @@ def evaluate_run(
     # First, because other shards than the run's are refused here.
     pairs = decoded_and_true(trained, folder) if trained.remembers_rooms else []
     generated = synthesize(trained, count, options.seed, distribution)
-    scores = evaluate_synthesis(generated, folder, options)
+    scores = evaluate_synthesis(generated, folder, options, [decoded for decoded, _ in pairs])
     if pairs:
         scores |= reconstruction_scores(pairs)
     scores["protocol"] |= {

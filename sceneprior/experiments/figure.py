@@ -36,7 +36,8 @@ def write_figure(
     independent = independent_rooms(real, SHOWN, comparison.sampling_seed, True)
     rows = {"Real training rooms": real[:SHOWN], "Independent objects": independent}
     for run, prior in zip(runs, trained, strict=True):
-        made = synthesize(prior, count, comparison.sampling_seed)
+        latents = comparison.distributions[0] if prior.remembers_rooms else None
+        made = synthesize(prior, count, comparison.sampling_seed, latents)
         rows[comparison.methods[run.method].title] = made[:SHOWN]
     size = (MARGIN_PX + SHOWN * TILE_PX, len(rows) * TILE_PX)
     sheet, font = Image.new("RGB", size, "white"), ImageFont.load_default(size=16)

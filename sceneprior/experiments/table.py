@@ -15,6 +15,7 @@ from sceneprior.files import write_whole
 REFERENCES = {
     "Independent objects, as boxes": "independent",
     "Independent objects, with meshes": "independent_meshes",
+    "Shuffled furniture, as boxes": "shuffled",
     "Real training rooms": "train_rooms",
 }
 """Rows that need no training: (title, where a result keeps their values)."""
@@ -23,11 +24,13 @@ GAP = "–"
 
 @dataclass(frozen=True)
 class Row:
-    """One run: which rooms, which method, its scores and what training it took."""
+    """Rooms of one run: of which kind, by which method, their scores and what training it took."""
 
     rooms: str
     group: str
     title: str
+    latents: str
+    """What their latents are drawn from."""
     seed: int
     scores: dict[str, Any]
     costs: dict[str, int | float | None]
@@ -63,11 +66,12 @@ def markdown(rows: Sequence[Row]) -> str:
     for rooms, own in _by(rows, lambda row: row.rooms).items():
         columns = _columns(own)
         lines = [f"### {rooms}", "", _say(own), ""]
-        lines.append("| method | " + " | ".join(COLUMNS[key][0].title for key in columns) + " |")
-        lines.append("| --- |" + " ---: |" * len(columns))
+        titles = " | ".join(COLUMNS[key][0].title for key in columns)
+        lines.append(f"| method | latents | {titles} |")
+        lines.append("| --- | --- |" + " ---: |" * len(columns))
         for cells in _body(own, columns):
             if len(cells) == 1:
-                lines.append(f"| *{cells[0]}* |" + " |" * len(columns))
+                lines.append(f"| *{cells[0]}* |" + " |" * (len(columns) + 1))
             else:
                 lines.append("| " + " | ".join(cells) + " |")
         parts.append("\n".join(lines))
@@ -81,29 +85,30 @@ def latex(rows: Sequence[Row]) -> str:
         columns = _columns(own)
         lines = [
             f"% {rooms}: {_say(own)}",
-            r"\begin{tabular}{l" + "r" * len(columns) + "}",
+            r"\begin{tabular}{ll" + "r" * len(columns) + "}",
             r"\toprule",
-            " & ".join(["method", *(_tex(COLUMNS[key][0].title) for key in columns)]) + r" \\",
+            " & ".join(["method", "latents", *(_tex(COLUMNS[key][0].title) for key in columns)])
+            + r" \\",
         ]
         for first, *cells in ([_tex(cell) for cell in line] for line in _body(own, columns)):
             if cells:
                 lines.append(" & ".join([first, *cells]) + r" \\")
             else:
-                width = len(columns) + 1
+                width = len(columns) + 2
                 lines.append(rf"\midrule \multicolumn{{{width}}}{{l}}{{\emph{{{first}}}}} \\")
         parts.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))
     return "\n\n".join([*parts, "% " + _tex(CAPTION)]) + "\n"
 
 
 def as_csv(rows: Sequence[Row]) -> str:
-    """A line a run, numbers in full."""
+    """A line a run and distribution of latents, numbers in full."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["rooms", "group", "method", "seed", *COLUMNS])
+    writer.writerow(["rooms", "group", "method", "latents", "seed", *COLUMNS])
     for row in rows:
         values = [_value(row, key) for key in COLUMNS]
         told = ["" if value is None else repr(value) for value in values]
-        writer.writerow([row.rooms, row.group, row.title, row.seed, *told])
+        writer.writerow([row.rooms, row.group, row.title, row.latents, row.seed, *told])
     return text.getvalue()
 
 
@@ -116,11 +121,12 @@ def _body(rows: Sequence[Row], columns: Sequence[str]) -> list[list[str]]:
     lines = [["reference"]]
     for title, name in REFERENCES.items():
         values = rows[0].scores.get(name, {})
-        lines.append([title, *(_cell([values.get(key)], key) for key in columns)])
+        lines.append([title, GAP, *(_cell([values.get(key)], key) for key in columns)])
     for group, members in _by(rows, lambda row: row.group).items():
         lines.append([group])
-        for title, runs in _by(members, lambda row: row.title).items():
-            lines.append([title, *(_cell([_value(r, key) for r in runs], key) for key in columns)])
+        for runs in _by(members, lambda row: f"{row.title}: {row.latents}").values():
+            cells = (_cell([_value(row, key) for row in runs], key) for key in columns)
+            lines.append([runs[0].title, runs[0].latents, *cells])
     return lines
 
 

@@ -24,6 +24,13 @@ BANDWIDTH = 0.15
 training rooms, 1 is the gaussian distribution. Larger is newer, and more often a room without a
 bed or with two."""
 DISTRIBUTIONS = ("kernel", "geodesic", "gaussian", "paper")
+MARKS = {
+    "kernel": "near training rooms",
+    "geodesic": "near training rooms",
+    "gaussian": "fitted to training rooms",
+}
+"""What tables say of rooms of a distribution that knows training rooms: nothing of `paper`, which
+takes nothing from them."""
 LATENTS_FILE = "latents.npz"
 _ENDINGS = (".npz", ".npy", ".json")
 

@@ -149,7 +149,6 @@ class SamplesConfig(Section):
         "category_kl"
     )
     """What `best.ckpt` is best in; the first three are better low, the others high."""
-    against: Literal["test", "train"] = "test"
+    against: Literal["val", "train"] = "val"
     """Rooms that `category_kl` and `objects_off` compare with; training rooms where there are no
-    others. A checkpoint chosen by its test score is no longer blind to the test rooms: take
-    `train` where `best.ckpt` is to be reported."""
+    others. Never test rooms: a checkpoint chosen on them is no longer blind to them."""

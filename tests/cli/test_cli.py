@@ -165,7 +165,7 @@ def test_eval_fid_scores_a_tiny_run(command, toy_run, tmp_path):
     scores = json.loads((tmp_path / "scores.json").read_text())
     for name in (
         "class_accuracy", "box_iou_3d", "category_kl", "type_share", "mean_objects",
-        "mean_objects_test", "overlap_pairs", "overlap_pairs_test", "fd_effnet_lite0",
+        "mean_objects_test", "implausible_pairs", "implausible_pairs_test", "fd_effnet_lite0",
     ):  # fmt: skip
         assert isinstance(scores[name], int | float), name
     assert 0 <= scores["class_accuracy"] <= 1 and 0 <= scores["box_iou_3d"] <= 1

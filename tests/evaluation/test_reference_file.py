@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toy_metrics import without_classifiers
 from toy_rooms import write_shard
 
 from sceneprior.errors import InputError
@@ -16,6 +17,13 @@ from sceneprior.evaluation.ground_truth import (
 )
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.scene import Scene
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_classifier():
+    with pytest.MonkeyPatch.context() as patch:
+        without_classifiers(patch)
+        yield
 
 
 @pytest.fixture(scope="module")

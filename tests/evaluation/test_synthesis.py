@@ -3,12 +3,14 @@
 import hashlib
 import io
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from rich.console import Console
+from toy_metrics import without_classifiers
 
 from sceneprior.errors import InputError, ShardError
 from sceneprior.evaluation import synthesis
@@ -18,7 +20,7 @@ from sceneprior.evaluation.metrics import classifier
 from sceneprior.evaluation.metrics.contents import category_kl
 from sceneprior.evaluation.metrics.frechet import frechet_distance, gap_closed
 from sceneprior.evaluation.registry import METRICS
-from sceneprior.evaluation.score_table import print_scores, score_rows
+from sceneprior.evaluation.score_table import headings, print_scores, score_rows
 from sceneprior.evaluation.synthesis import (
     EvalOptions,
     evaluate_synthesis,
@@ -47,22 +49,17 @@ def result(generated, shards, renderer, tmp_path_factory):
 
 @pytest.fixture
 def no_classifier(monkeypatch):
-    """Where scores are not about SCA: half of the time of an evaluation is logistic regression."""
-
-    def answer_one(features, labels, others, seed):
-        return np.ones(len(others), dtype=int)
-
-    monkeypatch.setattr(classifier, "linear", answer_one)
+    without_classifiers(monkeypatch)
 
 
 ALONE = {
-    "type_share", "mean_objects", "overlap_pairs", "overlap_pair_share", "overlap_volume_m3",
+    "type_share", "mean_objects", "implausible_pairs", "plausible_pairs", "overlap_volume_m3",
     "out_of_bounds_share", "walkable_share", "walkable_share_floor", "nearest_training_m",
     "near_copy_share",
 }  # fmt: skip
 AGAINST = {
     "category_kl", "fd_effnet_lite0", "kid_effnet_lite0", "precision_effnet_lite0",
-    "recall_effnet_lite0", "sca_effnet_lite0",
+    "recall_effnet_lite0", "sca_effnet_lite0", "layout_classifier_accuracy",
 }  # fmt: skip
 
 
@@ -70,15 +67,18 @@ def test_every_metric_stands_beside_that_of_real_rooms(result, generated, shards
     scores, _ = result
     assert scores["mean_objects"] == 2 and scores["mean_objects_test"] == 3
     assert scores["type_share"] == scores["type_share_test"] == 1
-    assert scores["overlap_pairs"] == scores["overlap_pairs_test"] == 0
+    assert scores["implausible_pairs"] == scores["plausible_pairs_test"] == 0
     assert scores["category_kl"] == category_kl(generated, reference_scenes(shards, "test")) > 0.1
     assert scores["fd_effnet_lite0"] > 0
     assert "fid" not in scores  # a distance in another network's features is never called FID
     beside = set(scores["train_rooms"])
     assert beside == ALONE | AGAINST and beside < set(scores)
-    assert set(scores["independent"]) == beside
+    assert set(scores["independent"]) == set(scores["shuffled"]) == beside
     # The same layouts: only their pictures differ.
-    assert set(scores["independent_meshes"]) == AGAINST - {"category_kl"}
+    assert set(scores["independent_meshes"]) == AGAINST - {
+        "category_kl", "layout_classifier_accuracy"
+    }  # fmt: skip
+    assert "decoded_rooms" not in scores and "nearest_decoded_training_ratio" not in scores
     assert {key for key in scores if key.endswith("_test")} == {f"{key}_test" for key in ALONE}
     assert beside < {metric.key for metric in METRICS}
     assert scores["train_rooms"]["category_kl"] == pytest.approx(0, abs=1e-12)
@@ -90,7 +90,7 @@ def test_the_protocol_says_all_that_the_metrics_depend_on(result, shards, render
     counts = {key: said[key] for key in said if key.startswith("n_")}
     assert counts == {
         "n_generated": 3, "n_test": 5, "n_train_rooms": 3, "n_train_rooms_available": 8,
-        "n_independent": 3, "n_gap": 3,
+        "n_independent": 3, "n_shuffled": 3, "n_gap": 3,
     }  # fmt: skip
     assert said["seed"] == 1
     assert said["render"]["image_size"] == (512, 512)
@@ -112,7 +112,7 @@ def test_the_same_rooms_score_the_same(result, generated, shards, renderer):
     assert again == result[0]
 
 
-def test_test_rooms_against_themselves_are_at_distance_zero(shards, renderer):
+def test_test_rooms_against_themselves_are_at_distance_zero(shards, renderer, no_classifier):
     scores = evaluate_synthesis(
         reference_scenes(shards, "test"), shards, EvalOptions(renderer=renderer)
     )
@@ -148,7 +148,7 @@ def test_as_boxes_only_layouts_count(generated, shards, renderer, no_classifier)
         for scenes in ([shrunk(scene) for scene in generated], bare)
     ]
     assert scores[0]["fd_effnet_lite0"] != scores[1]["fd_effnet_lite0"]
-    keys = {"fd_effnet_lite0_boxes", "gap_closed_effnet_lite0_boxes"}
+    keys = {"fd_effnet_lite0_boxes", "gap_closed_boxes"}
     assert {key for key in scores[0] if key.endswith("_boxes")} == keys
     assert keys < {metric.key for metric in METRICS}
     for key in keys:
@@ -208,7 +208,7 @@ def test_void_is_left_out_and_subsets_are_seeded(generated):
     assert seeded_rows(20, 50, 0) == list(range(20))
 
 
-def test_the_printed_table_holds_four_columns_of_rooms(result):
+def test_the_printed_table_holds_a_column_a_set(result):
     scores, _ = result
     page = Console(file=io.StringIO(), width=140)
     print_scores(scores, page)
@@ -216,8 +216,8 @@ def test_the_printed_table_holds_four_columns_of_rooms(result):
     assert "3 rooms" in text and "5 rooms" in text and "not FID" in text
     assert "nan" not in text.lower()
     rows = {row[0]: row[2:] for row in score_rows(scores)}
-    assert rows["Objects in a room"] == ("2.000", "3.000", "3.000", "3.000")
-    assert rows["Pieces out of the floor's bounds"] == ("0.000", "0.000", "–", "0.000")
+    assert rows["Objects in a room"] == ("2.000", "3.000", "3.000", "3.000", "3.000")
+    assert rows["Pieces out of the floor's bounds"] == ("0.000", "0.000", "–", "–", "0.000")
     value, interval = rows["Frechet distance, EfficientNet-Lite0 (not FID)"][0].split("\n")
     low, high = map(float, interval.split(" to "))
     assert low <= float(value) <= high
@@ -227,18 +227,23 @@ def test_the_printed_table_holds_four_columns_of_rooms(result):
 def test_the_gap_closed_compares_equal_numbers_of_rooms(shards, renderer, no_classifier):
     train = reference_scenes(shards, "train")
     independent = independent_rooms(train, len(train), 0)
-    for rooms, share in ((train, 1), (independent, 0)):
-        scores = evaluate_synthesis(rooms, shards, EvalOptions(renderer=renderer, resamples=5))
-        assert scores["gap_closed_effnet_lite0"] == pytest.approx(share, abs=1e-12)
-        low, high = scores["intervals"]["generated"]["gap_closed_effnet_lite0"]
+    furnished = independent_rooms(train, len(train), 0, with_meshes=True)
+    for rooms, share, key in (
+        (train, 1, "gap_closed_furnished"),
+        (furnished, 0, "gap_closed_furnished"),
+        (independent, 0, "gap_closed_boxes"),
+    ):
+        options = EvalOptions(renderer=renderer, resamples=5, boxes=key == "gap_closed_boxes")
+        scores = evaluate_synthesis(rooms, shards, options)
+        assert scores[key] == pytest.approx(share, abs=1e-12)
+        low, high = scores["intervals"]["generated"][key]
         assert low <= share <= high
-        distances = [
-            scores[group]["fd_effnet_lite0"] for group in ("independent", "independent_meshes")
-        ]
         real, ours = scores["train_rooms"]["fd_effnet_lite0"], scores["fd_effnet_lite0"]
-        for key, distance in zip(("", "_meshes"), distances, strict=True):
-            by_hand = gap_closed(ours, distance, real)
-            assert scores[f"gap_closed_effnet_lite0{key}"] == pytest.approx(by_hand, abs=1e-12)
+        by_hand = gap_closed(ours, scores["independent_meshes"]["fd_effnet_lite0"], real)
+        assert scores["gap_closed_furnished"] == pytest.approx(by_hand, abs=1e-12)
+    # Real training rooms are as varied as themselves.
+    scores = evaluate_synthesis(train, shards, EvalOptions(renderer=renderer, resamples=0))
+    assert scores["recall_ratio"] == 1
     # Twice as many rooms have a smaller distance, but enter the gap with as many as the others.
     twice = [replace(room, name=f"{room.name}_{k}") for room in train for k in range(2)]
     scores = evaluate_synthesis(twice, shards, EvalOptions(renderer=renderer, resamples=0))
@@ -247,7 +252,7 @@ def test_the_gap_closed_compares_equal_numbers_of_rooms(shards, renderer, no_cla
     chosen = evaluate_synthesis(
         [twice[row] for row in rows], shards, EvalOptions(renderer=renderer, resamples=0)
     )
-    key = "gap_closed_effnet_lite0"
+    key = "gap_closed_furnished"
     assert scores[key] == pytest.approx(chosen[key], abs=1e-9)
 
 
@@ -274,13 +279,13 @@ def test_a_nan_never_reaches_a_result_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_odd_sets_of_rooms_have_metrics_or_none_but_never_nan(shards, renderer):
+def test_odd_sets_of_rooms_have_metrics_or_none_but_never_nan(shards, renderer, no_classifier):
     bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
     empty, one = Scene("a", "front3d_bedroom"), Scene("b", "front3d_bedroom", (bed,))
     for rooms in ([empty] * 2, [one] * 5, [empty, one]):
         scores = evaluate_synthesis(rooms, shards, EvalOptions(renderer=renderer, resamples=10))
         json.dumps(scores, allow_nan=False)
-        assert scores["overlap_pairs"] == scores["overlap_pair_share"] == 0
+        assert scores["implausible_pairs"] == scores["plausible_pairs"] == 0
         # No floor, and no two pieces to walk between: there is no such share.
         for key in ("out_of_bounds_share", "walkable_share", "walkable_share_floor"):
             assert scores[key] is None and scores["intervals"]["generated"][key] is None
@@ -297,14 +302,16 @@ def test_odd_sets_of_rooms_have_metrics_or_none_but_never_nan(shards, renderer):
     )
 
 
-def test_copies_of_training_rooms_are_told(shards, renderer):
+def test_copies_of_training_rooms_are_told(shards, renderer, no_classifier):
     copies = [replace(scene, floor_m=None) for scene in reference_scenes(shards, "train")]
     scores = evaluate_synthesis(copies, shards, EvalOptions(renderer=renderer, resamples=0))
     assert scores["nearest_training_m"] == pytest.approx(0, abs=1e-6)
-    assert scores["near_copy_share"] == 1
+    assert scores["near_copy_share"] == 1 and scores["train_rooms"]["near_copy_share"] == 0
+    # The toy's test rooms are much like its training rooms, which takes from the excess.
+    assert scores["near_copy_excess"] == 1 - scores["near_copy_share_test"]
     # Real rooms pass themselves over.
     assert scores["train_rooms"]["nearest_training_m"] > 0.05
-    same = ("fd_effnet_lite0", "precision_effnet_lite0", "sca_effnet_lite0", "walkable_share")
+    same = ("fd_effnet_lite0", "precision_effnet_lite0", "walkable_share")
     for key in same:
         assert scores[key] == scores["train_rooms"][key]
     assert scores["walkable_share_floor"] is None
@@ -330,3 +337,40 @@ def test_the_papers_classifier_appears_with_its_weights(
     assert scores["sca"] == scores["train_rooms"]["sca"] == 0.5
     assert set(seen) == {((224, 224, 3), np.dtype("uint8"))}
     assert scores["protocol"]["sca"]["sha256"] == hashlib.sha256(b"weights").hexdigest()
+
+
+def test_decoded_training_rooms_are_a_set_of_their_own(shards, renderer, no_classifier):
+    train = reference_scenes(shards, "train")
+    decoded = [shrunk(scene) for scene in train]
+    options = EvalOptions(renderer=renderer, resamples=5)
+    scores = evaluate_synthesis(decoded[:4], shards, options, decoded)
+    assert scores["protocol"]["n_decoded_rooms"] == 4
+    assert scores["decoded_rooms"]["near_copy_share"] == scores["near_copy_share"] == 1
+    assert scores["decoded_rooms"]["nearest_decoded_m"] == 0
+    assert scores["nearest_decoded_training_ratio"] == pytest.approx(0, abs=1e-6)
+    # Their meshes are drawn, and not their boxes.
+    assert scores["decoded_rooms"]["fd_effnet_lite0"] > scores["train_rooms"]["fd_effnet_lite0"]
+    assert "decoded training" in {heading for heading, _ in headings(scores)}
+    # Test rooms are as new as test rooms.
+    real = evaluate_synthesis(reference_scenes(shards, "test"), shards, options, decoded)
+    assert real["nearest_decoded_training_ratio"] == 1 and real["near_copy_excess"] == 0
+
+
+def test_val_rooms_are_compared_with_where_settings_are_chosen(
+    generated, shards, renderer, no_classifier, tmp_path
+):
+    other = shutil.copytree(shards, tmp_path / "other")
+    (other / "test").rename(other / "val")
+    shutil.copytree(shards / "train", other / "test")
+    given = {"renderer": renderer, "resamples": 0}
+    on_test = evaluate_synthesis(generated, shards, EvalOptions(**given))
+    on_val = evaluate_synthesis(generated, other, EvalOptions(split="val", **given))
+    assert on_val["protocol"]["split"] == "val" and headings(on_val)[-1] == ("real val", "5 rooms")
+    assert on_val | {"protocol": 0} == on_test | {"protocol": 0}
+    # A reference file of test rooms does not pass for one of val rooms.
+    kept = tmp_path / "kept.npz"
+    evaluate_synthesis(generated, other, EvalOptions(reference=kept, **given))
+    with pytest.raises(InputError, match=r"kept\.npz does not fit: its 'val rooms'"):
+        evaluate_synthesis(generated, other, EvalOptions(split="val", reference=kept, **given))
+    with pytest.raises(InputError, match="or with val to choose settings by, but 'train' came"):
+        EvalOptions(split="train")

@@ -17,7 +17,13 @@ from tiny_runs import tiny_baseline_settings, write_tiny_config
 
 from sceneprior.config import load_any_run, load_config
 from sceneprior.errors import InputError
-from sceneprior.experiments.compare import Compared, CompareOptions, compare, costs_of
+from sceneprior.experiments.compare import (
+    Compared,
+    CompareOptions,
+    compare,
+    costs_of,
+    scoring_steps,
+)
 from sceneprior.experiments.comparison import load_comparison, part_of, runs_of
 from sceneprior.experiments.steps import StepRunner
 from sceneprior.files import only_writer
@@ -193,7 +199,12 @@ def test_a_run_is_trained_judged_and_tabulated(trained, toy_shards):
     count = sum(item.numel() for item in load_any_run(run.folder / "run").prior.parameters())
     assert (costs["parameters"], costs["cpu_s"]) == (count, noted["fit"]["cpu_s"])
     table = (trained / "out" / "table.md").read_text()
-    assert "| Ours |" in table and "LSTM" not in table and "4 generated rooms" in table
+    assert "LSTM" not in table and "4 generated rooms" in table
+    latents = [line.split(" | ")[1] for line in table.splitlines() if line.startswith("| Ours ")]
+    assert latents == ["paper", "kernel, near training rooms", "of training rooms, decoded"]
+    for name, distribution in (("scores", "paper"), ("scores_kernel", "kernel")):
+        scores = json.loads((run.folder / f"{name}.json").read_text())
+        assert scores["protocol"]["sampling_distribution"] == distribution
     with Image.open(trained / "out" / "toy.png") as sheet:
         assert sheet.height == 3 * 160  # real, independent, ours
 
@@ -210,9 +221,9 @@ def test_what_is_done_is_not_repeated_and_stays_in_the_table(begun, toy_shards, 
 def test_a_part_that_is_judged_otherwise_names_the_rows_it_leaves_out(begun, toy_shards, calls):
     done = again(begun, toy_shards, "lstm", count=5)
     assert done.table is None and done.left_out == ["toy, ours, seed 0"]
-    assert calls.names == ["fit", "eval-fid"]
+    assert calls.names == ["fit", "eval-fid", "eval-fid"]
     again(begun, toy_shards, "ours", count=5)
-    assert calls.names[2:] == ["eval-fid"]
+    assert calls.names[3:] == ["eval-fid", "eval-fid"]
 
 
 def test_without_a_count_as_many_rooms_are_made_as_are_trained_on(begun, toy_shards, calls):
@@ -239,10 +250,12 @@ def test_what_was_deleted_is_made_again(begun, toy_shards, calls):
     folder = begun / "out" / "toy" / "ours" / "seed0"
     (folder / "scores.json").unlink()
     again(begun, toy_shards)
-    assert calls.names == ["eval-fid"]
+    assert calls.names == ["eval-fid", "eval-fid"]  # the second is forgotten with the first
     shutil.rmtree(folder / "run")
     done = again(begun, toy_shards)
-    assert calls.names[1:] == ["fit", "eval-fid"] and done.table is None  # they made nothing
+    assert (
+        calls.names[2:] == ["fit", "eval-fid", "eval-fid"] and done.table is None
+    )  # they made nothing
     assert json.loads((folder / "steps.json").read_text())["fit"]["cpu_s"] == 2.5
 
 
@@ -323,3 +336,23 @@ def test_a_renderer_that_is_none_is_said_before_anything_is_trained(begun, toy_s
     with pytest.raises(InputError, match="vulkan"):
         compare(comparison, comparison, begun / "out", CompareOptions("vulkan"))
     assert calls.names == []
+
+
+def test_methods_without_latents_of_rooms_are_evaluated_once_by_their_own(written, tmp_path):
+    own = tmp_path / "atiss.yaml"
+    own.write_text(yaml.safe_dump(tiny_baseline_settings(Path("elsewhere"), "atiss")))
+    atiss = {"title": "ATISS", "group": "3D", "config": str(own)}
+    comparison = load_comparison(
+        written(
+            methods={"ours": METHODS["ours"], "atiss": atiss}, distributions=["paper", "geodesic"]
+        )
+    )
+    ours, other = (
+        scoring_steps(comparison, run, 4, SOFTWARE) for run in runs_of(comparison, Path())
+    )
+    assert [step.name for step in ours] == ["scores", "scores_geodesic"]
+    assert [step.arguments[-1] for step in ours] == ["paper", "geodesic"]
+    (step,) = other
+    assert step.name == "scores" and "--distribution" not in step.arguments
+    with pytest.raises(InputError, match="distributions"):
+        load_comparison(written(distributions=["anywhere"]))

@@ -31,12 +31,14 @@ def trained(toy_run):
     return load_run(toy_run)
 
 
-def test_samples_score_what_eval_would_score(trained, toy_shards):
+def test_samples_score_what_eval_would_score(trained, toy_shards, tmp_path):
+    toy_shards = shutil.copytree(toy_shards, tmp_path / "with_val")
+    shutil.copytree(toy_shards / "test", toy_shards / "val")
     config = tiny_config(toy_shards, samples={"every": 1, "count": 12, "seed": 7})
     result = SampleEvaluator(config)(trained)
     generated = synthesize(trained, 12, 7)
-    tracked = reference_scenes(toy_shards, "test", tracked_only=True)
-    assert result.against == "test"
+    tracked = reference_scenes(toy_shards, "val", tracked_only=True)
+    assert result.against == "val"
     counts, wanted = object_counts(generated).mean(), object_counts(tracked).mean()
     assert result.scores["category_kl"] == pytest.approx(category_kl(generated, tracked))
     assert result.scores["objects"] == counts
@@ -50,11 +52,10 @@ def test_samples_score_what_eval_would_score(trained, toy_shards):
     assert again.scores == result.scores and np.array_equal(again.picture, result.picture)
 
 
-def test_training_rooms_stand_in_where_there_are_no_test_rooms(trained, toy_shards, tmp_path):
-    alone = shutil.copytree(toy_shards, tmp_path / "alone")
-    shutil.rmtree(alone / "test")
+def test_training_rooms_stand_in_where_there_are_no_val_rooms(trained, toy_shards):
+    """Never the test rooms, which the toy shards have."""
     samples = {"every": 1, "count": 4}
-    there = SampleEvaluator(tiny_config(alone, samples=samples))(trained)
+    there = SampleEvaluator(tiny_config(toy_shards, samples=samples))(trained)
     asked = SampleEvaluator(tiny_config(toy_shards, samples={**samples, "against": "train"}))(
         trained
     )

@@ -11,7 +11,9 @@ from sceneprior.experiments.table import Row, as_csv, latex, markdown, write_tab
 PROTOCOL = {"n_generated": 200, "n_test": 38, "n_train_rooms": 149, "shards": "front"}
 
 
-def row(title, seed, fd, group="from masks in 2D", rooms="Bedrooms", **more) -> Row:
+def row(
+    title, seed, fd, group="from masks in 2D", rooms="Bedrooms", latents="paper", **more
+) -> Row:
     scores = {
         "protocol": PROTOCOL,
         "fd_effnet_lite0": fd,
@@ -19,10 +21,11 @@ def row(title, seed, fd, group="from masks in 2D", rooms="Bedrooms", **more) -> 
         "independent": {"fd_effnet_lite0": 61.0, "category_kl": 0.13},
         "independent_meshes": {"fd_effnet_lite0": 49.0},
         "train_rooms": {"fd_effnet_lite0": 39.0, "category_kl": 0.12},
+        "shuffled": {"layout_classifier_accuracy": 0.81},
         **more,
     }
     costs = {"cpu_s": 300.0 + 60 * seed, "steps": 4500, "parameters": 1_250_000}
-    return Row(rooms, group, title, seed, scores, costs)
+    return Row(rooms, group, title, latents, seed, scores, costs)
 
 
 @pytest.fixture
@@ -61,10 +64,28 @@ def test_a_cell_is_the_mean_of_seeds_and_half_their_range(rows):
 
 def test_methods_stand_under_their_group_in_the_order_they_came(rows):
     order = [line.strip("| ").split(" |")[0] for line in markdown(rows).splitlines()[6:]]
-    assert order[:9] == [
+    assert order[:10] == [
         "*reference*", "Independent objects, as boxes", "Independent objects, with meshes",
-        "Real training rooms", "*from masks in 2D*", "Ours", "GAN_x", "*from boxes in 3D*", "ATISS",
+        "Shuffled furniture, as boxes", "Real training rooms", "*from masks in 2D*", "Ours",
+        "GAN_x", "*from boxes in 3D*", "ATISS",
     ]  # fmt: skip
+
+
+def test_every_distribution_of_latents_has_a_row_that_names_it(rows):
+    near = replace(rows[0], latents="kernel, near training rooms", costs={})
+    near = replace(near, scores=near.scores | {"fd_effnet_lite0": 45.0})
+    table = markdown([rows[0], near, *rows[1:]])
+    lines = [line for line in table.splitlines() if line.startswith("| Ours ")]
+    assert [line.split(" | ")[1] for line in lines] == ["paper", "kernel, near training rooms"]
+    # Both seeds of the first are one row; what training took stands there alone.
+    assert "48.0 ± 1.0" in lines[0] and "5.5" in lines[0]
+    assert "45.0" in lines[1] and lines[1].endswith("| – | – | – |")
+    assert cells(table, "Real training rooms")["latents"] == "–"
+    assert {len(line.split(" |")) for line in table.splitlines() if line.startswith("|")} == {
+        len(lines[0].split(" |"))
+    }
+    found = list(csv.DictReader(io.StringIO(as_csv([rows[0], near]))))
+    assert [line["latents"] for line in found] == ["paper", "kernel, near training rooms"]
 
 
 def test_each_kind_of_rooms_has_a_table_that_says_what_it_is_of(rows):

@@ -7,7 +7,14 @@ from jaxtyping import Bool, Float
 from scipy.spatial.distance import cdist
 
 from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms
-from sceneprior.evaluation.metric import PICTURED, Comparison, Metric, RoomSet, TableColumn
+from sceneprior.evaluation.metric import (
+    GENERATED,
+    PICTURED,
+    Comparison,
+    Metric,
+    RoomSet,
+    TableColumn,
+)
 from sceneprior.evaluation.metrics.frechet import check_features
 
 NEIGHBOUR = 3
@@ -46,6 +53,11 @@ def _recall(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
     return mean_of_rooms(covered, test.counts, 1.0)
 
 
+def _recall_ratio(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
+    real = comparison.columns["train_rooms"][f"recall_{network}"]
+    return _recall(network, comparison.fair, comparison).over(real)
+
+
 def _metrics_of(network: str, title: str, column: TableColumn | None) -> tuple[Metric, Metric]:
     source = "Kynkaanniemi et al., NeurIPS 2019"
     return (
@@ -73,5 +85,11 @@ METRICS = (
         TableColumn(
             "recall", 2, "recall: share of test rooms that lie among the pictures of the row"
         ),
+    ),
+    Metric(
+        "recall_ratio", "Recall over that of real training rooms", "1: as varied as real", "higher",
+        "`recall_effnet_lite0` of generated rooms over that of real training rooms, `n_gap` rooms "
+        "each, since recall grows with their number; null where that is 0.",
+        partial(_recall_ratio, "effnet_lite0"), GENERATED, network="effnet_lite0",
     ),
 )  # fmt: skip

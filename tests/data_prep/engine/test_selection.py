@@ -1,5 +1,7 @@
 """Which rooms are asked for, and the split each is in."""
 
+from collections import Counter
+
 import pytest
 from front_files import room
 from front_jobs import front_job, three_houses
@@ -7,6 +9,7 @@ from front_jobs import front_job, three_houses
 from data_prep.engine.build import build_shards
 from data_prep.engine.selection import house_may_match, is_asked_for, seeded_split
 from sceneprior.errors import InputError
+from sceneprior.shards import list_shards
 
 
 @pytest.mark.parametrize(
@@ -38,6 +41,20 @@ def test_a_seeded_split_is_nine_to_one_and_keeps_its_order():
     assert seeded_split(["alone"], 0) == {"alone": "train"}
 
 
+def test_a_seeded_split_keeps_val_apart_and_takes_it_from_training_rooms():
+    ids = [f"room{k}" for k in range(40)]
+    two, three = seeded_split(ids, 0), seeded_split(ids, 0, val_share=0.1)
+    assert Counter(three.values()) == {"train": 32, "val": 4, "test": 4}
+    assert all(two[room] == split for room, split in three.items() if split != "val")
+    assert {two[room] for room, split in three.items() if split == "val"} == {"train"}
+    # Of a few rooms each split has one, as long as one is left to train on.
+    assert Counter(seeded_split(ids[:3], 0, val_share=0.1).values()) == dict.fromkeys(
+        ("train", "val", "test"), 1
+    )
+    assert Counter(seeded_split(ids[:2], 0, val_share=0.1).values()) == {"train": 1, "test": 1}
+    assert set(seeded_split(ids, 0, test_share=0).values()) == {"train"}
+
+
 def test_splits(front, tmp_path):
     three_houses(front)
     path = tmp_path / "splits.csv"
@@ -48,13 +65,14 @@ def test_splits(front, tmp_path):
 
     def split_sizes(name, **changes):
         counts = build_shards(front_job(front, tmp_path / name, splits=path, **changes)).counts
-        return [counts[split]["rooms"] for split in ("train", "test")]
+        return [counts[split]["rooms"] for split in ("train", "val", "test")]
 
-    assert split_sizes("a") == [2, 2]
-    assert split_sizes("b", val="test") == [1, 3]
-    assert split_sizes("c", val="none") == [1, 2]
-    with pytest.raises(InputError, match="'dev' is not where val rooms can go"):
-        split_sizes("d", val="dev")
+    assert split_sizes("a") == [1, 1, 2]
+    assert [len(list_shards(tmp_path / "a", split)) for split in ("train", "val", "test")] == [
+        1
+    ] * 3
+    path.write_text(path.read_text().replace("val", "train"))
+    assert split_sizes("b") == [2, 0, 2]  # nobody needs val rooms
     path.write_text("Bedroom-0,train\n")
     with pytest.raises(InputError, match="The 'test' split is empty: none of the 1 usable rooms"):
         split_sizes("e")

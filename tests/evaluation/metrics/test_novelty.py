@@ -1,94 +1,81 @@
-"""Layout distances against closed forms and against all pairings tried out."""
+"""Copies are told from rooms that are as new as real ones."""
 
-from itertools import permutations
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from toy_metrics import compared_with, room, room_set
 
-from sceneprior.evaluation.metrics.novelty import layout_distance, nearest_distances
-from sceneprior.scene import Scene, SceneObject
+from sceneprior.evaluation.metric import Comparison
+from sceneprior.evaluation.metrics.novelty import METRICS, near_copy_threshold
+from sceneprior.scene import Scene
 
+FUNCTIONS = {metric.key: metric.function for metric in METRICS}
 LABELS = ("desk", "chair", "sofa")
 
 
-def room(*rows) -> Scene:
-    objects = tuple(
-        SceneObject(label, tuple(map(float, center)), tuple(map(float, size)))
-        for label, center, size in rows
-    )
-    return Scene("a", "front3d_bedroom", objects)
-
-
-def random_room(rng: np.random.Generator, most: int = 5) -> Scene:
-    return room(
-        *(
-            (LABELS[rng.integers(3)], rng.uniform(-0.6, 0.6, 3), rng.uniform(0.3, 0.9, 3))
-            for _ in range(rng.integers(0, most))
-        )
-    )
-
-
-def by_all_pairings(a: Scene, b: Scene) -> float:
-    if len(a.objects) > len(b.objects):
-        a, b = b, a
-    if not b.objects:
-        return 0.0
-
-    def cost(x: SceneObject, y: SceneObject) -> float:
-        apart = np.subtract(x.center_m + x.size_m, y.center_m + y.size_m)
-        return min(1.0, float(np.linalg.norm(apart))) if x.label == y.label else 1.0
-
-    totals = [
-        sum(cost(x, y) for x, y in zip(a.objects, chosen, strict=True))
-        for chosen in permutations(b.objects, len(a.objects))
+@pytest.fixture
+def training(rng) -> list[Scene]:
+    """Thirty rooms of three pieces; two kinds of furnishing, so that many hold the same."""
+    rooms = [
+        room(*((label, rng.uniform(-2, 2, 3)) for label in (*LABELS[: 2 + row % 2], "bookshelf")))
+        for row in range(30)
     ]
-    return (min(totals) + len(b.objects) - len(a.objects)) / len(b.objects)
+    return [replace(scene, name=f"room_{row}") for row, scene in enumerate(rooms)]
 
 
-def test_distances_of_random_rooms_are_those_of_the_best_pairing(rng):
-    for _ in range(60):
-        a, b = random_room(rng), random_room(rng)
-        assert layout_distance(a, b) == pytest.approx(by_all_pairings(a, b), abs=1e-12)
-        assert layout_distance(b, a) == pytest.approx(layout_distance(a, b), abs=1e-12)
+def compared(training, test) -> Comparison:
+    return compared_with(room_set(test, training), near_copy_m=near_copy_threshold(training))
 
 
-def test_empty_and_unlike_rooms_have_defined_distances():
-    chair = room(("chair", (0, 0, 0), (1, 1, 1)))
-    desk = room(("desk", (0, 0, 0), (1, 1, 1)))
-    assert layout_distance(room(), room()) == 0
-    assert layout_distance(chair, room()) == layout_distance(chair, desk) == 1
-    assert layout_distance(chair, chair) == 0
+def values(rooms, comparison) -> dict[str, float]:
+    found = {key: function(rooms, comparison) for key, function in FUNCTIONS.items()}
+    return {key: estimate.value for key, estimate in found.items() if estimate is not None}
 
 
-def turned(scene: Scene) -> Scene:
-    """A quarter turn about y, +z towards +x."""
-    objects = [
-        (item.label, (item.center_m[2], item.center_m[1], -item.center_m[0]), item.size_m[::-1])
-        for item in scene.objects
-    ]
-    return room(*((label, center, size) for label, center, size in objects))
+def nudged(scenes, metres) -> list[Scene]:
+    def moved(item):
+        return replace(item, center_m=(item.center_m[0] + metres, *item.center_m[1:]))
+
+    return [replace(s, name="new", objects=tuple(map(moved, s.objects))) for s in scenes]
 
 
-def test_the_nearest_room_is_found_among_all_in_any_quarter_turn(rng):
-    # The last is empty: it has no object to start at.
-    training = [*(random_room(rng) for _ in range(30)), room()]
-    scenes = [*(random_room(rng, 6) for _ in range(15)), room()]
-    got = nearest_distances(scenes, training)
-    for scene, distance in zip(scenes, got, strict=True):
-        four = [scene]
-        for _ in range(3):
-            four.append(turned(four[-1]))
-        expected = min(by_all_pairings(turn, other) for turn in four for other in training)
-        assert distance == pytest.approx(expected, abs=1e-9)
+def test_exact_copies_are_all_near_copies_and_real_rooms_are_none(training):
+    # Rooms that share no class: as far from each training room as can be.
+    test = [room(("stool", (0, 0, 0)), ("wardrobe", (1, 0, 0)))] * 4
+    comparison = compared(training, test)
+    copies = values(room_set(nudged(training, 0.0), training, training), comparison)
+    assert copies["near_copy_share"] == copies["near_copy_excess"] == 1
+    assert copies["nearest_training_m"] == copies["nearest_decoded_m"] == 0
+    real = values(room_set(training, training, own=True), comparison)
+    assert real["near_copy_share"] == real["near_copy_excess"] == 0
+    assert real["nearest_training_m"] > comparison.near_copy_m > 0
 
 
-def test_a_turned_copy_is_no_news_and_a_training_room_passes_itself_over(rng):
-    training = [random_room(rng) for _ in range(20)]
-    copies = [turned(scene) for scene in training]
-    np.testing.assert_allclose(nearest_distances(copies, training), 0, atol=1e-9)
-    rows = [3, 7, 11]
-    apart = nearest_distances([training[row] for row in rows], training, own=rows)
-    for row, distance in zip(rows, apart, strict=True):
-        rest = training[:row] + training[row + 1 :]
-        expected = nearest_distances([training[row]], rest)[0]
-        assert distance == pytest.approx(expected, abs=1e-12)
+def test_a_copy_of_what_the_prior_remembers_is_one_though_the_true_room_is_far(training):
+    decoded = [replace(s, name=t.name) for s, t in zip(nudged(training, 5), training, strict=True)]
+    comparison = compared(training, training[:2])
+    drawn = room_set(nudged(decoded, 0.01), training, decoded)
+    assert values(drawn, comparison)["near_copy_share"] == 1
+    assert values(drawn, comparison)["nearest_decoded_m"] == pytest.approx(0.01)
+    # Another piece of furniture makes it another room.
+    more = [replace(s, objects=(*s.objects, s.objects[0])) for s in nudged(decoded, 0.01)]
+    assert values(room_set(more, training, decoded), comparison)["near_copy_share"] == 0
+
+
+def test_the_threshold_is_what_one_real_room_in_a_hundred_falls_below(training):
+    threshold = near_copy_threshold(training)
+    nearest = room_set(training, training, own=True).nearest.training_m
+    assert threshold == np.quantile(nearest, 0.01)
+    assert near_copy_threshold(training[:1]) == 0  # nothing is nearer than that
+
+
+def test_the_ratio_is_one_for_real_rooms_and_left_out_where_nothing_is_decoded(training, rng):
+    test = nudged(training[:6], 0.7)
+    comparison = compared(training, test)
+    assert "nearest_decoded_training_ratio" not in values(room_set(test, training), comparison)
+    comparison = replace(comparison, test=room_set(test, training, training))
+    same = values(room_set(test, training, training), comparison)
+    assert same["nearest_decoded_training_ratio"] == 1
+    nearer = values(room_set(nudged(training[:6], 0.35), training, training), comparison)
+    assert nearer["nearest_decoded_training_ratio"] < 0.8
