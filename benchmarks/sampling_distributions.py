@@ -16,7 +16,7 @@ from sceneprior.config import load_run
 from sceneprior.evaluation.features import Drawing
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.frechet import frechet_distance
-from sceneprior.evaluation.synthesis import without_void
+from sceneprior.evaluation.room_sets import without_void
 from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import open_renderer

@@ -141,7 +141,7 @@ def prep_posed(
         int | None, typer.Option(help="Sample larger masks down to this (default: as they are).")
     ] = None,
     max_views: Annotated[int, typer.Option(help="Frames are thinned to this many.")] = 100,
-    val_share: Annotated[float, typer.Option(help="Share of rooms in the test split.")] = 0.1,
+    test_share: Annotated[float, typer.Option(help="Share of rooms in the test split.")] = 0.1,
     seed: Annotated[int, typer.Option(help="Of the split.")] = 0,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
@@ -158,7 +158,7 @@ def prep_posed(
 
     settings = PosedSettings(up, floor_m, camera_height_m, metres_per_unit, max_side, max_views)
     classes = read_label_set(label_set)
-    source = PosedSource(rooms, classes, settings, val_share, seed, only)
+    source = PosedSource(rooms, classes, settings, test_share, seed, only)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
     run_job(source, out, workers, scheduler, "auto", strict, retry_failed=False)

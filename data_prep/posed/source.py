@@ -36,7 +36,7 @@ class PosedSource:
     label_set: str
     """As `sceneprior.classes.label_set` takes it."""
     posed_settings: PosedSettings = field(default_factory=PosedSettings)
-    val_share: float = 0.1
+    test_share: float = 0.1
     """Share of the rooms in the split `test`, at least one of several; 0: all rooms train."""
     seed: int = 0
     only: str | None = None
@@ -46,8 +46,10 @@ class PosedSource:
         """See `Source.settings`. The files' names and sizes take part, so that mended masks or
         classes are not answered with the shards of before."""
         label_set(self.label_set)
-        if not 0 <= self.val_share < 1:
-            raise InputError(f"val_share is {self.val_share}; expected a share from 0 to below 1.")
+        if not 0 <= self.test_share < 1:
+            raise InputError(
+                f"test_share is {self.test_share}; expected a share from 0 to below 1."
+            )
         rooms = [path for path in find_rooms(self.folder) if house_may_match(only, room_name(path))]
         if not rooms:
             raise InputError(f"{self.folder} has no room '{only}' (--only takes a room's folder).")
@@ -61,7 +63,7 @@ class PosedSource:
         return {
             "recipe": {"label_set": self.label_set, **asdict(self.posed_settings)},
             "seed": self.seed,
-            "val_share": self.val_share,
+            "test_share": self.test_share,
             "rooms": digest(repr(sorted(files.items()))),
         }
 
@@ -87,7 +89,7 @@ class PosedSource:
                 )
                 left_out.append(LeftOut(name, name, "filtered", why, "image_size"))
         names = [name for name, size in sizes.items() if size == usual]
-        split_of = seeded_split(names, self.seed, self.val_share)
+        split_of = seeded_split(names, self.seed, self.test_share)
         tasks = tuple(RoomTask(name, name, split_of[name]) for name in names)
         survey = Survey(tasks, tuple(left_out))
         return select(survey, self.only, f"{self.folder} can be prepared")

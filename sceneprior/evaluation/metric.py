@@ -115,9 +115,9 @@ class Metric:
     definition: str
     """One sentence (Markdown), for docs/evaluation.md."""
     function: Callable[..., Any]
-    """Its `Estimate` from a `RoomSet` and a `Comparison`, or None where there is not what it needs:
-    the result then leaves it out. (Of decoded training rooms against the truth, see
-    metrics/decoded_rooms.py, a number from matched rooms.)"""
+    """Its `Estimate` from a `RoomSet` and a `Comparison`, or None where no decoded training rooms
+    are known but it needs them: the result then leaves it out. (Of decoded training rooms against
+    the truth, see metrics/decoded_rooms.py, a number from matched rooms.)"""
     sets: tuple[str, ...] = EACH_SET
     """The sets of rooms that have it; of test rooms it stands as `<key>_test`."""
     source: str = ""
@@ -135,6 +135,8 @@ class Metric:
         """Unit and direction, as they stand below the title."""
         return ", ".join(filter(None, (self.unit, IN_WORDS.get(self.direction))))
 
-    def applies(self, networks: Sequence[str], boxes: bool) -> bool:
-        """Whether there is what it needs."""
-        return (self.network is None or self.network in networks) and (boxes or not self.boxes)
+    def lacks(self, networks: Sequence[str], boxes: bool) -> str | None:
+        """The option without which it cannot be measured; None where it can."""
+        if self.network is not None and self.network not in networks:
+            return f"--{self.network}"
+        return None if boxes or not self.boxes else "--boxes"

@@ -97,7 +97,7 @@ def _dim_below_first(cell: str) -> Text:
 def _caption(scores: dict[str, Any]) -> str:
     protocol = scores.get("protocol", {})
     parts = {
-        "latents": protocol.get("sampling_distribution"),
+        "latents": protocol.get("latents"),
         "shards": protocol.get("shards"),
         "seed": protocol.get("seed"),
         "renderer": protocol.get("render", {}).get("renderer"),
@@ -106,4 +106,10 @@ def _caption(scores: dict[str, Any]) -> str:
     if protocol.get("resamples"):
         parts["95% intervals from"] = f"{protocol['resamples']} resamples"
     stated = (f"{name} {value}" for name, value in parts.items() if value not in (None, ""))
-    return "\n".join(filter(None, (", ".join(stated), scores.get("note"))))
+    missing: dict[str, list[str]] = {}
+    for key, want in protocol.get("left_out", {}).items():
+        missing.setdefault(want, []).append(key)
+    left_out = [
+        f"Not measured without {want}: {', '.join(keys)}." for want, keys in missing.items()
+    ]
+    return "\n".join(filter(None, (", ".join(stated), *left_out, scores.get("note"))))

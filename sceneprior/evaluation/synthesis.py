@@ -1,35 +1,23 @@
 """Evaluate generated rooms against the test rooms of shards, beside real and independent ones."""
 
 import hashlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from rich.console import Console
-from rich.progress import Progress
-
-from sceneprior.classes import VOID
 from sceneprior.errors import InputError
 from sceneprior.evaluation.alexnet import check_alexnet
-from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES, Estimate, resample_counts
-from sceneprior.evaluation.features import Drawing, Features
-from sceneprior.evaluation.ground_truth import (
-    independent_rooms,
-    reference_scenes,
-    shuffled_rooms,
-)
-from sceneprior.evaluation.layout_distance import nearest_known
+from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES, Estimate
+from sceneprior.evaluation.features import Drawing
 from sceneprior.evaluation.metric import PICTURED, Comparison, RoomSet
 from sceneprior.evaluation.metrics.contents import common_label_set
 from sceneprior.evaluation.metrics.novelty import near_copy_threshold
 from sceneprior.evaluation.metrics.overlaps import plausible_pairs
 from sceneprior.evaluation.networks import check_inception
-from sceneprior.evaluation.reference_file import draw_reference
 from sceneprior.evaluation.registry import METRICS, definitions
+from sceneprior.evaluation.room_sets import choose_rooms, draw_rooms, room_sets
 from sceneprior.offscreen import Renderer, open_renderer
 from sceneprior.scene import Scene
 
@@ -77,18 +65,6 @@ class EvalOptions:
             )
 
 
-@dataclass(frozen=True)
-class _Rooms:
-    """The rooms to compare, without meshes but for those of generated and decoded ones."""
-
-    groups: dict[str, Sequence[Scene]]
-    """`test`, `generated`, `train`, `independent`, `shuffled` and, if any, `decoded_rooms`."""
-    every_train: Sequence[Scene]
-    train_rows: Sequence[int]
-    """Which of all training rooms `train` holds."""
-    every_decoded: Sequence[Scene]
-
-
 def evaluate_synthesis(
     generated: Sequence[Scene],
     shards: Path,
@@ -125,13 +101,13 @@ def evaluate_synthesis(
         check_inception(options.inception)
     if options.alexnet is not None:
         check_alexnet(options.alexnet)
-    rooms = _rooms(generated, shards, options, decoded)
+    rooms = choose_rooms(generated, shards, options.split, options.seed, decoded)
     names = common_label_set(rooms.groups["test"])
     renderer = options.renderer
     renderer = open_renderer(renderer) if isinstance(renderer, str) else renderer
     drawing = Drawing(names, renderer, options.inception, small=options.alexnet is not None)
-    drawn, as_boxes = _draw(rooms, shards, drawing, options)
-    sets = _room_sets(rooms, drawn, as_boxes, options)
+    drawn, as_boxes = draw_rooms(rooms, shards, drawing, options.boxes, options.reference)
+    sets = room_sets(rooms, drawn, as_boxes, options.resamples)
     comparison = Comparison(
         test=sets["test"],
         fair=sets["fair"],
@@ -161,102 +137,18 @@ def evaluate_synthesis(
         },
         "networks": drawing.networks,
         **definitions(names, options.alexnet),
+        "left_out": _left_out(columns["generated"], options),
         "packages": _package_versions(),
     }
     return _result(columns) | {"protocol": protocol}
-
-
-def _rooms(
-    generated: Sequence[Scene], shards: Path, options: EvalOptions, decoded: Sequence[Scene]
-) -> _Rooms:
-    seed = options.seed
-    test = reference_scenes(shards, options.split, meshes=False)
-    every_train = reference_scenes(shards, "train", meshes=False)
-    generated = [without_void(scene) for scene in generated]
-    common_label_set(generated, test)
-    rows = seeded_rows(len(every_train), len(generated), seed)
-    groups: dict[str, Sequence[Scene]] = {
-        "test": test,
-        "generated": generated,
-        "train": [every_train[row] for row in rows],
-    }
-    for group, scenes in groups.items():
-        if len(scenes) < 2:
-            raise InputError(
-                f"Scoring needs at least 2 {group} rooms, but {len(scenes)} came; synthesize or "
-                "prepare more."
-            )
-    groups["independent"] = independent_rooms(every_train, len(rows), seed)
-    groups["shuffled"] = shuffled_rooms(every_train, len(rows), seed)
-    if len(decoded) > 1:
-        chosen = seeded_rows(len(decoded), len(rows), seed)
-        groups["decoded_rooms"] = [decoded[row] for row in chosen]
-    return _Rooms(groups, every_train, rows, decoded)
-
-
-def _draw(
-    rooms: _Rooms, shards: Path, drawing: Drawing, options: EvalOptions
-) -> tuple[dict[str, Features], dict[str, Features]]:
-    """Features of every group's pictures (and of `independent_meshes`), and drawn as boxes."""
-    groups, count = rooms.groups, len(rooms.train_rows)
-    with Progress(console=Console(stderr=True)) as bars:
-
-        def progress(group: str, total: int) -> Callable[[int], object]:
-            return partial(bars.advance, bars.add_task(f"Drawing {group} rooms", total=total))
-
-        def draw(title: str, scenes: Sequence[Scene]) -> Features:
-            return drawing.features(scenes, progress(title, len(scenes)))
-
-        splits = {options.split: len(groups["test"]), "train": len(rooms.every_train)}
-        drawn = draw_reference(
-            shards, drawing, splits, rooms.train_rows, progress, options.reference
-        )
-        drawn["test"] = drawn.pop(options.split)
-        for group in sorted(set(groups) - set(drawn)):
-            drawn[group] = draw(group.replace("_", " "), groups[group])
-        # The same rooms once more: meshes of all training rooms live no longer than this line.
-        furnished = independent_rooms(reference_scenes(shards, "train"), count, options.seed, True)
-        drawn["independent_meshes"] = draw("independent, furnished", furnished)
-        del furnished
-        if not options.boxes:
-            return drawn, {}
-        as_boxes = {group: drawn[group] for group in ("independent", "shuffled")}  # boxes already
-        for group in sorted(set(groups) - set(as_boxes)):
-            plain = [scene.without_meshes() for scene in groups[group]]
-            as_boxes[group] = draw(f"boxed {group}", plain)
-    return drawn, as_boxes
-
-
-def _room_sets(
-    rooms: _Rooms,
-    drawn: dict[str, Features],
-    as_boxes: dict[str, Features],
-    options: EvalOptions,
-) -> dict[str, RoomSet]:
-    """The sets of rooms by their names in the result, and the `fair` share of generated ones."""
-    sets: dict[str, RoomSet] = {}
-    for number, (group, scenes) in enumerate(rooms.groups.items()):
-        sets[group] = RoomSet(
-            scenes,
-            drawn[group],
-            as_boxes.get(group),
-            nearest_known(scenes, rooms.every_train, rooms.every_decoded, group == "train"),
-            resample_counts(len(scenes), options.resamples, (options.seed, number)),
-        )
-    rows = seeded_rows(len(sets["generated"].scenes), len(rooms.train_rows), options.seed)
-    sets["fair"] = sets["generated"].of(rows, (options.seed, len(sets)))
-    pictures = drawn["independent_meshes"]
-    sets["independent_meshes"] = replace(sets["independent"], pictures=pictures)
-    return sets | {"train_rooms": sets["train"]}
 
 
 def _evaluate(
     sets: dict[str, RoomSet], comparison: Comparison, options: EvalOptions
 ) -> dict[str, dict[str, Estimate]]:
     """Every metric that there is what it needs for, by set of rooms and key."""
-    given = {"inception": options.inception, "alexnet": options.alexnet, "effnet_lite0": "a wheel"}
-    networks = [name for name, source in given.items() if source is not None]
-    metrics = [metric for metric in METRICS if metric.applies(networks, options.boxes)]
+    networks = _networks(options)
+    metrics = [metric for metric in METRICS if metric.lacks(networks, options.boxes) is None]
     for name in ("test", *PICTURED):
         if name not in sets:
             continue
@@ -267,6 +159,20 @@ def _evaluate(
         }
         comparison.columns[name] = {key: value for key, value in found.items() if value is not None}
     return comparison.columns
+
+
+def _networks(options: EvalOptions) -> list[str]:
+    given = {"inception": options.inception, "alexnet": options.alexnet, "effnet_lite0": "a wheel"}
+    return [name for name, source in given.items() if source is not None]
+
+
+def _left_out(measured: Container[str], options: EvalOptions) -> dict[str, str]:
+    """Which metrics of generated rooms a result does not hold, and for want of what."""
+    return {
+        metric.key: metric.lacks(_networks(options), options.boxes) or "decoded training rooms"
+        for metric in METRICS
+        if metric.key not in measured
+    }
 
 
 def _result(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
@@ -286,20 +192,6 @@ def _result(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
             for name, estimates in columns.items()
         },
     }
-
-
-def without_void(scene: Scene) -> Scene:
-    """The scene without furniture that no label names."""
-    known = zip(scene.objects, scene.class_indices, strict=True)
-    return replace(scene, objects=tuple(item for item, index in known if index != VOID))
-
-
-def seeded_rows(available: int, count: int, seed: int) -> list[int]:
-    """At most `count` of `available` rows, drawn without replacement, in order."""
-    if available <= count:
-        return list(range(available))
-    chosen = np.random.default_rng(seed).choice(available, size=count, replace=False)
-    return sorted(chosen.tolist())
 
 
 def _package_versions() -> dict[str, str]:

@@ -15,7 +15,6 @@ from sceneprior.experiments.comparison import Comparison, Run, runs_of
 from sceneprior.experiments.figure import write_figure
 from sceneprior.experiments.steps import Step, is_done, open_runner, read_journal, read_result
 from sceneprior.experiments.table import Row, write_tables
-from sceneprior.generation.sample import MARKS
 from sceneprior.offscreen import open_renderer
 from sceneprior.shards import iterate_rooms
 from sceneprior.training.checkpoints import read_checkpoint
@@ -204,8 +203,7 @@ def _rows(comparison: Comparison, run: Run, results: Sequence[Path]) -> list[Row
     rows: list[Row] = []
     for path in results:
         scores = read_result(path)
-        name = scores["protocol"].get("sampling_distribution", "its own")
-        latents = ", ".join(filter(None, (name, MARKS.get(name))))
+        latents = scores["protocol"]["latents"]
         rows.append(
             replace(first, latents=latents, scores=scores, costs={} if rows else first.costs)
         )

@@ -12,10 +12,12 @@ from sceneprior.errors import InputError
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.evaluation.report import write_report
-from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis, seeded_rows
+from sceneprior.evaluation.room_sets import seeded_rows
+from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.files import write_json
 from sceneprior.generation.decode import decode_latents, decode_training_rooms, synthesize
 from sceneprior.generation.export import load_scene_folder
+from sceneprior.generation.sample import MARKS
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene
 from sceneprior.training.method import TrainedPrior, TrainedSampler
@@ -56,8 +58,11 @@ def evaluate_run(
     scores["protocol"] |= {
         "run": run.resolve().name, "stage": trained.stage, "checkpoint": checkpoint
     }  # fmt: skip
+    latents = "its own"
     if isinstance(trained, TrainedPrior):
-        scores["protocol"]["sampling_distribution"] = distribution or trained.distribution
+        drawn = distribution or trained.distribution
+        latents = f"{drawn}, {MARKS[drawn]}" if drawn in MARKS else drawn
+    scores["protocol"]["latents"] = latents
     write_json(out, scores)
     return scores
 

@@ -7,7 +7,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from sceneprior.config import load_any_run
 from sceneprior.evaluation.ground_truth import independent_rooms, reference_scenes
-from sceneprior.evaluation.synthesis import without_void
+from sceneprior.evaluation.room_sets import without_void
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.experiments.comparison import Comparison, Run
 from sceneprior.files import write_whole

@@ -17,7 +17,8 @@ from sceneprior.baselines.sync2gen.stage import Sync2genStage
 from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.config import load_any_run, load_run
 from sceneprior.errors import ConfigError, InputError
-from sceneprior.evaluation.synthesis import EvalOptions, without_void
+from sceneprior.evaluation.room_sets import without_void
+from sceneprior.evaluation.synthesis import EvalOptions
 from sceneprior.experiments.evaluate import evaluate_run, read_curves, report_run
 from sceneprior.experiments.evaluate_samples import SampleEvaluator
 from sceneprior.generation.decode import decode_training_rooms, synthesize
@@ -228,9 +229,7 @@ def test_what_needs_a_latent_space_says_that_there_is_none(run, stage):
 def test_a_run_is_judged_and_reported(run, stage, tmp_path):
     options = EvalOptions(renderer="software")
     scores = evaluate_run(run, 4, options, tmp_path / "scores.json")
-    assert (
-        scores["protocol"]["stage"] == stage and "sampling_distribution" not in scores["protocol"]
-    )
+    assert scores["protocol"]["stage"] == stage and scores["protocol"]["latents"] == "its own"
     rooms = [without_void(room) for room in synthesize(load_any_run(run), 4, 0)]
     assert "box_iou_3d" not in scores
     assert scores["mean_objects"] == sum(len(room.objects) for room in rooms) / 4

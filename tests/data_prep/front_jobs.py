@@ -43,7 +43,7 @@ def digests(folder: Path, *patterns: str) -> dict[str, str]:
 def rooms_of(folder: Path) -> dict[str, Any]:
     """Room id -> (views with images, ground truth)."""
     found = {}
-    for split in ("train", "test"):
+    for split in ("train", "val", "test"):
         for path in sorted((folder / split).glob("*.h5")):
             with Shard(path) as shard:
                 for room_id in shard.room_ids:

@@ -62,6 +62,17 @@ def test_ratios_leave_out_what_weighs_nothing_and_stay_in_their_range():
     assert Estimate(0.9, np.array([0.0, 1.0]), 0.0, 1.0).interval() == pytest.approx([0.425, 1.0])
 
 
+def test_estimates_are_compared_resample_by_resample():
+    a = Estimate(0.6, np.array([0.5, 0.7, 0.9]), 0.0, 1.0)
+    b = Estimate(0.3, np.array([0.25, 0.0]), 0.0, 1.0)
+    assert a.over(b).value == 2 and a.over(b).resamples.tolist() == [2.0]  # 0.7 / 0 is nothing
+    assert a.minus(b).value == 0.3 and a.minus(b).resamples.tolist() == [0.25, 0.7]
+    nothing = Estimate(None, np.zeros(0))
+    for estimate in (a.over(nothing), nothing.over(a), a.minus(nothing), nothing.minus(a)):
+        assert estimate.value is None and estimate.interval() is None
+    assert a.over(Estimate(0.0, np.zeros(2))).value is None
+
+
 def test_nothing_to_weigh_is_no_estimate_and_no_nan():
     nothing = ratio(np.zeros(3), np.zeros(3), resample_counts(3, 9, 0))
     assert nothing.value is None and nothing.interval() is None

@@ -8,7 +8,11 @@ import pytest
 from toy_rooms import write_shard
 
 from sceneprior.errors import InputError, ShardError
-from sceneprior.evaluation.ground_truth import independent_rooms, reference_scenes
+from sceneprior.evaluation.ground_truth import (
+    independent_rooms,
+    reference_scenes,
+    shuffled_rooms,
+)
 from sceneprior.evaluation.metrics.contents import class_frequencies, object_counts
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.scene import Mesh, Scene, SceneObject
@@ -102,3 +106,25 @@ def test_empty_rooms_take_part_but_are_not_all():
     assert set(object_counts(rooms)) == {0, 2, 4}
     with pytest.raises(InputError, match="none of the 1 rooms given"):
         independent_rooms([Scene("empty", "front3d_bedroom")], 5, 0)
+
+
+def test_shuffled_rooms_keep_what_a_room_holds_and_take_places_from_all_rooms(rng):
+    real = [
+        replace(room, objects=tuple(
+            replace(item, center_m=(float(rng.uniform()), item.center_m[1], float(rng.uniform())))
+            for item in room.objects
+        ))
+        for room in (bedroom(f"{row}", row) for row in range(6))
+    ]  # fmt: skip
+    shuffled = shuffled_rooms(real, 6, 0)
+
+    def contents(scene: Scene) -> list:
+        return sorted((item.label, item.size_m, item.center_m[1]) for item in scene.objects)
+
+    assert sorted(map(contents, shuffled)) == sorted(map(contents, real))
+    places = {(item.center_m[0], item.center_m[2]) for room in real for item in room.objects}
+    found = [(item.center_m[0], item.center_m[2]) for room in shuffled for item in room.objects]
+    assert set(found) <= places and len(set(found)) > 5
+    assert all(item.mesh is None for room in shuffled for item in room.objects)
+    assert shuffled == shuffled_rooms(real, 6, 0) != shuffled_rooms(real, 6, 1)
+    assert len(shuffled_rooms(real, 2, 0)) == 2

@@ -20,13 +20,9 @@ from sceneprior.evaluation.metrics import classifier
 from sceneprior.evaluation.metrics.contents import category_kl
 from sceneprior.evaluation.metrics.frechet import frechet_distance, gap_closed
 from sceneprior.evaluation.registry import METRICS
+from sceneprior.evaluation.room_sets import seeded_rows
 from sceneprior.evaluation.score_table import headings, print_scores, score_rows
-from sceneprior.evaluation.synthesis import (
-    EvalOptions,
-    evaluate_synthesis,
-    seeded_rows,
-    without_void,
-)
+from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.evaluation.topdown import topdown
 from sceneprior.files import write_json
 from sceneprior.offscreen import open_renderer
@@ -198,16 +194,6 @@ def test_fid_appears_with_the_users_inception_file(
     assert entry["file"] == path.name
 
 
-def test_void_is_left_out_and_subsets_are_seeded(generated):
-    void = SceneObject("void", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
-    scene = replace(generated[0], objects=(void, *generated[0].objects))
-    assert without_void(scene) == generated[0]
-    rows = seeded_rows(20, 5, 0)
-    assert rows == seeded_rows(20, 5, 0) == sorted(set(rows)) and len(rows) == 5
-    assert rows != seeded_rows(20, 5, 1) and set(rows) < set(range(20))
-    assert seeded_rows(20, 50, 0) == list(range(20))
-
-
 def test_the_printed_table_holds_a_column_a_set(result):
     scores, _ = result
     page = Console(file=io.StringIO(), width=140)
@@ -215,6 +201,9 @@ def test_the_printed_table_holds_a_column_a_set(result):
     text = page.file.getvalue()
     assert "3 rooms" in text and "5 rooms" in text and "not FID" in text
     assert "nan" not in text.lower()
+    told = " ".join(text.split())
+    assert "Not measured without --boxes: fd_effnet_lite0_boxes, gap_closed_boxes." in told
+    assert "without decoded training rooms: nearest_decoded_m, nearest_decoded_training_r" in told
     rows = {row[0]: row[2:] for row in score_rows(scores)}
     assert rows["Objects in a room"] == ("2.000", "3.000", "3.000", "3.000", "3.000")
     assert rows["Pieces out of the floor's bounds"] == ("0.000", "0.000", "–", "–", "0.000")

@@ -67,7 +67,8 @@ def test_a_run_is_evaluated_with_its_own_shards(command, toy_run, tmp_path):
     assert status == 0, errors
     assert "5 rooms" in out and "nan" not in out.lower()
     scores = json.loads((tmp_path / "s.json").read_text())
-    assert scores["protocol"]["sampling_distribution"] and scores["rooms"] == 12
+    assert scores["protocol"]["latents"] == "kernel, near training rooms" and scores["rooms"] == 12
+    assert "latents kernel, near training rooms" in " ".join(out.split())
     assert scores["near_copy_share"] * 5 == round(scores["near_copy_share"] * 5)
     assert np.isfinite([value for value in scores.values() if isinstance(value, float)]).all()
 

@@ -19,7 +19,8 @@ from sceneprior.cli import app
 from sceneprior.config import check_config, load_run
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
-from sceneprior.evaluation.synthesis import EvalOptions, without_void
+from sceneprior.evaluation.room_sets import without_void
+from sceneprior.evaluation.synthesis import EvalOptions
 from sceneprior.experiments.evaluate import evaluate_run, read_curves, report_run
 from sceneprior.experiments.evaluate_samples import SampleEvaluator
 from sceneprior.generation.decode import decode_training_rooms, synthesize
@@ -172,10 +173,7 @@ def test_what_needs_latents_of_rooms_says_that_a_gan_has_none(gan_run):
 def test_a_gan_is_judged_and_reported_by_its_new_rooms_alone(gan_run, tmp_path):
     options = EvalOptions(renderer="software")
     scores = evaluate_run(gan_run, 4, options, tmp_path / "scores.json")
-    assert (
-        scores["protocol"]["stage"] == "gan"
-        and scores["protocol"]["sampling_distribution"] == "paper"
-    )
+    assert scores["protocol"]["stage"] == "gan" and scores["protocol"]["latents"] == "paper"
     rooms = [without_void(room) for room in synthesize(load_run(gan_run), 4, 0)]
     assert "box_iou_3d" not in scores
     assert scores["mean_objects"] == sum(len(room.objects) for room in rooms) / 4

@@ -29,7 +29,8 @@ def test_a_whole_job(front, tmp_path):
     out = tmp_path / "shards"
     summary = build_shards(front_job(front, out))
     assert summary.statuses == {"prepared": 6} and summary.renderer == "software"
-    assert summary.counts["train"]["rooms"] == 5 and summary.counts["test"]["rooms"] == 1
+    rooms = {split: counts["rooms"] for split, counts in summary.counts.items()}
+    assert rooms == {"train": 4, "val": 1, "test": 1}
     index = read_index(out)
     assert index["label_set"] == "front3d_bedroom" and index["room_type"] == "bedroom"
     assert index["counts"] == summary.counts
@@ -171,8 +172,9 @@ def test_inspection(front, tmp_path):
     out = tmp_path / "shards"
     build_shards(front_job(front, out))
     counts = count_shards(out)
-    assert counts["train"]["rooms"] == 5 and counts["test"]["objects"] == 3
-    assert counts["train"]["classes"] == {"nightstand": 10, "double_bed": 5}
+    assert counts["train"]["rooms"] == 4 and counts["test"]["objects"] == 3
+    assert counts["val"]["objects"] == 3
+    assert counts["train"]["classes"] == {"nightstand": 8, "double_bed": 4}
     assert counts["train"]["seen"] == pytest.approx(
         np.mean([r.visible.sum(axis=1).mean() for r in
                  (shard.read_room(name) for shard, name in iterate_rooms(out, "train"))])

@@ -110,12 +110,12 @@ def test_what_a_recipe_expects_is_compared_and_decides_nothing(front, tmp_path, 
     build_shards(job)
     assert "expected" not in json.loads((job.out / "report.json").read_text())
     assert "expected" not in read_index(job.out)["recipe"]
-    counts = Expected(of="this test", rooms=7, train=5)
+    counts = Expected(of="this test", rooms=7, train=4, val=2)
     recipe = job.source.recipe.model_copy(update={"expected": counts})
     summary = build_shards(replace(job, source=replace(job.source, recipe=recipe)))
     assert summary.shards_made == 0
     report = json.loads((job.out / "report.json").read_text())
-    assert [row["difference"] for row in report["expected"]["rows"]] == [-1, 0]
+    assert [row["difference"] for row in report["expected"]["rows"]] == [-1, 0, -1]
     # From the recipe's file, where a wrong name is told.
     monkeypatch.setattr("data_prep.front.recipe.FOLDER", tmp_path)
     text = "label_set: front3d_bedroom\nclass_columns: [bedroom_class]\nroom_types: [bedroom]\n"

@@ -73,7 +73,7 @@ def test_one_room(shards):
 def test_what_is_no_finished_folder(shards, tmp_path):
     with pytest.raises(ShardError, match=r"has no index\.json; it is not a finished folder"):
         verify(tmp_path)
-    for split in ("train", "test"):
+    for split in ("train", "val", "test"):
         shutil.rmtree(shards / split)
     with pytest.raises(InputError, match="holds no rooms; prepare them again"):
         verify(shards)

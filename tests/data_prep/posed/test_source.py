@@ -73,13 +73,13 @@ def test_splits_are_seeded_shares_of_rooms(source):
         assert sum(value == "test" for value in split.values()) == tests
     assert seeded_split(names, 0, 0.5) != seeded_split(names, 1, 0.5)
     assert seeded_split(["one"], 0, 0.5) == {"one": "train"}
-    everything = survey(PosedSource(source.folder, SET, val_share=0.0)).rooms
+    everything = survey(PosedSource(source.folder, SET, test_share=0.0)).rooms
     assert {room.split for room in everything} == {"train"} and len(everything) == 4
     for share in (-0.1, 1.0, float("nan")):
         with pytest.raises(
-            InputError, match=r"val_share is .*; expected a share from 0 to below 1"
+            InputError, match=r"test_share is .*; expected a share from 0 to below 1"
         ):
-            PosedSource(source.folder, SET, val_share=share).settings(None)
+            PosedSource(source.folder, SET, test_share=share).settings(None)
 
 
 def test_one_room_is_a_folder_of_rooms(source, rooms, tmp_path, monkeypatch):
@@ -133,7 +133,7 @@ def test_damaged_rooms_are_named_and_the_rest_goes_on(source, rooms, tmp_path):
     whole = rooms[1].png(3).read_bytes()
     rooms[1].png(3).write_bytes(whole[:60])
     (rooms[2].folder / "transforms.json").unlink()
-    job = Job(PosedSource(source.folder, SET, val_share=0.0), tmp_path / "out")
+    job = Job(PosedSource(source.folder, SET, test_share=0.0), tmp_path / "out")
     summary = build_shards(job)
     assert summary.statuses == {"prepared": 1, "failed": 3}
     reasons = {line["room_id"]: line["reason"] for line in summary.report["failed"]}
@@ -184,7 +184,7 @@ def test_the_command(rooms, tmp_path, cli):
     rooms[0].write()
     made = cli(
         "prep-posed", tmp_path / "rooms", "--out", tmp_path / "shards", "--label-set", SET,
-        "--max-side", 64, "--workers", 1, "--val-share", 0.25,
+        "--max-side", 64, "--workers", 1, "--test-share", 0.25,
     )  # fmt: skip
     assert made.exit_code == 0, made.output
     assert "Note: 1 of 4 rooms give no floor_m" in made.stderr
@@ -199,6 +199,6 @@ def test_the_command(rooms, tmp_path, cli):
     rooms[2].png(0).unlink()
     again = cli(
         "prep-posed", tmp_path / "rooms", "--out", tmp_path / "shards", "--label-set", SET,
-        "--max-side", 64, "--workers", 1, "--val-share", 0.25,
+        "--max-side", 64, "--workers", 1, "--test-share", 0.25,
     )  # fmt: skip
     assert "was begun with other settings (rooms differ)" in str(again.exception)

@@ -1,0 +1,136 @@
+"""The sets of rooms that an evaluation compares: chosen, drawn, and with what metrics need."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from sceneprior.classes import VOID
+from sceneprior.errors import InputError
+from sceneprior.evaluation.bootstrap import resample_counts
+from sceneprior.evaluation.features import Drawing, Features
+from sceneprior.evaluation.ground_truth import (
+    independent_rooms,
+    reference_scenes,
+    shuffled_rooms,
+)
+from sceneprior.evaluation.layout_distance import nearest_known
+from sceneprior.evaluation.metric import RoomSet
+from sceneprior.evaluation.metrics.contents import common_label_set
+from sceneprior.evaluation.reference_file import draw_reference
+from sceneprior.scene import Scene
+
+
+@dataclass(frozen=True)
+class ChosenRooms:
+    """The rooms to compare, without meshes but for those of generated and decoded ones."""
+
+    groups: dict[str, Sequence[Scene]]
+    """`test`, `generated`, `train`, `independent`, `shuffled` and, if any, `decoded_rooms`."""
+    every_train: Sequence[Scene]
+    train_rows: Sequence[int]
+    """Which of all training rooms `train` holds."""
+    every_decoded: Sequence[Scene]
+    split: str
+    """Whose rooms `test` holds."""
+    seed: int
+
+
+def choose_rooms(
+    generated: Sequence[Scene], shards: Path, split: str, seed: int, decoded: Sequence[Scene]
+) -> ChosenRooms:
+    """Choose the rooms of every set; the arguments are those of `evaluate_synthesis`."""
+    test = reference_scenes(shards, split, meshes=False)
+    every_train = reference_scenes(shards, "train", meshes=False)
+    generated = [without_void(scene) for scene in generated]
+    common_label_set(generated, test)
+    rows = seeded_rows(len(every_train), len(generated), seed)
+    groups: dict[str, Sequence[Scene]] = {
+        "test": test,
+        "generated": generated,
+        "train": [every_train[row] for row in rows],
+    }
+    for group, scenes in groups.items():
+        if len(scenes) < 2:
+            raise InputError(
+                f"Scoring needs at least 2 {group} rooms, but {len(scenes)} came; synthesize or "
+                "prepare more."
+            )
+    groups["independent"] = independent_rooms(every_train, len(rows), seed)
+    groups["shuffled"] = shuffled_rooms(every_train, len(rows), seed)
+    if len(decoded) > 1:
+        chosen = seeded_rows(len(decoded), len(rows), seed)
+        groups["decoded_rooms"] = [decoded[row] for row in chosen]
+    return ChosenRooms(groups, every_train, rows, decoded, split, seed)
+
+
+def draw_rooms(
+    rooms: ChosenRooms, shards: Path, drawing: Drawing, boxes: bool, reference: Path | None
+) -> tuple[dict[str, Features], dict[str, Features]]:
+    """Features of every group's pictures (and of `independent_meshes`), and drawn as boxes."""
+    groups, count = rooms.groups, len(rooms.train_rows)
+    with Progress(console=Console(stderr=True)) as bars:
+
+        def progress(group: str, total: int) -> Callable[[int], object]:
+            return partial(bars.advance, bars.add_task(f"Drawing {group} rooms", total=total))
+
+        def draw(title: str, scenes: Sequence[Scene]) -> Features:
+            return drawing.features(scenes, progress(title, len(scenes)))
+
+        splits = {rooms.split: len(groups["test"]), "train": len(rooms.every_train)}
+        drawn = draw_reference(shards, drawing, splits, rooms.train_rows, progress, reference)
+        drawn["test"] = drawn.pop(rooms.split)
+        for group in sorted(set(groups) - set(drawn)):
+            drawn[group] = draw(group.replace("_", " "), groups[group])
+        # The same rooms once more: meshes of all training rooms live no longer than this line.
+        furnished = independent_rooms(reference_scenes(shards, "train"), count, rooms.seed, True)
+        drawn["independent_meshes"] = draw("independent, furnished", furnished)
+        del furnished
+        if not boxes:
+            return drawn, {}
+        as_boxes = {group: drawn[group] for group in ("independent", "shuffled")}  # boxes already
+        for group in sorted(set(groups) - set(as_boxes)):
+            plain = [scene.without_meshes() for scene in groups[group]]
+            as_boxes[group] = draw(f"boxed {group}", plain)
+    return drawn, as_boxes
+
+
+def room_sets(
+    rooms: ChosenRooms,
+    drawn: dict[str, Features],
+    as_boxes: dict[str, Features],
+    resamples: int,
+) -> dict[str, RoomSet]:
+    """The sets of rooms by their names in the result, and the `fair` share of generated ones."""
+    sets: dict[str, RoomSet] = {}
+    for number, (group, scenes) in enumerate(rooms.groups.items()):
+        sets[group] = RoomSet(
+            scenes,
+            drawn[group],
+            as_boxes.get(group),
+            nearest_known(scenes, rooms.every_train, rooms.every_decoded, group == "train"),
+            resample_counts(len(scenes), resamples, (rooms.seed, number)),
+        )
+    rows = seeded_rows(len(sets["generated"].scenes), len(rooms.train_rows), rooms.seed)
+    sets["fair"] = sets["generated"].of(rows, (rooms.seed, len(sets)))
+    pictures = drawn["independent_meshes"]
+    sets["independent_meshes"] = replace(sets["independent"], pictures=pictures)
+    return sets | {"train_rooms": sets["train"]}
+
+
+def without_void(scene: Scene) -> Scene:
+    """The scene without furniture that no label names."""
+    known = zip(scene.objects, scene.class_indices, strict=True)
+    return replace(scene, objects=tuple(item for item, index in known if index != VOID))
+
+
+def seeded_rows(available: int, count: int, seed: int) -> list[int]:
+    """At most `count` of `available` rows, drawn without replacement, in order."""
+    if available <= count:
+        return list(range(available))
+    chosen = np.random.default_rng(seed).choice(available, size=count, replace=False)
+    return sorted(chosen.tolist())
