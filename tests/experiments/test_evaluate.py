@@ -85,6 +85,10 @@ def test_a_run_is_evaluated_with_its_own_shards(command, toy_run, tmp_path):
         ),
         (["--scenes", "b", "--shards", "c"], "No folder of scenes at b;"),
         (["--run", "a"], "a is not a run folder"),
+        (
+            ["--run", "a", "--split", "train"],
+            "Generated rooms are compared with the split test, or",
+        ),
     ],
 )
 def test_what_cannot_be_evaluated_is_one_sentence(command, tmp_path, arguments, sentence):
