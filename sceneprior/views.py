@@ -1,8 +1,8 @@
-"""Batches of rooms: `SceneViews`, `LiftedRooms`, `Rays`, `DecodedScenes`, `RoomBoxes`."""
+"""Batches of rooms: `SceneViews`, `LiftedRooms`, `DecodedScenes`, `RoomBoxes`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Integer
@@ -72,20 +72,6 @@ class SceneViews(_Batch):
         return self.intrinsics * scale[:, None]
 
 
-class Rays(NamedTuple):
-    """What rays through pixels say of objects: of each object, whether they met it."""
-
-    origins_m: Float[Tensor, "objects rays 3"]
-    """The cameras' places, in the room frame."""
-    directions: Float[Tensor, "objects rays 3"]
-    """Of unit length."""
-    is_hit: Bool[Tensor, "objects rays"]
-    """Whether the ray ends on the object."""
-    until_m: Float[Tensor, "objects rays"]
-    """How far along the ray this is known: a miss meets nothing of the object before it, a hit
-    meets it somewhere before it. Infinite where nothing ends the ray, 0 where it says nothing."""
-
-
 @dataclass(frozen=True)
 class DecodedScenes:
     """A batch of decoded latents: N objects a room, in the order of generation."""
@@ -103,6 +89,8 @@ class DecodedScenes:
     vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
     """Mesh vertices in the room frame; None until the shape decoder ran, or where it makes grids.
     """
+    shape_codes: Float[Tensor, "rooms objects codes"] | None = None
+    """What `occupancy` is a weighted sum by (`models.occupancy`); None where shapes are meshes."""
     occupancy: Float[Tensor, "rooms objects x y z"] | None = None
     """Logits, positive inside the object, of the centres of cells that fill the box times
     `margin`; None until the shape decoder ran, or where it makes meshes."""
@@ -112,8 +100,8 @@ class DecodedScenes:
 
 @dataclass(frozen=True)
 class LiftedRooms(_Batch):
-    """Tracked objects of a batch of rooms as `lifting` found them in 3D, from masks alone, and
-    perhaps rays through the masks; objects are padded to the fullest room's count."""
+    """Tracked objects of a batch of rooms as `lifting` found them in 3D, from masks alone;
+    objects are padded to the fullest room's count."""
 
     room_index: Int[Tensor, " rooms"]
     """Row of each room in the data set: which latent vector is its own."""
@@ -125,25 +113,9 @@ class LiftedRooms(_Batch):
     """Whether the box is known: some view showed the object."""
     boxes_m: Float[Tensor, "rooms objects 6"]
     """Centre x, y, z, then full extents; axis-aligned, in the room frame."""
-    ray_origins_m: Float[Tensor, "rooms objects rays 3"] | None = None
-    ray_directions: Float[Tensor, "rooms objects rays 3"] | None = None
-    """Unit vectors."""
-    ray_hits: Bool[Tensor, "rooms objects rays"] | None = None
-    """Whether the ray goes through a pixel of the object."""
-    ray_until_m: Float[Tensor, "rooms objects rays"] | None = None
-    """Up to where the object is met, or known not to be; 0 for a ray that tells nothing."""
+    shape_codes: Float[Tensor, "rooms objects codes"] | None = None
+    """What its lifted shape is in the shape space of the training rooms."""
     room_ids: tuple[str, ...] = ()
-
-    def rays_of(self, room: Int[Tensor, " picked"], item: Int[Tensor, " picked"]) -> Rays:
-        """The rays of some objects.
-
-        Raises:
-            ValueError: the rooms were loaded without them.
-        """
-        parts = (self.ray_origins_m, self.ray_directions, self.ray_hits, self.ray_until_m)
-        if any(part is None for part in parts):
-            raise ValueError("These rooms have no rays; load the data with rays_per_object.")
-        return Rays(*(part[room, item] for part in parts if part is not None))
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ OWNERS = {
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
     "skimage": ["sceneprior/geometry/isosurface.py"],
     "fast_simplification": ["sceneprior/geometry/isosurface.py"],
-    "sklearn": ["sceneprior/evaluation/"],
+    "sklearn": ["sceneprior/evaluation/", "sceneprior/lifting/shapes"],
     "scipy.optimize": ["sceneprior/losses/matching.py", "sceneprior/evaluation/"],
     "cv2": ["data_prep/"],
     "distributed": ["data_prep/engine/cluster.py"],

@@ -9,15 +9,13 @@ import yaml
 from sceneprior.config import RunConfig, check_config
 
 OCCUPANCY: dict[str, Any] = {
-    "model__shape": {"name": "occupancy", "width": 8, "cells": 8},
+    "model__shape": {"name": "occupancy", "codes": 6, "width": 8, "cells": 8},
     "shape": {
-        "supervision": "rays",
+        "supervision": "lifted",
         "epochs": 3,
         "batch_size": 6,
         "learning_rate": 2e-3,
         "latent_learning_rate": 2e-3,
-        "rays_per_object": 12,
-        "samples": 6,
     },
 }
 """Changes to a run whose shapes are occupancy grids."""

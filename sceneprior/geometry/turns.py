@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 QUARTERS = 4
@@ -50,3 +50,18 @@ def turn_boxes(
     """Boxes (centre, full extents) of rooms turned about +y by so many quarters."""
     centers_m, sizes_m = boxes_m.split(3, dim=-1)
     return torch.cat([turn_vectors(centers_m, quarters), turn_vectors(sizes_m, quarters).abs()], -1)
+
+
+def turn_grids(
+    grids: Bool[np.ndarray, "objects x y z"], quarters: int
+) -> Bool[np.ndarray, "objects x y z"]:
+    """Grids of things that turn about +y by so many quarters. x and z have as many cells.
+
+    Example: what is in the last cell of z comes to the last of x.
+
+        >>> grids = np.zeros((1, 2, 1, 2), dtype=bool)
+        >>> grids[0, 0, 0, 1] = True
+        >>> np.argwhere(turn_grids(grids, 1)[0]).tolist()
+        [[1, 0, 1]]
+    """
+    return np.rot90(grids, quarters, axes=(3, 1))

@@ -4,25 +4,27 @@ import contextlib
 import hashlib
 import io
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
 from sceneprior.data.dataset import BLANK, RoomDataset, allowed_views
 from sceneprior.files import write_whole
-from sceneprior.geometry.turns import turn_boxes, turn_vectors
+from sceneprior.geometry.turns import turn_boxes, turn_grids
 from sceneprior.lifting.boxes import LiftedBoxes, lift_boxes
-from sceneprior.lifting.rays import RayPool, draw_rays
+from sceneprior.lifting.shapes import ShapeGrid, ShapeSpace, lift_shapes, shape_space
 from sceneprior.shards import RoomViews, Shard, iterate_rooms
 from sceneprior.views import LiftedRooms
 
 VERSION = 1
-"""Of what `lift_boxes` finds: raise it when the same views give other boxes."""
+SHAPES_VERSION = 1
+"""Of what `lift_boxes` and `lift_shapes` find: raise it when the same views give something else."""
 
 
 class LiftedDataset(RoomDataset):
@@ -30,12 +32,12 @@ class LiftedDataset(RoomDataset):
     `ViewDataset`'s.
 
     Boxes are found once, a fifth of a CPU second an object, and kept as `lifted_<split>.npz`
-    beside the shards, if that folder may be written to.
+    beside the shards, if that folder may be written to; shapes likewise.
 
     Args:
         folder, split, rotations: See `RoomDataset`.
         view_fraction, seed: As for `ViewDataset`.
-        rays_per_object: Rays drawn through an object's masks each time; 0 reads no images.
+        shape: Also lift shapes, onto such grids, and find their shape space; None does not.
 
     Raises:
         ShardError: a shard is missing, damaged, or of another label set than the first.
@@ -49,47 +51,46 @@ class LiftedDataset(RoomDataset):
         split: str,
         rotations: int = 1,
         view_fraction: float = 1.0,
-        rays_per_object: int = 0,
+        shape: ShapeGrid | None = None,
         seed: int = 0,
-        pool: int = 768,
     ):
         super().__init__(rotations)
-        self.seed, self.rays_per_object = seed, rays_per_object
+        folder = Path(folder)
         rooms = self.read_rooms(folder, split, Shard.read_room)
         chosen = [
             allowed_views(seed, index, len(room.visible), view_fraction)
             for index, room in enumerate(rooms)
         ]
-        self.boxes = _find_boxes(Path(folder), split, rooms, chosen)
-        counts = np.array([len(room.object_class) for room in rooms])
-        self.max_objects = int(counts.max())
-        self._counts = torch.from_numpy(counts)
-        self._classes, self._lifted, self._boxes_m = (
-            torch.nn.utils.rnn.pad_sequence([torch.from_numpy(a) for a in parts], batch_first=True)
-            for parts in (
-                [room.object_class.astype(np.int64) for room in rooms],
-                [boxes.explained > 0 for boxes in self.boxes],
-                [
-                    np.hstack([boxes.centers_m, boxes.sizes_m]).astype(np.float32)
-                    for boxes in self.boxes
-                ],
-            )
+        key = _fingerprint(rooms, chosen)
+        counts = [len(room.object_class) for room in rooms]
+        self.boxes = _find_boxes(folder, split, key, counts, chosen)
+        self.max_objects = max(counts)
+        self._counts = torch.tensor(counts)
+        self._classes = _padded([room.object_class.astype(np.int64) for room in rooms])
+        self._lifted = _padded([boxes.explained > 0 for boxes in self.boxes])
+        self._boxes_m = _padded(
+            [np.hstack([boxes.centers_m, boxes.sizes_m]).astype(np.float32) for boxes in self.boxes]
         )
-        self._rays: list[RayPool] = []
-        if rays_per_object:
-            for index, (shard, room_id) in enumerate(iterate_rooms(folder, split)):
-                views = shard.read_room(room_id, images=True)
-                self._rays.append(draw_rays(views, self.boxes[index], pool, chosen[index], seed))
+        self.space: ShapeSpace | None = None
+        self._codes: Tensor | None = None
+        """By room and quarter turn."""
+        if shape is not None:
+            grids = _find_shapes(folder, split, key, self.boxes, chosen, shape)
+            self.space, codes = _spanned(grids, self.boxes, rotations, shape.codes)
+            self._codes = torch.stack(
+                [_padded(np.split(turned, np.cumsum(counts)[:-1])) for turned in codes], dim=1
+            )
 
     def to(self, device: torch.device | str) -> "LiftedDataset":
-        """Move all boxes to `device`, where batches are then made."""
+        """Move all boxes and codes to `device`, where batches are then made."""
         self._counts, self._classes = self._counts.to(device), self._classes.to(device)
         self._lifted, self._boxes_m = self._lifted.to(device), self._boxes_m.to(device)
+        self._codes = None if self._codes is None else self._codes.to(device)
         return self
 
     def __getitems__(self, draws: list[tuple[int, int]]) -> LiftedRooms:
-        """A batch of rows; each draw is (row, epoch), which together decide its rays. A draw of an
-        epoch `BLANK` is a room in which there is nothing."""
+        """A batch of rows; each draw is (row, epoch). A draw of an epoch `BLANK` is a room in which
+        there is nothing; no other epoch matters."""
         device = self._counts.device
         rows = torch.tensor([row for row, _ in draws], device=device)
         shown = torch.tensor([epoch != BLANK for _, epoch in draws], device=device)
@@ -97,68 +98,93 @@ class LiftedDataset(RoomDataset):
         counts = self._counts[rooms] * shown
         widest = max(int(counts.max()), 1)
         is_object = torch.arange(widest, device=device) < counts[:, None]
-        lifted = LiftedRooms(
+        return LiftedRooms(
             room_index=rows,
             object_class=self._classes[rooms, :widest] * is_object,
             is_object=is_object,
             is_lifted=self._lifted[rooms, :widest] & is_object,
             boxes_m=turn_boxes(self._boxes_m[rooms, :widest], quarters),
+            shape_codes=None if self._codes is None else self._codes[rooms, quarters, :widest],
             room_ids=tuple(self.plain_ids[room] for room in rooms.tolist()),
-            **(self._draw_rays(draws, widest) if self._rays else {}),
         )
-        return lifted
 
-    def _draw_rays(self, draws: list[tuple[int, int]], widest: int) -> dict[str, Tensor]:
-        many = self.rays_per_object
-        origins = np.zeros((len(draws), widest, many, 3), np.float32)
-        directions = np.ones_like(origins)
-        hits = np.zeros((len(draws), widest, many), bool)
-        until = np.zeros((len(draws), widest, many), np.float32)
-        for place, (row, epoch) in enumerate(draws):
-            pool = self._rays[row // self.rotations]
-            count = 0 if epoch == BLANK else len(pool.hits)
-            # A pure function of seed, row and epoch: a resumed run draws what it would have drawn.
-            rng = np.random.default_rng([self.seed, row, max(epoch, 0)])
-            picked = rng.integers(pool.hits.shape[1], size=(count, many))
-            item = np.arange(count)[:, None]
-            origins[place, :count] = pool.origins_m[item, picked]
-            directions[place, :count] = pool.directions[item, picked]
-            hits[place, :count] = pool.hits[item, picked]
-            until[place, :count] = pool.until_m[item, picked]
-        device = self._counts.device
-        quarters = torch.tensor([row % self.rotations for row, _ in draws], device=device)
-        return {
-            "ray_origins_m": turn_vectors(torch.from_numpy(origins).to(device), quarters),
-            "ray_directions": turn_vectors(torch.from_numpy(directions).to(device), quarters),
-            "ray_hits": torch.from_numpy(hits).to(device),
-            "ray_until_m": torch.from_numpy(until).to(device),
-        }
+
+def _padded(parts: Sequence[np.ndarray]) -> Tensor:
+    """What each room has of its objects, as one tensor."""
+    return torch.nn.utils.rnn.pad_sequence([torch.from_numpy(a) for a in parts], batch_first=True)
 
 
 def _find_boxes(
-    folder: Path, split: str, rooms: Sequence[RoomViews], chosen: Sequence[np.ndarray]
+    folder: Path, split: str, key: str, counts: Sequence[int], chosen: Sequence[np.ndarray]
 ) -> list[LiftedBoxes]:
-    path = folder / f"lifted_{split}.npz"
-    key = _fingerprint(rooms, chosen)
-    ends = np.cumsum([len(room.object_class) for room in rooms])[:-1]
+    def find() -> dict[str, np.ndarray]:
+        progress = track(chosen, "lifting boxes from masks (rooms)", console=Console(stderr=True))
+        found = [
+            lift_boxes(shard.read_room(room_id, images=True), views)
+            for views, (shard, room_id) in zip(progress, iterate_rooms(folder, split), strict=True)
+        ]
+        return {
+            name: np.concatenate([getattr(room, name) for room in found])
+            for name in LiftedBoxes._fields
+        }
+
+    saved = _kept(folder / f"lifted_{split}.npz", key, find)
+    parts = [np.split(saved[name], np.cumsum(counts)[:-1]) for name in LiftedBoxes._fields]
+    return [LiftedBoxes(*each) for each in zip(*parts, strict=True)]
+
+
+def _find_shapes(
+    folder: Path,
+    split: str,
+    key: str,
+    boxes: Sequence[LiftedBoxes],
+    chosen: Sequence[np.ndarray],
+    shape: ShapeGrid,
+) -> Bool[np.ndarray, "objects x y z"]:
+    def find() -> dict[str, np.ndarray]:
+        progress = track(
+            list(zip(boxes, chosen, strict=True)),
+            "lifting shapes from masks (rooms)",
+            console=Console(stderr=True),
+        )
+        found = [
+            lift_shapes(shard.read_room(room_id, images=True), its_boxes, shape, views)
+            for (its_boxes, views), (shard, room_id) in zip(
+                progress, iterate_rooms(folder, split), strict=True
+            )
+        ]
+        return {"bits": np.packbits(np.concatenate(found).reshape(-1, shape.cells**3), axis=1)}
+
+    key = f"{key} {SHAPES_VERSION} {shape.cells} {shape.margin}"
+    bits = _kept(folder / f"lifted_shapes_{split}.npz", key, find)["bits"]
+    flat = np.unpackbits(bits, axis=1, count=shape.cells**3).astype(bool)
+    return flat.reshape(-1, *(shape.cells,) * 3)
+
+
+def _spanned(
+    grids: Bool[np.ndarray, "objects x y z"],
+    boxes: Sequence[LiftedBoxes],
+    rotations: int,
+    codes: int,
+) -> tuple[ShapeSpace, list[Float[np.ndarray, "objects codes"]]]:
+    """The space of the shapes in all turns of their rooms; by turn, each object's place there."""
+    known = np.concatenate([room.explained > 0 for room in boxes])
+    turned = [turn_grids(grids, quarters) for quarters in range(rotations)]
+    space = shape_space(np.concatenate([each[known] for each in turned]), codes)
+    return space, [space.codes_of(each) for each in turned]
+
+
+def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """What a file keeps under a key, or what is found now, and kept if it may be written."""
     try:
         with np.load(path) as saved:
             if str(saved["key"]) == key:
-                parts = [np.split(saved[name], ends) for name in LiftedBoxes._fields]
-                return [LiftedBoxes(*each) for each in zip(*parts, strict=True)]
+                return {name: saved[name] for name in saved.files}
     except (OSError, KeyError, ValueError, zipfile.BadZipFile):
         pass  # not there yet, or not to be trusted: found again
-    progress = track(chosen, "lifting boxes from masks (rooms)", console=Console(stderr=True))
-    found = [
-        lift_boxes(shard.read_room(room_id, images=True), views)
-        for views, (shard, room_id) in zip(progress, iterate_rooms(folder, split), strict=True)
-    ]
-    named = {
-        name: np.concatenate([getattr(room, name) for room in found])
-        for name in LiftedBoxes._fields
-    }
+    found = find()
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, key=np.array(key), **named)
+    np.savez(buffer, allow_pickle=False, key=np.array(key), **found)
     with contextlib.suppress(OSError):  # a folder of shards may be read-only: found again then
         write_whole(path, buffer.getvalue())
     return found

@@ -53,3 +53,23 @@ def lifted_losses(
 def predicted_boxes(scenes: DecodedScenes) -> Float[Tensor, "rooms objects 6"]:
     """Centre and full extents of every prediction."""
     return torch.cat([scenes.centers_m, scenes.sizes_m], dim=-1)
+
+
+def shape_code_loss(
+    scenes: DecodedScenes, rooms: LiftedRooms, matches: Matches, cells: int
+) -> Float[Tensor, ""]:
+    """The squared distance of decoded and lifted occupancies, a mean over a grid's cells.
+
+        L_S = mean over objects of |a_k - a_j|_2^2 / cells
+
+    with a the weights of an orthonormal basis (`lifting.shapes.ShapeSpace`): what the components
+    leave out of a lifted shape, no weights could give, and no gradient comes from it.
+
+    Args:
+        scenes, rooms: With `shape_codes`.
+        matches: As `match_lifted` gives them.
+        cells: Of one grid.
+    """
+    assert scenes.shape_codes is not None and rooms.shape_codes is not None
+    apart = take(scenes.shape_codes, matches.prediction, dim=1) - rooms.shape_codes
+    return mean_of_objects(apart.square().sum(dim=-1) / cells, matches.valid)

@@ -108,6 +108,8 @@ class ScenePrior(nn.Module):
         with torch.autocast(z.device.type, enabled=False):
             layout, shared = self.layout(features.to(z.dtype))
         scenes = DecodedScenes(**layout._asdict(), bevels=self.bevels(layout.class_logits))
+        if isinstance(self.shape, OccupancyDecoder):
+            scenes = replace(scenes, shape_codes=self.shape.codes(shared).to(z.dtype))
         if not with_shape:
             return scenes
         if wanted is None:

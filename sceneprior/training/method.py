@@ -22,6 +22,8 @@ from sceneprior.classes import label_set
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.lifting.dataset import LiftedDataset
+from sceneprior.lifting.shapes import ShapeGrid
+from sceneprior.models.occupancy import OccupancyConfig
 from sceneprior.models.prior import ModelConfig, ScenePrior
 from sceneprior.settings import Section
 from sceneprior.training.checkpoints import read_networks
@@ -164,15 +166,16 @@ class PriorConfig(RunConfig):
         self.check_rooms(rooms, self.model.max_objects)
         return rooms
 
-    def open_lifted(self, rays_per_object: int = 0) -> LiftedDataset:
-        """The training rooms with 3D boxes found from their masks; InputError as above."""
+    def open_lifted(self, shape: OccupancyConfig | None = None) -> LiftedDataset:
+        """The training rooms with 3D boxes found from their masks, and perhaps grids of shapes;
+        InputError as above."""
         data = self.data
         rooms = LiftedDataset(
             Path(data.shards),
             "train",
             rotations=data.rotations,
             view_fraction=data.view_fraction,
-            rays_per_object=rays_per_object,
+            shape=None if shape is None else ShapeGrid(shape.cells, shape.margin, shape.codes),
             seed=self.seed,
         )
         self.check_rooms(rooms, self.model.max_objects)

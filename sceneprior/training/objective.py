@@ -17,7 +17,7 @@ from sceneprior.geometry.meshes import beveled_cube, icosphere, place
 from sceneprior.losses.layout import layout_losses
 from sceneprior.losses.matching import Matches, match_objects
 from sceneprior.silhouettes.render import render_silhouettes
-from sceneprior.training.settings import LossConfig, RaysConfig, ShapeConfig
+from sceneprior.training.settings import LiftedShapeConfig, LossConfig, ShapeConfig
 from sceneprior.views import DecodedScenes, LiftedRooms, RoomBoxes, SceneViews
 
 POINTS_LEVEL = 2
@@ -61,12 +61,12 @@ def match_and_score(
 
 
 def seen_boxes(
-    scenes: DecodedScenes, views: SceneViews, settings: ShapeConfig | RaysConfig
+    scenes: DecodedScenes, views: SceneViews, settings: ShapeConfig | LiftedShapeConfig
 ) -> Boxes2D:
     """2D boxes of decoded objects: of their meshes where there are any (`ShapeConfig.box_from`)."""
     if (
         scenes.vertices_m is None
-        or isinstance(settings, RaysConfig)
+        or isinstance(settings, LiftedShapeConfig)
         or settings.box_from == "proxy"
     ):
         return proxy_boxes(scenes, views, settings.proxy)

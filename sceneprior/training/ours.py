@@ -10,16 +10,17 @@ from torch import nn
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.lifting.dataset import LiftedDataset
+from sceneprior.models.occupancy import OccupancyConfig, OccupancyDecoder
 from sceneprior.training.method import PriorConfig, Stage, TrainedPrior
 from sceneprior.training.settings import (
     LayoutConfig,
+    LiftedShapeConfig,
     LossConfig,
-    RaysConfig,
     SamplingConfig,
     ShapeConfig,
     StageConfig,
 )
-from sceneprior.training.stages import LayoutStage, LiftedStage, PaperStage, RaysStage, ShapeStage
+from sceneprior.training.stages import LayoutStage, LiftedStage, PaperStage, ShapeStage
 
 
 class PaperConfig(PriorConfig):
@@ -29,7 +30,7 @@ class PaperConfig(PriorConfig):
     loss: LossConfig = LossConfig()
     layout: LayoutConfig | None
     """Null trains layout and shape together from the start (ablation c3)."""
-    shape: Annotated[ShapeConfig | RaysConfig, Field(discriminator="supervision")]
+    shape: Annotated[ShapeConfig | LiftedShapeConfig, Field(discriminator="supervision")]
     sampling: SamplingConfig = SamplingConfig()
 
     remembers_rooms: ClassVar[bool] = True
@@ -45,11 +46,12 @@ class PaperConfig(PriorConfig):
 
     @model_validator(mode="after")
     def _shapes_fit(self) -> "PaperConfig":
-        needed = "rays" if self.model.shape.name == "occupancy" else "masks"
+        needed = "lifted" if self.model.shape.name == "occupancy" else "masks"
         if self.shape.supervision != needed:
             raise ValueError(
-                f"model.shape is '{self.model.shape.name}', which is learnt from {needed}, but "
-                f"shape.supervision is '{self.shape.supervision}'; say {needed} there"
+                f"model.shape is '{self.model.shape.name}', which is learnt with "
+                f"shape.supervision '{needed}', but that is '{self.shape.supervision}'; change "
+                "one of them"
             )
         return self
 
@@ -64,10 +66,11 @@ class PaperConfig(PriorConfig):
         build = partial(self._build, LayoutStage, self.layout)
         return Stage("layout", self.layout, boxes, build), shape
 
-    def _shape_stage(self, stage: ShapeConfig | RaysConfig) -> Stage:
-        if isinstance(stage, RaysConfig):
-            rays = partial(self.open_lifted, stage.rays_per_object)
-            return Stage("shape", stage, rays, partial(self._build, RaysStage, stage))
+    def _shape_stage(self, stage: ShapeConfig | LiftedShapeConfig) -> Stage:
+        if isinstance(stage, LiftedShapeConfig):
+            assert isinstance(self.model.shape, OccupancyConfig), "checked above"
+            shapes = partial(self.open_lifted, self.model.shape)
+            return Stage("shape", stage, shapes, partial(self._build, LiftedStage, stage))
         views = stage.views_per_room or self.data.views_per_room
         masks = partial(self.open_views, views, self.data.mask_step)
         return Stage("shape", stage, masks, partial(self._build, ShapeStage, stage))
@@ -91,5 +94,8 @@ class PaperConfig(PriorConfig):
                 )
             prior = before.prior.train()
             latents = nn.Embedding.from_pretrained(before.logits, freeze=False)
+        if isinstance(rooms, LiftedDataset) and rooms.space is not None:
+            assert isinstance(prior.shape, OccupancyDecoder)
+            prior.shape.set_space(*rooms.space)
         target = self.model.completeness_target
         return kind(prior, latents, stage, self.loss, target, self.seed)

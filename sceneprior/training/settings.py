@@ -114,19 +114,13 @@ class ShapeConfig(StageConfig):
     """Whether 2D boxes come from the deformed mesh (paper) or still from the proxy."""
 
 
-class RaysConfig(StageConfig):
-    """How the shape stage of occupancy grids is trained: lifted boxes go on teaching the layout
-    beside rays through the masks (`loss.mask` weighs them)."""
+class LiftedShapeConfig(StageConfig):
+    """How the shape stage of occupancy grids is trained: lifted boxes teach the layout beside the
+    shapes that were lifted with them (`loss.mask` weighs those)."""
 
-    supervision: Literal["rays"] = "rays"
+    supervision: Literal["lifted"] = "lifted"
     decoder_learning_rate: float | None = Field(None, gt=0)
     """As in `ShapeConfig`."""
-    rays_per_object: int = Field(64, ge=1)
-    """Rays drawn through an object's masks in each step."""
-    samples: int = Field(24, ge=2)
-    """Places along each ray where the grid is asked."""
-    smoothness: float = Field(0.1, ge=0)
-    """Weight of the total variation of occupancies; without it surfaces are noise."""
 
 
 class SamplingConfig(Section):

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
-from sceneprior.losses.lifted import lifted_losses, match_lifted
-from sceneprior.losses.rays import ray_loss, total_variation
+from sceneprior.losses.lifted import lifted_losses, match_lifted, shape_code_loss
 from sceneprior.losses.shape import mask_loss
+from sceneprior.models.occupancy import OccupancyDecoder
 from sceneprior.models.prior import ScenePrior
 from sceneprior.training.objective import (
     batch_seed,
@@ -27,8 +27,8 @@ from sceneprior.training.objective import (
 )
 from sceneprior.training.settings import (
     LayoutConfig,
+    LiftedShapeConfig,
     LossConfig,
-    RaysConfig,
     ShapeConfig,
     StageConfig,
 )
@@ -104,9 +104,9 @@ class PaperStage(lightning.LightningModule, ABC):
         own may have other rates."""
         stage, others = self.stage, ("shape.", "bevels.")
         trained = [p for name, p in self.prior.named_parameters() if not name.startswith(others)]
-        shape_rate = (
-            stage.decoder_learning_rate if isinstance(stage, ShapeConfig | RaysConfig) else None
-        )
+        shape_rate = None
+        if isinstance(stage, ShapeConfig | LiftedShapeConfig):
+            shape_rate = stage.decoder_learning_rate
         tables = [*self.latents.parameters(), *self.prior.bevels.parameters()]
         groups = [
             {"params": trained, "lr": stage.learning_rate},
@@ -134,7 +134,8 @@ class LayoutStage(PaperStage):
 
 
 class LiftedStage(PaperStage):
-    """The layout loss against lifted 3D boxes, which no camera has to be asked for again."""
+    """The layout loss against lifted 3D boxes, which no camera has to be asked for again; as the
+    shape stage, with the distance to the lifted shapes."""
 
     @staticmethod
     def has_proxies(stage: Any) -> bool:
@@ -145,6 +146,10 @@ class LiftedStage(PaperStage):
         with full_precision(self.device):
             matches = match_lifted(scenes, rooms, self.loss.match_box)
             losses = lifted_losses(scenes, rooms, matches, self.completeness_target)
+            if isinstance(self.stage, LiftedShapeConfig):
+                shape = self.prior.shape
+                assert isinstance(shape, OccupancyDecoder), "lifted shapes are grids"
+                losses["mask"] = shape_code_loss(scenes, rooms, matches, shape.cells**3)
             return self.total(losses, rooms)
 
 
@@ -171,38 +176,3 @@ class ShapeStage(PaperStage):
             masks = seen_masks(scenes.vertices_m, faces, views, self.stage)
             losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
             return self.total(losses, views, beside=overlap)
-
-
-class RaysStage(PaperStage):
-    """The layout loss against lifted boxes, plus the loss of rays through occupancy grids."""
-
-    stage: RaysConfig
-
-    @staticmethod
-    def has_proxies(stage: Any) -> bool:
-        return False
-
-    def training_step(self, rooms: LiftedRooms, batch_idx: int) -> Tensor:
-        count, slots = rooms.is_object.sum(dim=-1, keepdim=True), self.prior.max_objects
-        # Only the first n predictions are matched to a room's n objects: the rest needs no grid.
-        wanted = torch.arange(slots, device=count.device) < count
-        scenes = self.prior.decode(self.room_latents(rooms, batch_idx), wanted=wanted)
-        with full_precision(self.device):
-            matches = match_lifted(scenes, rooms, self.loss.match_box)
-            losses = lifted_losses(scenes, rooms, matches, self.completeness_target)
-            assert scenes.occupancy is not None, "decode() adds grids unless told not to"
-            room, item = matches.valid.nonzero(as_tuple=True)
-            prediction = matches.prediction[room, item]
-            grids = scenes.occupancy[room, prediction]
-            rays = rooms.rays_of(room, item)
-            crossing, seen = ray_loss(
-                grids,
-                scenes.centers_m[room, prediction],
-                scenes.sizes_m[room, prediction],
-                scenes.margin,
-                rays,
-                self.stage.samples,
-                torch.rand(rays.is_hit.shape, device=grids.device),
-            )
-            losses["mask"] = crossing + self.stage.smoothness * total_variation(grids)
-            return self.total(losses, rooms, beside=seen)

@@ -1,4 +1,4 @@
-"""Lifted rooms in batches: rows of the views, rays by epoch, boxes found once."""
+"""Lifted rooms in batches: rows of the views, boxes and shapes found once."""
 
 import shutil
 
@@ -6,11 +6,16 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from sceneprior.data.dataset import BLANK, ViewDataset
 from sceneprior.geometry.turns import turn_boxes
 from sceneprior.lifting import dataset as module
 from sceneprior.lifting.dataset import LiftedDataset
+from sceneprior.lifting.shapes import ShapeGrid, lift_shapes
+from sceneprior.shards import iterate_rooms
+
+GRID = ShapeGrid(cells=8, margin=1.2, codes=200)
 
 
 @pytest.fixture(scope="module")
@@ -36,33 +41,57 @@ def test_rows_and_objects_are_those_of_the_views_and_truth_is_not_needed(shards)
     for name in ("room_index", "object_class", "is_object"):
         assert torch.equal(getattr(mine, name), getattr(theirs, name))
     assert mine.room_ids == theirs.room_ids
-    assert mine.ray_hits is None
+    assert mine.shape_codes is None
 
 
-def test_turned_rows_are_turned_rooms(shards):
-    data = LiftedDataset(shards, "train", rotations=4, rays_per_object=6)
-    plain, turned = data.__getitems__([(4, 0)]), data.__getitems__([(7, 0)])
+def test_turned_rows_are_turned_rooms(shards, monkeypatch):
+    rng = np.random.default_rng(0)
+    monkeypatch.setattr(
+        module,
+        "lift_shapes",
+        lambda views, *_: rng.random((len(views.object_class), 8, 8, 8)) < 0.5,
+    )
+    monkeypatch.setattr(module, "write_whole", lambda *_: None)
+    data = LiftedDataset(shards, "train", rotations=4, shape=GRID._replace(margin=1.15))
+    plain, turned = data.__getitems__([(4, 0)]), data.__getitems__([(7, 2)])
     assert torch.equal(turned.boxes_m, turn_boxes(plain.boxes_m, torch.tensor([3])))
-    # Each copy draws its own rays from the pool of the room, turned: -z to x.
-    pool = torch.from_numpy(data._rays[1].directions)
-    back = turned.ray_directions[0, : len(pool)][..., [2, 1, 0]] * torch.tensor([1.0, 1, -1])
-    for item in range(len(pool)):
-        assert (back[item].unsqueeze(1) == pool[item]).all(dim=-1).any(dim=1).all()
+    # All shapes in all turns are in the space: codes give turned grids back.
+    assert data.space is not None
+    for item in range(int(plain.is_object.sum())):
+        before, after = (
+            data.space.mean + np.tensordot(batch.shape_codes[0, item].numpy(), data.space.basis, 1)
+            for batch in (plain, turned)
+        )
+        np.testing.assert_allclose(np.rot90(before, 3, axes=(2, 0)), after, rtol=0, atol=1e-3)
+        assert np.abs(before - after).max() > 0.9
 
 
-def test_rays_depend_on_seed_row_and_epoch_alone(shards):
-    data = LiftedDataset(shards, "train", rays_per_object=8, seed=5)
-    once, again = data.__getitems__([(1, 2), (3, 2)]), data.__getitems__([(3, 2)])
-    count = int(again.is_object.sum())
-    assert torch.equal(once.ray_directions[1, :count], again.ray_directions[0, :count])
-    later = data.__getitems__([(3, 3)])
-    assert not torch.equal(again.ray_directions, later.ray_directions)
-    assert later.ray_until_m[~later.is_object].eq(0).all()
+def test_codes_are_those_of_the_lifted_shapes_in_the_order_of_objects(shards):
+    data = LiftedDataset(shards, "train", shape=GRID)
+    batch = data.__getitems__([(1, 0), (3, 0)])
+    for row, (shard, room_id) in enumerate(iterate_rooms(shards, "train")):
+        if row in (1, 3):
+            grids = lift_shapes(shard.read_room(room_id, images=True), data.boxes[row], GRID)
+            wanted = torch.from_numpy(data.space.codes_of(grids))
+            found = batch.shape_codes[(row - 1) // 2, : len(grids)]
+            assert_close(found, wanted, rtol=0, atol=1e-5)
+    assert LiftedDataset(shards, "train").__getitems__([(1, 0)]).shape_codes is None
 
 
 def test_a_blank_draw_is_a_room_in_which_there_is_nothing(shards):
-    batch = LiftedDataset(shards, "train", rays_per_object=4).__getitems__([(0, BLANK)])
-    assert not batch.is_object.any() and not batch.is_lifted.any() and not batch.ray_until_m.any()
+    batch = LiftedDataset(shards, "train", shape=GRID).__getitems__([(0, BLANK)])
+    assert not batch.is_object.any() and not batch.is_lifted.any()
+
+
+def test_shapes_are_found_once_and_again_on_other_grids(shards, monkeypatch):
+    LiftedDataset(shards, "train", shape=GRID)
+    calls = []
+    find = module.lift_shapes
+    monkeypatch.setattr(module, "lift_shapes", lambda *given: calls.append(1) or find(*given))
+    LiftedDataset(shards, "train", shape=GRID._replace(codes=2))
+    assert calls == [], "codes are found from the same shapes"
+    LiftedDataset(shards, "train", shape=GRID._replace(margin=1.3))
+    assert len(calls) == 6
 
 
 def test_boxes_are_found_once_and_again_when_views_change(shards, monkeypatch):

@@ -1,5 +1,6 @@
 """Lifted boxes as targets: the matching against all permutations, the terms against loops."""
 
+from dataclasses import replace
 from itertools import permutations
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.losses.lifted import PER_METRE, lifted_losses, match_lifted
+from sceneprior.losses.lifted import PER_METRE, lifted_losses, match_lifted, shape_code_loss
 from sceneprior.views import DecodedScenes, LiftedRooms
 
 COUNTS = (3, 2, 0)
@@ -96,3 +97,21 @@ def test_a_right_scene_has_no_box_loss_and_one_without_objects_no_nan(scenes, ro
     )))  # fmt: skip
     matches = match_lifted(right, first, 50.0)
     assert lifted_losses(right, first, matches, "first_n")["box"] == 0
+
+
+def test_the_distance_of_codes_is_that_of_grids_a_cell(scenes, rooms, torch_rng):
+    """In an orthonormal basis of two grids of five cells, object by object; float64 gradients."""
+    basis = torch.linalg.qr(torch.randn(5, 2, generator=torch_rng, dtype=torch.float64))[0].T
+    codes = torch.randn(3, 5, 2, generator=torch_rng, dtype=torch.float64, requires_grad=True)
+    lifted = replace(rooms, shape_codes=torch.randn(3, 3, 2, generator=torch_rng).double())
+    matches = match_lifted(scenes, rooms)
+    apart = []
+    for room, item in rooms.is_lifted.nonzero().tolist():
+        k = int(matches.prediction[room, item])
+        apart.append(((codes[room, k] - lifted.shape_codes[room, item]) @ basis).square().mean())
+
+    def loss(codes):
+        return shape_code_loss(replace(scenes, shape_codes=codes), lifted, matches, 5)
+
+    assert_close(loss(codes), torch.stack(apart).mean(), rtol=0, atol=1e-12)
+    assert torch.autograd.gradcheck(loss, codes)

@@ -1,17 +1,17 @@
-"""Occupancy grids: where they start, how coarse and fine join, and how the prior decodes them."""
+"""Occupancy grids: sums of given grids, and how the prior decodes them."""
 
+import numpy as np
 import pytest
 import torch
-from scipy import ndimage
 from tiny_runs import OCCUPANCY, tiny_baseline, tiny_config
 from torch.testing import assert_close
 
 from sceneprior.errors import ConfigError
-from sceneprior.models.occupancy import FINEST, OccupancyConfig
+from sceneprior.models.occupancy import OccupancyConfig, OccupancyDecoder
 from sceneprior.models.prior import ScenePrior
 from sceneprior.models.shape_decoder import ShapeDecoderConfig
 
-SMALL = {"name": "occupancy", "width": 8, "cells": 8, "margin": 1.2}
+SMALL = {"name": "occupancy", "codes": 4, "width": 8, "cells": 8, "margin": 1.2}
 GRIDS = {**OCCUPANCY, "model__shape": SMALL}
 
 
@@ -20,51 +20,41 @@ def prior(tmp_path) -> ScenePrior:
     return tiny_config(tmp_path, **GRIDS).build_prior()
 
 
-def test_a_fresh_grid_is_undecided_everywhere(torch_rng):
+@pytest.fixture
+def decoder(torch_rng) -> OccupancyDecoder:
+    """In a space of three random grids."""
     torch.manual_seed(0)
-    decoder = OccupancyConfig().build(1024)
-    grids = decoder(torch.randn(2, 3, 1024, generator=torch_rng))
-    assert grids.shape == (2, 3, 32, 32, 32)
-    # Hits and misses are both likely, and no two objects are the same.
-    assert grids.abs().max() < 0.5 and not torch.equal(grids[0, 0], grids[0, 1])
+    decoder = OccupancyConfig(codes=3, width=8, cells=8).build(6)
+    rng = np.random.default_rng(0)
+    decoder.set_space(rng.random((8, 8, 8)), rng.standard_normal((3, 8, 8, 8)), 2.5)
+    return decoder.double()
 
 
-def test_the_learnt_grids_are_sums_of_coarse_middle_and_fine_ones():
-    """Against SciPy's interpolation and filter, grid by grid."""
-    torch.manual_seed(0)
-    decoder = OccupancyConfig(width=8, cells=12).build(6).double()
-    basis = decoder.basis().detach()
-    for row in (0, 8):
-        wanted = FINEST * ndimage.uniform_filter(
-            decoder.fine[row].detach().numpy(), 3, mode="nearest"
-        )
-        for grid in (decoder.coarse[row], decoder.middle[row]):
-            place = [(k + 0.5) * len(grid) / 12 - 0.5 for k in range(12)]
-            places = torch.cartesian_prod(*[torch.tensor(place)] * 3).T.numpy()
-            finer = ndimage.map_coordinates(grid.detach().numpy(), places, order=1, mode="nearest")
-            wanted = wanted + finer.reshape(12, 12, 12)
-        # The matrices are made in float32: thirds are rounded to 3e-8.
-        assert_close(basis[row], torch.from_numpy(wanted), rtol=0, atol=1e-7)
-
-
-def test_logits_are_weighted_sums_of_the_learnt_grids(torch_rng):
-    torch.manual_seed(0)
-    decoder = OccupancyConfig(width=8, cells=8).build(6).double()
+def test_logits_are_of_weighted_sums_of_the_grids(decoder, torch_rng):
     features = torch.randn(2, 3, 6, generator=torch_rng, dtype=torch.float64)
-    grids, basis = decoder(features), decoder.basis()
+    logits = decoder(features)
     for room in range(2):
         for item in range(3):
-            weights = decoder.code(features[room, item])
-            wanted = basis[8] + sum(weights[k] * basis[k] for k in range(8))
-            assert_close(grids[room, item], wanted, rtol=0, atol=1e-12)
+            weights = 2.5 * decoder.mlp(features[room, item])
+            grid = decoder.mean + sum(weights[k] * decoder.basis[k] for k in range(3))
+            assert_close(logits[room, item], 8 * (grid - 0.5), rtol=0, atol=1e-12)
+    assert torch.equal(logits, decoder.grids(decoder.codes(features)))
 
 
-def test_every_weight_learns_from_every_object(torch_rng):
-    decoder = OccupancyConfig(width=8, cells=8).build(6)
-    decoder(torch.randn(1, 4, 6, generator=torch_rng)).square().sum().backward()
+def test_the_space_is_kept_in_checkpoints_and_is_no_weight(decoder):
+    fresh = OccupancyConfig(codes=3, width=8, cells=8).build(6)
+    assert not fresh.basis.any() and not fresh.mean.any()
+    fresh.double().load_state_dict(decoder.state_dict())
+    assert torch.equal(fresh.basis, decoder.basis) and fresh.spread == 2.5
+    assert not {"mean", "basis", "spread"} & {name for name, _ in fresh.named_parameters()}
+    # Half precision in the file: a cell's occupancy is known to 0.0005.
+    assert OccupancyConfig().build(6).basis.dtype == torch.float16
+
+
+def test_every_weight_learns_from_every_object(decoder, torch_rng):
+    features = torch.randn(1, 4, 6, generator=torch_rng, dtype=torch.float64)
+    decoder(features).square().sum().backward()
     assert all(parameter.grad.any() for parameter in decoder.parameters())
-    # What follows from `cells` is not kept in checkpoints.
-    assert set(decoder.state_dict()) == {name for name, _ in decoder.named_parameters()}
 
 
 def test_the_prior_decodes_grids_in_place_of_meshes(prior, torch_rng):
@@ -73,7 +63,9 @@ def test_the_prior_decodes_grids_in_place_of_meshes(prior, torch_rng):
     assert prior.faces is None and scenes.vertices_m is None
     assert scenes.occupancy.shape == (3, 6, 8, 8, 8) and scenes.margin == 1.2
     bare = prior(logits, with_shape=False)
-    assert bare.occupancy is None and torch.equal(bare.centers_m, scenes.centers_m)
+    assert scenes.shape_codes.shape == (3, 6, 4)
+    assert bare.occupancy is None and torch.equal(bare.shape_codes, scenes.shape_codes)
+    assert torch.equal(bare.centers_m, scenes.centers_m)
 
 
 def test_only_wanted_objects_have_grids_and_the_others_are_empty(prior, torch_rng):
@@ -97,7 +89,7 @@ def test_a_shape_without_a_name_is_a_mesh(tmp_path):
         ({"name": "cloud"}, "no name of 'model.shape' is 'cloud'; choose from mesh, occupancy."),
         ("occupancy", "'model.shape' is a section; write {name: ...} with one of mesh, occupancy."),
         ({"name": "occupancy", "level": 2}, "unknown key 'model.shape.level'; the nearest valid"),
-        ({"name": "occupancy", "cells": 30}, "'model.shape.cells': input should be a multiple of"),
+        ({"name": "occupancy", "cells": 4}, "'model.shape.cells': input should be greater than or"),
         ({"name": "occupancy", "margin": 0.9}, "'model.shape.margin': input should be greater"),
     ],
 )  # fmt: skip
@@ -114,5 +106,5 @@ def test_the_gan_draws_meshes_alone(tmp_path):
 
 @pytest.mark.parametrize("changes", [{"model__shape": SMALL}, {"shape": OCCUPANCY["shape"]}])
 def test_a_shape_and_what_teaches_it_go_together(tmp_path, changes):
-    with pytest.raises(ConfigError, match=r"model.shape is '\w+', which is learnt from"):
+    with pytest.raises(ConfigError, match=r"model.shape is '\w+', which is learnt with"):
         tiny_config(tmp_path, **changes)

@@ -1,0 +1,109 @@
+"""What each tracked object may fill of its box, as far as its masks tell; and the space of shapes
+that those of a data set span."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from sklearn.decomposition import PCA
+
+from sceneprior.lifting.boxes import LiftedBoxes
+from sceneprior.lifting.hulls import carve, sightings_of
+from sceneprior.shards import RoomViews
+
+REACH = 0.4
+"""As `hulls.carve` takes it: parts this thin, in cells, are kept."""
+EMPTY = 0.05
+"""A cell that more than this share of the views sees past is empty. Less than what `boxes.py`
+forgives: there, one wrong cell moves a side; here, it is one cell."""
+MOST_SHAPES = 4000
+"""A shape space is found from at most so many shapes, drawn with a fixed seed."""
+
+
+class ShapeGrid(NamedTuple):
+    """How shapes are described."""
+
+    cells: int
+    """Along each axis of a grid."""
+    margin: float
+    """A grid fills the object's box times this."""
+    codes: int
+    """Dimensions of the shape space."""
+
+
+def lift_shapes(
+    views: RoomViews,
+    boxes: LiftedBoxes,
+    shape: ShapeGrid,
+    chosen: Int[np.ndarray, " views"] | None = None,
+) -> Bool[np.ndarray, "objects x y z"]:
+    """The visual hull of each of a room's objects, on a grid in the frame of its box.
+
+    Args:
+        views: A room, read with its images.
+        boxes: What `lift_boxes` says of it.
+        shape: The grids.
+        chosen: The views to take; None takes all.
+
+    Returns:
+        True where the object may be, indexed x, y, z; nowhere for an object without a box. What
+        lies outside of the box is outside of the object.
+    """
+    rows = np.arange(len(views.visible)) if chosen is None else chosen
+    cells, margin = shape.cells, shape.margin
+    grids = np.zeros((len(views.object_class), cells, cells, cells), dtype=bool)
+    # Cells whose centres lie in the box.
+    inside = np.abs((np.arange(cells) + 0.5) / cells - 0.5) * margin < 0.5
+    for item in np.flatnonzero(boxes.explained > 0):
+        assert views.instance_ids is not None, "shapes are lifted from images"
+        seeing = rows[views.visible[rows, item]]
+        seen = sightings_of(
+            views.instance_ids[seeing], views.world_to_camera[seeing], views.intrinsics[seeing],
+            int(item) + 1,
+        )  # fmt: skip
+        half_m = margin * boxes.sizes_m[item] / 2
+        low_m, high_m = boxes.centers_m[item] - half_m, boxes.centers_m[item] + half_m
+        hull = carve(seen, low_m, high_m, cells, REACH)
+        grids[item] = (hull.emptiness <= EMPTY) & inside & inside[:, None] & inside[:, None, None]
+    return grids
+
+
+class ShapeSpace(NamedTuple):
+    """Grids as a mean plus a weighted sum of orthonormal ones: their principal components."""
+
+    mean: Float[np.ndarray, "x y z"]
+    basis: Float[np.ndarray, "codes x y z"]
+    spread: float
+    """Root mean square of the weights, over shapes and components."""
+
+    def codes_of(
+        self, grids: Bool[np.ndarray, "shapes x y z"]
+    ) -> Float[np.ndarray, "shapes codes"]:
+        """The weights that come nearest to grids. Distances between them are those between the
+        grids, summed over cells, but for what the components leave out."""
+        flat = self.basis.reshape(len(self.basis), -1)
+        parts = np.array_split(grids, max(1, len(grids) // 256))  # as floats 32 times as large
+        codes = [(part - self.mean).reshape(len(part), flat.shape[1]) @ flat.T for part in parts]
+        return np.concatenate(codes).astype(np.float32)
+
+
+def shape_space(grids: Bool[np.ndarray, "shapes x y z"], codes: int) -> ShapeSpace:
+    """The first principal components of shapes; zeros for those that fewer shapes do not have.
+
+    Source:
+        Leventon et al., "Statistical Shape Influence in Geodesic Active Contours", CVPR 2000, who
+        take components of distance fields.
+    """
+    mean = np.zeros(grids.shape[1:], np.float32)
+    basis = np.zeros((codes, *grids.shape[1:]), np.float32)
+    if len(grids) > MOST_SHAPES:
+        grids = grids[np.random.default_rng(0).choice(len(grids), MOST_SHAPES, replace=False)]
+    found = min(codes, len(grids) - 1)
+    if len(grids):
+        mean[:] = grids.mean(axis=0)
+    if found < 1:
+        return ShapeSpace(mean, basis, 1.0)
+    components = PCA(found, svd_solver="randomized", random_state=0)
+    weights = components.fit_transform(grids.reshape(len(grids), -1).astype(np.float32))
+    basis[:found] = components.components_.reshape(found, *grids.shape[1:])
+    return ShapeSpace(mean, basis, float(np.sqrt((weights**2).mean())) or 1.0)

@@ -1,0 +1,112 @@
+"""Lifted shapes: hulls in the frame of a box; the shape space against its definition."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprior.lifting.boxes import lift_boxes
+from sceneprior.lifting.hulls import carve, sightings_of
+from sceneprior.lifting.shapes import EMPTY, REACH, ShapeGrid, lift_shapes, shape_space
+from sceneprior.shards import iterate_rooms
+
+GRID = ShapeGrid(cells=10, margin=1.25, codes=4)
+
+
+@pytest.fixture(scope="module")
+def room(toy_shards):
+    return next(
+        (shard.read_room(room_id, images=True), shard.read_ground_truth(room_id))
+        for shard, room_id in iterate_rooms(toy_shards, "train")
+    )
+
+
+def test_shapes_fill_the_true_boxes_of_toy_furniture_and_nothing_beyond_the_lifted(room):
+    """Toy furniture fills its boxes, so a cell in both of them is the object's own."""
+    views, truth = room
+    boxes = lift_boxes(views)
+    grids = lift_shapes(views, boxes, GRID)
+    assert grids.shape == (len(views.object_class), 10, 10, 10)
+    steps = (np.arange(10) + 0.5) / 10 - 0.5
+    offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1) * GRID.margin
+    in_lifted = (np.abs(offsets) < 0.5).all(axis=-1)
+    known = np.flatnonzero(boxes.explained > 0)
+    assert len(known) > 2
+    for item in known:
+        grid = grids[item]
+        places = boxes.centers_m[item] + offsets * boxes.sizes_m[item]
+        reach = truth.sizes_m[item] / 2 - boxes.sizes_m[item] / 10  # a cell inside
+        in_true = (np.abs(places - truth.centers_m[item]) < reach).all(axis=-1)
+        assert not grid[~in_lifted].any()
+        assert grid[in_lifted & in_true].mean() > 0.97
+
+
+def test_a_shape_is_the_hull_where_few_views_see_past(room):
+    views, _ = room
+    boxes = lift_boxes(views)
+    grids = lift_shapes(views, boxes, GRID)
+    item = 0
+    rows = np.flatnonzero(views.visible[:, item])
+    seen = sightings_of(
+        views.instance_ids[rows], views.world_to_camera[rows], views.intrinsics[rows], item + 1
+    )
+    half = GRID.margin * boxes.sizes_m[item] / 2
+    hull = carve(seen, boxes.centers_m[item] - half, boxes.centers_m[item] + half, 10, REACH)
+    # 10 cells span 1.25 boxes: the outermost on each side lies beyond the box.
+    wanted = np.pad(hull.emptiness[1:-1, 1:-1, 1:-1] <= EMPTY, 1)
+    np.testing.assert_array_equal(grids[item], wanted)
+
+
+def test_an_object_without_a_box_has_no_shape_and_fewer_views_are_asked(room):
+    views, _ = room
+    visible = views.visible.copy()
+    visible[:, 0] = False
+    unseen = replace(views, visible=visible)
+    found = lift_boxes(unseen)
+    filled = lift_shapes(unseen, found, GRID).any(axis=(1, 2, 3))
+    np.testing.assert_array_equal(filled, found.explained > 0)
+    assert not filled[0] and filled[1:].any()
+    boxes = lift_boxes(views)
+    half = lift_shapes(views, boxes, GRID, np.arange(0, len(views.visible), 2))
+    assert (half != lift_shapes(views, boxes, GRID)).any()
+
+
+@pytest.fixture
+def grids() -> np.ndarray:
+    return np.random.default_rng(3).random((9, 4, 4, 4)) < 0.4
+
+
+def test_a_shape_space_is_the_singular_vectors_of_the_grids(grids):
+    space = shape_space(grids, 5)
+    flat = grids.reshape(9, -1) - grids.reshape(9, -1).mean(axis=0)
+    *_, rows = np.linalg.svd(flat, full_matrices=False)
+    basis = space.basis.reshape(5, -1)
+    np.testing.assert_allclose(np.abs(basis @ rows[:5].T), np.eye(5), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(space.mean, grids.mean(axis=0), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(space.codes_of(grids), flat @ basis.T, rtol=0, atol=1e-5)
+    assert space.spread == pytest.approx(np.sqrt(((flat @ basis.T) ** 2).mean()), rel=1e-4)
+
+
+def test_with_all_components_codes_give_the_grids_back_and_keep_distances(grids):
+    space = shape_space(grids, 8)
+    codes = space.codes_of(grids)
+    back = space.mean + np.tensordot(codes, space.basis, axes=1)
+    np.testing.assert_allclose(back, grids, rtol=0, atol=1e-4)
+    apart = ((codes[0] - codes[1:]) ** 2).sum(axis=1)
+    np.testing.assert_allclose(apart, (grids[0] ^ grids[1:]).sum(axis=(1, 2, 3)), atol=1e-3)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_fewer_shapes_than_components_leave_zeros(grids, count):
+    space = shape_space(grids[:count], 6)
+    assert space.basis.shape == (6, 4, 4, 4) and not space.basis[max(count - 1, 0) :].any()
+    assert np.isfinite(space.spread) and space.spread > 0
+    assert np.isfinite(space.codes_of(grids)).all()
+    assert space.codes_of(grids[:0]).shape == (0, 6)
+
+
+def test_a_space_of_many_shapes_is_found_from_some(grids, monkeypatch):
+    monkeypatch.setattr("sceneprior.lifting.shapes.MOST_SHAPES", 5)
+    space, again = shape_space(grids, 8), shape_space(grids, 8)
+    assert not space.basis[4:].any() and space.basis[:4].any(axis=(1, 2, 3)).all()
+    np.testing.assert_array_equal(space.basis, again.basis)
