@@ -1,9 +1,10 @@
-"""Chamfer distance of decoded training rooms to the true surfaces, after each stage.
+"""Chamfer distance of decoded training rooms to the true surfaces, in all and by class.
 
-Run `python benchmarks/shape_fidelity.py RUN`. The layout stage has boxes alone, which stand here as
-the ellipsoids that fill them (the paper's proxy) and as boxes; the shape stage has meshes. All of
-them are held against the same true meshes, which training never saw. Pairs are chosen by boxes
-(`match_scenes`), each object counts once, and points are drawn with a fixed seed.
+Run `python benchmarks/shape_fidelity.py RUN`. Boxes alone, as the layout stage has them (a run of
+one stage: as that has them), stand here as the ellipsoids that fill them (the paper's proxy) and
+as boxes; the shape stage has meshes. All of them are held against the same true meshes, which
+training never saw. Pairs are chosen by boxes (`match_scenes`), each object counts once, and points
+are drawn with a fixed seed. A second table has the same by class.
 """
 
 import argparse
@@ -11,6 +12,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from statistics import mean
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,23 +45,33 @@ def box(item: SceneObject) -> Mesh:
 
 def own(item: SceneObject) -> Mesh:
     """The decoded mesh."""
-    assert item.mesh is not None, "a run of stages: two ends with meshes"
+    assert item.mesh is not None, "the shape stage ends with meshes"
     return item.mesh
+
+
+class Fidelity(NamedTuple):
+    """How near one object's surface is to the true one."""
+
+    label: str
+    """The true class."""
+    chamfer_m: float
+    """L2, both ways added."""
+    f_score: float
 
 
 def distances(
     pairs: list[tuple[Scene, Scene]], shape: Callable[[SceneObject], Mesh], points: int
-) -> list[tuple[float, float]]:
-    """Chamfer distance in metres (L2, both ways added) and F-score of every matched object."""
+) -> list[Fidelity]:
+    """How near `shape` makes every matched object."""
     found = []
     for decoded, truth in pairs:
         match = match_scenes(decoded, truth)
         for mine, true in zip(match.decoded, match.truth, strict=True):
-            target = truth.objects[true].mesh
-            assert target is not None, "asked for meshes"
+            target = truth.objects[true]
+            assert target.mesh is not None, "asked for meshes"
             a = sample_surface(shape(decoded.objects[mine]), points, 0)
-            b = sample_surface(target, points, 1)
-            found.append((chamfer_sum(a, b).l2_m, f_score(a, b)))
+            b = sample_surface(target.mesh, points, 1)
+            found.append(Fidelity(target.label, chamfer_sum(a, b).l2_m, f_score(a, b)))
     return found
 
 
@@ -87,28 +99,38 @@ def main() -> None:
     options.add_argument("--renderer", default="auto")
     given = options.parse_args()
     trained = load_run(given.run)
-    boxes = trained.config.load("layout", given.run / "layout" / "final.ckpt")
-    assert isinstance(boxes, TrainedPrior), "load_run refuses runs without latents"
     shards = Path(trained.config.data.shards)
-    layout = decoded_and_true(boxes, shards, meshes=True)
-    shaped = decoded_and_true(trained, shards, meshes=True)
+    shaped = layout = decoded_and_true(trained, shards, meshes=True)
+    if "layout" in trained.config.stage_names:
+        boxes = trained.config.load("layout", given.run / "layout" / "final.ckpt")
+        assert isinstance(boxes, TrainedPrior), "load_run refuses runs without latents"
+        layout = decoded_and_true(boxes, shards, meshes=True)
     rows = {
-        "layout stage, ellipsoids": distances(layout, ellipsoid, given.points),
-        "layout stage, boxes": distances(layout, box, given.points),
-        "shape stage, ellipsoids in its boxes": distances(shaped, ellipsoid, given.points),
-        "shape stage, its meshes": distances(shaped, own, given.points),
+        "ellipsoids in the layout's boxes": distances(layout, ellipsoid, given.points),
+        "the layout's boxes": distances(layout, box, given.points),
+        "the decoded meshes": distances(shaped, own, given.points),
     }
-    base = mean(value for value, _ in rows["layout stage, ellipsoids"])
-    objects = len(rows["layout stage, boxes"])
+    base = mean(item.chamfer_m for item in rows["ellipsoids in the layout's boxes"])
+    objects = len(rows["the layout's boxes"])
     print(f"{given.run.resolve().name}: {len(layout)} training rooms, {objects} objects")
     print("| shape | Chamfer distance L2, m | against the first row | F-score at 5 cm |")
     print("| --- | ---: | ---: | ---: |")
     for name, found in rows.items():
-        middle = mean(value for value, _ in found)
-        score = mean(value for _, value in found)
+        middle = mean(item.chamfer_m for item in found)
+        score = mean(item.f_score for item in found)
         print(f"| {name} | {middle:.4f} | {middle / base - 1:+.0%} | {score:.3f} |")
+    print(f"\n| class | objects | {' | '.join(rows)} |")
+    print(f"| --- | ---: |{' ---: |' * len(rows)}")
+    by_class: dict[str, list[list[float]]] = {}
+    for column, found in enumerate(rows.values()):
+        for item in found:
+            columns = by_class.setdefault(item.label, [[] for _ in rows])
+            columns[column].append(item.chamfer_m)
+    for label, columns in sorted(by_class.items()):
+        cells = " | ".join(f"{mean(column):.3f}" if column else "-" for column in columns)
+        print(f"| {label} | {len(columns[-1])} | {cells} |")
     if given.json:
-        ours = mean(value for value, _ in rows["shape stage, its meshes"])
+        ours = mean(item.chamfer_m for item in rows["the decoded meshes"])
         found = {"chamfer_over_ellipsoid": ours / base} | figures(shaped, shards, given.renderer)
         print(found)
         given.json.write_text(json.dumps(found, indent=1) + "\n")

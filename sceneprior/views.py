@@ -115,6 +115,8 @@ class LiftedRooms(_Batch):
     """Centre x, y, z, then full extents; axis-aligned, in the room frame."""
     shape_codes: Float[Tensor, "rooms objects codes"] | None = None
     """What its lifted shape is in the shape space of the training rooms."""
+    shape_cells: Float[Tensor, "rooms objects"] | None = None
+    """How many cells that shape fills; 1 for an empty one."""
     room_ids: tuple[str, ...] = ()
 
 

@@ -74,18 +74,21 @@ class LiftedDataset(RoomDataset):
         self.space: ShapeSpace | None = None
         self._codes: Tensor | None = None
         """By room and quarter turn."""
+        self._filled: Tensor | None = None
         if shape is not None:
+            ends = np.cumsum(counts)[:-1]
             grids = _find_shapes(folder, split, key, self.boxes, chosen, shape)
             self.space, codes = _spanned(grids, self.boxes, rotations, shape.codes)
-            self._codes = torch.stack(
-                [_padded(np.split(turned, np.cumsum(counts)[:-1])) for turned in codes], dim=1
-            )
+            self._codes = torch.stack([_padded(np.split(turned, ends)) for turned in codes], dim=1)
+            filled = grids.sum(axis=(1, 2, 3)).clip(min=1).astype(np.float32)
+            self._filled = _padded(np.split(filled, ends))
 
     def to(self, device: torch.device | str) -> "LiftedDataset":
         """Move all boxes and codes to `device`, where batches are then made."""
         self._counts, self._classes = self._counts.to(device), self._classes.to(device)
         self._lifted, self._boxes_m = self._lifted.to(device), self._boxes_m.to(device)
-        self._codes = None if self._codes is None else self._codes.to(device)
+        if self._codes is not None and self._filled is not None:
+            self._codes, self._filled = self._codes.to(device), self._filled.to(device)
         return self
 
     def __getitems__(self, draws: list[tuple[int, int]]) -> LiftedRooms:
@@ -105,6 +108,7 @@ class LiftedDataset(RoomDataset):
             is_lifted=self._lifted[rooms, :widest] & is_object,
             boxes_m=turn_boxes(self._boxes_m[rooms, :widest], quarters),
             shape_codes=None if self._codes is None else self._codes[rooms, quarters, :widest],
+            shape_cells=None if self._filled is None else self._filled[rooms, :widest].clamp(min=1),
             room_ids=tuple(self.plain_ids[room] for room in rooms.tolist()),
         )
 

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from sceneprior.losses.lifted import lifted_losses, match_lifted, shape_code_loss
 from sceneprior.losses.shape import mask_loss
-from sceneprior.models.occupancy import OccupancyDecoder
 from sceneprior.models.prior import ScenePrior
 from sceneprior.training.objective import (
     batch_seed,
@@ -147,9 +146,7 @@ class LiftedStage(PaperStage):
             matches = match_lifted(scenes, rooms, self.loss.match_box)
             losses = lifted_losses(scenes, rooms, matches, self.completeness_target)
             if isinstance(self.stage, LiftedShapeConfig):
-                shape = self.prior.shape
-                assert isinstance(shape, OccupancyDecoder), "lifted shapes are grids"
-                losses["mask"] = shape_code_loss(scenes, rooms, matches, shape.cells**3)
+                losses["mask"] = shape_code_loss(scenes, rooms, matches)
             return self.total(losses, rooms)
 
 

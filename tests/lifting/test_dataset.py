@@ -75,6 +75,8 @@ def test_codes_are_those_of_the_lifted_shapes_in_the_order_of_objects(shards):
             wanted = torch.from_numpy(data.space.codes_of(grids))
             found = batch.shape_codes[(row - 1) // 2, : len(grids)]
             assert_close(found, wanted, rtol=0, atol=1e-5)
+            filled = batch.shape_cells[(row - 1) // 2, : len(grids)].tolist()
+            assert filled == grids.sum(axis=(1, 2, 3)).clip(min=1).tolist()
     assert LiftedDataset(shards, "train").__getitems__([(1, 0)]).shape_codes is None
 
 
