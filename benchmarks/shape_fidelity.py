@@ -15,20 +15,24 @@ from statistics import mean
 from typing import NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from sceneprior.config import load_run
 from sceneprior.evaluation.metrics.decoded_rooms import match_scenes, reconstruction_scores
 from sceneprior.evaluation.metrics.frechet import FRECHET
 from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
-from sceneprior.evaluation.topdown import box_mesh
+from sceneprior.evaluation.topdown import box_mesh, corner_view, perspective
 from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.geometry.surfaces import chamfer_sum
+from sceneprior.offscreen import open_renderer
+from sceneprior.pictures import contact_sheet
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.training.method import TrainedPrior
 
 SPHERE_LEVEL = 3
+SHEET_ROOMS, SHEET_COLUMNS, TILE_PX = 24, 6, (210, 280)
 
 
 def ellipsoid(item: SceneObject) -> Mesh:
@@ -90,12 +94,25 @@ def figures(
     }
 
 
+def sheet(pairs: list[tuple[Scene, Scene]], renderer: str) -> Image.Image:
+    """Training rooms drawn by a fixed seed, each as it is and, to the right of it, as decoded."""
+    rows = np.random.default_rng(0).permutation(len(pairs))[:SHEET_ROOMS]
+    opened = open_renderer(renderer)
+    tiles = []
+    for row in sorted(rows):
+        decoded, truth = pairs[row]
+        view = corner_view([truth], TILE_PX)
+        tiles += [perspective(scene, opened, view=view) for scene in (truth, decoded)]
+    return Image.fromarray(contact_sheet(tiles, SHEET_COLUMNS, gap_px=4))
+
+
 def main() -> None:
     """Print a table in Markdown."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("run", type=Path)
     options.add_argument("--points", type=int, default=2000, help="on each surface")
     options.add_argument("--json", type=Path, help="also writes four figures, see `figures`")
+    options.add_argument("--sheet", type=Path, help="also draws 24 rooms, truth beside them (PNG)")
     options.add_argument("--renderer", default="auto")
     given = options.parse_args()
     trained = load_run(given.run)
@@ -129,11 +146,13 @@ def main() -> None:
     for label, columns in sorted(by_class.items()):
         cells = " | ".join(f"{mean(column):.3f}" if column else "-" for column in columns)
         print(f"| {label} | {len(columns[-1])} | {cells} |")
+    if given.sheet:
+        sheet(shaped, given.renderer).save(given.sheet, optimize=True)
     if given.json:
         ours = mean(item.chamfer_m for item in rows["the decoded meshes"])
-        found = {"chamfer_over_ellipsoid": ours / base} | figures(shaped, shards, given.renderer)
-        print(found)
-        given.json.write_text(json.dumps(found, indent=1) + "\n")
+        scores = {"chamfer_over_ellipsoid": ours / base} | figures(shaped, shards, given.renderer)
+        print(scores)
+        given.json.write_text(json.dumps(scores, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -26,6 +26,9 @@ VERSION = 1
 SHAPES_VERSION = 1
 """Of what `lift_boxes` and `lift_shapes` find: raise it when the same views give something else."""
 
+MOST_SHAPES = 4000
+"""A shape space is found from at most so many shapes, drawn with a fixed seed."""
+
 
 class LiftedDataset(RoomDataset):
     """Tracked objects of a split with the 3D boxes that their masks imply; rows and turns are
@@ -172,10 +175,13 @@ def _spanned(
     codes: int,
 ) -> tuple[ShapeSpace, list[Float[np.ndarray, "objects codes"]]]:
     """The space of the shapes in all turns of their rooms; by turn, each object's place there."""
-    known = np.concatenate([room.explained > 0 for room in boxes])
-    turned = [turn_grids(grids, quarters) for quarters in range(rotations)]
-    space = shape_space(np.concatenate([each[known] for each in turned]), codes)
-    return space, [space.codes_of(each) for each in turned]
+    known = np.flatnonzero(np.concatenate([room.explained > 0 for room in boxes]))
+    if len(known) * rotations > MOST_SHAPES:
+        some = MOST_SHAPES // rotations
+        known = np.sort(np.random.default_rng(0).choice(known, some, replace=False))
+    turns = range(rotations)
+    space = shape_space(np.concatenate([turn_grids(grids[known], q) for q in turns]), codes)
+    return space, [space.codes_of(turn_grids(grids, q)) for q in turns]
 
 
 def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

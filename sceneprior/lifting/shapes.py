@@ -16,8 +16,6 @@ REACH = 0.4
 EMPTY = 0.05
 """A cell that more than this share of the views sees past is empty. Less than what `boxes.py`
 forgives: there, one wrong cell moves a side; here, it is one cell."""
-MOST_SHAPES = 4000
-"""A shape space is found from at most so many shapes, drawn with a fixed seed."""
 
 
 class ShapeGrid(NamedTuple):
@@ -96,8 +94,6 @@ def shape_space(grids: Bool[np.ndarray, "shapes x y z"], codes: int) -> ShapeSpa
     """
     mean = np.zeros(grids.shape[1:], np.float32)
     basis = np.zeros((codes, *grids.shape[1:]), np.float32)
-    if len(grids) > MOST_SHAPES:
-        grids = grids[np.random.default_rng(0).choice(len(grids), MOST_SHAPES, replace=False)]
     found = min(codes, len(grids) - 1)
     if len(grids):
         mean[:] = grids.mean(axis=0)

@@ -85,6 +85,14 @@ def test_a_blank_draw_is_a_room_in_which_there_is_nothing(shards):
     assert not batch.is_object.any() and not batch.is_lifted.any()
 
 
+def test_a_space_of_many_shapes_is_found_from_some(shards, monkeypatch):
+    monkeypatch.setattr(module, "MOST_SHAPES", 12)
+    space, again = (LiftedDataset(shards, "train", rotations=4, shape=GRID).space for _ in "ab")
+    # Three objects in four turns have at most eleven components.
+    assert 0 < space.basis.any(axis=(1, 2, 3)).sum() <= 11
+    np.testing.assert_array_equal(space.basis, again.basis)
+
+
 def test_shapes_are_found_once_and_again_on_other_grids(shards, monkeypatch):
     LiftedDataset(shards, "train", shape=GRID)
     calls = []
