@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 QUARTERS = 4
@@ -53,9 +53,10 @@ def turn_boxes(
 
 
 def turn_grids(
-    grids: Bool[np.ndarray, "objects x y z"], quarters: int
-) -> Bool[np.ndarray, "objects x y z"]:
-    """Grids of things that turn about +y by so many quarters. x and z have as many cells.
+    grids: Shaped[np.ndarray, "objects x y z"], quarters: int, mirrored: bool = False
+) -> Shaped[np.ndarray, "objects x y z"]:
+    """Grids of things that are perhaps mirrored, x reversed, then turn about +y by so many
+    quarters. x and z have as many cells.
 
     Example: what is in the last cell of z comes to the last of x.
 
@@ -64,4 +65,4 @@ def turn_grids(
         >>> np.argwhere(turn_grids(grids, 1)[0]).tolist()
         [[1, 0, 1]]
     """
-    return np.rot90(grids, quarters, axes=(3, 1))
+    return np.rot90(grids[:, ::-1] if mirrored else grids, quarters, axes=(3, 1))

@@ -18,7 +18,9 @@ from sceneprior.data.dataset import BLANK, RoomDataset, allowed_views
 from sceneprior.files import write_whole
 from sceneprior.geometry.turns import turn_boxes, turn_grids
 from sceneprior.lifting.boxes import LiftedBoxes, lift_boxes
+from sceneprior.lifting.rays import RayPool, draw_rays
 from sceneprior.lifting.shapes import ShapeGrid, ShapeSpace, lift_shapes, shape_space
+from sceneprior.lifting.thinning import thin_shapes
 from sceneprior.shards import RoomViews, Shard, iterate_rooms
 from sceneprior.views import LiftedRooms
 
@@ -26,6 +28,8 @@ VERSION = 1
 SHAPES_VERSION = 1
 """Of what `lift_boxes` and `lift_shapes` find: raise it when the same views give something else."""
 
+RAYS_KEPT = 1024
+"""Rays an object, from which shapes are thinned."""
 MOST_SHAPES = 4000
 """A shape space is found from at most so many shapes, drawn with a fixed seed."""
 
@@ -80,7 +84,7 @@ class LiftedDataset(RoomDataset):
         self._filled: Tensor | None = None
         if shape is not None:
             ends = np.cumsum(counts)[:-1]
-            grids = _find_shapes(folder, split, key, self.boxes, chosen, shape)
+            grids = _find_shapes(folder, split, key, rooms, self.boxes, chosen, shape)
             self.space, codes = _spanned(grids, self.boxes, rotations, shape.codes)
             self._codes = torch.stack([_padded(np.split(turned, ends)) for turned in codes], dim=1)
             filled = grids.sum(axis=(1, 2, 3)).clip(min=1).astype(np.float32)
@@ -144,23 +148,27 @@ def _find_shapes(
     folder: Path,
     split: str,
     key: str,
+    rooms: Sequence[RoomViews],
     boxes: Sequence[LiftedBoxes],
     chosen: Sequence[np.ndarray],
     shape: ShapeGrid,
 ) -> Bool[np.ndarray, "objects x y z"]:
     def find() -> dict[str, np.ndarray]:
-        progress = track(
-            list(zip(boxes, chosen, strict=True)),
-            "lifting shapes from masks (rooms)",
-            console=Console(stderr=True),
+        hulls, rays = [], []
+        progress = track(boxes, "lifting shapes from masks (rooms)", console=Console(stderr=True))
+        for its_boxes, views, (shard, room_id) in zip(
+            progress, chosen, iterate_rooms(folder, split), strict=True
+        ):
+            room = shard.read_room(room_id, images=True)
+            hulls.append(lift_shapes(room, its_boxes, shape, views))
+            rays.append(draw_rays(room, its_boxes, RAYS_KEPT, shape.margin, views))
+        thin = thin_shapes(
+            np.concatenate(hulls),
+            RayPool(*(np.concatenate(part) for part in zip(*rays, strict=True))),
+            np.concatenate([each.sizes_m for each in boxes]),
+            np.concatenate([room.object_class for room in rooms]),
         )
-        found = [
-            lift_shapes(shard.read_room(room_id, images=True), its_boxes, shape, views)
-            for (its_boxes, views), (shard, room_id) in zip(
-                progress, iterate_rooms(folder, split), strict=True
-            )
-        ]
-        return {"bits": np.packbits(np.concatenate(found).reshape(-1, shape.cells**3), axis=1)}
+        return {"bits": np.packbits(thin.reshape(-1, shape.cells**3), axis=1)}
 
     key = f"{key} {SHAPES_VERSION} {shape.cells} {shape.margin}"
     bits = _kept(folder / f"lifted_shapes_{split}.npz", key, find)["bits"]

@@ -1,0 +1,79 @@
+"""Which objects of a data set look alike: pieces repeat, and each is seen from other sides."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sceneprior.geometry.turns import quarter_rotation, turn_grids
+
+MOST = 8
+"""Lookalikes of an object."""
+FARTHEST = 0.25
+"""How far apart two objects may be; see `lookalikes`."""
+SIZE_WEIGHT = 0.3
+
+
+class Lookalike(NamedTuple):
+    """An object that looks like another once it is mirrored and turned."""
+
+    item: int
+    quarters: int
+    """Turns about +y, after mirroring."""
+    mirrored: bool
+    """Whether x is reversed first."""
+
+
+def moved_vectors(
+    vectors: Float[np.ndarray, "vectors 3"], quarters: int, mirrored: bool
+) -> Float[np.ndarray, "vectors 3"]:
+    """Mirror and turn vectors as `turn_grids` does grids."""
+    mirror = np.array([-1 if mirrored else 1, 1, 1], vectors.dtype)
+    return (mirror * vectors) @ quarter_rotation(quarters).T.astype(vectors.dtype)
+
+
+def lookalikes(
+    grids: Bool[np.ndarray, "objects x y z"],
+    sizes_m: Float[np.ndarray, "objects 3"],
+    object_class: Int[np.ndarray, " objects"],
+) -> list[list[Lookalike]]:
+    """For each object the nearest of its class, at most `MOST`, nearest first; itself mirrored or
+    turned may be among them.
+
+    Two objects are apart by the mean difference of their grids, at half the resolution, plus 0.3
+    times the sum of how much their sizes' logarithms differ; an empty grid is like no other.
+    """
+    found: list[list[Lookalike]] = [[] for _ in grids]
+    filled = grids.any(axis=(1, 2, 3))
+    ways = [(quarters, mirrored) for mirrored in (False, True) for quarters in range(4)]
+    for label in np.unique(object_class[filled]):
+        items = np.flatnonzero((object_class == label) & filled)
+        coarse = _halved(grids[items])
+        sizes = np.log(sizes_m[items])
+        moved = [turn_grids(coarse, *way).reshape(len(items), -1) for way in ways]
+        turned = [sizes if quarters % 2 == 0 else sizes[:, ::-1] for quarters, _ in ways]
+        for row, item in enumerate(items):
+            apart = np.stack(
+                [
+                    np.abs(there - moved[0][row]).mean(axis=1)
+                    + SIZE_WEIGHT * np.abs(size - sizes[row]).sum(axis=1)
+                    for there, size in zip(moved, turned, strict=True)
+                ],
+                axis=1,
+            )
+            apart[row, 0] = np.inf  # as it is
+            nearest = np.argsort(apart, axis=None, kind="stable")[:MOST]
+            found[item] = [
+                Lookalike(int(items[other]), *ways[way])
+                for other, way in zip(*np.unravel_index(nearest, apart.shape), strict=True)
+                if apart[other, way] < FARTHEST
+            ]
+    return found
+
+
+def _halved(grids: Bool[np.ndarray, "n x y z"]) -> Float[np.ndarray, "n u v w"]:
+    """Means of two cells along each axis; an odd last cell is left out."""
+    n, cells = len(grids), grids.shape[1] // 2
+    even = grids[:, : 2 * cells, : 2 * cells, : 2 * cells].astype(np.float32)
+    halved: np.ndarray = even.reshape(n, cells, 2, cells, 2, cells, 2).mean(axis=(2, 4, 6))
+    return halved

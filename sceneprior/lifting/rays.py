@@ -1,0 +1,163 @@
+"""Rays through the masks of an object: each says that it is met, or that a stretch is empty."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sceneprior.lifting.boxes import LiftedBoxes, pixel_directions
+from sceneprior.lifting.hulls import pass_through, sightings_of
+from sceneprior.shards import RoomViews
+
+NEAR_OUTLINE_PX = 4
+"""Pixels this near to a mask's outline are drawn as often as all others together."""
+FAR_M = 100.0
+"""Where rays end that nothing stops."""
+
+
+class RayPool(NamedTuple):
+    """The parts of rays in the frames of a room's objects, as many for each; a frame spans
+    [-1, 1]."""
+
+    starts: Float[np.ndarray, "objects rays 3"]
+    spans: Float[np.ndarray, "objects rays 3"]
+    """From where a ray enters the frame, to where it leaves it or is known no further; 0: none."""
+    hits: Bool[np.ndarray, "objects rays"]
+    """Whether the object is met on the way; else all is empty."""
+
+
+def draw_rays(
+    views: RoomViews,
+    boxes: LiftedBoxes,
+    count: int,
+    margin: float,
+    chosen: Int[np.ndarray, " views"] | None = None,
+    seed: int = 0,
+) -> RayPool:
+    """`count` rays an object, through pixels in and round its mask in every view that shows it.
+
+    A pixel of another object tells that the ray is empty as far as that object's box: it may stand
+    in front. Walls, floor and all that has no id are behind everything.
+
+    Args:
+        views: A room, read with its images.
+        boxes: What `lift_boxes` says of it.
+        count: Rays an object.
+        margin: An object's frame is its box times this.
+        chosen, seed: As for `lift_boxes`.
+    """
+    rng = np.random.default_rng([seed, 1])
+    rows = np.arange(len(views.visible)) if chosen is None else chosen
+    pools = [
+        _draw(views, boxes, rows[views.visible[rows, item]], item, count, margin, rng)
+        for item in range(len(views.object_class))
+    ]
+    if not pools:
+        many = np.zeros((0, count, 3), np.float32)
+        return RayPool(many, many, many[..., 0] > 0)
+    return RayPool(*(np.stack(part) for part in zip(*pools, strict=True)))
+
+
+def _draw(
+    views: RoomViews,
+    boxes: LiftedBoxes,
+    rows: Int[np.ndarray, " views"],
+    item: int,
+    count: int,
+    margin: float,
+    rng: np.random.Generator,
+) -> RayPool:
+    nowhere = np.zeros((count, 3), np.float32)
+    nothing = RayPool(nowhere, nowhere, np.zeros(count, bool))
+    if not len(rows):
+        return nothing
+    assert views.instance_ids is not None, "rays are drawn from images"
+    poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]
+    seen = sightings_of(views.instance_ids[rows], poses, intrinsics, item + 1)
+    view, u, v = _pixels_round(views, rows, item, 6 * count, rng)
+    ids = seen.ids[view, v, u].astype(np.int64)
+    directions = np.empty((len(u), 3))
+    for row, (pose, camera) in enumerate(zip(poses, intrinsics, strict=True)):
+        mine = view == row
+        directions[mine] = pixel_directions(u[mine], v[mine], pose, camera)
+    cameras_m = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+    origins_m = cameras_m[view].astype(np.float64)
+    until_m = np.full(len(u), FAR_M)
+    other = (ids != 0) & (ids != item + 1)
+    sizes_m = 1.05 * boxes.sizes_m  # boxes err, too
+    entered = entry_m(
+        origins_m[other], directions[other],
+        boxes.centers_m[ids[other] - 1], sizes_m[ids[other] - 1],
+    )  # fmt: skip
+    until_m[other] = np.where(np.isfinite(entered), entered, 0)
+    half_m = margin * boxes.sizes_m[item] / 2
+    near, far = pass_through(
+        origins_m, directions, boxes.centers_m[item] - half_m, boxes.centers_m[item] + half_m
+    )
+    far = np.minimum(far, until_m)
+    useful = np.flatnonzero(far > near)
+    if not len(useful):
+        return nothing
+    weights = np.where(_near_outline(seen.own_before, view[useful], u[useful], v[useful]), 1.0, 0)
+    share = weights.mean()
+    if 0 < share < 1:
+        weights = weights / share + (1 - weights) / (1 - share)
+    else:
+        weights = np.ones(len(useful))
+    drawn = rng.choice(useful, count, p=weights / weights.sum())
+    origin, ray = (origins_m[drawn] - boxes.centers_m[item]) / half_m, directions[drawn] / half_m
+    return RayPool(
+        (origin + near[drawn, None] * ray).astype(np.float32),
+        ((far - near)[drawn, None] * ray).astype(np.float32),
+        ids[drawn] == item + 1,
+    )
+
+
+def _pixels_round(
+    views: RoomViews,
+    rows: Int[np.ndarray, " views"],
+    item: int,
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """View, column and row of pixels in the 2D boxes, widened by a sixth and 8 pixels."""
+    height, width = views.image_size
+    size = np.array([width, height])
+    boxes_px = views.boxes[rows, item].reshape(-1, 2, 2) * size
+    wider = 8 + (boxes_px[:, 1] - boxes_px[:, 0]) / 6
+    low = (boxes_px[:, 0] - wider).clip(0)
+    high = np.minimum(boxes_px[:, 1] + wider, size)
+    view = np.repeat(np.arange(len(rows)), -(-count // len(rows)))
+    places = low[view] + rng.random((len(view), 2)) * (high - low)[view]
+    u, v = np.minimum(places.astype(np.int64), size - 1).T
+    return view, u, v
+
+
+def _near_outline(
+    own_before: Int[np.ndarray, "views bottom right"],
+    view: Int[np.ndarray, " pixels"],
+    u: Int[np.ndarray, " pixels"],
+    v: Int[np.ndarray, " pixels"],
+) -> Bool[np.ndarray, " pixels"]:
+    """Whether some but not all pixels of the square round a pixel are the object's own."""
+    _, height, width = own_before.shape
+    left, right = (u - NEAR_OUTLINE_PX).clip(0), (u + NEAR_OUTLINE_PX + 1).clip(max=width - 1)
+    top, bottom = (v - NEAR_OUTLINE_PX).clip(0), (v + NEAR_OUTLINE_PX + 1).clip(max=height - 1)
+    own = (
+        own_before[view, bottom, right] - own_before[view, top, right]
+        - own_before[view, bottom, left] + own_before[view, top, left]
+    )  # fmt: skip
+    return (own > 0) & (own < (right - left) * (bottom - top))
+
+
+def entry_m(
+    origins_m: Float[np.ndarray, "rays 3"],
+    directions: Float[np.ndarray, "rays 3"],
+    centers_m: Float[np.ndarray, "*rays 3"],
+    sizes_m: Float[np.ndarray, "*rays 3"],
+) -> Float[np.ndarray, " rays"]:
+    """Where rays enter axis-aligned boxes, 0 from inside; infinite for those that miss."""
+    near, far = pass_through(
+        origins_m, directions, centers_m - sizes_m / 2, centers_m + sizes_m / 2
+    )
+    return np.where(far > near, near, np.inf)
