@@ -68,8 +68,8 @@ def _metrics_of(network: str, title: str, column: TableColumn | None) -> tuple[M
             f"precision_{network}", f"Precision, {title}", "share of rooms", "higher",
             f"Improved precision in {title} features: the share of rooms inside the test rooms' "
             "manifold, the union of balls around its pictures that each reach to the 3rd nearest "
-            "other (in a set of 3 or fewer the farthest), border included; null where more than half "
-            "of the rooms are empty, since blank pictures lie there, too.",
+            "other (in a set of 3 or fewer the farthest), border included; null where more than "
+            "half of the rooms are empty, since blank pictures lie there, too.",
             partial(_precision, network), PICTURED, source, network,
             protocol={"precision_recall_k": NEIGHBOUR},
         ),
