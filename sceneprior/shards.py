@@ -292,8 +292,8 @@ def list_shards(folder: Path, split: str) -> list[Path]:
     paths = sorted((folder / split).glob("*.h5"))
     if not paths:
         raise ShardError(
-            f"The '{split}' split of {folder} holds no shards; check the split file given to "
-            f"{PREPARE}, and its report."
+            f"The '{split}' split of {folder} holds no shards; prepare more rooms, or check the "
+            f"split file given to {PREPARE}, and its report."
         )
     return paths
 

@@ -42,8 +42,10 @@ def reference_scenes(
 
 
 def known_in_3d(shards: Path, split: str) -> bool:
-    """Whether every room of a split has a ground truth; rooms of posed pictures have none."""
-    return all(shard.has_ground_truth(room_id) for shard, room_id in iterate_rooms(shards, split))
+    """Whether a split has rooms, each with a ground truth; rooms of posed pictures have none."""
+    return any((Path(shards) / split).glob("*.h5")) and all(
+        shard.has_ground_truth(room_id) for shard, room_id in iterate_rooms(shards, split)
+    )
 
 
 def stream_scenes(shards: Path, split: str, rows: Collection[int]) -> Iterator[Scene]:

@@ -48,7 +48,7 @@ def write_report(
     so that it can be passed on.
 
     Args:
-        shards: Input views come from `train`, real rooms from `test` if rooms are known in 3D.
+        shards: Input views come from `train`, real rooms from `test` if known in 3D.
         generated: Synthesized rooms; the first 8 are shown.
         scores: From `evaluate_synthesis`; class_accuracy, box_iou_3d, seconds and
             peak_memory_gib are shown too where they stand in it.
@@ -59,7 +59,7 @@ def write_report(
             and saw no views.
     """
     generated = list(generated)[:ROOMS_SHOWN]
-    known = known_in_3d(shards, "train")
+    known = known_in_3d(shards, "test")
     test = reference_scenes(shards, "test", limit=ROOMS_SHOWN) if known else []
     with Shard(list_shards(shards, "train")[0]) as first:
         names = first.label_set

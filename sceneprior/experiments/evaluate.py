@@ -123,9 +123,10 @@ def report_run(
     """
     trained = load_any_run(run, checkpoint)
     shards = Path(trained.config.data.shards)
-    known = known_in_3d(shards, "train")
+    # Without true test rooms eval-fid can write no scores, and the page does without.
+    needed = known_in_3d(shards, "test")
     try:
-        found = json.loads(scores.read_text()) if known or scores.exists() else {}
+        found = json.loads(scores.read_text()) if needed or scores.exists() else {}
     except (OSError, ValueError) as error:
         raise InputError(
             f"{scores} holds no scores ({error}); write them with "
@@ -134,7 +135,8 @@ def report_run(
     decoded: list[tuple[Scene, Scene]] = []
     unfolding: list[Scene] = []
     if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
-        decoded = decoded_and_true(trained, shards, meshes=True) if known else []
+        if known_in_3d(shards, "train"):
+            decoded = decoded_and_true(trained, shards, meshes=True)
         unfolding = unfold(trained)
     from_boxes = isinstance(trained, TrainedSampler)
     write_report(

@@ -152,9 +152,16 @@ def test_a_run_without_3d_truth_has_a_page_and_eval_fid_names_it(
     status, _, errors = command("report", "--run", "run", "--renderer", "software")
     assert status == 0, errors
     page = (tmp_path / "run" / "report.html").read_text()
-    assert "<h2>New rooms</h2>" in page and "No room of these shards is known in 3D" in page
+    assert "<h2>New rooms</h2>" in page and "No test room of these shards is known in 3D" in page
     assert "<h2>What training saw</h2>" in page and "Real, test split" not in page
     assert "<h2>Scores</h2>" not in page and "read back in 3D" not in page
+    # Without a test split, too; the training rooms are compared with what they were.
+    shutil.rmtree(tmp_path / "bare")
+    shutil.copytree(toy_shards, tmp_path / "bare", ignore=shutil.ignore_patterns("test"))
+    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    assert status == 0, errors
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "<h2>New rooms</h2>" in page and "read back in 3D" in page
     # Runs whose rooms are known still have to be evaluated first.
     config.write_text(config.read_text().replace(str(tmp_path / "bare"), str(toy_shards)))
     status, _, errors = command("report", "--run", "run", "--renderer", "software")
