@@ -203,5 +203,11 @@ def run_job(
         made += f", {summary.shards_open} still to make: run without --only"
     drawn = f"; {summary.renderer}" if summary.renderer else ""
     typer.echo(f"{out}: {summary} ({made}{drawn})")
+    if source.only is None and not summary.counts["test"]["rooms"]:
+        typer.echo(
+            "Note: the 'test' split is empty. `fit` and `synthesize` need none; eval-fid compares "
+            "with test rooms: prepare more rooms, or name some in a file of splits.",
+            err=True,
+        )
     if summary.statuses.get("failed"):
         raise typer.Exit(3)

@@ -257,8 +257,10 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
             if "ground_truth" not in group:
                 raise ShardError(
                     f"{self.path}, room {room_id} carries no 3D ground truth, which this "
-                    "evaluation compares with. Use shards made from a data set that has it; "
-                    "posed pictures have none."
+                    "evaluation compares with; posed pictures have none. What can be had without "
+                    "it: `sceneprior report` shows generated rooms and what cameras saw, and the "
+                    "config's `samples` section compares classes, numbers of objects and masks "
+                    "during training (docs/posed_data.md)."
                 )
             hidden = group["ground_truth"]
             return RoomGroundTruth(
@@ -290,8 +292,8 @@ def list_shards(folder: Path, split: str) -> list[Path]:
     paths = sorted((folder / split).glob("*.h5"))
     if not paths:
         raise ShardError(
-            f"The '{split}' split of {folder} holds no shards; check the split file given to "
-            f"{PREPARE}, and its report."
+            f"The '{split}' split of {folder} holds no shards; prepare more rooms, or check the "
+            f"split file given to {PREPARE}, and its report."
         )
     return paths
 

@@ -11,9 +11,6 @@ from pathlib import Path
 from data_prep.engine.source import LeftOut, Survey
 from sceneprior.errors import InputError
 
-NEEDED = ("train", "test")
-"""Splits that a whole data set must have; `val` may be empty: choose on training rooms then."""
-
 
 def house_may_match(only: str | None, house: str) -> bool:
     """Whether a house can hold what `--only` names; the beginning of its name is enough."""
@@ -77,17 +74,18 @@ def _size(share: float, rooms: int, left: int) -> int:
     return min(round(share * rooms) or 1, left - 1) if share > 0 else 0
 
 
-def select(survey: Survey, only: str | None, where: str, empty_split: str = "") -> Survey:
+def select(survey: Survey, only: str | None, where: str, splits: str = "") -> Survey:
     """The part of a survey that `--only` asks for.
 
     Args:
         survey: What was found.
         only: As given.
         where: "FOLDER passes the recipe NAME": the end of "No room of ...".
-        empty_split: What to check if a split of a whole data set is empty; "": it may be.
+        splits: What decides on the splits of a whole data set, which must have rooms to train on;
+            "": our own, which always leave one. `val` and `test` may be empty.
 
     Raises:
-        InputError: nothing is left to prepare, with the most frequent reason; or an empty split.
+        InputError: nothing is left to prepare, with the most frequent reason; or to train on.
     """
     rooms = tuple(room for room in survey.rooms if is_asked_for(only, room.room_id, room.house))
     left_out = tuple(
@@ -96,12 +94,11 @@ def select(survey: Survey, only: str | None, where: str, empty_split: str = "") 
     if not rooms:
         about = f" for --only {only}" if only else ""
         raise InputError(f"No room of {where}{about} ({_in_words(left_out)}).")
-    for split in NEEDED if empty_split and only is None else ():
-        if not any(room.split == split for room in rooms):
-            raise InputError(
-                f"The '{split}' split is empty: none of the {len(rooms)} usable rooms is in "
-                f"it. Check {empty_split}."
-            )
+    if splits and only is None and not any(room.split == "train" for room in rooms):
+        raise InputError(
+            f"The 'train' split is empty: none of the {len(rooms)} usable rooms is in it. "
+            f"Check {splits}."
+        )
     return Survey(rooms, left_out)
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 import yaml
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from data_prep.engine.source import Expected
 from sceneprior.classes import label_set
@@ -70,8 +70,10 @@ class Recipe(Section):
     max_floor_m: Finite | None = None
     """Longest side of the floor's bounding box."""
     max_height_m: Finite | None = 4.0
-    required_classes: Names = ()
-    """One of these must be there."""
+    required_classes: Annotated[
+        Names, BeforeValidator(lambda names: () if names is None else names)
+    ] = ()
+    """One of these must be there; null is as good as none."""
     scale_range: Range | None = (1e-5, 5.0)
     """A room with a piece scaled beyond this (absolute value, each axis) is left out."""
     allow_mirrored: bool = True

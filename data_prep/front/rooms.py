@@ -123,6 +123,10 @@ class _RoomReader:
         ]
         if not placed:
             raise _FilteredError("no_furniture", "no furniture stands in it")
+        meshes = [self.house.meshes.get(key_of(child.get("ref")), {}) for child in children]
+        if not any(mesh.get("type") == "Floor" for mesh in meshes):
+            # As in many an OtherRoom, which collects what stands in no room.
+            raise _FilteredError("no_floor", "no floor belongs to it")
         notes: list[str] = []
         surfaces = self._surfaces(children, notes)
         floor, floor_y = floor_of(surfaces.get("Floor", []))

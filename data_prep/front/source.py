@@ -29,7 +29,7 @@ from data_prep.front.rooms import HouseRooms, read_house
 from data_prep.front.viewpoints import view_counts
 from sceneprior.errors import InputError
 from sceneprior.files import file_stamp
-from sceneprior.furniture import model_info_path
+from sceneprior.furniture import model_categories, model_info_path
 from sceneprior.offscreen import Renderer
 
 _HOUSES_PER_TASK = 8
@@ -69,6 +69,7 @@ class FrontSource:
     def settings(self, only: str | None) -> dict[str, Any]:
         """See `Source.settings`."""
         info = model_info_path(Path(self.future))
+        model_categories(Path(self.future))  # else a wrong list would be told once a house
         if self.splits is not None:
             read_splits(self.splits)
         return {
@@ -110,8 +111,8 @@ class FrontSource:
                 why = "it is in no split"
                 left_out.append(LeftOut(room_id, house, "filtered", why, rule="split"))
         where = f"{self.front} passes the recipe {self.recipe.name}"
-        hint = str(self.splits or "that the data set has more than one usable room")
-        return select(Survey(tuple(tasks), tuple(left_out)), self.only, where, hint)
+        survey = Survey(tuple(tasks), tuple(left_out))
+        return select(survey, self.only, where, str(self.splits or ""))
 
     def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
         """Read one room with its meshes and draw its views."""
@@ -160,9 +161,10 @@ class FrontSource:
     def _houses(self, only: str | None) -> list[Path]:
         chosen = [path for path in house_files(self.front) if house_may_match(only, path.stem)]
         if not chosen:
-            house = (only or "").partition("/")[0]
+            house, slash, _ = (only or "").partition("/")
+            room = "" if slash else f" A room is named with its house: --only HOUSE/{house}."
             raise InputError(
-                f"{self.front} has no house '{house}' (--only takes HOUSE, HOUSE/ROOM or ID)."
+                f"{self.front} has no house '{house}' (--only takes HOUSE, HOUSE/ROOM or ID).{room}"
             )
         return chosen
 

@@ -1,7 +1,7 @@
 """How well the ground truth in 3D, projected, agrees with the masks in 2D."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,8 +52,14 @@ class Agreement:
     the object: its mesh, or, where the data set has none, its 3D box."""
 
     mesh: list[float] = field(default_factory=list)
-    """IoU of each unoccluded object in each view."""
+    """IoU of each unoccluded object in each view; 0 where part of it lies behind the camera."""
     box: list[float] = field(default_factory=list)
+
+    @property
+    def means(self) -> dict[str, float]:
+        """`mesh` and `box`, each where it was measured."""
+        kinds = {"mesh": self.mesh, "box": self.box}
+        return {kind: float(np.mean(values)) for kind, values in kinds.items() if values}
 
     def __add__(self, other: "Agreement") -> "Agreement":
         return Agreement(self.mesh + other.mesh, self.box + other.box)
@@ -97,9 +103,41 @@ def measure(
             continue
         chosen = np.flatnonzero(seen[:, k])
         boxes = boxes_around(points, views.world_to_camera[chosen], views.intrinsics[chosen])
-        overlap = box_iou_2d(boxes, views.boxes[chosen, k] * scale)
-        (agreement.mesh if model_id else agreement.box).extend(overlap[~np.isnan(overlap)].tolist())
+        # All of the object is seen, so an overlap that is undefined (behind the camera) is a miss.
+        overlap = np.nan_to_num(box_iou_2d(boxes, views.boxes[chosen, k] * scale))
+        (agreement.mesh if model_id else agreement.box).extend(overlap.tolist())
     return agreement, problems
+
+
+def _inverse(poses: np.ndarray) -> np.ndarray:
+    """Of rigid transforms, (T, 4, 4)."""
+    inverse = poses.copy()
+    inverse[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
+    inverse[:, :3, 3:] = -inverse[:, :3, :3] @ poses[:, :3, 3:]
+    return inverse
+
+
+_OPENGL_AXES = np.diag(np.array([1, -1, -1, 1], dtype=np.float32))
+CAMERA_REPAIRS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "world_to_camera seems to hold camera-to-world matrices; inverted": _inverse,
+    "the cameras seem to have OpenGL axes (y up, z backward) instead of OpenCV's; with y and z "
+    "flipped": lambda poses: _OPENGL_AXES @ poses,
+    "world_to_camera seems to hold camera-to-world matrices with OpenGL axes; inverted, and with "
+    "y and z flipped": lambda poses: _OPENGL_AXES @ _inverse(poses),
+}
+"""What is often wrong with given poses, as a sentence up to the overlap -> the right poses."""
+
+
+def measure_repaired(
+    views: RoomViews, truth: RoomGroundTruth, models: ModelPoints
+) -> dict[str, Agreement]:
+    """The agreement that each of `CAMERA_REPAIRS` would give."""
+    return {
+        cause: measure(
+            replace(views, world_to_camera=repair(views.world_to_camera)), truth, models
+        )[0]
+        for cause, repair in CAMERA_REPAIRS.items()
+    }
 
 
 def placed(points: np.ndarray, model_to_room: np.ndarray) -> np.ndarray:

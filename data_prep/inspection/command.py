@@ -136,8 +136,8 @@ def _check_tables(found: "FolderCheck") -> "list[Table]":
             str(sum(len(check.agreement.mesh) + len(check.agreement.box) for check in rooms)),
             _mean_iou(rooms),
         )
-    every = [check for checks in found.rooms.values() for check in checks if check.mean_iou]
-    worst = sorted(every, key=lambda check: (min(check.mean_iou.values()), check.room_id))
+    every = [check for checks in found.rooms.values() for check in checks if check.agreement.means]
+    worst = sorted(every, key=lambda check: (min(check.agreement.means.values()), check.room_id))
     # Folded, or a narrow terminal would cut off the end of an id, which is the room's name.
     table = Table(Column("worst rooms", overflow="fold"), "unoccluded objects", "mean 2D IoU")
     for check in worst[:_WORST_SHOWN]:

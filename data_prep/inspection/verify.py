@@ -1,15 +1,19 @@
 """Checks a folder of shards: checksums, shapes, ranges, boxes, masks, ground truth in 3D."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from data_prep.engine.source import SPLITS
 from data_prep.engine.workers import pool
-from data_prep.inspection.agreement import Agreement, ModelPoints, measure
+from data_prep.inspection.agreement import (
+    CAMERA_REPAIRS,
+    Agreement,
+    ModelPoints,
+    measure,
+    measure_repaired,
+)
 from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError, ShardError
@@ -22,11 +26,10 @@ from sceneprior.shards import (
     room_checksum,
 )
 
-MESH_IOU_AT_LEAST = 0.85
-"""Mean over a folder. A mesh and its own mask agree to the pixel but for parts thinner than one."""
-BOX_IOU_AT_LEAST = 0.5
-"""The same where only 3D boxes are known: the corners of a box reach beyond the silhouette of what
-is in it, and annotated boxes are those of a partial scan. A wrong axis gives 0.1 or less."""
+IOU_AT_LEAST = {"mesh": 0.85, "box": 0.5}
+"""For the mean over a folder. A mesh and its own mask agree to the pixel but for parts thinner than
+one. The corners of a 3D box reach beyond the silhouette of what is in it, and annotated boxes are
+those of a partial scan. A wrong axis gives 0.1 or less."""
 ROOM_IOU_AT_LEAST = {"mesh": 0.6, "box": 0.2}
 """For the mean of one room, so that one wrong room does not hide among many right ones."""
 _ROOM_OBJECTS = 5
@@ -44,14 +47,10 @@ class RoomCheck:
     problems: tuple[str, ...] = ()
     """Sentences without the room's name."""
     agreement: Agreement = field(default_factory=Agreement)
+    repaired: dict[str, Agreement] = field(default_factory=dict)
+    """By likely cause, the agreement without it; measured only where the room's own is low."""
     has_truth: bool = False
     has_checksum: bool = False
-
-    @property
-    def mean_iou(self) -> dict[str, float]:
-        """`mesh` and `box`, each where it was measured."""
-        kinds = {"mesh": self.agreement.mesh, "box": self.agreement.box}
-        return {kind: float(np.mean(values)) for kind, values in kinds.items() if values}
 
 
 @dataclass(frozen=True)
@@ -110,17 +109,24 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
         if all(room.views for room in every):  # else it is said already why something is missing
             problems += _count_problems(folder, index, rooms)
         agreement = sum((room.agreement for room in every), Agreement())
-        for kind, values, least in (
-            ("meshes", agreement.mesh, MESH_IOU_AT_LEAST),
-            ("3D boxes", agreement.box, BOX_IOU_AT_LEAST),
-        ):
-            if values and np.mean(values) < least:
+        for kind, what in (("mesh", "meshes"), ("box", "3D boxes")):
+            mean, least = agreement.means.get(kind, 1.0), IOU_AT_LEAST[kind]
+            if mean < least:
                 problems.append(
-                    f"{folder}: the projected {kind} of the ground truth agree with the masks with "
-                    f"a mean 2D IoU of {np.mean(values):.2f}, expected at least {least}: is an "
-                    "axis or a unit wrong?"
+                    f"{folder}: the projected {what} of the ground truth agree with the masks with "
+                    f"a mean 2D IoU of {mean:.2f}, expected at least {least}: "
+                    + _likely_cause(every, kind, least)
                 )
     return FolderCheck(rooms, tuple(problems))
+
+
+def _likely_cause(rooms: Sequence[RoomCheck], kind: str, least: float) -> str:
+    """The end of a sentence: the cause without which the overlap would be at least `least`."""
+    for cause in CAMERA_REPAIRS:
+        repaired = sum((room.repaired.get(cause, room.agreement) for room in rooms), Agreement())
+        if (mean := repaired.means[kind]) >= least:
+            return f"{cause}, the mean would be {mean:.2f}"
+    return "is an axis or a unit wrong?"
 
 
 def _count_problems(
@@ -184,14 +190,18 @@ def _check_room(shard: Shard, name: str, room_id: str, models: ModelPoints) -> R
             agreement, found = measure(views, truth, models)
         problems += found
     check = RoomCheck(
-        name, room_id, len(views.visible), len(views.object_class), tuple(problems), agreement,
-        truth is not None, stored is not None,
+        name, room_id, len(views.visible), len(views.object_class), agreement=agreement,
+        has_truth=truth is not None, has_checksum=stored is not None,
     )  # fmt: skip
-    for kind, mean in check.mean_iou.items():
-        count = len(getattr(agreement, kind))
-        if count >= _ROOM_OBJECTS and mean < ROOM_IOU_AT_LEAST[kind]:
+    if truth is not None and any(
+        mean < IOU_AT_LEAST[kind] for kind, mean in agreement.means.items()
+    ):
+        check = replace(check, repaired=measure_repaired(views, truth, models))
+    for kind, mean in agreement.means.items():
+        count, least = len(getattr(agreement, kind)), ROOM_IOU_AT_LEAST[kind]
+        if count >= _ROOM_OBJECTS and mean < least:
             problems.append(
                 f"its ground truth projects onto its masks with a mean 2D IoU of {mean:.2f} only "
-                f"({count} unoccluded objects): is an axis or a unit wrong?"
+                f"({count} unoccluded objects): {_likely_cause([check], kind, least)}"
             )
     return replace(check, problems=tuple(problems))

@@ -10,7 +10,7 @@ from data_prep.engine.selection import house_may_match, seeded_split, select
 from data_prep.engine.source import Expected, LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
 from data_prep.engine.workers import Run
 from data_prep.posed.labels import TABLES
-from data_prep.posed.transforms import FILE_NAME, INSTANCES, read_transforms, room_name
+from data_prep.posed.transforms import FILE_NAME, INSTANCES, read_transforms, room_name, split_files
 from data_prep.posed.views import (
     PosedSettings,
     prepare_posed,
@@ -139,8 +139,8 @@ class PosedSource:
 
 
 def find_rooms(folder: Path) -> list[Path]:
-    """The folder itself if it holds a transforms.json, else its sub-folders that hold one, or
-    that hold `instances/` without, for the report to name them; sorted.
+    """The folder itself if it holds a transforms.json, else its sub-folders that hold one; sorted.
+    Those with split files or `instances/` alone are among them, for the report to name them.
 
     Raises:
         InputError: there is no room.
@@ -148,12 +148,12 @@ def find_rooms(folder: Path) -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"No folder at {folder}; prep-posed reads a folder of rooms.")
-    if (folder / FILE_NAME).is_file():
+    if (folder / FILE_NAME).is_file() or split_files(folder):
         return [folder]
     found = [
         path
         for path in sorted(folder.iterdir())
-        if (path / FILE_NAME).is_file() or (path / INSTANCES).is_dir()
+        if (path / FILE_NAME).is_file() or (path / INSTANCES).is_dir() or split_files(path)
     ]
     if not found:
         raise InputError(f"{folder} holds no {FILE_NAME}, and none of its sub-folders does.")

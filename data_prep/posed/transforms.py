@@ -116,6 +116,10 @@ def read_transforms(folder: Path) -> Recording:
             lens is not a pinhole's; the message names the file, the frame and the key.
     """
     path = Path(folder) / FILE_NAME
+    if not path.is_file() and (parts := split_files(folder)):
+        raise InputError(
+            f"{path} is missing: join the `frames` of {', '.join(parts)} in one file of that name."
+        )
     data = read_json(path)
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
         raise InputError(f"{path} has no list `frames` with a frame in it.")
@@ -130,6 +134,11 @@ def read_transforms(folder: Path) -> Recording:
             )
     room = _checked(_FileEntry, data, str(path))
     return Recording(path, frames, room.floor_m, room.floor_center_m, room.metres_per_unit)
+
+
+def split_files(folder: Path) -> list[str]:
+    """Names such as transforms_train.json, in which some tools keep the frames of each split."""
+    return sorted(path.name for path in Path(folder).glob("transforms_*.json"))
 
 
 def room_name(folder: Path) -> str:

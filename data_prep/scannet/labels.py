@@ -55,6 +55,11 @@ def read_labels(path: Path) -> Labels:
             "--labels names ScanNet's scannetv2-labels.combined.tsv."
         ) from None
     columns = [name.strip().lower() for name in rows[0]] if rows else []
+    if "raw_category" not in columns and {"category", "nyu40class"} <= set(columns):
+        raise InputError(
+            f"{path} is the label table of ScanNet's first release; give the second one's, "
+            "scannetv2-labels.combined.tsv, with --labels: it works for scans of either."
+        )
     if "raw_category" not in columns or "nyu40class" not in columns:
         raise InputError(
             f"{path} has no columns raw_category and nyu40class (it begins with "

@@ -120,6 +120,11 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
     properties = read_properties(properties_path)
     aligned = _Y_UP @ axis_alignment(properties_path, properties)
     groups, notes = read_groups(folder / f"{name}.aggregation.json")
+    if "axisAlignment" not in properties:
+        notes.append(
+            f"{properties_path.name} has no axisAlignment: walls may stand at an angle to the axes "
+            "and boxes be larger than what is in them; ScanNet v2's file has one"
+        )
     segments_path = folder / f"{name}_vh_clean_2.0.010000.segs.json"
     mesh_path = folder / f"{name}_vh_clean_2.ply"
     segments, vertices = read_segments(segments_path), read_vertices(mesh_path)

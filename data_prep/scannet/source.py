@@ -85,7 +85,7 @@ class ScanNetSource:
             half = seeded_split(list(dict.fromkeys(map(space_of, names))), self.seed)
             split_of = {name: half[space_of(name)] for name in names}
         tasks = tuple(RoomTask(name, name, split) for name, split in split_of.items())
-        hint = "the lists" if self.train or self.val else "that there is more than one space"
+        hint = "the lists" if self.train or self.val else ""
         where = f"{self.scans} is to be prepared"
         return select(Survey(tasks, tuple(left_out)), self.only, where, hint)
 

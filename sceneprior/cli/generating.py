@@ -26,6 +26,7 @@ def synthesize(
 ) -> None:
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents where the method has them."""
     from sceneprior.config import load_any_run
+    from sceneprior.evaluation.metrics.contents import emptiness
     from sceneprior.generation.decode import decode_latents
     from sceneprior.generation.decode import synthesize as generate
     from sceneprior.generation.export import check_free, write_scenes
@@ -38,10 +39,13 @@ def synthesize(
     artist = open_renderer(renderer)
     if isinstance(trained, TrainedPrior):
         z, names = draw_latents(trained, count, seed, distribution)
-        write_scenes(decode_latents(trained, z, names), out, artist, overwrite, z)
+        scenes = decode_latents(trained, z, names)
     else:
-        write_scenes(generate(trained, count, seed, distribution), out, artist, overwrite)
+        z, scenes = None, generate(trained, count, seed, distribution)
+    write_scenes(scenes, out, artist, overwrite, z)
     typer.echo(f"Wrote {count} rooms to {out}")
+    if (warning := emptiness(scenes)) is not None:
+        typer.echo(f"Warning: {warning}", err=True)
 
 
 _END_HELP = "a training room's id, seed:7, or a file of latents: scenes/latents.npz:seed0_0003."

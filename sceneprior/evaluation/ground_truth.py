@@ -41,6 +41,13 @@ def reference_scenes(
     ]
 
 
+def known_in_3d(shards: Path, split: str) -> bool:
+    """Whether a split has rooms, each with a ground truth; rooms of posed pictures have none."""
+    return any((Path(shards) / split).glob("*.h5")) and all(
+        shard.has_ground_truth(room_id) for shard, room_id in iterate_rooms(shards, split)
+    )
+
+
 def stream_scenes(shards: Path, split: str, rows: Collection[int]) -> Iterator[Scene]:
     """Some rooms of `reference_scenes`, by their places there, with meshes and one at a time."""
     for row, room in enumerate(iterate_rooms(shards, split)):

@@ -11,13 +11,14 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from sceneprior import __version__
-from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.evaluation.ground_truth import known_in_3d, reference_scenes
 from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
 from sceneprior.evaluation.report_pictures import curves_svg, input_views, legend, room_pictures
 from sceneprior.evaluation.score_table import headings, score_rows
 from sceneprior.files import write_whole
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Scene
+from sceneprior.shards import Shard, list_shards
 
 ROOMS_SHOWN = 8
 DECODED_SHOWN = 5
@@ -47,7 +48,7 @@ def write_report(
     so that it can be passed on.
 
     Args:
-        shards: Input views come from `train`, real rooms from `test`.
+        shards: Input views come from `train`, real rooms from `test` if known in 3D.
         generated: Synthesized rooms; the first 8 are shown.
         scores: From `evaluate_synthesis`; class_accuracy, box_iou_3d, seconds and
             peak_memory_gib are shown too where they stand in it.
@@ -58,7 +59,10 @@ def write_report(
             and saw no views.
     """
     generated = list(generated)[:ROOMS_SHOWN]
-    test = reference_scenes(shards, "test", limit=ROOMS_SHOWN)
+    known = known_in_3d(shards, "test")
+    test = reference_scenes(shards, "test", limit=ROOMS_SHOWN) if known else []
+    with Shard(list_shards(shards, "train")[0]) as first:
+        names = first.label_set
     along = _spread(unfolding, UNFOLDING_SHOWN)
     pairs = list(decoded)[:DECODED_SHOWN]
     shown = [*generated, *test, *along, *(scene for pair in pairs for scene in pair)]
@@ -72,7 +76,7 @@ def write_report(
         version=__version__,
         run=Path(run).resolve().name,
         shards=Path(shards).resolve().name,
-        label_set=test[0].label_set.replace("_", " "),
+        label_set=names.replace("_", " "),
         tiles=_tiles(scores),
         views=[] if from_boxes else input_views(shards, rooms=3, views_per_room=2),
         from_boxes=from_boxes,

@@ -12,7 +12,7 @@ from sceneprior.evaluation.alexnet import check_alexnet
 from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES, Estimate
 from sceneprior.evaluation.features import Drawing
 from sceneprior.evaluation.metric import PICTURED, Comparison, RoomSet
-from sceneprior.evaluation.metrics.contents import common_label_set
+from sceneprior.evaluation.metrics.contents import common_label_set, emptiness
 from sceneprior.evaluation.metrics.novelty import near_copy_threshold
 from sceneprior.evaluation.metrics.overlaps import plausible_pairs
 from sceneprior.evaluation.networks import check_inception
@@ -141,7 +141,8 @@ def evaluate_synthesis(
         "left_out": _left_out(columns["generated"], options),
         "packages": _package_versions(),
     }
-    return _result(columns) | {"protocol": protocol}
+    note = " ".join(filter(None, (emptiness(rooms.groups["generated"]), NOTE)))
+    return _result(columns) | {"note": note, "protocol": protocol}
 
 
 def _evaluate(
@@ -184,7 +185,6 @@ def _result(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
-        "note": NOTE,
         **values.pop("generated"),
         **{f"{key}_test": value for key, value in values.pop("test").items()},
         **values,

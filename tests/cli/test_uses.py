@@ -3,10 +3,12 @@
 import json
 
 import pytest
+import torch
 from cli_helpers import everything_in, one_sentence
 from model_folder import corner_sofa, write_models
 
 from sceneprior.config import load_run
+from sceneprior.generation import decode
 
 SOFT = ("--renderer", "software")
 
@@ -16,6 +18,21 @@ def rooms(command, toy_run, tmp_path):
     """Three generated rooms in `rooms/`."""
     assert command("synthesize", "--run", toy_run, "-n", 3, "--out", "rooms", *SOFT)[0] == 0
     return tmp_path / "rooms"
+
+
+def test_empty_rooms_are_written_with_a_warning(command, toy_run, monkeypatch):
+    call = ["synthesize", "--run", toy_run, "-n", 3, *SOFT]
+    status, _, errors = command(*call, "--out", "full")
+    assert status == 0 and "empty" not in errors
+    monkeypatch.setattr(
+        decode, "kept_objects", lambda logits, target: torch.zeros_like(logits, dtype=torch.bool)
+    )
+    status, out, errors = command(*call, "--out", "none")
+    assert (status, out) == (0, "Wrote 3 rooms to none\n")
+    assert errors.strip().splitlines()[-1] == (
+        "Warning: 3 of 3 generated rooms are empty, so no other number of theirs can be trusted: "
+        "train longer, and see that `samples/empty_share` falls (docs/cluster.md)."
+    )
 
 
 def test_interpolate(command, toy_run, rooms, tmp_path):

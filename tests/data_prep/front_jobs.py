@@ -1,16 +1,18 @@
 """Small jobs on small data sets, and what lies on disk after them."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import h5py
 from front_files import FrontFolder, bedroom
 
 from data_prep.engine.build import Job
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
-from sceneprior.shards import Shard
+from sceneprior.shards import Shard, room_checksum
 
 SMALL = ("views.image_size=[90, 120]", "views.per_m2=0.5", "views.min_object_pixels=20")
 
@@ -50,3 +52,20 @@ def rooms_of(folder: Path) -> dict[str, Any]:
                     truth = shard.read_ground_truth(room_id)
                     found[room_id] = (shard.read_room(room_id, images=True), truth)
     return found
+
+
+def change_room(
+    path: Path, change: Callable[[Any], None], number: int = 0, seal: bool = True
+) -> str:
+    """Change one room of a shard, and its checksum with it; its id."""
+    with h5py.File(path, "a") as file:
+        group = list(file["rooms"].values())[number]
+        change(group)
+        room_id = str(group.attrs["room_id"])
+    if seal:
+        with Shard(path) as shard:
+            views = shard.read_room(room_id, images=True)
+            checksum = room_checksum(views, shard.read_ground_truth(room_id))
+        with h5py.File(path, "a") as file:
+            list(file["rooms"].values())[number].attrs["sha256"] = checksum
+    return room_id

@@ -67,6 +67,35 @@ def test_failed_rooms_give_status_3_and_filtered_ones_do_not(front, tmp_path, pr
     assert '"broken"' in (tmp_path / "shards" / "report.json").read_text()
 
 
+def test_furniture_without_a_floor_is_no_failure(front, tmp_path, prep):
+    bare = bedroom("OtherRoom-1", kind="OtherRoom")
+    bare["children"] = bare["children"][1:]
+    front.house("house", bare, bedroom("Bedroom-1"), bedroom("Bedroom-2"))
+    made = prep("--room-type", "all")
+    assert made.exit_code == 0, made.output
+    assert "filtered by no_floor" in made.stdout
+
+
+def test_one_room_is_enough_to_train_on(front, tmp_path, prep):
+    front.house("house", bedroom("Bedroom-1"))
+    made = prep()
+    assert made.exit_code == 0 and "train 1 rooms" in made.stdout, made.output
+    assert "Note: the 'test' split is empty. `fit` and `synthesize` need none; eval-fid" in (
+        made.stderr
+    )
+    front.house("other", bedroom("Bedroom-2"))
+    assert "split is empty" not in prep("--out", tmp_path / "two").stderr
+
+
+def test_a_wrong_list_of_models_is_told_once(front, tmp_path, prep):
+    three_houses(front)
+    (front.future / "model_info.json").write_text('{"a": 1}')
+    said = str(prep().exception)
+    assert said.count("is not 3D-FUTURE's list of models") == 1
+    assert said.startswith(str(front.future)) and "left out" not in said
+    assert not (tmp_path / "shards").exists()
+
+
 def test_only_in_a_whole_folder_says_what_is_still_to_make(front, tmp_path, prep):
     front.house("house", *(bedroom(f"Bedroom-{k}") for k in range(12)))
     assert prep().exit_code == 0

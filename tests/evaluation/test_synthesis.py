@@ -363,3 +363,21 @@ def test_val_rooms_are_compared_with_where_settings_are_chosen(
         evaluate_synthesis(generated, other, EvalOptions(split="val", reference=kept, **given))
     with pytest.raises(InputError, match="or with val to choose settings by, but 'train' came"):
         EvalOptions(split="train")
+
+
+@pytest.mark.usefixtures("no_classifier")
+def test_mostly_empty_rooms_are_told_and_have_no_precision(generated, shards, renderer):
+    half = [*generated[:2], *(replace(scene, objects=()) for scene in generated[:2])]
+    options = EvalOptions(renderer=renderer, resamples=0)
+    scores = evaluate_synthesis(half, shards, options)
+    assert scores["precision_effnet_lite0"] is not None and "are empty" not in scores["note"]
+    scores = evaluate_synthesis(half[1:], shards, options)
+    assert scores["note"].startswith(
+        "2 of 3 generated rooms are empty, so no other number of theirs can be trusted: train "
+        "longer, and see that `samples/empty_share` falls (docs/cluster.md). Measured on"
+    )
+    assert scores["precision_effnet_lite0"] is None
+    assert scores["train_rooms"]["precision_effnet_lite0"] is not None
+    console = Console(record=True, width=150)
+    print_scores(scores, console)
+    assert "2 of 3 generated rooms are empty" in console.export_text()

@@ -1,9 +1,11 @@
 """eval-fid from the command line: a run, the user's scenes, kept references, refusals."""
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 
@@ -131,3 +133,36 @@ def test_boxes_are_converted_and_then_evaluated(command, toy_shards, tmp_path):
     assert status == 0, errors
     scores = json.loads((tmp_path / "ours" / "scores.json").read_text())
     assert scores["mean_objects"] == 2 and scores["out_of_bounds_share"] is None
+
+
+def test_a_run_without_3d_truth_has_a_page_and_eval_fid_names_it(
+    command, toy_shards, toy_run, tmp_path
+):
+    shutil.copytree(toy_shards, tmp_path / "bare")
+    for path in (tmp_path / "bare").glob("*/*.h5"):
+        with h5py.File(path, "a") as file:
+            for group in file["rooms"].values():
+                del group["ground_truth"]
+    shutil.copytree(toy_run, tmp_path / "run")
+    config = tmp_path / "run" / "config.yaml"
+    config.write_text(config.read_text().replace(str(toy_shards), str(tmp_path / "bare")))
+    status, _, errors = command("eval-fid", "--run", "run", "-n", 3, "--renderer", "software")
+    assert status == 2 and errors.count("\n") == 1, errors
+    assert "carries no 3D ground truth" in errors and "`sceneprior report` shows" in errors
+    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    assert status == 0, errors
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "<h2>New rooms</h2>" in page and "No test room of these shards is known in 3D" in page
+    assert "<h2>What training saw</h2>" in page and "Real, test split" not in page
+    assert "<h2>Scores</h2>" not in page and "read back in 3D" not in page
+    # Without a test split, too; the training rooms are compared with what they were.
+    shutil.rmtree(tmp_path / "bare")
+    shutil.copytree(toy_shards, tmp_path / "bare", ignore=shutil.ignore_patterns("test"))
+    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    assert status == 0, errors
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "<h2>New rooms</h2>" in page and "read back in 3D" in page
+    # Runs whose rooms are known still have to be evaluated first.
+    config.write_text(config.read_text().replace(str(tmp_path / "bare"), str(toy_shards)))
+    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    assert status == 2 and "scores.json holds no scores" in errors

@@ -91,6 +91,21 @@ def _count(scene: Scene) -> int:
     return int((scene.class_indices != VOID).sum())
 
 
+def emptiness(scenes: Sequence[Scene]) -> str | None:
+    """A sentence for generated rooms more than half of which are empty; None for others.
+
+    What is measured of such rooms misleads: nothing intersects in them, and the ball round a real
+    room's picture easily holds a blank one.
+    """
+    empty = int((object_counts(scenes) == 0).sum())
+    if 2 * empty <= len(scenes):
+        return None
+    return (
+        f"{empty} of {len(scenes)} generated rooms are empty, so no other number of theirs can be "
+        "trusted: train longer, and see that `samples/empty_share` falls (docs/cluster.md)."
+    )
+
+
 def type_share(scenes: Sequence[Scene]) -> float | None:
     """Share of the scenes that hold what their room type stands for (`TYPE_CLASSES`).
 

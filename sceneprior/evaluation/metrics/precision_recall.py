@@ -15,6 +15,7 @@ from sceneprior.evaluation.metric import (
     RoomSet,
     TableColumn,
 )
+from sceneprior.evaluation.metrics.contents import emptiness
 from sceneprior.evaluation.metrics.frechet import check_features
 
 NEIGHBOUR = 3
@@ -43,6 +44,8 @@ def in_manifold(
 
 
 def _precision(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
+    if emptiness(rooms.scenes) is not None:
+        return Estimate(None, np.zeros(0))
     inside = in_manifold(rooms.features(network), comparison.test.features(network))
     return mean_of_rooms(inside, rooms.counts, 1.0)
 
@@ -65,7 +68,8 @@ def _metrics_of(network: str, title: str, column: TableColumn | None) -> tuple[M
             f"precision_{network}", f"Precision, {title}", "share of rooms", "higher",
             f"Improved precision in {title} features: the share of rooms inside the test rooms' "
             "manifold, the union of balls around its pictures that each reach to the 3rd nearest "
-            "other (in a set of 3 or fewer the farthest), border included.",
+            "other (in a set of 3 or fewer the farthest), border included; null where more than "
+            "half of the rooms are empty, since blank pictures lie there, too.",
             partial(_precision, network), PICTURED, source, network,
             protocol={"precision_recall_k": NEIGHBOUR},
         ),

@@ -74,7 +74,9 @@ def test_splits(front, tmp_path):
     path.write_text(path.read_text().replace("val", "train"))
     assert split_sizes("b") == [2, 0, 2]  # nobody needs val rooms
     path.write_text("Bedroom-0,train\n")
-    with pytest.raises(InputError, match="The 'test' split is empty: none of the 1 usable rooms"):
+    assert split_sizes("c") == [1, 0, 0]  # enough to train on
+    path.write_text("Bedroom-0,test\n")
+    with pytest.raises(InputError, match="The 'train' split is empty: none of the 1 usable rooms"):
         split_sizes("e")
     assert not (tmp_path / "e").exists()  # nothing half-written
     path.write_text("nothing\n")

@@ -67,11 +67,13 @@ def test_duplicate_uids_and_duplicate_placements(front):
     assert room_.notes == ("bed stands twice at the same place; one is kept",)
 
 
-def test_a_room_without_floor_fails_by_name(front):
-    bad = bedroom("Bad")
-    bad["children"] = bad["children"][1:]
-    result = read(front, front.house("house", bad, bedroom("Good")))
+def test_a_room_without_floor_is_left_out_and_with_a_damaged_one_fails(front):
+    bare, bad = bedroom("OtherRoom-1"), bedroom("Bad")
+    bare["children"] = bare["children"][1:]
+    bad["_meshes"][0]["xyz"] = [0.0] * 12
+    result = read(front, front.house("house", bare, bad, bedroom("Good")))
     assert [room_.room_id for room_ in result.rooms] == ["house_Good"]
+    assert result.filtered == [("house_OtherRoom-1", "no_floor", "no floor belongs to it")]
     assert result.failures == [("house_Bad", "it has no floor")]
 
 

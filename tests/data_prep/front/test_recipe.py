@@ -24,6 +24,12 @@ def test_recipes_load_and_say_what_is_wrong():
         load_recipe("front3d_bedroom", ("max_floor_m",))
 
 
+def test_required_classes_are_switched_off_by_null_as_by_an_empty_list():
+    for value in ("null", "[]"):
+        recipe = load_recipe("front3d_bedroom", (f"required_classes={value}",))
+        assert recipe.required_classes == ()
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

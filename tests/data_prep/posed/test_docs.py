@@ -40,11 +40,15 @@ def test_the_example_runs_as_printed(tmp_path, monkeypatch):
     assert len(list(Path("scenes").glob("*.glb"))) == 2
     with Image.open("shards/inspect.png") as sheet:
         assert sheet.width > 1000
+    page = Path("run/report.html").read_text()
+    assert "<h2>New rooms</h2>" in page and "is known in 3D" in page and "Real, test" not in page
+    assert "<h2>What training saw</h2>" in page and "<h2>Learning curves</h2>" in page
     judged = subprocess.run(
         [sys.executable, "-m", "sceneprior", "eval-fid", "--run", "run", "-n", "2"],
         capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert judged.returncode == 2 and "carries no 3D ground truth" in judged.stderr
+    assert "What can be had without it: `sceneprior report` shows" in judged.stderr
     assert len(judged.stderr.strip().splitlines()) == 1
 
 

@@ -1,6 +1,7 @@
 """Posed rooms through the engine and the command: splits, sizes, failures, assumptions."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,20 @@ def test_one_room_is_a_folder_of_rooms(source, rooms, tmp_path, monkeypatch):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"holds no transforms\.json, and none of its sub-folders"):
         find_rooms(tmp_path / "empty")
+
+
+def test_frames_in_files_by_split_are_to_be_joined(rooms, tmp_path):
+    for split in ("train", "val"):
+        text = (rooms[0].folder / "transforms.json").read_text()
+        (rooms[0].folder / f"transforms_{split}.json").write_text(text)
+    assert len(survey(PosedSource(rooms[0].folder, SET)).rooms) == 1
+    (rooms[0].folder / "transforms.json").unlink()
+    shutil.rmtree(rooms[0].folder / "instances")
+    hint = r"join the `frames` of transforms_train\.json, transforms_val\.json in one file of that"
+    with pytest.raises(InputError, match=hint):
+        survey(PosedSource(rooms[0].folder, SET))
+    (lost,) = survey(PosedSource(rooms[0].folder.parent, SET)).left_out
+    assert lost.room_id == "room_0" and "transforms.json is missing: join the" in lost.reason
 
 
 def test_rooms_of_another_size_are_left_out_with_the_reason(source, rooms):

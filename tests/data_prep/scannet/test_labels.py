@@ -49,6 +49,10 @@ def test_the_shell_has_no_class():
             "id,raw_category,nyu40class\n",
             "begins with id,raw_category,nyu40class.; .* tab separated",
         ),
+        (
+            "category\tcount\tnyuId\tnyu40id\teigen13id\tnyuClass\tnyu40class\nbed\t3\n",
+            r"first release; give the second one's, scannetv2-labels\.combined\.tsv, with --labels",
+        ),
         ("id\traw_category\tnyu40class\n", "lists no categories"),
     ],
 )

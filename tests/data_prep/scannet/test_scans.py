@@ -173,3 +173,11 @@ def test_masks_of_another_shape_than_the_colour_frames(scan, labels):
 def test_settings_that_mean_nothing(change, words):
     with pytest.raises(InputError, match=words):
         ScanSettings(**change)
+
+
+def test_a_scan_without_an_alignment_says_so(scan, labels):
+    scan.write()
+    assert not any("axisAlignment" in note for note in read_scan(scan.folder, labels).notes)
+    scan.path(".txt").write_text("sceneType = Bedroom / Hotel\n")
+    (note,) = (n for n in read_scan(scan.folder, labels).notes if "axisAlignment" in n)
+    assert note.startswith("scene0000_00.txt has no axisAlignment: walls may stand at an angle")
