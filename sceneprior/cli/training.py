@@ -41,11 +41,12 @@ def fit(
             SampleEvaluator(settings),
         )  # fmt: skip
     except KeyboardInterrupt:
-        typer.echo(
-            "Stopped and saved. Go on with: sceneprior fit "
-            f"--config {folder / 'config.yaml'} --run {folder} --resume",
-            err=True,
-        )
+        saved = folder / "config.yaml"
+        said = "Stopped before training began; run the same command again."
+        if saved.is_file():
+            go_on = f"sceneprior fit --config {saved} --run {folder} --resume"
+            said = f"Stopped and saved. Go on with: {go_on}"
+        typer.echo(said, err=True)
         raise typer.Exit(130) from None
     typer.echo(f"Trained: {folder}")
 

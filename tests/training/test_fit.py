@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 import torch
 from tiny_runs import tiny_config, write_tiny_config
+from typer.testing import CliRunner
 
+from sceneprior.cli import app
 from sceneprior.config import load_config, load_run
 from sceneprior.errors import InputError
 from sceneprior.training import fit as train
@@ -172,6 +174,18 @@ def test_training_never_opens_the_ground_truth(toy_shards, tmp_path):
     assert same(results[0][0], results[1][0]) and same(results[0][1], results[1][1])
     start = tiny_config(toy_shards).build_latents(12)
     assert not torch.equal(start.weight, results[0][1]["latents.weight"])  # it did train
+
+
+def test_ctrl_c_before_training_does_not_speak_of_a_run(toy_shards, tmp_path, monkeypatch):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sceneprior.training.method.ViewDataset", stop)
+    config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards)
+    result = CliRunner().invoke(app, ["fit", "--config", str(config), "--run", str(tmp_path / "r")])
+    assert result.exit_code == 130
+    assert "Stopped before training began; run the same command again." in result.output
+    assert not (tmp_path / "r").exists()
 
 
 def test_ctrl_c_at_the_command_saves_and_resume_finishes(toy_shards, tmp_path, start):
