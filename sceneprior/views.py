@@ -135,6 +135,9 @@ class RoomBoxes(_Batch):
     room_ids: tuple[str, ...] = ()
     yaw_rad: Float[Tensor, "rooms objects"] | None = None
     """Turn about +y that takes +z to each piece's front, in [-pi, pi]; None: nobody knows."""
+    looks: Int[Tensor, "rooms objects"] | None = None
+    """Which prototype each object looks like, times 8, plus the pose in which it does
+    (`sampler/prototypes.py`); None: nobody knows."""
 
     def split(self, rooms: int) -> list["RoomBoxes"]:
         """Batches of at most so many rooms, without ids."""
@@ -144,6 +147,10 @@ class RoomBoxes(_Batch):
             return replace(part, room_ids=())
 
         return [batch(start) for start in range(0, len(self.is_object), rooms)]
+
+    def only(self, here: Bool[Tensor, "rooms objects"]) -> "RoomBoxes":
+        """The same slots, but empty where `here` is false."""
+        return replace(self, object_class=self.object_class * here, is_object=self.is_object & here)
 
     def take(self, order: Int[Tensor, "rooms slots"]) -> "RoomBoxes":
         """The same rooms with other slots: those that `order` names, in its order."""

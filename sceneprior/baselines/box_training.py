@@ -50,7 +50,7 @@ class BoxConfig(RunConfig):
     def stages(self) -> tuple[Stage, ...]:
         return (Stage(self.method, self.training, self._open, self.build),)
 
-    def networks(self, rooms: int) -> nn.ModuleDict:
+    def networks(self, stage: str, rooms: int) -> nn.ModuleDict:
         torch.manual_seed(self.seed)
         return nn.ModuleDict({"prior": self.make().prior})
 

@@ -27,21 +27,14 @@ def synthesize(
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents where the method has them."""
     from sceneprior.config import load_any_run
     from sceneprior.evaluation.metrics.contents import emptiness
-    from sceneprior.generation.decode import decode_latents
-    from sceneprior.generation.decode import synthesize as generate
+    from sceneprior.generation.decode import new_rooms
     from sceneprior.generation.export import check_free, write_scenes
-    from sceneprior.generation.sample import draw_latents
     from sceneprior.offscreen import open_renderer
-    from sceneprior.training.method import TrainedPrior
 
     check_free(out, overwrite)
     trained = load_any_run(run, checkpoint)
     artist = open_renderer(renderer)
-    if isinstance(trained, TrainedPrior):
-        z, names = draw_latents(trained, count, seed, distribution)
-        scenes = decode_latents(trained, z, names)
-    else:
-        z, scenes = None, generate(trained, count, seed, distribution)
+    scenes, z = new_rooms(trained, count, seed, distribution)
     write_scenes(scenes, out, artist, overwrite, z)
     typer.echo(f"Wrote {count} rooms to {out}")
     if (warning := emptiness(scenes)) is not None:
@@ -83,12 +76,16 @@ def complete(
     out: Annotated[Path, typer.Option(help="Folder for the completed rooms.")],
     count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many answers.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same answers.")] = 0,
+    classes: Annotated[
+        str | None,
+        typer.Option(help="What to add, and nothing else: double_bed,nightstand (samplers only)."),
+    ] = None,
     distribution: DistributionOption = None,
     checkpoint: CheckpointOption = "final",
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "auto",
 ) -> None:
-    """Furnish the rest of a room of which some objects are given."""
+    """Furnish the rest of a room of which some objects, or its floor, are given."""
     from sceneprior.config import load_run
     from sceneprior.generation.complete import complete as furnish
     from sceneprior.generation.export import check_free, load_scene, write_scenes
@@ -96,7 +93,9 @@ def complete(
 
     check_free(out, overwrite)
     scene = load_scene(given)
-    z, scenes = furnish(load_run(run, checkpoint), [scene], count, seed, distribution)[0]
+    wanted = None if classes is None else [label.strip() for label in classes.split(",")]
+    trained = load_run(run, checkpoint)
+    z, scenes = furnish(trained, [scene], count, seed, distribution, classes=wanted)[0]
     write_scenes(scenes, out, open_renderer(renderer), overwrite, z)
     typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects to {out}")
 

@@ -11,7 +11,7 @@ RendererOption = Annotated[
 RunOption = Annotated[Path, typer.Option(help="Folder of a run that `fit` made.")]
 DistributionOption = Annotated[
     str | None,
-    typer.Option(help="kernel, geodesic, gaussian or paper (default: the config's)."),
+    typer.Option(help="sampler, kernel, geodesic, gaussian or paper (default: the config's)."),
 ]
 CheckpointOption = Annotated[
     str,

@@ -23,7 +23,7 @@ from sceneprior.evaluation.metrics.contents import (
 from sceneprior.evaluation.metrics.overlaps import overlap_pairs
 from sceneprior.evaluation.topdown import topdown, topdown_protocol
 from sceneprior.generation.decode import decode_latents, synthesize
-from sceneprior.generation.sample import sample_latents
+from sceneprior.generation.sample import sample_latents, uses_sampler
 from sceneprior.geometry.cameras import boxes_of_points
 from sceneprior.geometry.meshes import place
 from sceneprior.losses.matching import match_objects
@@ -91,7 +91,7 @@ class SampleEvaluator:
 
     def __call__(self, trained: TrainedPrior | TrainedSampler) -> EvaluationResult:
         settings = self.config.samples
-        if isinstance(trained, TrainedSampler):
+        if isinstance(trained, TrainedSampler) or uses_sampler(trained, None):
             generated = synthesize(trained, settings.count, settings.seed)
             return EvaluationResult(
                 self._scores(generated), tile(generated[:PICTURED]), self._compared[0]

@@ -1,4 +1,6 @@
-"""Furnish the rest of a room of which some objects are given, by fitting latents to these.
+"""Furnish the rest of a room of which some objects are given.
+
+A run's sampler draws what is missing, given what is there. Without one, latents are fitted:
 
 1. Latents are drawn by the run's distribution and decoded. Those whose rooms come nearest to the
    given objects are where the answers start, each answer from others.
@@ -22,9 +24,11 @@ from sceneprior.classes import VOID, label_set
 from sceneprior.errors import InputError
 from sceneprior.generation.decode import decode_latents
 from sceneprior.generation.insert import insert
-from sceneprior.generation.sample import draw_latents
+from sceneprior.generation.sample import draw_latents, uses_sampler
+from sceneprior.generation.sampled import class_rows, floor_rectangle, sample_scenes
 from sceneprior.losses.layout import take
 from sceneprior.losses.matching import assign
+from sceneprior.sampler.draw import Given
 from sceneprior.scene import Scene
 from sceneprior.training.method import TrainedPrior
 from sceneprior.views import DecodedScenes, RoomBoxes
@@ -50,23 +54,35 @@ def complete(
     seed: int = 0,
     distribution: str | None = None,
     steps: int = STEPS,
-) -> list[tuple[Float[Tensor, "count dimension"], list[Scene]]]:
+    classes: Sequence[str] | None = None,
+) -> list[tuple[Float[Tensor, "count dimension"] | None, list[Scene]]]:
     """Furnish the rest of rooms; all rooms and all answers in one batch.
 
     Args:
         scenes: The given objects of each room: classes, boxes, perhaps meshes. Without any, the
-            answers are what the run generates.
+            answers are what the run generates. A sampler keeps to the rectangle round a scene's
+            floor.
         count: Answers a room.
-        seed, distribution: Of the latents that answers start from; see `draw_latents`.
+        seed, distribution: `sampler`, or of the latents that answers start from; see
+            `draw_latents`.
         steps: Of the fit; 0 leaves the drawn latents as they are.
+        classes: What to add, and nothing else; None leaves it to the sampler.
 
     Returns:
-        Of each room the answers' latents and the answers: see `insert`.
+        Of each room the answers' latents, None where a sampler did without, and the answers: see
+        `insert`.
 
     Raises:
         InputError: a given object cannot be used, or there are more than the run's rooms hold.
     """
     given = gather_given(trained, scenes)
+    if uses_sampler(trained, distribution):
+        return [(None, rooms) for rooms in _drawn(trained, scenes, given, count, seed, classes)]
+    if classes is not None:
+        raise InputError(
+            "Which classes to add can be asked of a sampler alone, and these rooms come from "
+            "latents; leave the classes out, or train with a section `sampler`."
+        )
     starts = _starts(trained, given, count * RESTARTS, seed, distribution)
     z, loss = fit_latents(trained, starts, repeated(given, count * RESTARTS), steps)
     # Starts are in order of promise; dealt out in turn, every answer has good ones.
@@ -77,6 +93,28 @@ def complete(
         (own, [insert(room, scene, seed=seed) for room in decode_latents(trained, own, names)])
         for scene, own in zip(scenes, z, strict=True)
     ]
+
+
+def _drawn(
+    trained: TrainedPrior,
+    scenes: Sequence[Scene],
+    given: RoomBoxes,
+    count: int,
+    seed: int,
+    classes: Sequence[str] | None,
+) -> list[list[Scene]]:
+    """Answers of a run's sampler, by room."""
+    names = [f"complete_{k:02d}" for k in range(count)]
+    coming = None if classes is None else class_rows(trained.config.label_set, classes)
+    answers = []
+    for scene, one in zip(scenes, given.split(1), strict=True):
+        frame = None if scene.floor_m is None else floor_rectangle(scene).expand(count, -1)
+        whole = Given(
+            repeated(one, count), frame, None if coming is None else coming.expand(count, -1)
+        )
+        rooms = sample_scenes(trained, names, seed, whole)
+        answers.append([insert(room, scene, seed=seed) for room in rooms])
+    return answers
 
 
 def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> RoomBoxes:

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from sceneprior.classes import VOID, label_set
 from sceneprior.errors import InputError
-from sceneprior.generation.sample import draw_latents, scene_names
+from sceneprior.generation.sample import draw_latents, scene_names, uses_sampler
+from sceneprior.generation.sampled import sample_scenes
 from sceneprior.geometry.isosurface import surface_of
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.scene import Mesh, Scene, SceneObject
@@ -117,23 +118,42 @@ def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]
     return decode_latents(trained, trained.prior.latent_space(trained.logits), trained.room_ids)
 
 
-def synthesize(
-    trained: TrainedPrior | TrainedSampler, count: int, seed: int, distribution: str | None = None
-) -> list[Scene]:
-    """New scenes, of a run of any kind; the same seed, the same scenes.
+class NewRooms(NamedTuple):
+    """Rooms that a run makes."""
 
-    `distribution` says where latents come from: None takes the run's own. It is an `InputError` for
-    a method without latents.
+    scenes: list[Scene]
+    latents: Float[Tensor, "rooms width"] | None
+    """None where no latent makes a room."""
+
+
+def new_rooms(
+    trained: TrainedPrior | TrainedSampler, count: int, seed: int, distribution: str | None = None
+) -> NewRooms:
+    """New rooms of a run of any kind; the same seed, the same rooms.
+
+    `distribution` says where they come from: `sampler`, or a distribution of latents; None takes
+    the run's own. It is an `InputError` for a method that has neither.
     """
+    names = scene_names(count, seed)
     if isinstance(trained, TrainedPrior):
-        return decode_latents(trained, *draw_latents(trained, count, seed, distribution))
+        if uses_sampler(trained, distribution):
+            return NewRooms(sample_scenes(trained, names, seed), None)
+        z, _ = draw_latents(trained, count, seed, distribution)
+        return NewRooms(decode_latents(trained, z, names), z)
     if distribution is not None:
         raise InputError(
             f"A distribution says where latents of rooms come from, but `method: "
             f"{trained.config.method}` has none; leave out --distribution {distribution}."
         )
     rooms = trained.prior.sample(count, seed)
-    return boxes_to_scenes(rooms, trained.config.label_set, scene_names(count, seed))
+    return NewRooms(boxes_to_scenes(rooms, trained.config.label_set, names), None)
+
+
+def synthesize(
+    trained: TrainedPrior | TrainedSampler, count: int, seed: int, distribution: str | None = None
+) -> list[Scene]:
+    """The scenes of `new_rooms`."""
+    return new_rooms(trained, count, seed, distribution).scenes
 
 
 def boxes_to_scenes(rooms: RoomBoxes, label_set_name: str, names: Sequence[str]) -> list[Scene]:

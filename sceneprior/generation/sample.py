@@ -24,6 +24,8 @@ BANDWIDTH = 0.15
 training rooms, 1 is the gaussian distribution. Larger is newer, and more often a room without a
 bed or with two."""
 DISTRIBUTIONS = ("kernel", "geodesic", "gaussian", "paper")
+"""Of latents; new rooms may come from `SAMPLER`, too, which knows none."""
+SAMPLER = "sampler"
 MARKS = {
     "kernel": "near training rooms",
     "geodesic": "near training rooms",
@@ -117,11 +119,28 @@ def _rooms_in_turn(rooms: int, count: int, generator: torch.Generator) -> Int[Te
     return torch.cat(rounds)[:count]
 
 
+def uses_sampler(trained: TrainedPrior, distribution: str | None) -> bool:
+    """Whether new rooms come from the run's sampler: asked for, or the run's own way (None).
+
+    Raises:
+        InputError: it is asked for, but the run has none, or not yet.
+    """
+    if (distribution or trained.distribution) != SAMPLER:
+        return False
+    if trained.sampler is None:
+        raise InputError(
+            "This run has no sampler, or its stage has not begun; leave out --distribution "
+            f"{SAMPLER}, or train with a section `sampler` (`--config front_bedroom_large.yaml`)."
+        )
+    return True
+
+
 def draw_latents(
     trained: TrainedPrior, count: int, seed: int, distribution: str | None = None
 ) -> tuple[Float[Tensor, "count dimension"], list[str]]:
     """Latents sampled by a distribution (None: the run's own), and the names of their rooms."""
-    space, distribution = trained.prior.latent_space, distribution or trained.distribution
+    space = trained.prior.latent_space
+    distribution = distribution or trained.latent_distribution
     z = sample_latents(space, trained.logits, count, seed, distribution)
     return z, scene_names(count, seed)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 QUARTERS = 4
@@ -45,10 +45,17 @@ def turn_vectors(
 
 
 def turn_boxes(
-    boxes_m: Float[Tensor, "rooms objects 6"], quarters: Int[Tensor, " rooms"]
+    boxes_m: Float[Tensor, "rooms objects 6"],
+    quarters: Int[Tensor, " rooms"],
+    mirrored: Bool[Tensor, " rooms"] | None = None,
 ) -> Float[Tensor, "rooms objects 6"]:
-    """Boxes (centre, full extents) of rooms turned about +y by so many quarters."""
+    """Boxes (centre, full extents) of rooms that are perhaps mirrored, x reversed, then turned
+    about +y by so many quarters."""
     centers_m, sizes_m = boxes_m.split(3, dim=-1)
+    if mirrored is not None:
+        sign = 1 - 2 * mirrored.to(boxes_m)
+        x, others = centers_m.split([1, 2], dim=-1)
+        centers_m = torch.cat([x * sign[:, None, None], others], dim=-1)
     return torch.cat([turn_vectors(centers_m, quarters), turn_vectors(sizes_m, quarters).abs()], -1)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from rich.console import Console
 from rich.progress import track
 from torch import Tensor
@@ -79,6 +79,9 @@ class LiftedDataset(RoomDataset):
             [np.hstack([boxes.centers_m, boxes.sizes_m]).astype(np.float32) for boxes in self.boxes]
         )
         self.space: ShapeSpace | None = None
+        self.object_classes = np.concatenate([room.object_class for room in rooms]).astype(np.int64)
+        """Of the objects of all rooms, one room after the other."""
+        self._bits, self._cells = np.zeros((0, 0), dtype=np.uint8), 0
         self._codes: Tensor | None = None
         """By room and quarter turn."""
         self._filled: Tensor | None = None
@@ -87,8 +90,13 @@ class LiftedDataset(RoomDataset):
             grids = _find_shapes(folder, split, key, rooms, self.boxes, chosen, shape)
             self.space, codes = _spanned(grids, self.boxes, rotations, shape.codes)
             self._codes = torch.stack([_padded(np.split(turned, ends)) for turned in codes], dim=1)
+            self._cells, self._bits = shape.cells, _packed(grids)
             filled = grids.sum(axis=(1, 2, 3)).clip(min=1).astype(np.float32)
             self._filled = _padded(np.split(filled, ends))
+
+    def grids(self) -> Bool[np.ndarray, "objects x y z"]:
+        """The lifted shapes of the objects of all rooms; see `lift_shapes`."""
+        return _unpacked(self._bits, self._cells)
 
     def to(self, device: torch.device | str) -> "LiftedDataset":
         """Move all boxes and codes to `device`, where batches are then made."""
@@ -168,12 +176,21 @@ def _find_shapes(
             np.concatenate([each.sizes_m for each in boxes]),
             np.concatenate([room.object_class for room in rooms]),
         )
-        return {"bits": np.packbits(thin.reshape(-1, shape.cells**3), axis=1)}
+        return {"bits": _packed(thin)}
 
     key = f"{key} {SHAPES_VERSION} {shape.cells} {shape.margin}"
-    bits = _kept(folder / f"lifted_shapes_{split}.npz", key, find)["bits"]
-    flat = np.unpackbits(bits, axis=1, count=shape.cells**3).astype(bool)
-    return flat.reshape(-1, *(shape.cells,) * 3)
+    return _unpacked(_kept(folder / f"lifted_shapes_{split}.npz", key, find)["bits"], shape.cells)
+
+
+def _packed(grids: Bool[np.ndarray, "objects x y z"]) -> UInt8[np.ndarray, "objects bytes"]:
+    return np.packbits(grids.reshape(len(grids), -1), axis=1)
+
+
+def _unpacked(
+    bits: UInt8[np.ndarray, "objects bytes"], cells: int
+) -> Bool[np.ndarray, "objects x y z"]:
+    flat = np.unpackbits(bits, axis=1, count=cells**3).astype(bool)
+    return flat.reshape(len(bits), *(cells,) * 3)
 
 
 def _spanned(

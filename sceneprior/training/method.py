@@ -9,6 +9,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -23,8 +24,8 @@ from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.lifting.dataset import LiftedDataset
 from sceneprior.lifting.shapes import ShapeGrid
-from sceneprior.models.occupancy import OccupancyConfig
 from sceneprior.models.prior import ModelConfig, ScenePrior
+from sceneprior.sampler.network import RoomSampler
 from sceneprior.settings import Section
 from sceneprior.training.checkpoints import read_networks
 from sceneprior.training.settings import DataConfig, SamplesConfig, TrainConfig
@@ -39,7 +40,8 @@ class Stage:
     """The stage's folder in the run."""
     settings: TrainConfig
     open_data: Callable[[], Any]
-    """Opens the training rooms: a `ViewDataset`, or a `TruthDataset`."""
+    """Opens the training rooms: a `ViewDataset`, a `LiftedDataset`, `SamplerRooms`, or a
+    `TruthDataset`."""
     build: Callable[[Any, Path | None], lightning.LightningModule]
     """Makes the module from these rooms and the checkpoint of the stage before."""
     steps_itself: bool = False
@@ -82,9 +84,9 @@ class RunConfig(Section, ABC):
         return tuple(stage.name for stage in self.stages())
 
     @abstractmethod
-    def networks(self, rooms: int) -> nn.ModuleDict:
-        """What tasks take out of a checkpoint of so many rooms, freshly initialised from the seed:
-        `prior`, and `latents` if any."""
+    def networks(self, stage: str, rooms: int) -> nn.ModuleDict:
+        """What tasks take out of a stage's checkpoint of so many rooms, freshly initialised from
+        the seed: `prior`, and `latents` and `sampler` if any."""
 
     @abstractmethod
     def trained(self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]) -> "Trained":
@@ -96,7 +98,7 @@ class RunConfig(Section, ABC):
         Raises:
             InputError: it is damaged, or of another network.
         """
-        networks, room_ids = read_networks(path, self.networks)
+        networks, room_ids = read_networks(path, partial(self.networks, stage))
         return self.trained(networks, stage, room_ids)
 
     def check_rooms(self, rooms: Any, max_objects: int | None) -> None:
@@ -142,14 +144,15 @@ class PriorConfig(RunConfig):
         logits = torch.randn(rooms, self.model.logits_per_room, generator=generator)
         return nn.Embedding.from_pretrained(logits, freeze=False)
 
-    def networks(self, rooms: int) -> nn.ModuleDict:
+    def networks(self, stage: str, rooms: int) -> nn.ModuleDict:
         return nn.ModuleDict({"prior": self.build_prior(), "latents": self.build_latents(rooms)})
 
     def trained(self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]) -> "TrainedPrior":
         prior, latents = networks.prior, networks.latents
         assert isinstance(prior, ScenePrior) and isinstance(latents, nn.Embedding)
         logits = latents.weight.detach().cpu().clone()
-        return TrainedPrior(ready_copy(prior), logits, room_ids, self, stage)
+        sampler = ready_copy(networks.sampler) if hasattr(networks, "sampler") else None
+        return TrainedPrior(ready_copy(prior), logits, room_ids, self, stage, sampler)
 
     def open_views(self, views_per_room: int, mask_step: int | None) -> ViewDataset:
         """The training rooms; InputError if they do not fit the config."""
@@ -166,20 +169,24 @@ class PriorConfig(RunConfig):
         self.check_rooms(rooms, self.model.max_objects)
         return rooms
 
-    def open_lifted(self, shape: OccupancyConfig | None = None) -> LiftedDataset:
-        """The training rooms with 3D boxes found from their masks, and perhaps grids of shapes;
-        InputError as above."""
+    def open_lifted(self, shape: ShapeGrid | None = None, split: str = "train") -> LiftedDataset:
+        """Rooms with 3D boxes found from their masks, and perhaps grids of shapes; InputError as
+        above."""
         data = self.data
         rooms = LiftedDataset(
             Path(data.shards),
-            "train",
+            split,
             rotations=data.rotations,
             view_fraction=data.view_fraction,
-            shape=None if shape is None else ShapeGrid(shape.cells, shape.margin, shape.codes),
+            shape=shape,
             seed=self.seed,
         )
         self.check_rooms(rooms, self.model.max_objects)
         return rooms
+
+
+LATENTS_BESIDE = "kernel"
+"""The distribution of latents of a run whose new rooms come from its sampler."""
 
 
 @dataclass(frozen=True)
@@ -191,6 +198,8 @@ class TrainedPrior:
     room_ids: tuple[str, ...]
     config: PriorConfig
     stage: str
+    sampler: RoomSampler | None = None
+    """What makes new rooms without a latent; None before its stage, and where there is none."""
 
     @property
     def remembers_rooms(self) -> bool:
@@ -199,8 +208,16 @@ class TrainedPrior:
 
     @property
     def distribution(self) -> str:
-        """The config's distribution of new latents."""
-        return self.config.distribution
+        """Where new rooms come from unless a task says otherwise: as the config says; before the
+        stage of the sampler that it names, from `latent_distribution`."""
+        asked = self.config.distribution
+        return asked if asked != "sampler" or self.sampler is not None else LATENTS_BESIDE
+
+    @property
+    def latent_distribution(self) -> str:
+        """Where new latents come from, which a sampler does without."""
+        asked = self.config.distribution
+        return asked if asked != "sampler" else LATENTS_BESIDE
 
 
 @runtime_checkable

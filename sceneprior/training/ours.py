@@ -1,5 +1,6 @@
 """The paper's method: its settings, and its two stages from opened data to a trained prior."""
 
+import contextlib
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -8,9 +9,16 @@ from pydantic import Field, field_validator, model_validator
 from torch import nn
 
 from sceneprior.data.dataset import ViewDataset
-from sceneprior.errors import InputError
+from sceneprior.errors import InputError, ShardError
 from sceneprior.lifting.dataset import LiftedDataset
+from sceneprior.lifting.shapes import ShapeGrid
 from sceneprior.models.occupancy import OccupancyConfig, OccupancyDecoder
+from sceneprior.sampler.network import RoomSampler
+from sceneprior.sampler.prototypes import Prototypes
+from sceneprior.sampler.rooms import SamplerRooms
+from sceneprior.sampler.settings import SamplerConfig
+from sceneprior.sampler.stage import SamplerStage, teach
+from sceneprior.shards import list_shards
 from sceneprior.training.method import PriorConfig, Stage, TrainedPrior
 from sceneprior.training.settings import (
     LayoutConfig,
@@ -31,6 +39,8 @@ class PaperConfig(PriorConfig):
     layout: LayoutConfig | None
     """Null trains layout and shape together from the start (ablation c3)."""
     shape: Annotated[ShapeConfig | LiftedShapeConfig, Field(discriminator="supervision")]
+    sampler: SamplerConfig | None = None
+    """A model of rooms' objects one by one, which makes new rooms; null for none, as the paper."""
     sampling: SamplingConfig = SamplingConfig()
 
     remembers_rooms: ClassVar[bool] = True
@@ -53,23 +63,77 @@ class PaperConfig(PriorConfig):
                 f"shape.supervision '{needed}', but that is '{self.shape.supervision}'; change "
                 "one of them"
             )
+        if self.sampler is not None and needed != "lifted":
+            raise ValueError(
+                "sampler: it learns from shapes that were lifted from masks; set model.shape.name "
+                "to occupancy and shape.supervision to lifted, or leave the sampler out"
+            )
+        if self.sampler is None and self.sampling.distribution == "sampler":
+            raise ValueError(
+                "sampling.distribution is 'sampler', but there is no section `sampler`; add one "
+                "(`sampler: {epochs: 200}`), or choose another distribution"
+            )
         return self
 
     def stages(self) -> tuple[Stage, ...]:
-        shape = self._shape_stage(self.shape)
-        if self.layout is None:
-            return (shape,)
-        if self.layout.supervision == "lifted":
-            lifted = partial(self._build, LiftedStage, self.layout)
-            return Stage("layout", self.layout, self.open_lifted, lifted), shape
+        first = () if self.layout is None else (self._layout_stage(self.layout),)
+        last = () if self.sampler is None else (self._sampler_stage(self.sampler),)
+        return (*first, self._shape_stage(self.shape), *last)
+
+    def networks(self, stage: str, rooms: int) -> nn.ModuleDict:
+        networks = super().networks(stage, rooms)
+        if stage == "sampler" and self.sampler is not None:
+            networks["sampler"] = self.build_sampler(self.sampler)
+        return networks
+
+    def build_sampler(self, settings: SamplerConfig) -> RoomSampler:
+        """The sampler's network, freshly initialised from the seed; it knows no rooms yet."""
+        assert isinstance(self.model.shape, OccupancyConfig), "checked above"
+        torch.manual_seed(self.seed)
+        return RoomSampler(settings, self.classes, self.model.shape.codes, self.model.max_objects)
+
+    def _layout_stage(self, stage: LayoutConfig) -> Stage:
+        if stage.supervision == "lifted":
+            lifted = partial(self._build, LiftedStage, stage)
+            return Stage("layout", stage, self.open_lifted, lifted)
         boxes = partial(self.open_views, self.data.views_per_room, None)
-        build = partial(self._build, LayoutStage, self.layout)
-        return Stage("layout", self.layout, boxes, build), shape
+        return Stage("layout", stage, boxes, partial(self._build, LayoutStage, stage))
+
+    def _sampler_stage(self, stage: SamplerConfig) -> Stage:
+        return Stage(
+            "sampler",
+            stage,
+            partial(self._sampler_rooms, "train", stage.prototypes),
+            partial(self._build_sampler_stage, stage),
+        )
+
+    def _sampler_rooms(self, split: str, prototypes: Prototypes | int) -> SamplerRooms:
+        assert isinstance(self.model.shape, OccupancyConfig), "checked above"
+        # Shapes alone: where they lie in the shape space, the sampler asks of prototypes only.
+        grid = ShapeGrid(self.model.shape.cells, self.model.shape.margin, codes=0)
+        return SamplerRooms(self.open_lifted(grid, split), prototypes)
+
+    def _build_sampler_stage(
+        self, stage: SamplerConfig, rooms: SamplerRooms, previous: Path | None
+    ) -> SamplerStage:
+        assert previous is not None, "the shape stage comes before"
+        before = self._before(previous, rooms.room_ids)
+        assert isinstance(before.prior.shape, OccupancyDecoder)
+        sampler = self.build_sampler(stage)
+        teach(sampler, rooms, before.prior.shape)
+        val = None
+        with contextlib.suppress(ShardError):  # no val rooms: the newest network is kept
+            list_shards(Path(self.data.shards), "val")
+            val = self._sampler_rooms("val", rooms.prototypes)
+        latents = nn.Embedding.from_pretrained(before.logits)
+        return SamplerStage(before.prior, latents, sampler, stage, val, self.seed)
 
     def _shape_stage(self, stage: ShapeConfig | LiftedShapeConfig) -> Stage:
         if isinstance(stage, LiftedShapeConfig):
             assert isinstance(self.model.shape, OccupancyConfig), "checked above"
-            shapes = partial(self.open_lifted, self.model.shape)
+            shape = self.model.shape
+            grid = ShapeGrid(shape.cells, shape.margin, shape.codes)
+            shapes = partial(self.open_lifted, grid)
             return Stage("shape", stage, shapes, partial(self._build, LiftedStage, stage))
         views = stage.views_per_room or self.data.views_per_room
         masks = partial(self.open_views, views, self.data.mask_step)
@@ -85,13 +149,7 @@ class PaperConfig(PriorConfig):
         if previous is None:
             prior, latents = self.build_prior(), self.build_latents(len(rooms))
         else:
-            before = self.load("", previous)
-            assert isinstance(before, TrainedPrior)
-            if before.room_ids != rooms.room_ids:
-                raise InputError(
-                    f"{self.data.shards} no longer holds the rooms of {previous}; the shape stage "
-                    "needs the shards that the layout stage was trained on."
-                )
+            before = self._before(previous, rooms.room_ids)
             prior = before.prior.train()
             latents = nn.Embedding.from_pretrained(before.logits, freeze=False)
         if isinstance(rooms, LiftedDataset) and rooms.space is not None:
@@ -99,3 +157,14 @@ class PaperConfig(PriorConfig):
             prior.shape.set_space(*rooms.space)
         target = self.model.completeness_target
         return kind(prior, latents, stage, self.loss, target, self.seed)
+
+    def _before(self, previous: Path, room_ids: tuple[str, ...]) -> TrainedPrior:
+        """What the stage before learnt, of the same rooms; else an `InputError`."""
+        before = self.load(previous.parent.name, previous)
+        assert isinstance(before, TrainedPrior)
+        if before.room_ids != room_ids:
+            raise InputError(
+                f"{self.data.shards} no longer holds the rooms of {previous}; every stage of a run "
+                "needs the shards that the first was trained on."
+            )
+        return before

@@ -124,11 +124,12 @@ class LiftedShapeConfig(StageConfig):
 
 
 class SamplingConfig(Section):
-    """Where new latents come from."""
+    """Where new rooms come from."""
 
-    distribution: Literal["kernel", "geodesic", "gaussian", "paper"] = "kernel"
-    """`kernel`: around training rooms; `geodesic`: between neighbouring ones; `gaussian`: fitted
-    to their logits; `paper`: logits from N(0, 1)."""
+    distribution: Literal["sampler", "kernel", "geodesic", "gaussian", "paper"] = "kernel"
+    """`sampler`: from a model of rooms' objects, without a latent (needs the section `sampler`).
+    The others are distributions of latents: `kernel`: around training rooms; `geodesic`: between
+    neighbouring ones; `gaussian`: fitted to their logits; `paper`: logits from N(0, 1)."""
 
 
 class SamplesConfig(Section):

@@ -1,0 +1,90 @@
+"""Rooms of a run's sampler as scenes: each object's look becomes a mesh in its box."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sceneprior.classes import VOID, label_set
+from sceneprior.errors import InputError
+from sceneprior.geometry.isosurface import surface_of
+from sceneprior.geometry.turns import quarter_rotation
+from sceneprior.models.occupancy import OccupancyDecoder
+from sceneprior.sampler.draw import Given, draw_rooms
+from sceneprior.sampler.prototypes import POSES, turn_of
+from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.training.method import TrainedPrior
+from sceneprior.views import RoomBoxes
+
+
+def sample_scenes(
+    trained: TrainedPrior, names: Sequence[str], seed: int, given: Given | None = None
+) -> list[Scene]:
+    """One new room a name, with meshes; see `draw_rooms`."""
+    assert trained.sampler is not None, "callers ask trained.sampler first"
+    rooms = draw_rooms(trained.sampler, len(names), seed, given)
+    return looks_to_scenes(trained, rooms, names)
+
+
+def looks_to_scenes(trained: TrainedPrior, rooms: RoomBoxes, names: Sequence[str]) -> list[Scene]:
+    """Rooms of objects that have looks, as the run's shape decoder makes them."""
+    assert rooms.looks is not None
+    shapes = PrototypeMeshes(trained)
+    classes = label_set(trained.config.label_set)
+    scenes = []
+    for row, name in enumerate(names):
+        objects = []
+        for item in rooms.is_object[row].nonzero()[:, 0].tolist():
+            box = rooms.boxes_m[row, item].double().numpy()
+            mesh = shapes.mesh(int(rooms.looks[row, item]), box)
+            label = classes[int(rooms.object_class[row, item])]
+            objects.append(SceneObject(label, tuple(box[:3]), tuple(box[3:]), mesh))
+        scenes.append(Scene(name, trained.config.label_set, tuple(objects)))
+    return scenes
+
+
+def class_rows(label_set_name: str, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:
+    """Classes by name, as `Given.coming` takes them; an `InputError` for one that is none."""
+    classes = label_set(label_set_name)
+    for label in labels:
+        if label not in classes or classes.index(label) == VOID:
+            raise InputError(
+                f"'{label}' is no class of this run; choose from {', '.join(classes[1:])}."
+            )
+    return torch.tensor([[classes.index(label) for label in labels]], dtype=torch.int64)
+
+
+def floor_rectangle(scene: Scene) -> Float[Tensor, "1 4"]:
+    """The rectangle round a scene's floor: centre x, z and extents x, z."""
+    assert scene.floor_m is not None
+    low, high = scene.floor_m.min(axis=0), scene.floor_m.max(axis=0)
+    return torch.from_numpy(np.concatenate([(low + high) / 2, high - low])[None]).float()
+
+
+class PrototypeMeshes:
+    """Meshes of a sampler's prototypes, each decoded once: rooms by the thousand share them."""
+
+    def __init__(self, trained: TrainedPrior):
+        assert trained.sampler is not None and isinstance(trained.prior.shape, OccupancyDecoder)
+        self._codes, self._decoder = trained.sampler.prototype_codes, trained.prior.shape
+        self._unit: dict[
+            int, tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]
+        ] = {}
+
+    def mesh(self, look: int, box_m: Float[np.ndarray, "6"]) -> Mesh:
+        """A look's mesh in a box (centre, full extents)."""
+        prototype, pose = divmod(look, POSES)
+        if prototype not in self._unit:
+            with torch.no_grad():
+                logits = self._decoder.grids(self._codes[prototype][None, None])[0, 0].numpy()
+            self._unit[prototype] = surface_of(
+                logits, np.zeros(3), np.ones(3), self._decoder.margin
+            )
+        vertices, faces = self._unit[prototype]
+        quarters, mirrored = turn_of(pose)
+        if mirrored:  # turns its faces inside out: pass their corners the other way
+            vertices, faces = vertices * [-1, 1, 1], faces[:, ::-1].copy()
+        vertices = vertices @ quarter_rotation(quarters).T
+        return Mesh(vertices * box_m[3:] + box_m[:3], faces)

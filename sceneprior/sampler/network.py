@@ -1,0 +1,224 @@
+"""The sampler's network: the distribution of a room's next object, given the set of the others."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sceneprior.models.layers import mlp
+from sceneprior.sampler.mixtures import LogisticMixture, draw_index
+from sceneprior.sampler.placement import Placement
+from sceneprior.sampler.prototypes import PARTS, POSES
+from sceneprior.sampler.settings import SamplerConfig
+from sceneprior.views import RoomBoxes
+
+END = 0
+"""The class that ends a room: void, which is no furniture."""
+CLASS_WIDTH = 32
+OCTAVES = 6
+LONGEST_M = 16.0
+"""A length is shown as sines and cosines of `OCTAVES` periods: this one, its half and so on."""
+LENGTHS = 1 + 2 * OCTAVES
+"""Numbers that a length is shown as."""
+SHOWN = PARTS**3 + 3
+"""Numbers that a look is shown as: its coarse grid and the logarithms of its extents."""
+RECTANGLES = 6
+"""Gaussians of the rectangle round a room's furniture."""
+DETAILS = 4
+"""Logistics of an object's size and height."""
+MATCH_WIDTH = 64
+"""Width in which looks are compared with what is wanted."""
+
+
+class RoomSampler(nn.Module):
+    """Objects one after the other, each given the set of those before it, whatever their order.
+
+    A transformer encoder without positional encoding reads the rectangle round the room's
+    furniture, the objects there are, and a learnt query. What it makes of the query gives the class
+    of the next object, or the room's end; then, given the class, its look: a prototype in one of
+    its poses; then how its size differs from that, and the height of its bottom; then its place
+    (`Placement`), which is in relation to the rectangle or to an object.
+
+    Args:
+        settings: Its size.
+        classes: Of the label set, void included.
+        codes: Numbers that a shape is, as `OccupancyDecoder` decodes it.
+        max_objects: Where drawing stops, if the end was not drawn before.
+    """
+
+    prototype_codes: Tensor
+    look_class: Tensor
+    look_shown: Tensor
+    rectangle_logits: Tensor
+    rectangle_means: Tensor
+    rectangle_factors: Tensor
+    may_meet: Tensor
+
+    def __init__(self, settings: SamplerConfig, classes: int, codes: int, max_objects: int):
+        super().__init__()
+        width, dropout, prototypes = settings.width, settings.dropout, settings.prototypes
+        self.max_objects = max_objects
+        # Found from the training rooms before the first step, and kept in checkpoints.
+        looks = prototypes * POSES
+        self.register_buffer("prototype_codes", torch.zeros(prototypes, codes))
+        self.register_buffer("look_class", torch.full((looks,), -1))
+        self.register_buffer("look_shown", torch.zeros(looks, SHOWN))
+        self.register_buffer("rectangle_logits", torch.zeros(RECTANGLES))
+        self.register_buffer("rectangle_means", torch.zeros(RECTANGLES, 4))
+        self.register_buffer("rectangle_factors", torch.zeros(RECTANGLES, 4, 4))
+        self.register_buffer("may_meet", torch.zeros(classes, classes, dtype=torch.bool))
+        self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
+        self.look_embedding = nn.Linear(SHOWN, width)
+        self.object_embedding = nn.Linear(CLASS_WIDTH + 10 * LENGTHS, width)
+        self.rectangle_embedding = nn.Linear(4 * LENGTHS, width)
+        self.query = nn.Parameter(torch.randn(width))
+        self.dropout = nn.Dropout(dropout)
+        self.encoder = nn.ModuleList(
+            nn.TransformerEncoderLayer(
+                width, settings.heads, 2 * width, dropout, "gelu", batch_first=True, norm_first=True
+            )
+            for _ in range(settings.layers)
+        )
+        self.norm = nn.LayerNorm(width)
+        known = width + CLASS_WIDTH
+        self.class_head = _head(width, width, classes)
+        self.wanted_look = _head(known, width, MATCH_WIDTH)
+        self.offered_look = _head(SHOWN, width, MATCH_WIDTH)
+        self.frequency = nn.Parameter(torch.zeros(prototypes))
+        self.details_head = _head(known + width, width, DETAILS * 9)
+        self.place_query = _head(known + width + 4 * LENGTHS, width, width)
+        self.placement = Placement(width)
+
+    def rectangles(
+        self, choice: Float[Tensor, "*batch"], noise: Float[Tensor, "*batch 4"]
+    ) -> Float[Tensor, "*batch 4"]:
+        """Rectangles (centre x, z, extents x, z) of a uniform number and standard normal ones."""
+        which = draw_index(self.rectangle_logits.expand(*choice.shape, -1), choice)
+        moved = (self.rectangle_factors[which] @ noise.unsqueeze(-1))[..., 0]
+        found = self.rectangle_means[which] + moved
+        return torch.cat([found[..., :2], found[..., 2:].exp()], dim=-1)
+
+    def tokens(
+        self, rooms: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]
+    ) -> Float[Tensor, "rooms objects width"]:
+        """What the encoder reads of each object: class, look, size, height, and its place in the
+        rectangle (centre x, z, extents x, z)."""
+        assert rooms.looks is not None
+        centre, size = rooms.boxes_m.split(3, dim=-1)
+        middle, extents = rectangle_m.unsqueeze(1).split(2, dim=-1)
+        place, footprint = centre[..., ::2] - middle, size[..., ::2]
+        bottom = centre[..., 1:2] - size[..., 1:2] / 2
+        low, high = (extents - footprint) / 2 + place, (extents - footprint) / 2 - place
+        shown = lengths_shown(torch.cat([place, bottom, size, low, high], dim=-1))
+        known = torch.cat([self.class_embedding(rooms.object_class), shown], dim=-1)
+        return self.object_embedding(known) + self.look_embedding(self.look_shown)[rooms.looks]
+
+    def read(
+        self,
+        before: RoomBoxes,
+        rectangle_m: Float[Tensor, "rooms 4"],
+        tokens: Float[Tensor, "rooms objects width"],
+    ) -> "Reading":
+        """Read the objects that stand, whatever their order, of `tokens`."""
+        query = self.query.expand(len(tokens), 1, -1)
+        frame = self.rectangle_embedding(lengths_shown(rectangle_m)).unsqueeze(1)
+        features = self.dropout(torch.cat([query, frame, tokens], dim=1))
+        nothing = torch.cat([query.new_zeros(len(tokens), 2).bool(), ~before.is_object], dim=1)
+        for layer in self.encoder:
+            features = layer(features, src_key_padding_mask=nothing)
+        features = self.norm(features)
+        return Reading(before, rectangle_m, features[:, 0], features[:, 2:])
+
+    def look_logits(
+        self, reading: "Reading", label: Int[Tensor, " rooms"]
+    ) -> Float[Tensor, "rooms looks"]:
+        """Of the next object's look, given its class: those of other classes are ruled out."""
+        known = torch.cat([reading.context, self.class_embedding(label)], dim=-1)
+        offered = self.offered_look(self.look_shown)
+        logits = self.wanted_look(known) @ offered.T / math.sqrt(MATCH_WIDTH)
+        logits = logits + self.frequency.repeat_interleave(POSES)
+        return logits.masked_fill(self.look_class != label.unsqueeze(-1), -torch.inf)
+
+    def details(
+        self, reading: "Reading", label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
+    ) -> LogisticMixture:
+        """Of the logarithms of the extents less those of the look, and the height of the bottom."""
+        return LogisticMixture.of(self.details_head(self._known(reading, label, look)), 4)
+
+    def place(
+        self,
+        reading: "Reading",
+        label: Int[Tensor, " rooms"],
+        look: Int[Tensor, " rooms"],
+        size_m: Float[Tensor, "rooms 3"],
+        bottom_m: Float[Tensor, " rooms"],
+    ) -> LogisticMixture:
+        """Of x and z of the centre."""
+        lengths = lengths_shown(torch.cat([size_m, bottom_m.unsqueeze(-1)], dim=-1))
+        known = torch.cat([self._known(reading, label, look), lengths], dim=-1)
+        footprints = reading.before.boxes_m[..., [0, 2, 3, 5]]
+        return self.placement(
+            self.place_query(known), size_m[:, ::2], reading.rectangle_m,
+            reading.objects, footprints, reading.before.is_object,
+        )  # fmt: skip
+
+    def log_prob(self, reading: "Reading", coming: RoomBoxes) -> dict[str, Float[Tensor, " rooms"]]:
+        """Log-probability of each room's next object, part by part; only of the class where that
+        is `END`. Rooms of `coming` have one object, or none."""
+        label = coming.object_class[:, 0]
+        class_logits = self.class_head(reading.context)
+        found = {"class": -F.cross_entropy(class_logits, label, reduction="none")}
+        more = label != END
+        reading, label, coming = reading.rows(more), label[more], coming.changed(lambda p: p[more])
+        assert coming.looks is not None
+        look = coming.looks[:, 0]
+        centre_m, size_m = coming.boxes_m[:, 0].split(3, dim=-1)
+        bottom_m = centre_m[:, 1] - size_m[:, 1] / 2
+        looks = self.look_logits(reading, label).log_softmax(dim=-1)
+        details = torch.cat(
+            [size_m.log() - self.look_shown[look, -3:], bottom_m.unsqueeze(-1)], dim=-1
+        )
+        place = self.place(reading, label, look, size_m, bottom_m)
+        parts = {
+            "look": looks.gather(-1, look.unsqueeze(-1))[:, 0],
+            "size": self.details(reading, label, look).log_prob(details),
+            "place": place.log_prob(centre_m[:, ::2]),
+        }
+        nothing = found["class"].new_zeros(len(more))
+        return found | {name: nothing.index_put((more,), part) for name, part in parts.items()}
+
+    def _known(
+        self, reading: "Reading", label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
+    ) -> Float[Tensor, "rooms known"]:
+        look_seen = self.look_embedding(self.look_shown[look])
+        return torch.cat([reading.context, self.class_embedding(label), look_seen], dim=-1)
+
+
+class Reading(NamedTuple):
+    """What the encoder makes of rooms as far as they are furnished."""
+
+    before: RoomBoxes
+    rectangle_m: Float[Tensor, "rooms 4"]
+    context: Float[Tensor, "rooms width"]
+    """Of the query: what the set means for the next object."""
+    objects: Float[Tensor, "rooms objects width"]
+    """Of each object; anything where there is none."""
+
+    def rows(self, chosen: Tensor) -> "Reading":
+        """Of some of the rooms."""
+        rest = (part[chosen] for part in self[1:])
+        return Reading(self.before.changed(lambda part: part[chosen]), *rest)
+
+
+def lengths_shown(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch shown"]:
+    """Lengths as they are (in 4 m), and as sines and cosines."""
+    octaves = torch.arange(OCTAVES, device=lengths_m.device, dtype=lengths_m.dtype)
+    phase = (lengths_m.unsqueeze(-1) * (2 * math.pi / LONGEST_M * 2**octaves)).flatten(-2)
+    return torch.cat([lengths_m / 4, phase.sin(), phase.cos()], dim=-1)
+
+
+def _head(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    return mlp(nn.Linear(inputs, width), nn.Linear(width, outputs))

@@ -1,0 +1,165 @@
+"""Shapes repeat: a few prototypes, mirrored and turned, stand for all objects of a data set."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sceneprior.geometry.turns import QUARTERS, turn_grids
+
+POSES = 2 * QUARTERS
+"""Of a prototype: pose p is mirrored, x reversed, where p is 4 or more, then turned about +y by
+p % 4 quarters. A look is a prototype times this, plus a pose."""
+ALIKE = 0.12
+"""Two objects look alike that are no farther apart than this: the mean squared difference of their
+coarse grids plus `SIZE_WEIGHT` times the sum of how much their extents' logarithms differ."""
+SIZE_WEIGHT = 0.3
+COARSE, PARTS = 8, 4
+"""Parts along each axis of the grids that are compared, and of those that the network is shown."""
+
+
+class Prototypes(NamedTuple):
+    """Objects that stand for all others of their classes."""
+
+    items: Int[np.ndarray, " prototypes"]
+    """Which objects of the data set they were chosen from."""
+    grids: Bool[np.ndarray, "prototypes x y z"]
+    sizes_m: Float[np.ndarray, "prototypes 3"]
+    object_class: Int[np.ndarray, " prototypes"]
+
+    def shown(self) -> Float[np.ndarray, "looks shown"]:
+        """What each look looks like to a network: a coarse grid, and logarithms of the extents."""
+        rows = [
+            np.hstack([
+                turn_grids(pooled(self.grids, PARTS), *turn_of(pose)).reshape(len(self.items), -1),
+                turned_extents(np.log(self.sizes_m), pose),
+            ])
+            for pose in range(POSES)
+        ]  # fmt: skip
+        return np.stack(rows, axis=1).reshape(len(self.items) * POSES, -1).astype(np.float32)
+
+    def looks_of(
+        self,
+        grids: Bool[np.ndarray, "objects x y z"],
+        sizes_m: Float[np.ndarray, "objects 3"],
+        object_class: Int[np.ndarray, " objects"],
+    ) -> Int[np.ndarray, " objects"]:
+        """The look that comes nearest to each object, -1 where its class has none."""
+        looks = np.full(len(grids), -1, dtype=np.int64)
+        for label in np.unique(object_class):
+            rows, own = (
+                np.flatnonzero(all_ == label) for all_ in (object_class, self.object_class)
+            )
+            if len(own):
+                ours = described(grids[rows], sizes_m[rows])
+                apart, pose = distances(ours, described(self.grids[own], self.sizes_m[own]))
+                nearest = apart.argmin(axis=1)
+                looks[rows] = own[nearest] * POSES + pose[np.arange(len(rows)), nearest]
+        return looks
+
+
+def choose_prototypes(
+    grids: Bool[np.ndarray, "objects x y z"],
+    sizes_m: Float[np.ndarray, "objects 3"],
+    object_class: Int[np.ndarray, " objects"],
+    usable: Bool[np.ndarray, " objects"],
+    most: int,
+) -> Prototypes:
+    """Of each class the objects that look like most others, until every usable one looks like one.
+
+    `ALIKE` is taken half as large again until there are at most `most`, or one a class.
+    """
+    apart = {}
+    for label in np.unique(object_class[usable]):
+        rows = np.flatnonzero((object_class == label) & usable)
+        own = described(grids[rows], sizes_m[rows])
+        apart[label] = rows, distances(own, own)[0]
+    alike, items = ALIKE, _covering(apart, ALIKE)
+    while len(items) > max(most, len(apart)):
+        alike *= 1.5
+        items = _covering(apart, alike)
+    return Prototypes(items, grids[items], sizes_m[items], object_class[items])
+
+
+def _covering(
+    apart: dict[int, tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n n"]]], alike: float
+) -> Int[np.ndarray, " prototypes"]:
+    items = []
+    for rows, distance in apart.values():
+        near = (distance <= alike) | np.eye(len(rows), dtype=bool)
+        while near.any():
+            best = int(near.sum(axis=0).argmax())
+            items.append(rows[best])
+            near[near[:, best]] = False  # they are spoken for
+    return np.array(items, dtype=np.int64)
+
+
+class Described(NamedTuple):
+    """What objects are compared by."""
+
+    coarse: Float[np.ndarray, "objects u v w"]
+    log_sizes: Float[np.ndarray, "objects 3"]
+
+
+def described(
+    grids: Bool[np.ndarray, "objects x y z"], sizes_m: Float[np.ndarray, "objects 3"]
+) -> Described:
+    """Coarse grids and logarithms of extents."""
+    return Described(pooled(grids, COARSE), np.log(sizes_m))
+
+
+def distances(
+    objects: Described, offered: Described
+) -> tuple[Float[np.ndarray, "objects offered"], Int[np.ndarray, "objects offered"]]:
+    """How far each object is from each offered one in its best pose, and which that is; the first
+    of equal ones."""
+    own = objects.coarse.reshape(len(objects.coarse), -1).astype(np.float64)
+    apart = np.full((len(own), len(offered.coarse)), np.inf)
+    best = np.zeros(apart.shape, dtype=np.int64)
+    for pose in range(POSES):
+        turned = turn_grids(offered.coarse, *turn_of(pose)).reshape(len(offered.coarse), -1)
+        squared = (own**2).sum(1)[:, None] + (turned**2).sum(1) - 2 * own @ turned.T
+        sizes = turned_extents(offered.log_sizes, pose)
+        differ = np.abs(objects.log_sizes[:, None] - sizes).sum(2)
+        found = squared / own.shape[1] + SIZE_WEIGHT * differ
+        better = found < apart - 1e-9
+        best[better], apart[better] = pose, found[better]
+    return apart, best
+
+
+def turn_of(pose: int) -> tuple[int, bool]:
+    """Quarters and whether it is mirrored, as `turn_grids` takes them."""
+    return pose % QUARTERS, pose >= QUARTERS
+
+
+def turned_extents(extents: Float[np.ndarray, "n 3"], pose: int) -> Float[np.ndarray, "n 3"]:
+    """Extents along x, y, z of things in a pose."""
+    return extents[:, ::-1] if pose % 2 else extents
+
+
+def turned_looks(
+    looks: Int[Tensor, "rooms objects"],
+    quarters: Int[Tensor, " rooms"],
+    mirrored: Bool[Tensor, " rooms"],
+) -> Int[Tensor, "rooms objects"]:
+    """The looks of objects in rooms that are perhaps mirrored, then turned by so many quarters."""
+    pose = looks % POSES
+    own, flipped = pose % QUARTERS, pose >= QUARTERS
+    # Mirroring a turn makes it a turn the other way.
+    turn = torch.where(mirrored[:, None], -own, own) + quarters[:, None]
+    return looks - pose + turn % QUARTERS + QUARTERS * (flipped ^ mirrored[:, None])
+
+
+def pooled(
+    grids: Bool[np.ndarray, "objects x y z"], parts: int
+) -> Float[np.ndarray, "objects u v w"]:
+    """Means of a grid's cells in so many parts along each axis; cells left over at the end of an
+    axis are left out."""
+    n, cells = len(grids), grids.shape[1] // parts
+    even = grids[:, : parts * cells, : parts * cells, : parts * cells]
+    means: np.ndarray = even.reshape(n, parts, cells, parts, cells, parts, cells).mean(
+        axis=(2, 4, 6), dtype=np.float32
+    )
+    return means

@@ -1,0 +1,137 @@
+"""What the sampler learns from: the lifted objects of rooms, each with its look."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from sceneprior.classes import VOID
+from sceneprior.geometry.turns import QUARTERS, turn_boxes
+from sceneprior.lifting.dataset import LiftedDataset
+from sceneprior.sampler.prototypes import Prototypes, choose_prototypes, turned_looks
+from sceneprior.views import RoomBoxes
+
+GRAZE_M = 0.05
+"""Lifted boxes that share no more than this along some axis may do so for want of accuracy."""
+PLAUSIBLE_SHARE = 0.2
+"""Two classes may intersect that do so in at least this part of the training rooms with both:
+lifted boxes of chairs intersect each other in a seventh, and true ones in none."""
+
+
+class SamplerRooms:
+    """Rooms as unordered sets of objects: class, box and look. Rows are rooms, not turned copies.
+
+    Objects without a label, and those that no view shows, are left out.
+
+    Args:
+        lifted: A split, with its shapes.
+        prototypes: What the looks are of; or a number: the most that are chosen from these rooms.
+    """
+
+    room_ids: tuple[str, ...]
+    """Those of the prior's latents, turned copies among them."""
+    masks = None
+    """Batches are made in the training process, as `ViewDataset` says."""
+
+    def __init__(self, lifted: LiftedDataset, prototypes: Prototypes | int):
+        self.room_ids, self.label_set = lifted.room_ids, lifted.label_set
+        self.plain_ids = tuple(lifted.plain_ids)
+        counts = [len(room.explained) for room in lifted.boxes]
+        classes, grids = lifted.object_classes, lifted.grids()
+        boxes_m = np.concatenate([np.hstack([b.centers_m, b.sizes_m]) for b in lifted.boxes])
+        usable = np.concatenate([room.explained > 0 for room in lifted.boxes]) & (classes != VOID)
+        # What is left out has a box of nothing.
+        sizes_m = np.where(usable[:, None], boxes_m[:, 3:], 1.0)
+        if isinstance(prototypes, int):
+            prototypes = choose_prototypes(grids, sizes_m, classes, usable, prototypes)
+        self.prototypes = prototypes
+        looks = prototypes.looks_of(grids, sizes_m, classes)
+        usable &= looks >= 0
+        rows = np.split(np.arange(len(usable)), np.cumsum(counts)[:-1])
+        kept = [torch.from_numpy(row[usable[row]]) for row in rows]
+
+        def padded(values: np.ndarray) -> Tensor:
+            return pad_sequence([torch.from_numpy(values)[row] for row in kept], batch_first=True)
+
+        self.rooms = RoomBoxes(
+            object_class=padded(classes),
+            is_object=padded(np.ones(len(usable), dtype=bool)),
+            boxes_m=padded(boxes_m.astype(np.float32)),
+            room_ids=self.plain_ids,
+            looks=padded(looks),
+        )
+
+    def __len__(self) -> int:
+        return len(self.plain_ids)
+
+    def to(self, device: torch.device | str) -> "SamplerRooms":
+        """Move all rooms to `device`, where batches are then made."""
+        self.rooms = self.rooms.to(device)
+        return self
+
+    def __getitems__(self, draws: list[tuple[int, int]]) -> RoomBoxes:
+        """A batch of rows; each draw is (row, epoch). Rooms without objects teach nothing, as does
+        a draw of an epoch `BLANK`."""
+        shown = torch.tensor([epoch >= 0 for _, epoch in draws])
+        rows = [row for row, _ in draws]
+        rooms = self.rooms.changed(lambda part: part[rows])
+        rooms = rooms.only(shown.to(rooms.is_object.device)[:, None])
+        return replace(rooms, room_ids=tuple(self.plain_ids[row] for row in rows))
+
+    def may_meet(self, classes: int) -> Bool[Tensor, "classes classes"]:
+        """Pairs of classes that intersect in enough rooms to be meant to, such as a chair and its
+        table; symmetric."""
+        together = torch.zeros(2, classes, classes, dtype=torch.int64)
+        for row in range(len(self)):
+            here = self.rooms.is_object[row]
+            label, boxes_m = self.rooms.object_class[row, here], self.rooms.boxes_m[row, here]
+            first, second = torch.triu_indices(len(label), len(label), 1)
+            shared = shared_extents(boxes_m[first], boxes_m[second]).amin(dim=-1) > GRAZE_M
+            for number, pairs in enumerate((torch.ones_like(shared), shared)):
+                found = torch.zeros(classes, classes, dtype=torch.bool)
+                found[label[first[pairs]], label[second[pairs]]] = True
+                together[number] += found | found.T
+        both, meeting = together
+        return (both > 0) & (meeting >= PLAUSIBLE_SHARE * both)
+
+
+def shared_extents(
+    boxes_m: Float[Tensor, "*batch 6"], others_m: Float[Tensor, "*batch 6"]
+) -> Float[Tensor, "*batch 3"]:
+    """How much of each axis two boxes (centre, full extents) share; 0 where they do not meet."""
+    apart = (boxes_m[..., :3] - others_m[..., :3]).abs()
+    total = (boxes_m[..., 3:] + others_m[..., 3:]) / 2
+    least = torch.minimum(boxes_m[..., 3:], others_m[..., 3:])
+    return torch.minimum(total - apart, least).clamp(min=0)
+
+
+def rectangles_of(rooms: RoomBoxes) -> Float[Tensor, "rooms 4"]:
+    """The rectangle round each room's footprints: centre x, z, extents x, z; zeros without any."""
+    centers, sizes = (part[..., ::2] for part in rooms.boxes_m.split(3, dim=-1))
+    nowhere = ~rooms.is_object.unsqueeze(-1)
+    low = (centers - sizes / 2).masked_fill(nowhere, torch.inf).amin(dim=1)
+    high = (centers + sizes / 2).masked_fill(nowhere, -torch.inf).amax(dim=1)
+    found = torch.cat([(low + high) / 2, high - low], dim=-1)
+    return found.where(rooms.is_object.any(dim=1, keepdim=True), 0.0)
+
+
+def turned_rooms(rooms: RoomBoxes, generator: torch.Generator) -> RoomBoxes:
+    """Every room in one of its eight symmetries: mirrored or not, and turned by quarters."""
+    assert rooms.looks is not None
+    device = rooms.boxes_m.device
+    quarters = torch.randint(QUARTERS, (len(rooms.boxes_m),), generator=generator).to(device)
+    mirrored = (torch.rand(len(rooms.boxes_m), generator=generator) < 0.5).to(device)
+    return replace(
+        rooms,
+        boxes_m=turn_boxes(rooms.boxes_m, quarters, mirrored),
+        looks=turned_looks(rooms.looks, quarters, mirrored),
+    )
+
+
+def shuffled(rooms: RoomBoxes, generator: torch.Generator) -> RoomBoxes:
+    """Every room's objects in a random order, followed by its padding."""
+    tickets = torch.rand(rooms.is_object.shape, generator=generator).to(rooms.boxes_m.device)
+    return rooms.take(tickets.masked_fill(~rooms.is_object, 2.0).argsort(dim=1))

@@ -1,0 +1,143 @@
+"""The stage that learns to make new rooms: maximum likelihood of the training rooms' objects."""
+
+import copy
+import math
+from dataclasses import replace
+from typing import Any
+
+import lightning
+import numpy as np
+import torch
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
+from sklearn.mixture import GaussianMixture
+from torch import Tensor, nn
+
+from sceneprior.geometry.turns import QUARTERS, turn_boxes
+from sceneprior.lifting.shapes import ShapeSpace
+from sceneprior.losses.averages import share_of_batch
+from sceneprior.models.occupancy import OccupancyDecoder
+from sceneprior.models.prior import ScenePrior
+from sceneprior.sampler.likelihood import negative_log_likelihood
+from sceneprior.sampler.network import RECTANGLES, RoomSampler
+from sceneprior.sampler.prototypes import POSES
+from sceneprior.sampler.rooms import SamplerRooms, rectangles_of, turned_rooms
+from sceneprior.sampler.settings import SamplerConfig
+from sceneprior.training.objective import (
+    batch_seed,
+    check_finite,
+    full_precision,
+    log_losses,
+    with_cosine,
+)
+from sceneprior.views import RoomBoxes
+
+ORDERS = 4
+"""Random orders of every val room that a likelihood is the mean of."""
+LEAST_VARIANCE = 0.01
+"""Of rectangles: 10 cm, or a tenth of an extent."""
+
+
+class SamplerStage(lightning.LightningModule):
+    """Rooms in random orders of their objects, in one of their eight symmetries each."""
+
+    def __init__(
+        self,
+        prior: ScenePrior,
+        latents: nn.Embedding,
+        sampler: RoomSampler,
+        stage: SamplerConfig,
+        val: SamplerRooms | None,
+        seed: int,
+    ):
+        super().__init__()
+        self.prior, self.latents = prior.requires_grad_(False), latents.requires_grad_(False)
+        self.learner = sampler
+        # What checkpoints are read for: the best learner so far.
+        self.sampler = copy.deepcopy(sampler).requires_grad_(False)
+        self.stage, self.seed = stage, seed
+        self.val = val
+        self.least: Tensor
+        self.register_buffer("least", torch.tensor(math.inf))
+
+    def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
+        """Minus the log-likelihood of a room, mean over the batch."""
+        generator = torch.Generator().manual_seed(batch_seed(self.seed, self.trainer, batch_idx))
+        with full_precision(self.device):
+            parts = negative_log_likelihood(self.learner, turned_rooms(rooms, generator), generator)
+            taught = rooms.is_object.any(dim=1)
+            share = share_of_batch(taught.sum()) / max(int(taught.sum()), 1)
+            means = {name: (part * taught).sum() * share for name, part in parts.items()}
+            total = torch.stack(list(means.values())).sum()
+        check_finite(total, rooms)
+        log_losses(self, means, total, len(rooms.boxes_m))
+        return total
+
+    def on_train_batch_end(self, outputs: Any, batch: RoomBoxes, batch_idx: int) -> None:
+        """Every few epochs, keep the learner if it finds val rooms likelier than any before.
+
+        After the epoch's last batch and not after the epoch, when its checkpoint is written.
+        """
+        done = self.current_epoch + 1
+        looks = done % self.stage.val_every == 0 or done == self.stage.epochs
+        if batch_idx + 1 < self.trainer.num_training_batches or not looks:
+            return
+        if self.val is not None:
+            found = self.val_loss()
+            self.log("val/loss", found, on_step=False, on_epoch=True, batch_size=1)
+            if found >= self.least:
+                return
+            self.least.copy_(found)
+        self.sampler.load_state_dict(self.learner.state_dict())
+
+    @torch.no_grad()
+    def val_loss(self) -> Tensor:
+        """Minus the log-likelihood of a val room, mean over rooms and `ORDERS` orders; the same
+        orders each time."""
+        assert self.val is not None
+        rooms = self.val.to(self.device).rooms
+        generator = torch.Generator().manual_seed(self.seed)
+        self.learner.eval()
+        found = [negative_log_likelihood(self.learner, rooms, generator) for _ in range(ORDERS)]
+        self.learner.train()
+        return (
+            torch.stack([part.mean() for parts in found for part in parts.values()]).sum() / ORDERS
+        )
+
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
+        optimizer = torch.optim.AdamW(
+            self.learner.parameters(),
+            self.stage.learning_rate,
+            weight_decay=self.stage.weight_decay,
+        )
+        return with_cosine(optimizer, int(self.trainer.estimated_stepping_batches))
+
+
+def teach(sampler: RoomSampler, rooms: SamplerRooms, decoder: OccupancyDecoder) -> None:
+    """Give a fresh sampler what it takes from the training rooms before it learns: prototypes, as
+    the prior's shape decoder knows them, rectangles, and which classes may intersect."""
+    prototypes = rooms.prototypes
+    looks = torch.from_numpy(prototypes.shown())
+    sampler.look_shown[: len(looks)] = looks
+    labels = torch.from_numpy(prototypes.object_class)
+    sampler.look_class[: len(looks)] = labels.repeat_interleave(POSES)
+    mean, basis = (part.float().numpy() for part in (decoder.mean, decoder.basis))
+    codes = ShapeSpace(mean, basis, 1.0).codes_of(prototypes.grids)
+    sampler.prototype_codes[: len(codes)] = torch.from_numpy(codes)
+    sampler.may_meet.copy_(rooms.may_meet(len(sampler.may_meet)))
+    everyone = rooms.rooms
+    turned = [
+        rectangles_of(replace(everyone, boxes_m=turn_boxes(everyone.boxes_m, quarters, mirrored)))
+        for quarters in torch.arange(QUARTERS)[:, None].expand(-1, len(rooms))
+        for mirrored in torch.tensor([[False], [True]]).expand(-1, len(rooms))
+    ]
+    furnished = everyone.is_object.any(dim=1).repeat(len(turned))
+    centre, extents = torch.cat(turned)[furnished].split(2, dim=-1)
+    found = GaussianMixture(RECTANGLES, reg_covar=LEAST_VARIANCE, random_state=0).fit(
+        torch.cat([centre, extents.log()], dim=-1).numpy()
+    )
+    for buffer, values in (
+        (sampler.rectangle_logits, np.log(found.weights_)),
+        (sampler.rectangle_means, found.means_),
+        (sampler.rectangle_factors, np.linalg.cholesky(found.covariances_)),
+    ):
+        buffer.copy_(torch.from_numpy(values))
