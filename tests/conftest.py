@@ -21,7 +21,7 @@ import scipy.stats  # noqa: F401
 import sklearn.linear_model  # noqa: F401
 import torch
 from threadpoolctl import threadpool_limits
-from tiny_runs import OCCUPANCY, tiny_config
+from tiny_runs import OCCUPANCY, tiny_config, tiny_sampler_config
 from toy_rooms import write_toy_shards
 
 # Toy tensors gain nothing from a second thread, and wait for it where cores are shared: thirty
@@ -104,6 +104,17 @@ def toy_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
 
     config = tiny_config(toy_shards, layout__epochs=20)
     return made_once("run", lambda run: fit(config, run, trainer_options={"accelerator": "cpu"}))
+
+
+@pytest.fixture(scope="session")
+def sampler_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
+    """A prior of occupancy grids and its sampler, hardly trained. Tests read it only."""
+    from sceneprior.training.fit import fit
+
+    config = tiny_sampler_config(toy_shards)
+    return made_once(
+        "sampled", lambda run: fit(config, run, trainer_options={"accelerator": "cpu"})
+    )
 
 
 @pytest.fixture

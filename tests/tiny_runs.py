@@ -122,6 +122,14 @@ def tiny_config(shards: Path, **changes: Any) -> RunConfig:
     return check_config(tiny_settings(shards, **changes), "tiny")
 
 
+def tiny_sampler_config(shards: Path, **changes: Any) -> RunConfig:
+    """A run of one stage and a sampler; `changes` are the sampler's."""
+    sampler = {"epochs": 3, "width": 16, "layers": 1, "heads": 2, "val_every": 1, **changes}
+    return tiny_config(
+        shards, **OCCUPANCY, layout=None, sampler=sampler, sampling={"distribution": "sampler"}
+    )
+
+
 def write_tiny_config(path: Path, shards: Path, **changes: Any) -> Path:
     """The same, as a YAML file."""
     path.write_text(yaml.safe_dump(tiny_settings(shards, **changes), sort_keys=False))

@@ -11,7 +11,7 @@ from pathlib import Path
 from sceneprior.config import load_any_run, load_config
 from sceneprior.errors import InputError
 from sceneprior.evaluation.networks import check_inception
-from sceneprior.experiments.comparison import Comparison, Run, runs_of
+from sceneprior.experiments.comparison import Comparison, Run, distributions_of, runs_of
 from sceneprior.experiments.figure import write_figure
 from sceneprior.experiments.steps import Step, is_done, open_runner, read_journal, read_result
 from sceneprior.experiments.table import Row, write_tables
@@ -145,9 +145,8 @@ def scoring_steps(
     # Some methods decode meshes and some have boxes alone: --boxes compares what all have.
     alike = ["-n", str(count), "--seed", str(comparison.sampling_seed), "--boxes"]
     alike += ["--renderer", options.renderer, *weights]
-    has_latents = load_config(run.config, run.settings).remembers_rooms
     steps = []
-    for number, distribution in enumerate(comparison.distributions if has_latents else (None,)):
+    for number, distribution in enumerate(distributions_of(comparison, run)):
         name = f"scores_{distribution}" if number else "scores"
         scores = run.folder / f"{name}.json"
         asked = alike if distribution is None else [*alike, "--distribution", distribution]

@@ -183,3 +183,13 @@ def _value(data: Any, key: str) -> Any:
     for part in key.split("."):
         data = data.get(part) if isinstance(data, dict) else None
     return data
+
+
+def distributions_of(comparison: Comparison, run: Run) -> tuple[str | None, ...]:
+    """Where rooms of a run come from, a row of the table each; None is the run's own way, which is
+    all that methods without latents have, and comes first where that is a sampler."""
+    config = load_config(run.config, run.settings)
+    if not config.remembers_rooms:
+        return (None,)
+    own = (None,) if getattr(config, "distribution", None) == SAMPLER else ()
+    return (*own, *comparison.distributions)

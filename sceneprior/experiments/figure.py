@@ -9,7 +9,7 @@ from sceneprior.config import load_any_run
 from sceneprior.evaluation.ground_truth import independent_rooms, reference_scenes
 from sceneprior.evaluation.room_sets import without_void
 from sceneprior.evaluation.topdown import topdown
-from sceneprior.experiments.comparison import Comparison, Run
+from sceneprior.experiments.comparison import Comparison, Run, distributions_of
 from sceneprior.files import write_whole
 from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import Renderer
@@ -36,7 +36,7 @@ def write_figure(
     independent = independent_rooms(real, SHOWN, comparison.sampling_seed, True)
     rows = {"Real training rooms": real[:SHOWN], "Independent objects": independent}
     for run, prior in zip(runs, trained, strict=True):
-        latents = comparison.distributions[0] if prior.remembers_rooms else None
+        latents = distributions_of(comparison, run)[0]
         made = synthesize(prior, count, comparison.sampling_seed, latents)
         rows[comparison.methods[run.method].title] = made[:SHOWN]
     size = (MARGIN_PX + SHOWN * TILE_PX, len(rows) * TILE_PX)

@@ -26,7 +26,7 @@ class ShapeGrid(NamedTuple):
     margin: float
     """A grid fills the object's box times this."""
     codes: int
-    """Dimensions of the shape space."""
+    """Dimensions of the shape space; 0 for shapes alone."""
 
 
 def lift_shapes(
@@ -79,7 +79,7 @@ class ShapeSpace(NamedTuple):
     ) -> Float[np.ndarray, "shapes codes"]:
         """The weights that come nearest to grids. Distances between them are those between the
         grids, summed over cells, but for what the components leave out."""
-        flat = self.basis.reshape(len(self.basis), -1)
+        flat = self.basis.reshape(len(self.basis), self.mean.size)
         parts = np.array_split(grids, max(1, len(grids) // 256))  # as floats 32 times as large
         codes = [(part - self.mean).reshape(len(part), flat.shape[1]) @ flat.T for part in parts]
         return np.concatenate(codes).astype(np.float32)

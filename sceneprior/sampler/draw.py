@@ -66,11 +66,12 @@ def draw_rooms(
 
     The same seed draws the same rooms, the first of them however many follow.
     """
+    attempts, each = 2 * sampler.max_objects, 7 + 3 * PLACES
     generator = torch.Generator().manual_seed(seed)
-    attempts = 2 * sampler.max_objects
-    uniform = torch.rand(count, attempts, 7 + 3 * PLACES, generator=generator)
-    choice = torch.rand(count, RECTANGLES, generator=generator)
-    noise = torch.randn(count, RECTANGLES, 4, generator=generator)
+    # All in one call: what a room gets does not depend on how many there are.
+    numbers = torch.rand(count, attempts * each + 5 * RECTANGLES, generator=generator)
+    uniform, frames = numbers.split([attempts * each, 5 * RECTANGLES], dim=1)
+    uniform, frames = uniform.unflatten(1, (attempts, each)), frames.unflatten(1, (RECTANGLES, 5))
     given = given or nothing_given(count)
     drawn = []
     for start in range(0, count, BATCH):
@@ -78,7 +79,8 @@ def draw_rooms(
         own = given.part(rows)
         frame = own.rectangle_m
         if frame is None:
-            tried = sampler.rectangles(choice[rows], noise[rows])
+            normal = torch.special.ndtri(frames[rows, :, 1:].clamp(1e-6, 1 - 1e-6))
+            tried = sampler.rectangles(frames[rows, :, 0], normal)
             frame = _holding(tried, own.objects)
         drawn.append(_draw(sampler, uniform[rows], frame, own))
     parts = [(each.object_class, each.is_object, each.boxes_m, each.looks) for each in drawn]
@@ -122,7 +124,7 @@ def _draw(
     for chance in uniform.unbind(dim=1):
         reading = _read(sampler, rooms, number, rectangle_m)
         if wanted is None:
-            label = draw_index(sampler.class_head(reading.context), chance[:, 0])
+            label = draw_index(sampler.class_logits(reading), chance[:, 0])
         else:
             label = F.pad(wanted, (0, slots)).gather(1, added[:, None])[:, 0]
         going = going & (label != END) & (number < slots)
@@ -166,7 +168,8 @@ def _tried(
     look = draw_index(sampler.look_logits(reading, label), chance[:, 1])
     details = sampler.details(reading, label, look).draw(chance[:, 2], chance[:, 3:7])
     off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)
-    size_m, bottom_m = (sampler.look_shown[look, -3:] + off).exp(), details[:, 3]
+    size_m = (sampler.look_shown[look, -3:] + off).exp()
+    bottom_m = details[:, 3].clamp(min=0)  # the floor
     places = sampler.place(reading, label, look, size_m, bottom_m)
     numbers = chance[:, 7:].unflatten(1, (PLACES, 3))
     x, z = places.drawn(numbers[..., 0], numbers[..., 1:]).unbind(dim=-1)

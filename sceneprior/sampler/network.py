@@ -132,6 +132,14 @@ class RoomSampler(nn.Module):
         features = self.norm(features)
         return Reading(before, rectangle_m, features[:, 0], features[:, 2:])
 
+    def class_logits(self, reading: "Reading") -> Float[Tensor, "rooms classes"]:
+        """Of the next object's class, or of `END`; classes without a look are ruled out."""
+        known = torch.zeros_like(self.may_meet[0])
+        known[self.look_class[self.look_class >= 0]] = True
+        known[END] = True
+        logits: Tensor = self.class_head(reading.context)
+        return logits.masked_fill(~known, -torch.inf)
+
     def look_logits(
         self, reading: "Reading", label: Int[Tensor, " rooms"]
     ) -> Float[Tensor, "rooms looks"]:
@@ -169,8 +177,7 @@ class RoomSampler(nn.Module):
         """Log-probability of each room's next object, part by part; only of the class where that
         is `END`. Rooms of `coming` have one object, or none."""
         label = coming.object_class[:, 0]
-        class_logits = self.class_head(reading.context)
-        found = {"class": -F.cross_entropy(class_logits, label, reduction="none")}
+        found = {"class": -F.cross_entropy(self.class_logits(reading), label, reduction="none")}
         more = label != END
         reading, label, coming = reading.rows(more), label[more], coming.changed(lambda p: p[more])
         assert coming.looks is not None

@@ -71,11 +71,11 @@ def choose_prototypes(
 
     `ALIKE` is taken half as large again until there are at most `most`, or one a class.
     """
-    apart = {}
+    apart = []
     for label in np.unique(object_class[usable]):
         rows = np.flatnonzero((object_class == label) & usable)
         own = described(grids[rows], sizes_m[rows])
-        apart[label] = rows, distances(own, own)[0]
+        apart.append((rows, distances(own, own)[0]))
     alike, items = ALIKE, _covering(apart, ALIKE)
     while len(items) > max(most, len(apart)):
         alike *= 1.5
@@ -84,10 +84,11 @@ def choose_prototypes(
 
 
 def _covering(
-    apart: dict[int, tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n n"]]], alike: float
+    apart: list[tuple[np.ndarray, np.ndarray]], alike: float
 ) -> Int[np.ndarray, " prototypes"]:
+    """`choose_prototypes` from each class's rows and their distances."""
     items = []
-    for rows, distance in apart.values():
+    for rows, distance in apart:
         near = (distance <= alike) | np.eye(len(rows), dtype=bool)
         while near.any():
             best = int(near.sum(axis=0).argmax())

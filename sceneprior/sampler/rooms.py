@@ -99,8 +99,8 @@ class SamplerRooms:
 
 
 def shared_extents(
-    boxes_m: Float[Tensor, "*batch 6"], others_m: Float[Tensor, "*batch 6"]
-) -> Float[Tensor, "*batch 3"]:
+    boxes_m: Float[Tensor, "*#batch 6"], others_m: Float[Tensor, "*#batch 6"]
+) -> Float[Tensor, "*#batch 3"]:
     """How much of each axis two boxes (centre, full extents) share; 0 where they do not meet."""
     apart = (boxes_m[..., :3] - others_m[..., :3]).abs()
     total = (boxes_m[..., 3:] + others_m[..., 3:]) / 2

@@ -1,0 +1,118 @@
+"""Rooms of a sampler as scenes, round what is given, and what has latents nevertheless."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from sceneprior.config import load_run
+from sceneprior.errors import InputError
+from sceneprior.generation.complete import complete
+from sceneprior.generation.decode import new_rooms, synthesize
+from sceneprior.generation.sample import draw_latents, read_latent
+from sceneprior.generation.sampled import PrototypeMeshes
+from sceneprior.geometry.isosurface import surface_of
+from sceneprior.geometry.turns import turn_grids
+from sceneprior.sampler.prototypes import POSES, turn_of
+from sceneprior.scene import Scene, SceneObject
+
+BED = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
+
+
+@pytest.fixture(scope="module")
+def trained(sampler_run):
+    return load_run(sampler_run)
+
+
+def scene(*objects: SceneObject, floor=None) -> Scene:
+    return Scene("mine", "front3d_bedroom", objects, floor)
+
+
+def test_meshes_turn_and_fill_boxes_as_grids_do(trained):
+    """A look's mesh against the surface of its turned grid, on a shape without symmetry."""
+    rng = np.random.default_rng(0)
+    decoder = trained.prior.shape
+    cells = decoder.cells
+    logits = np.full((cells,) * 3, -4.0, np.float32)
+    logits[1:, 1:4, 2:7] = 4.0
+    logits[2:4, 1:7, 2:4] = 4.0
+    meshes = PrototypeMeshes(trained)
+    meshes._unit[0] = surface_of(logits, np.zeros(3), np.ones(3), decoder.margin)
+    box = np.array([*rng.normal(size=3), 2.0, 0.5, 1.0])
+    for pose in range(POSES):
+        mesh = meshes.mesh(pose, box)
+        turned = turn_grids(logits[None], *turn_of(pose))[0]
+        slow = surface_of(turned, box[:3], box[3:], decoder.margin)
+        here = trimesh.Trimesh(mesh.vertices_m, mesh.faces)
+        there = trimesh.Trimesh(*slow)
+        # A cell's corners may be cut along its other diagonal.
+        assert here.volume == pytest.approx(there.volume, rel=0.02) and here.volume > 0
+        assert np.allclose(here.bounds, there.bounds, atol=1e-6)
+        assert np.allclose(here.center_mass, there.center_mass, atol=0.02)
+
+
+def test_new_rooms_come_from_the_sampler_and_others_if_asked(trained):
+    made = new_rooms(trained, 3, 5)
+    assert made.latents is None and len(made.scenes) == 3
+    assert made.scenes[0].name == "seed5_0000"
+    again = synthesize(trained, 2, 5)
+    for one, other in zip(again, made.scenes[:2], strict=True):
+        assert [item.label for item in one.objects] == [item.label for item in other.objects]
+        assert np.allclose(one.centers_m, other.centers_m, atol=1e-4)
+    assert all(item.mesh is not None for room in made.scenes for item in room.objects)
+    other = new_rooms(trained, 3, 5, "paper")
+    assert other.latents is not None and len(other.latents) == 3
+
+
+def test_latents_of_such_a_run_are_the_kernel_s(trained):
+    own, _ = draw_latents(trained, 1, 7)
+    assert torch.equal(own, draw_latents(trained, 1, 7, "kernel")[0])
+    assert torch.equal(read_latent(trained, "seed:7"), own[0])
+
+
+def test_runs_without_a_sampler_say_so(toy_run):
+    with pytest.raises(InputError, match="has no sampler"):
+        synthesize(load_run(toy_run), 2, 0, "sampler")
+    with pytest.raises(InputError, match="asked of a sampler alone"):
+        complete(load_run(toy_run), [scene(BED)], classes=["desk"])
+
+
+def test_before_its_stage_rooms_come_from_latents(trained):
+    early = replace(trained, sampler=None, stage="shape")
+    assert early.distribution == "kernel"
+    assert new_rooms(early, 2, 0).latents is not None
+
+
+def test_answers_hold_what_is_given_exactly_and_differ(trained):
+    given = scene(BED)
+    ((latents, answers),) = complete(trained, [given], count=3, seed=1)
+    assert latents is None and len(answers) == 3
+    for answer in answers:
+        first = answer.objects[0]
+        assert (first.label, first.center_m, first.size_m) == (BED.label, BED.center_m, BED.size_m)
+        assert first.mesh is not None  # of the look that was recognised
+        assert answer.extra["given"] == [0]
+    places = {tuple(answer.centers_m.round(3).ravel()) for answer in answers}
+    assert len(places) == 3
+    ((_, again),) = complete(trained, [given], count=3, seed=1)
+    assert places == {tuple(answer.centers_m.round(3).ravel()) for answer in again}
+
+
+def test_classes_and_floor_are_kept_to(trained):
+    floor = np.array([[-2.0, -1.5], [2.0, -1.5], [2.0, 1.5], [-2.0, 1.5]])
+    room = scene(floor=floor)
+    known = {item.label for made in synthesize(trained, 20, 0) for item in made.objects}
+    wanted = sorted(known)[:2]
+    ((_, answers),) = complete(trained, [room], count=4, seed=0, classes=wanted)
+    for answer in answers:
+        assert sorted(item.label for item in answer.objects) == wanted
+    with pytest.raises(InputError, match="'piano' is no class"):
+        complete(trained, [room], classes=["piano"])
+
+
+def test_several_rooms_are_completed_at_once(trained):
+    both = complete(trained, [scene(BED), scene()], count=2)
+    assert [len(answers) for _, answers in both] == [2, 2]
+    assert both[0][1][0].objects[0].label == "double_bed"

@@ -1,0 +1,68 @@
+"""Rooms, shapes and a small sampler for tests, made from numbers alone."""
+
+import numpy as np
+import torch
+
+from sceneprior.lifting.boxes import LiftedBoxes
+from sceneprior.lifting.dataset import LiftedDataset
+from sceneprior.models.occupancy import OccupancyConfig, OccupancyDecoder
+from sceneprior.sampler.network import RoomSampler
+from sceneprior.sampler.rooms import SamplerRooms
+from sceneprior.sampler.settings import SamplerConfig
+from sceneprior.sampler.stage import teach
+
+CLASSES, CODES, CELLS = 5, 7, 8
+TINY = {"epochs": 2, "width": 16, "layers": 1, "heads": 2, "dropout": 0.0, "prototypes": 12}
+
+
+class Lifted(LiftedDataset):
+    """Rooms without shards: what the sampler reads of lifted ones."""
+
+    def __init__(self, boxes: list[LiftedBoxes], classes: list[int], grids: list[np.ndarray]):
+        self.rotations, self.label_set, self.boxes = 1, "toy", boxes
+        self.plain_ids = [f"room{row}" for row in range(len(boxes))]
+        self.object_classes = np.array(classes, dtype=np.int64)
+        self._grids = np.array(grids)
+
+    def grids(self) -> np.ndarray:
+        return self._grids
+
+
+def lifted_rooms(count: int = 6, seed: int = 0) -> Lifted:
+    """An L-shaped sofa (1), a box (2), and in every other room a thin box (3), far enough from each
+    other."""
+    rng = np.random.default_rng(seed)
+    corner = np.ones((CELLS,) * 3, dtype=bool)
+    corner[4:, :, 4:] = False
+    plain = np.ones((CELLS,) * 3, dtype=bool)
+    boxes, classes, grids = [], [], []
+    for room in range(count):
+        labels = [1, 2, 3][: 2 + room % 2]
+        sizes = np.array([[2.0, 0.8, 1.4], [0.5, 0.5, 0.5], [0.3, 1.5, 0.3]])[: len(labels)]
+        sizes = sizes * rng.uniform(0.98, 1.02, sizes.shape)
+        x = np.array([-1.0, 0.7, 1.4])[: len(labels)] + rng.uniform(-0.1, 0.1, len(labels))
+        centers = np.stack([x, sizes[:, 1] / 2, rng.uniform(-0.5, 0.5, len(labels))], axis=1)
+        boxes.append(LiftedBoxes(centers, sizes, np.ones(len(labels))))
+        classes += labels
+        grids += [corner, plain, plain][: len(labels)]
+    return Lifted(boxes, classes, grids)
+
+
+def small_decoder() -> OccupancyDecoder:
+    """A decoder whose space holds the shapes above."""
+    decoder = OccupancyDecoder(4, OccupancyConfig(codes=CODES, width=8, cells=CELLS, margin=1.0))
+    grids = lifted_rooms().grids()[:2].astype(np.float32)
+    apart = (grids[1] - grids[0]) / np.linalg.norm(grids[1] - grids[0])
+    basis = np.zeros((CODES, *grids.shape[1:]), np.float32)
+    basis[0] = apart
+    decoder.set_space(grids[0], basis, 1.0)
+    return decoder
+
+
+def small_sampler(rooms: SamplerRooms, seed: int = 0, **settings: object) -> RoomSampler:
+    """Untrained, but it knows its rooms."""
+    torch.manual_seed(seed)
+    config = SamplerConfig.model_validate({**TINY, **settings})
+    sampler = RoomSampler(config, CLASSES, CODES, max_objects=5)
+    teach(sampler, rooms, small_decoder())
+    return sampler.eval()

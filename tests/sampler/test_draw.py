@@ -1,0 +1,119 @@
+"""Drawing rooms: seeds, what is given, and what must not happen."""
+
+import pytest
+import torch
+from rooms_of_boxes import lifted_rooms, small_sampler
+from torch.testing import assert_close
+
+from sceneprior.sampler import draw as module
+from sceneprior.sampler.draw import BEYOND_M, INTERSECTING, Given, draw_rooms
+from sceneprior.sampler.rooms import SamplerRooms, rectangles_of, shared_extents
+from sceneprior.views import RoomBoxes
+
+
+@pytest.fixture(scope="module")
+def rooms() -> SamplerRooms:
+    return SamplerRooms(lifted_rooms(), 99)
+
+
+@pytest.fixture(scope="module")
+def sampler(rooms):
+    return small_sampler(rooms)
+
+
+def given(count: int, label: int, box: list[float]) -> RoomBoxes:
+    """One object in each room."""
+    return RoomBoxes(
+        torch.full((count, 1), label),
+        torch.ones(count, 1, dtype=torch.bool),
+        torch.tensor(box).expand(count, 1, 6),
+    )
+
+
+def test_a_seed_draws_the_same_rooms_the_first_of_them_however_many_follow(sampler):
+    some, more = draw_rooms(sampler, 3, 5), draw_rooms(sampler, 7, 5)
+    assert torch.equal(some.object_class, more.object_class[:3])
+    assert torch.equal(some.looks, more.looks[:3])
+    assert_close(some.boxes_m, more.boxes_m[:3], atol=1e-4, rtol=0)
+    assert not torch.equal(draw_rooms(sampler, 3, 6).boxes_m, some.boxes_m)
+
+
+def test_batches_do_not_matter(sampler, monkeypatch):
+    whole = draw_rooms(sampler, 6, 1)
+    monkeypatch.setattr(module, "BATCH", 4)
+    parts = draw_rooms(sampler, 6, 1)
+    assert torch.equal(parts.object_class, whole.object_class)
+    assert_close(parts.boxes_m, whole.boxes_m, atol=1e-4, rtol=0)
+
+
+def test_objects_are_what_they_say(sampler):
+    drawn = draw_rooms(sampler, 30, 0)
+    here = drawn.is_object
+    assert here.any()
+    assert torch.equal(here, drawn.object_class > 0)
+    counts = here.sum(dim=1)
+    assert torch.equal(here, torch.arange(here.shape[1]) < counts[:, None])
+    assert torch.equal(sampler.look_class[drawn.looks[here]], drawn.object_class[here])
+    assert (drawn.boxes_m[here][:, 3:] > 0).all()
+
+
+def test_nothing_stands_in_what_it_may_not_or_sticks_out(sampler):
+    frame = torch.tensor([[0.0, 0, 4, 4]]).expand(40, -1)
+    none = module.nothing_given(40).objects
+    drawn = draw_rooms(sampler, 40, 3, Given(none, frame))
+    assert not sampler.may_meet.any()
+    first, second = torch.triu_indices(5, 5, 1)
+    pairs = drawn.is_object[:, first] & drawn.is_object[:, second]
+    a, b = drawn.boxes_m[:, first], drawn.boxes_m[:, second]
+    shares = shared_extents(a, b).prod(-1) / torch.minimum(a[..., 3:].prod(-1), b[..., 3:].prod(-1))
+    assert pairs.any() and shares[pairs].max() <= INTERSECTING + 1e-6
+    outer = rectangles_of(drawn)[drawn.is_object.any(dim=1)]
+    assert (outer[:, :2].abs() + outer[:, 2:] / 2).max() <= 2 + BEYOND_M + 1e-5
+
+
+def test_given_objects_stay_first_and_as_they_are(sampler):
+    box = [0.3, 0.4, -0.2, 1.4, 0.8, 2.0]
+    drawn = draw_rooms(sampler, 4, 0, Given(given(4, 1, box)))
+    assert torch.equal(drawn.boxes_m[:, 0], torch.tensor(box).expand(4, 6))
+    assert (drawn.object_class[:, 0] == 1).all()
+    # 1.4 x 2.0 m: the sofa of 2.0 x 1.4 m in a pose that turns it by a quarter or three.
+    assert (sampler.look_class[drawn.looks[:, 0]] == 1).all()
+    assert (drawn.looks[:, 0] % 2 == 1).all()
+
+
+def test_a_drawn_rectangle_holds_what_is_given(sampler):
+    far = [30.0, 0.4, 0.0, 1.0, 0.8, 1.0]
+    tried = sampler.rectangles(torch.rand(1, 5), torch.randn(1, 5, 4))
+    held = module._holding(tried, given(1, 1, far))
+    assert held[0, 0] + held[0, 2] / 2 >= 30.5 - 1e-4
+    low = tried[:, 0, 0] - tried[:, 0, 2] / 2
+    assert_close(held[:, 0] - held[:, 2] / 2, low)
+    near = [*tried[0, 3, :1].tolist(), 0.4, *tried[0, 3, 1:2].tolist(), 0.01, 0.8, 0.01]
+    off = (tried[0] - module._holding(tried, given(1, 1, near))).abs().amax(dim=-1)
+    assert off.min() < 1e-5
+
+
+def test_asked_classes_come_in_their_order_and_no_others(sampler):
+    none = module.nothing_given(3).objects
+    wanted = torch.tensor([[3, 1, 0], [2, 2, 2], [0, 0, 0]])
+    drawn = draw_rooms(sampler, 3, 0, Given(none, None, wanted))
+    assert drawn.object_class[:, :3].tolist() == wanted.tolist()
+    assert drawn.is_object.sum(dim=1).tolist() == [2, 3, 0]
+
+
+def test_a_full_room_takes_nothing_more(sampler):
+    full = RoomBoxes(
+        torch.ones(2, 5, dtype=torch.int64),
+        torch.ones(2, 5, dtype=torch.bool),
+        torch.tensor([0.0, 0.4, 0, 1, 0.8, 1]).repeat(2, 5, 1),
+    )
+    drawn = draw_rooms(sampler, 2, 0, Given(full))
+    assert torch.equal(drawn.boxes_m, full.boxes_m)
+
+
+def test_rooms_given_differently_many_objects_draw_together(sampler):
+    two = given(2, 1, [0.0, 0.4, 0.0, 2.0, 0.8, 1.4]).only(torch.tensor([[True], [False]]))
+    drawn = draw_rooms(sampler, 2, 2, Given(two))
+    assert drawn.boxes_m[0, 0].tolist() == pytest.approx([0.0, 0.4, 0.0, 2.0, 0.8, 1.4])
+    counts = drawn.is_object.sum(dim=1)
+    assert torch.equal(drawn.is_object, torch.arange(5) < counts[:, None])

@@ -1,0 +1,140 @@
+"""The sampler's network: order does not matter, and likelihoods are those of a plain loop."""
+
+import copy
+
+import pytest
+import torch
+from rooms_of_boxes import lifted_rooms, small_sampler
+from torch.testing import assert_close
+
+from sceneprior.sampler.likelihood import negative_log_likelihood
+from sceneprior.sampler.network import END, Reading
+from sceneprior.sampler.placement import Placement
+from sceneprior.sampler.rooms import SamplerRooms, rectangles_of, shuffled
+from sceneprior.views import RoomBoxes
+
+
+@pytest.fixture(scope="module")
+def rooms() -> SamplerRooms:
+    return SamplerRooms(lifted_rooms(), 99)
+
+
+@pytest.fixture(scope="module")
+def sampler(rooms):
+    return small_sampler(rooms).double()
+
+
+def in_float64(rooms: RoomBoxes) -> RoomBoxes:
+    return rooms.changed(lambda part: part.double() if part.is_floating_point() else part)
+
+
+def read(sampler, rooms: RoomBoxes, rectangle_m: torch.Tensor) -> Reading:
+    return sampler.read(rooms, rectangle_m, sampler.tokens(rooms, rectangle_m))
+
+
+def test_order_and_padding_change_nothing(sampler, rooms):
+    whole = in_float64(rooms.rooms)
+    frame = rectangles_of(whole)
+    plain = read(sampler, whole, frame)
+    order = torch.tensor([[2, 0, 1]]).expand(len(frame), -1)
+    mixed = read(sampler, whole.take(order), frame)
+    assert_close(mixed.context, plain.context)
+    there = torch.take_along_dim(plain.objects, order.unsqueeze(-1), dim=1)
+    assert_close(mixed.objects[mixed.before.is_object], there[mixed.before.is_object])
+    wrong = whole.boxes_m.where(whole.is_object.unsqueeze(-1), 99.0)
+    filled = RoomBoxes(whole.object_class, whole.is_object, wrong, looks=whole.looks)
+    assert torch.equal(read(sampler, filled, frame).context, plain.context)
+
+
+def test_likelihoods_are_those_of_one_object_after_the_other(sampler, rooms):
+    whole = in_float64(rooms.rooms)
+    fast = negative_log_likelihood(sampler, whole, torch.Generator().manual_seed(4))
+    mixed = shuffled(whole, torch.Generator().manual_seed(4))
+    for row in range(len(whole.boxes_m)):
+        one = mixed.changed(lambda part, row=row: part[row : row + 1])
+        frame, count = rectangles_of(one), int(one.is_object.sum())
+        slow = dict.fromkeys(fast, 0.0)
+        for step in range(count + 1):
+            before = one.changed(lambda part, step=step: part[:, :step])
+            coming = one.changed(
+                lambda part, step=step, n=count: part[:, min(step, n - 1)][:, None]
+            )
+            coming = coming.only(torch.tensor([[step < count]]))
+            found = sampler.log_prob(read(sampler, before, frame), coming)
+            slow = {name: slow[name] - float(found[name]) for name in slow}
+        for name, value in slow.items():
+            assert value == pytest.approx(float(fast[name][row]), rel=1e-9), name
+
+
+def test_the_end_of_a_room_has_a_class_and_nothing_else(sampler, rooms):
+    whole = in_float64(rooms.rooms)
+    nothing = whole.changed(lambda part: part[:, :1]).only(torch.zeros(len(rooms), 1).bool())
+    found = sampler.log_prob(read(sampler, whole, rectangles_of(whole)), nothing)
+    assert (found["class"] < 0).all()
+    assert not any(found[name].any() for name in ("look", "size", "place"))
+
+
+def test_looks_of_other_classes_are_ruled_out(sampler, rooms):
+    whole = in_float64(rooms.rooms)
+    reading = read(sampler, whole, rectangles_of(whole))
+    logits = sampler.look_logits(reading, torch.full((len(rooms),), 2))
+    assert torch.equal(logits.isfinite(), (sampler.look_class == 2).expand_as(logits))
+
+
+def test_gradients_of_the_likelihood_are_right(rooms):
+    sampler = small_sampler(rooms, width=8).double().requires_grad_(True)
+    two = in_float64(rooms.rooms).changed(lambda part: part[:2])
+
+    def loss(query: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+        changed = {"query": query, "placement.of_object.2.weight": weight}
+        parts = torch.func.functional_call(
+            _Likelihood(sampler), {f"sampler.{k}": v for k, v in changed.items()}, (two,)
+        )
+        return torch.stack(list(parts.values())).sum()
+
+    start = (sampler.query, sampler.placement.of_object[2].weight)
+    leaves = [value.detach().clone().requires_grad_(True) for value in start]
+    assert torch.autograd.gradcheck(loss, leaves, fast_mode=True)
+
+
+class _Likelihood(torch.nn.Module):
+    def __init__(self, sampler):
+        super().__init__()
+        self.sampler = copy.deepcopy(sampler)
+
+    def forward(self, rooms: RoomBoxes) -> dict[str, torch.Tensor]:
+        return negative_log_likelihood(self.sampler, rooms, torch.Generator().manual_seed(0))
+
+
+def test_places_move_with_the_room():
+    """A rectangle and objects that move by a metre move the places; nothing else does."""
+    torch.manual_seed(0)
+    placement = Placement(8).double()
+    rng = torch.Generator().manual_seed(1)
+    query, objects = (torch.randn(*n, 8, generator=rng).double() for n in ((3,), (3, 2)))
+    size_m = torch.rand(3, 2, generator=rng).double() + 0.2
+    frame = torch.tensor([0.0, 1.0, 4.0, 3.0]).double().expand(3, -1)
+    boxes_m = torch.rand(3, 2, 4, generator=rng).double()
+    here = torch.tensor([[True, True], [True, False], [False, False]])
+    before = placement(query, size_m, frame, objects, boxes_m, here)
+    by = torch.tensor([1.0, -2.0, 0.0, 0.0]).double()
+    after = placement(query, size_m, frame + by, objects, boxes_m + by, here)
+    assert_close(after.means, before.means + by[:2])
+    assert torch.equal(after.weight_logits, before.weight_logits)
+    assert before.weight_logits[2].isfinite().sum() == before.weight_logits[2, :18].numel()
+
+
+def test_an_object_larger_than_the_rectangle_stands_in_its_middle():
+    placement = Placement(8)
+    nothing = torch.zeros(1, 0, 8), torch.zeros(1, 0, 4), torch.zeros(1, 0, dtype=torch.bool)
+    frame = torch.tensor([[1.0, 2.0, 0.5, 0.5]])
+    for name, weight in placement.named_parameters():
+        if name.startswith("of_rectangle.2"):
+            torch.nn.init.zeros_(weight)
+    found = placement(torch.randn(1, 8), torch.full((1, 2), 3.0), frame, *nothing)
+    assert_close(found.means, torch.tensor([1.0, 2.0]).expand(1, 18, 2))
+
+
+def test_void_ends_a_room(sampler):
+    assert END == 0
+    assert not (sampler.look_class == END).any()

@@ -1,0 +1,89 @@
+"""Prototypes: what looks alike in some pose is one, and looks turn as their rooms do."""
+
+import numpy as np
+import pytest
+import torch
+from rooms_of_boxes import CELLS, lifted_rooms
+
+from sceneprior.geometry.turns import turn_grids
+from sceneprior.sampler.prototypes import (
+    POSES,
+    choose_prototypes,
+    described,
+    distances,
+    pooled,
+    turn_of,
+    turned_extents,
+    turned_looks,
+)
+
+RNG = np.random.default_rng(0)
+# Nothing in common with itself mirrored or turned.
+ODD = RNG.random((CELLS,) * 3) < 0.5
+SIZE = np.array([2.0, 0.5, 1.0])
+
+
+def in_poses() -> tuple[np.ndarray, np.ndarray]:
+    grids = np.concatenate([turn_grids(ODD[None], *turn_of(pose)) for pose in range(POSES)])
+    return grids, np.concatenate([turned_extents(SIZE[None], pose) for pose in range(POSES)])
+
+
+def test_one_object_in_all_its_poses_is_one_prototype():
+    grids, sizes = in_poses()
+    labels, usable = np.ones(POSES, dtype=np.int64), np.ones(POSES, dtype=bool)
+    found = choose_prototypes(grids, sizes, labels, usable, most=99)
+    assert len(found.items) == 1
+    looks = found.looks_of(grids, sizes, labels)
+    shown = found.shown()
+    for row, look in enumerate(looks):
+        assert look // POSES == 0
+        assert np.array_equal(turn_grids(found.grids, *turn_of(int(look % POSES)))[0], grids[row])
+        assert np.allclose(shown[look][-3:], np.log(sizes[row]))
+        assert np.allclose(shown[look][:-3], pooled(grids[row : row + 1], 4).ravel())
+
+
+def test_other_classes_and_other_sizes_are_other_prototypes():
+    grids = np.stack([ODD] * 3)
+    sizes = np.stack([SIZE, SIZE, 2 * SIZE])
+    labels = np.array([1, 2, 2])
+    found = choose_prototypes(grids, sizes, labels, np.ones(3, dtype=bool), most=99)
+    assert sorted(found.items.tolist()) == [0, 1, 2]
+    assert found.looks_of(grids, sizes, np.array([1, 2, 3])).tolist()[2] == -1  # no such class
+    fewer = choose_prototypes(grids, sizes, labels, np.ones(3, dtype=bool), most=1)
+    assert sorted(fewer.object_class.tolist()) == [1, 2]  # one a class stays
+
+
+def test_what_is_not_usable_is_no_prototype():
+    lifted = lifted_rooms()
+    sizes = np.concatenate([room.sizes_m for room in lifted.boxes])
+    usable = lifted.object_classes != 3
+    found = choose_prototypes(lifted.grids(), sizes, lifted.object_classes, usable, most=99)
+    assert set(found.object_class.tolist()) == {1, 2}
+
+
+def test_distances_are_those_of_a_loop():
+    grids = RNG.random((3, CELLS, CELLS, CELLS)) < 0.5
+    sizes = RNG.uniform(0.3, 2, (3, 3))
+    ours, pose = distances(described(grids, sizes), described(grids[:2], sizes[:2]))
+    for a in range(3):
+        for b in range(2):
+            each = []
+            for way in range(POSES):
+                there = pooled(turn_grids(grids[b : b + 1], *turn_of(way)), 8)[0]
+                differ = np.log(sizes[a]) - np.log(turned_extents(sizes[b : b + 1], way)[0])
+                squared = (pooled(grids[a : a + 1], 8)[0] - there) ** 2
+                each.append(squared.mean() + 0.3 * np.abs(differ).sum())
+            assert ours[a, b] == pytest.approx(min(each), abs=1e-6)
+            assert each[pose[a, b]] == pytest.approx(min(each), abs=1e-6)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("quarters", range(4))
+def test_looks_turn_as_grids_do(quarters, mirrored):
+    looks = torch.arange(POSES)[None] + 3 * POSES
+    turned = turned_looks(looks, torch.tensor([quarters]), torch.tensor([mirrored]))[0]
+    assert (turned // POSES == 3).all()
+    for pose, after in enumerate((turned % POSES).tolist()):
+        here = turn_grids(ODD[None], *turn_of(pose))
+        there = turn_grids(here, quarters, mirrored)
+        assert np.array_equal(turn_grids(ODD[None], *turn_of(after)), there)

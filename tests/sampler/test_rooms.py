@@ -1,0 +1,108 @@
+"""What the sampler learns from: sets of lifted objects, turned and mirrored exactly."""
+
+import numpy as np
+import pytest
+import torch
+from rooms_of_boxes import CLASSES, lifted_rooms
+from torch.testing import assert_close
+
+from sceneprior.sampler.rooms import (
+    SamplerRooms,
+    rectangles_of,
+    shared_extents,
+    shuffled,
+    turned_rooms,
+)
+from sceneprior.views import RoomBoxes
+
+
+@pytest.fixture(scope="module")
+def rooms() -> SamplerRooms:
+    return SamplerRooms(lifted_rooms(), 99)
+
+
+def test_objects_without_a_label_or_a_box_are_left_out():
+    lifted = lifted_rooms()
+    lifted.object_classes[0] = 0
+    lifted.boxes[1].explained[2] = 0
+    lifted.boxes[1].sizes_m[2] = 0
+    found = SamplerRooms(lifted, 99).rooms
+    assert found.is_object.sum(dim=1).tolist()[:2] == [1, 2]
+    assert found.object_class[0, 0] == 2
+
+
+def test_other_rooms_take_the_looks_of_the_training_rooms(rooms):
+    other = SamplerRooms(lifted_rooms(seed=5), rooms.prototypes)
+    assert other.prototypes is rooms.prototypes
+    assert other.rooms.looks.max() < 8 * len(rooms.prototypes.items)
+
+
+def test_a_blank_draw_is_an_empty_room(rooms):
+    batch = rooms.__getitems__([(1, 0), (2, -1)])
+    assert batch.is_object.any(dim=1).tolist() == [True, False]
+    assert batch.room_ids == ("room1", "room2")
+    assert batch.looks is not None
+
+
+def test_rectangles_hold_all_footprints_and_no_more():
+    boxes_m = torch.tensor([[[0.0, 1, 0, 2, 2, 1], [2.0, 1, 1, 1, 1, 1], [9.0, 9, 9, 9, 9, 9]]])
+    here = torch.tensor([[True, True, False]])
+    found = rectangles_of(RoomBoxes(here.long(), here, boxes_m))
+    assert_close(found, torch.tensor([[0.75, 0.5, 3.5, 2.0]]))
+    assert not rectangles_of(RoomBoxes(here.long() * 0, here & False, boxes_m)).any()
+
+
+def test_boxes_share_what_they_do_along_each_axis():
+    a = torch.tensor([0.0, 0, 0, 2, 2, 2])
+    b = torch.tensor([1.0, 0, 5, 2, 1, 1])
+    assert shared_extents(a, b).tolist() == [1.0, 1.0, 0.0]
+
+
+def test_symmetries_move_boxes_looks_and_rectangles_together(rooms):
+    batch = rooms.rooms
+    generator = torch.Generator().manual_seed(0)
+    seen = set()
+    for _ in range(40):
+        turned = turned_rooms(batch, generator)
+        assert torch.equal(turned.object_class, batch.object_class)
+        sizes = batch.boxes_m[..., 3:].sort(dim=-1).values
+        assert torch.equal(turned.boxes_m[..., 3:].sort(dim=-1).values, sizes)
+        # The look's own extents turn with the box's: the L-shaped sofa has no symmetry.
+        shown = torch.from_numpy(rooms.prototypes.shown())[turned.looks][..., -3:]
+        off = (shown.exp() - turned.boxes_m[..., 3:]).abs() / turned.boxes_m[..., 3:]
+        assert off[turned.is_object].max() < 0.1
+        seen.add(int(turned.looks[0, 0] % 8))
+    assert len(seen) > 4
+
+
+def test_shuffling_keeps_the_set_and_puts_padding_last(rooms):
+    batch = rooms.rooms
+    mixed = shuffled(batch, torch.Generator().manual_seed(3))
+    counts = batch.is_object.sum(dim=1)
+    assert torch.equal(mixed.is_object, torch.arange(3)[None] < counts[:, None])
+    for row, count in enumerate(counts.tolist()):
+        before, after = (
+            {(int(r.object_class[row, k]), *r.boxes_m[row, k].tolist()) for k in range(count)}
+            for r in (batch, mixed)
+        )
+        assert before == after
+
+
+def test_classes_may_meet_that_do_often_enough():
+    lifted = lifted_rooms(12)
+    for room in (1, 3, 5):  # of six with a third object: its box stands in the second's
+        lifted.boxes[room].centers_m[2] = lifted.boxes[room].centers_m[1]
+    found = SamplerRooms(lifted, 99).may_meet(CLASSES)
+    assert found.nonzero().tolist() == [[2, 3], [3, 2]]
+    lifted.boxes[1].centers_m[2] += 5
+    lifted.boxes[3].centers_m[2] += 5
+    assert not SamplerRooms(lifted, 99).may_meet(CLASSES).any()
+
+
+def test_boxes_that_graze_do_not_meet():
+    lifted = lifted_rooms(2)
+    boxes = lifted.boxes[0]
+    boxes.centers_m[1] = boxes.centers_m[0] + np.array(
+        [(boxes.sizes_m[0, 0] + boxes.sizes_m[1, 0]) / 2 - 0.04, 0, 0]
+    )
+    assert not SamplerRooms(lifted, 99).may_meet(CLASSES).any()
