@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -170,3 +171,14 @@ def test_help_loads_nothing_heavy(arguments):
     assert "typer" in loaded
     heavy = {"torch", "numpy", "lightning", "trimesh", "numba", "scipy", "h5py", "pyrender", "cv2"}
     assert not loaded & heavy
+
+
+def test_the_wheel_carries_every_package():
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = {
+        path.parent.relative_to(ROOT).as_posix().replace("/", ".")
+        for name in ("sceneprior", "data_prep")
+        for path in (ROOT / name).rglob("*")
+        if path.suffix == ".py" or path.parent.name == "recipes"
+    }
+    assert set(listed) == folders | {"sceneprior.configs"}

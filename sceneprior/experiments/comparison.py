@@ -9,6 +9,7 @@ from pydantic import Field, field_validator, model_validator
 
 from sceneprior.config import load_config
 from sceneprior.errors import InputError
+from sceneprior.generation.sample import SAMPLER
 from sceneprior.settings import Section, check_settings, read_settings
 
 EVERY = "every"
