@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from sceneprior.sampler.mixtures import draw_index
 from sceneprior.sampler.network import END, Reading, RoomSampler
-from sceneprior.sampler.rooms import rectangles_of, shared_extents
+from sceneprior.sampler.rooms import rectangle_sides, rectangles_of, shared_extents
 from sceneprior.views import RoomBoxes
 
 PLACES = 32
@@ -93,19 +93,14 @@ def _holding(tried: Float[Tensor, "rooms tries 4"], objects: RoomBoxes) -> Float
     if not objects.is_object.any():
         return tried[:, 0]
     known = rectangles_of(objects).unsqueeze(1)
-    low, high = _ends(tried)
-    known_low, known_high = _ends(known)
+    low, high = rectangle_sides(tried)
+    known_low, known_high = rectangle_sides(known)
     holds = ((low <= known_low + BEYOND_M) & (high >= known_high - BEYOND_M)).all(dim=-1)
     first = holds.int().argmax(dim=1)[:, None, None]
     low = torch.minimum(torch.take_along_dim(low, first, dim=1), known_low)[:, 0]
     high = torch.maximum(torch.take_along_dim(high, first, dim=1), known_high)[:, 0]
     grown = torch.cat([(low + high) / 2, high - low], dim=-1)
     return grown.where(objects.is_object.any(dim=1, keepdim=True), tried[:, 0])
-
-
-def _ends(rectangle_m: Float[Tensor, "*batch 4"]) -> tuple[Tensor, Tensor]:
-    middle, extents = rectangle_m.split(2, dim=-1)
-    return middle - extents / 2, middle + extents / 2
 
 
 def _draw(

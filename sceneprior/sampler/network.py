@@ -12,6 +12,7 @@ from sceneprior.models.layers import mlp
 from sceneprior.sampler.mixtures import LogisticMixture, draw_index
 from sceneprior.sampler.placement import Placement
 from sceneprior.sampler.prototypes import PARTS, POSES
+from sceneprior.sampler.rooms import rectangle_sides, rectangles_of
 from sceneprior.sampler.settings import SamplerConfig
 from sceneprior.views import RoomBoxes
 
@@ -75,6 +76,7 @@ class RoomSampler(nn.Module):
         self.object_embedding = nn.Linear(CLASS_WIDTH + 10 * LENGTHS, width)
         self.rectangle_embedding = nn.Linear(4 * LENGTHS, width)
         self.query = nn.Parameter(torch.randn(width))
+        self.summary_embedding = nn.Linear(classes + 4 * LENGTHS, width)
         self.dropout = nn.Dropout(dropout)
         self.encoder = nn.ModuleList(
             nn.TransformerEncoderLayer(
@@ -123,14 +125,29 @@ class RoomSampler(nn.Module):
         tokens: Float[Tensor, "rooms objects width"],
     ) -> "Reading":
         """Read the objects that stand, whatever their order, of `tokens`."""
-        query = self.query.expand(len(tokens), 1, -1)
+        query = self.query + self.summary_embedding(self.summary(before, rectangle_m))
+        query = query.unsqueeze(1)
         frame = self.rectangle_embedding(lengths_shown(rectangle_m)).unsqueeze(1)
         features = self.dropout(torch.cat([query, frame, tokens], dim=1))
-        nothing = torch.cat([query.new_zeros(len(tokens), 2).bool(), ~before.is_object], dim=1)
+        nothing = torch.cat([before.is_object.new_zeros(len(tokens), 2), ~before.is_object], dim=1)
         for layer in self.encoder:
             features = layer(features, src_key_padding_mask=nothing)
         features = self.norm(features)
         return Reading(before, rectangle_m, features[:, 0], features[:, 2:])
+
+    def summary(
+        self, before: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]
+    ) -> Float[Tensor, "rooms summary"]:
+        """What attention would have to count: objects of each class, and how far they all are from
+        each side of the rectangle, which a finished room touches."""
+        counts = rectangle_m.new_zeros(len(rectangle_m), self.class_embedding.num_embeddings)
+        counts = counts.scatter_add(1, before.object_class, before.is_object.to(counts))
+        low, high = rectangle_sides(rectangle_m)
+        own_low, own_high = rectangle_sides(rectangles_of(before))
+        gaps = torch.cat([own_low - low, high - own_high], dim=-1)
+        furnished = before.is_object.any(dim=1, keepdim=True)
+        gaps = gaps.where(furnished, torch.cat([high - low] * 2, dim=-1))
+        return torch.cat([counts, lengths_shown(gaps)], dim=-1)
 
     def class_logits(self, reading: "Reading") -> Float[Tensor, "rooms classes"]:
         """Of the next object's class, or of `END`; classes without a look are ruled out."""

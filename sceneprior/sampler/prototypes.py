@@ -16,6 +16,9 @@ ALIKE = 0.12
 """Two objects look alike that are no farther apart than this: the mean squared difference of their
 coarse grids plus `SIZE_WEIGHT` times the sum of how much their extents' logarithms differ."""
 SIZE_WEIGHT = 0.3
+STANDS_FOR = 3
+"""A prototype looks like at least so many objects, itself among them, or is its class's most
+common one: an odd shape is more often badly lifted than rare."""
 COARSE, PARTS = 8, 4
 """Parts along each axis of the grids that are compared, and of those that the network is shown."""
 
@@ -67,7 +70,8 @@ def choose_prototypes(
     usable: Bool[np.ndarray, " objects"],
     most: int,
 ) -> Prototypes:
-    """Of each class the objects that look like most others, until every usable one looks like one.
+    """Of each class the objects that look like most others, until every usable one looks like one
+    or like few (`STANDS_FOR`).
 
     `ALIKE` is taken half as large again until there are at most `most`, or one a class.
     """
@@ -90,10 +94,12 @@ def _covering(
     items = []
     for rows, distance in apart:
         near = (distance <= alike) | np.eye(len(rows), dtype=bool)
-        while near.any():
+        first = True
+        while first or near.sum(axis=0).max() >= STANDS_FOR:
             best = int(near.sum(axis=0).argmax())
             items.append(rows[best])
             near[near[:, best]] = False  # they are spoken for
+            first = False
     return np.array(items, dtype=np.int64)
 
 

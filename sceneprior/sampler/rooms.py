@@ -110,12 +110,22 @@ def shared_extents(
 
 def rectangles_of(rooms: RoomBoxes) -> Float[Tensor, "rooms 4"]:
     """The rectangle round each room's footprints: centre x, z, extents x, z; zeros without any."""
+    if not rooms.boxes_m.shape[1]:
+        return rooms.boxes_m.new_zeros(len(rooms.boxes_m), 4)
     centers, sizes = (part[..., ::2] for part in rooms.boxes_m.split(3, dim=-1))
     nowhere = ~rooms.is_object.unsqueeze(-1)
     low = (centers - sizes / 2).masked_fill(nowhere, torch.inf).amin(dim=1)
     high = (centers + sizes / 2).masked_fill(nowhere, -torch.inf).amax(dim=1)
     found = torch.cat([(low + high) / 2, high - low], dim=-1)
     return found.where(rooms.is_object.any(dim=1, keepdim=True), 0.0)
+
+
+def rectangle_sides(
+    rectangle_m: Float[Tensor, "*batch 4"],
+) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2"]]:
+    """Where rectangles (centre x, z, extents x, z) begin and end."""
+    middle, extents = rectangle_m.split(2, dim=-1)
+    return middle - extents / 2, middle + extents / 2
 
 
 def turned_rooms(rooms: RoomBoxes, generator: torch.Generator) -> RoomBoxes:

@@ -114,3 +114,32 @@ def test_complete(command, toy_run, rooms, tmp_path):
     said = one_sentence(command(*call[:3], "--given", "gone.json", *SOFT, "--out", "many"))
     assert "gone.json cannot be read (No such file or directory)" in said
     assert not (tmp_path / "many").exists()
+
+
+def test_a_sampler_s_rooms_have_no_latents(command, sampler_run, tmp_path):
+    call = ["synthesize", "--run", sampler_run, "-n", 2, *SOFT]
+    assert command(*call, "--out", "drawn")[0] == 0
+    assert command(*call, "--out", "decoded", "--distribution", "paper")[0] == 0
+    assert not (tmp_path / "drawn" / "latents.npz").exists()
+    assert (tmp_path / "decoded" / "latents.npz").exists()
+    assert (tmp_path / "drawn" / "seed0_0001.json").exists()
+
+
+def test_complete_adds_what_is_asked_for(command, sampler_run, toy_run, tmp_path):
+    empty = {
+        "format": "sceneprior-scene", "version": 1, "name": "mine", "objects": [],
+        "label_set": "front3d_bedroom", "floor_m": [[-2, -2], [2, -2], [2, 2], [-2, 2]],
+    }  # fmt: skip
+    (tmp_path / "given.json").write_text(json.dumps(empty))
+    call = ["complete", "--given", "given.json", "-n", 2, "--classes", "double_bed, nightstand"]
+    status, _, errors = command(*call, "--run", sampler_run, "--out", "whole", *SOFT)
+    assert status == 0, errors
+    room = json.loads((tmp_path / "whole" / "complete_00.json").read_text())
+    assert sorted(item["class"] for item in room["objects"]) == ["double_bed", "nightstand"]
+    assert "asked of a sampler alone" in one_sentence(
+        command(*call, "--run", toy_run, "--out", "other", *SOFT)
+    )
+    assert "has no sampler" in one_sentence(
+        command("synthesize", "--run", toy_run, "--distribution", "sampler", "--out", "other")
+    )
+    assert not (tmp_path / "other").exists()

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 from PIL import Image
-from tiny_runs import tiny_baseline_settings, write_tiny_config
+from tiny_runs import tiny_baseline_settings, tiny_sampler_config, write_tiny_config
 
 from sceneprior.config import load_any_run, load_config
 from sceneprior.errors import InputError
@@ -24,7 +24,7 @@ from sceneprior.experiments.compare import (
     costs_of,
     scoring_steps,
 )
-from sceneprior.experiments.comparison import load_comparison, part_of, runs_of
+from sceneprior.experiments.comparison import distributions_of, load_comparison, part_of, runs_of
 from sceneprior.experiments.steps import StepRunner
 from sceneprior.files import only_writer
 
@@ -354,3 +354,24 @@ def test_methods_without_latents_of_rooms_are_evaluated_once_by_their_own(writte
     assert step.name == "scores" and "--distribution" not in step.arguments
     with pytest.raises(InputError, match="distributions"):
         load_comparison(written(distributions=["anywhere"]))
+
+
+def test_a_run_with_a_sampler_is_first_evaluated_by_it(written, tmp_path):
+    own = tmp_path / "sampled.yaml"
+    settings = tiny_sampler_config(Path("elsewhere")).model_dump(mode="json", by_alias=True)
+    own.write_text(yaml.safe_dump(settings))
+    ours = {"title": "Ours", "group": "2D", "config": str(own)}
+    comparison = load_comparison(written(methods={"ours": ours}))
+    (run,) = runs_of(comparison, Path())
+    steps = scoring_steps(comparison, run, 4, SOFTWARE)
+    assert [step.name for step in steps] == ["scores", "scores_paper", "scores_kernel"]
+    assert "--distribution" not in steps[0].arguments
+    assert steps[1].arguments[-1] == "paper"
+
+
+def test_the_large_comparison_loads_and_says_where_rooms_come_from():
+    comparison = load_comparison("compare_front_large.yaml")
+    origins = {run.method: distributions_of(comparison, run) for run in runs_of(comparison, Path())}
+    assert origins["ours"] == (None, "paper", "kernel")
+    assert origins["lstm"] == origins["c1"] == ("paper", "kernel")
+    assert origins["atiss"] == (None,)

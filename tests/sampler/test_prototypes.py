@@ -43,14 +43,25 @@ def test_one_object_in_all_its_poses_is_one_prototype():
 
 
 def test_other_classes_and_other_sizes_are_other_prototypes():
-    grids = np.stack([ODD] * 3)
-    sizes = np.stack([SIZE, SIZE, 2 * SIZE])
-    labels = np.array([1, 2, 2])
-    found = choose_prototypes(grids, sizes, labels, np.ones(3, dtype=bool), most=99)
-    assert sorted(found.items.tolist()) == [0, 1, 2]
-    assert found.looks_of(grids, sizes, np.array([1, 2, 3])).tolist()[2] == -1  # no such class
-    fewer = choose_prototypes(grids, sizes, labels, np.ones(3, dtype=bool), most=1)
+    grids = np.stack([ODD] * 9)
+    sizes = np.stack([SIZE] * 6 + [2 * SIZE] * 3)
+    labels = np.array([1] * 3 + [2] * 6)
+    found = choose_prototypes(grids, sizes, labels, np.ones(9, dtype=bool), most=99)
+    assert sorted(found.object_class.tolist()) == [1, 2, 2]
+    assert found.looks_of(grids, sizes, np.full(9, 3)).tolist() == [-1] * 9  # no such class
+    fewer = choose_prototypes(grids, sizes, labels, np.ones(9, dtype=bool), most=1)
     assert sorted(fewer.object_class.tolist()) == [1, 2]  # one a class stays
+
+
+def test_an_odd_shape_looks_like_one_that_others_share():
+    grids = np.stack([ODD] * 3 + [~ODD] * 2)
+    sizes, labels = np.stack([SIZE] * 5), np.ones(5, dtype=np.int64)
+    found = choose_prototypes(grids, sizes, labels, np.ones(5, dtype=bool), most=99)
+    assert len(found.items) == 1 and found.items[0] < 3
+    assert (found.looks_of(grids, sizes, labels) >= 0).all()
+    # But a class has at least one.
+    alone = choose_prototypes(grids[:1], sizes[:1], labels[:1], np.ones(1, dtype=bool), most=99)
+    assert alone.items.tolist() == [0]
 
 
 def test_what_is_not_usable_is_no_prototype():
