@@ -34,9 +34,9 @@ def synthesize(
     check_free(out, overwrite)
     trained = load_any_run(run, checkpoint)
     artist = open_renderer(renderer)
-    scenes, z = new_rooms(trained, count, seed, distribution)
+    scenes, z, origin = new_rooms(trained, count, seed, distribution)
     write_scenes(scenes, out, artist, overwrite, z)
-    typer.echo(f"Wrote {count} rooms to {out}")
+    typer.echo(f"Wrote {count} rooms to {out} (from: {origin})")
     if (warning := emptiness(scenes)) is not None:
         typer.echo(f"Warning: {warning}", err=True)
 
@@ -97,7 +97,8 @@ def complete(
     trained = load_run(run, checkpoint)
     z, scenes = furnish(trained, [scene], count, seed, distribution, classes=wanted)[0]
     write_scenes(scenes, out, open_renderer(renderer), overwrite, z)
-    typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects to {out}")
+    how = "drawn by the sampler" if z is None else "of fitted latents"
+    typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects, {how}, to {out}")
 
 
 def retrieve(

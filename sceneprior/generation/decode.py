@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sceneprior.classes import VOID, label_set
 from sceneprior.errors import InputError
-from sceneprior.generation.sample import draw_latents, scene_names, uses_sampler
+from sceneprior.generation.sample import SAMPLER, draw_latents, scene_names, uses_sampler
 from sceneprior.generation.sampled import sample_scenes
 from sceneprior.geometry.isosurface import surface_of
 from sceneprior.losses.completeness import kept_objects
@@ -124,6 +124,8 @@ class NewRooms(NamedTuple):
     scenes: list[Scene]
     latents: Float[Tensor, "rooms width"] | None
     """None where no latent makes a room."""
+    origin: str
+    """`sampler`, a distribution of latents, or the method."""
 
 
 def new_rooms(
@@ -137,16 +139,18 @@ def new_rooms(
     names = scene_names(count, seed)
     if isinstance(trained, TrainedPrior):
         if uses_sampler(trained, distribution):
-            return NewRooms(sample_scenes(trained, names, seed), None)
+            return NewRooms(sample_scenes(trained, names, seed), None, SAMPLER)
         z, _ = draw_latents(trained, count, seed, distribution)
-        return NewRooms(decode_latents(trained, z, names), z)
+        origin = distribution or trained.latent_distribution
+        return NewRooms(decode_latents(trained, z, names), z, origin)
     if distribution is not None:
         raise InputError(
             f"A distribution says where latents of rooms come from, but `method: "
             f"{trained.config.method}` has none; leave out --distribution {distribution}."
         )
     rooms = trained.prior.sample(count, seed)
-    return NewRooms(boxes_to_scenes(rooms, trained.config.label_set, names), None)
+    scenes = boxes_to_scenes(rooms, trained.config.label_set, names)
+    return NewRooms(scenes, None, trained.config.method)
 
 
 def synthesize(

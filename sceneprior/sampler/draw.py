@@ -20,7 +20,7 @@ LOOKS = 16
 """Looks drawn for a given object, which takes one by how well its place fits."""
 INTERSECTING = 0.01
 """Two boxes intersect from this share of the smaller one's volume on, as scores have it."""
-BEYOND_M = 0.05
+BEYOND_M = 0.01
 """An object may stick out of the rectangle this far."""
 SIZE_RANGE = 0.5
 """An object's extents differ from its look's by this factor's logarithm at most."""

@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sceneprior.sampler.network import Reading, RoomSampler
-from sceneprior.sampler.rooms import rectangles_of, shuffled
+from sceneprior.sampler.rooms import frames_of, shuffled
 from sceneprior.views import RoomBoxes
 
 
@@ -19,7 +19,7 @@ def negative_log_likelihood(
     The mean over orders bounds that of the set from above.
     """
     rooms = shuffled(rooms, generator)
-    rectangle_m = rectangles_of(rooms)
+    rectangle_m = frames_of(rooms, generator)
     tokens = sampler.tokens(rooms, rectangle_m)
     counts, slots = rooms.is_object.sum(dim=1), tokens.shape[1]
     readings, rows, steps = [], [], []

@@ -16,6 +16,8 @@ from sceneprior.views import RoomBoxes
 
 GRAZE_M = 0.05
 """Lifted boxes that share no more than this along some axis may do so for want of accuracy."""
+FRAME_M = 0.15
+"""See `frames_of`."""
 PLAUSIBLE_SHARE = 0.2
 """Two classes may intersect that do so in at least this part of the training rooms with both:
 lifted boxes of chairs intersect each other in a seventh, and true ones in none."""
@@ -118,6 +120,19 @@ def rectangles_of(rooms: RoomBoxes) -> Float[Tensor, "rooms 4"]:
     high = (centers + sizes / 2).masked_fill(nowhere, -torch.inf).amax(dim=1)
     found = torch.cat([(low + high) / 2, high - low], dim=-1)
     return found.where(rooms.is_object.any(dim=1, keepdim=True), 0.0)
+
+
+def frames_of(rooms: RoomBoxes, generator: torch.Generator) -> Float[Tensor, "rooms 4"]:
+    """`rectangles_of`, each side moved out by half a normal distribution of `FRAME_M`.
+
+    Sides that the furniture touched to the millimetre would say when a room is full, which drawn
+    furniture never does.
+    """
+    rectangle_m = rectangles_of(rooms)
+    out = FRAME_M * torch.randn(len(rectangle_m), 4, generator=generator).abs().to(rectangle_m)
+    low, high = rectangle_sides(rectangle_m)
+    low, high = low - out[:, :2], high + out[:, 2:]
+    return torch.cat([(low + high) / 2, high - low], dim=-1)
 
 
 def rectangle_sides(

@@ -20,7 +20,7 @@ from sceneprior.models.prior import ScenePrior
 from sceneprior.sampler.likelihood import negative_log_likelihood
 from sceneprior.sampler.network import RECTANGLES, RoomSampler
 from sceneprior.sampler.prototypes import POSES
-from sceneprior.sampler.rooms import SamplerRooms, rectangles_of, turned_rooms
+from sceneprior.sampler.rooms import SamplerRooms, frames_of, turned_rooms
 from sceneprior.sampler.settings import SamplerConfig
 from sceneprior.training.objective import (
     batch_seed,
@@ -125,8 +125,11 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms, decoder: OccupancyDecoder) 
     sampler.prototype_codes[: len(codes)] = torch.from_numpy(codes)
     sampler.may_meet.copy_(rooms.may_meet(len(sampler.may_meet)))
     everyone = rooms.rooms
+    generator = torch.Generator().manual_seed(0)
     turned = [
-        rectangles_of(replace(everyone, boxes_m=turn_boxes(everyone.boxes_m, quarters, mirrored)))
+        frames_of(
+            replace(everyone, boxes_m=turn_boxes(everyone.boxes_m, quarters, mirrored)), generator
+        )
         for quarters in torch.arange(QUARTERS)[:, None].expand(-1, len(rooms))
         for mirrored in torch.tensor([[False], [True]]).expand(-1, len(rooms))
     ]

@@ -139,7 +139,7 @@ def test_data_commands_refuse_in_sentences(command, tmp_path):
 def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
     call = ["synthesize", "--run", toy_run, "-n", "3", "--seed", "5", "--renderer", "software"]
     status, out, _ = command(*call, "--out", "made")
-    assert (status, out) == (0, "Wrote 3 rooms to made\n")
+    assert (status, out) == (0, "Wrote 3 rooms to made (from: kernel)\n")
     names = {f"seed5_000{k}.{kind}" for k in range(3) for kind in ("json", "glb", "png")}
     names |= {"overview.png", "latents.npz"}
     assert {path.name for path in (tmp_path / "made").iterdir()} == names

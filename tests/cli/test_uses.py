@@ -28,7 +28,7 @@ def test_empty_rooms_are_written_with_a_warning(command, toy_run, monkeypatch):
         decode, "kept_objects", lambda logits, target: torch.zeros_like(logits, dtype=torch.bool)
     )
     status, out, errors = command(*call, "--out", "none")
-    assert (status, out) == (0, "Wrote 3 rooms to none\n")
+    assert (status, out) == (0, "Wrote 3 rooms to none (from: kernel)\n")
     assert errors.strip().splitlines()[-1] == (
         "Warning: 3 of 3 generated rooms are empty, so no other number of theirs can be trusted: "
         "train longer, and see that `samples/empty_share` falls (docs/cluster.md)."
@@ -91,7 +91,10 @@ def test_complete(command, toy_run, rooms, tmp_path):
     given.write_text(json.dumps(scene))
     call = ["complete", "--run", toy_run, "--given", given, *SOFT]
     status, out, errors = command(*call, "-n", 2, "--out", "whole")
-    assert (status, out) == (0, "Wrote 2 rooms round 1 given objects to whole\n"), errors
+    assert (status, out) == (
+        0,
+        "Wrote 2 rooms round 1 given objects, of fitted latents, to whole\n",
+    ), errors
     made = json.loads((tmp_path / "whole" / "complete_01.json").read_text())
     assert made["objects"][0] == scene["objects"][0] and made["extra"]["given"] == [0]
     assert (tmp_path / "whole" / "overview.png").is_file()

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from sceneprior.sampler.likelihood import negative_log_likelihood
 from sceneprior.sampler.network import END, Reading
 from sceneprior.sampler.placement import Placement
-from sceneprior.sampler.rooms import SamplerRooms, rectangles_of, shuffled
+from sceneprior.sampler.rooms import SamplerRooms, frames_of, rectangles_of, shuffled
 from sceneprior.views import RoomBoxes
 
 
@@ -49,10 +49,12 @@ def test_order_and_padding_change_nothing(sampler, rooms):
 def test_likelihoods_are_those_of_one_object_after_the_other(sampler, rooms):
     whole = in_float64(rooms.rooms)
     fast = negative_log_likelihood(sampler, whole, torch.Generator().manual_seed(4))
-    mixed = shuffled(whole, torch.Generator().manual_seed(4))
+    generator = torch.Generator().manual_seed(4)
+    mixed = shuffled(whole, generator)
+    frames = frames_of(mixed, generator)
     for row in range(len(whole.boxes_m)):
         one = mixed.changed(lambda part, row=row: part[row : row + 1])
-        frame, count = rectangles_of(one), int(one.is_object.sum())
+        frame, count = frames[row : row + 1], int(one.is_object.sum())
         slow = dict.fromkeys(fast, 0.0)
         for step in range(count + 1):
             before = one.changed(lambda part, step=step: part[:, :step])

@@ -7,7 +7,10 @@ from rooms_of_boxes import CLASSES, lifted_rooms
 from torch.testing import assert_close
 
 from sceneprior.sampler.rooms import (
+    FRAME_M,
     SamplerRooms,
+    frames_of,
+    rectangle_sides,
     rectangles_of,
     shared_extents,
     shuffled,
@@ -50,6 +53,18 @@ def test_rectangles_hold_all_footprints_and_no_more():
     found = rectangles_of(RoomBoxes(here.long(), here, boxes_m))
     assert_close(found, torch.tensor([[0.75, 0.5, 3.5, 2.0]]))
     assert not rectangles_of(RoomBoxes(here.long() * 0, here & False, boxes_m)).any()
+
+
+def test_frames_hold_the_rectangle_and_a_little_more(rooms):
+    generator = torch.Generator().manual_seed(0)
+    low, high = rectangle_sides(rectangles_of(rooms.rooms))
+    outs = []
+    for _ in range(50):
+        frame_low, frame_high = rectangle_sides(frames_of(rooms.rooms, generator))
+        outs += [low - frame_low, frame_high - high]
+    out = torch.cat(outs)
+    assert out.min() >= -1e-5
+    assert_close(out.square().mean().sqrt().item(), FRAME_M, rtol=0.1, atol=0)
 
 
 def test_boxes_share_what_they_do_along_each_axis():
