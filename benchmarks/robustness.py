@@ -117,8 +117,9 @@ def train(config: OursConfig, rooms: SmallRooms) -> TrainedPrior:
     )  # fmt: skip
     loader = make_loader(rooms, config.layout.batch_size, config.seed, 0)  # type: ignore[arg-type]
     stage = LayoutStage(
-        prior, latents, config.layout, config.loss, config.model.completeness_target, config.seed
-    )
+        prior, latents, rooms, config.layout, config.loss, config.model.completeness_target,
+        config.seed,
+    )  # fmt: skip
     trainer.fit(stage, loader)
     prior = prior.eval().requires_grad_(False)
     return TrainedPrior(prior, latents.weight.detach(), rooms.room_ids, config, "layout")

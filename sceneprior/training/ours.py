@@ -98,4 +98,4 @@ class PaperConfig(PriorConfig):
             assert isinstance(prior.shape, OccupancyDecoder)
             prior.shape.set_space(*rooms.space)
         target = self.model.completeness_target
-        return kind(prior, latents, stage, self.loss, target, self.seed)
+        return kind(prior, latents, rooms, stage, self.loss, target, self.seed)
