@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -138,6 +139,13 @@ def test_the_rules_can_fail(tmp_path):
     path = tmp_path / "file.py"
     path.write_text("def f():\n    from scipy.optimize import linear_sum_assignment\n")
     assert "scipy.optimize" in imports(path)
+
+
+def test_the_wheel_carries_every_package():
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = {path.parent for path in FILES if path.name == "__init__.py"}
+    missing = {".".join(folder.relative_to(ROOT).parts) for folder in folders} - set(listed)
+    assert not missing
 
 
 def loaded_after(code: str) -> set[str]:

@@ -8,11 +8,16 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
+from torch.utils.data import Dataset
 
-from sceneprior.data.dataset import RoomDataset
 from sceneprior.lifting.dataset import LiftedDataset
 from sceneprior.lifting.shapes import ShapeSpace
-from sceneprior.losses.lifted import lifted_losses, match_lifted, shape_code_loss
+from sceneprior.losses.lifted import (
+    lifted_losses,
+    match_lifted,
+    needed_predictions,
+    shape_code_loss,
+)
 from sceneprior.losses.shape import mask_loss
 from sceneprior.models.occupancy import OccupancyDecoder
 from sceneprior.models.prior import ScenePrior
@@ -54,7 +59,7 @@ class PaperStage(lightning.LightningModule, ABC):
         self,
         prior: ScenePrior,
         latents: nn.Embedding,
-        rooms: RoomDataset,
+        rooms: Dataset[Any],
         stage: StageConfig,
         loss: LossConfig,
         completeness_target: str,
@@ -154,7 +159,9 @@ class LiftedStage(PaperStage):
             self.rooms.place_shapes(ShapeSpace(*self.prior.shape.space))
 
     def training_step(self, rooms: LiftedRooms, batch_idx: int) -> Tensor:
-        scenes = self.prior.decode(self.room_latents(rooms, batch_idx), with_shape=False)
+        slots = min(rooms.is_object.shape[1] + 1, self.prior.max_objects)
+        wanted = needed_predictions(rooms, slots)
+        scenes = self.prior.decode(self.room_latents(rooms, batch_idx), False, wanted)
         with full_precision(self.device):
             matches = match_lifted(scenes, rooms, self.loss.match_box)
             losses = lifted_losses(scenes, rooms, matches, self.completeness_target)
