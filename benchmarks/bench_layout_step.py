@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from bench_boxes import SIZE, make_batch
@@ -61,7 +61,9 @@ def make_views(rooms: int, views: int, objects: int) -> SceneViews:
 def room(batch: Batch, index: int) -> Batch:
     """One room of a batch, as a batch."""
     values = {item.name: getattr(batch, item.name) for item in fields(batch)}
-    part = {name: v[index : index + 1] for name, v in values.items() if isinstance(v, Tensor)}
+    part: dict[str, Any] = {
+        name: v[index : index + 1] for name, v in values.items() if isinstance(v, Tensor)
+    }
     return replace(batch, **part)
 
 
@@ -77,7 +79,8 @@ def their_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: OursConf
     names = ("class_logits", "centers_m", "sizes_m", "completeness_logits")
     outputs = [getattr(scenes, name) for name in names]
     leaves = [output.detach().requires_grad_() for output in outputs]
-    loose = replace(scenes, **dict(zip(names, leaves, strict=True)))
+    parted: dict[str, Any] = dict(zip(names, leaves, strict=True))
+    loose = replace(scenes, **parted)
     sphere = icosphere(4)[0].expand(1, scenes.centers_m.shape[1], -1, -1)
     for index in range(len(z)):
         one, seen = room(loose, index), room(views, index)
@@ -96,6 +99,7 @@ Step = Callable[[ScenePrior, Tensor, SceneViews, OursConfig], None]
 def step_ratio(rooms: int = 128, views: int = 20, repeats: int = 5) -> dict[str, float]:
     """Median seconds of a step in both ways, and how many times as fast ours is."""
     config = load_config(str(CONFIG))
+    assert isinstance(config, OursConfig)
     objects = config.model.max_objects
     batch = make_views(rooms, views, objects)
     prior = config.build_prior()

@@ -54,9 +54,10 @@ def main() -> None:
     figures = {}
     for variant in arguments.variants:
         start = time.perf_counter()
+        mode, compositing = variant.split("/")
         results = [
             fit_rooms(dataset, truths, list(range(first, min(first + BATCH, arguments.rooms))),
-                      *variant.split("/"), arguments)
+                      mode, compositing, arguments)
             for first in range(0, arguments.rooms, BATCH)
         ]  # fmt: skip
         masks, boxes = (np.concatenate(values) for values in zip(*results, strict=True))
@@ -122,7 +123,7 @@ def fit_rooms(dataset, truths, rows, mode, compositing, arguments):
 
 def cameras(views: SceneViews) -> tuple[torch.Tensor, torch.Tensor, tuple[int, int]]:
     """Poses, intrinsics and size of the views' mask images."""
-    height, width = views.instance_ids.shape[-2:]
+    height, width = views.observed_ids.shape[-2:]
     return views.world_to_camera, views.intrinsics_at(height, width), (height, width)
 
 

@@ -108,6 +108,7 @@ class SmallRooms(Dataset):
 
 def train(config: OursConfig, rooms: SmallRooms) -> TrainedPrior:
     """The layout stage alone, on what is in memory."""
+    assert config.layout is not None, "BASE has a layout stage"
     lightning.seed_everything(config.seed, verbose=False)
     prior, latents = config.build_prior(), config.build_latents(len(rooms))
     trainer = lightning.Trainer(
@@ -117,8 +118,9 @@ def train(config: OursConfig, rooms: SmallRooms) -> TrainedPrior:
     )  # fmt: skip
     loader = make_loader(rooms, config.layout.batch_size, config.seed, 0)  # type: ignore[arg-type]
     stage = LayoutStage(
-        prior, latents, config.layout, config.loss, config.model.completeness_target, config.seed
-    )
+        prior, latents, rooms, config.layout, config.loss, config.model.completeness_target,
+        config.seed,
+    )  # fmt: skip
     trainer.fit(stage, loader)
     prior = prior.eval().requires_grad_(False)
     return TrainedPrior(prior, latents.weight.detach(), rooms.room_ids, config, "layout")
@@ -167,4 +169,6 @@ if __name__ == "__main__":
             changes = (
                 f"data.shards={options.shards}", f"layout.epochs={options.epochs}", f"seed={seed}"
             )  # fmt: skip
-            row(said, load_config(str(BASE), SETTINGS + changes), options.rooms, masks, poses)
+            config = load_config(str(BASE), SETTINGS + changes)
+            assert isinstance(config, OursConfig)
+            row(said, config, options.rooms, masks, poses)

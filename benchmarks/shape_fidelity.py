@@ -1,10 +1,10 @@
-"""Chamfer distance of decoded training rooms to the true surfaces, in all and by class.
+"""Chamfer distance and volumetric IoU of decoded training objects to true ones, by class.
 
 Run `python benchmarks/shape_fidelity.py RUN`. Boxes alone, as the layout stage has them (a run of
 one stage: as that has them), stand here as the ellipsoids that fill them (the paper's proxy) and
 as boxes; the shape stage has meshes. All of them are held against the same true meshes, which
 training never saw. Pairs are chosen by boxes (`match_scenes`), each object counts once, and points
-are drawn with a fixed seed. A second table has the same by class.
+are drawn with a fixed seed. Two more tables have the same by class.
 """
 
 import argparse
@@ -16,6 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
+from trimesh.voxel.encoding import DenseEncoding
+from trimesh.voxel.morphology import fill_orthographic
 
 from sceneprior.config import load_run
 from sceneprior.evaluation.metrics.decoded_rooms import match_scenes, reconstruction_scores
@@ -32,6 +34,7 @@ from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.training.method import TrainedPrior
 
 SPHERE_LEVEL = 3
+SOLID_CELLS, SOLID_POINTS = 32, 50_000
 SHEET_ROOMS, SHEET_COLUMNS, TILE_PX = 24, 6, (210, 280)
 
 
@@ -54,13 +57,33 @@ def own(item: SceneObject) -> Mesh:
 
 
 class Fidelity(NamedTuple):
-    """How near one object's surface is to the true one."""
+    """How near one object's surface is to the true one, and its volume."""
 
     label: str
     """The true class."""
     chamfer_m: float
     """L2, both ways added."""
     f_score: float
+    volume_iou: float
+    """See `volume_iou`."""
+
+
+def volume_iou(a: Mesh, b: Mesh) -> float:
+    """Intersection over union of two solids, on 32 cells along each axis of what holds both.
+
+    Furniture is drawn hollow, open and in pieces, so a solid is the cells of its surface and those
+    that lie between such cells along all three axes: air below a table or above a seat is not.
+    """
+    points = [sample_surface(mesh, SOLID_POINTS, 0) for mesh in (a, b)]
+    low_m = np.minimum(*(each.min(axis=0) for each in points))
+    high_m = np.maximum(*(each.max(axis=0) for each in points))
+    solids = []
+    for each in points:
+        at = ((each - low_m) / (high_m - low_m).clip(1e-9) * SOLID_CELLS).astype(int)
+        grid = np.zeros((SOLID_CELLS,) * 3, dtype=bool)
+        grid[tuple(at.clip(max=SOLID_CELLS - 1).T)] = True
+        solids.append(fill_orthographic(DenseEncoding(grid)).dense)
+    return float((solids[0] & solids[1]).sum() / (solids[0] | solids[1]).sum())
 
 
 def distances(
@@ -73,9 +96,10 @@ def distances(
         for mine, true in zip(match.decoded, match.truth, strict=True):
             target = truth.objects[true]
             assert target.mesh is not None, "asked for meshes"
-            a = sample_surface(shape(decoded.objects[mine]), points, 0)
-            b = sample_surface(target.mesh, points, 1)
-            found.append(Fidelity(target.label, chamfer_sum(a, b).l2_m, f_score(a, b)))
+            mesh = shape(decoded.objects[mine])
+            a, b = sample_surface(mesh, points, 0), sample_surface(target.mesh, points, 1)
+            volumes = volume_iou(mesh, target.mesh)
+            found.append(Fidelity(target.label, chamfer_sum(a, b).l2_m, f_score(a, b), volumes))
     return found
 
 
@@ -106,12 +130,24 @@ def sheet(pairs: list[tuple[Scene, Scene]], renderer: str) -> Image.Image:
     return Image.fromarray(contact_sheet(tiles, SHEET_COLUMNS, gap_px=4))
 
 
+def print_by_class(rows: dict[str, list[Fidelity]], figure: Callable[[Fidelity], float]) -> None:
+    """A table in Markdown: a class a line, a shape a column."""
+    print(f"\n| class | objects | {' | '.join(rows)} |")
+    print(f"| --- | ---: |{' ---: |' * len(rows)}")
+    for label in sorted({item.label for found in rows.values() for item in found}):
+        columns = [
+            [figure(item) for item in found if item.label == label] for found in rows.values()
+        ]
+        cells = " | ".join(f"{mean(column):.3f}" if column else "-" for column in columns)
+        print(f"| {label} | {len(columns[-1])} | {cells} |")
+
+
 def main() -> None:
     """Print a table in Markdown."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("run", type=Path)
     options.add_argument("--points", type=int, default=2000, help="on each surface")
-    options.add_argument("--json", type=Path, help="also writes four figures, see `figures`")
+    options.add_argument("--json", type=Path, help="also writes five figures")
     options.add_argument("--sheet", type=Path, help="also draws 24 rooms, truth beside them (PNG)")
     options.add_argument("--renderer", default="auto")
     given = options.parse_args()
@@ -130,27 +166,28 @@ def main() -> None:
     base = mean(item.chamfer_m for item in rows["ellipsoids in the layout's boxes"])
     objects = len(rows["the layout's boxes"])
     print(f"{given.run.resolve().name}: {len(layout)} training rooms, {objects} objects")
-    print("| shape | Chamfer distance L2, m | against the first row | F-score at 5 cm |")
-    print("| --- | ---: | ---: | ---: |")
+    columns = "Chamfer distance L2, m", "against the first row", "F-score at 5 cm", "volumetric IoU"
+    print(f"| shape | {' | '.join(columns)} |")
+    print(f"| --- |{' ---: |' * len(columns)}")
     for name, found in rows.items():
         middle = mean(item.chamfer_m for item in found)
         score = mean(item.f_score for item in found)
-        print(f"| {name} | {middle:.4f} | {middle / base - 1:+.0%} | {score:.3f} |")
-    print(f"\n| class | objects | {' | '.join(rows)} |")
-    print(f"| --- | ---: |{' ---: |' * len(rows)}")
-    by_class: dict[str, list[list[float]]] = {}
-    for column, found in enumerate(rows.values()):
-        for item in found:
-            columns = by_class.setdefault(item.label, [[] for _ in rows])
-            columns[column].append(item.chamfer_m)
-    for label, columns in sorted(by_class.items()):
-        cells = " | ".join(f"{mean(column):.3f}" if column else "-" for column in columns)
-        print(f"| {label} | {len(columns[-1])} | {cells} |")
+        volumes = mean(item.volume_iou for item in found)
+        print(f"| {name} | {middle:.4f} | {middle / base - 1:+.0%} | {score:.3f} | {volumes:.3f} |")
+    print("\nChamfer distance L2 in metres by class:")
+    print_by_class(rows, lambda item: item.chamfer_m)
+    print("\nVolumetric IoU by class:")
+    print_by_class(rows, lambda item: item.volume_iou)
     if given.sheet:
         sheet(shaped, given.renderer).save(given.sheet, optimize=True)
     if given.json:
         ours = mean(item.chamfer_m for item in rows["the decoded meshes"])
-        scores = {"chamfer_over_ellipsoid": ours / base} | figures(shaped, shards, given.renderer)
+        volumes = mean(item.volume_iou for item in rows["the decoded meshes"])
+        scores: dict[str, float | None] = {
+            "chamfer_over_ellipsoid": ours / base,
+            "volume_iou": volumes,
+        }
+        scores |= figures(shaped, shards, given.renderer)
         print(scores)
         given.json.write_text(json.dumps(scores, indent=1) + "\n")
 

@@ -80,6 +80,7 @@ def mask_iou(trained: TrainedPrior) -> float:
     total = count = 0.0
     for views in make_loader(dataset, 16, seed=0, workers=0):
         scenes = trained.prior.decode(trained.prior.latent_space(trained.logits[views.room_index]))
+        assert scenes.vertices_m is not None and trained.prior.faces is not None, "of meshes"
         boxes = boxes_of_points(
             scenes.vertices_m, views.world_to_camera, views.intrinsics, views.image_size
         )

@@ -144,6 +144,13 @@ def test_the_rules_can_fail(tmp_path):
     assert "scipy.optimize" in imports(path)
 
 
+def test_the_wheel_carries_every_package():
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = {path.parent for path in FILES if path.name == "__init__.py"}
+    missing = {".".join(folder.relative_to(ROOT).parts) for folder in folders} - set(listed)
+    assert not missing
+
+
 def loaded_after(code: str) -> set[str]:
     """Top-level names in sys.modules after running code in a fresh process."""
     code += "\nimport sys; print('|' + ' '.join({name.split('.')[0] for name in sys.modules}))"
@@ -171,14 +178,3 @@ def test_help_loads_nothing_heavy(arguments):
     assert "typer" in loaded
     heavy = {"torch", "numpy", "lightning", "trimesh", "numba", "scipy", "h5py", "pyrender", "cv2"}
     assert not loaded & heavy
-
-
-def test_the_wheel_carries_every_package():
-    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
-    folders = {
-        path.parent.relative_to(ROOT).as_posix().replace("/", ".")
-        for name in ("sceneprior", "data_prep")
-        for path in (ROOT / name).rglob("*")
-        if path.suffix == ".py" or path.parent.name == "recipes"
-    }
-    assert set(listed) == folders | {"sceneprior.configs"}

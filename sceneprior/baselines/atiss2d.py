@@ -3,7 +3,7 @@
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
@@ -59,7 +59,10 @@ class SceneAtiss(nn.Module):
         self.end = nn.LayerNorm(width)
 
     def forward(
-        self, z: Float[Tensor, "rooms width"], objects: int
+        self,
+        z: Float[Tensor, "rooms width"],
+        objects: int,
+        needed: Int[Tensor, " rooms"] | None = None,
     ) -> Float[Tensor, "rooms objects width"]:
         """Unroll `objects` steps from the empty set."""
         features = z.new_zeros(len(z), 0, z.shape[-1])

@@ -3,7 +3,7 @@
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sceneprior.models.layers import DecoderConfig
@@ -31,7 +31,10 @@ class SceneLstm(nn.Module):
         self.cell = nn.LSTMCell(width, width)
 
     def forward(
-        self, z: Float[Tensor, "rooms width"], objects: int
+        self,
+        z: Float[Tensor, "rooms width"],
+        objects: int,
+        needed: Int[Tensor, " rooms"] | None = None,
     ) -> Float[Tensor, "rooms objects width"]:
         """Unroll `objects` steps; z is scaled as it is for the transformer."""
         feature, state = z * z.shape[-1] ** 0.5, None

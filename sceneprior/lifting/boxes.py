@@ -58,9 +58,8 @@ def _lift(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     if not len(rows):
         return np.full(3, -0.5), np.full(3, 0.5), 0.0
-    assert views.instance_ids is not None, "lifting reads images"
     poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]
-    seen = sightings_of(views.instance_ids[rows], poses, intrinsics, item + 1)
+    seen = sightings_of(views, rows, item)
     origins_m, directions = own_rays(seen, poses, intrinsics, views.sides_clear[rows, item], rng)
     low_m, high_m = _where_to_look(views, rows, item)
     for cells, reach in GRIDS:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, UInt8
 from rich.console import Console
 from rich.progress import track
 from torch import Tensor
@@ -25,7 +25,7 @@ from sceneprior.shards import RoomViews, Shard, iterate_rooms
 from sceneprior.views import LiftedRooms
 
 VERSION = 1
-SHAPES_VERSION = 1
+SHAPES_VERSION = 2
 """Of what `lift_boxes` and `lift_shapes` find: raise it when the same views give something else."""
 
 RAYS_KEPT = 1024
@@ -79,6 +79,7 @@ class LiftedDataset(RoomDataset):
             [np.hstack([boxes.centers_m, boxes.sizes_m]).astype(np.float32) for boxes in self.boxes]
         )
         self.space: ShapeSpace | None = None
+        """Of all shapes in all turns of their rooms."""
         self.object_classes = np.concatenate([room.object_class for room in rooms]).astype(np.int64)
         """Of the objects of all rooms, one room after the other."""
         self._bits, self._cells = np.zeros((0, 0), dtype=np.uint8), 0
@@ -86,13 +87,23 @@ class LiftedDataset(RoomDataset):
         """By room and quarter turn."""
         self._filled: Tensor | None = None
         if shape is not None:
-            ends = np.cumsum(counts)[:-1]
-            grids = _find_shapes(folder, split, key, rooms, self.boxes, chosen, shape)
-            self.space, codes = _spanned(grids, self.boxes, rotations, shape.codes)
-            self._codes = torch.stack([_padded(np.split(turned, ends)) for turned in codes], dim=1)
-            self._cells, self._bits = shape.cells, _packed(grids)
+            self._bits = _find_shapes(folder, split, key, rooms, self.boxes, chosen, shape)
+            self._cells, grids = shape.cells, _unpacked(self._bits, shape.cells)
+            self.space = _spanned(grids, self.boxes, rotations, shape.codes)
             filled = grids.sum(axis=(1, 2, 3)).clip(min=1).astype(np.float32)
-            self._filled = _padded(np.split(filled, ends))
+            self._filled = _padded(np.split(filled, np.cumsum(counts)[:-1]))
+
+    def place_shapes(self, space: ShapeSpace) -> None:
+        """Find the places of all shapes in a space; until then, batches have no `shape_codes`.
+
+        It is `self.space`, or what a checkpoint has of it: found again, on another processor, it
+        differs in its last bits.
+        """
+        grids = _unpacked(self._bits, len(space.mean))
+        ends = np.cumsum(self._counts.tolist())[:-1]
+        turned = [space.codes_of(turn_grids(grids, q)) for q in range(self.rotations)]
+        codes = torch.stack([_padded(np.split(each, ends)) for each in turned], dim=1)
+        self._codes = codes.to(self._counts.device)
 
     def grids(self) -> Bool[np.ndarray, "objects x y z"]:
         """The lifted shapes of the objects of all rooms; see `lift_shapes`."""
@@ -102,8 +113,8 @@ class LiftedDataset(RoomDataset):
         """Move all boxes and codes to `device`, where batches are then made."""
         self._counts, self._classes = self._counts.to(device), self._classes.to(device)
         self._lifted, self._boxes_m = self._lifted.to(device), self._boxes_m.to(device)
-        if self._codes is not None and self._filled is not None:
-            self._codes, self._filled = self._codes.to(device), self._filled.to(device)
+        self._codes = None if self._codes is None else self._codes.to(device)
+        self._filled = None if self._filled is None else self._filled.to(device)
         return self
 
     def __getitems__(self, draws: list[tuple[int, int]]) -> LiftedRooms:
@@ -160,7 +171,9 @@ def _find_shapes(
     boxes: Sequence[LiftedBoxes],
     chosen: Sequence[np.ndarray],
     shape: ShapeGrid,
-) -> Bool[np.ndarray, "objects x y z"]:
+) -> UInt8[np.ndarray, "objects bytes"]:
+    """Eight cells a byte; see `_unpacked`."""
+
     def find() -> dict[str, np.ndarray]:
         hulls, rays = [], []
         progress = track(boxes, "lifting shapes from masks (rooms)", console=Console(stderr=True))
@@ -179,7 +192,7 @@ def _find_shapes(
         return {"bits": _packed(thin)}
 
     key = f"{key} {SHAPES_VERSION} {shape.cells} {shape.margin}"
-    return _unpacked(_kept(folder / f"lifted_shapes_{split}.npz", key, find)["bits"], shape.cells)
+    return _kept(folder / f"lifted_shapes_{split}.npz", key, find)["bits"]
 
 
 def _packed(grids: Bool[np.ndarray, "objects x y z"]) -> UInt8[np.ndarray, "objects bytes"]:
@@ -189,8 +202,8 @@ def _packed(grids: Bool[np.ndarray, "objects x y z"]) -> UInt8[np.ndarray, "obje
 def _unpacked(
     bits: UInt8[np.ndarray, "objects bytes"], cells: int
 ) -> Bool[np.ndarray, "objects x y z"]:
-    flat = np.unpackbits(bits, axis=1, count=cells**3).astype(bool)
-    return flat.reshape(len(bits), *(cells,) * 3)
+    flat = np.unpackbits(bits, axis=1, count=cells**3).view(bool)
+    return flat.reshape(-1, cells, cells, cells)
 
 
 def _spanned(
@@ -198,15 +211,14 @@ def _spanned(
     boxes: Sequence[LiftedBoxes],
     rotations: int,
     codes: int,
-) -> tuple[ShapeSpace, list[Float[np.ndarray, "objects codes"]]]:
-    """The space of the shapes in all turns of their rooms; by turn, each object's place there."""
+) -> ShapeSpace:
+    """The space of the shapes in all turns of their rooms."""
     known = np.flatnonzero(np.concatenate([room.explained > 0 for room in boxes]))
     if len(known) * rotations > MOST_SHAPES:
         some = MOST_SHAPES // rotations
         known = np.sort(np.random.default_rng(0).choice(known, some, replace=False))
     turns = range(rotations)
-    space = shape_space(np.concatenate([turn_grids(grids[known], q) for q in turns]), codes)
-    return space, [space.codes_of(turn_grids(grids, q)) for q in turns]
+    return shape_space(np.concatenate([turn_grids(grids[known], q) for q in turns]), codes)
 
 
 def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

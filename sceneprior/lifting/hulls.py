@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int, Integer
 from numba import njit
 
+from sceneprior.shards import RoomViews
 from sceneprior.silhouettes.cpu.threads import in_threads
 
 MOST_EMPTY = 0.35
@@ -24,13 +25,17 @@ class Sightings(NamedTuple):
     """The views of one room that see one object."""
 
     ids: Integer[np.ndarray, "views height width"]
-    own_before: Int[np.ndarray, "views bottom right"]
-    """How many of the object's pixels lie above and to the left of each pixel's corner, and of the
-    image's ends: a summed-area table of (height + 1) x (width + 1)."""
+    own_id: int
+    boxes_px: Int[np.ndarray, "views 4"]
+    """First column and row of the object's pixels, and one past the last of each."""
+    own_before: Int[np.ndarray, " corners"]
+    """How many of the object's pixels lie above and to the left of each corner of a pixel in its
+    box: a summed-area table of (height + 1) x (width + 1) of the box, view after view."""
+    table_starts: Int[np.ndarray, " views"]
+    """Where each view's table begins."""
     world_to_image: Float[np.ndarray, "views 3 4"]
     """Intrinsics times `world_to_camera`."""
     focal_px: Float[np.ndarray, " views"]
-    own_id: int
 
 
 class Hull(NamedTuple):
@@ -39,8 +44,8 @@ class Hull(NamedTuple):
     low_m: Float[np.ndarray, "3"]
     high_m: Float[np.ndarray, "3"]
     emptiness: Float[np.ndarray, "x y z"]
-    """Share of the views that look at a cell and see past it, up to `MOST_EMPTY`; else `NEVER`. A
-    hull is where this is low; how low, `boxes.py` decides, since masks err."""
+    """Share of the views that look at a cell and see past it; `NEVER` where more than the carver
+    was told do. A hull is where this is low; how low, `boxes.py` decides, since masks err."""
 
     @property
     def cell_m(self) -> Float[np.ndarray, "3"]:
@@ -48,18 +53,21 @@ class Hull(NamedTuple):
         return (self.high_m - self.low_m) / self.emptiness.shape[0]
 
 
-def sightings_of(
-    ids: Integer[np.ndarray, "views height width"],
-    world_to_camera: Float[np.ndarray, "views 4 4"],
-    intrinsics: Float[np.ndarray, "views 3 3"],
-    own_id: int,
-) -> Sightings:
-    """Lay out what `carve` reads."""
-    views, height, width = ids.shape
-    table = np.zeros((views, height + 1, width + 1), dtype=np.int32)
-    in_threads(_sum_areas, views, ids, own_id, table)
-    matrices = intrinsics.astype(np.float64) @ world_to_camera[:, :3].astype(np.float64)
-    return Sightings(ids, table, matrices, intrinsics[:, 0, 0].astype(np.float64), own_id)
+def sightings_of(views: RoomViews, rows: Int[np.ndarray, " views"], item: int) -> Sightings:
+    """Lay out what `carve` reads of an object in the `rows` of a room's views that show it."""
+    assert views.instance_ids is not None, "lifting reads images"
+    ids = views.instance_ids[rows]
+    count, height, width = ids.shape
+    boxes = views.boxes[rows, item] * np.array([width, height, width, height])
+    boxes_px = np.rint(boxes).astype(np.int64)
+    columns, lines = (boxes_px[:, 2:] - boxes_px[:, :2] + 1).T
+    ends = np.cumsum(columns * lines)
+    table = np.empty(int(ends[-1]) if count else 0, dtype=np.int32)
+    starts = ends - columns * lines
+    in_threads(_sum_areas, count, ids, item + 1, boxes_px, starts, table)
+    intrinsics = views.intrinsics[rows].astype(np.float64)
+    matrices = intrinsics @ views.world_to_camera[rows, :3].astype(np.float64)
+    return Sightings(ids, item + 1, boxes_px, table, starts, matrices, intrinsics[:, 0, 0].copy())
 
 
 def carve(
@@ -68,8 +76,9 @@ def carve(
     high_m: Float[np.ndarray, "3"],
     cells: int,
     reach: float,
+    most_empty: float = MOST_EMPTY,
 ) -> Hull:
-    """Ask every view about every cell of a grid.
+    """Ask every view about every cell of a grid, until `most_empty` of them see past it.
 
     A view sees past a cell if the pixel there is background and no pixel of the object lies within
     `reach` cells of it, so that parts thinner than a cell survive. A pixel of another object says
@@ -77,8 +86,8 @@ def carve(
     """
     emptiness = np.empty((cells, cells, cells), dtype=np.float32)
     in_threads(
-        _carve, cells, seen.ids, seen.own_before, seen.world_to_image, seen.focal_px, seen.own_id,
-        low_m, high_m, reach, emptiness,
+        _carve, cells, seen.ids, seen.boxes_px, seen.own_before, seen.table_starts,
+        seen.world_to_image, seen.focal_px, low_m, high_m, reach, most_empty, emptiness,
     )  # fmt: skip
     return Hull(low_m, high_m, emptiness)
 
@@ -121,52 +130,84 @@ def pass_through(
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 @njit(cache=True, nogil=True)
 @no_type_check
-def _sum_areas(first, last, ids, own_id, table):
-    _, height, width = ids.shape
+def _sum_areas(first, last, ids, own_id, boxes_px, starts, table):
     for view in range(first, last):
-        for row in range(height):
-            so_far = 0
-            for column in range(width):
+        x1, y1, x2, y2 = boxes_px[view]
+        columns, at = x2 - x1 + 1, starts[view]
+        table[at : at + columns] = 0
+        for row in range(y1, y2):
+            at += columns
+            table[at] = so_far = 0
+            for column in range(x1, x2):
                 so_far += ids[view, row, column] == own_id
-                table[view, row + 1, column + 1] = table[view, row, column + 1] + so_far
+                here = at + column - x1 + 1
+                table[here] = table[here - columns] + so_far
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _carve(first, last, ids, table, matrices, focal_px, own_id, low_m, high_m, reach, emptiness):
+def own_in(box_px, table, start, x1, y1, x2, y2):
+    """How many of the object's pixels lie in columns x1 to x2 and rows y1 to y2 (one past the
+    last) of a view; `start` is where the view's table begins."""
+    x1, x2 = max(x1, box_px[0]) - box_px[0], min(x2, box_px[2]) - box_px[0]
+    y1, y2 = max(y1, box_px[1]) - box_px[1], min(y2, box_px[3]) - box_px[1]
+    if x1 >= x2 or y1 >= y2:
+        return 0
+    columns = box_px[2] - box_px[0] + 1
+    top, bottom = start + y1 * columns, start + y2 * columns
+    return table[bottom + x2] - table[top + x2] - table[bottom + x1] + table[top + x1]
+
+
+# "numpy": a division by zero is no error, so that a row of cells is projected at once.
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _carve(
+    first, last, ids, boxes_px, table, starts, matrices, focal_px, low_m, high_m, reach, most_empty,
+    emptiness,
+):  # fmt: skip
     views, height, width = ids.shape
     cells = emptiness.shape[0]
     size_m = (high_m - low_m) / cells
     radius_m = reach * size_m.max()
-    enough = MOST_EMPTY * views + 0.5  # more than in any hull, whatever the other views see
+    enough = most_empty * views + 0.5  # more than in any hull, whatever the other views see
+    own, past = np.empty((cells, cells), np.int32), np.empty((cells, cells), np.int32)
+    u, v, depth = np.empty(cells), np.empty(cells), np.empty(cells)
+    z = low_m[2] + (np.arange(cells) + 0.5) * size_m[2]
     for i in range(first, last):
+        own[:] = 0
+        past[:] = 0
         x = low_m[0] + (i + 0.5) * size_m[0]
+        for view in range(views):  # outside of the cells: its images stay in the cache
+            m = matrices[view]
+            box, start = boxes_px[view], starts[view]
+            for j in range(cells):
+                y = low_m[1] + (j + 0.5) * size_m[1]
+                a, b, c = (
+                    m[0, 0] * x + m[0, 1] * y,
+                    m[1, 0] * x + m[1, 1] * y,
+                    m[2, 0] * x + m[2, 1] * y,
+                )
+                for k in range(cells):
+                    depth[k] = c + m[2, 2] * z[k] + m[2, 3]
+                    u[k] = (a + m[0, 2] * z[k] + m[0, 3]) / depth[k]
+                    v[k] = (b + m[1, 2] * z[k] + m[1, 3]) / depth[k]
+                for k in range(cells):
+                    if past[j, k] > enough or depth[k] < MIN_DEPTH_M:
+                        continue
+                    if not (0 <= u[k] < width and 0 <= v[k] < height):
+                        continue
+                    column, row = int(u[k]), int(v[k])
+                    radius = int(radius_m * focal_px[view] / depth[k] + 0.5)
+                    if own_in(
+                        box, table, start,
+                        column - radius, row - radius, column + radius + 1, row + radius + 1,
+                    ):  # fmt: skip
+                        own[j, k] += 1
+                    elif ids[view, row, column] == 0:
+                        past[j, k] += 1
         for j in range(cells):
-            y = low_m[1] + (j + 0.5) * size_m[1]
             for k in range(cells):
-                z = low_m[2] + (k + 0.5) * size_m[2]
-                own = 0
-                past = 0
-                for view in range(views):
-                    m = matrices[view]
-                    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-                    if depth < MIN_DEPTH_M:
-                        continue
-                    u = int(np.floor((m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth))
-                    v = int(np.floor((m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth))
-                    if u < 0 or v < 0 or u >= width or v >= height:
-                        continue
-                    radius = int(radius_m * focal_px[view] / depth + 0.5)
-                    left, right = max(u - radius, 0), min(u + radius + 1, width)
-                    top, bottom = max(v - radius, 0), min(v + radius + 1, height)
-                    t = table[view]
-                    if t[bottom, right] - t[top, right] - t[bottom, left] + t[top, left] > 0:
-                        own += 1
-                    elif ids[view, v, u] == 0:
-                        past += 1
-                        if past > enough:
-                            break
                 # One view that sees past is forgiven: an outline runs through its pixels.
-                emptiness[i, j, k] = NEVER if own < 2 else max(past - 0.5, 0.0) / (own + past)
-                if past > enough:
-                    emptiness[i, j, k] = NEVER
+                share = max(past[j, k] - 0.5, 0.0) / (own[j, k] + past[j, k])
+                never = own[j, k] < 2 or past[j, k] > enough
+                emptiness[i, j, k] = NEVER if never else share

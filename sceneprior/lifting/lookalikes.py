@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.distance import cdist
 
 from sceneprior.geometry.turns import quarter_rotation, turn_grids
 
@@ -49,24 +50,20 @@ def lookalikes(
     for label in np.unique(object_class[filled]):
         items = np.flatnonzero((object_class == label) & filled)
         coarse = _halved(grids[items])
-        sizes = np.log(sizes_m[items])
-        moved = [turn_grids(coarse, *way).reshape(len(items), -1) for way in ways]
-        turned = [sizes if quarters % 2 == 0 else sizes[:, ::-1] for quarters, _ in ways]
+        flat, sizes = coarse.reshape(len(items), -1), np.log(sizes_m[items])
+        apart = np.empty((len(items), len(items), len(ways)))
+        for place, way in enumerate(ways):
+            moved = turn_grids(coarse, *way).reshape(flat.shape)
+            turned = sizes if way[0] % 2 == 0 else sizes[:, ::-1]
+            apart[..., place] = cdist(flat, moved, "cityblock") / flat.shape[1]
+            apart[..., place] += SIZE_WEIGHT * cdist(sizes, turned, "cityblock")
         for row, item in enumerate(items):
-            apart = np.stack(
-                [
-                    np.abs(there - moved[0][row]).mean(axis=1)
-                    + SIZE_WEIGHT * np.abs(size - sizes[row]).sum(axis=1)
-                    for there, size in zip(moved, turned, strict=True)
-                ],
-                axis=1,
-            )
-            apart[row, 0] = np.inf  # as it is
-            nearest = np.argsort(apart, axis=None, kind="stable")[:MOST]
+            apart[row, row, 0] = np.inf  # as it is
+            nearest = np.argsort(apart[row], axis=None, kind="stable")[:MOST]
             found[item] = [
                 Lookalike(int(items[other]), *ways[way])
-                for other, way in zip(*np.unravel_index(nearest, apart.shape), strict=True)
-                if apart[other, way] < FARTHEST
+                for other, way in zip(*np.unravel_index(nearest, apart.shape[1:]), strict=True)
+                if apart[row, other, way] < FARTHEST
             ]
     return found
 

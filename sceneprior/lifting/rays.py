@@ -1,13 +1,15 @@
 """Rays through the masks of an object: each says that it is met, or that a stretch is empty."""
 
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numba import njit
 
 from sceneprior.lifting.boxes import LiftedBoxes, pixel_directions
-from sceneprior.lifting.hulls import pass_through, sightings_of
+from sceneprior.lifting.hulls import own_in, pass_through, sightings_of
 from sceneprior.shards import RoomViews
+from sceneprior.silhouettes.cpu.threads import in_threads
 
 NEAR_OUTLINE_PX = 4
 """Pixels this near to a mask's outline are drawn as often as all others together."""
@@ -71,9 +73,8 @@ def _draw(
     nothing = RayPool(nowhere, nowhere, np.zeros(count, bool))
     if not len(rows):
         return nothing
-    assert views.instance_ids is not None, "rays are drawn from images"
     poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]
-    seen = sightings_of(views.instance_ids[rows], poses, intrinsics, item + 1)
+    seen = sightings_of(views, rows, item)
     view, u, v = _pixels_round(views, rows, item, 6 * count, rng)
     ids = seen.ids[view, v, u].astype(np.int64)
     directions = np.empty((len(u), 3))
@@ -98,7 +99,12 @@ def _draw(
     useful = np.flatnonzero(far > near)
     if not len(useful):
         return nothing
-    weights = np.where(_near_outline(seen.own_before, view[useful], u[useful], v[useful]), 1.0, 0)
+    near_outline = np.empty(len(useful), bool)
+    in_threads(
+        _near_outline, len(useful), view[useful], u[useful], v[useful], views.image_size,
+        seen.boxes_px, seen.own_before, seen.table_starts, near_outline,
+    )  # fmt: skip
+    weights = near_outline.astype(np.float64)
     share = weights.mean()
     if 0 < share < 1:
         weights = weights / share + (1 - weights) / (1 - share)
@@ -133,21 +139,16 @@ def _pixels_round(
     return view, u, v
 
 
-def _near_outline(
-    own_before: Int[np.ndarray, "views bottom right"],
-    view: Int[np.ndarray, " pixels"],
-    u: Int[np.ndarray, " pixels"],
-    v: Int[np.ndarray, " pixels"],
-) -> Bool[np.ndarray, " pixels"]:
+@njit(cache=True, nogil=True)
+@no_type_check
+def _near_outline(first, last, view, u, v, image_size, boxes_px, table, starts, near):
     """Whether some but not all pixels of the square round a pixel are the object's own."""
-    _, height, width = own_before.shape
-    left, right = (u - NEAR_OUTLINE_PX).clip(0), (u + NEAR_OUTLINE_PX + 1).clip(max=width - 1)
-    top, bottom = (v - NEAR_OUTLINE_PX).clip(0), (v + NEAR_OUTLINE_PX + 1).clip(max=height - 1)
-    own = (
-        own_before[view, bottom, right] - own_before[view, top, right]
-        - own_before[view, bottom, left] + own_before[view, top, left]
-    )  # fmt: skip
-    return (own > 0) & (own < (right - left) * (bottom - top))
+    height, width = image_size
+    for i in range(first, last):
+        x1, x2 = max(u[i] - NEAR_OUTLINE_PX, 0), min(u[i] + NEAR_OUTLINE_PX + 1, width)
+        y1, y2 = max(v[i] - NEAR_OUTLINE_PX, 0), min(v[i] + NEAR_OUTLINE_PX + 1, height)
+        own = own_in(boxes_px[view[i]], table, starts[view[i]], x1, y1, x2, y2)
+        near[i] = 0 < own < (x2 - x1) * (y2 - y1)
 
 
 def entry_m(

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from sklearn.decomposition import PCA
+from scipy import linalg
 
 from sceneprior.lifting.boxes import LiftedBoxes
 from sceneprior.lifting.hulls import carve, sightings_of
@@ -53,15 +53,10 @@ def lift_shapes(
     # Cells whose centres lie in the box.
     inside = np.abs((np.arange(cells) + 0.5) / cells - 0.5) * margin < 0.5
     for item in np.flatnonzero(boxes.explained > 0):
-        assert views.instance_ids is not None, "shapes are lifted from images"
-        seeing = rows[views.visible[rows, item]]
-        seen = sightings_of(
-            views.instance_ids[seeing], views.world_to_camera[seeing], views.intrinsics[seeing],
-            int(item) + 1,
-        )  # fmt: skip
+        seen = sightings_of(views, rows[views.visible[rows, item]], int(item))
         half_m = margin * boxes.sizes_m[item] / 2
         low_m, high_m = boxes.centers_m[item] - half_m, boxes.centers_m[item] + half_m
-        hull = carve(seen, low_m, high_m, cells, REACH)
+        hull = carve(seen, low_m, high_m, cells, REACH, EMPTY)
         grids[item] = (hull.emptiness <= EMPTY) & inside & inside[:, None] & inside[:, None, None]
     return grids
 
@@ -99,7 +94,13 @@ def shape_space(grids: Bool[np.ndarray, "shapes x y z"], codes: int) -> ShapeSpa
         mean[:] = grids.mean(axis=0)
     if found < 1:
         return ShapeSpace(mean, basis, 1.0)
-    components = PCA(found, svd_solver="randomized", random_state=0)
-    weights = components.fit_transform(grids.reshape(len(grids), -1).astype(np.float32))
-    basis[:found] = components.components_.reshape(found, *grids.shape[1:])
-    return ShapeSpace(mean, basis, float(np.sqrt((weights**2).mean())) or 1.0)
+    apart = (grids - mean).reshape(len(grids), -1)
+    # The products of shapes have the singular values of the shapes, squared, and there are far
+    # fewer shapes than cells.
+    products = (apart @ apart.T).astype(np.float64)
+    squares, turns = linalg.eigh(products, subset_by_index=(len(grids) - found, len(grids) - 1))
+    kept = squares[::-1] > 1e-6 * squares[-1]  # what is less is rounding
+    squares, turns = squares[::-1][kept], turns[:, ::-1][:, kept]
+    weights = (turns / np.sqrt(squares)).astype(np.float32)
+    basis[: len(squares)] = (weights.T @ apart).reshape(-1, *grids.shape[1:])
+    return ShapeSpace(mean, basis, float(np.sqrt(squares.sum() / (len(grids) * found))) or 1.0)

@@ -84,10 +84,11 @@ def _thin_some(
             turn_grids(hulls[other.item][None], other.quarters, other.mirrored)[0]
             for other in alike[item]
         ]
-        logits = START * (2 * np.mean([hulls[item], *others], axis=0) - 1)
+        filled = np.mean(np.stack([hulls[item], *others]), axis=0, dtype=np.float32)
+        logits = np.asarray(START * (2 * filled - 1), np.float32)
         picked = rng.integers(len(pool.hits), size=(STEPS, RAYS))
         offsets = rng.random((STEPS, RAYS))
-        _fit(logits, *pool, picked, offsets)
+        _fit(logits, pool, picked, offsets)
         thin[item] = hulls[item] & ndimage.binary_dilation(logits > 0, np.ones((3, 3, 3)))
 
 
@@ -109,22 +110,37 @@ def _pool_of(item: int, rays: RayPool, alike: list[Lookalike], rng: np.random.Ge
     return _Pool(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
-@njit(cache=True, nogil=True)
-@no_type_check
-def _fit(logits, starts, spans, hits, picked, offsets):
+def _fit(
+    logits: Float[np.ndarray, "x y z"],
+    pool: _Pool,
+    picked: Int[np.ndarray, "steps rays"],
+    offsets: Float[np.ndarray, "steps rays"],
+) -> None:
     """Adam on the logits, in place; rates fall by a cosine."""
-    mean, square = np.zeros_like(logits), np.zeros_like(logits)
-    slope = np.empty_like(logits)
-    for step in range(len(picked)):
-        slope[:] = 0
-        some = picked[step]
-        ray_slope(logits, starts[some], spans[some], hits[some], offsets[step], SAMPLES, slope)
-        regular_slope(logits, VARIATION, VOLUME, slope)
+    mean, square, slope, occupancy = (np.zeros_like(logits) for _ in range(4))
+    number = logits.dtype.type
+    for step, (some, offset) in enumerate(zip(picked, offsets, strict=True)):
+        # NumPy's exp takes many numbers at once, which Numba's does not.
+        np.exp(np.negative(logits, out=occupancy), out=occupancy)
+        occupancy += 1
+        np.reciprocal(occupancy, out=occupancy)
+        regular_slope(occupancy, number(VARIATION), number(VOLUME), slope)
+        ray_slope(logits, *(part[some] for part in pool), offset, SAMPLES, slope)
         rate = RATE * (0.5 + 0.5 * np.cos(np.pi * step / len(picked))) + 0.01
         first, second = 1 - 0.9 ** (step + 1), 1 - 0.95 ** (step + 1)
-        mean[:] = 0.9 * mean + 0.1 * slope
-        square[:] = 0.95 * square + 0.05 * slope * slope
-        logits -= rate * (mean / first) / (np.sqrt(square / second) + 1e-8)
+        _adam(
+            logits.ravel(), slope.ravel(), mean.ravel(), square.ravel(),
+            *map(number, (0.9, 0.1, 0.95, 0.05, rate / first, 1 / second, 1e-8)),
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _adam(values, slope, mean, square, keep, take, keep_square, take_square, rate, scale, least):
+    for i in range(len(values)):
+        mean[i] = keep * mean[i] + take * slope[i]
+        square[i] = keep_square * square[i] + take_square * slope[i] * slope[i]
+        values[i] -= rate * mean[i] / (np.sqrt(scale * square[i]) + least)
 
 
 @njit(cache=True, nogil=True)
@@ -135,35 +151,36 @@ def ray_slope(logits, starts, spans, hits, offsets, samples, slope):
     Logits are trilinear between the cells' centres, and constant from the outermost ones outwards.
     """
     cells = logits.shape[0]
-    corner = np.empty((samples, 3), np.int64)
-    part = np.empty((samples, 3))
+    flat, flat_slope = logits.ravel(), slope.ravel()  # views: both are contiguous
+    # Unsigned, which Numba does not ask whether they count from the end.
+    along_x, along_y, along_z = np.uint64(cells * cells), np.uint64(cells), np.uint64(1)
+    first = np.empty(samples, np.uint64)
+    parts = np.empty((samples, 3))
     along = np.empty(samples)
     counted = 0
     for ray in range(len(hits)):
-        counted += np.abs(spans[ray]).max() > 0
+        counted += spans[ray, 0] != 0 or spans[ray, 1] != 0 or spans[ray, 2] != 0
     for ray in range(len(hits)):
-        if np.abs(spans[ray]).max() == 0:
+        if spans[ray, 0] == 0 and spans[ray, 1] == 0 and spans[ray, 2] == 0:
             continue
         largest = -np.inf
         for i in range(samples):
             share = (i + offsets[ray]) / samples
+            at = 0
             for axis in range(3):
                 place = (starts[ray, axis] + share * spans[ray, axis] + 1) / 2 * cells - 0.5
                 place = min(max(place, 0.0), cells - 1.0)
-                corner[i, axis] = min(int(place), cells - 2)
-                part[i, axis] = place - corner[i, axis]
+                corner = min(int(place), cells - 2)
+                parts[i, axis] = place - corner
+                at = at * cells + corner
+            first[i] = at
+            x, y, z = parts[i]
             value = 0.0
-            for a in range(2):
-                for b in range(2):
-                    for c in range(2):
-                        weight = (
-                            (part[i, 0] if a else 1 - part[i, 0])
-                            * (part[i, 1] if b else 1 - part[i, 1])
-                            * (part[i, 2] if c else 1 - part[i, 2])
-                        )
-                        value += (
-                            weight * logits[corner[i, 0] + a, corner[i, 1] + b, corner[i, 2] + c]
-                        )
+            for column, weight in (
+                (first[i], (1 - x) * (1 - y)), (first[i] + along_y, (1 - x) * y),
+                (first[i] + along_x, x * (1 - y)), (first[i] + along_x + along_y, x * y),
+            ):  # fmt: skip
+                value += weight * ((1 - z) * flat[column] + z * flat[column + along_z])
             along[i] = value
             largest = max(largest, value)
         total = 0.0
@@ -171,45 +188,49 @@ def ray_slope(logits, starts, spans, hits, offsets, samples, slope):
             along[i] = np.exp(SHARPNESS * (along[i] - largest))
             total += along[i]
         logit = largest + np.log(total) / SHARPNESS - np.log(samples) / (2 * SHARPNESS)
-        pull = (1 / (1 + np.exp(-logit)) - hits[ray]) / counted
+        pull = (1 / (1 + np.exp(-logit)) - hits[ray]) / (counted * total)
         for i in range(samples):
-            for a in range(2):
-                for b in range(2):
-                    for c in range(2):
-                        weight = (
-                            (part[i, 0] if a else 1 - part[i, 0])
-                            * (part[i, 1] if b else 1 - part[i, 1])
-                            * (part[i, 2] if c else 1 - part[i, 2])
-                        )
-                        slope[corner[i, 0] + a, corner[i, 1] + b, corner[i, 2] + c] += (
-                            pull * weight * along[i] / total
-                        )
+            x, y, z = parts[i]
+            push = pull * along[i]
+            for column, weight in (
+                (first[i], (1 - x) * (1 - y)), (first[i] + along_y, (1 - x) * y),
+                (first[i] + along_x, x * (1 - y)), (first[i] + along_x + along_y, x * y),
+            ):  # fmt: skip
+                flat_slope[column] += push * weight * (1 - z)
+                flat_slope[column + along_z] += push * weight * z
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def regular_slope(occupancy, variation, volume, slope):
+    """The gradient, by the logits, of the weighted total variation and mean of their occupancies:
+    the mean absolute difference of neighbours along x, plus along y, plus along z. Fastest where
+    all are of one type."""
+    cells = occupancy.shape[0]
+    one = occupancy.dtype.type(1)
+    per_pair = variation / occupancy.dtype.type(cells * cells * (cells - 1))
+    per_cell = volume / occupancy.dtype.type(cells**3)
+    slope[:] = 0
+    # By slices, since Numba does not vectorise loops over sums of indices.
+    for x in range(cells):
+        here, out = occupancy[x].ravel(), slope[x].ravel()
+        if x > 0:
+            _add_signs(here, occupancy[x - 1].ravel(), out)
+        if x < cells - 1:
+            _add_signs(here, occupancy[x + 1].ravel(), out)
+        for step in (cells, 1):
+            _add_signs(here[step:], here[:-step], out[step:])
+            _add_signs(here[:-step], here[step:], out[:-step])
+        for end in range(cells, cells * cells, cells):  # those are no neighbours along z
+            sign = np.sign(here[end] - here[end - 1])
+            out[end] -= sign
+            out[end - 1] += sign
+        for i in range(len(out)):
+            out[i] = (per_pair * out[i] + per_cell) * here[i] * (one - here[i])
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def regular_slope(logits, variation, volume, slope):
-    """Add the gradient of the weighted total variation and mean of the occupancies: the mean
-    absolute difference of neighbours along x, plus along y, plus along z."""
-    cells = logits.shape[0]
-    occupancy = 1 / (1 + np.exp(-logits))
-    per_pair = variation / (cells * cells * (cells - 1))
-    per_cell = volume / cells**3
-    for x in range(cells):
-        for y in range(cells):
-            for z in range(cells):
-                here = occupancy[x, y, z]
-                sides = 0.0
-                if x > 0:
-                    sides += np.sign(here - occupancy[x - 1, y, z])
-                if x < cells - 1:
-                    sides += np.sign(here - occupancy[x + 1, y, z])
-                if y > 0:
-                    sides += np.sign(here - occupancy[x, y - 1, z])
-                if y < cells - 1:
-                    sides += np.sign(here - occupancy[x, y + 1, z])
-                if z > 0:
-                    sides += np.sign(here - occupancy[x, y, z - 1])
-                if z < cells - 1:
-                    sides += np.sign(here - occupancy[x, y, z + 1])
-                slope[x, y, z] += (per_pair * sides + per_cell) * here * (1 - here)
+def _add_signs(a, b, signs):
+    for i in range(len(a)):
+        signs[i] += np.sign(a[i] - b[i])

@@ -5,11 +5,13 @@ box that a piece's masks imply, so the distance is taken there, and no frustum t
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from sceneprior.losses.averages import mean_of_objects
-from sceneprior.losses.layout import class_loss, completeness_loss, take
+from sceneprior.losses.completeness import completeness_targets
+from sceneprior.losses.layout import class_loss, take
 from sceneprior.losses.matching import Matches, assign, class_cost
 from sceneprior.views import DecodedScenes, LiftedRooms
 
@@ -34,19 +36,32 @@ def match_lifted(scenes: DecodedScenes, rooms: LiftedRooms, box_weight: float = 
     return Matches(assign(cost, counts, counts), rooms.is_lifted)
 
 
+def needed_predictions(rooms: LiftedRooms, slots: int) -> Bool[Tensor, "rooms slots"]:
+    """The first n + 1 of a room of n objects: the last of them says that there are no more, and no
+    scene is decoded further. None of a room without objects, which stands for no room."""
+    counts = rooms.is_object.sum(dim=-1, keepdim=True)
+    return (torch.arange(slots, device=counts.device) <= counts) & (counts > 0)
+
+
 def lifted_losses(
     scenes: DecodedScenes, rooms: LiftedRooms, matches: Matches, completeness_target: str
 ) -> dict[str, Float[Tensor, ""]]:
-    """`class`, `box` and `completeness`, unweighted, as `layout_losses` has them of views.
+    """`class`, `box` and `completeness`, unweighted, as `layout_losses` has them of views, but for
+    the completeness of predictions that are not needed (`needed_predictions`).
 
     L_box = mean over objects of |c_k - c_j|_1 + |s_k - s_j|_1, in metres
     """
+    logits = scenes.completeness_logits
+    goes_on = completeness_targets(
+        rooms.is_object.sum(dim=-1), logits.shape[1], completeness_target
+    )
+    every = F.binary_cross_entropy_with_logits(logits, goes_on.to(logits.dtype), reduction="none")
     predicted = take(predicted_boxes(scenes), matches.prediction, dim=1)
     apart = (predicted - rooms.boxes_m).abs().sum(dim=-1)
     return {
         "class": class_loss(scenes, rooms, matches),
         "box": mean_of_objects(PER_METRE * apart, matches.valid),
-        "completeness": completeness_loss(scenes, rooms, completeness_target),
+        "completeness": mean_of_objects(every, needed_predictions(rooms, logits.shape[1])),
     }
 
 

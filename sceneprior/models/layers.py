@@ -26,7 +26,8 @@ def mlp(*layers: nn.Module, slope: float = 0.0) -> nn.Sequential:
 class DecoderConfig(Section, ABC):
     """What makes object features x_k of a latent z: a section that builds its module.
 
-    The module takes (z of shape (rooms, D_z), N) to features of shape (rooms, N, D_z).
+    The module takes (z of shape (rooms, D_z), N) to features of shape (rooms, N, D_z); it may be
+    told how many of the N each room needs, and what it says of the others then means nothing.
     """
 
     name: str

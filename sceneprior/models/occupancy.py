@@ -41,9 +41,10 @@ class OccupancyDecoder(nn.Module):
 
         occupancy = mean + spread * MLP(x) @ basis
 
-    Mean and basis are no weights: training finds them from the data before its first step
-    (`set_space`), and checkpoints keep them. Since the basis is orthonormal, the squared distance
-    of two grids, summed over cells, is that of their weights: training needs no grid.
+    Mean and basis are no parameters: training finds them from the data before its first step
+    (`set_space`), checkpoints keep them, and a resumed run's targets are weights of the same. Since
+    the basis is orthonormal, the squared distance of two grids, summed over cells, is that of their
+    weights: training needs no grid.
     """
 
     nothing: ClassVar[float] = -20.0
@@ -77,6 +78,16 @@ class OccupancyDecoder(nn.Module):
         self.mean.copy_(torch.from_numpy(mean))
         self.basis.copy_(torch.from_numpy(basis))
         self.spread.fill_(spread)
+
+    @property
+    def space(
+        self,
+    ) -> tuple[
+        Float[np.ndarray, "cells cells cells"], Float[np.ndarray, "codes cells cells cells"], float
+    ]:
+        """What `set_space` was given, as far as half precision holds it."""
+        mean, basis = (part.float().cpu().numpy() for part in (self.mean, self.basis))
+        return mean, basis, self.spread.item()
 
     def codes(
         self, features: Float[Tensor, "*objects features"]

@@ -98,13 +98,15 @@ class ScenePrior(nn.Module):
     ) -> DecodedScenes:
         """Decode rooms from points of the latent space; `with_shape` adds meshes or grids.
 
-        `wanted` decodes as many objects as it has columns, and shapes only where it is true; the
-        other vertices lie at their box's centre, and the other grids are empty. None: all N.
+        `wanted`, the first so many of each room, decodes as many objects as it has columns; where
+        it is false, vertices lie at their box's centre, grids are empty, and all else means
+        nothing. None: all N.
 
         Layouts stay float32 under autocast: bfloat16 would round 3 m to steps of 2 cm.
         """
         count = self.max_objects if wanted is None else wanted.shape[1]
-        features = self.decoder(z, count)
+        needed = None if wanted is None else wanted.sum(dim=1)
+        features = self.decoder(z, count, needed)
         with torch.autocast(z.device.type, enabled=False):
             layout, shared = self.layout(features.to(z.dtype))
         scenes = DecodedScenes(**layout._asdict(), bevels=self.bevels(layout.class_logits))

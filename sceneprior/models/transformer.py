@@ -3,7 +3,7 @@
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -92,21 +92,39 @@ class SceneTransformer(nn.Module):
         self.output = StepOutputs(max_objects, width) if config.step_mlps else None
 
     def forward(
-        self, z: Float[Tensor, "rooms width"], objects: int
+        self,
+        z: Float[Tensor, "rooms width"],
+        objects: int,
+        needed: Int[Tensor, " rooms"] | None = None,
     ) -> Float[Tensor, "rooms objects width"]:
         """Unroll `objects` steps from the start token (the empty room)."""
+        if needed is not None and self.output is None:  # whose last steps have weights to train
+            # Rooms that are done leave from the end.
+            order = needed.argsort(descending=True)
+            steps = torch.arange(objects, device=z.device)
+            going_on = (needed[:, None] > steps).sum(dim=0).tolist()
+            return self._unroll(z[order], going_on)[order.argsort()]
+        return self._unroll(z, [len(z)] * objects)
+
+    def _unroll(self, z: Tensor, going_on: list[int]) -> Tensor:
+        """Features; of each step, only the first so many rooms', and zeros for the others."""
         query = self._query(z)
         tokens = self.start.expand(len(z), 1, -1)
         qkv = self._split(self.encoder_qkv(tokens))
         key_query = self._key_query(query)
         features: list[Tensor] = []
-        for step in range(objects):
-            features.append(self._next(query, key_query, tokens, qkv))
-            if step + 1 < objects:
-                newest = features[-1].unsqueeze(1)
-                tokens = torch.cat([tokens, newest], dim=1)
+        for rooms in going_on:
+            if features:
+                newest = features[-1][:rooms].unsqueeze(1)
+                tokens = torch.cat([tokens[:rooms], newest], dim=1)
                 added = self._split(self.encoder_qkv(newest))
-                qkv = [torch.cat(pair, dim=2) for pair in zip(qkv, added, strict=True)]
+                qkv = [
+                    torch.cat([old[:rooms], new], dim=2)
+                    for old, new in zip(qkv, added, strict=True)
+                ]
+            seen = [part[:rooms] for part in qkv]
+            feature = self._next(query[:rooms], key_query[:rooms], tokens[:rooms], seen)
+            features.append(F.pad(feature, (0, 0, 0, len(z) - rooms)))
         return torch.stack(features, dim=1)
 
     def _query(self, z: Tensor) -> Tensor:

@@ -157,7 +157,7 @@ class PaperConfig(PriorConfig):
             assert isinstance(prior.shape, OccupancyDecoder)
             prior.shape.set_space(*rooms.space)
         target = self.model.completeness_target
-        return kind(prior, latents, stage, self.loss, target, self.seed)
+        return kind(prior, latents, rooms, stage, self.loss, target, self.seed)
 
     def _before(self, previous: Path, room_ids: tuple[str, ...]) -> TrainedPrior:
         """What the stage before learnt, of the same rooms; else an `InputError`."""

@@ -8,9 +8,18 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
+from torch.utils.data import Dataset
 
-from sceneprior.losses.lifted import lifted_losses, match_lifted, shape_code_loss
+from sceneprior.lifting.dataset import LiftedDataset
+from sceneprior.lifting.shapes import ShapeSpace
+from sceneprior.losses.lifted import (
+    lifted_losses,
+    match_lifted,
+    needed_predictions,
+    shape_code_loss,
+)
 from sceneprior.losses.shape import mask_loss
+from sceneprior.models.occupancy import OccupancyDecoder
 from sceneprior.models.prior import ScenePrior
 from sceneprior.training.objective import (
     batch_seed,
@@ -40,6 +49,7 @@ class PaperStage(lightning.LightningModule, ABC):
     Args:
         prior: The network, as the stage before left it; a fresh one in the first.
         latents: One row of logits a training room.
+        rooms: What the stage is trained on.
         stage, loss: How it is trained, and the weights of the terms.
         completeness_target: Of the model.
         seed: Of the run.
@@ -49,6 +59,7 @@ class PaperStage(lightning.LightningModule, ABC):
         self,
         prior: ScenePrior,
         latents: nn.Embedding,
+        rooms: Dataset[Any],
         stage: StageConfig,
         loss: LossConfig,
         completeness_target: str,
@@ -59,7 +70,7 @@ class PaperStage(lightning.LightningModule, ABC):
         prior.requires_grad_(True)
         prior.shape.requires_grad_(not isinstance(stage, LayoutConfig))
         prior.bevels.requires_grad_(stage.proxy == "beveled_box" and self.has_proxies(stage))
-        self.prior, self.latents = prior, latents
+        self.prior, self.latents, self.rooms = prior, latents, rooms
         self.stage, self.loss, self.seed = stage, loss, seed
         self.completeness_target = completeness_target
 
@@ -140,8 +151,17 @@ class LiftedStage(PaperStage):
     def has_proxies(stage: Any) -> bool:
         return False
 
+    def on_fit_start(self) -> None:
+        # Only now, when a resumed run has its checkpoint's shape space.
+        if isinstance(self.stage, LiftedShapeConfig):
+            assert isinstance(self.rooms, LiftedDataset)
+            assert isinstance(self.prior.shape, OccupancyDecoder)
+            self.rooms.place_shapes(ShapeSpace(*self.prior.shape.space))
+
     def training_step(self, rooms: LiftedRooms, batch_idx: int) -> Tensor:
-        scenes = self.prior.decode(self.room_latents(rooms, batch_idx), with_shape=False)
+        slots = min(rooms.is_object.shape[1] + 1, self.prior.max_objects)
+        wanted = needed_predictions(rooms, slots)
+        scenes = self.prior.decode(self.room_latents(rooms, batch_idx), False, wanted)
         with full_precision(self.device):
             matches = match_lifted(scenes, rooms, self.loss.match_box)
             losses = lifted_losses(scenes, rooms, matches, self.completeness_target)

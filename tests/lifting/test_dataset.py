@@ -53,6 +53,7 @@ def test_turned_rows_are_turned_rooms(shards, monkeypatch):
     )
     monkeypatch.setattr(module, "write_whole", lambda *_: None)
     data = LiftedDataset(shards, "train", rotations=4, shape=GRID._replace(margin=1.15))
+    data.place_shapes(data.space)
     plain, turned = data.__getitems__([(4, 0)]), data.__getitems__([(7, 2)])
     assert torch.equal(turned.boxes_m, turn_boxes(plain.boxes_m, torch.tensor([3])))
     # All shapes in all turns are in the space: codes give turned grids back.
@@ -68,6 +69,8 @@ def test_turned_rows_are_turned_rooms(shards, monkeypatch):
 
 def test_codes_are_those_of_the_lifted_shapes_in_the_order_of_objects(shards):
     data = LiftedDataset(shards, "train", shape=GRID)
+    assert data.__getitems__([(1, 0)]).shape_codes is None, "not before they have a space"
+    data.place_shapes(data.space)
     batch = data.__getitems__([(1, 0), (3, 0)])
     for row, (shard, room_id) in enumerate(iterate_rooms(shards, "train")):
         if row in (1, 3):

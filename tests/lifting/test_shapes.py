@@ -47,9 +47,7 @@ def test_a_shape_is_the_hull_where_few_views_see_past(room):
     grids = lift_shapes(views, boxes, GRID)
     item = 0
     rows = np.flatnonzero(views.visible[:, item])
-    seen = sightings_of(
-        views.instance_ids[rows], views.world_to_camera[rows], views.intrinsics[rows], item + 1
-    )
+    seen = sightings_of(views, rows, item)
     half = GRID.margin * boxes.sizes_m[item] / 2
     hull = carve(seen, boxes.centers_m[item] - half, boxes.centers_m[item] + half, 10, REACH)
     # 10 cells span 1.25 boxes: the outermost on each side lies beyond the box.
