@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -26,6 +27,8 @@ SIZE_RANGE = 0.5
 """An object's extents differ from its look's by this factor's logarithm at most."""
 SIZE_DOUBT = 0.1
 """The same of a given object, as a standard deviation."""
+ROUNDS = 8
+"""Times that a room is begun, at most."""
 BATCH = 256
 """Rooms drawn at a time."""
 
@@ -42,7 +45,7 @@ class Given:
     """Classes of the objects to add, and of no others, in this order; `END` for none. None leaves
     it to the sampler."""
 
-    def part(self, rows: slice) -> "Given":
+    def rows(self, rows: Int[Tensor, " some"]) -> "Given":
         """Of some rooms."""
         rest = (None if each is None else each[rows] for each in (self.rectangle_m, self.coming))
         return Given(self.objects.changed(lambda each: each[rows]), *rest)
@@ -60,32 +63,50 @@ def draw_rooms(
 ) -> RoomBoxes:
     """Rooms with looks; given objects come first, with the boxes that they came with.
 
-    An object that finds no place, of `PLACES`, at which it neither intersects what it should not
-    (`RoomSampler.may_meet`) nor sticks out of the rectangle is drawn again, class and all; if its
-    class was asked for, it takes the place with least wrong.
+    A room in which some object finds no place, of `PLACES`, at which it neither intersects what it
+    should not (`RoomSampler.may_meet`) nor sticks out of the rectangle is begun again, `ROUNDS`
+    times at most; in the last, such objects are left out. Objects whose classes were asked for are
+    never left out: there, they take the place with least wrong.
 
     The same seed draws the same rooms, the first of them however many follow.
     """
-    attempts, each = 2 * sampler.max_objects, 7 + 3 * PLACES
-    generator = torch.Generator().manual_seed(seed)
-    # All in one call: what a room gets does not depend on how many there are.
-    numbers = torch.rand(count, attempts * each + 5 * RECTANGLES, generator=generator)
-    uniform, frames = numbers.split([attempts * each, 5 * RECTANGLES], dim=1)
-    uniform, frames = uniform.unflatten(1, (attempts, each)), frames.unflatten(1, (RECTANGLES, 5))
     given = given or nothing_given(count)
-    drawn = []
-    for start in range(0, count, BATCH):
-        rows = slice(start, start + BATCH)
-        own = given.part(rows)
-        frame = own.rectangle_m
-        if frame is None:
-            normal = torch.special.ndtri(frames[rows, :, 1:].clamp(1e-6, 1 - 1e-6))
-            tried = sampler.rectangles(frames[rows, :, 0], normal)
-            frame = _holding(tried, own.objects)
-        drawn.append(_draw(sampler, uniform[rows], frame, own))
-    parts = [(each.object_class, each.is_object, each.boxes_m, each.looks) for each in drawn]
-    label, is_object, boxes_m, looks = (torch.cat(part) for part in zip(*parts, strict=True))
-    return RoomBoxes(label, is_object, boxes_m, looks=looks)
+    drawn = _nothing_drawn(count, sampler.max_objects)
+    waiting = torch.arange(count)
+    for number in range(ROUNDS):
+        last = number + 1 == ROUNDS
+        numbers = _numbers(sampler, count, seed, number)
+        stuck = []
+        for rows in waiting.split(BATCH):
+            found, found_stuck = _draw(sampler, numbers[rows], given.rows(rows), last)
+            for whole, part in zip(_parts(drawn), _parts(found), strict=True):
+                whole[rows] = part
+            stuck.append(rows[found_stuck])
+        waiting = torch.cat(stuck)
+        if last or not len(waiting):
+            break
+    return drawn
+
+
+def _numbers(
+    sampler: RoomSampler, count: int, seed: int, number: int
+) -> Float[Tensor, "rooms numbers"]:
+    """Uniform numbers of all rooms for one round, drawn in one call: what a room gets does not
+    depend on how many there are."""
+    (state,) = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)
+    generator = torch.Generator().manual_seed(int(state >> np.uint64(1)))
+    each = 2 * sampler.max_objects * (7 + 3 * PLACES) + 5 * RECTANGLES
+    return torch.rand(count, each, generator=generator)
+
+
+def _nothing_drawn(count: int, slots: int) -> RoomBoxes:
+    none = torch.zeros(count, slots, dtype=torch.int64)
+    return RoomBoxes(none, none > 0, torch.zeros(count, slots, 6), looks=none.clone())
+
+
+def _parts(rooms: RoomBoxes) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    assert rooms.looks is not None
+    return rooms.object_class, rooms.is_object, rooms.boxes_m, rooms.looks
 
 
 def _holding(tried: Float[Tensor, "rooms tries 4"], objects: RoomBoxes) -> Float[Tensor, "rooms 4"]:
@@ -104,18 +125,23 @@ def _holding(tried: Float[Tensor, "rooms tries 4"], objects: RoomBoxes) -> Float
 
 
 def _draw(
-    sampler: RoomSampler,
-    uniform: Float[Tensor, "rooms attempts numbers"],
-    rectangle_m: Float[Tensor, "rooms 4"],
-    given: Given,
-) -> RoomBoxes:
+    sampler: RoomSampler, numbers: Float[Tensor, "rooms numbers"], given: Given, last: bool
+) -> tuple[RoomBoxes, Bool[Tensor, " rooms"]]:
+    """Rooms, and those in which some object found no place."""
+    frames, uniform = numbers.split([5 * RECTANGLES, numbers.shape[1] - 5 * RECTANGLES], dim=1)
+    uniform = uniform.unflatten(1, (-1, 7 + 3 * PLACES))
+    rectangle_m = given.rectangle_m
+    if rectangle_m is None:
+        choice, *normal = frames.unflatten(1, (RECTANGLES, 5)).unbind(dim=-1)
+        noise = torch.special.ndtri(torch.stack(normal, dim=-1).clamp(1e-6, 1 - 1e-6))
+        rectangle_m = _holding(sampler.rectangles(choice, noise), given.objects)
     slots, number = sampler.max_objects, given.objects.is_object.sum(dim=1)
     rooms = _recognised(sampler, uniform, rectangle_m, given.objects)
     looks = rooms.looks
     assert looks is not None
     wanted = given.coming
     going = number < slots
-    added = torch.zeros_like(number)
+    added, stuck = torch.zeros_like(number), torch.zeros_like(going)
     for chance in uniform.unbind(dim=1):
         reading = _read(sampler, rooms, number, rectangle_m)
         if wanted is None:
@@ -129,15 +155,17 @@ def _draw(
         look, tried_m = _tried(sampler, reading, some, chance)
         wrong = _wrong(tried_m, some, reading, sampler.may_meet)
         best = wrong.argmin(dim=1, keepdim=True)  # the first of equal ones
-        placed = going
-        if wanted is None:
-            placed = going & (wrong.gather(1, best)[:, 0] == 0)
+        fits = wrong.gather(1, best)[:, 0] == 0
+        stuck = stuck | (going & ~fits)
+        # A room that is begun again needs no end.
+        placed = going & fits if wanted is None or not last else going
+        going = going & (fits | last)
         box_m = torch.take_along_dim(tried_m, best.unsqueeze(-1), dim=1)[:, 0]
         at = (placed.nonzero()[:, 0], number[placed])
         rooms.object_class[at], rooms.is_object[at] = some[placed], True
         rooms.boxes_m[at], looks[at] = box_m[placed], look[placed]
         number, added = number + placed, added + placed
-    return rooms
+    return rooms, stuck
 
 
 def _read(

@@ -35,6 +35,7 @@ def negative_log_likelihood(
     whole = Reading(
         taken.only(torch.arange(slots, device=row.device) < number[:, None]),
         rectangle_m[row],
+        torch.cat([reading.summary for reading in readings]),
         torch.cat([reading.context for reading in readings]),
         torch.cat(
             [F.pad(each.objects, (0, 0, 0, slots - each.objects.shape[1])) for each in readings]

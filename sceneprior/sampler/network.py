@@ -87,6 +87,8 @@ class RoomSampler(nn.Module):
         self.norm = nn.LayerNorm(width)
         known = width + CLASS_WIDTH
         self.class_head = _head(width, width, classes)
+        # What is there already says most of what comes; dropout does not touch this way.
+        self.class_by_count = _head(classes + 4 * LENGTHS, width, classes)
         self.wanted_look = _head(known, width, MATCH_WIDTH)
         self.offered_look = _head(SHOWN, width, MATCH_WIDTH)
         self.frequency = nn.Parameter(torch.zeros(prototypes))
@@ -125,15 +127,15 @@ class RoomSampler(nn.Module):
         tokens: Float[Tensor, "rooms objects width"],
     ) -> "Reading":
         """Read the objects that stand, whatever their order, of `tokens`."""
-        query = self.query + self.summary_embedding(self.summary(before, rectangle_m))
-        query = query.unsqueeze(1)
+        summary = self.summary(before, rectangle_m)
+        query = (self.query + self.summary_embedding(summary)).unsqueeze(1)
         frame = self.rectangle_embedding(lengths_shown(rectangle_m)).unsqueeze(1)
         features = self.dropout(torch.cat([query, frame, tokens], dim=1))
         nothing = torch.cat([before.is_object.new_zeros(len(tokens), 2), ~before.is_object], dim=1)
         for layer in self.encoder:
             features = layer(features, src_key_padding_mask=nothing)
         features = self.norm(features)
-        return Reading(before, rectangle_m, features[:, 0], features[:, 2:])
+        return Reading(before, rectangle_m, summary, features[:, 0], features[:, 2:])
 
     def summary(
         self, before: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]
@@ -154,7 +156,7 @@ class RoomSampler(nn.Module):
         known = torch.zeros_like(self.may_meet[0])
         known[self.look_class[self.look_class >= 0]] = True
         known[END] = True
-        logits: Tensor = self.class_head(reading.context)
+        logits: Tensor = self.class_head(reading.context) + self.class_by_count(reading.summary)
         return logits.masked_fill(~known, -torch.inf)
 
     def look_logits(
@@ -226,6 +228,7 @@ class Reading(NamedTuple):
 
     before: RoomBoxes
     rectangle_m: Float[Tensor, "rooms 4"]
+    summary: Float[Tensor, "rooms summary"]
     context: Float[Tensor, "rooms width"]
     """Of the query: what the set means for the next object."""
     objects: Float[Tensor, "rooms objects width"]

@@ -31,17 +31,19 @@ def given(count: int, label: int, box: list[float]) -> RoomBoxes:
 
 
 def test_a_seed_draws_the_same_rooms_the_first_of_them_however_many_follow(sampler):
-    some, more = draw_rooms(sampler, 3, 5), draw_rooms(sampler, 7, 5)
-    assert torch.equal(some.object_class, more.object_class[:3])
-    assert torch.equal(some.looks, more.looks[:3])
-    assert_close(some.boxes_m, more.boxes_m[:3], atol=1e-4, rtol=0)
-    assert not torch.equal(draw_rooms(sampler, 3, 6).boxes_m, some.boxes_m)
+    some, more = draw_rooms(sampler, 9, 5), draw_rooms(sampler, 20, 5)
+    assert some.is_object.any()
+    assert torch.equal(some.object_class, more.object_class[:9])
+    assert torch.equal(some.looks, more.looks[:9])
+    assert_close(some.boxes_m, more.boxes_m[:9], atol=1e-4, rtol=0)
+    assert not torch.equal(draw_rooms(sampler, 9, 6).boxes_m, some.boxes_m)
 
 
 def test_batches_do_not_matter(sampler, monkeypatch):
-    whole = draw_rooms(sampler, 6, 1)
-    monkeypatch.setattr(module, "BATCH", 4)
-    parts = draw_rooms(sampler, 6, 1)
+    whole = draw_rooms(sampler, 12, 1)
+    monkeypatch.setattr(module, "BATCH", 5)
+    parts = draw_rooms(sampler, 12, 1)
+    assert whole.is_object.any()
     assert torch.equal(parts.object_class, whole.object_class)
     assert_close(parts.boxes_m, whole.boxes_m, atol=1e-4, rtol=0)
 
@@ -117,3 +119,35 @@ def test_rooms_given_differently_many_objects_draw_together(sampler):
     assert drawn.boxes_m[0, 0].tolist() == pytest.approx([0.0, 0.4, 0.0, 2.0, 0.8, 1.4])
     counts = drawn.is_object.sum(dim=1)
     assert torch.equal(drawn.is_object, torch.arange(5) < counts[:, None])
+
+
+def test_a_room_in_which_something_finds_no_place_is_begun_again(sampler, monkeypatch):
+    """Where every second attempt is refused, rooms hold what they would have held elsewhere."""
+    plain = draw_rooms(sampler, 30, 4)
+    refused = torch.zeros(30, dtype=torch.bool)
+    kept = module._draw
+    calls = []
+
+    def refuse(sampler, numbers, given, last):
+        rooms, stuck = kept(sampler, numbers, given, last)
+        calls.append((len(numbers), last))
+        if len(calls) == 1:
+            stuck = stuck | (torch.arange(30) % 2 == 0)
+            refused.copy_(stuck)
+        return rooms, stuck
+
+    monkeypatch.setattr(module, "_draw", refuse)
+    again = draw_rooms(sampler, 30, 4)
+    assert calls[1][0] == int(refused.sum()) >= 15
+    assert torch.equal(again.boxes_m[~refused], plain.boxes_m[~refused])
+    assert not torch.equal(again.boxes_m[refused], plain.boxes_m[refused])
+
+
+def test_what_never_finds_a_place_is_left_out_unless_it_was_asked_for(sampler):
+    """In a rectangle of a centimetre nothing fits."""
+    frame = torch.tensor([[0.0, 0, 0.01, 0.01]]).expand(4, -1)
+    none = module.nothing_given(4).objects
+    assert not draw_rooms(sampler, 4, 0, Given(none, frame)).is_object.any()
+    wanted = torch.full((4, 2), 1)
+    asked = draw_rooms(sampler, 4, 0, Given(none, frame, wanted))
+    assert asked.is_object.sum(dim=1).tolist() == [2] * 4
