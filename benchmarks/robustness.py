@@ -167,4 +167,5 @@ if __name__ == "__main__":
             changes = (
                 f"data.shards={options.shards}", f"layout.epochs={options.epochs}", f"seed={seed}"
             )  # fmt: skip
-            row(said, load_config(str(BASE), SETTINGS + changes), options.rooms, masks, poses)
+            config = load_config(str(BASE), SETTINGS + changes).with_label_set()
+            row(said, config, options.rooms, masks, poses)

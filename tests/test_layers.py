@@ -34,7 +34,7 @@ OWNERS = {
     "triton": ["sceneprior/silhouettes/"],
     "lightning": ["sceneprior/training/", "sceneprior/baselines/"],
     "wandb": ["sceneprior/training/"],
-    "yaml": ["sceneprior/settings.py", "data_prep/front/recipe.py", "data_prep/homes/furniture.py"],
+    "yaml": ["sceneprior/settings.py", "data_prep/homes/furniture.py"],
     "pydantic": [
         "sceneprior/settings.py", "sceneprior/scene.py", "sceneprior/models/",
         "sceneprior/training/", "sceneprior/baselines/", "sceneprior/config.py",

@@ -76,7 +76,7 @@ def write_report(
         version=__version__,
         run=Path(run).resolve().name,
         shards=Path(shards).resolve().name,
-        label_set=names.replace("_", " "),
+        label_set=names.removeprefix("void,").replace(",", ", ").replace("_", " "),
         tiles=_tiles(scores),
         views=[] if from_boxes else input_views(shards, rooms=3, views_per_room=2),
         from_boxes=from_boxes,

@@ -72,7 +72,7 @@ class SampleEvaluator:
     """
 
     def __init__(self, config: RunConfig):
-        self.config = config
+        self.config = config = config.with_label_set()
         if config.samples.metric == "type_share" and config.label_set not in TYPE_CLASSES:
             raise InputError(
                 f"samples.metric is type_share, but {config.label_set} mixes room types; choose "

@@ -204,7 +204,6 @@ def test_the_command(rooms, tmp_path, cli):
     assert made.exit_code == 0, made.output
     assert "Note: 1 of 4 rooms give no floor_m" in made.stderr
     assert "train 3 rooms, 15 views" in made.stdout
-    assert "To train on them: sceneprior fit --set 'label_set=void,bed,chair'" in made.stdout
     assert json.loads((tmp_path / "shards/index.json").read_text())["label_set"] == SET
     looked = cli("inspect", tmp_path / "shards", "--room", "room_0")
     assert looked.exit_code == 0 and "unknown" in looked.stdout, looked.output
