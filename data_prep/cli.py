@@ -134,19 +134,28 @@ def prep_scannet(
 
 def prep_posed(
     rooms: Annotated[
-        Path, typer.Argument(help="A room's folder with transforms.json, or a folder of such.")
+        Path,
+        typer.Argument(
+            help="A room's folder (transforms.json, or COLMAP's sparse/0), or a folder of such."
+        ),
     ],
     out: OutOption,
     label_set: Annotated[
         str,
         typer.Option(help="A file with a class a line, void,bed,chair or a known set's name."),
     ],
-    up: Annotated[str, typer.Option(help="The poses' axis that points up: z or y.")] = "z",
+    up: Annotated[
+        str,
+        typer.Option(
+            help="The poses' axis that points up: z or y; cameras: as upright cameras were held; "
+            "auto: z, or cameras for COLMAP's models."
+        ),
+    ] = "auto",
     floor_m: Annotated[
         float | None, typer.Option(help="Height of the floor where a file gives no floor_m.")
     ] = None,
     camera_height_m: Annotated[
-        float, typer.Option(help="Without: the lowest camera stood this far above the floor.")
+        float, typer.Option(help="Of the lowest camera, where nothing shows the floor.")
     ] = 1.2,
     metres_per_unit: Annotated[
         float, typer.Option(help="Of the poses, where a file does not say.")

@@ -173,9 +173,7 @@ def test_houses_made_by_others():
     folder = shared_front()
     models = ModelBank(folder / "3D-FUTURE-model")
     house = folder / "3D-FRONT" / "0022c821-c1f2-516e-8552-8f01efccfc26.json"
-    result = read_house(
-        house, models, load_recipe("bedroom"), lambda _, kind: "Bedroom" in kind
-    )
+    result = read_house(house, models, load_recipe("bedroom"), lambda _, kind: "Bedroom" in kind)
     assert not result.failures and len(result.rooms) == 1
     room_ = result.rooms[0]
     np.testing.assert_allclose(room_.floor.bounds, (-2.4145, -2.4145, 2.4145, 2.4145), atol=1e-9)
