@@ -49,7 +49,9 @@ OWNERS = {
     "skimage": ["sceneprior/geometry/isosurface.py"],
     "fast_simplification": ["sceneprior/geometry/isosurface.py"],
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifting/shapes"],
-    "scipy.optimize": ["sceneprior/losses/matching.py", "sceneprior/evaluation/"],
+    "scipy.optimize": [
+        "sceneprior/losses/matching.py", "sceneprior/evaluation/", "data_prep/posed/floor.py",
+    ],
     "cv2": ["data_prep/"],
     "distributed": ["data_prep/engine/cluster.py"],
     "dask": ["data_prep/engine/cluster.py"],

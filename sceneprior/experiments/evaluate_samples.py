@@ -83,7 +83,7 @@ class SampleEvaluator:
                 f"samples.metric is mask_iou, but `method: {config.method}` remembers no rooms; "
                 "choose category_kl, objects_off, overlaps or type_share."
             )
-        if config.samples.metric == "mask_iou" and not _has_meshes(config):
+        if config.samples.metric == "mask_iou" and not has_meshes(config):
             raise InputError(
                 "samples.metric is mask_iou, which compares masks of meshes, but model.shape is "
                 "occupancy; choose category_kl, objects_off, overlaps or type_share."
@@ -154,7 +154,8 @@ class SampleEvaluator:
         return rooms.__getitems__([(row, 0) for row in range(0, len(rooms), rooms.rotations)])
 
 
-def _has_meshes(config: RunConfig) -> bool:
+def has_meshes(config: RunConfig) -> bool:
+    """Whether a run's shapes are meshes, of which masks are drawn."""
     return isinstance(config, PriorConfig) and config.model.shape.name == "mesh"
 
 
