@@ -108,8 +108,8 @@ class Recipe(Section):
         return self.categories.get(category) or class_of_category(category, self.label_set)
 
     def knows(self, category: str) -> bool:
-        """Whether somebody decided on this category's class, void or not: the user in `categories`,
-        or the paper's table in a label set of the package."""
+        """Whether this category's class, void or not, is stated: by `categories`, by a class of its
+        name, or by the paper's table in a label set of the package."""
         if category in self.categories or self.class_of(category) != "void":
             return True
         return self.label_set in LABEL_SETS and category in category_table()
@@ -162,8 +162,9 @@ def recipe_text(name: str) -> str:
     written out.
 
     Raises:
-        InputError: there is no such recipe.
+        InputError: none of this name ships.
     """
+    name = name.removesuffix(".yaml")  # a file of the user's has categories of its own
     text, recipe = find_recipe(name).read_text(encoding="utf-8"), load_recipe(name)
     classes = {category: recipe.class_of(category) for category in category_table()}
     table = [f"  {category}: {label}\n" for category, label in classes.items() if label != "void"]

@@ -56,8 +56,9 @@ def evaluate_run(
     trained = load_any_run(run, checkpoint)
     folder = shards or Path(trained.config.data.shards)
     if known_from_views_alone(folder, options.split):
-        remembered = isinstance(trained, TrainedPrior) and trained.remembers_rooms
-        masks = mask_scores(trained, folder) if remembered else {}
+        masks: dict[str, float] = {}
+        if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
+            masks = mask_scores(trained, folder)
         generated = synthesize(trained, count, options.seed, distribution)
         scores = evaluate_from_views(generated, folder, options) | masks
     else:

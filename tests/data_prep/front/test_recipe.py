@@ -136,6 +136,8 @@ def test_a_recipe_of_the_users_own(tmp_path):
     path.write_text(KITCHEN)
     recipe = load_recipe(str(path), ("views.per_m2=3",))
     assert (recipe.name, recipe.label_set) == ("kitchens", "void,fridge,sink,table")
+    with pytest.raises(InputError, match=r"No recipe is called '.*kitchens'; there are all,"):
+        recipe_text(str(path))  # it is the user's, and there to be read
     assert recipe.scale_range == (1e-3, 5.0) and recipe.views.per_m2 == 3
     classes = {
         "fridge": "fridge",  # the class of its own name
