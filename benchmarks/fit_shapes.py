@@ -2,7 +2,7 @@
 
     sceneprior make-homes out/fit/homes --rooms 48 --room-type bedroom --seed 0
     sceneprior prep-front --front out/fit/homes/3D-FRONT --future out/fit/homes/3D-FUTURE-model \
-        --room-type bedroom --out out/fit/shards
+        --recipe bedroom --out out/fit/shards
     python benchmarks/fit_shapes.py --shards out/fit/shards --rooms 24 --steps 150 --seed 0
 
 Every object starts as a sphere in its true box, moved by about 15 cm and scaled by about a

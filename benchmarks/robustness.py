@@ -169,6 +169,6 @@ if __name__ == "__main__":
             changes = (
                 f"data.shards={options.shards}", f"layout.epochs={options.epochs}", f"seed={seed}"
             )  # fmt: skip
-            config = load_config(str(BASE), SETTINGS + changes)
+            config = load_config(str(BASE), SETTINGS + changes).with_label_set()
             assert isinstance(config, OursConfig)
             row(said, config, options.rooms, masks, poses)

@@ -17,6 +17,7 @@ def add_commands(app: typer.Typer) -> None:
     """Mount the prep-* commands, inspect and make-homes."""
     app.command("make-homes")(make_homes_command)
     app.command("prep-front")(prep_front)
+    app.command("recipe")(recipe)
     app.command("prep-scannet")(prep_scannet)
     app.command("prep-posed")(prep_posed)
     app.command("inspect")(inspect_command)
@@ -42,8 +43,12 @@ def prep_front(
     front: Annotated[Path, typer.Option(help="Folder of house JSONs (3D-FRONT).")],
     future: Annotated[Path, typer.Option(help="Folder of furniture models (3D-FUTURE-model).")],
     out: OutOption,
-    room_type: Annotated[
-        str, typer.Option(help="bedroom, living, dining, library or all.")
+    recipe: Annotated[
+        str,
+        typer.Option(
+            help="Which rooms and classes: bedroom, living, dining, library, kitchen, all, or a "
+            "file such as mine.yaml."
+        ),
     ] = "bedroom",
     splits: Annotated[
         Path | None, typer.Option(help="CSV of `room id,split`; without it, a seeded 8:1:1.")
@@ -76,9 +81,18 @@ def prep_front(
     changes = list(rule or [])
     if views_per_m2 is not None:
         changes.append(f"views.per_m2={views_per_m2}")
-    recipe = load_recipe(f"front3d_{room_type}", tuple(changes))
-    source = FrontSource(front, future, recipe, splits, seed, only, rgb)
+    rules = load_recipe(recipe, tuple(changes))
+    source = FrontSource(front, future, rules, splits, seed, only, rgb)
     run_job(source, out, workers, scheduler, renderer, strict, retry_failed)
+
+
+def recipe(
+    name: Annotated[str, typer.Argument(help="bedroom, living, dining, library, kitchen, all.")],
+) -> None:
+    """Print a recipe of prep-front, to start one of your own: recipe bedroom > mine.yaml."""
+    from data_prep.front.recipe import recipe_text
+
+    typer.echo(recipe_text(name), nl=False)
 
 
 def prep_scannet(
@@ -120,19 +134,28 @@ def prep_scannet(
 
 def prep_posed(
     rooms: Annotated[
-        Path, typer.Argument(help="A room's folder with transforms.json, or a folder of such.")
+        Path,
+        typer.Argument(
+            help="A room's folder (transforms.json, or COLMAP's sparse/0), or a folder of such."
+        ),
     ],
     out: OutOption,
     label_set: Annotated[
         str,
         typer.Option(help="A file with a class a line, void,bed,chair or a known set's name."),
     ],
-    up: Annotated[str, typer.Option(help="The poses' axis that points up: z or y.")] = "z",
+    up: Annotated[
+        str,
+        typer.Option(
+            help="The poses' axis that points up: z or y; cameras: as upright cameras were held; "
+            "auto: z, or cameras for COLMAP's models."
+        ),
+    ] = "auto",
     floor_m: Annotated[
         float | None, typer.Option(help="Height of the floor where a file gives no floor_m.")
     ] = None,
     camera_height_m: Annotated[
-        float, typer.Option(help="Without: the lowest camera stood this far above the floor.")
+        float, typer.Option(help="Of the lowest camera, where nothing shows the floor.")
     ] = 1.2,
     metres_per_unit: Annotated[
         float, typer.Option(help="Of the poses, where a file does not say.")
@@ -162,7 +185,6 @@ def prep_posed(
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
     run_job(source, out, workers, scheduler, "auto", strict, retry_failed=False)
-    typer.echo(f"To train on them: sceneprior fit --set 'label_set={classes}' ...")
 
 
 def run_job(

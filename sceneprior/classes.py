@@ -29,8 +29,12 @@ LABEL_SETS: dict[str, tuple[str, ...]] = {
 LABEL_SETS |= {
     "front3d_dining": LABEL_SETS["front3d_living"],
     "front3d_library": LABEL_SETS["front3d_living"],
+    "front3d_kitchen": (
+        "void", "bar", "cabinet", "ceiling_lamp", "chair", "pendant_lamp", "shelf", "stool",
+        "table",
+    ),
     "front3d_all": LABEL_SETS["front3d_bedroom"],  # it holds every name of the living rooms' list
-}
+}  # fmt: skip
 
 VOID = 0
 """Index of `void` in every label set: furniture outside the list."""

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.files import read_json
 from sceneprior.scene import Mesh
@@ -52,30 +53,18 @@ def model_categories(folder: Path, option: str = "--future") -> dict[str, str]:
             f"{path} is not 3D-FUTURE's list of models ({type(error).__name__}: {error})."
         ) from None
     return {
-        model_id: "others" if text is None else str(text).strip().lower().replace(" / ", "/")
+        model_id: "others" if text is None else tidy_category(str(text))
         for model_id, text in categories.items()
     }
 
 
-@functools.cache
-def category_classes(columns: tuple[str, ...]) -> dict[str, str]:
-    """3D-FUTURE's category strings -> class names, from front3d_categories.csv. Of the `columns`
-    (`bedroom_class`, `living_room_class`) the first that is not void decides.
+def tidy_category(text: str) -> str:
+    """A category as the table has it: lower case, "a / b" as "a/b".
 
-    Raises:
-        InputError: there is no such column.
+    >>> tidy_category("King-size Bed")
+    'king-size bed'
     """
-    with CATEGORY_TABLE.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    for column in columns:
-        if column not in rows[0]:
-            raise InputError(f"{CATEGORY_TABLE.name} has no column '{column}'.")
-    return {
-        row["model_info_category"]: next(
-            (row[column] for column in columns if row[column] != "void"), "void"
-        )
-        for row in rows
-    }
+    return text.strip().lower().replace(" / ", "/")
 
 
 _COLUMNS = {
@@ -86,21 +75,31 @@ _COLUMNS = {
 }
 
 
-def class_of_category(category: str, label_set_name: str, names: tuple[str, ...]) -> str:
+@functools.cache
+def category_table() -> dict[str, dict[str, str]]:
+    """3D-FUTURE's categories -> their classes in bedrooms (`bedroom_class`) and living rooms
+    (`living_room_class`), from front3d_categories.csv."""
+    with CATEGORY_TABLE.open(newline="") as file:
+        return {row["model_info_category"]: row for row in csv.DictReader(file)}
+
+
+def class_of_category(category: str, label_set_name: str) -> str:
     """The class that models of a category have in a label set; `void` where there is none.
 
     The label sets of 3D-FRONT follow the paper's table. In any other the category itself is the
     class where the set has that name, and then what it is in bedrooms or else in living rooms.
 
-        >>> class_of_category("king-size bed", "front3d_bedroom", ("void", "double_bed"))
+        >>> class_of_category("king-size bed", "front3d_bedroom")
         'double_bed'
-        >>> class_of_category("dining table", "scannet", ("void", "table"))
+        >>> class_of_category("dining table", "void,sink,table")
         'table'
     """
+    names = label_set(label_set_name)
     if label_set_name not in _COLUMNS and category in names:
         return category
+    row = category_table().get(category, {})
     for column in _COLUMNS.get(label_set_name, ("bedroom_class", "living_room_class")):
-        found = category_classes((column,)).get(category, "void")
+        found = row.get(column, "void")
         if found != "void" and found in names:
             return found
     return "void"

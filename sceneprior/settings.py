@@ -63,15 +63,21 @@ def read_settings(name: str, overrides: tuple[str, ...] = ()) -> tuple[Path, dic
         ConfigError: not found, not YAML, or an override that is none.
     """
     path = find_config(name)
+    data = read_yaml(path)
+    for override in overrides:
+        apply_override(data, override)
+    return path, data
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """What a YAML file of settings holds; a ConfigError where it is none."""
     try:
-        data = yaml.load(path.read_text(), _Loader)
+        data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ConfigError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict):
         raise ConfigError(f"{path} holds no settings; expected `section:` and `key: value` lines.")
-    for override in overrides:
-        _apply(data, override)
-    return path, data
+    return data
 
 
 def check_settings(model: type[_S], data: dict[str, Any], source: str) -> _S:
@@ -83,20 +89,25 @@ def check_settings(model: type[_S], data: dict[str, Any], source: str) -> _S:
         raise ConfigError(_explain(model, error, source)) from None
 
 
-def _apply(data: dict[str, Any], override: str) -> None:
+def apply_override(data: dict[str, Any], override: str, option: str = "--set") -> None:
+    """Change plain data by `section.key=value`; `option` is what the user gave it with.
+
+    Raises:
+        ConfigError: it is no such text, its value no YAML, or its section a value.
+    """
     key, equals, text = override.partition("=")
     if not equals:
-        raise ConfigError(f"--set takes section.key=value, got '{override}'.")
+        raise ConfigError(f"{option} takes section.key=value, got '{override}'.")
     *parents, last = key.strip().split(".")
     node = data
     for parent in parents:
         node = node.setdefault(parent, {})
         if not isinstance(node, dict):
-            raise ConfigError(f"--set {override}: '{parent}' is a value, not a section.")
+            raise ConfigError(f"{option} {override}: '{parent}' is a value, not a section.")
     try:
         node[last] = yaml.load(text, _Loader)
     except yaml.YAMLError:
-        raise ConfigError(f"--set {override}: '{text}' is not a YAML value.") from None
+        raise ConfigError(f"{option} {override}: '{text}' is not a YAML value.") from None
 
 
 def dump_settings(settings: Section, path: Path) -> None:
@@ -128,7 +139,7 @@ def _explain(model: type[Section], error: ValidationError, source: str) -> str:
             f"{source}: '{key}' is a section; write {{name: ...}} with one of {known_names}.{more}"
         )
     got = f" (got {first['input']!r})" if not isinstance(first["input"], dict) else ""
-    reason = first["msg"].removeprefix("Value error, ")
+    reason = first["msg"].removeprefix("Value error, ").removesuffix(".")
     reason = reason[:1].lower() + reason[1:]
     where = f"'{key}': " if key else ""
     return f"{source}: {where}{reason}{got}.{more}"

@@ -257,10 +257,8 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
             if "ground_truth" not in group:
                 raise ShardError(
                     f"{self.path}, room {room_id} carries no 3D ground truth, which this "
-                    "evaluation compares with; posed pictures have none. What can be had without "
-                    "it: `sceneprior report` shows generated rooms and what cameras saw, and the "
-                    "config's `samples` section compares classes, numbers of objects and masks "
-                    "during training (docs/posed_data.md)."
+                    "evaluation compares with; posed pictures have none. Without it, `sceneprior "
+                    "eval-fid` compares what views tell (docs/posed_data.md)."
                 )
             hidden = group["ground_truth"]
             return RoomGroundTruth(

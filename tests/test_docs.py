@@ -16,6 +16,7 @@ import pytest
 import yaml
 from typer.main import get_command
 
+from data_prep.front.recipe import load_recipe
 from sceneprior.cli import app
 from sceneprior.config import load_config
 from sceneprior.errors import ConfigError
@@ -156,7 +157,7 @@ def check_json(block: Block, folder: Path) -> None:
 
 
 def check_yaml(block: Block, folder: Path) -> None:
-    """A comparison, a run's config, or a section of one."""
+    """A comparison, a run's config or a section of one, a recipe."""
     data = yaml.safe_load(block.text)
     path = folder / "block.yaml"
     path.write_text(block.text)
@@ -164,6 +165,8 @@ def check_yaml(block: Block, folder: Path) -> None:
         load_comparison(str(path))
     elif "method" in data:
         load_config(str(path))
+    elif "room_types" in data:
+        load_recipe(str(path))
     else:
         load_config("demo.yaml", tuple(f"{key}={json.dumps(value)}" for key, value in data.items()))
 

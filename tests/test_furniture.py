@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.furniture import class_of_category, model_categories
 
@@ -27,7 +26,7 @@ from sceneprior.furniture import class_of_category, model_categories
     ],
 )
 def test_classes_of_categories(category, name, wanted):
-    assert class_of_category(category, name, label_set(name)) == wanted
+    assert class_of_category(category, name) == wanted
 
 
 def test_categories_are_tidied_and_damage_is_a_sentence(tmp_path):

@@ -35,7 +35,7 @@ OWNERS = {
     "triton": ["sceneprior/silhouettes/"],
     "lightning": ["sceneprior/training/", "sceneprior/sampler/", "sceneprior/baselines/"],
     "wandb": ["sceneprior/training/"],
-    "yaml": ["sceneprior/settings.py", "data_prep/front/recipe.py", "data_prep/homes/furniture.py"],
+    "yaml": ["sceneprior/settings.py", "data_prep/homes/furniture.py"],
     "pydantic": [
         "sceneprior/settings.py", "sceneprior/scene.py", "sceneprior/models/",
         "sceneprior/training/", "sceneprior/sampler/", "sceneprior/baselines/",
@@ -53,7 +53,9 @@ OWNERS = {
     "sklearn": [
         "sceneprior/evaluation/", "sceneprior/lifting/shapes", "sceneprior/sampler/stage",
     ],
-    "scipy.optimize": ["sceneprior/losses/matching.py", "sceneprior/evaluation/"],
+    "scipy.optimize": [
+        "sceneprior/losses/matching.py", "sceneprior/evaluation/", "data_prep/posed/floor.py",
+    ],
     "cv2": ["data_prep/"],
     "distributed": ["data_prep/engine/cluster.py"],
     "dask": ["data_prep/engine/cluster.py"],

@@ -40,7 +40,7 @@ def test_shipped_configs_are_found_by_name(installed, tmp_path):
         "import sceneprior, data_prep.front.recipe\n"
         "from sceneprior.config import load_config\n"
         "assert load_config('bedroom.yaml').model.max_objects == 13\n"
-        "assert data_prep.front.recipe.load_recipe('front3d_bedroom')\n"
+        "assert data_prep.front.recipe.load_recipe('bedroom')\n"
         "print(sceneprior.__file__)"
     )
     done = run(installed, "-c", code, cwd=tmp_path)

@@ -34,6 +34,8 @@ class Line:
     """What was left out of the room, and why."""
     classes: dict[str, int] = field(default_factory=dict)
     """Tracked objects of each class."""
+    unknown_categories: dict[str, int] = field(default_factory=dict)
+    """See `PreparedRoom`."""
 
 
 def line_of(
@@ -44,6 +46,7 @@ def line_of(
         return Line(
             result.room_id, result.house, result.status, result.rule, result.reason,
             split=task.split if task else "", notes=list(result.notes),
+            unknown_categories=dict(result.unknown_categories),
         )  # fmt: skip
     assert task is not None
     names = label_set(label_set_name)
@@ -58,6 +61,7 @@ def line_of(
         visible=int(views.visible.sum()),
         notes=list(result.notes),
         classes=dict(Counter(names[index] for index in views.object_class)),
+        unknown_categories=dict(result.unknown_categories),
     )
 
 
@@ -109,6 +113,7 @@ def make_report(
             split: _means([line for line in prepared if line.split == split]) for split in SPLITS
         },
         "classes": _classes(prepared),
+        "unknown_categories": _sums(line.unknown_categories for line in lines),
     }
     if expected is not None:
         report["expected"] = {"of": expected.of, "rows": compare(expected, prepared)}
@@ -146,10 +151,14 @@ def _means(lines: Sequence[Line]) -> dict[str, Any]:
 
 
 def _classes(lines: Iterable[Line]) -> dict[str, int]:
-    classes: Counter[str] = Counter()
-    for line in lines:
-        classes.update(line.classes)
-    return dict(sorted(classes.items()))
+    return _sums(line.classes for line in lines)
+
+
+def _sums(counts: Iterable[dict[str, int]]) -> dict[str, int]:
+    total: Counter[str] = Counter()
+    for one in counts:
+        total.update(one)
+    return dict(sorted(total.items()))
 
 
 def report_csv(lines: Iterable[Line]) -> str:

@@ -9,12 +9,14 @@ _FAILURES_SHOWN = 10
 
 
 def report_tables(report: dict[str, Any]) -> list[Table]:
-    """What became of the rooms, how much is in each split, its classes, and what was expected.
+    """What became of the rooms, what is in each split, what has no class, and what was expected.
 
     Args:
         report: What `make_report` made.
     """
     tables = [_outcome(report), _splits(report), _classes(report)]
+    if report["unknown_categories"]:
+        tables.append(_unknown(report["unknown_categories"]))
     if report["failed"]:
         tables.append(_failures(report["failed"]))
     if "expected" in report:
@@ -57,6 +59,13 @@ def _classes(report: dict[str, Any]) -> Table:
     for name, _ in sorted(report["classes"].items(), key=lambda item: (-item[1], item[0])):
         per_split = [report["per_split"][split]["classes"].get(name, 0) for split in splits]
         table.add_row(name, *map(str, per_split))
+    return table
+
+
+def _unknown(pieces: dict[str, int]) -> Table:
+    table = Table("category without a class", "pieces", caption="void: the recipe does not say")
+    for name, count in sorted(pieces.items(), key=lambda item: (-item[1], item[0])):
+        table.add_row(Text(name), str(count))
     return table
 
 

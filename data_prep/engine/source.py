@@ -65,6 +65,8 @@ class LeftOut:
     rule: str = ""
     """What filters it: a rule of the recipe by its name, or `split`, `no_view`, ..."""
     notes: tuple[str, ...] = ()
+    unknown_categories: Mapping[str, int] = field(default_factory=dict)
+    """As in `PreparedRoom`."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,9 @@ class PreparedRoom:
     """More files: path within the output folder -> bytes (`rgb/<room>/0000.png`)."""
     notes: tuple[str, ...] = ()
     """What was left out of the room, and why."""
+    unknown_categories: Mapping[str, int] = field(default_factory=dict)
+    """What the data set calls furniture that is void because the recipe says nothing about it ->
+    how many pieces."""
 
 
 class Source(Protocol):

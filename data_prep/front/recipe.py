@@ -1,16 +1,16 @@
 """Recipes: which rooms of 3D-FRONT are kept, under which classes, and how cameras stand in them."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import yaml
 from pydantic import BeforeValidator, Field
 
 from data_prep.engine.source import Expected
-from sceneprior.classes import label_set
+from sceneprior.classes import LABEL_SETS, label_set, label_set_name
 from sceneprior.errors import InputError
-from sceneprior.furniture import category_classes
-from sceneprior.settings import Section, check_settings
+from sceneprior.files import is_name
+from sceneprior.furniture import category_table, class_of_category, tidy_category
+from sceneprior.settings import Section, apply_override, check_settings, read_yaml
 
 FOLDER = Path(__file__).parents[1] / "recipes"
 
@@ -55,13 +55,28 @@ class ViewRules(Section):
     """After so many tries the best view drawn stays."""
 
 
+def _named(given: Any) -> Any:
+    """A list of classes as the name of a label set; anything else as it is."""
+    if isinstance(given, list) and all(isinstance(name, str) for name in given):
+        return label_set_name([name for name in given if name != "void"])
+    return given
+
+
+def _tidied(given: Any) -> Any:
+    if not isinstance(given, dict):
+        return given
+    return {tidy_category(str(category)): label for category, label in given.items()}
+
+
 class Recipe(Section):
     """One data set's rules for one type of room; each rule is off where it is null."""
 
     name: str
-    label_set: str
-    class_columns: Names
-    """Columns of front3d_categories.csv: the first of them that is not void counts."""
+    """Of its file, without the ending; shards are called after it."""
+    label_set: Annotated[str, BeforeValidator(_named)]
+    """A name in `sceneprior/classes.py`, or the user's own list: `[bed, chair]`."""
+    categories: Annotated[dict[str, str], BeforeValidator(_tidied)] = Field(default_factory=dict)
+    """The data set's category -> class, where `class_of_category` does not say so already."""
     room_types: Names | None
     """A room is of this recipe if its type contains one of these, whatever the case; null: all."""
     min_objects: int | None = 2
@@ -88,39 +103,73 @@ class Recipe(Section):
             return True
         return any(word.lower() in room_type.lower() for word in self.room_types)
 
-    @property
-    def classes(self) -> dict[str, str]:
-        """3D-FUTURE's category -> class; what is not listed is void."""
-        return category_classes(self.class_columns)
+    def class_of(self, category: str) -> str:
+        """The class of a category; `void` where it has none."""
+        return self.categories.get(category) or class_of_category(category, self.label_set)
+
+    def knows(self, category: str) -> bool:
+        """Whether this category's class, void or not, is stated: by `categories`, by a class of its
+        name, or by the paper's table in a label set of the package."""
+        if category in self.categories or self.class_of(category) != "void":
+            return True
+        return self.label_set in LABEL_SETS and category in category_table()
 
 
-def load_recipe(name: str, changes: tuple[str, ...] = ()) -> Recipe:
-    """Read `recipes/<name>.yaml`, with changes such as `views.per_m2=3` or `max_floor_m=null`.
+def find_recipe(text: str) -> Path:
+    """The file of a recipe: a path that ends in .yaml, or the name of one that ships.
 
     Raises:
-        InputError: no such recipe, or a rule that recipes do not have.
+        InputError: there is no such recipe.
     """
-    path = FOLDER / f"{name}.yaml"
-    if not path.is_file():
+    if Path(text).suffix in (".yaml", ".yml"):
+        if not Path(text).is_file():
+            raise InputError(f"No recipe at {text}; `sceneprior recipe bedroom` prints one.")
+        return Path(text)
+    path = FOLDER / f"{text}.yaml"
+    if not is_name(text) or not path.is_file():
         known = ", ".join(sorted(item.stem for item in FOLDER.glob("*.yaml")))
-        raise InputError(f"No recipe is called '{name}'; there are {known}.")
-    data = {"name": name, **yaml.safe_load(path.read_text())}
+        raise InputError(
+            f"No recipe is called '{text}'; there are {known}, or name a file: mine.yaml."
+        )
+    return path
+
+
+def load_recipe(text: str, changes: tuple[str, ...] = ()) -> Recipe:
+    """Read a recipe (`find_recipe`), with changes such as `views.per_m2=3` or `max_floor_m=null`.
+
+    Raises:
+        InputError: no such recipe, a rule that recipes do not have, or a class outside of its
+            label set.
+    """
+    path = find_recipe(text)
+    data = {"name": path.stem, **read_yaml(path)}
     for change in changes:
-        key, equals, value = change.partition("=")
-        section, _, rule = key.strip().rpartition(".")
-        if not equals or section not in ("", "views"):
-            raise InputError(f"'{change}' is not a rule; write it as max_floor_m=8.")
-        target = data.setdefault("views", {}) if section else data
-        try:
-            target[rule] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise InputError(f"The value of '{change}' is no YAML; quote it, or mend it.") from None
+        apply_override(data, change, "--rule")
     recipe = check_settings(Recipe, data, path.name)
+    if not is_name(recipe.name):
+        raise InputError(f"{path.name}: its name, {ascii(recipe.name)[:60]}, can name no shards.")
     names = label_set(recipe.label_set)
-    for used in {*recipe.required_classes, *recipe.classes.values()}:
+    for used in (*recipe.required_classes, *recipe.categories.values()):
         if used not in names:
             raise InputError(
-                f"{name}: the label set {recipe.label_set} has no class '{used}'; it has "
-                f"{', '.join(names)}."
+                f"{path.name}: '{used}' is no class of its label set, which has {', '.join(names)}."
             )
     return recipe
+
+
+def recipe_text(name: str) -> str:
+    """A recipe that ships as a text to start from: with the classes of 3D-FUTURE's categories
+    written out.
+
+    Raises:
+        InputError: none of this name ships.
+    """
+    name = name.removesuffix(".yaml")  # a file of the user's has categories of its own
+    text, recipe = find_recipe(name).read_text(encoding="utf-8"), load_recipe(name)
+    classes = {category: recipe.class_of(category) for category in category_table()}
+    table = [f"  {category}: {label}\n" for category, label in classes.items() if label != "void"]
+    head = (
+        "# 3D-FUTURE's categories, or others. One that is not listed is of the class of its own\n"
+        "# name, or void. `label_set` may be a list of your own: [bed, night stand].\n"
+    )
+    return f"{text.rstrip()}\n{head}categories:\n{''.join(table)}"

@@ -58,7 +58,7 @@ def read_house(
     Args:
         house: `<house uid>.json`, or what `parse_house` made of it.
         models: The furniture's meshes; `load_models=False` leaves every mesh empty (a survey).
-        recipe: Its classes (a category that is not listed is `void`) and rules about scales.
+        recipe: Says which class a category is, and which scales are allowed.
         wanted: Called with (room id, room type).
 
     Raises:
@@ -185,7 +185,7 @@ class _RoomReader:
             unit = np.diag([*[unit_of(model, entry)] * 3, 1.0])
             pieces.append(
                 Furniture(
-                    label=self.recipe.classes.get(category, "void"),
+                    label=self.recipe.class_of(category),
                     category=category,
                     model_id=model_id,
                     model=model,

@@ -19,7 +19,7 @@ from data_prep.engine.source import (
 from data_prep.engine.workers import Run
 from data_prep.front.drawing import prepare_room
 from data_prep.front.files import house_files
-from data_prep.front.filters import broken_rule
+from data_prep.front.filters import broken_rule, unknown_categories
 from data_prep.front.furnished import Room
 from data_prep.front.houses import House, parse_house
 from data_prep.front.models import ModelBank
@@ -60,7 +60,7 @@ class FrontSource:
 
     @property
     def room_type(self) -> str:
-        return self.recipe.name.removeprefix("front3d_")
+        return self.recipe.name
 
     @property
     def expected(self) -> Expected | None:
@@ -132,14 +132,17 @@ class FrontSource:
             made = prepare_room(room, task.views, self.recipe, self.seed, renderer)
             broken = "no_view", "no view shows any object"
         if made is None:
-            return _filtered(room, task.house, *broken)
+            return _filtered(room, task.house, self.recipe, *broken)
         pieces = [piece for piece in room.furniture if piece.label != "void"]
         models = {piece.model_id: piece.model for piece in pieces}
         pictures = {}
         if self.rgb:
             colors = [self._bank.color(piece.model_id) for piece in room.furniture]
             pictures = rgb_files(room, colors, made[0], self.label_set, renderer)
-        return PreparedRoom(*made, models=models, files=pictures, notes=room.notes)
+        return PreparedRoom(
+            *made, models=models, files=pictures, notes=room.notes,
+            unknown_categories=unknown_categories(room, self.recipe),
+        )  # fmt: skip
 
     def read(self, house: House, load_models: bool, room_id: str | None = None) -> HouseRooms:
         """The rooms of a house that are of the recipe's type, or the one with this id."""
@@ -181,8 +184,9 @@ def _parsed(path: Path, stamp: tuple[int, int]) -> House:
     return parse_house(path)
 
 
-def _filtered(room: Room, house: str, rule: str, reason: str) -> LeftOut:
-    return LeftOut(room.room_id, house, "filtered", reason, rule, room.notes)
+def _filtered(room: Room, house: str, recipe: Recipe, rule: str, reason: str) -> LeftOut:
+    unknown = unknown_categories(room, recipe)
+    return LeftOut(room.room_id, house, "filtered", reason, rule, room.notes, unknown)
 
 
 def _survey_houses(
@@ -209,7 +213,7 @@ def _survey_houses(
             if broken is None:
                 good.append(room)
             else:
-                left_out.append(_filtered(room, house, *broken))
+                left_out.append(_filtered(room, house, source.recipe, *broken))
         counts = view_counts([float(room.floor.area) for room in good], source.recipe.views)
         found += [(room.room_id, house, views) for room, views in zip(good, counts, strict=True)]
     return found, left_out

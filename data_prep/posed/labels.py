@@ -1,13 +1,13 @@
-"""Reads the user's label set, and a room's table of classes."""
+"""Reads the user's label set, and finds a room's table of classes."""
 
 import json
 from pathlib import Path
 
+from data_prep.posed.panoptic import FILE_NAME as PANOPTIC
 from sceneprior.classes import LABEL_SETS, label_set_name
 from sceneprior.errors import InputError
-from sceneprior.instances.tables import read_class_table
 
-TABLES = ("classes.json", "classes.csv")
+TABLES = ("classes.json", "classes.csv", PANOPTIC)
 
 
 def read_label_set(text: str) -> str:
@@ -52,14 +52,15 @@ def read_label_set(text: str) -> str:
         raise InputError(f"{path}: {error}") from None
 
 
-def read_classes(folder: Path) -> dict[int, str]:
-    """Instance id -> class name, from a room's `classes.json` or `classes.csv`.
+def find_table(folder: Path) -> Path:
+    """Where a room says of which classes its ids are: `classes.json`, `classes.csv`, or COCO's
+    `panoptic.json`.
 
     Raises:
-        InputError: there is no table, or two; or see `read_class_table`.
+        InputError: there is none, or more than one.
     """
     found = [Path(folder) / name for name in TABLES if (Path(folder) / name).is_file()]
     if len(found) != 1:
-        why = "has no classes.json or classes.csv" if not found else "has two tables of classes"
-        raise InputError(f"{folder} {why}; one table says which class each instance id is.")
-    return read_class_table(found[0])
+        named = " and ".join(path.name for path in found) or f"no {' or '.join(TABLES)}"
+        raise InputError(f"{folder} has {named}; one table says which class each instance id is.")
+    return found[0]

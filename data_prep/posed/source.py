@@ -1,4 +1,4 @@
-"""Folders of posed pictures as a source of rooms: a folder with a transforms.json is a room."""
+"""Folders of posed pictures as a source of rooms: a folder with poses and masks is a room."""
 
 from collections import Counter
 from dataclasses import asdict, dataclass, field
@@ -9,15 +9,11 @@ from data_prep.engine.plan import digest, digest_of_files
 from data_prep.engine.selection import house_may_match, seeded_split, select
 from data_prep.engine.source import Expected, LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
 from data_prep.engine.workers import Run
+from data_prep.posed.cameras import seems_up
 from data_prep.posed.labels import TABLES
-from data_prep.posed.transforms import FILE_NAME, INSTANCES, read_transforms, room_name, split_files
-from data_prep.posed.views import (
-    PosedSettings,
-    prepare_posed,
-    seems_up,
-    stored_size,
-    usable_frames,
-)
+from data_prep.posed.recording import INSTANCES, room_name
+from data_prep.posed.transforms import FILE_NAME, read_recording, room_files
+from data_prep.posed.views import PosedSettings, prepare_posed, stored_size
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.offscreen import Renderer
@@ -55,8 +51,9 @@ class PosedSource:
             raise InputError(f"{self.folder} has no room '{only}' (--only takes a room's folder).")
         files = {
             room_name(room): digest_of_files(
-                [room / name for name in (FILE_NAME, *TABLES) if (room / name).is_file()]
-                + sorted((room / INSTANCES).glob("*.png"))
+                room_files(room)
+                + [room / name for name in TABLES if (room / name).is_file()]
+                + sorted((room / INSTANCES).rglob("*.png"))
             )
             for room in rooms
         }
@@ -68,7 +65,7 @@ class PosedSource:
         }
 
     def survey(self, run: Run) -> Survey:
-        """Read every room's transforms.json and the size of its masks."""
+        """Read every room's poses and the size of its masks."""
         rooms = find_rooms(self.folder)
         sizes: dict[str, tuple[int, int]] = {}
         left_out: list[LeftOut] = []
@@ -99,7 +96,7 @@ class PosedSource:
         folders = {room_name(room): room for room in find_rooms(self.folder)}
         if task.house not in folders:
             raise InputError(f"{self.folder} has lost this room meanwhile; give it back.")
-        recording = read_transforms(folders[task.house])
+        recording = read_recording(folders[task.house])
         made = prepare_posed(recording, self.label_set, self.posed_settings)
         if made is None:
             why = f"none of its {len(recording.frames)} frames shows any object"
@@ -111,7 +108,7 @@ class PosedSource:
         recordings = []
         for room in find_rooms(self.folder):
             try:
-                recordings.append(read_transforms(room))
+                recordings.append(read_recording(room))
             except InputError:
                 continue  # the report will say it
         settings, count = self.posed_settings, len(recordings)
@@ -119,8 +116,9 @@ class PosedSource:
         unknown = sum(recording.floor_m is None for recording in recordings)
         if unknown and settings.floor_m is None:
             sentences.append(
-                f"{unknown} of {count} rooms give no floor_m: the floor is assumed "
-                f"{settings.camera_height_m:g} m below the lowest camera (--camera-height-m)."
+                f"{unknown} of {count} rooms give no floor_m: the floor is where the lowest pieces "
+                f"end, or else {settings.camera_height_m:g} m below the lowest camera "
+                "(--camera-height-m); report.csv says which."
             )
         unknown = sum(recording.metres_per_unit is None for recording in recordings)
         if unknown and settings.metres_per_unit == 1:
@@ -128,19 +126,21 @@ class PosedSource:
                 f"{unknown} of {count} rooms give no metres_per_unit: poses are taken as metres; "
                 "those of COLMAP are not."
             )
-        other = sum(seems_up(recording) not in (None, settings.up) for recording in recordings)
-        if other:
-            axis = "y" if settings.up == "z" else "z"
+        taken = "z" if settings.up == "auto" else settings.up
+        tops = [seems_up(recording) for recording in recordings if recording.leveled]
+        other = sum(axis not in (None, taken) for axis in tops)
+        if other and taken != "cameras":
+            axis = "y" if taken == "z" else "z"
             sentences.append(
                 f"In {other} of {count} rooms the tops of the pictures point along {axis}, but "
-                f"{settings.up} is taken as up: is it --up {axis}?"
+                f"{taken} is taken as up: is it --up {axis}?"
             )
         return sentences
 
 
 def find_rooms(folder: Path) -> list[Path]:
-    """The folder itself if it holds a transforms.json, else its sub-folders that hold one; sorted.
-    Those with split files or `instances/` alone are among them, for the report to name them.
+    """The folder itself if it holds poses (`room_files`), else its sub-folders that do; sorted.
+    Those with `instances/` alone are among them, for the report to name them.
 
     Raises:
         InputError: there is no room.
@@ -148,22 +148,25 @@ def find_rooms(folder: Path) -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"No folder at {folder}; prep-posed reads a folder of rooms.")
-    if (folder / FILE_NAME).is_file() or split_files(folder):
+    if room_files(folder):
         return [folder]
     found = [
         path
         for path in sorted(folder.iterdir())
-        if (path / FILE_NAME).is_file() or (path / INSTANCES).is_dir() or split_files(path)
+        if path.is_dir() and (room_files(path) or (path / INSTANCES).is_dir())
     ]
     if not found:
-        raise InputError(f"{folder} holds no {FILE_NAME}, and none of its sub-folders does.")
+        raise InputError(
+            f"{folder} holds no {FILE_NAME} and no model of COLMAP (sparse/0), and none of its "
+            "sub-folders does."
+        )
     return found
 
 
 def _look(source: PosedSource, room: Path) -> tuple[int, int] | str:
     """The size at which a room would be stored, or why it cannot be."""
     try:
-        recording = read_transforms(room)
-        return stored_size(usable_frames(recording)[0], source.posed_settings)
+        recording = read_recording(room)
+        return stored_size(recording, source.posed_settings)
     except Exception as error:
         return sentence_of(error)

@@ -103,7 +103,7 @@ def complete(
 
 def retrieve(
     scenes: Annotated[Path, typer.Option(help="Folder of scene JSONs, with their GLBs.")],
-    models: Annotated[Path, typer.Option(help="3D-FUTURE-model, or a folder like it.")],
+    models: Annotated[Path, typer.Option(help="3D-FUTURE-model, a folder like it, or shards.")],
     out: Annotated[Path, typer.Option(help="Folder for the scenes with CAD models.")],
     cache: Annotated[
         Path | None,

@@ -174,11 +174,14 @@ class FlatViews:
         }
 
 
-def allowed_views(seed: int, room: int, count: int, fraction: float) -> Int64[np.ndarray, " views"]:
-    """Which of a room's `count` views training may use: a share of them, chosen by the seed."""
+def allowed_views(
+    seed: int, room: int, count: int, fraction: float, held_out: bool = False
+) -> Int64[np.ndarray, " views"]:
+    """Which of a room's `count` views training may use: a share of them, chosen by the seed; or the
+    others, which it may not."""
     keep = max(1, round(fraction * count))
     order = np.random.default_rng([seed, room]).permutation(count)
-    return np.sort(order[:keep])
+    return np.sort(order[keep:] if held_out else order[:keep])
 
 
 class ViewDataset(RoomDataset):
@@ -191,6 +194,8 @@ class ViewDataset(RoomDataset):
         folder, split, rotations, limit: See `RoomDataset`.
         views_per_room: Views drawn each time a room is asked for, by `seed`.
         view_fraction: Share of each room's views that may be drawn, chosen once by `seed`.
+        held_out: The other views are drawn instead, those of which training sees nothing; every
+            room must have some.
         mask_step: Every how many pixels the instance ids are kept; None reads no images.
     """
 
@@ -206,6 +211,7 @@ class ViewDataset(RoomDataset):
         mask_step: int | None = None,
         seed: int = 0,
         limit: int | None = None,
+        held_out: bool = False,
     ):
         super().__init__(rotations)
         self.views_per_room, self.seed = views_per_room, seed
@@ -222,7 +228,7 @@ class ViewDataset(RoomDataset):
         self._object_counts = np.array([len(room.object_class) for room in rooms])
         self.max_objects = int(self._object_counts.max())
         self._allowed = [
-            allowed_views(seed, index, len(room.visible), view_fraction)
+            allowed_views(seed, index, len(room.visible), view_fraction, held_out)
             for index, room in enumerate(rooms)
         ]
 

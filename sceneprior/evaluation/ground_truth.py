@@ -155,7 +155,7 @@ def _triple(values: np.ndarray) -> tuple[float, float, float]:
 def _placed(shards: Path, model_id: str, model_to_room: np.ndarray) -> Mesh | None:
     if not model_id:
         return None
-    model = _load_model(shards / MODELS_FOLDER / f"{model_id}.ply")
+    model = read_model(model_path(shards, model_id))
     matrix = np.asarray(model_to_room, dtype=np.float64)
     vertices = model.vertices_m @ matrix[:3, :3].T + matrix[:3, 3]
     # A mirrored placement turns every triangle inside out.
@@ -163,8 +163,18 @@ def _placed(shards: Path, model_id: str, model_to_room: np.ndarray) -> Mesh | No
     return Mesh(vertices, model.faces[:, ::-1] if mirrored else model.faces)
 
 
+def model_path(shards: Path, model_id: str) -> Path:
+    """Where a folder of shards keeps a model."""
+    return shards / MODELS_FOLDER / f"{model_id}.ply"
+
+
 @lru_cache(maxsize=4096)
-def _load_model(path: Path) -> Mesh:
+def read_model(path: Path) -> Mesh:
+    """A model of shards (`model_path`) in its own frame.
+
+    Raises:
+        ShardError: it is missing or damaged.
+    """
     if not path.is_file():
         raise ShardError(
             f"{path} is missing, but a room's ground truth stands on it. Keep `models/` beside "

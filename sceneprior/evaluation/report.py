@@ -76,7 +76,7 @@ def write_report(
         version=__version__,
         run=Path(run).resolve().name,
         shards=Path(shards).resolve().name,
-        label_set=names.replace("_", " "),
+        label_set=names.removeprefix("void,").replace(",", ", ").replace("_", " "),
         tiles=_tiles(scores),
         views=[] if from_boxes else input_views(shards, rooms=3, views_per_room=2),
         from_boxes=from_boxes,
@@ -128,6 +128,9 @@ _TILES = (
      "real test rooms {mean_objects_test:.2f}"),
     ("class_accuracy", "{0:.1%}", "of true classes right",
      "decoded training rooms, matched by box"),
+    ("mask_iou_held_out", "{0:.2f}", "mean mask IoU in held-out views", "decoded training rooms"),
+    ("mask_iou_training_views", "{0:.2f}", "mean mask IoU in training views",
+     "decoded training rooms; data.view_fraction below 1 holds views out"),
     ("box_iou_3d", "{0:.2f}", "mean 3D box IoU", "decoded training rooms; 3D was never shown"),
 )  # fmt: skip
 """Key, value, what it is, beside what."""

@@ -160,7 +160,7 @@ def keeps_settings(run: Run) -> bool:
     saved = run.folder / "run" / "config.yaml"
     if not saved.is_file():
         return True
-    wanted = load_config(run.config, run.settings)
+    wanted = load_config(run.config, run.settings).with_label_set()
     try:
         return load_config(str(saved)) == wanted
     except InputError:

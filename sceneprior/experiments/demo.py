@@ -41,7 +41,7 @@ def demo_steps(out: Path, config: str, rooms: int, count: int, renderer: str) ->
         "homes": ["make-homes", homes, "--rooms", str(rooms), "--seed", "0"],
         "shards": [
             "prep-front", "--front", f"{homes}/3D-FRONT", "--future", f"{homes}/3D-FUTURE-model",
-            "--splits", f"{homes}/splits/bedroom.csv", "--room-type", "bedroom",
+            "--splits", f"{homes}/splits/bedroom.csv", "--recipe", "bedroom",
             "--out", shards, *draw,
         ],
         "fit": [

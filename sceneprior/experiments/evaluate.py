@@ -14,6 +14,11 @@ from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.evaluation.report import write_report
 from sceneprior.evaluation.room_sets import seeded_rows
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
+from sceneprior.experiments.evaluate_views import (
+    evaluate_from_views,
+    known_from_views_alone,
+    mask_scores,
+)
 from sceneprior.files import write_json
 from sceneprior.generation.decode import decode_latents, decode_training_rooms, synthesize
 from sceneprior.generation.export import load_scene_folder
@@ -40,7 +45,8 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Score generated rooms against test rooms, and write the scores.
 
-    In runs that remember their training rooms, those are decoded and scored against the truth, too.
+    In runs that remember their training rooms, those are decoded and scored against the truth, too;
+    against masks, where rooms are known from views alone.
 
     The options' seed draws the latents, too; `shards` and `distribution` are by default the run's.
 
@@ -49,12 +55,19 @@ def evaluate_run(
     """
     trained = load_any_run(run, checkpoint)
     folder = shards or Path(trained.config.data.shards)
-    # First, because other shards than the run's are refused here.
-    pairs = decoded_and_true(trained, folder) if trained.remembers_rooms else []
-    generated = synthesize(trained, count, options.seed, distribution)
-    scores = evaluate_synthesis(generated, folder, options, [decoded for decoded, _ in pairs])
-    if pairs:
-        scores |= reconstruction_scores(pairs)
+    if known_from_views_alone(folder, options.split):
+        masks: dict[str, float] = {}
+        if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
+            masks = mask_scores(trained, folder)
+        generated = synthesize(trained, count, options.seed, distribution)
+        scores = evaluate_from_views(generated, folder, options) | masks
+    else:
+        # First, because other shards than the run's are refused here.
+        pairs = decoded_and_true(trained, folder) if trained.remembers_rooms else []
+        generated = synthesize(trained, count, options.seed, distribution)
+        scores = evaluate_synthesis(generated, folder, options, [decoded for decoded, _ in pairs])
+        if pairs:
+            scores |= reconstruction_scores(pairs)
     scores["protocol"] |= {
         "run": run.resolve().name, "stage": trained.stage, "checkpoint": checkpoint
     }  # fmt: skip
@@ -81,7 +94,9 @@ def evaluate_folder(
     """
     scenes = load_scene_folder(folder)
     rows = seeded_rows(len(scenes), count or len(scenes), options.seed)
-    scores = evaluate_synthesis([scenes[row] for row in rows], shards, options)
+    chosen = [scenes[row] for row in rows]
+    alone = known_from_views_alone(shards, options.split)
+    scores = (evaluate_from_views if alone else evaluate_synthesis)(chosen, shards, options)
     scores["protocol"] |= {"scenes": folder.resolve().name, "n_scenes_available": len(scenes)}
     write_json(out, scores)
     return scores

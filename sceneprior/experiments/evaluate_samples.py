@@ -72,7 +72,7 @@ class SampleEvaluator:
     """
 
     def __init__(self, config: RunConfig):
-        self.config = config
+        self.config = config = config.with_label_set()
         if config.samples.metric == "type_share" and config.label_set not in TYPE_CLASSES:
             raise InputError(
                 f"samples.metric is type_share, but {config.label_set} mixes room types; choose "
@@ -83,7 +83,7 @@ class SampleEvaluator:
                 f"samples.metric is mask_iou, but `method: {config.method}` remembers no rooms; "
                 "choose category_kl, objects_off, overlaps or type_share."
             )
-        if config.samples.metric == "mask_iou" and not _has_meshes(config):
+        if config.samples.metric == "mask_iou" and not has_meshes(config):
             raise InputError(
                 "samples.metric is mask_iou, which compares masks of meshes, but model.shape is "
                 "occupancy; choose category_kl, objects_off, overlaps or type_share."
@@ -154,7 +154,8 @@ class SampleEvaluator:
         return rooms.__getitems__([(row, 0) for row in range(0, len(rooms), rooms.rotations)])
 
 
-def _has_meshes(config: RunConfig) -> bool:
+def has_meshes(config: RunConfig) -> bool:
+    """Whether a run's shapes are meshes, of which masks are drawn."""
     return isinstance(config, PriorConfig) and config.model.shape.name == "mesh"
 
 

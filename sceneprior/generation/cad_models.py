@@ -1,4 +1,4 @@
-"""Read the CAD models of a 3D-FUTURE folder by class, with points on each model's surface.
+"""Read CAD models by class, of a 3D-FUTURE folder or of shards, with points on their surfaces.
 
 Points are drawn once a model and kept in one file; where the file of a model changes, its points
 are drawn again.
@@ -17,10 +17,12 @@ from jaxtyping import Float
 
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
+from sceneprior.evaluation.ground_truth import model_path, read_model
 from sceneprior.files import file_stamp, is_name, write_whole
 from sceneprior.furniture import MODEL_FILE, class_of_category, model_categories, read_obj
 from sceneprior.geometry.surfaces import surface_points
 from sceneprior.scene import Mesh
+from sceneprior.shards import INDEX_NAME, iterate_rooms
 
 POINTS = 1024
 """Points of a surface: at 2 m2 of it, one every 4 to 5 cm."""
@@ -63,20 +65,27 @@ def default_cache() -> Path:
 def open_models(
     folder: Path, label_set_name: str, cache: Path, points: int = POINTS, track: Track = iter
 ) -> CadModels:
-    """Read the models of a 3D-FUTURE folder that have a class in a label set. Their points are kept
-    in a file in the folder `cache`; deleting it costs time, nothing else.
+    """Read the models that have a class in a label set, of 3D-FUTURE, or of rooms of `prep-front`
+    with this label set. Their points are kept in a file in the folder `cache`; deleting it costs
+    time, nothing else.
 
     Raises:
-        InputError: the folder is not 3D-FUTURE's, or has no model of these classes.
+        InputError: the folder is neither, has shards of another label set, or has no model of
+            these classes.
     """
     folder = Path(folder)
     names = label_set(label_set_name)
-    labels = {
-        model_id: class_of_category(category, label_set_name, names)
-        for model_id, category in sorted(model_categories(folder, "--models").items())
+    of_shards = (folder / INDEX_NAME).is_file()
+    labels_of = _labels_of_shards if of_shards else _labels_of_3d_future
+    labels = labels_of(folder, label_set_name)
+    read: Callable[[Path], Mesh] = read_model if of_shards else read_obj
+    files = {
+        model_id: model_path(folder, model_id) if of_shards else folder / model_id / MODEL_FILE
+        for model_id, label in sorted(labels.items())
+        if label != "void"
     }
-    wanted = [model_id for model_id, label in labels.items() if label != "void"]
-    drawn, broken = _points_of_models(folder, wanted, Path(cache), points, track)
+    wanted = list(files)
+    drawn, broken = _points_of_models(folder, files, read, Path(cache), points, track)
     by_class = {}
     for label in names:
         if of_class := [m for m in wanted if labels[m] == label and m not in broken]:
@@ -85,13 +94,40 @@ def open_models(
     if not by_class:
         raise InputError(
             f"{folder} holds no usable model of a class of {label_set_name} ({len(labels)} models "
-            f"listed, {len(broken)} of them broken); --models names a folder with the OBJ files."
+            f"listed, {len(broken)} of them broken); --models names a folder with their files."
         )
 
     def load(model_id: str) -> Mesh:
-        return unit_mesh(read_obj(folder / model_id / MODEL_FILE))
+        return unit_mesh(read(files[model_id]))
 
     return CadModels(by_class, lru_cache(_MESHES_KEPT)(load), broken)
+
+
+def _labels_of_3d_future(folder: Path, label_set_name: str) -> dict[str, str]:
+    categories = model_categories(folder, "--models")
+    return {
+        model_id: class_of_category(category, label_set_name)
+        for model_id, category in categories.items()
+    }
+
+
+def _labels_of_shards(folder: Path, label_set_name: str) -> dict[str, str]:
+    """Of the models in training rooms: the recipe that made the shards decided on their classes."""
+    labels: dict[str, str] = {}
+    for shard, room_id in iterate_rooms(folder, "train"):
+        if shard.label_set != label_set_name:
+            raise InputError(
+                f"The rooms of {folder} are labelled '{shard.label_set}', but the scenes "
+                f"'{label_set_name}'; --models names shards with the scenes' classes."
+            )
+        truth = shard.read_ground_truth(room_id)
+        names = label_set(label_set_name)
+        labels |= {
+            model_id: names[label]
+            for model_id, label in zip(truth.model_ids, truth.object_class, strict=True)
+            if model_id  # ScanNet's objects have none
+        }
+    return labels
 
 
 def unit_mesh(mesh: Mesh) -> Mesh:
@@ -108,20 +144,25 @@ def _into_unit_box(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 
 def _points_of_models(
-    folder: Path, model_ids: list[str], cache: Path, count: int, track: Track
+    folder: Path,
+    files: Mapping[str, Path],
+    read: Callable[[Path], Mesh],
+    cache: Path,
+    count: int,
+    track: Track,
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """`count` points of each model, and why broken models have none. What was drawn is kept in an
     npz in the folder `cache`, even if this is interrupted."""
     settings = f"{folder.resolve()}|{count}|{SEED}|{FORMAT}"
-    path = cache / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
-    points, stamps = _read_points(path, count)
+    kept = cache / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
+    points, stamps = _read_points(kept, count)
     todo: dict[str, tuple[int, int]] = {}
     broken: dict[str, str] = {}
-    for model_id in model_ids:
+    for model_id, path in files.items():
         try:
             if not is_name(model_id):
                 raise InputError(f"{ascii(model_id)[:60]} cannot be a folder's name")
-            stamp = file_stamp(folder / model_id / MODEL_FILE)
+            stamp = file_stamp(path)
             if stamps.get(model_id) != stamp:
                 todo[model_id] = stamp
         except InputError as error:
@@ -130,7 +171,7 @@ def _points_of_models(
     try:
         for model_id in track(list(todo)):
             try:
-                mesh = read_obj(folder / model_id / MODEL_FILE)
+                mesh = read(files[model_id])
                 vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
                 # Drawn on the model as it is: in a unit box thin sides would count as wide ones.
                 drawn = surface_points(vertices, mesh.faces, count, SEED)
@@ -147,7 +188,7 @@ def _points_of_models(
                 stamps=np.array([stamps[m] for m in ids], np.int64),
                 points=np.stack([points[m] for m in ids]),
             )
-            write_whole(path, buffer.getvalue())
+            write_whole(kept, buffer.getvalue())
     return points, broken
 
 

@@ -48,7 +48,7 @@ def fit(
         InputError: the run exists and is not resumed, its settings differ from `config`, or the
             shards do not fit it; a run refused at its start leaves nothing behind.
     """
-    run = Path(run)
+    run, config = Path(run), config.with_label_set()
     if config.samples.every and evaluate is None:
         raise InputError(
             f"samples.every is {config.samples.every}, but nothing was given to evaluate what is "

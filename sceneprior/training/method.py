@@ -27,9 +27,13 @@ from sceneprior.lifting.shapes import ShapeGrid
 from sceneprior.models.prior import ModelConfig, ScenePrior
 from sceneprior.sampler.network import RoomSampler
 from sceneprior.settings import Section
+from sceneprior.shards import Shard, list_shards
 from sceneprior.training.checkpoints import read_networks
 from sceneprior.training.settings import DataConfig, SamplesConfig, TrainConfig
 from sceneprior.views import RoomBoxes
+
+OF_SHARDS = "shards"
+"""In place of a label set's name: whatever the training rooms are labelled with."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,9 @@ class RunConfig(Section, ABC):
     """What a run of any method is; saved with it as `config.yaml`."""
 
     method: str
-    label_set: str
-    """A name in `sceneprior/classes.py`, or the user's own list: `void,bed,chair`."""
+    label_set: str = OF_SHARDS
+    """`shards`: that of `data.shards`, which `fit` writes here; or a name in
+    `sceneprior/classes.py`, or the user's own list, `void,bed,chair`: no other shards will do."""
     seed: int = Field(0, ge=0)
     data: DataConfig
     samples: SamplesConfig = SamplesConfig()
@@ -64,10 +69,22 @@ class RunConfig(Section, ABC):
     @model_validator(mode="after")
     def _known_label_set(self) -> "RunConfig":
         try:
-            label_set(self.label_set)
+            if self.label_set != OF_SHARDS:
+                label_set(self.label_set)
         except InputError as error:
             raise ValueError(f"label_set: {str(error).removesuffix('.')}") from None
         return self
+
+    def with_label_set(self) -> "RunConfig":
+        """The same with the label set of `data.shards` where it is left to them.
+
+        Raises:
+            ShardError: it is, and there are none to train on.
+        """
+        if self.label_set != OF_SHARDS:
+            return self
+        with Shard(list_shards(Path(self.data.shards), "train")[0]) as shard:
+            return self.model_copy(update={"label_set": shard.label_set})
 
     @property
     def classes(self) -> int:
@@ -111,7 +128,7 @@ class RunConfig(Section, ABC):
         if rooms.label_set != self.label_set:
             raise InputError(
                 f"{shards} is labelled '{rooms.label_set}' but the config says "
-                f"'{self.label_set}'; set label_set or point data.shards elsewhere."
+                f"'{self.label_set}'; set label_set=shards or point data.shards elsewhere."
             )
         if max_objects is not None and rooms.max_objects > max_objects:
             raise InputError(

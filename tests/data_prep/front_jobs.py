@@ -19,7 +19,7 @@ SMALL = ("views.image_size=[90, 120]", "views.per_m2=0.5", "views.min_object_pix
 
 def front_job(front: FrontFolder, out: Path, **changes: Any) -> Job:
     """A job on small images; `changes` are fields of FrontSource or Job, or more `rules`."""
-    recipe = load_recipe("front3d_bedroom", (*SMALL, *changes.pop("rules", ())))
+    recipe = load_recipe("bedroom", (*SMALL, *changes.pop("rules", ())))
     names = {item.name for item in fields(FrontSource)}
     of_source = {name: changes.pop(name) for name in list(changes) if name in names}
     source = FrontSource(front.front, front.future, **{"recipe": recipe, **of_source})

@@ -19,7 +19,7 @@ def read(
     front: FrontFolder,
     path: Path,
     rules: tuple[str, ...] = (),
-    recipe: str = "front3d_bedroom",
+    recipe: str = "bedroom",
     **options: Any,
 ) -> HouseRooms:
     """All rooms of a house, under the bedroom's recipe and these changes of its rules."""

@@ -71,7 +71,7 @@ def test_furniture_without_a_floor_is_no_failure(front, tmp_path, prep):
     bare = bedroom("OtherRoom-1", kind="OtherRoom")
     bare["children"] = bare["children"][1:]
     front.house("house", bare, bedroom("Bedroom-1"), bedroom("Bedroom-2"))
-    made = prep("--room-type", "all")
+    made = prep("--recipe", "all")
     assert made.exit_code == 0, made.output
     assert "filtered by no_floor" in made.stdout
 
@@ -125,12 +125,12 @@ def test_pictures_and_wrong_words(front, tmp_path, prep, cli):
     assert made.exit_code == 3 and "its instanceid, '[/] [bold]'" in made.stdout, made.output
     assert len(list((tmp_path / "shards" / "rgb").glob("*/0000.png"))) == 6
     for words, said in (
-        (("--room-type", "attic"), "No recipe is called 'front3d_attic'; there are front3d_all,"),
+        (("--recipe", "attic"), "No recipe is called 'attic'; there are all, bedroom,"),
         (
             ("--rule", "max_floor_m=wide"),
             "'max_floor_m': input should be a valid number (got 'wide')",
         ),
-        (("--room-type", "library"), "is of a type that front3d_library is about (library)"),
+        (("--recipe", "library"), "is of a type that library is about (library)"),
     ):
         result = cli(
             "prep-front", "--front", front.front, "--future", front.future,

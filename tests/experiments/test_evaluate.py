@@ -10,9 +10,16 @@ import numpy as np
 import pytest
 
 from sceneprior import cli
+from sceneprior.config import load_run
+from sceneprior.data.dataset import allowed_views
+from sceneprior.errors import InputError
 from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.evaluation.metrics.contents import class_frequencies, frequency_kl
+from sceneprior.experiments.evaluate_views import mask_scores
+from sceneprior.generation.decode import synthesize
 from sceneprior.generation.export import write_scenes
 from sceneprior.offscreen import SoftwareRenderer
+from sceneprior.shards import iterate_rooms
 
 
 @pytest.fixture
@@ -135,7 +142,7 @@ def test_boxes_are_converted_and_then_evaluated(command, toy_shards, tmp_path):
     assert scores["mean_objects"] == 2 and scores["out_of_bounds_share"] is None
 
 
-def test_a_run_without_3d_truth_has_a_page_and_eval_fid_names_it(
+def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
     command, toy_shards, toy_run, tmp_path
 ):
     shutil.copytree(toy_shards, tmp_path / "bare")
@@ -146,15 +153,38 @@ def test_a_run_without_3d_truth_has_a_page_and_eval_fid_names_it(
     shutil.copytree(toy_run, tmp_path / "run")
     config = tmp_path / "run" / "config.yaml"
     config.write_text(config.read_text().replace(str(toy_shards), str(tmp_path / "bare")))
-    status, _, errors = command("eval-fid", "--run", "run", "-n", 3, "--renderer", "software")
-    assert status == 2 and errors.count("\n") == 1, errors
-    assert "carries no 3D ground truth" in errors and "`sceneprior report` shows" in errors
     status, _, errors = command("report", "--run", "run", "--renderer", "software")
     assert status == 0, errors
     page = (tmp_path / "run" / "report.html").read_text()
     assert "<h2>New rooms</h2>" in page and "No test room of these shards is known in 3D" in page
     assert "<h2>What training saw</h2>" in page and "Real, test split" not in page
     assert "<h2>Scores</h2>" not in page and "read back in 3D" not in page
+    status, printed, errors = command("eval-fid", "--run", "run", "-n", 3, "--seed", 1)
+    assert status == 0, errors
+    assert "Not measured without rooms in 3D" in printed and "Category KL" in printed
+    scores = json.loads((tmp_path / "run" / "scores.json").read_text())
+    tracked = [s.read_room(r).object_class for s, r in iterate_rooms(toy_shards, "test")]
+    assert scores["mean_objects_test"] == np.mean([len(labels) for labels in tracked])
+    seen = np.bincount(np.concatenate(tracked), minlength=22) / sum(map(len, tracked))
+    made = synthesize(load_run(tmp_path / "run"), 3, 1)
+    assert scores["category_kl"] == pytest.approx(frequency_kl(seen, class_frequencies(made)))
+    assert scores["mean_objects"] == np.mean([len(scene.objects) for scene in made])
+    assert scores["type_share_test"] == 1 and scores["train_rooms"]["category_kl"] >= 0
+    low, high = scores["intervals"]["generated"]["mean_objects"]
+    assert low <= scores["mean_objects"] <= high
+    assert 0 < scores["mask_iou_training_views"] < 1
+    assert scores["protocol"]["n_test"] == 4 and "known from views alone" in scores["note"]
+    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "<h2>Scores</h2>" in page and "mean mask IoU in training views" in page
+    (tmp_path / "run" / "scores.json").unlink()
+    # Scenes of any method have scores from views, too.
+    write_scenes(made, tmp_path / "made", SoftwareRenderer())
+    call = ["eval-fid", "--scenes", "made", "--shards", "bare", "--resamples", 0]
+    assert command(*call)[0] == 0
+    again = json.loads((tmp_path / "made" / "scores.json").read_text())
+    assert again["category_kl"] == pytest.approx(scores["category_kl"])
+    assert again["intervals"]["generated"]["mean_objects"] is None
     # Without a test split, too; the training rooms are compared with what they were.
     shutil.rmtree(tmp_path / "bare")
     shutil.copytree(toy_shards, tmp_path / "bare", ignore=shutil.ignore_patterns("test"))
@@ -166,3 +196,16 @@ def test_a_run_without_3d_truth_has_a_page_and_eval_fid_names_it(
     config.write_text(config.read_text().replace(str(tmp_path / "bare"), str(toy_shards)))
     status, _, errors = command("report", "--run", "run", "--renderer", "software")
     assert status == 2 and "scores.json holds no scores" in errors
+
+
+def test_views_that_training_never_saw_are_held_out(toy_shards, toy_run):
+    trained = load_run(toy_run)
+    assert set(mask_scores(trained, toy_shards)) == {"mask_iou_training_views"}
+    data = trained.config.data.model_copy(update={"view_fraction": 0.5})
+    half = replace(trained, config=trained.config.model_copy(update={"data": data}))
+    (found,) = mask_scores(half, toy_shards).items()
+    assert found[0] == "mask_iou_held_out" and 0 < found[1] < 1
+    seen, others = (allowed_views(0, 3, 8, 0.5, held_out=held) for held in (False, True))
+    assert sorted([*seen, *others]) == list(range(8)) and len(others) == 4
+    with pytest.raises(InputError, match="does not hold the training rooms of this run"):
+        mask_scores(replace(trained, room_ids=("elsewhere",)), toy_shards)

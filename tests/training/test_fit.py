@@ -269,6 +269,16 @@ def test_settings_and_shards_that_do_not_fit_are_sentences(toy_run, toy_shards, 
         fit(config, tmp_path / "c", loggers=("paper",))
 
 
+def test_the_label_set_of_the_shards_is_the_runs(toy_shards, tmp_path):
+    config = tiny_config(toy_shards, label_set="shards", layout__epochs=1, shape__epochs=1)
+    fit(config, tmp_path / "run", trainer_options=CPU)
+    trained = load_run(tmp_path / "run")
+    assert trained.config.label_set == "front3d_bedroom"
+    fit(config, tmp_path / "run", resume=True, trainer_options=CPU)  # no other settings
+    with pytest.raises(InputError, match="No folder of shards at"):
+        tiny_config(tmp_path / "none", label_set="shards").with_label_set()
+
+
 def test_a_run_refused_can_be_started_again_without_resume(toy_shards, tmp_path):
     """Nothing half-written: a refused run leaves no folder that the next try trips over."""
     for changes in ({"data__shards": str(tmp_path / "none")}, {"model__max_objects": 3}):

@@ -195,7 +195,7 @@ def shared_front() -> Path:
 def test_houses_made_by_others(tmp_path):
     """Ground-truth boxes, projected, agree with the boxes of masks that nothing hides."""
     folder = shared_front()
-    recipe = load_recipe("front3d_bedroom", ("views.per_m2=0.5",))
+    recipe = load_recipe("bedroom", ("views.per_m2=0.5",))
     source = FrontSource(folder / "3D-FRONT", folder / "3D-FUTURE-model", recipe, only="0022c821")
     build_shards(Job(source, tmp_path / "a", renderer="software"))
     ((views, truth),) = rooms_of(tmp_path / "a").values()

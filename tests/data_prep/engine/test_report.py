@@ -118,7 +118,7 @@ def test_what_a_recipe_expects_is_compared_and_decides_nothing(front, tmp_path, 
     assert [row["difference"] for row in report["expected"]["rows"]] == [-1, 0, -1]
     # From the recipe's file, where a wrong name is told.
     monkeypatch.setattr("data_prep.front.recipe.FOLDER", tmp_path)
-    text = "label_set: front3d_bedroom\nclass_columns: [bedroom_class]\nroom_types: [bedroom]\n"
+    text = "label_set: front3d_bedroom\nroom_types: [bedroom]\n"
     (tmp_path / "mine.yaml").write_text(text + "expected: {of: me, rooms: 7}\n")
     assert load_recipe("mine").expected == Expected(of="me", rooms=7)
     (tmp_path / "mine.yaml").write_text(text + "expected: {chairs: 7}\n")

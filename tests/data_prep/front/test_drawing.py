@@ -33,7 +33,7 @@ def room(front):
 
 
 def prepare(room, renderer, *rules, count=12, seed=0):
-    recipe = load_recipe("front3d_bedroom", (*SMALL, *rules))
+    recipe = load_recipe("bedroom", (*SMALL, *rules))
     return prepare_room(room, count, recipe, seed, renderer)
 
 
@@ -72,6 +72,6 @@ def test_the_room_and_the_seed_decide(room):
 
 
 def test_the_papers_pictures():
-    views = load_recipe("front3d_bedroom").views
+    views = load_recipe("bedroom").views
     assert views.image_size == (360, 480) and views.fov_deg == 90
     assert views.eye_height_m == (1.4, 1.8) and views.per_house_at_most == 100

@@ -72,7 +72,7 @@ def damage(data: Any, rng: np.random.Generator) -> None:
 def check(front: FrontFolder, path: Any, bank: ModelBank, rules: tuple[str, ...]) -> str:
     """Read a house, and say what came of it."""
     try:
-        result = read_house(path, bank, load_recipe("front3d_bedroom", rules))
+        result = read_house(path, bank, load_recipe("bedroom", rules))
     except InputError as error:
         assert path.name in str(error) and "\n" not in str(error)
         return "house refused"

@@ -57,7 +57,7 @@ def flat(front: FrontFolder) -> None:
 )  # fmt: skip
 def test_each_room_type_finds_its_rooms(front, kind, rooms):
     flat(front)
-    found = survey(front, f"front3d_{kind}", only="flat")
+    found = survey(front, kind, only="flat")
     assert [task.room_id for task in found.rooms] == [f"flat_{name}" for name in rooms]
     assert sum(task.views for task in found.rooms) <= 100
     # Of the kitchen's one piece, `all` says which rule leaves it out.
@@ -66,7 +66,7 @@ def test_each_room_type_finds_its_rooms(front, kind, rooms):
 
 def test_rooms_of_every_type_become_one_data_set(front, tmp_path):
     flat(front)
-    recipe = load_recipe("front3d_all", SMALL)
+    recipe = load_recipe("all", SMALL)
     summary = build_shards(front_job(front, tmp_path / "shards", recipe=recipe))
     assert summary.statuses == {"prepared": 5, "filtered": 1}
     index = read_index(tmp_path / "shards")
@@ -77,8 +77,8 @@ def test_rooms_of_every_type_become_one_data_set(front, tmp_path):
 
 def test_a_type_that_no_room_has(front):
     flat(front)
-    with pytest.raises(InputError, match=r"is of a type that front3d_bedroom is about \(attic\)"):
-        survey(front, "front3d_bedroom", "room_types=[attic]")
+    with pytest.raises(InputError, match=r"is of a type that bedroom is about \(attic\)"):
+        survey(front, "bedroom", "room_types=[attic]")
 
 
 @pytest.mark.parametrize(
@@ -100,12 +100,12 @@ def test_each_rule_leaves_a_room_out_by_name_and_can_be_switched_off(front, chan
     wall = written["_meshes"][1]["xyz"]
     wall[7] = wall[10] = change.get("wall_m", 2.6)
     front.house("house", written, bedroom("B"), bedroom("C"))
-    found = survey(front, "front3d_bedroom")
+    found = survey(front, "bedroom")
     (item,) = found.left_out
     assert (item.room_id, item.rule, item.status) == ("house_A", rule, "filtered")
     assert item.reason.startswith(why)
     off = f"{rule}=[]" if rule == "required_classes" else f"{rule}=null"
-    assert not survey(front, "front3d_bedroom", off).left_out
+    assert not survey(front, "bedroom", off).left_out
 
 
 def test_the_views_of_a_house(front):
@@ -114,10 +114,10 @@ def test_the_views_of_a_house(front):
     pieces = [{"jid": "bed", "pos": (0, 0, 0)}, {"jid": "stand", "pos": (0, 0, 0)}]
     rooms = [room(f"R{k}", pieces, bounds=(0, 0, side, 4)) for k, side in enumerate(sides)]
     front.house("house", *rooms)
-    views = [task.views for task in survey(front, "front3d_bedroom").rooms]
+    views = [task.views for task in survey(front, "bedroom").rooms]
     assert views == [10, 15, 20, 25, 30]
     # Rooms that the recipe leaves out take no views away.
-    views = [task.views for task in survey(front, "front3d_bedroom", "max_floor_m=4.5").rooms]
+    views = [task.views for task in survey(front, "bedroom", "max_floor_m=4.5").rooms]
     assert views == [16, 24, 32]
 
 
@@ -127,7 +127,7 @@ def test_the_views_of_a_house(front):
 )
 def test_no_room_is_lost_that_the_shared_houses_promise(kind, csv, train, test):
     folder = shared_front()
-    recipe = load_recipe(f"front3d_{kind}", RULES_OFF)
+    recipe = load_recipe(kind, RULES_OFF)
     source = FrontSource(
         folder / "3D-FRONT", folder / "3D-FUTURE-model", recipe, folder / "splits" / csv
     )
@@ -141,7 +141,7 @@ def test_pieces_and_floors_are_what_the_shared_houses_promise():
     folder = shared_front()
     promised = json.loads((folder / "stats.json").read_text())["rooms"]
     bank = ModelBank(folder / "3D-FUTURE-model")
-    recipe = load_recipe("front3d_all")
+    recipe = load_recipe("all")
     kinds = [kind for kind in promised if kind != "Kitchen"]  # this copy lacks some kitchens
     pieces, areas = defaultdict(list), defaultdict(list)
     for path in sorted((folder / "3D-FRONT").glob("*.json")):

@@ -2,9 +2,10 @@
 
 import pytest
 
-from data_prep.posed.labels import read_classes, read_label_set
+from data_prep.posed.labels import find_table, read_label_set
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
+from sceneprior.instances.tables import read_class_table
 
 
 def table(folder, text, name="classes.json"):
@@ -21,15 +22,18 @@ def table(folder, text, name="classes.json"):
     ],
 )
 def test_tables(tmp_path, name, text):
-    assert read_classes(table(tmp_path, text, name)) == {1: "bed", 300: "night stand"}
+    found = find_table(table(tmp_path, text, name))
+    assert read_class_table(found) == {1: "bed", 300: "night stand"}
 
 
 def test_one_table_a_room(tmp_path):
-    with pytest.raises(InputError, match=r"has no classes\.json or classes\.csv; one table says"):
-        read_classes(tmp_path)
+    with pytest.raises(
+        InputError, match=r"has no classes\.json or .* or panoptic\.json; one table"
+    ):
+        find_table(tmp_path)
     table(table(tmp_path, "{}"), "", "classes.csv")
-    with pytest.raises(InputError, match="has two tables of classes"):
-        read_classes(tmp_path)
+    with pytest.raises(InputError, match=r"has classes\.json and classes\.csv; one table says"):
+        find_table(tmp_path)
 
 
 def test_label_sets(tmp_path):

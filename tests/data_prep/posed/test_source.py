@@ -92,22 +92,20 @@ def test_one_room_is_a_folder_of_rooms(source, rooms, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"No folder at .*; prep-posed reads a folder of rooms"):
         find_rooms(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"holds no transforms\.json, and none of its sub-folders"):
+    with pytest.raises(InputError, match=r"holds no transforms\.json and no model of COLMAP"):
         find_rooms(tmp_path / "empty")
 
 
-def test_frames_in_files_by_split_are_to_be_joined(rooms, tmp_path):
-    for split in ("train", "val"):
-        text = (rooms[0].folder / "transforms.json").read_text()
-        (rooms[0].folder / f"transforms_{split}.json").write_text(text)
-    assert len(survey(PosedSource(rooms[0].folder, SET)).rooms) == 1
-    (rooms[0].folder / "transforms.json").unlink()
-    shutil.rmtree(rooms[0].folder / "instances")
-    hint = r"join the `frames` of transforms_train\.json, transforms_val\.json in one file of that"
-    with pytest.raises(InputError, match=hint):
-        survey(PosedSource(rooms[0].folder, SET))
-    (lost,) = survey(PosedSource(rooms[0].folder.parent, SET)).left_out
-    assert lost.room_id == "room_0" and "transforms.json is missing: join the" in lost.reason
+def test_files_by_split_make_a_room_a_room(rooms):
+    folder = rooms[0].folder
+    (folder / "transforms.json").rename(folder / "transforms_train.json")
+    assert len(survey(PosedSource(folder, SET)).rooms) == 1
+    assert len(survey(PosedSource(folder.parent, SET)).rooms) == 4
+    shutil.rmtree(folder / "instances")
+    with pytest.raises(InputError, match="none of its 5 frames has a PNG of instance ids"):
+        survey(PosedSource(folder, SET))
+    (lost,) = survey(PosedSource(folder.parent, SET)).left_out
+    assert lost.room_id == "room_0" and "transforms_train.json: none of" in lost.reason
 
 
 def test_rooms_of_another_size_are_left_out_with_the_reason(source, rooms):
@@ -176,7 +174,7 @@ def test_assumptions_are_said_before_the_work(source, rooms):
     rooms[0].write()
     rooms[1].write(floor_m=0.0)
     said = PosedSource(source.folder, SET, PosedSettings(up="y")).assumptions()
-    assert said[0].startswith("1 of 4 rooms give no floor_m: the floor is assumed 1.2 m below the")
+    assert said[0].startswith("1 of 4 rooms give no floor_m: the floor is where the lowest")
     assert said[1].startswith("2 of 4 rooms give no metres_per_unit: poses are taken as metres;")
     assert said[2] == (
         "In 4 of 4 rooms the tops of the pictures point along z, but y is taken as up: is it "
@@ -204,7 +202,6 @@ def test_the_command(rooms, tmp_path, cli):
     assert made.exit_code == 0, made.output
     assert "Note: 1 of 4 rooms give no floor_m" in made.stderr
     assert "train 3 rooms, 15 views" in made.stdout
-    assert "To train on them: sceneprior fit --set 'label_set=void,bed,chair'" in made.stdout
     assert json.loads((tmp_path / "shards/index.json").read_text())["label_set"] == SET
     looked = cli("inspect", tmp_path / "shards", "--room", "room_0")
     assert looked.exit_code == 0 and "unknown" in looked.stdout, looked.output

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from posed_files import PosedRoom
 
-from data_prep.posed.transforms import frame_intrinsics, read_transforms, room_name
+from data_prep.posed.recording import frame_intrinsics, room_name
+from data_prep.posed.transforms import read_recording
 from sceneprior.errors import InputError
 
 
@@ -17,7 +18,7 @@ def room(tmp_path):
 
 def refusal(folder):
     with pytest.raises(InputError) as error:
-        recording = read_transforms(folder)
+        recording = read_recording(folder)
         for frame in recording.frames:
             frame_intrinsics(frame, (96, 128))
     return str(error.value)
@@ -30,7 +31,7 @@ def test_frames_poses_and_their_files(room):
     data["frames"][3] |= {"instance_path": "elsewhere/3.png"}
     room.folder.mkdir()
     room.write_transforms(data | {"floor_m": -1, "floor_center_m": [1, 2.5]})
-    recording = read_transforms(room.folder)
+    recording = read_recording(room.folder)
     inside = [str(frame.instances.relative_to(room.folder)) for frame in recording.frames]
     assert inside == [
         "instances/frame_00000.png", "instances/r_1.png", "instances/frame.0002.png",
@@ -66,9 +67,9 @@ def test_room_names(tmp_path, monkeypatch):
         ({"w": 12.5}, "frame 'images/frame_00000.jpg': w, h are 12.5, 96.0; expected pixel counts"),
         ({"fl_x": None}, "has no fl_x and no camera_angle_x, here or for the whole file"),
         ({"fl_x": -1}, "fl_x, fl_y are -1.0, 80.0; expected above 0"),
-        ({"k2": 0.03}, "its lens is distorted (k2 = 0.03); undistort the pictures first"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "its camera_model is OPENCV_FISHEYE, not a pinhole;"),
-        ({"is_fisheye": True}, "its camera_model is fisheye, not a pinhole; undistort the pict"),
+        ({"k4": 0.03}, "its k4 is 0.03, which OPENCV does not have."),
+        ({"camera_model": "FULL_OPENCV"}, "its camera_model is FULL_OPENCV; expected a pinhole,"),
+        ({"is_fisheye": True, "p2": 0.1}, "its p2 is 0.1, which OPENCV_FISHEYE does not have."),
         ({"metres_per_unit": 0}, "metres_per_unit is '0'; input should be greater than 0."),
         ({"floor_center_m": [1]}, "floor_center_m.1 is '[1]'; field required."),
         (
@@ -95,7 +96,7 @@ def test_a_wrong_key_is_a_sentence(room, changes, said):
         ({"instance_path": "a\0b"}, "instance_path is "),
         ({"mask_path": ""}, "mask_path is ''; string should have at least 1 character."),
         ({"file_path": "other/frame_00000.png"}, "would share the ids in "),
-        ({"k1": 1e-3}, "its lens is distorted (k1 = 0.001)"),
+        ({"k4": 1e-3}, "its k4 is 0.001, which OPENCV does not have."),
     ],
 )
 def test_a_wrong_frame_is_named(room, changes, said):
@@ -129,7 +130,7 @@ def test_nothing_random_is_a_traceback(room, numbers):
         target[str(numbers.choice(list(target)))] = values[numbers.integers(len(values))]
         room.write_transforms(data)
         try:
-            for frame in read_transforms(room.folder).frames:
+            for frame in read_recording(room.folder).frames:
                 frame_intrinsics(frame, (96, 128))
         except InputError as error:
             assert len(str(error)) > 30

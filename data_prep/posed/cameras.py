@@ -1,0 +1,115 @@
+"""Puts the cameras of a posed room into the room frame: up, the floor, the middle."""
+
+import numpy as np
+
+from data_prep.frames import is_pose, room_cameras
+from data_prep.posed.recording import Recording
+from sceneprior.errors import InputError
+
+UP = ("auto", "z", "y", "cameras")
+_GL_TO_CV = np.diag([1.0, -1, -1, 1])
+_Y_UP = {
+    "y": np.eye(4),
+    # (x, y, z) with z up -> (x, z, -y); right-handed as before.
+    "z": np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
+}
+_LARGEST_SPREAD_M = 100.0
+_LEAST_TURN = 0.1
+"""Of the cameras' sideways axes, the second of their singular values relative to the first: cameras
+that all look the same way do not tell how they were tilted."""
+
+
+def upright_cameras(
+    recording: Recording, frames: list[int], up: str, metres_per_unit: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cameras in a world whose y points up, in metres: camera-to-world, (views, 4, 4), OpenCV axes,
+    and (4, 4) from the file's world (in metres) to this one.
+
+    Args:
+        up: One of `UP`; `auto` is z, but `cameras` for a world without an axis that points up.
+
+    Raises:
+        InputError: the cameras are spread too far for metres, or do not tell which way is up.
+    """
+    poses = np.stack([recording.frames[i].camera_to_world for i in frames])
+    poses[:, :3, 3] *= recording.metres_per_unit or metres_per_unit
+    if up == "auto":
+        up = "z" if recording.leveled else "cameras"
+    turn = _turn_of_cameras(recording, poses) if up == "cameras" else _Y_UP[up]
+    upright = turn @ poses
+    spread = np.ptp(upright[:, :3, 3], axis=0).max()
+    if spread > _LARGEST_SPREAD_M:
+        raise InputError(
+            f"{recording.path}: its cameras are spread over {spread:.0f} m; is "
+            "metres_per_unit wrong?"
+        )
+    return upright @ _GL_TO_CV, turn
+
+
+def _turn_of_cameras(recording: Recording, poses: np.ndarray) -> np.ndarray:
+    """Cameras that are held upright have sideways axes that are level, however they look up or
+    down: up is the direction at right angles to all of them."""
+    _, strength, axes = np.linalg.svd(poses[:, :3, 0])
+    if len(strength) < 2 or strength[1] < _LEAST_TURN * strength[0]:
+        raise InputError(
+            f"{recording.path}: its cameras all look about the same way, which does not tell which "
+            "way is up; turn the poses until an axis points up, and name it with --up."
+        )
+    y = axes[2] * np.sign(axes[2] @ poses[:, :3, 1].sum(axis=0))
+    x = np.eye(3)[np.argmin(np.abs(y))]
+    x = x - (x @ y) * y
+    x /= np.linalg.norm(x)
+    turn = np.eye(4)
+    turn[:3, :3] = x, y, np.cross(x, y)
+    return turn
+
+
+def cameras_in_room(
+    recording: Recording, upright: np.ndarray, turn: np.ndarray, floor: float
+) -> np.ndarray:
+    """World-to-camera transforms in the room frame, (views, 4, 4).
+
+    The room frame: y up; the floor at 0; the origin below the middle of the cameras, where the file
+    gives no `floor_center_m`.
+
+    Args:
+        upright, turn: See `upright_cameras`.
+        floor: Height of the floor in that world.
+
+    Raises:
+        InputError: the lowest camera is below the floor.
+    """
+    eyes = upright[:, :3, 3]
+    low, high = eyes.min(axis=0), eyes.max(axis=0)
+    if low[1] <= floor:
+        raise InputError(
+            f"{recording.path}: its lowest camera is at {low[1]:.2f} m, below the floor at "
+            f"{floor:.2f} m; check floor_m, metres_per_unit and --up."
+        )
+    middle = (low[0] + high[0]) / 2, (low[2] + high[2]) / 2
+    if recording.floor_center_m is not None:
+        first, second = recording.floor_center_m
+        level = [axis for axis in range(3) if abs(turn[1, axis]) < 0.5]
+        if len(level) != 2 or not np.isin(np.abs(turn), (0.0, 1.0)).all():
+            raise InputError(
+                f"{recording.path}: floor_center_m is along two level axes, but none of this "
+                "world's is level; leave it out, or turn the poses and name the axis with --up."
+            )
+        center = np.zeros(4)
+        center[level] = first, second
+        x, _, z, _ = turn @ center
+        middle = x, z
+    room_from_upright = np.eye(4)
+    room_from_upright[:3, 3] = -middle[0], -floor, -middle[1]
+    return room_cameras(upright, room_from_upright)
+
+
+def seems_up(recording: Recording) -> str | None:
+    """Which axis the tops of the pictures point along, `y` or `z`; None where neither is clear."""
+    poses = np.stack([frame.camera_to_world for frame in recording.frames])
+    tops = poses[is_pose(poses), :3, 1]
+    if not len(tops):
+        return None
+    mean = tops.mean(axis=0)
+    best = "y" if mean[1] > mean[2] else "z"
+    return best if max(mean[1], mean[2]) > 0.7 else None

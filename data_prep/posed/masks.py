@@ -1,0 +1,107 @@
+"""Reads the masks of a room: ids of its instances, through straightened lenses, sampled down."""
+
+from pathlib import Path
+
+import numpy as np
+
+from data_prep.frames import mask_intrinsics, sampled_lines
+from data_prep.posed.labels import find_table
+from data_prep.posed.lens import Lens, Straightened, straighten
+from data_prep.posed.panoptic import FILE_NAME as PANOPTIC
+from data_prep.posed.panoptic import read_panoptic
+from data_prep.posed.recording import PosedFrame, frame_intrinsics
+from sceneprior.errors import InputError
+from sceneprior.instances.pngs import mask_size, read_mask
+from sceneprior.instances.tables import IdTable, read_class_table
+
+
+def png_size(folder: Path, frame: PosedFrame) -> tuple[int, int]:
+    """(height, width) of a frame's PNG of ids."""
+    return mask_size(frame.instances, rgb=find_table(folder).name == PANOPTIC)
+
+
+class RoomMasks:
+    """The masks of one room, all of one size, and what there is to say about them.
+
+    Args:
+        folder: The room's.
+        label_set_name: As `sceneprior.classes.label_set` takes it.
+        size: (height, width) of every PNG.
+        stored: (height, width) of the images that are made of them.
+
+    Raises:
+        InputError: the room's table of classes cannot be used.
+    """
+
+    def __init__(
+        self, folder: Path, label_set_name: str, size: tuple[int, int], stored: tuple[int, int]
+    ):
+        table = find_table(folder)
+        if table.name == PANOPTIC:
+            panoptic = read_panoptic(table, label_set_name)
+            of_id, self._read = panoptic.classes, panoptic.read
+        else:
+            of_id, self._read = read_class_table(table), read_mask
+        self.table = IdTable(of_id, label_set_name, str(folder))
+        self._size, self._stored = size, stored
+        self._views: dict[tuple[Lens, bytes], Straightened] = {}
+
+    @property
+    def notes(self) -> list[str]:
+        """What has been left out or changed so far."""
+        notes = list(self.table.notes)
+        if self.table.unlisted:
+            listed = ", ".join(map(str, sorted(self.table.unlisted)[:20]))
+            notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
+        for lens in dict.fromkeys(lens for lens, _ in self._views):
+            cut = max(view.cut_share for (other, _), view in self._views.items() if other == lens)
+            notes.append(f"the lens {lens} is straightened; {cut:.0%} of its pictures is cut away")
+        return notes
+
+    def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray]:
+        """(height, width) uint32 ids for `observe`, as stored, and (3, 3) intrinsics of them.
+
+        Raises:
+            InputError: a PNG is missing, damaged or of another size, or the camera cannot be used.
+        """
+        values = self._values(frame)
+        K, picture = frame_intrinsics(frame, self._size)
+        # That function counts pixel centres in whole numbers, as ScanNet does.
+        K = mask_intrinsics(_counted_from_0(K), picture, self._size, self._size)
+        if not (lens := frame.camera.lens).is_straight:
+            key = lens, K.tobytes()
+            if key not in self._views:
+                try:
+                    self._views[key] = straighten(lens, K, self._size)
+                except InputError as error:
+                    raise InputError(f"frame '{frame.name}': {error}") from None
+            view = self._views[key]
+            K, values = view.intrinsics, values[view.rows, view.columns]
+        lines = [sampled_lines(*sides) for sides in zip(self._size, self._stored, strict=True)]
+        sampled = mask_intrinsics(_counted_from_0(K), self._size, self._size, self._stored)
+        return self.table.ids(values[np.ix_(*lines)]), sampled
+
+    def _values(self, frame: PosedFrame) -> np.ndarray:
+        """Ids of one frame, int32; -1 where nothing is known."""
+        ids = self._read(frame.instances).astype(np.int32)
+        size = self._size
+        if ids.shape != size:
+            raise InputError(
+                f"{frame.instances} is {ids.shape[1]} x {ids.shape[0]} pixels, but the first "
+                f"frame's {size[1]} x {size[0]}; a room has one size"
+            )
+        if frame.known is not None:
+            known = read_mask(frame.known)
+            if known.shape != size:
+                raise InputError(
+                    f"{frame.known} is {known.shape[1]} x {known.shape[0]} pixels, but the ids "
+                    f"{size[1]} x {size[0]}"
+                )
+            ids[known == 0] = -1
+        return ids
+
+
+def _counted_from_0(K: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    return matrix

@@ -1,0 +1,159 @@
+"""Evaluate generated rooms where real ones are known from views alone, as posed captures are."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from sceneprior.classes import VOID, label_set
+from sceneprior.data.dataset import ViewDataset, allowed_views
+from sceneprior.errors import InputError
+from sceneprior.evaluation.bootstrap import METHOD, Estimate, mean_of_rooms, resample_counts
+from sceneprior.evaluation.metrics.contents import (
+    TYPE_CLASSES,
+    class_counts,
+    common_label_set,
+    emptiness,
+    frequency_kl,
+)
+from sceneprior.evaluation.metrics.overlaps import room_overlaps
+from sceneprior.evaluation.registry import METRICS
+from sceneprior.evaluation.synthesis import FORMAT, VERSION, EvalOptions
+from sceneprior.experiments.evaluate_samples import has_meshes, mask_iou_of_rooms
+from sceneprior.scene import Scene
+from sceneprior.shards import iterate_rooms, list_shards
+from sceneprior.training.method import TrainedPrior
+
+VIEWS = 4
+"""Of each training room, in which its decoded masks are compared."""
+_BATCH = 8
+_NOTE = (
+    "The rooms of these shards are known from views alone: their objects are counted as cameras "
+    "saw them, and what compares with true rooms in 3D is left out."
+)
+
+
+def known_from_views_alone(shards: Path, split: str) -> bool:
+    """Whether a room of a split lacks a ground truth; a ShardError where there is no room."""
+    list_shards(shards, split)
+    return any(not shard.has_ground_truth(room) for shard, room in iterate_rooms(shards, split))
+
+
+def evaluate_from_views(
+    generated: Sequence[Scene], shards: Path, options: EvalOptions
+) -> dict[str, Any]:
+    """Scores by key of `METRICS`, of those that need no room in 3D, as `evaluate_synthesis` has
+    them: of generated rooms, of real training rooms, and of the rooms compared with (`_test`).
+
+    Raises:
+        InputError: no rooms, or other classes than the shards'.
+    """
+    names = common_label_set(generated)
+    rooms = {split: _counted(shards, split, names) for split in ("train", options.split)}
+    counts = {
+        "generated": class_counts(generated), "train_rooms": rooms["train"],
+        "test": rooms[options.split],
+    }  # fmt: skip
+    draws = {
+        name: resample_counts(len(table), options.resamples, (options.seed, number))
+        for number, (name, table) in enumerate(counts.items())
+    }
+    columns: dict[str, dict[str, Estimate]] = {}
+    for name, table in counts.items():
+        found = {"mean_objects": mean_of_rooms(table.sum(axis=1), draws[name])}
+        if wanted := TYPE_CLASSES.get(names):
+            held = table[:, [label_set(names).index(label) for label in wanted]].any(axis=1)
+            found["type_share"] = mean_of_rooms(held.astype(float), draws[name], 1.0)
+        if name != "test":
+            pairs = (table, counts["test"], draws[name], draws["test"])
+            found["category_kl"] = _category_kl(*pairs)
+        columns[name] = found
+    volumes = [room_overlaps(scene).volume_m3 for scene in generated]
+    columns["generated"]["overlap_volume_m3"] = mean_of_rooms(volumes, draws["generated"])
+    values = {name: {k: v.value for k, v in found.items()} for name, found in columns.items()}
+    measured = columns["generated"]
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        **values["generated"],
+        **{f"{key}_test": value for key, value in values["test"].items()},
+        "train_rooms": values["train_rooms"],
+        "intervals": {
+            name: {key: estimate.interval() for key, estimate in found.items()}
+            for name, found in columns.items()
+        },
+        "note": " ".join(filter(None, (emptiness(generated), _NOTE))),
+        "protocol": {
+            "label_set": names,
+            "shards": Path(shards).resolve().name,
+            "split": options.split,
+            **{f"n_{name}": len(table) for name, table in counts.items()},
+            "seed": options.seed,
+            "resamples": options.resamples,
+            "intervals": METHOD,
+            "left_out": {m.key: "rooms in 3D" for m in METRICS if m.key not in measured},
+        },
+    }
+
+
+def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
+    """Mean IoU of decoded training rooms' masks with observed ones, in views that training never
+    saw (`mask_iou_held_out`, where `data.view_fraction` left some out of every room), or else in
+    some that it did (`mask_iou_training_views`). Nothing where shapes are no meshes.
+
+    Raises:
+        InputError: the shards are not those of the run.
+    """
+    config = trained.config
+    if not has_meshes(config):
+        return {}
+    data = config.data
+    fewest = min(len(shard.read_room(r).visible) for shard, r in iterate_rooms(shards, "train"))
+    held_out = len(allowed_views(0, 0, fewest, data.view_fraction)) < fewest
+    rooms = ViewDataset(
+        shards, "train", views_per_room=VIEWS, rotations=data.rotations, seed=config.seed,
+        mask_step=data.mask_step, view_fraction=data.view_fraction, held_out=held_out,
+    )  # fmt: skip
+    if set(rooms.room_ids) != set(trained.room_ids):
+        raise InputError(
+            f"{shards} does not hold the training rooms of this run; give the shards it was "
+            "trained on with --shards."
+        )
+    total, pairs = 0.0, 0
+    rows = range(0, len(rooms), rooms.rotations)
+    for start in range(0, len(rows), _BATCH):
+        views = rooms.__getitems__([(row, 0) for row in rows[start : start + _BATCH]])
+        seen = int(views.visible.sum())
+        if seen:
+            total, pairs = total + seen * mask_iou_of_rooms(trained, views), pairs + seen
+    key = "mask_iou_held_out" if held_out else "mask_iou_training_views"
+    return {key: total / pairs} if pairs else {}
+
+
+def _counted(shards: Path, split: str, names: str) -> Int[np.ndarray, "rooms classes"]:
+    """Tracked objects of each class in each room, void left out."""
+    tables = []
+    for shard, room_id in iterate_rooms(shards, split):
+        if shard.label_set != names:
+            raise InputError(
+                f"Scores compare scenes of one label set, but the scenes have '{names}' and "
+                f"{shards} '{shard.label_set}'."
+            )
+        labels = shard.read_room(room_id).object_class
+        tables.append(np.bincount(labels, minlength=len(label_set(names))))
+    table = np.stack(tables).astype(np.int64)
+    table[:, VOID] = 0
+    return table
+
+
+def _category_kl(
+    table: np.ndarray, test: np.ndarray, draws: np.ndarray, test_draws: np.ndarray
+) -> Estimate:
+    def shares(counts: np.ndarray) -> np.ndarray:
+        return np.asarray(counts / np.maximum(counts.sum(axis=-1, keepdims=True), 1))
+
+    resamples = zip(shares(test_draws @ test), shares(draws @ table), strict=True)
+    value = frequency_kl(shares(test.sum(axis=0)), shares(table.sum(axis=0)))
+    return Estimate(value, np.array([frequency_kl(p, q) for p, q in resamples]), 0.0)

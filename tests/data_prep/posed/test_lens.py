@@ -1,0 +1,74 @@
+"""Lenses are bent as OpenCV bends them, and straightened pictures show what a pinhole would."""
+
+import cv2
+import numpy as np
+import pytest
+
+from data_prep.posed.lens import Lens, straighten
+from sceneprior.errors import InputError
+
+K = np.array([[80.0, 0, 63], [0, 82, 49], [0, 0, 1]])
+SIZE = (96, 128)
+LENSES = [
+    Lens((-0.28, 0.07, 0.001, -0.0005, 0.01)),
+    Lens((0.1, 0.02, 0.0, 0.002, 0.0)),
+    Lens((-0.0024, 0.0, 0.0, 0.0, 0.0)),  # a real phone's
+    Lens((0.02, -0.01, 0.003, -0.001), fisheye=True),
+    Lens((0.0, 0.0, 0.0, 0.0), fisheye=True),
+]
+
+
+def opencv(lens, points):
+    """OpenCV's own answer: (n, 2) on the plane at depth 1 -> as the lens bends it."""
+    rays = np.concatenate([points, np.ones((len(points), 1))], axis=1).reshape(-1, 1, 3)
+    project = cv2.fisheye.projectPoints if lens.fisheye else cv2.projectPoints
+    bent, _ = project(rays, np.zeros(3), np.zeros(3), np.eye(3), np.array(lens.coefficients))
+    return bent.reshape(-1, 2)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=str)
+def test_rays_bend_as_in_opencv(lens, rng):
+    points = rng.uniform(-0.9, 0.9, (200, 2))
+    bent = lens.distort(points)
+    np.testing.assert_allclose(bent, opencv(lens, points), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(lens.undistort(bent), points, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=str)
+def test_each_pixel_is_the_nearest_that_saw_its_ray(lens):
+    view = straighten(lens, K, SIZE)
+    v, u = np.indices(SIZE) + 0.5
+    rays = (np.stack([u, v], axis=-1).reshape(-1, 2) - view.intrinsics[:2, 2]) / np.diag(
+        view.intrinsics
+    )[:2]
+    seen = opencv(lens, rays) * np.diag(K)[:2] + K[:2, 2]
+    off = seen - np.stack([view.columns, view.rows], axis=-1).reshape(-1, 2) - 0.5
+    # Half a pixel to the nearest centre, and as much again where the rim bends between its points.
+    assert np.abs(off).max() <= 1.0 and np.abs(off).mean() < 0.27
+    # It is the largest such view: each side of the picture is reached.
+    assert view.columns.min() == 0 and view.columns.max() == 127
+    assert view.rows.min() == 0 and view.rows.max() == 95
+    assert 0 <= view.cut_share < 0.2
+
+
+def test_a_straight_lens_changes_nothing():
+    assert Lens().is_straight and not Lens((1e-3, 0, 0, 0, 0)).is_straight
+    assert not Lens((0.0,) * 4, fisheye=True).is_straight
+    view = straighten(Lens(), K, SIZE)
+    np.testing.assert_allclose(view.intrinsics, K, atol=1e-9)
+    np.testing.assert_array_equal(view.rows, np.indices(SIZE)[0])
+    np.testing.assert_array_equal(view.columns, np.indices(SIZE)[1])
+    assert view.cut_share == 0
+
+
+def test_of_a_lens_that_sees_more_than_half_the_world_the_middle_is_kept():
+    wide = K * [[0.4, 1, 1], [1, 0.4, 1], [1, 1, 1]]  # 115 degrees from the middle at the corners
+    view = straighten(Lens((0.0,) * 4, fisheye=True), wide, SIZE)
+    assert view.cut_share > 0.5
+    half = np.degrees(np.arctan(view.intrinsics[0, 2] / view.intrinsics[0, 0]))
+    assert 50 < half <= 65.1
+
+
+def test_a_lens_that_folds_the_picture_over_is_refused():
+    with pytest.raises(InputError, match=r"its lens \(OPENCV -0.9, 0, 0, 0, 0\) bends so much"):
+        straighten(Lens((-0.9, 0.0, 0.0, 0.0, 0.0)), K, SIZE)
