@@ -55,16 +55,13 @@ def lifted_losses(
     goes_on = completeness_targets(
         rooms.is_object.sum(dim=-1), logits.shape[1], completeness_target
     )
-    needed = needed_predictions(rooms, logits.shape[1])
     every = F.binary_cross_entropy_with_logits(logits, goes_on.to(logits.dtype), reduction="none")
-    # A mean of all, as in `layout_losses`, with nothing for those that are not needed.
-    by_room = (every * needed).mean(dim=1, keepdim=True)
     predicted = take(predicted_boxes(scenes), matches.prediction, dim=1)
     apart = (predicted - rooms.boxes_m).abs().sum(dim=-1)
     return {
         "class": class_loss(scenes, rooms, matches),
         "box": mean_of_objects(PER_METRE * apart, matches.valid),
-        "completeness": mean_of_objects(by_room, needed[:, :1]),
+        "completeness": mean_of_objects(every, needed_predictions(rooms, logits.shape[1])),
     }
 
 
