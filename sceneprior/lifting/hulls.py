@@ -58,8 +58,10 @@ def sightings_of(views: RoomViews, rows: Int[np.ndarray, " views"], item: int) -
     assert views.instance_ids is not None, "lifting reads images"
     ids = views.instance_ids[rows]
     count, height, width = ids.shape
-    boxes = views.boxes[rows, item] * np.array([width, height, width, height])
-    boxes_px = np.rint(boxes).astype(np.int64)
+    size = np.array([width, height, width, height])
+    # Clipped, though they are in the image: what is compiled checks no index.
+    boxes_px = np.rint(np.nan_to_num(views.boxes[rows, item]) * size).clip(0, size).astype(np.int64)
+    boxes_px[:, 2:] = np.maximum(boxes_px[:, 2:], boxes_px[:, :2])
     columns, lines = (boxes_px[:, 2:] - boxes_px[:, :2] + 1).T
     ends = np.cumsum(columns * lines)
     table = np.empty(int(ends[-1]) if count else 0, dtype=np.int32)
