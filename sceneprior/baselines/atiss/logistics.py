@@ -10,6 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from sceneprior.sampler.mixtures import draw_index
+
 LEVELS = 256
 """Steps that [-1, 1] is told apart in. On continuous coordinates a density could grow without end
 where many rooms share a number; the probability of a step is at most 1."""
@@ -60,9 +62,3 @@ class LogisticMixture:
         mean = self.means.gather(-1, chosen)[..., 0]
         scale = self.log_scales.gather(-1, chosen)[..., 0].exp()
         return (mean + scale * torch.logit(place, eps=1e-6)).clamp(-1, 1)
-
-
-def draw_index(logits: Float[Tensor, "*batch choices"], uniform: Float[Tensor, "*batch"]) -> Tensor:
-    """(*batch) int64: one of the choices, by their probabilities, of a uniform number in [0, 1)."""
-    reached = logits.softmax(dim=-1).cumsum(dim=-1) <= uniform.unsqueeze(-1)
-    return reached.sum(dim=-1).clamp(max=logits.shape[-1] - 1)

@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from sceneprior.baselines.atiss.logistics import LogisticMixture, draw_index
+from sceneprior.baselines.atiss.logistics import LogisticMixture
 from sceneprior.models.layers import mlp
+from sceneprior.sampler.mixtures import draw_index
 from sceneprior.settings import Section
 from sceneprior.views import RoomBoxes
 

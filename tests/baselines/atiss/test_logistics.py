@@ -6,7 +6,8 @@ import torch
 from scipy import stats
 from torch.testing import assert_close
 
-from sceneprior.baselines.atiss.logistics import HALF_STEP, LEVELS, LogisticMixture, draw_index
+from sceneprior.baselines.atiss.logistics import HALF_STEP, LEVELS, LogisticMixture
+from sceneprior.sampler.mixtures import draw_index
 
 
 @pytest.fixture
