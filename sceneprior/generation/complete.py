@@ -105,7 +105,14 @@ def _drawn(
 ) -> list[list[Scene]]:
     """Answers of a run's sampler, by room."""
     names = [f"complete_{k:02d}" for k in range(count)]
-    coming = None if classes is None else class_rows(trained.config.label_set, classes)
+    coming = None if classes is None else class_rows(trained, classes)
+    most = trained.config.model.max_objects
+    fullest = int(given.is_object.sum(dim=1).max()) + len(classes or ())
+    if fullest > most:
+        raise InputError(
+            f"Given and asked-for objects are {fullest} together, but rooms of this run hold at "
+            f"most {most} (model.max_objects); ask for fewer."
+        )
     answers = []
     for scene, one in zip(scenes, given.split(1), strict=True):
         frame = None if scene.floor_m is None else floor_rectangle(scene).expand(count, -1)

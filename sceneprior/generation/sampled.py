@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sceneprior.classes import VOID, label_set
+from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.geometry.isosurface import surface_of
 from sceneprior.geometry.turns import quarter_rotation
@@ -30,7 +30,7 @@ def sample_scenes(
 
 def looks_to_scenes(trained: TrainedPrior, rooms: RoomBoxes, names: Sequence[str]) -> list[Scene]:
     """Rooms of objects that have looks, as the run's shape decoder makes them."""
-    assert rooms.looks is not None
+    assert rooms.looks is not None and trained.sampler is not None
     shapes = PrototypeMeshes(trained)
     classes = label_set(trained.config.label_set)
     scenes = []
@@ -38,20 +38,28 @@ def looks_to_scenes(trained: TrainedPrior, rooms: RoomBoxes, names: Sequence[str
         objects = []
         for item in rooms.is_object[row].nonzero()[:, 0].tolist():
             box = rooms.boxes_m[row, item].double().numpy()
-            mesh = shapes.mesh(int(rooms.looks[row, item]), box)
-            label = classes[int(rooms.object_class[row, item])]
+            look, index = int(rooms.looks[row, item]), int(rooms.object_class[row, item])
+            # A given object may be of a class that has no look, and then it has no shape.
+            known = int(trained.sampler.look_class[look]) == index
+            mesh = shapes.mesh(look, box) if known else None
+            label = classes[index]
             objects.append(SceneObject(label, tuple(box[:3]), tuple(box[3:]), mesh))
         scenes.append(Scene(name, trained.config.label_set, tuple(objects)))
     return scenes
 
 
-def class_rows(label_set_name: str, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:
-    """Classes by name, as `Given.coming` takes them; an `InputError` for one that is none."""
-    classes = label_set(label_set_name)
+def class_rows(trained: TrainedPrior, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:
+    """Classes by name, as `Given.coming` takes them; an `InputError` for one that the sampler has
+    never seen."""
+    assert trained.sampler is not None
+    classes = label_set(trained.config.label_set)
+    looks = trained.sampler.look_class
+    known = [classes[row] for row in looks[looks >= 0].unique().tolist()]
     for label in labels:
-        if label not in classes or classes.index(label) == VOID:
+        if label not in known:
             raise InputError(
-                f"'{label}' is no class of this run; choose from {', '.join(classes[1:])}."
+                f"'{label}' is no class of this run's training rooms; choose from "
+                f"{', '.join(known)}."
             )
     return torch.tensor([[classes.index(label) for label in labels]], dtype=torch.int64)
 

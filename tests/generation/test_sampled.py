@@ -112,6 +112,18 @@ def test_classes_and_floor_are_kept_to(trained):
         complete(trained, [room], classes=["piano"])
 
 
+def test_too_many_and_unknown_classes_are_sentences(trained):
+    some = next(item.label for made in synthesize(trained, 20, 0) for item in made.objects)
+    with pytest.raises(InputError, match="are 7 together"):
+        complete(trained, [scene(BED)], classes=[some] * 6)
+    unseen = "dressing_table"  # in the label set, in no toy room
+    with pytest.raises(InputError, match="no class of this run's training rooms"):
+        complete(trained, [scene()], classes=[unseen])
+    stool = SceneObject(unseen, (0.0, 0.3, 0.0), (0.5, 0.6, 0.5))
+    ((_, (answer,)),) = complete(trained, [scene(stool)], count=1)
+    assert answer.objects[0].label == unseen and answer.objects[0].mesh is None
+
+
 def test_several_rooms_are_completed_at_once(trained):
     both = complete(trained, [scene(BED), scene()], count=2)
     assert [len(answers) for _, answers in both] == [2, 2]
