@@ -87,15 +87,13 @@ class DecodedScenes:
     """How far the edges of the proxy `beveled_box` are cut off (`geometry.meshes`); None
     for rooms that no prior decoded."""
     vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
-    """Mesh vertices in the room frame; None until the shape decoder ran, or where it makes grids.
+    """Mesh vertices in the room frame; None until the shape decoder ran, or where it chooses looks.
     """
     shape_codes: Float[Tensor, "rooms objects codes"] | None = None
-    """What `occupancy` is a weighted sum by (`models.occupancy`); None where shapes are meshes."""
-    occupancy: Float[Tensor, "rooms objects x y z"] | None = None
-    """Logits, positive inside the object, of the centres of cells that fill the box times
-    `margin`; None until the shape decoder ran, or where it makes meshes."""
-    margin: float = 1.0
-    """The frame of `occupancy` over the box."""
+    """What shapes are learnt as (`models.occupancy`); None where they are deformed meshes."""
+    looks: Int[Tensor, "rooms objects"] | None = None
+    """Which shape each object has, in which pose (`models/prototypes.py`); None until the shape
+    decoder ran, or where it makes meshes."""
 
 
 @dataclass(frozen=True)
@@ -113,10 +111,9 @@ class LiftedRooms(_Batch):
     """Whether the box is known: some view showed the object."""
     boxes_m: Float[Tensor, "rooms objects 6"]
     """Centre x, y, z, then full extents; axis-aligned, in the room frame."""
-    shape_codes: Float[Tensor, "rooms objects codes"] | None = None
-    """What its lifted shape is in the shape space of the training rooms."""
-    shape_cells: Float[Tensor, "rooms objects"] | None = None
-    """How many cells that shape fills; 1 for an empty one."""
+    looks: Int[Tensor, "rooms objects"] | None = None
+    """Which prototype in which pose its lifted shape is nearest to (`models/prototypes.py`); -1
+    where there is none."""
     room_ids: tuple[str, ...] = ()
 
 
@@ -137,7 +134,7 @@ class RoomBoxes(_Batch):
     """Turn about +y that takes +z to each piece's front, in [-pi, pi]; None: nobody knows."""
     looks: Int[Tensor, "rooms objects"] | None = None
     """Which prototype each object looks like, times 8, plus the pose in which it does
-    (`sampler/prototypes.py`); None: nobody knows."""
+    (`models/prototypes.py`); None: nobody knows."""
 
     def split(self, rooms: int) -> list["RoomBoxes"]:
         """Batches of at most so many rooms, without ids."""

@@ -11,8 +11,8 @@ from sceneprior.sampler.rooms import SamplerRooms
 from sceneprior.sampler.settings import SamplerConfig
 from sceneprior.sampler.stage import teach
 
-CLASSES, CODES, CELLS = 5, 7, 8
-TINY = {"epochs": 2, "width": 16, "layers": 1, "heads": 2, "dropout": 0.0, "prototypes": 12}
+CLASSES, CODES, CELLS, PROTOTYPES = 5, 7, 8, 12
+TINY = {"epochs": 2, "width": 16, "layers": 1, "heads": 2, "dropout": 0.0}
 
 
 class Lifted(LiftedDataset):
@@ -48,14 +48,16 @@ def lifted_rooms(count: int = 6, seed: int = 0) -> Lifted:
     return Lifted(boxes, classes, grids)
 
 
+def sampler_rooms(count: int = 6, seed: int = 0) -> SamplerRooms:
+    """The same with looks, of prototypes that the first six rooms have."""
+    return SamplerRooms(lifted_rooms(count, seed)).see_looks(lifted_rooms().find_prototypes(99))
+
+
 def small_decoder() -> OccupancyDecoder:
-    """A decoder whose space holds the shapes above."""
-    decoder = OccupancyDecoder(4, OccupancyConfig(codes=CODES, width=8, cells=CELLS, margin=1.0))
-    grids = lifted_rooms().grids()[:2].astype(np.float32)
-    apart = (grids[1] - grids[0]) / np.linalg.norm(grids[1] - grids[0])
-    basis = np.zeros((CODES, *grids.shape[1:]), np.float32)
-    basis[0] = apart
-    decoder.set_space(grids[0], basis, 1.0)
+    """A decoder that knows the shapes above."""
+    config = OccupancyConfig(prototypes=PROTOTYPES, codes=CODES, width=8, cells=CELLS, margin=1.0)
+    decoder = OccupancyDecoder(4, config)
+    decoder.learn_prototypes(lifted_rooms().find_prototypes(99))
     return decoder
 
 
@@ -63,6 +65,6 @@ def small_sampler(rooms: SamplerRooms, seed: int = 0, **settings: object) -> Roo
     """Untrained, but it knows its rooms."""
     torch.manual_seed(seed)
     config = SamplerConfig.model_validate({**TINY, **settings})
-    sampler = RoomSampler(config, CLASSES, CODES, max_objects=5)
-    teach(sampler, rooms, small_decoder())
+    sampler = RoomSampler(config, CLASSES, PROTOTYPES, max_objects=5)
+    teach(sampler, rooms)
     return sampler.eval()

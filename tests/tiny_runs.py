@@ -9,7 +9,7 @@ import yaml
 from sceneprior.config import RunConfig, check_config
 
 OCCUPANCY: dict[str, Any] = {
-    "model__shape": {"name": "occupancy", "codes": 6, "width": 8, "cells": 8},
+    "model__shape": {"name": "occupancy", "prototypes": 20, "codes": 6, "width": 8, "cells": 8},
     "shape": {
         "supervision": "lifted",
         "epochs": 3,

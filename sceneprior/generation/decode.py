@@ -4,15 +4,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from sceneprior.classes import VOID, label_set
 from sceneprior.errors import InputError
 from sceneprior.generation.sample import SAMPLER, draw_latents, scene_names, uses_sampler
 from sceneprior.generation.sampled import sample_scenes
-from sceneprior.geometry.isosurface import surface_of
 from sceneprior.losses.completeness import kept_objects
+from sceneprior.models.occupancy import OccupancyDecoder
+from sceneprior.models.prior import ScenePrior
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.training.method import TrainedPrior, TrainedSampler
 from sceneprior.views import DecodedScenes, RoomBoxes
@@ -31,7 +32,7 @@ class DecodedRoom(NamedTuple):
 
 def to_rooms(
     decoded: DecodedScenes,
-    faces: Int[Tensor, "faces 3"] | None,
+    prior: ScenePrior,
     label_set_name: str,
     names: Sequence[str],
     completeness_target: str = "first_n",
@@ -39,14 +40,14 @@ def to_rooms(
     """Objects up to where completeness says that the scene ends; their likeliest classes.
 
     `void` is a class like any other to the network, but no furniture: such objects are left out.
-    `faces` are those of decoded meshes (`ScenePrior.faces`).
+    `prior` is what decoded them.
     """
     kept = kept_objects(decoded.completeness_logits, completeness_target)
     kept = kept & (decoded.class_logits.argmax(dim=-1) != VOID)
     rooms = []
     for row, name in enumerate(names):
         predictions = kept[row].nonzero()[:, 0].tolist()
-        scene = scene_of(decoded, row, predictions, faces, label_set_name, name)
+        scene = scene_of(decoded, row, predictions, prior, label_set_name, name)
         rooms.append(DecodedRoom(scene, predictions, decoded.class_logits[row, predictions]))
     return rooms
 
@@ -55,7 +56,7 @@ def scene_of(
     decoded: DecodedScenes,
     row: int,
     predictions: Sequence[int],
-    faces: Int[Tensor, "faces 3"] | None,
+    prior: ScenePrior,
     label_set_name: str,
     name: str,
 ) -> Scene:
@@ -67,22 +68,20 @@ def scene_of(
         logits = decoded.class_logits[row, item].clone()
         logits[VOID] = -torch.inf
         center, size = (part[row, item].tolist() for part in (decoded.centers_m, decoded.sizes_m))
-        mesh = _mesh_of(decoded, row, item, faces)
+        mesh = _mesh_of(decoded, row, item, prior)
         objects.append(SceneObject(classes[int(logits.argmax())], tuple(center), tuple(size), mesh))
     return Scene(name, label_set_name, tuple(objects))
 
 
-def _mesh_of(
-    decoded: DecodedScenes, row: int, item: int, faces: Int[Tensor, "faces 3"] | None
-) -> Mesh | None:
-    """A prediction's mesh: as decoded, or the surface of its grid; None before the shape stage."""
-    if decoded.vertices_m is not None and faces is not None:
-        return Mesh(decoded.vertices_m[row, item].cpu().numpy(), faces.cpu().numpy())
-    if decoded.occupancy is None:
+def _mesh_of(decoded: DecodedScenes, row: int, item: int, prior: ScenePrior) -> Mesh | None:
+    """A prediction's mesh: as decoded, or that of its look; None before the shape stage."""
+    if decoded.vertices_m is not None and prior.faces is not None:
+        return Mesh(decoded.vertices_m[row, item].cpu().numpy(), prior.faces.cpu().numpy())
+    if decoded.looks is None:
         return None
-    parts = (decoded.occupancy, decoded.centers_m, decoded.sizes_m)
-    logits, center_m, size_m = (part[row, item].detach().cpu().numpy() for part in parts)
-    return Mesh(*surface_of(logits, center_m, size_m, decoded.margin))
+    assert isinstance(prior.shape, OccupancyDecoder), "looks are what it decodes"
+    parts = (decoded.centers_m[row, item], decoded.sizes_m[row, item])
+    return prior.shape.mesh(int(decoded.looks[row, item]), torch.cat(parts).double().cpu().numpy())
 
 
 @torch.no_grad()
@@ -90,13 +89,13 @@ def decode_rooms(
     trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: Sequence[str]
 ) -> list[DecodedRoom]:
     """Rooms of latents; with meshes once the shape stage has finished."""
-    config, faces = trained.config, trained.prior.faces
+    config = trained.config
     rooms: list[DecodedRoom] = []
     for start in range(0, len(z), BATCH):
         part = slice(start, start + BATCH)
         decoded = trained.prior.decode(z[part], with_shape=trained.stage != "layout")
         target = config.model.completeness_target
-        rooms += to_rooms(decoded, faces, config.label_set, names[part], target)
+        rooms += to_rooms(decoded, trained.prior, config.label_set, names[part], target)
     return rooms
 
 

@@ -9,12 +9,9 @@ from torch import Tensor
 
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
-from sceneprior.geometry.isosurface import surface_of
-from sceneprior.geometry.turns import quarter_rotation
 from sceneprior.models.occupancy import OccupancyDecoder
 from sceneprior.sampler.draw import Given, draw_rooms
-from sceneprior.sampler.prototypes import POSES, turn_of
-from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.scene import Scene, SceneObject
 from sceneprior.training.method import TrainedPrior
 from sceneprior.views import RoomBoxes
 
@@ -31,7 +28,8 @@ def sample_scenes(
 def looks_to_scenes(trained: TrainedPrior, rooms: RoomBoxes, names: Sequence[str]) -> list[Scene]:
     """Rooms of objects that have looks, as the run's shape decoder makes them."""
     assert rooms.looks is not None and trained.sampler is not None
-    shapes = PrototypeMeshes(trained)
+    shapes = trained.prior.shape
+    assert isinstance(shapes, OccupancyDecoder), "whose looks the sampler draws"
     classes = label_set(trained.config.label_set)
     scenes = []
     for row, name in enumerate(names):
@@ -69,30 +67,3 @@ def floor_rectangle(scene: Scene) -> Float[Tensor, "1 4"]:
     assert scene.floor_m is not None
     low, high = scene.floor_m.min(axis=0), scene.floor_m.max(axis=0)
     return torch.from_numpy(np.concatenate([(low + high) / 2, high - low])[None]).float()
-
-
-class PrototypeMeshes:
-    """Meshes of a sampler's prototypes, each decoded once: rooms by the thousand share them."""
-
-    def __init__(self, trained: TrainedPrior):
-        assert trained.sampler is not None and isinstance(trained.prior.shape, OccupancyDecoder)
-        self._codes, self._decoder = trained.sampler.prototype_codes, trained.prior.shape
-        self._unit: dict[
-            int, tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]
-        ] = {}
-
-    def mesh(self, look: int, box_m: Float[np.ndarray, "6"]) -> Mesh:
-        """A look's mesh in a box (centre, full extents)."""
-        prototype, pose = divmod(look, POSES)
-        if prototype not in self._unit:
-            with torch.no_grad():
-                logits = self._decoder.grids(self._codes[prototype][None, None])[0, 0].numpy()
-            self._unit[prototype] = surface_of(
-                logits, np.zeros(3), np.ones(3), self._decoder.margin
-            )
-        vertices, faces = self._unit[prototype]
-        quarters, mirrored = turn_of(pose)
-        if mirrored:  # turns its faces inside out: pass their corners the other way
-            vertices, faces = vertices * [-1, 1, 1], faces[:, ::-1].copy()
-        vertices = vertices @ quarter_rotation(quarters).T
-        return Mesh(vertices * box_m[3:] + box_m[:3], faces)

@@ -23,7 +23,8 @@ def surface_of(
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
     """The surface where an object's occupancy logits are 0, inside its box.
 
-    Matter beyond the box is cut off at the box's sides, and small floating pieces are dropped.
+    Of cells, those whose centres lie in the box count. What the outermost of them hold goes on to
+    the box's sides and ends there, with sharp corners. Small floating pieces are dropped.
 
     Args:
         logits: Positive inside the object; of the centres of cells that fill the frame.
@@ -59,30 +60,28 @@ def surface_of(
     if not np.isfinite(logits).all():
         raise ValueError("An occupancy logit is not a finite number, so there is no surface.")
     center_m, size_m = (np.asarray(value, dtype=np.float64) for value in (center_m, size_m))
-    # One cell more on every side, all outside the box, closes the surface.
-    padded = np.pad(logits, 1, mode="edge").clip(-SURE, SURE)
-    inside = inside_box(logits.shape, margin)
-    if not (padded > 0).any(where=inside > 0) or (padded > 0).all(where=inside > 0):
+    logits = logits.clip(-SURE, SURE)
+    within = [
+        np.abs((np.arange(cells) + 0.5) / cells - 0.5) * margin < 0.5 for cells in logits.shape
+    ]
+    inner = logits[np.ix_(*within)]
+    if not (inner > 0).any() or (inner > 0).all():
         return CUBE_CORNERS * size_m / 2 + center_m, BOX_FACES.copy()
-    field = without_small_pieces(np.minimum(padded, inside))
-    vertices, faces, *_ = marching_cubes(field.astype(np.float32), 0.0, gradient_direction="ascent")
+    # One cell more on every side reaches beyond the box; the next, empty, closes the surface there.
+    beyond = np.pad(without_small_pieces(inner), 1, mode="edge")
+    field = np.pad(beyond, 1, constant_values=-SURE).astype(np.float32)
+    vertices, faces, *_ = marching_cubes(field, 0.0, gradient_direction="ascent")
+    # Vertex i of the padded grid is the centre of cell i + first - 2.
+    first = np.array([np.argmax(each) for each in within])
+    unit = (vertices + (first - 1.5)) / np.array(logits.shape) - 0.5
+    # Flat sides first: decimation spends its faces elsewhere then. It moves corners out a little.
+    unit = (unit * margin).clip(-0.5, 0.5)
     if len(faces) > most_faces:
-        vertices, faces = fast_simplification.simplify(vertices, faces, target_count=most_faces)
-    # Vertex i of the padded grid is the centre of cell i - 1.
-    unit = (vertices.astype(np.float64) - 0.5) / np.array(logits.shape) - 0.5
-    unit = (unit * margin).clip(-0.5, 0.5)  # decimation moves corners out by up to a centimetre
+        unit, faces = fast_simplification.simplify(
+            unit.astype(np.float32), faces, target_count=most_faces
+        )
+        unit = unit.astype(np.float64).clip(-0.5, 0.5)
     return unit * size_m + center_m, faces.astype(np.int64)
-
-
-def inside_box(shape: tuple[int, ...], margin: float) -> Float[np.ndarray, "x y z"]:
-    """How far inside the box each cell's centre is, as a logit: 0 on the box's nearest side, SURE
-    one cell from it; of a grid with one cell more on every side than `shape`."""
-    depth = []
-    for cells in shape:
-        from_middle = np.abs(np.arange(-1, cells + 1) + 0.5 - cells / 2)
-        depth.append(cells / (2 * margin) - from_middle)
-    x, y, z = np.ix_(*depth)
-    return (SURE * np.minimum(np.minimum(x, y), z)).clip(-SURE, SURE)
 
 
 def without_small_pieces(field: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]:

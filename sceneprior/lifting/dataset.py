@@ -9,18 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
+from sceneprior.classes import VOID
 from sceneprior.data.dataset import BLANK, RoomDataset, allowed_views
 from sceneprior.files import write_whole
-from sceneprior.geometry.turns import turn_boxes, turn_grids
+from sceneprior.geometry.turns import turn_boxes
 from sceneprior.lifting.boxes import LiftedBoxes, lift_boxes
 from sceneprior.lifting.rays import RayPool, draw_rays
-from sceneprior.lifting.shapes import ShapeGrid, ShapeSpace, lift_shapes, shape_space
+from sceneprior.lifting.shapes import ShapeGrid, lift_shapes
 from sceneprior.lifting.thinning import thin_shapes
+from sceneprior.models.prototypes import Prototypes, choose_prototypes, turned_looks
 from sceneprior.shards import RoomViews, Shard, iterate_rooms
 from sceneprior.views import LiftedRooms
 
@@ -30,8 +32,6 @@ SHAPES_VERSION = 2
 
 RAYS_KEPT = 1024
 """Rays an object, from which shapes are thinned."""
-MOST_SHAPES = 4000
-"""A shape space is found from at most so many shapes, drawn with a fixed seed."""
 
 
 class LiftedDataset(RoomDataset):
@@ -44,7 +44,7 @@ class LiftedDataset(RoomDataset):
     Args:
         folder, split, rotations: See `RoomDataset`.
         view_fraction, seed: As for `ViewDataset`.
-        shape: Also lift shapes, onto such grids, and find their shape space; None does not.
+        shape: Also lift shapes, onto such grids; None does not.
 
     Raises:
         ShardError: a shard is missing, damaged, or of another label set than the first.
@@ -78,43 +78,61 @@ class LiftedDataset(RoomDataset):
         self._boxes_m = _padded(
             [np.hstack([boxes.centers_m, boxes.sizes_m]).astype(np.float32) for boxes in self.boxes]
         )
-        self.space: ShapeSpace | None = None
-        """Of all shapes in all turns of their rooms."""
         self.object_classes = np.concatenate([room.object_class for room in rooms]).astype(np.int64)
         """Of the objects of all rooms, one room after the other."""
         self._bits, self._cells = np.zeros((0, 0), dtype=np.uint8), 0
-        self._codes: Tensor | None = None
+        self._looks: Tensor | None = None
         """By room and quarter turn."""
-        self._filled: Tensor | None = None
         if shape is not None:
             self._bits = _find_shapes(folder, split, key, rooms, self.boxes, chosen, shape)
-            self._cells, grids = shape.cells, _unpacked(self._bits, shape.cells)
-            self.space = _spanned(grids, self.boxes, rotations, shape.codes)
-            filled = grids.sum(axis=(1, 2, 3)).clip(min=1).astype(np.float32)
-            self._filled = _padded(np.split(filled, np.cumsum(counts)[:-1]))
+            self._cells = shape.cells
 
-    def place_shapes(self, space: ShapeSpace) -> None:
-        """Find the places of all shapes in a space; until then, batches have no `shape_codes`.
+    @property
+    def usable(self) -> Bool[np.ndarray, " objects"]:
+        """Whether an object has a label and a box, and so a shape; one room after the other."""
+        known = np.concatenate([room.explained > 0 for room in self.boxes])
+        return known & (self.object_classes != VOID)
 
-        It is `self.space`, or what a checkpoint has of it: found again, on another processor, it
-        differs in its last bits.
+    @property
+    def sizes_m(self) -> Float[np.ndarray, "objects 3"]:
+        """Full extents, one room after the other; a metre where no object is usable."""
+        sizes_m = np.concatenate([room.sizes_m for room in self.boxes])
+        return np.where(self.usable[:, None], sizes_m, 1.0)
+
+    def find_prototypes(self, most: int) -> Prototypes:
+        """Shapes that stand for those of all usable objects."""
+        given = (self.grids(), self.sizes_m, self.object_classes, self.usable)
+        return choose_prototypes(*given, most)
+
+    def looks_of(self, prototypes: Prototypes) -> Int[np.ndarray, " objects"]:
+        """The look of each object, -1 where it is not usable or its class has none."""
+        looks = prototypes.looks_of(self.grids(), self.sizes_m, self.object_classes)
+        return np.where(self.usable, looks, -1)
+
+    def see_looks(self, prototypes: Prototypes) -> None:
+        """Find every object's look, in every turn of its room; until then, batches have none.
+
+        Prototypes are a checkpoint's, if there is one: found again, on another processor, they
+        may be others.
         """
-        grids = _unpacked(self._bits, len(space.mean))
-        ends = np.cumsum(self._counts.tolist())[:-1]
-        turned = [space.codes_of(turn_grids(grids, q)) for q in range(self.rotations)]
-        codes = torch.stack([_padded(np.split(each, ends)) for each in turned], dim=1)
-        self._codes = codes.to(self._counts.device)
+        looks = torch.from_numpy(self.looks_of(prototypes))[None].expand(self.rotations, -1)
+        turned = turned_looks(
+            looks.clamp(min=0), torch.arange(self.rotations), torch.zeros(self.rotations).bool()
+        )
+        turned = turned.where(looks >= 0, -1)
+        parts = turned.T.split(self._counts.tolist())
+        padded = torch.nn.utils.rnn.pad_sequence(list(parts), batch_first=True, padding_value=-1)
+        self._looks = padded.transpose(1, 2).to(self._counts.device)
 
     def grids(self) -> Bool[np.ndarray, "objects x y z"]:
         """The lifted shapes of the objects of all rooms; see `lift_shapes`."""
         return _unpacked(self._bits, self._cells)
 
     def to(self, device: torch.device | str) -> "LiftedDataset":
-        """Move all boxes and codes to `device`, where batches are then made."""
+        """Move all boxes and looks to `device`, where batches are then made."""
         self._counts, self._classes = self._counts.to(device), self._classes.to(device)
         self._lifted, self._boxes_m = self._lifted.to(device), self._boxes_m.to(device)
-        self._codes = None if self._codes is None else self._codes.to(device)
-        self._filled = None if self._filled is None else self._filled.to(device)
+        self._looks = None if self._looks is None else self._looks.to(device)
         return self
 
     def __getitems__(self, draws: list[tuple[int, int]]) -> LiftedRooms:
@@ -133,8 +151,7 @@ class LiftedDataset(RoomDataset):
             is_object=is_object,
             is_lifted=self._lifted[rooms, :widest] & is_object,
             boxes_m=turn_boxes(self._boxes_m[rooms, :widest], quarters),
-            shape_codes=None if self._codes is None else self._codes[rooms, quarters, :widest],
-            shape_cells=None if self._filled is None else self._filled[rooms, :widest].clamp(min=1),
+            looks=None if self._looks is None else self._looks[rooms, quarters, :widest],
             room_ids=tuple(self.plain_ids[room] for room in rooms.tolist()),
         )
 
@@ -204,21 +221,6 @@ def _unpacked(
 ) -> Bool[np.ndarray, "objects x y z"]:
     flat = np.unpackbits(bits, axis=1, count=cells**3).view(bool)
     return flat.reshape(-1, cells, cells, cells)
-
-
-def _spanned(
-    grids: Bool[np.ndarray, "objects x y z"],
-    boxes: Sequence[LiftedBoxes],
-    rotations: int,
-    codes: int,
-) -> ShapeSpace:
-    """The space of the shapes in all turns of their rooms."""
-    known = np.flatnonzero(np.concatenate([room.explained > 0 for room in boxes]))
-    if len(known) * rotations > MOST_SHAPES:
-        some = MOST_SHAPES // rotations
-        known = np.sort(np.random.default_rng(0).choice(known, some, replace=False))
-    turns = range(rotations)
-    return shape_space(np.concatenate([turn_grids(grids[known], q) for q in turns]), codes)
 
 
 def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -1,11 +1,9 @@
-"""What each tracked object may fill of its box, as far as its masks tell; and the space of shapes
-that those of a data set span."""
+"""What each tracked object may fill of its box, as far as its masks tell."""
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy import linalg
+from jaxtyping import Bool, Int
 
 from sceneprior.lifting.boxes import LiftedBoxes
 from sceneprior.lifting.hulls import carve, sightings_of
@@ -25,8 +23,6 @@ class ShapeGrid(NamedTuple):
     """Along each axis of a grid."""
     margin: float
     """A grid fills the object's box times this."""
-    codes: int
-    """Dimensions of the shape space; 0 for shapes alone."""
 
 
 def lift_shapes(
@@ -59,48 +55,3 @@ def lift_shapes(
         hull = carve(seen, low_m, high_m, cells, REACH, EMPTY)
         grids[item] = (hull.emptiness <= EMPTY) & inside & inside[:, None] & inside[:, None, None]
     return grids
-
-
-class ShapeSpace(NamedTuple):
-    """Grids as a mean plus a weighted sum of orthonormal ones: their principal components."""
-
-    mean: Float[np.ndarray, "x y z"]
-    basis: Float[np.ndarray, "codes x y z"]
-    spread: float
-    """Root mean square of the weights, over shapes and components."""
-
-    def codes_of(
-        self, grids: Bool[np.ndarray, "shapes x y z"]
-    ) -> Float[np.ndarray, "shapes codes"]:
-        """The weights that come nearest to grids. Distances between them are those between the
-        grids, summed over cells, but for what the components leave out."""
-        flat = self.basis.reshape(len(self.basis), self.mean.size)
-        parts = np.array_split(grids, max(1, len(grids) // 256))  # as floats 32 times as large
-        codes = [(part - self.mean).reshape(len(part), flat.shape[1]) @ flat.T for part in parts]
-        return np.concatenate(codes).astype(np.float32)
-
-
-def shape_space(grids: Bool[np.ndarray, "shapes x y z"], codes: int) -> ShapeSpace:
-    """The first principal components of shapes; zeros for those that fewer shapes do not have.
-
-    Source:
-        Leventon et al., "Statistical Shape Influence in Geodesic Active Contours", CVPR 2000, who
-        take components of distance fields.
-    """
-    mean = np.zeros(grids.shape[1:], np.float32)
-    basis = np.zeros((codes, *grids.shape[1:]), np.float32)
-    found = min(codes, len(grids) - 1)
-    if len(grids):
-        mean[:] = grids.mean(axis=0)
-    if found < 1:
-        return ShapeSpace(mean, basis, 1.0)
-    apart = (grids - mean).reshape(len(grids), -1)
-    # The products of shapes have the singular values of the shapes, squared, and there are far
-    # fewer shapes than cells.
-    products = (apart @ apart.T).astype(np.float64)
-    squares, turns = linalg.eigh(products, subset_by_index=(len(grids) - found, len(grids) - 1))
-    kept = squares[::-1] > 1e-6 * squares[-1]  # what is less is rounding
-    squares, turns = squares[::-1][kept], turns[:, ::-1][:, kept]
-    weights = (turns / np.sqrt(squares)).astype(np.float32)
-    basis[: len(squares)] = (weights.T @ apart).reshape(-1, *grids.shape[1:])
-    return ShapeSpace(mean, basis, float(np.sqrt(squares.sum() / (len(grids) * found))) or 1.0)

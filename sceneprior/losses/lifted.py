@@ -71,22 +71,23 @@ def predicted_boxes(scenes: DecodedScenes) -> Float[Tensor, "rooms objects 6"]:
 
 
 def shape_code_loss(
-    scenes: DecodedScenes, rooms: LiftedRooms, matches: Matches
+    scenes: DecodedScenes,
+    matches: Matches,
+    codes: Float[Tensor, "rooms objects codes"],
+    cells: Float[Tensor, "rooms objects"],
 ) -> Float[Tensor, ""]:
-    """The squared distance of decoded and lifted occupancies over the cells that the latter fill.
+    """The squared distance of decoded and lifted shapes over the cells that the latter fill.
 
         L_S = mean over objects of |a_k - a_j|_2^2 / cells_j
 
-    with a the weights of an orthonormal basis (`lifting.shapes.ShapeSpace`): what the components
-    leave out of a lifted shape, no weights could give, and no gradient comes from it. A lamp on a
-    cord fills a hundredth of its box: without the division, it would not be worth learning.
+    with a codes whose squared distances are numbers of cells. A lamp on a cord fills a hundredth
+    of its box: without the division, it would not be worth learning.
 
     Args:
         scenes: With `shape_codes`.
-        rooms: With `shape_codes` and `shape_cells`.
         matches: As `match_lifted` gives them.
+        codes, cells: Of the looks that the objects have (`OccupancyDecoder.targets`).
     """
-    assert scenes.shape_codes is not None, "the prior decodes grids"
-    assert rooms.shape_codes is not None and rooms.shape_cells is not None, "shapes were lifted"
-    apart = take(scenes.shape_codes, matches.prediction, dim=1) - rooms.shape_codes
-    return mean_of_objects(apart.square().sum(dim=-1) / rooms.shape_cells, matches.valid)
+    assert scenes.shape_codes is not None, "the prior decodes looks"
+    apart = take(scenes.shape_codes, matches.prediction, dim=1) - codes
+    return mean_of_objects(apart.square().sum(dim=-1) / cells, matches.valid)

@@ -81,7 +81,7 @@ class ScenePrior(nn.Module):
 
     @property
     def faces(self) -> Int[Tensor, "faces 3"] | None:
-        """The triangles of all decoded meshes; None where shapes are occupancy grids."""
+        """The triangles of all decoded meshes; None where shapes are looks."""
         return None if isinstance(self.shape, OccupancyDecoder) else self.shape.faces
 
     def forward(
@@ -96,11 +96,10 @@ class ScenePrior(nn.Module):
         with_shape: bool = True,
         wanted: Bool[Tensor, "rooms wanted"] | None = None,
     ) -> DecodedScenes:
-        """Decode rooms from points of the latent space; `with_shape` adds meshes or grids.
+        """Decode rooms from points of the latent space; `with_shape` adds meshes or looks.
 
         `wanted`, the first so many of each room, decodes as many objects as it has columns; where
-        it is false, vertices lie at their box's centre, grids are empty, and all else means
-        nothing. None: all N.
+        it is false, vertices lie at their box's centre, and all else means nothing. None: all N.
 
         Layouts stay float32 under autocast: bfloat16 would round 3 m to steps of 2 cm.
         """
@@ -111,7 +110,9 @@ class ScenePrior(nn.Module):
             layout, shared = self.layout(features.to(z.dtype))
         scenes = DecodedScenes(**layout._asdict(), bevels=self.bevels(layout.class_logits))
         if isinstance(self.shape, OccupancyDecoder):
-            scenes = replace(scenes, shape_codes=self.shape.codes(shared).to(z.dtype))
+            codes = self.shape(shared).to(z.dtype)
+            looks = self.shape.looks(codes) if with_shape else None
+            return replace(scenes, shape_codes=codes, looks=looks)
         if not with_shape:
             return scenes
         if wanted is None:
@@ -120,6 +121,4 @@ class ScenePrior(nn.Module):
             some = self.shape(shared[wanted].unsqueeze(0))[0].to(z.dtype)
             shapes = some.new_full((*wanted.shape, *some.shape[1:]), self.shape.nothing)
             shapes = shapes.index_put((wanted,), some)
-        if isinstance(self.shape, OccupancyDecoder):
-            return replace(scenes, occupancy=shapes, margin=self.shape.margin)
         return replace(scenes, vertices_m=place(shapes, layout.centers_m, layout.sizes_m))

@@ -119,11 +119,11 @@ def _reconstruct_batch(
     fit = fit_latents(trained, repeated, starts.flatten(0, 1), schedule, options.masks)
     best = fit.loss.score.reshape(len(images), -1).argmin(dim=1)
     rows = best + options.restarts * torch.arange(len(images))
-    faces, labels = trained.prior.faces, trained.config.label_set
+    labels = trained.config.label_set
 
     def answer(image: ObservedImage, row: int) -> Reconstruction:
         predictions = fit.loss.matches.prediction[row, : len(image.object_class)].tolist()
-        scene = scene_of(fit.scenes, row, predictions, faces, labels, image.name)
+        scene = scene_of(fit.scenes, row, predictions, trained.prior, labels, image.name)
         score, mask_iou = float(fit.loss.score[row]), float(fit.loss.mask_iou[row])
         return Reconstruction(image, scene, score, mask_iou, int(fit.steps[row]))
 

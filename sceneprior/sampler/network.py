@@ -9,9 +9,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.models.layers import mlp
+from sceneprior.models.prototypes import PARTS, POSES
 from sceneprior.sampler.mixtures import LogisticMixture, draw_index
 from sceneprior.sampler.placement import Placement
-from sceneprior.sampler.prototypes import PARTS, POSES
 from sceneprior.sampler.rooms import rectangle_sides, rectangles_of
 from sceneprior.sampler.settings import SamplerConfig
 from sceneprior.views import RoomBoxes
@@ -46,11 +46,10 @@ class RoomSampler(nn.Module):
     Args:
         settings: Its size.
         classes: Of the label set, void included.
-        codes: Numbers that a shape is, as `OccupancyDecoder` decodes it.
+        prototypes: Shapes that the prior decodes, at most.
         max_objects: Where drawing stops, if the end was not drawn before.
     """
 
-    prototype_codes: Tensor
     look_class: Tensor
     look_shown: Tensor
     rectangle_logits: Tensor
@@ -58,13 +57,12 @@ class RoomSampler(nn.Module):
     rectangle_factors: Tensor
     may_meet: Tensor
 
-    def __init__(self, settings: SamplerConfig, classes: int, codes: int, max_objects: int):
+    def __init__(self, settings: SamplerConfig, classes: int, prototypes: int, max_objects: int):
         super().__init__()
-        width, dropout, prototypes = settings.width, settings.dropout, settings.prototypes
+        width, dropout = settings.width, settings.dropout
         self.max_objects = max_objects
         # Found from the training rooms before the first step, and kept in checkpoints.
         looks = prototypes * POSES
-        self.register_buffer("prototype_codes", torch.zeros(prototypes, codes))
         self.register_buffer("look_class", torch.full((looks,), -1))
         self.register_buffer("look_shown", torch.zeros(looks, SHOWN))
         self.register_buffer("rectangle_logits", torch.zeros(RECTANGLES))

@@ -8,10 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from sceneprior.classes import VOID
 from sceneprior.geometry.turns import QUARTERS, turn_boxes
 from sceneprior.lifting.dataset import LiftedDataset
-from sceneprior.sampler.prototypes import Prototypes, choose_prototypes, turned_looks
+from sceneprior.models.prototypes import Prototypes, turned_looks
 from sceneprior.views import RoomBoxes
 
 GRAZE_M = 0.05
@@ -30,7 +29,6 @@ class SamplerRooms:
 
     Args:
         lifted: A split, with its shapes.
-        prototypes: What the looks are of; or a number: the most that are chosen from these rooms.
     """
 
     room_ids: tuple[str, ...]
@@ -38,33 +36,35 @@ class SamplerRooms:
     masks = None
     """Batches are made in the training process, as `ViewDataset` says."""
 
-    def __init__(self, lifted: LiftedDataset, prototypes: Prototypes | int):
+    def __init__(self, lifted: LiftedDataset):
         self.room_ids, self.label_set = lifted.room_ids, lifted.label_set
         self.plain_ids = tuple(lifted.plain_ids)
+        self._lifted = lifted
+        self.prototypes: Prototypes
+        self.rooms: RoomBoxes
+
+    def see_looks(self, prototypes: Prototypes) -> "SamplerRooms":
+        """Itself, with a look for every object, of prototypes that the prior decodes. Only then
+        are there `rooms`."""
+        lifted = self._lifted
         counts = [len(room.explained) for room in lifted.boxes]
-        classes, grids = lifted.object_classes, lifted.grids()
         boxes_m = np.concatenate([np.hstack([b.centers_m, b.sizes_m]) for b in lifted.boxes])
-        usable = np.concatenate([room.explained > 0 for room in lifted.boxes]) & (classes != VOID)
-        # What is left out has a box of nothing.
-        sizes_m = np.where(usable[:, None], boxes_m[:, 3:], 1.0)
-        if isinstance(prototypes, int):
-            prototypes = choose_prototypes(grids, sizes_m, classes, usable, prototypes)
-        self.prototypes = prototypes
-        looks = prototypes.looks_of(grids, sizes_m, classes)
-        usable &= looks >= 0
-        rows = np.split(np.arange(len(usable)), np.cumsum(counts)[:-1])
-        kept = [torch.from_numpy(row[usable[row]]) for row in rows]
+        looks = lifted.looks_of(prototypes)
+        rows = np.split(np.arange(len(looks)), np.cumsum(counts)[:-1])
+        kept = [torch.from_numpy(row[looks[row] >= 0]) for row in rows]
 
         def padded(values: np.ndarray) -> Tensor:
             return pad_sequence([torch.from_numpy(values)[row] for row in kept], batch_first=True)
 
+        self.prototypes = prototypes
         self.rooms = RoomBoxes(
-            object_class=padded(classes),
-            is_object=padded(np.ones(len(usable), dtype=bool)),
+            object_class=padded(lifted.object_classes),
+            is_object=padded(np.ones(len(looks), dtype=bool)),
             boxes_m=padded(boxes_m.astype(np.float32)),
             room_ids=self.plain_ids,
             looks=padded(looks),
         )
+        return self
 
     def __len__(self) -> int:
         return len(self.plain_ids)

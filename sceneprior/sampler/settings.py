@@ -17,8 +17,6 @@ class SamplerConfig(TrainConfig):
     layers: int = Field(2, ge=1)
     heads: int = Field(4, ge=1)
     dropout: float = Field(0.1, ge=0, lt=1)
-    prototypes: int = Field(512, ge=1)
-    """Shapes that stand for those of all objects, at most."""
     val_every: int = Field(10, ge=1)
     """Epochs from one look at the val rooms to the next. What is kept is the network that finds
     them likeliest; the newest where there are none."""

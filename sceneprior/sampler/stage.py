@@ -13,13 +13,11 @@ from sklearn.mixture import GaussianMixture
 from torch import Tensor, nn
 
 from sceneprior.geometry.turns import QUARTERS, turn_boxes
-from sceneprior.lifting.shapes import ShapeSpace
 from sceneprior.losses.averages import share_of_batch
-from sceneprior.models.occupancy import OccupancyDecoder
 from sceneprior.models.prior import ScenePrior
+from sceneprior.models.prototypes import POSES
 from sceneprior.sampler.likelihood import negative_log_likelihood
 from sceneprior.sampler.network import RECTANGLES, RoomSampler
-from sceneprior.sampler.prototypes import POSES
 from sceneprior.sampler.rooms import SamplerRooms, frames_of, turned_rooms
 from sceneprior.sampler.settings import SamplerConfig
 from sceneprior.training.objective import (
@@ -112,17 +110,14 @@ class SamplerStage(lightning.LightningModule):
         return with_cosine(optimizer, int(self.trainer.estimated_stepping_batches))
 
 
-def teach(sampler: RoomSampler, rooms: SamplerRooms, decoder: OccupancyDecoder) -> None:
-    """Give a fresh sampler what it takes from the training rooms before it learns: prototypes, as
-    the prior's shape decoder knows them, rectangles, and which classes may intersect."""
+def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
+    """Give a fresh sampler what it takes from the training rooms before it learns: what looks are
+    like, rectangles, and which classes may intersect."""
     prototypes = rooms.prototypes
     looks = torch.from_numpy(prototypes.shown())
     sampler.look_shown[: len(looks)] = looks
     labels = torch.from_numpy(prototypes.object_class)
     sampler.look_class[: len(looks)] = labels.repeat_interleave(POSES)
-    mean, basis = (part.float().numpy() for part in (decoder.mean, decoder.basis))
-    codes = ShapeSpace(mean, basis, 1.0).codes_of(prototypes.grids)
-    sampler.prototype_codes[: len(codes)] = torch.from_numpy(codes)
     sampler.may_meet.copy_(rooms.may_meet(len(sampler.may_meet)))
     everyone = rooms.rooms
     generator = torch.Generator().manual_seed(0)

@@ -15,7 +15,6 @@ from sceneprior.lifting.dataset import LiftedDataset
 from sceneprior.lifting.shapes import ShapeGrid
 from sceneprior.models.occupancy import OccupancyConfig, OccupancyDecoder
 from sceneprior.sampler.network import RoomSampler
-from sceneprior.sampler.prototypes import Prototypes
 from sceneprior.sampler.rooms import SamplerRooms
 from sceneprior.sampler.settings import SamplerConfig
 from sceneprior.sampler.stage import SamplerStage, teach
@@ -91,7 +90,8 @@ class PaperConfig(PriorConfig):
         """The sampler's network, freshly initialised from the seed; it knows no rooms yet."""
         assert isinstance(self.model.shape, OccupancyConfig), "checked above"
         torch.manual_seed(self.seed)
-        return RoomSampler(settings, self.classes, self.model.shape.codes, self.model.max_objects)
+        most = self.model.shape.prototypes
+        return RoomSampler(settings, self.classes, most, self.model.max_objects)
 
     def _layout_stage(self, stage: LayoutConfig) -> Stage:
         if stage.supervision == "lifted":
@@ -104,15 +104,16 @@ class PaperConfig(PriorConfig):
         return Stage(
             "sampler",
             stage,
-            partial(self._sampler_rooms, "train", stage.prototypes),
+            self._sampler_rooms,
             partial(self._build_sampler_stage, stage),
         )
 
-    def _sampler_rooms(self, split: str, prototypes: Prototypes | int) -> SamplerRooms:
+    def _lifted_shapes(self, split: str = "train") -> LiftedDataset:
         assert isinstance(self.model.shape, OccupancyConfig), "checked above"
-        # Shapes alone: where they lie in the shape space, the sampler asks of prototypes only.
-        grid = ShapeGrid(self.model.shape.cells, self.model.shape.margin, codes=0)
-        return SamplerRooms(self.open_lifted(grid, split), prototypes)
+        return self.open_lifted(ShapeGrid(self.model.shape.cells, self.model.shape.margin), split)
+
+    def _sampler_rooms(self, split: str = "train") -> SamplerRooms:
+        return SamplerRooms(self._lifted_shapes(split))
 
     def _build_sampler_stage(
         self, stage: SamplerConfig, rooms: SamplerRooms, previous: Path | None
@@ -120,22 +121,20 @@ class PaperConfig(PriorConfig):
         assert previous is not None, "the shape stage comes before"
         before = self._before(previous, rooms.room_ids)
         assert isinstance(before.prior.shape, OccupancyDecoder)
+        prototypes = before.prior.shape.prototypes
         sampler = self.build_sampler(stage)
-        teach(sampler, rooms, before.prior.shape)
+        teach(sampler, rooms.see_looks(prototypes))
         val = None
         with contextlib.suppress(ShardError):  # no val rooms: the newest network is kept
             list_shards(Path(self.data.shards), "val")
-            val = self._sampler_rooms("val", rooms.prototypes)
+            val = self._sampler_rooms("val").see_looks(prototypes)
         latents = nn.Embedding.from_pretrained(before.logits)
         return SamplerStage(before.prior, latents, sampler, stage, val, self.seed)
 
     def _shape_stage(self, stage: ShapeConfig | LiftedShapeConfig) -> Stage:
         if isinstance(stage, LiftedShapeConfig):
-            assert isinstance(self.model.shape, OccupancyConfig), "checked above"
-            shape = self.model.shape
-            grid = ShapeGrid(shape.cells, shape.margin, shape.codes)
-            shapes = partial(self.open_lifted, grid)
-            return Stage("shape", stage, shapes, partial(self._build, LiftedStage, stage))
+            lifted = partial(self._build, LiftedStage, stage)
+            return Stage("shape", stage, self._lifted_shapes, lifted)
         views = stage.views_per_room or self.data.views_per_room
         masks = partial(self.open_views, views, self.data.mask_step)
         return Stage("shape", stage, masks, partial(self._build, ShapeStage, stage))
@@ -153,9 +152,10 @@ class PaperConfig(PriorConfig):
             before = self._before(previous, rooms.room_ids)
             prior = before.prior.train()
             latents = nn.Embedding.from_pretrained(before.logits, freeze=False)
-        if isinstance(rooms, LiftedDataset) and rooms.space is not None:
-            assert isinstance(prior.shape, OccupancyDecoder)
-            prior.shape.set_space(*rooms.space)
+        if isinstance(stage, LiftedShapeConfig):
+            assert isinstance(rooms, LiftedDataset) and isinstance(prior.shape, OccupancyDecoder)
+            assert isinstance(self.model.shape, OccupancyConfig)
+            prior.shape.learn_prototypes(rooms.find_prototypes(self.model.shape.prototypes))
         target = self.model.completeness_target
         return kind(prior, latents, rooms, stage, self.loss, target, self.seed)
 

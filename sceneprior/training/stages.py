@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from sceneprior.lifting.dataset import LiftedDataset
-from sceneprior.lifting.shapes import ShapeSpace
 from sceneprior.losses.lifted import (
     lifted_losses,
     match_lifted,
@@ -152,11 +151,11 @@ class LiftedStage(PaperStage):
         return False
 
     def on_fit_start(self) -> None:
-        # Only now, when a resumed run has its checkpoint's shape space.
+        # Only now, when a resumed run has its checkpoint's prototypes.
         if isinstance(self.stage, LiftedShapeConfig):
             assert isinstance(self.rooms, LiftedDataset)
             assert isinstance(self.prior.shape, OccupancyDecoder)
-            self.rooms.place_shapes(ShapeSpace(*self.prior.shape.space))
+            self.rooms.see_looks(self.prior.shape.prototypes)
 
     def training_step(self, rooms: LiftedRooms, batch_idx: int) -> Tensor:
         slots = min(rooms.is_object.shape[1] + 1, self.prior.max_objects)
@@ -166,7 +165,10 @@ class LiftedStage(PaperStage):
             matches = match_lifted(scenes, rooms, self.loss.match_box)
             losses = lifted_losses(scenes, rooms, matches, self.completeness_target)
             if isinstance(self.stage, LiftedShapeConfig):
-                losses["mask"] = shape_code_loss(scenes, rooms, matches)
+                assert isinstance(self.prior.shape, OccupancyDecoder) and rooms.looks is not None
+                known = matches._replace(valid=matches.valid & (rooms.looks >= 0))
+                targets = self.prior.shape.targets(rooms.looks.clamp(min=0))
+                losses["mask"] = shape_code_loss(scenes, known, *targets)
             return self.total(losses, rooms)
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny_runs import OCCUPANCY, tiny_config
 
 from sceneprior.classes import label_set
 from sceneprior.config import load_run
@@ -16,7 +17,8 @@ from sceneprior.generation.decode import (
     synthesize,
     to_rooms,
 )
-from sceneprior.geometry.isosurface import surface_of
+from sceneprior.models.prior import ScenePrior
+from sceneprior.models.prototypes import POSES, Prototypes
 from sceneprior.scene import Scene
 from sceneprior.views import DecodedScenes
 
@@ -38,6 +40,14 @@ def decoded(torch_rng) -> DecodedScenes:
     )
 
 
+@pytest.fixture
+def prior(tmp_path) -> ScenePrior:
+    """Whose meshes have two triangles."""
+    prior = tiny_config(tmp_path).build_prior()
+    prior.shape.faces = torch.tensor([[0, 1, 2], [3, 4, 5]])
+    return prior
+
+
 def scenes_of(*arguments) -> list[Scene]:
     return [room.scene for room in to_rooms(*arguments)]
 
@@ -46,12 +56,11 @@ def labels(scene) -> list[str]:
     return [item.label for item in scene.objects]
 
 
-def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded):
-    faces = torch.tensor([[0, 1, 2], [3, 4, 5]])
-    rooms = to_rooms(decoded, faces, "front3d_bedroom", ["a", "b"])
+def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded, prior):
+    rooms = to_rooms(decoded, prior, "front3d_bedroom", ["a", "b"])
     assert [room.predictions for room in rooms] == [[0, 1, 3], [0]]
     assert torch.equal(rooms[0].class_logits, decoded.class_logits[0, [0, 1, 3]])
-    first, second = scenes_of(decoded, faces, "front3d_bedroom", ["a", "b"])
+    first, second = scenes_of(decoded, prior, "front3d_bedroom", ["a", "b"])
     assert (first.name, second.name) == ("a", "b")
     # void is decoded like any class, but is no furniture; what follows it stays.
     assert labels(first) == ["double_bed", "nightstand", "wardrobe"]
@@ -61,48 +70,42 @@ def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded):
         np.testing.assert_array_equal(item.center_m, decoded.centers_m[0, source])
         np.testing.assert_array_equal(item.size_m, decoded.sizes_m[0, source])
         np.testing.assert_array_equal(item.mesh.vertices_m, decoded.vertices_m[0, source])
-        np.testing.assert_array_equal(item.mesh.faces, faces)
+        np.testing.assert_array_equal(item.mesh.faces, prior.faces)
 
 
-def test_a_stop_flag_ends_a_scene_after_the_object_that_has_it(decoded):
-    faces = torch.tensor([[0, 1, 2], [3, 4, 5]])
+def test_a_stop_flag_ends_a_scene_after_the_object_that_has_it(decoded, prior):
     stops = replace(
         decoded, completeness_logits=torch.tensor([[-2.0, 0.1, -5, 3], [-1, -1, -1, -1]])
     )
-    first, second = scenes_of(stops, faces, "front3d_bedroom", ["a", "b"], "stop")
+    first, second = scenes_of(stops, prior, "front3d_bedroom", ["a", "b"], "stop")
     assert labels(first) == ["double_bed", "nightstand"]
     assert labels(second) == ["double_bed", "nightstand", "wardrobe"]
 
 
-def test_nothing_complete_is_an_empty_room_and_no_vertices_are_boxes(decoded):
+def test_nothing_complete_is_an_empty_room_and_no_vertices_are_boxes(decoded, prior):
     none = replace(decoded, completeness_logits=-torch.ones(2, 4), vertices_m=None)
-    faces = torch.tensor([[0, 1, 2]])
-    assert [scene.objects for scene in scenes_of(none, faces, "front3d_bedroom", ["a", "b"])] == [
+    assert [scene.objects for scene in scenes_of(none, prior, "front3d_bedroom", ["a", "b"])] == [
         (),
         (),
     ]
     boxes = replace(decoded, vertices_m=None)
-    assert scenes_of(boxes, faces, "front3d_bedroom", ["a", "b"])[0].objects[0].mesh is None
+    assert scenes_of(boxes, prior, "front3d_bedroom", ["a", "b"])[0].objects[0].mesh is None
 
 
-def test_grids_become_meshes_in_the_boxes_of_objects_that_are_kept(decoded, monkeypatch):
-    grids = torch.full((2, 4, 8, 8, 8), -4.0)
-    grids[:, :, :, :4] = 4.0  # the lower half of every frame
-    asked = []
-
-    def counted(logits, center_m, size_m, margin):
-        asked.append(margin)
-        return surface_of(logits, center_m, size_m, margin)
-
-    monkeypatch.setattr(decode, "surface_of", counted)
-    filled = replace(decoded, vertices_m=None, occupancy=grids, margin=1.25)
-    scenes = scenes_of(filled, None, "front3d_bedroom", ["a", "b"])
-    assert asked == [1.25] * 4
-    for item in scenes[0].objects:
+def test_looks_become_meshes_in_the_boxes_of_objects_that_are_kept(decoded, tmp_path):
+    grids = np.zeros((2, 8, 8, 8), dtype=bool)
+    grids[0, :, :4] = True  # the lower half of every frame
+    grids[1, :4] = True
+    prior = tiny_config(tmp_path, **OCCUPANCY).build_prior()
+    prior.shape.learn_prototypes(Prototypes(grids, np.ones((2, 3)), np.array([9, 13])))
+    looks = torch.tensor([[0, POSES, 0, 0], [0, 0, 0, 0]])
+    chosen = replace(decoded, vertices_m=None, looks=looks)
+    scenes = scenes_of(chosen, prior, "front3d_bedroom", ["a", "b"])
+    for item, share in zip(scenes[0].objects, ([1, 0.5, 1], [0.5, 1, 1], [1, 0.5, 1]), strict=True):
         low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
         bottom = np.subtract(item.center_m, np.divide(item.size_m, 2))
         np.testing.assert_allclose(low, bottom, atol=1e-6)
-        np.testing.assert_allclose(high - low, np.multiply(item.size_m, [1, 0.5, 1]), atol=1e-6)
+        np.testing.assert_allclose(high - low, np.multiply(item.size_m, share), atol=1e-6)
 
 
 def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(toy_run, monkeypatch):

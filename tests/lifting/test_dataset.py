@@ -6,16 +6,17 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from torch.testing import assert_close
 
+from sceneprior.classes import VOID
 from sceneprior.data.dataset import BLANK, ViewDataset
-from sceneprior.geometry.turns import turn_boxes
+from sceneprior.geometry.turns import turn_boxes, turn_grids
 from sceneprior.lifting import dataset as module
 from sceneprior.lifting.dataset import LiftedDataset
 from sceneprior.lifting.shapes import ShapeGrid, lift_shapes
+from sceneprior.models.prototypes import POSES, Prototypes, turn_of
 from sceneprior.shards import iterate_rooms
 
-GRID = ShapeGrid(cells=8, margin=1.2, codes=200)
+GRID = ShapeGrid(cells=8, margin=1.2)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def test_rows_and_objects_are_those_of_the_views_and_truth_is_not_needed(shards)
     for name in ("room_index", "object_class", "is_object"):
         assert torch.equal(getattr(mine, name), getattr(theirs, name))
     assert mine.room_ids == theirs.room_ids
-    assert mine.shape_codes is None
+    assert mine.looks is None
 
 
 def test_turned_rows_are_turned_rooms(shards, monkeypatch):
@@ -53,34 +54,46 @@ def test_turned_rows_are_turned_rooms(shards, monkeypatch):
     )
     monkeypatch.setattr(module, "write_whole", lambda *_: None)
     data = LiftedDataset(shards, "train", rotations=4, shape=GRID._replace(margin=1.15))
-    data.place_shapes(data.space)
+    prototypes = Prototypes(data.grids(), data.sizes_m, data.object_classes)  # every one its own
+    data.see_looks(prototypes)
     plain, turned = data.__getitems__([(4, 0)]), data.__getitems__([(7, 2)])
     assert torch.equal(turned.boxes_m, turn_boxes(plain.boxes_m, torch.tensor([3])))
-    # All shapes in all turns are in the space: codes give turned grids back.
-    assert data.space is not None
     for item in range(int(plain.is_object.sum())):
         before, after = (
-            data.space.mean + np.tensordot(batch.shape_codes[0, item].numpy(), data.space.basis, 1)
-            for batch in (plain, turned)
+            turn_grids(prototypes.grids[look // POSES][None], *turn_of(look % POSES))[0]
+            for look in (int(batch.looks[0, item]) for batch in (plain, turned))
         )
-        np.testing.assert_allclose(np.rot90(before, 3, axes=(2, 0)), after, rtol=0, atol=1e-3)
-        assert np.abs(before - after).max() > 0.9
+        np.testing.assert_array_equal(np.rot90(before, 3, axes=(2, 0)), after)
+        assert (before != after).any()
 
 
-def test_codes_are_those_of_the_lifted_shapes_in_the_order_of_objects(shards):
+def test_looks_are_those_of_the_lifted_shapes_in_the_order_of_objects(shards):
     data = LiftedDataset(shards, "train", shape=GRID)
-    assert data.__getitems__([(1, 0)]).shape_codes is None, "not before they have a space"
-    data.place_shapes(data.space)
+    assert data.__getitems__([(1, 0)]).looks is None, "not before there are prototypes"
+    prototypes = data.find_prototypes(99)
+    data.see_looks(prototypes)
     batch = data.__getitems__([(1, 0), (3, 0)])
     for row, (shard, room_id) in enumerate(iterate_rooms(shards, "train")):
         if row in (1, 3):
-            grids = lift_shapes(shard.read_room(room_id, images=True), data.boxes[row], GRID)
-            wanted = torch.from_numpy(data.space.codes_of(grids))
-            found = batch.shape_codes[(row - 1) // 2, : len(grids)]
-            assert_close(found, wanted, rtol=0, atol=1e-5)
-            filled = batch.shape_cells[(row - 1) // 2, : len(grids)].tolist()
-            assert filled == grids.sum(axis=(1, 2, 3)).clip(min=1).tolist()
-    assert LiftedDataset(shards, "train").__getitems__([(1, 0)]).shape_codes is None
+            room = shard.read_room(room_id, images=True)
+            grids = lift_shapes(room, data.boxes[row], GRID)
+            sizes_m = np.where(data.boxes[row].sizes_m > 0, data.boxes[row].sizes_m, 1)
+            wanted = prototypes.looks_of(grids, sizes_m, room.object_class.astype(np.int64))
+            known = (data.boxes[row].explained > 0) & (room.object_class != VOID)
+            found = batch.looks[(row - 1) // 2, : len(grids)].numpy()
+            np.testing.assert_array_equal(found, np.where(known, wanted, -1))
+            assert (found >= 0).any()
+
+
+def test_what_has_no_label_or_no_box_has_no_look(shards):
+    data = LiftedDataset(shards, "train", shape=GRID)
+    prototypes = data.find_prototypes(99)
+    data.object_classes[0] = VOID
+    data.boxes[0].explained[1] = 0
+    assert data.usable.tolist()[:3] == [False, False, True]
+    assert data.looks_of(prototypes).tolist()[:2] == [-1, -1]
+    data.see_looks(prototypes)
+    assert data.__getitems__([(0, 0)]).looks[0, :2].tolist() == [-1, -1]
 
 
 def test_a_blank_draw_is_a_room_in_which_there_is_nothing(shards):
@@ -88,21 +101,13 @@ def test_a_blank_draw_is_a_room_in_which_there_is_nothing(shards):
     assert not batch.is_object.any() and not batch.is_lifted.any()
 
 
-def test_a_space_of_many_shapes_is_found_from_some(shards, monkeypatch):
-    monkeypatch.setattr(module, "MOST_SHAPES", 12)
-    space, again = (LiftedDataset(shards, "train", rotations=4, shape=GRID).space for _ in "ab")
-    # Three objects in four turns have at most eleven components.
-    assert 0 < space.basis.any(axis=(1, 2, 3)).sum() <= 11
-    np.testing.assert_array_equal(space.basis, again.basis)
-
-
 def test_shapes_are_found_once_and_again_on_other_grids(shards, monkeypatch):
     LiftedDataset(shards, "train", shape=GRID)
     calls = []
     find = module.lift_shapes
     monkeypatch.setattr(module, "lift_shapes", lambda *given: calls.append(1) or find(*given))
-    LiftedDataset(shards, "train", shape=GRID._replace(codes=2))
-    assert calls == [], "codes are found from the same shapes"
+    LiftedDataset(shards, "train", shape=GRID)
+    assert calls == []
     LiftedDataset(shards, "train", shape=GRID._replace(margin=1.3))
     assert len(calls) == 6
 

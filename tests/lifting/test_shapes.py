@@ -1,4 +1,4 @@
-"""Lifted shapes: hulls in the frame of a box; the shape space against its definition."""
+"""Lifted shapes: hulls in the frame of a box."""
 
 from dataclasses import replace
 
@@ -7,10 +7,10 @@ import pytest
 
 from sceneprior.lifting.boxes import lift_boxes
 from sceneprior.lifting.hulls import carve, sightings_of
-from sceneprior.lifting.shapes import EMPTY, REACH, ShapeGrid, lift_shapes, shape_space
+from sceneprior.lifting.shapes import EMPTY, REACH, ShapeGrid, lift_shapes
 from sceneprior.shards import iterate_rooms
 
-GRID = ShapeGrid(cells=10, margin=1.25, codes=4)
+GRID = ShapeGrid(cells=10, margin=1.25)
 
 
 @pytest.fixture(scope="module")
@@ -67,37 +67,3 @@ def test_an_object_without_a_box_has_no_shape_and_fewer_views_are_asked(room):
     boxes = lift_boxes(views)
     half = lift_shapes(views, boxes, GRID, np.arange(0, len(views.visible), 2))
     assert (half != lift_shapes(views, boxes, GRID)).any()
-
-
-@pytest.fixture
-def grids() -> np.ndarray:
-    return np.random.default_rng(3).random((9, 4, 4, 4)) < 0.4
-
-
-def test_a_shape_space_is_the_singular_vectors_of_the_grids(grids):
-    space = shape_space(grids, 5)
-    flat = grids.reshape(9, -1) - grids.reshape(9, -1).mean(axis=0)
-    *_, rows = np.linalg.svd(flat, full_matrices=False)
-    basis = space.basis.reshape(5, -1)
-    np.testing.assert_allclose(np.abs(basis @ rows[:5].T), np.eye(5), rtol=0, atol=1e-4)
-    np.testing.assert_allclose(space.mean, grids.mean(axis=0), rtol=0, atol=1e-7)
-    np.testing.assert_allclose(space.codes_of(grids), flat @ basis.T, rtol=0, atol=1e-5)
-    assert space.spread == pytest.approx(np.sqrt(((flat @ basis.T) ** 2).mean()), rel=1e-4)
-
-
-def test_with_all_components_codes_give_the_grids_back_and_keep_distances(grids):
-    space = shape_space(grids, 8)
-    codes = space.codes_of(grids)
-    back = space.mean + np.tensordot(codes, space.basis, axes=1)
-    np.testing.assert_allclose(back, grids, rtol=0, atol=1e-4)
-    apart = ((codes[0] - codes[1:]) ** 2).sum(axis=1)
-    np.testing.assert_allclose(apart, (grids[0] ^ grids[1:]).sum(axis=(1, 2, 3)), atol=1e-3)
-
-
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_fewer_shapes_than_components_leave_zeros(grids, count):
-    space = shape_space(grids[:count], 6)
-    assert space.basis.shape == (6, 4, 4, 4) and not space.basis[max(count - 1, 0) :].any()
-    assert np.isfinite(space.spread) and space.spread > 0
-    assert np.isfinite(space.codes_of(grids)).all()
-    assert space.codes_of(grids[:0]).shape == (0, 6)

@@ -1,17 +1,20 @@
-"""Occupancy grids: sums of given grids, and how the prior decodes them."""
+"""Occupancy grids: prototypes, their looks, and how the prior decodes them."""
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from tiny_runs import OCCUPANCY, tiny_baseline, tiny_config
-from torch.testing import assert_close
 
 from sceneprior.errors import ConfigError
+from sceneprior.geometry.isosurface import surface_of
+from sceneprior.geometry.turns import turn_grids
 from sceneprior.models.occupancy import OccupancyConfig, OccupancyDecoder
 from sceneprior.models.prior import ScenePrior
+from sceneprior.models.prototypes import POSES, Prototypes, turn_of
 from sceneprior.models.shape_decoder import ShapeDecoderConfig
 
-SMALL = {"name": "occupancy", "codes": 4, "width": 8, "cells": 8, "margin": 1.2}
+SMALL = {"name": "occupancy", "prototypes": 9, "codes": 4, "width": 8, "cells": 8, "margin": 1.2}
 GRIDS = {**OCCUPANCY, "model__shape": SMALL}
 
 
@@ -21,60 +24,77 @@ def prior(tmp_path) -> ScenePrior:
 
 
 @pytest.fixture
-def decoder(torch_rng) -> OccupancyDecoder:
-    """In a space of three random grids."""
-    torch.manual_seed(0)
-    decoder = OccupancyConfig(codes=3, width=8, cells=8).build(6)
+def prototypes() -> Prototypes:
+    """Three shapes without symmetry."""
     rng = np.random.default_rng(0)
-    decoder.set_space(rng.random((8, 8, 8)), rng.standard_normal((3, 8, 8, 8)), 2.5)
-    return decoder.double()
+    return Prototypes(rng.random((3, 8, 8, 8)) < 0.5, rng.random((3, 3)), np.array([2, 1, 2]))
 
 
-def test_logits_are_of_weighted_sums_of_the_grids(decoder, torch_rng):
-    features = torch.randn(2, 3, 6, generator=torch_rng, dtype=torch.float64)
-    logits = decoder(features)
-    for room in range(2):
-        for item in range(3):
-            weights = 2.5 * decoder.mlp(features[room, item])
-            grid = decoder.mean + sum(weights[k] * decoder.basis[k] for k in range(3))
-            assert_close(logits[room, item], 8 * (grid - 0.5), rtol=0, atol=1e-12)
-    assert torch.equal(logits, decoder.grids(decoder.codes(features)))
+@pytest.fixture
+def decoder(prototypes) -> OccupancyDecoder:
+    torch.manual_seed(0)
+    decoder = OccupancyConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
+    decoder.learn_prototypes(prototypes)
+    return decoder
 
 
-def test_the_space_is_kept_in_checkpoints_and_is_no_weight(decoder):
-    fresh = OccupancyConfig(codes=3, width=8, cells=8).build(6)
-    assert not fresh.basis.any() and not fresh.mean.any()
-    fresh.double().load_state_dict(decoder.state_dict())
-    assert torch.equal(fresh.basis, decoder.basis) and fresh.spread == 2.5
-    assert not {"mean", "basis", "spread"} & {name for name, _ in fresh.named_parameters()}
-    # Half precision in the file: a cell's occupancy is known to 0.0005.
-    assert OccupancyConfig().build(6).basis.dtype == torch.float16
+def test_an_object_has_the_look_whose_code_is_nearest(decoder, torch_rng):
+    looks = torch.arange(3 * POSES)
+    codes, cells = decoder.targets(looks)
+    assert torch.equal(decoder.looks(codes), looks)
+    # Half a look's way to its neighbour is still its own; beyond that it is the neighbour.
+    assert torch.equal(decoder.looks(torch.lerp(codes[:-1], codes[1:], 0.4)), looks[:-1])
+    assert torch.equal(decoder.looks(torch.lerp(codes[:-1], codes[1:], 0.6)), looks[1:])
+    some = 3 * torch.randn(2, 4, 30, generator=torch_rng)
+    slow = ((some.unsqueeze(2) - codes) ** 2).sum(dim=-1).argmin(dim=-1)
+    assert torch.equal(decoder.looks(some), slow)  # never one of those that are none
+    assert torch.equal(cells, decoder.filled[looks // POSES]) and (cells > 100).all()
+
+
+def test_prototypes_are_kept_in_checkpoints_and_are_no_weights(decoder, prototypes):
+    fresh = OccupancyConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
+    assert len(fresh.prototypes.grids) == 0
+    assert fresh.looks(torch.zeros(2, 30)).tolist() == [0, 0]
+    fresh.load_state_dict(decoder.state_dict())
+    for one, other in zip(fresh.prototypes, prototypes, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+    assert all(name.startswith("mlp.") for name, _ in fresh.named_parameters())
 
 
 def test_every_weight_learns_from_every_object(decoder, torch_rng):
-    features = torch.randn(1, 4, 6, generator=torch_rng, dtype=torch.float64)
-    decoder(features).square().sum().backward()
+    decoder(torch.randn(1, 4, 6, generator=torch_rng)).square().sum().backward()
     assert all(parameter.grad.any() for parameter in decoder.parameters())
 
 
-def test_the_prior_decodes_grids_in_place_of_meshes(prior, torch_rng):
+def test_meshes_turn_and_fill_boxes_as_grids_do():
+    """A look's mesh against the surface of its turned grid, on a shape without symmetry."""
+    rng = np.random.default_rng(0)
+    decoder = OccupancyConfig(prototypes=2, codes=8, cells=8).build(6)
+    grids = np.zeros((1, 8, 8, 8), dtype=bool)
+    grids[0, 1:, 1:4, 2:7] = True
+    grids[0, 2:4, 1:7, 2:4] = True
+    decoder.learn_prototypes(Prototypes(grids, np.ones((1, 3)), np.array([1])))
+    box = np.array([*rng.normal(size=3), 2.0, 0.5, 1.0])
+    for pose in range(POSES):
+        mesh = decoder.mesh(pose, box)
+        turned = turn_grids(grids, *turn_of(pose))[0]
+        slow = surface_of(turned - 0.5, box[:3], box[3:], decoder.margin)
+        here, there = trimesh.Trimesh(mesh.vertices_m, mesh.faces), trimesh.Trimesh(*slow)
+        # A cell's corners may be cut along its other diagonal.
+        assert here.volume == pytest.approx(there.volume, rel=0.02) and here.volume > 0
+        assert np.allclose(here.bounds, there.bounds, atol=1e-6)
+        assert np.allclose(here.center_mass, there.center_mass, atol=0.02)
+
+
+def test_the_prior_decodes_looks_in_place_of_meshes(prior, torch_rng):
     logits = torch.randn(3, 10, generator=torch_rng)
     scenes = prior(logits)
     assert prior.faces is None and scenes.vertices_m is None
-    assert scenes.occupancy.shape == (3, 6, 8, 8, 8) and scenes.margin == 1.2
+    assert scenes.looks.shape == (3, 6)
     bare = prior(logits, with_shape=False)
     assert scenes.shape_codes.shape == (3, 6, 4)
-    assert bare.occupancy is None and torch.equal(bare.shape_codes, scenes.shape_codes)
+    assert bare.looks is None and torch.equal(bare.shape_codes, scenes.shape_codes)
     assert torch.equal(bare.centers_m, scenes.centers_m)
-
-
-def test_only_wanted_objects_have_grids_and_the_others_are_empty(prior, torch_rng):
-    z = prior.latent_space(torch.randn(3, 10, generator=torch_rng))
-    wanted = torch.tensor([[True, False], [True, True], [False, False]])
-    some, everything = prior.decode(z, wanted=wanted), prior.decode(z)
-    # Products of other matrices: the same sums of 16 numbers in another order.
-    assert_close(some.occupancy[wanted], everything.occupancy[:, :2][wanted], rtol=1e-5, atol=1e-6)
-    assert (some.occupancy[~wanted] == -20).all()
 
 
 def test_a_shape_without_a_name_is_a_mesh(tmp_path):

@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from rooms_of_boxes import lifted_rooms, small_sampler
+from rooms_of_boxes import sampler_rooms, small_sampler
 from torch.testing import assert_close
 
 from sceneprior.sampler.likelihood import negative_log_likelihood
@@ -16,7 +16,7 @@ from sceneprior.views import RoomBoxes
 
 @pytest.fixture(scope="module")
 def rooms() -> SamplerRooms:
-    return SamplerRooms(lifted_rooms(), 99)
+    return sampler_rooms()
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from rooms_of_boxes import CLASSES, lifted_rooms
+from rooms_of_boxes import CLASSES, lifted_rooms, sampler_rooms
 from torch.testing import assert_close
 
+from sceneprior.lifting.dataset import LiftedDataset
 from sceneprior.sampler.rooms import (
     FRAME_M,
     SamplerRooms,
@@ -21,7 +22,11 @@ from sceneprior.views import RoomBoxes
 
 @pytest.fixture(scope="module")
 def rooms() -> SamplerRooms:
-    return SamplerRooms(lifted_rooms(), 99)
+    return sampler_rooms()
+
+
+def with_looks(lifted: LiftedDataset) -> SamplerRooms:
+    return SamplerRooms(lifted).see_looks(lifted_rooms().find_prototypes(99))
 
 
 def test_objects_without_a_label_or_a_box_are_left_out():
@@ -29,15 +34,15 @@ def test_objects_without_a_label_or_a_box_are_left_out():
     lifted.object_classes[0] = 0
     lifted.boxes[1].explained[2] = 0
     lifted.boxes[1].sizes_m[2] = 0
-    found = SamplerRooms(lifted, 99).rooms
+    found = with_looks(lifted).rooms
     assert found.is_object.sum(dim=1).tolist()[:2] == [1, 2]
     assert found.object_class[0, 0] == 2
 
 
 def test_other_rooms_take_the_looks_of_the_training_rooms(rooms):
-    other = SamplerRooms(lifted_rooms(seed=5), rooms.prototypes)
-    assert other.prototypes is rooms.prototypes
-    assert other.rooms.looks.max() < 8 * len(rooms.prototypes.items)
+    other = sampler_rooms(seed=5)
+    assert np.array_equal(other.prototypes.grids, rooms.prototypes.grids)
+    assert other.rooms.looks.max() < 8 * len(rooms.prototypes.grids)
 
 
 def test_a_blank_draw_is_an_empty_room(rooms):
@@ -107,11 +112,11 @@ def test_classes_may_meet_that_do_often_enough():
     lifted = lifted_rooms(12)
     for room in (1, 3, 5):  # of six with a third object: its box stands in the second's
         lifted.boxes[room].centers_m[2] = lifted.boxes[room].centers_m[1]
-    found = SamplerRooms(lifted, 99).may_meet(CLASSES)
+    found = with_looks(lifted).may_meet(CLASSES)
     assert found.nonzero().tolist() == [[2, 3], [3, 2]]
     lifted.boxes[1].centers_m[2] += 5
     lifted.boxes[3].centers_m[2] += 5
-    assert not SamplerRooms(lifted, 99).may_meet(CLASSES).any()
+    assert not with_looks(lifted).may_meet(CLASSES).any()
 
 
 def test_boxes_that_graze_do_not_meet():
@@ -120,4 +125,4 @@ def test_boxes_that_graze_do_not_meet():
     boxes.centers_m[1] = boxes.centers_m[0] + np.array(
         [(boxes.sizes_m[0, 0] + boxes.sizes_m[1, 0]) / 2 - 0.04, 0, 0]
     )
-    assert not SamplerRooms(lifted, 99).may_meet(CLASSES).any()
+    assert not with_looks(lifted).may_meet(CLASSES).any()

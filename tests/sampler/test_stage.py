@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from lightning.pytorch import Trainer
-from rooms_of_boxes import TINY, lifted_rooms, small_decoder, small_sampler
+from rooms_of_boxes import TINY, sampler_rooms, small_sampler
 from tiny_runs import OCCUPANCY, tiny_config, tiny_sampler_config
 from torch import nn
 
@@ -36,7 +36,7 @@ def train(stage: SamplerStage, rooms: SamplerRooms, epochs: int) -> None:
 
 
 def test_rooms_become_likelier():
-    rooms = SamplerRooms(lifted_rooms(12), 99)
+    rooms = sampler_rooms(12)
     stage = stage_of(rooms, None, epochs=40, learning_rate=5e-3)
 
     def unlikely() -> float:
@@ -51,7 +51,7 @@ def test_rooms_become_likelier():
 
 
 def test_without_val_rooms_the_newest_network_is_kept():
-    rooms = SamplerRooms(lifted_rooms(), 99)
+    rooms = sampler_rooms()
     stage = stage_of(rooms, None)
     train(stage, rooms, 2)
     for one, other in zip(stage.sampler.parameters(), stage.learner.parameters(), strict=True):
@@ -59,8 +59,8 @@ def test_without_val_rooms_the_newest_network_is_kept():
 
 
 def test_with_val_rooms_the_likeliest_is_kept(monkeypatch):
-    rooms = SamplerRooms(lifted_rooms(), 99)
-    val = SamplerRooms(lifted_rooms(4, seed=1), rooms.prototypes)
+    rooms = sampler_rooms()
+    val = sampler_rooms(4, seed=1)
     stage = stage_of(rooms, val, epochs=4)
     losses, states = iter([3.0, 1.0, 2.0, 1.0]), []
 
@@ -77,7 +77,7 @@ def test_with_val_rooms_the_likeliest_is_kept(monkeypatch):
 
 
 def test_val_loss_is_the_same_each_time_and_leaves_the_learner_in_training():
-    rooms = SamplerRooms(lifted_rooms(), 99)
+    rooms = sampler_rooms()
     stage = stage_of(rooms, rooms, dropout=0.5)
     stage.train()
     assert torch.equal(stage.val_loss(), stage.val_loss())
@@ -85,16 +85,12 @@ def test_val_loss_is_the_same_each_time_and_leaves_the_learner_in_training():
 
 
 def test_a_sampler_is_taught_what_it_draws_from():
-    rooms = SamplerRooms(lifted_rooms(), 99)
+    rooms = sampler_rooms()
     sampler = small_sampler(rooms)
-    count = len(rooms.prototypes.items)
+    count = len(rooms.prototypes.grids)
     assert (sampler.look_class[: 8 * count] > 0).all() and (
         sampler.look_class[8 * count :] < 0
     ).all()
-    # Prototypes as the prior's decoder knows them.
-    with torch.no_grad():
-        grids = small_decoder().grids(sampler.prototype_codes[None, :count])[0]
-    assert torch.equal(grids > 0, torch.from_numpy(rooms.prototypes.grids))
     drawn = sampler.rectangles(torch.rand(500), torch.randn(500, 4))
     known = rectangles_of(rooms.rooms)[:, 2:]
     assert known.min() * 0.5 < drawn[:, 2:].median() < known.max() * 2

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy import linalg
 from torch import Tensor
 
 from sceneprior.geometry.turns import QUARTERS, turn_grids
@@ -26,8 +27,6 @@ COARSE, PARTS = 8, 4
 class Prototypes(NamedTuple):
     """Objects that stand for all others of their classes."""
 
-    items: Int[np.ndarray, " prototypes"]
-    """Which objects of the data set they were chosen from."""
     grids: Bool[np.ndarray, "prototypes x y z"]
     sizes_m: Float[np.ndarray, "prototypes 3"]
     object_class: Int[np.ndarray, " prototypes"]
@@ -36,12 +35,12 @@ class Prototypes(NamedTuple):
         """What each look looks like to a network: a coarse grid, and logarithms of the extents."""
         rows = [
             np.hstack([
-                turn_grids(pooled(self.grids, PARTS), *turn_of(pose)).reshape(len(self.items), -1),
+                turn_grids(pooled(self.grids, PARTS), *turn_of(pose)).reshape(len(self.grids), -1),
                 turned_extents(np.log(self.sizes_m), pose),
             ])
             for pose in range(POSES)
         ]  # fmt: skip
-        return np.stack(rows, axis=1).reshape(len(self.items) * POSES, -1).astype(np.float32)
+        return np.stack(rows, axis=1).reshape(len(self.grids) * POSES, -1).astype(np.float32)
 
     def looks_of(
         self,
@@ -84,7 +83,7 @@ def choose_prototypes(
     while len(items) > max(most, len(apart)):
         alike *= 1.5
         items = _covering(apart, alike)
-    return Prototypes(items, grids[items], sizes_m[items], object_class[items])
+    return Prototypes(grids[items], sizes_m[items], object_class[items])
 
 
 def _covering(
@@ -101,6 +100,27 @@ def _covering(
             near[near[:, best]] = False  # they are spoken for
             first = False
     return np.array(items, dtype=np.int64)
+
+
+def looks_apart(
+    grids: Bool[np.ndarray, "prototypes x y z"], codes: int
+) -> Float[np.ndarray, "looks codes"]:
+    """Codes of all looks, whose squared distances come nearest to the numbers of cells in which
+    the looks differ: their principal components; zeros for those that fewer looks do not have.
+
+    Source:
+        Torgerson, "Multidimensional scaling: I. Theory and method", Psychometrika 1952.
+    """
+    looks = np.stack([turn_grids(grids, *turn_of(pose)) for pose in range(POSES)], axis=1)
+    flat = looks.reshape(len(grids) * POSES, -1).astype(np.float32)
+    flat -= flat.mean(axis=0)
+    # The products of looks have their singular values, squared; there are far fewer than cells.
+    products = (flat @ flat.T).astype(np.float64)
+    found = min(codes, len(flat))
+    squares, turns = linalg.eigh(products, subset_by_index=(len(flat) - found, len(flat) - 1))
+    placed = np.zeros((len(flat), codes), np.float32)
+    placed[:, :found] = turns[:, ::-1] * np.sqrt(squares[::-1].clip(min=0))
+    return placed
 
 
 class Described(NamedTuple):

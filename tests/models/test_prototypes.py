@@ -6,11 +6,12 @@ import torch
 from rooms_of_boxes import CELLS, lifted_rooms
 
 from sceneprior.geometry.turns import turn_grids
-from sceneprior.sampler.prototypes import (
+from sceneprior.models.prototypes import (
     POSES,
     choose_prototypes,
     described,
     distances,
+    looks_apart,
     pooled,
     turn_of,
     turned_extents,
@@ -32,7 +33,7 @@ def test_one_object_in_all_its_poses_is_one_prototype():
     grids, sizes = in_poses()
     labels, usable = np.ones(POSES, dtype=np.int64), np.ones(POSES, dtype=bool)
     found = choose_prototypes(grids, sizes, labels, usable, most=99)
-    assert len(found.items) == 1
+    assert len(found.grids) == 1
     looks = found.looks_of(grids, sizes, labels)
     shown = found.shown()
     for row, look in enumerate(looks):
@@ -57,11 +58,11 @@ def test_an_odd_shape_looks_like_one_that_others_share():
     grids = np.stack([ODD] * 3 + [~ODD] * 2)
     sizes, labels = np.stack([SIZE] * 5), np.ones(5, dtype=np.int64)
     found = choose_prototypes(grids, sizes, labels, np.ones(5, dtype=bool), most=99)
-    assert len(found.items) == 1 and found.items[0] < 3
+    assert len(found.grids) == 1 and np.array_equal(found.grids[0], ODD)
     assert (found.looks_of(grids, sizes, labels) >= 0).all()
     # But a class has at least one.
     alone = choose_prototypes(grids[:1], sizes[:1], labels[:1], np.ones(1, dtype=bool), most=99)
-    assert alone.items.tolist() == [0]
+    assert len(alone.grids) == 1
 
 
 def test_what_is_not_usable_is_no_prototype():
@@ -86,6 +87,31 @@ def test_distances_are_those_of_a_loop():
                 each.append(squared.mean() + 0.3 * np.abs(differ).sum())
             assert ours[a, b] == pytest.approx(min(each), abs=1e-6)
             assert each[pose[a, b]] == pytest.approx(min(each), abs=1e-6)
+
+
+@pytest.mark.parametrize("codes", [3, 40])
+def test_codes_are_as_far_apart_as_the_grids_of_looks(codes):
+    grids = RNG.random((4, CELLS, CELLS, CELLS)) < 0.5
+    found = looks_apart(grids, codes)
+    flat = np.concatenate(
+        [
+            turn_grids(grid[None], *turn_of(pose)).reshape(1, -1)
+            for grid in grids
+            for pose in range(8)
+        ]
+    )
+    apart, wanted = (
+        ((each[:, None] - each[None]) ** 2).sum(axis=-1)
+        for each in (found, flat.astype(np.float64))
+    )
+    if codes == 40:  # 32 looks: nothing is left out
+        np.testing.assert_allclose(apart, wanted, rtol=0, atol=0.01)
+        assert not found[:, 31:].round(3).any()
+    else:  # the most that so few numbers can say
+        centred = flat - flat.mean(axis=0)
+        kept = (np.linalg.svd(centred, compute_uv=False)[:codes] ** 2).sum()
+        assert (found**2).sum() == pytest.approx(kept, rel=1e-4)
+        assert (apart < wanted + 0.01).all()
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
