@@ -28,7 +28,7 @@ from sceneprior.training.method import TrainedPrior
 from sceneprior.training.stages import LayoutStage
 from sceneprior.views import SceneViews
 
-BASE = Path(__file__).parents[1] / "configs" / "demo.yaml"
+BASE = Path(__file__).parents[1] / "configs" / "front_bedroom_small.yaml"
 SETTINGS = (
     "data.views_per_room=12",
     "model.max_objects=4",

@@ -1,7 +1,7 @@
 """Which silhouettes teach shapes best? The shape stage from one layout, at equal steps.
 
-    make demo                                            # once: makes the rooms and the layout
-    python benchmarks/silhouette_quality.py --run out/demo/run --epochs 10 --seed 0
+    sceneprior fit --config front_bedroom_small.yaml --run out/small     # once: for the layout
+    python benchmarks/silhouette_quality.py --run out/small --epochs 10 --seed 0
 
 Every variant of renderer and compositing starts from the same layout checkpoint and sees the same
 batches. Afterwards all are judged alike: the decoded training rooms are drawn hard, and each
@@ -33,7 +33,7 @@ VARIANTS = ("exact/layered", "exact/paper", "fast/layered", "fast/paper")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--run", type=Path, default=Path("out/demo/run"))
+    parser.add_argument("--run", type=Path, default=Path("out/small"))
     parser.add_argument("--out", type=Path, default=Path("out/silhouette_quality"))
     parser.add_argument("--epochs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)

@@ -65,7 +65,7 @@ def demo(
         "out/demo"
     ),
     config: Annotated[str, typer.Option(help="What to train.")] = "demo.yaml",
-    rooms: Annotated[int, typer.Option(min=20, help="Homes to make.")] = 480,
+    rooms: Annotated[int, typer.Option(min=20, help="Homes to make.")] = 240,
     count: Annotated[int, typer.Option(min=2, help="Rooms to generate and evaluate.")] = 200,
     renderer: RendererOption = "auto",
 ) -> None:

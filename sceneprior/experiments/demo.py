@@ -7,6 +7,7 @@ import shlex
 import sys
 from pathlib import Path
 
+from sceneprior.config import load_config
 from sceneprior.errors import InputError
 from sceneprior.experiments.steps import (
     Step,
@@ -51,8 +52,9 @@ def demo_steps(out: Path, config: str, rooms: int, count: int, renderer: str) ->
         "scores": ["eval-fid", "--run", run, "-n", str(count), "--out", scores, *draw],
         "report": ["report", "--run", run, "--scores", scores, "--out", page, *draw],
     }  # fmt: skip
+    last = load_config(config).stages()[-1].name
     results = {
-        "homes": "homes", "shards": "shards/index.json", "fit": "run/shape/final.ckpt",
+        "homes": "homes", "shards": "shards/index.json", "fit": f"run/{last}/final.ckpt",
         "scenes": "scenes/overview.png", "scores": "scores.json", "report": "report.html",
     }  # fmt: skip
     continues = {"shards": "shards", "fit": "run"}

@@ -1,9 +1,10 @@
 """The smallest 3D box of each tracked object that explains its masks in all views."""
 
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
+from numba import njit
 
 from sceneprior.lifting.hulls import MOST_EMPTY, Sightings, carve, cells_along, sightings_of
 from sceneprior.shards import RoomViews
@@ -129,7 +130,7 @@ def own_rays(
     each = max(4, RAYS // len(poses))
     origins, directions = [], []
     for ids, pose, camera, clear in zip(seen.ids, poses, intrinsics, sides_clear, strict=True):
-        u, v = _pixels(ids == seen.own_id)
+        u, v = _pixels(ids, seen.own_id)
         outermost = np.array([u.argmin(), v.argmin(), u.argmax(), v.argmax()])[clear]
         picked = np.concatenate([rng.integers(len(u), size=each), outermost])
         rays = pixel_directions(u[picked], v[picked], pose, camera)
@@ -138,12 +139,24 @@ def own_rays(
     return np.concatenate(origins).astype(np.float64), np.concatenate(directions)
 
 
-def _pixels(mask: Bool[np.ndarray, "height width"]) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows of a mask's pixels."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    part = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    v, u = np.nonzero(part)
-    return u + columns[0], v + rows[0]
+# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
+@njit(cache=True, nogil=True)
+@no_type_check
+def _pixels(ids, own_id):
+    """Columns and rows of the pixels of an image that have an id, row after row."""
+    height, width = ids.shape
+    count = 0
+    for row in range(height):
+        for column in range(width):
+            count += ids[row, column] == own_id
+    u, v = np.empty(count, np.int64), np.empty(count, np.int64)
+    at = 0
+    for row in range(height):
+        for column in range(width):
+            if ids[row, column] == own_id:
+                u[at], v[at] = column, row
+                at += 1
+    return u, v
 
 
 def pixel_directions(

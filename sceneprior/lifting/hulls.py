@@ -102,15 +102,13 @@ def cells_along(
 ) -> tuple[Int[np.ndarray, "rays samples 3"], Float[np.ndarray, "rays samples"]]:
     """The cells that rays pass through, evenly from entry to exit, and their emptiness."""
     near, far = pass_through(origins_m, directions, hull.low_m, hull.high_m)
-    met = far > near
-    near, far = np.where(met, near, 0), np.where(met, far, 0)
-    steps = (np.arange(samples) + 0.5) / samples
-    depth_m = near[:, None] + (far - near)[:, None] * steps
-    points_m = origins_m[:, None] + depth_m[..., None] * directions[:, None]
-    cells = hull.emptiness.shape[0]
-    where = ((points_m - hull.low_m) / hull.cell_m).clip(0, cells - 1).astype(np.int64)
-    emptiness = hull.emptiness[tuple(np.moveaxis(where, -1, 0))]
-    return where, np.where(met[:, None], emptiness, np.float32(NEVER))
+    where = np.empty((len(near), samples, 3), dtype=np.int32)
+    emptiness = np.empty((len(near), samples), dtype=np.float32)
+    in_threads(
+        _cells_along, len(near), origins_m, directions, near, far, hull.low_m, hull.cell_m,
+        hull.emptiness, where, emptiness,
+    )  # fmt: skip
+    return where, emptiness
 
 
 def pass_through(
@@ -213,3 +211,20 @@ def _carve(
                 share = max(past[j, k] - 0.5, 0.0) / (own[j, k] + past[j, k])
                 never = own[j, k] < 2 or past[j, k] > enough
                 emptiness[i, j, k] = NEVER if never else share
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _cells_along(first, last, origins, directions, near, far, low_m, cell_m, grid, where, found):
+    cells, samples = grid.shape[0], found.shape[1]
+    for ray in range(first, last):
+        met = far[ray] > near[ray]
+        start, span = (near[ray], far[ray] - near[ray]) if met else (0.0, 0.0)
+        for i in range(samples):
+            depth_m = start + span * ((i + 0.5) / samples)
+            for axis in range(3):
+                point_m = origins[ray, axis] + depth_m * directions[ray, axis]
+                cell = (point_m - low_m[axis]) / cell_m[axis]
+                where[ray, i, axis] = int(min(max(cell, 0.0), cells - 1.0))
+            x, y, z = where[ray, i]
+            found[ray, i] = grid[x, y, z] if met else NEVER

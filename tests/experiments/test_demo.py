@@ -62,7 +62,7 @@ def test_the_page_lists_the_commands_and_the_scores_their_costs(ran, tmp_path):
 def test_what_follows_a_step_that_is_done_again_is_done_again(ran, tmp_path):
     called, status = ran
     run(tmp_path, called)
-    (tmp_path / "run" / "shape" / "final.ckpt").unlink()
+    (tmp_path / "run" / "sampler" / "final.ckpt").unlink()
     status["synthesize"] = 2
     with pytest.raises(InputError, match="The demo stopped at 'scenes'"):
         run(tmp_path, called)
