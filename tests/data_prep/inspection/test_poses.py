@@ -63,7 +63,7 @@ OF_TRUTH = {
     ),
     "centimetres": (
         {"poses": scaled(100)},
-        "the translations of the cameras seem to have another unit than the objects; times 0.01, ",
+        "the translations of the cameras seem to have another unit than the objects; times 0.0",
     ),
     "next frames": (
         {"poses": lambda poses: np.roll(poses, 1, axis=0)},
