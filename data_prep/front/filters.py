@@ -16,15 +16,15 @@ def broken_rule(room: Room, recipe: Recipe) -> tuple[str, str] | None:
     if not room.furniture:
         why = f" ({room.notes[0]})" if room.notes else ""
         return "no_furniture", f"no usable furniture stands in it{why}"
-    if {room.room_id, room.room_id.rpartition("_")[2]} & set(recipe.invalid_rooms):
+    parts = room.room_id.split("_")  # which house and room may have in them, too
+    ids = {"_".join(parts[k:]) for k in range(len(parts))}
+    if not ids.isdisjoint(recipe.invalid_rooms):
         return "invalid_rooms", "it is among the invalid_rooms"
-    known = len(room.furniture) / (len(room.furniture) + room.without_model)
-    if recipe.min_models_share is not None and known < recipe.min_models_share:
-        return "min_models_share", (
-            f"there are models of {len(room.furniture)} of its "
-            f"{len(room.furniture) + room.without_model} pieces, min_models_share is "
-            f"{recipe.min_models_share:g}"
-        )
+    pieces = len(room.furniture) + room.without_model
+    least = recipe.min_models_share
+    if least is not None and len(room.furniture) < least * pieces:
+        known = f"there are models of {len(room.furniture)} of its {pieces} pieces"
+        return "min_models_share", f"{known}, min_models_share is {least:g}"
     if recipe.min_objects is not None and len(labels) < recipe.min_objects:
         unknown = ", ".join(unknown_categories(room, recipe))
         why = f" (of no class: {unknown})" if unknown else ""

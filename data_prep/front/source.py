@@ -150,8 +150,7 @@ class FrontSource:
             pictures = rgb_files(room, colors, made[0], self.label_set, renderer)
         notes = room.notes
         if outside := outside_floor(room):
-            pieces_ = "piece stands" if outside == 1 else "pieces stand"
-            notes += (f"{outside} of {len(room.furniture)} {pieces_} outside of the floor",)
+            notes += (f"{outside} of {len(room.furniture)} pieces stand outside of the floor",)
         return PreparedRoom(
             *made, models=models, files=pictures, notes=notes,
             unknown_categories=unknown_categories(room, self.recipe),
