@@ -46,8 +46,8 @@ def prep_front(
     recipe: Annotated[
         str,
         typer.Option(
-            help="Which rooms and classes: bedroom, living, dining, library, kitchen, all, or a "
-            "file such as mine.yaml."
+            help="Which rooms and classes: bedroom, living, dining, library, kitchen, all, "
+            "atiss_bedroom, atiss_living, atiss_dining, or a file such as mine.yaml."
         ),
     ] = "bedroom",
     splits: Annotated[

@@ -54,7 +54,7 @@ OWNERS = {
         "sceneprior/evaluation/", "sceneprior/lifting/shapes", "sceneprior/sampler/stage",
     ],
     "scipy.optimize": [
-        "sceneprior/losses/matching.py", "sceneprior/evaluation/", "data_prep/posed/floor.py",
+        "sceneprior/losses/matching.py", "sceneprior/evaluation/", "data_prep/inspection/causes.py",
     ],
     "cv2": ["data_prep/"],
     "distributed": ["data_prep/engine/cluster.py"],

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -108,6 +109,7 @@ def make_report(
             if line.status == "failed"
         ],
         "with_notes": sum(bool(line.notes) for line in prepared),
+        "notes": _kinds_of_notes(prepared),
         "counts": count_splits(lines),
         "per_split": {
             split: _means([line for line in prepared if line.split == split]) for split in SPLITS
@@ -133,6 +135,14 @@ def compare(expected: Expected, prepared: Sequence[Line]) -> list[dict[str, Any]
         for what, count in expected.model_dump().items()
         if what != "of" and count is not None
     ]
+
+
+def _kinds_of_notes(lines: Sequence[Line]) -> dict[str, int]:
+    """Notes without their names and numbers -> rooms, most first."""
+    kinds: Counter[str] = Counter()
+    for line in lines:
+        kinds.update({re.sub(r"'[^']*'|\S*\d\S*", "...", note) for note in line.notes})
+    return dict(sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
 
 
 def _means(lines: Sequence[Line]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 _FAILURES_SHOWN = 10
+_NOTES_SHOWN = 10
 
 
 def report_tables(report: dict[str, Any]) -> list[Table]:
@@ -15,6 +16,8 @@ def report_tables(report: dict[str, Any]) -> list[Table]:
         report: What `make_report` made.
     """
     tables = [_outcome(report), _splits(report), _classes(report)]
+    if report["notes"]:
+        tables.append(_notes(report["notes"]))
     if report["unknown_categories"]:
         tables.append(_unknown(report["unknown_categories"]))
     if report["failed"]:
@@ -33,6 +36,15 @@ def _outcome(report: dict[str, Any]) -> Table:
     table.add_row("failed", str(report["statuses"].get("failed", 0)))
     if report["with_notes"]:
         table.add_row("prepared with notes", str(report["with_notes"]))
+    return table
+
+
+def _notes(kinds: dict[str, int]) -> Table:
+    table = Table(Column("note of prepared rooms", overflow="fold"), "rooms")
+    for note, rooms in list(kinds.items())[:_NOTES_SHOWN]:
+        table.add_row(Text(note), str(rooms))
+    if len(kinds) > _NOTES_SHOWN:
+        table.add_row(f"and {len(kinds) - _NOTES_SHOWN} more: report.csv", "")
     return table
 
 

@@ -2,6 +2,9 @@
 
 from collections import Counter
 
+import numpy as np
+import shapely
+
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import Recipe
 
@@ -13,12 +16,26 @@ def broken_rule(room: Room, recipe: Recipe) -> tuple[str, str] | None:
     if not room.furniture:
         why = f" ({room.notes[0]})" if room.notes else ""
         return "no_furniture", f"no usable furniture stands in it{why}"
+    parts = room.room_id.split("_")  # which house and room may have in them, too
+    ids = {"_".join(parts[k:]) for k in range(len(parts))}
+    if not ids.isdisjoint(recipe.invalid_rooms):
+        return "invalid_rooms", "it is among the invalid_rooms"
+    pieces = len(room.furniture) + room.without_model
+    least = recipe.min_models_share
+    if least is not None and len(room.furniture) < least * pieces:
+        known = f"there are models of {len(room.furniture)} of its {pieces} pieces"
+        return "min_models_share", f"{known}, min_models_share is {least:g}"
     if recipe.min_objects is not None and len(labels) < recipe.min_objects:
         unknown = ", ".join(unknown_categories(room, recipe))
         why = f" (of no class: {unknown})" if unknown else ""
         return "min_objects", f"{len(labels)} objects, min_objects is {recipe.min_objects}{why}"
     if recipe.max_objects is not None and len(labels) > recipe.max_objects:
         return "max_objects", f"{len(labels)} objects, max_objects is {recipe.max_objects}"
+    for piece in room.furniture:
+        if recipe.allowed_categories and piece.category not in recipe.allowed_categories:
+            return "allowed_categories", f"'{piece.category}' is none of allowed_categories"
+        if piece.model_id in recipe.invalid_models:
+            return "invalid_models", f"'{piece.model_id}' is among the invalid_models"
     if recipe.required_classes and not set(labels) & set(recipe.required_classes):
         names = ", ".join(recipe.required_classes)
         return "required_classes", f"none of {names}, which required_classes asks for"
@@ -28,7 +45,38 @@ def broken_rule(room: Room, recipe: Recipe) -> tuple[str, str] | None:
     if recipe.max_height_m is not None and room.height_m > recipe.max_height_m:
         height = f"height {room.height_m:.2f} m"
         return "max_height_m", f"{height}, max_height_m is {recipe.max_height_m:g}"
+    return _broken_by_meshes(room, recipe)
+
+
+def _broken_by_meshes(room: Room, recipe: Recipe) -> tuple[str, str] | None:
+    """The same of rules that ask where meshes are, of a room that is read with them."""
+    boxes = boxes_m(room)
+    if not len(boxes):
+        return None
+    if (limits := recipe.furniture_between_m) is not None:
+        low, high = float(boxes[:, 0, 1].min()), float(boxes[:, 1, 1].max())
+        if low < limits[0] or high > limits[1]:
+            text = f"its furniture reaches from {low:.3f} to {high:.2f} m above the floor"
+            said = f"furniture_between_m is {limits[0]:g} to {limits[1]:g}"
+            return "furniture_between_m", f"{text}, {said}"
+    outside = outside_floor(room)
+    inside = 1 - outside / len(boxes)
+    if recipe.min_inside_floor is not None and inside < recipe.min_inside_floor:
+        text = f"{outside} of its {len(boxes)} pieces stand outside of the floor"
+        return "min_inside_floor", f"{text}, min_inside_floor is {recipe.min_inside_floor:g}"
     return None
+
+
+def boxes_m(room: Room) -> np.ndarray:
+    """(pieces, 2, 3) lowest and highest corner of each mesh; (0, 2, 3) where none was read."""
+    meshes = [piece.mesh.vertices_m for piece in room.furniture if len(piece.model.vertices_m)]
+    return np.array([(mesh.min(axis=0), mesh.max(axis=0)) for mesh in meshes]).reshape(-1, 2, 3)
+
+
+def outside_floor(room: Room) -> int:
+    """How many pieces have their middle not above the floor."""
+    middles = boxes_m(room).mean(axis=1)
+    return int((~shapely.covers(room.floor, shapely.points(middles[:, [0, 2]]))).sum())
 
 
 def unknown_categories(room: Room, recipe: Recipe) -> dict[str, int]:

@@ -52,6 +52,8 @@ class Room:
     furniture: tuple[Furniture, ...]
     notes: tuple[str, ...] = field(default=())
     """What was left out of the room, and why."""
+    without_model: int = 0
+    """Pieces that are left out because there is no model of theirs."""
 
     @property
     def floor_outline_m(self) -> np.ndarray:

@@ -18,6 +18,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 # YAML has lists where we have tuples.
 Range = Annotated[tuple[Finite, Finite], Field(strict=False)]
 Names = Annotated[tuple[str, ...], Field(strict=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Listed = Annotated[Names, BeforeValidator(lambda names: () if names is None else names)]
 Side = Annotated[int, Field(ge=8, le=8192)]
 
 
@@ -85,10 +87,20 @@ class Recipe(Section):
     max_floor_m: Finite | None = None
     """Longest side of the floor's bounding box."""
     max_height_m: Finite | None = 4.0
-    required_classes: Annotated[
-        Names, BeforeValidator(lambda names: () if names is None else names)
-    ] = ()
+    required_classes: Listed = ()
     """One of these must be there; null is as good as none."""
+    allowed_categories: Listed = ()
+    """A room with a piece of another category is left out; none or null: every piece is allowed."""
+    furniture_between_m: Range | None = None
+    """Above the floor: a room with a piece that reaches lower or higher is left out."""
+    min_inside_floor: Share | None = None
+    """Share of the furniture whose middle lies above the floor, at least."""
+    min_models_share: Share | None = None
+    """Share of the furniture for which there is a model, at least."""
+    invalid_rooms: Listed = ()
+    """Room ids, with their house or without; in a recipe, also a file with one a line."""
+    invalid_models: Listed = ()
+    """A room with one of these models is left out; a list, or a file."""
     scale_range: Range | None = (1e-5, 5.0)
     """A room with a piece scaled beyond this (absolute value, each axis) is left out."""
     allow_mirrored: bool = True
@@ -128,9 +140,7 @@ def find_recipe(text: str) -> Path:
     path = FOLDER / f"{text}.yaml"
     if not is_name(text) or not path.is_file():
         known = ", ".join(sorted(item.stem for item in FOLDER.glob("*.yaml")))
-        raise InputError(
-            f"No recipe is called '{text}'; there are {known}, or name a file: mine.yaml."
-        )
+        raise InputError(f"No recipe is called '{text}'; there are {known}, and files: mine.yaml.")
     return path
 
 
@@ -145,6 +155,9 @@ def load_recipe(text: str, changes: tuple[str, ...] = ()) -> Recipe:
     data = {"name": path.stem, **read_yaml(path)}
     for change in changes:
         apply_override(data, change, "--rule")
+    for key in ("invalid_rooms", "invalid_models"):
+        if isinstance(data.get(key), str):
+            data[key] = _lines(Path(data[key]), key)
     recipe = check_settings(Recipe, data, path.name)
     if not is_name(recipe.name):
         raise InputError(f"{path.name}: its name, {ascii(recipe.name)[:60]}, can name no shards.")
@@ -157,6 +170,13 @@ def load_recipe(text: str, changes: tuple[str, ...] = ()) -> Recipe:
     return recipe
 
 
+def _lines(path: Path, key: str) -> list[str]:
+    try:
+        return sorted({line.strip() for line in path.read_text().splitlines()} - {""})
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{key} names no file of ids that can be read ({error}).") from None
+
+
 def recipe_text(name: str) -> str:
     """A recipe that ships as a text to start from: with the classes of 3D-FUTURE's categories
     written out.
@@ -164,7 +184,11 @@ def recipe_text(name: str) -> str:
     Raises:
         InputError: none of this name ships.
     """
-    name = name.removesuffix(".yaml")  # a file of the user's has categories of its own
+    if Path(name).suffix in (".yaml", ".yml"):
+        raise InputError(
+            f"{name} is a file, not a recipe of the package, which `sceneprior recipe` prints; use "
+            f"yours as it is: prep-front --recipe {name}."
+        )
     text, recipe = find_recipe(name).read_text(encoding="utf-8"), load_recipe(name)
     classes = {category: recipe.class_of(category) for category in category_table()}
     table = [f"  {category}: {label}\n" for category, label in classes.items() if label != "void"]

@@ -138,6 +138,9 @@ class _RoomReader:
             height_of(surfaces, floor_y),
             tuple(self._furniture(placed, room_from_house, notes)),
             tuple(notes),
+            without_model=sum(
+                not self.models.has(str(entry.get("jid") or "")) for _, entry in placed
+            ),
         )
 
     def _surfaces(

@@ -1,6 +1,8 @@
 """3D-FRONT (or homes in its format) as a source of rooms: surveyed by house, drawn by room."""
 
+import contextlib
 import functools
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,7 +21,7 @@ from data_prep.engine.source import (
 from data_prep.engine.workers import Run
 from data_prep.front.drawing import prepare_room
 from data_prep.front.files import house_files
-from data_prep.front.filters import broken_rule, unknown_categories
+from data_prep.front.filters import broken_rule, outside_floor, unknown_categories
 from data_prep.front.furnished import Room
 from data_prep.front.houses import House, parse_house
 from data_prep.front.models import ModelBank
@@ -73,7 +75,12 @@ class FrontSource:
         if self.splits is not None:
             read_splits(self.splits)
         return {
-            "recipe": self.recipe.model_dump(exclude={"expected"}),
+            "recipe": {
+                **self.recipe.model_dump(exclude={"expected"}),
+                # They may be thousands.
+                "invalid_rooms": _digest_of_ids(self.recipe.invalid_rooms),
+                "invalid_models": _digest_of_ids(self.recipe.invalid_models),
+            },
             "seed": self.seed,
             "rgb": self.rgb,
             "splits": None if self.splits is None else digest(Path(self.splits).read_text()),
@@ -93,8 +100,10 @@ class FrontSource:
             left_out += lost
         if not found and not left_out:
             kinds = " or ".join(self.recipe.room_types or ("any type",))
+            there = ", ".join(_room_types(files)) or "none that could be read"
             raise InputError(
-                f"No room of {self.front} is of a type that {self.recipe.name} is about ({kinds})."
+                f"No room of {self.front} is of a type that {self.recipe.name} is about ({kinds}); "
+                f"there are {there}."
             )
         if self.splits is None:
             room_ids = [room_id for room_id, _, _ in found]
@@ -139,8 +148,11 @@ class FrontSource:
         if self.rgb:
             colors = [self._bank.color(piece.model_id) for piece in room.furniture]
             pictures = rgb_files(room, colors, made[0], self.label_set, renderer)
+        notes = room.notes
+        if outside := outside_floor(room):
+            notes += (f"{outside} of {len(room.furniture)} pieces stand outside of the floor",)
         return PreparedRoom(
-            *made, models=models, files=pictures, notes=room.notes,
+            *made, models=models, files=pictures, notes=notes,
             unknown_categories=unknown_categories(room, self.recipe),
         )  # fmt: skip
 
@@ -172,6 +184,10 @@ class FrontSource:
         return chosen
 
 
+def _digest_of_ids(ids: tuple[str, ...]) -> str | None:
+    return digest("\n".join(ids)) if ids else None
+
+
 # Kept from room to room within a process. The stamps make a worker that outlives the job, as those
 # of a cluster do, read a mended file again.
 @functools.lru_cache(maxsize=1)
@@ -182,6 +198,16 @@ def _bank(future: Path, stamp: tuple[int, int]) -> ModelBank:
 @functools.lru_cache(maxsize=1)
 def _parsed(path: Path, stamp: tuple[int, int]) -> House:
     return parse_house(path)
+
+
+def _room_types(files: list[Path]) -> list[str]:
+    """The types of rooms in these houses, most frequent first, with their counts."""
+    types: Counter[str] = Counter()
+    for path in files:
+        with contextlib.suppress(InputError):  # it is in the report, if there is one
+            entries = [entry for entry in parse_house(path).rooms if isinstance(entry, dict)]
+            types.update(str(entry.get("type") or "?") for entry in entries)
+    return [f"{name} ({count})" for name, count in types.most_common()]
 
 
 def _filtered(room: Room, house: str, recipe: Recipe, rule: str, reason: str) -> LeftOut:

@@ -8,7 +8,8 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from data_prep.inspection.verify import FolderCheck, RoomCheck
+    from data_prep.inspection.agreement import Agreement
+    from data_prep.inspection.verify import FolderCheck
 
 SHEET_NAME = "inspect.png"
 _WORST_SHOWN = 5
@@ -125,7 +126,10 @@ def _verify(console: "object", shards: Path, room: str | None, workers: int) -> 
 def _check_tables(found: "FolderCheck") -> "list[Table]":
     from rich.table import Column, Table
 
-    totals = Table("split", "rooms", "views", "checksums", "unoccluded objects", "mean 2D IoU")
+    from data_prep.inspection.agreement import Agreement
+
+    judged = ("in 3D", "masks within", "mean 2D IoU")
+    totals = Table("split", "rooms", "views", "checksums", *judged)
     for split, checks in found.rooms.items():
         rooms = [check for check in checks if check.room_id]
         totals.add_row(
@@ -133,46 +137,54 @@ def _check_tables(found: "FolderCheck") -> "list[Table]":
             str(len(rooms)),
             str(sum(check.views for check in rooms)),
             f"{sum(check.has_checksum for check in rooms)} rooms",
-            str(sum(len(check.agreement.mesh) + len(check.agreement.box) for check in rooms)),
-            _mean_iou(rooms),
+            *_judged(sum((check.agreement for check in rooms), Agreement())),
         )
-    every = [check for checks in found.rooms.values() for check in checks if check.agreement.means]
-    worst = sorted(every, key=lambda check: (min(check.agreement.means.values()), check.room_id))
+    every = [check for checks in found.rooms.values() for check in checks]
+    worst = sorted(
+        (check for check in every if check.agreement.tallies),
+        key=lambda check: (
+            min(tally.share for tally in check.agreement.tallies.values()),
+            check.room_id,
+        ),
+    )
     # Folded, or a narrow terminal would cut off the end of an id, which is the room's name.
-    table = Table(Column("worst rooms", overflow="fold"), "unoccluded objects", "mean 2D IoU")
+    table = Table(Column("worst rooms", overflow="fold"), *judged)
     for check in worst[:_WORST_SHOWN]:
-        count = len(check.agreement.mesh) + len(check.agreement.box)
-        table.add_row(check.room_id, str(count), _mean_iou([check]))
+        table.add_row(check.room_id, *_judged(check.agreement))
     return [totals, table] if worst else [totals]
 
 
-def _mean_iou(rooms: "list[RoomCheck]") -> str:
-    import numpy as np
+def _judged(agreement: "Agreement") -> tuple[str, str, str]:
+    """What stands for the objects, masks within its projection, IoU of unoccluded ones."""
+    from data_prep.inspection.bodies import KINDS
 
-    mesh = [value for room in rooms for value in room.agreement.mesh]
-    box = [value for room in rooms for value in room.agreement.box]
-    parts = [
-        f"{np.mean(values):.3f} ({what})"
-        for values, what in ((mesh, "meshes"), (box, "3D boxes"))
-        if values
-    ]
-    return ", ".join(parts) or "-"
+    tallies = agreement.tallies
+    return (
+        "\n".join(KINDS[kind] for kind in tallies) or "-",
+        "\n".join(f"{tally.share:.1%} of {tally.masks}" for tally in tallies.values()) or "-",
+        "\n".join(
+            f"{tally.mean_iou:.3f} of {tally.whole}" if tally.whole else "-"
+            for tally in tallies.values()
+        )
+        or "-",
+    )
 
 
 def _summary(found: "FolderCheck") -> str:
+    from data_prep.inspection.bodies import KINDS
+
     rooms = [check for checks in found.rooms.values() for check in checks]
     without = sum(not check.has_checksum for check in rooms)
-    count = len(found.agreement.mesh) + len(found.agreement.box)
     parts = ["Checksums, shapes, ranges, 2D boxes and masks agree"]
     if without:
         parts.append(f"{without} rooms carry no checksum (shards of an earlier release)")
-    if count:
-        parts.append(
-            f"the ground truth of {count} unoccluded objects projects onto their masks with a mean "
-            f"2D IoU of {_mean_iou(rooms)}"
-        )
-    elif any(check.has_truth for check in rooms):
-        parts.append("no object is unoccluded in any view, so no ground truth could be projected")
-    else:
-        parts.append("no room is known in 3D, so no ground truth was projected")
+    for kind, tally in found.agreement.tallies.items():
+        text = f"{tally.share:.1%} of {tally.masks} masks lie within their projected {KINDS[kind]}"
+        if tally.whole:
+            text += f"; {tally.whole} unoccluded ones have a mean 2D IoU of {tally.mean_iou:.3f}"
+        parts.append(text)
+    if not found.agreement.tallies:
+        parts.append("no object could be held against its masks in 3D")
+    elif "found" in found.agreement.tallies:
+        parts.append("found boxes do not tell whether all is too large, too small or mirrored")
     return "; ".join(parts) + "."

@@ -1,8 +1,13 @@
 """Projects points and wires of a room into its views, in numpy: for pictures and checks."""
 
+import warnings
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from sceneprior.geometry.corners import BOX_EDGES, box_corners
 
 WIRE_NEAR_M = 0.05
 """Lines are cut where they come nearer to the camera than this."""
@@ -60,31 +65,65 @@ def _cut(behind: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     return behind + (ahead - behind) * (WIRE_NEAR_M - behind[2]) / (ahead[2] - behind[2])
 
 
-def boxes_around(
-    points_m: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray
-) -> np.ndarray:
-    """The 2D box round projected points in each view, beyond the image's borders, too.
+class Hull(NamedTuple):
+    """The corners of a convex body, and its edges as pairs of rows."""
+
+    points_m: np.ndarray
+    """(P, 3)"""
+    edges: np.ndarray
+    """(E, 2)"""
+
+
+def hull_of(points_m: np.ndarray) -> Hull:
+    """The convex hull of (P, 3) points: it projects into the same 2D box with fewer of them."""
+    low, high = points_m.min(axis=0), points_m.max(axis=0)
+    try:
+        # Joggled, for what is flat has no hull of its own.
+        found = ConvexHull(points_m, qhull_options="QJ")
+    except QhullError:
+        return Hull(box_corners((low + high) / 2, high - low), np.array(BOX_EDGES))
+    number = np.zeros(len(points_m), dtype=np.int64)
+    number[found.vertices] = np.arange(len(found.vertices))
+    edges = number[np.concatenate([found.simplices[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])]
+    return Hull(points_m[found.vertices], np.unique(np.sort(edges, axis=1), axis=0))
+
+
+def boxes_around(hull: Hull, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """The 2D box round a projected body in each view, beyond the image's borders, too.
 
     Args:
-        points_m: (P, 3) in the room frame.
+        hull: In the room frame.
         world_to_camera: (T, 4, 4).
         intrinsics: (T, 3, 3), pixels.
 
     Returns:
-        (T, 4) x1, y1, x2, y2 in pixels; NaN where a point is nearer than the near plane.
+        (T, 4) x1, y1, x2, y2 in pixels, of what lies beyond the near plane; NaN where nothing does.
     """
-    boxes = np.full((len(world_to_camera), 4), np.nan)
-    for view, (matrix, K) in enumerate(zip(world_to_camera, intrinsics, strict=True)):
-        camera = to_camera(points_m, matrix)
-        if camera[:, 2].min() < WIRE_NEAR_M:
-            continue
-        pixels = (camera / camera[:, 2:]) @ np.asarray(K, dtype=np.float64).T
-        boxes[view] = (*pixels[:, :2].min(axis=0), *pixels[:, :2].max(axis=0))
+    poses = np.asarray(world_to_camera, dtype=np.float64)
+    camera = hull.points_m @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+    ahead = camera[..., 2] >= WIRE_NEAR_M
+    pixels = _pixels(np.where(ahead[..., None], camera, np.nan), intrinsics)
+    with warnings.catch_warnings():  # views that are behind the camera altogether
+        warnings.simplefilter("ignore", RuntimeWarning)
+        boxes = np.concatenate([np.nanmin(pixels, axis=1), np.nanmax(pixels, axis=1)], axis=1)
+    for view in np.flatnonzero(ahead.any(axis=1) & ~ahead.all(axis=1)):
+        crossing = hull.edges[ahead[view, hull.edges].sum(axis=1) == 1]
+        a, b = camera[view, crossing[:, 0]], camera[view, crossing[:, 1]]
+        share = (WIRE_NEAR_M - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
+        cut = _pixels((a + (b - a) * share)[None], intrinsics[view : view + 1])[0]
+        boxes[view, :2] = np.minimum(boxes[view, :2], cut.min(axis=0))
+        boxes[view, 2:] = np.maximum(boxes[view, 2:], cut.max(axis=0))
     return boxes
 
 
+def _pixels(camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """(T, P, 2) of (T, P, 3) points in the cameras' axes."""
+    lenses = np.asarray(intrinsics, dtype=np.float64)
+    return ((camera / camera[..., 2:]) @ lenses.transpose(0, 2, 1))[..., :2]
+
+
 def box_iou_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Intersection over union of rows of 2D boxes; NaN where a box is NaN.
+    """Intersection over union of rows of 2D boxes; NaN where a box is NaN, or both are empty.
 
     Example: two squares that share one half.
 
@@ -94,4 +133,5 @@ def box_iou_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     low, high = np.maximum(a[..., :2], b[..., :2]), np.minimum(a[..., 2:], b[..., 2:])
     shared = np.maximum(high - low, 0).prod(axis=-1)
     areas = [(box[..., 2:] - box[..., :2]).prod(axis=-1) for box in (a, b)]
-    return shared / (areas[0] + areas[1] - shared)
+    union = np.asarray(areas[0] + areas[1] - shared)
+    return np.divide(shared, union, out=np.full(union.shape, np.nan), where=union > 0)

@@ -1,20 +1,17 @@
 """Checks a folder of shards: checksums, shapes, ranges, boxes, masks, ground truth in 3D."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from data_prep.engine.source import SPLITS
 from data_prep.engine.workers import pool
-from data_prep.inspection.agreement import (
-    CAMERA_REPAIRS,
-    Agreement,
-    ModelPoints,
-    measure,
-    measure_repaired,
-)
+from data_prep.inspection.agreement import Agreement, compare
+from data_prep.inspection.bodies import ModelHulls, found_bodies, true_bodies
+from data_prep.inspection.causes import Trial, try_repairs
 from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
+from data_prep.inspection.verdicts import disagreement, room_problems
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError, ShardError
 from sceneprior.shards import (
@@ -26,14 +23,8 @@ from sceneprior.shards import (
     room_checksum,
 )
 
-IOU_AT_LEAST = {"mesh": 0.85, "box": 0.5}
-"""For the mean over a folder. A mesh and its own mask agree to the pixel but for parts thinner than
-one. The corners of a 3D box reach beyond the silhouette of what is in it, and annotated boxes are
-those of a partial scan. A wrong axis gives 0.1 or less."""
-ROOM_IOU_AT_LEAST = {"mesh": 0.6, "box": 0.2}
-"""For the mean of one room, so that one wrong room does not hide among many right ones."""
-_ROOM_OBJECTS = 5
-"""A mean over fewer says nothing about a room."""
+_TRIED_ROOMS = 2
+"""Of a shard, in which repairs of the cameras are tried; the others are wrong in the same way."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +38,8 @@ class RoomCheck:
     problems: tuple[str, ...] = ()
     """Sentences without the room's name."""
     agreement: Agreement = field(default_factory=Agreement)
-    repaired: dict[str, Agreement] = field(default_factory=dict)
-    """By likely cause, the agreement without it; measured only where the room's own is low."""
+    trials: dict[str, Trial] = field(default_factory=dict)
+    """By likely cause, what is gained without it; tried in some rooms that do not agree."""
     has_truth: bool = False
     has_checksum: bool = False
 
@@ -109,24 +100,10 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
         if all(room.views for room in every):  # else it is said already why something is missing
             problems += _count_problems(folder, index, rooms)
         agreement = sum((room.agreement for room in every), Agreement())
-        for kind, what in (("mesh", "meshes"), ("box", "3D boxes")):
-            mean, least = agreement.means.get(kind, 1.0), IOU_AT_LEAST[kind]
-            if mean < least:
-                problems.append(
-                    f"{folder}: the projected {what} of the ground truth agree with the masks with "
-                    f"a mean 2D IoU of {mean:.2f}, expected at least {least}: "
-                    + _likely_cause(every, kind, least)
-                )
+        trials = [room.trials for room in every if room.trials]
+        for kind in agreement.failing():
+            problems.append(f"{folder}: {disagreement(agreement, kind, trials)}")
     return FolderCheck(rooms, tuple(problems))
-
-
-def _likely_cause(rooms: Sequence[RoomCheck], kind: str, least: float) -> str:
-    """The end of a sentence: the cause without which the overlap would be at least `least`."""
-    for cause in CAMERA_REPAIRS:
-        repaired = sum((room.repaired.get(cause, room.agreement) for room in rooms), Agreement())
-        if (mean := repaired.means[kind]) >= least:
-            return f"{cause}, the mean would be {mean:.2f}"
-    return "is an axis or a unit wrong?"
 
 
 def _count_problems(
@@ -153,7 +130,7 @@ def _check_shard(
 ) -> list[RoomCheck]:
     """Every room of a shard, or the one asked for; a shard that cannot be read is one problem."""
     name = str(path.relative_to(folder))
-    models = ModelPoints(folder / MODELS_FOLDER)
+    models = ModelHulls(folder / MODELS_FOLDER)
     checks: list[RoomCheck] = []
     try:
         with Shard(path) as shard:
@@ -162,13 +139,16 @@ def _check_shard(
                 checks.append(RoomCheck(name, "", problems=(f"{said} '{label_set_name}'",)))
             for room_id in shard.room_ids:
                 if only is None or room_id == only:
-                    checks.append(_check_room(shard, name, room_id, models))
+                    left = _TRIED_ROOMS - sum(bool(check.trials) for check in checks)
+                    checks.append(_check_room(shard, name, room_id, models, left > 0))
     except ShardError as error:
         checks.append(RoomCheck(name, "", problems=(str(error).removesuffix("."),)))
     return checks
 
 
-def _check_room(shard: Shard, name: str, room_id: str, models: ModelPoints) -> RoomCheck:
+def _check_room(
+    shard: Shard, name: str, room_id: str, models: ModelHulls, try_causes: bool
+) -> RoomCheck:
     truth = None
     try:
         views = shard.read_room(room_id, images=True)
@@ -181,27 +161,25 @@ def _check_room(shard: Shard, name: str, room_id: str, models: ModelPoints) -> R
     problems = []
     if stored is not None and stored != room_checksum(views, truth):
         problems.append("its checksum is not that of its contents: the file was changed or damaged")
-    problems += array_problems(views, len(label_set(shard.label_set)))
-    problems += mask_problems(views)
-    agreement = Agreement()
+    wrong = [*array_problems(views, len(label_set(shard.label_set)))]
+    problems += [*wrong, *mask_problems(views)]
     if truth is not None:
-        found = list(truth_problems(views, truth))
-        if not found:
-            agreement, found = measure(views, truth, models)
+        wrong += (found := [*truth_problems(views, truth)])
         problems += found
     check = RoomCheck(
-        name, room_id, len(views.visible), len(views.object_class), agreement=agreement,
-        has_truth=truth is not None, has_checksum=stored is not None,
+        name, room_id, len(views.visible), len(views.object_class),
+        problems=tuple(problems), has_truth=truth is not None, has_checksum=stored is not None,
     )  # fmt: skip
-    if truth is not None and any(
-        mean < IOU_AT_LEAST[kind] for kind, mean in agreement.means.items()
-    ):
-        check = replace(check, repaired=measure_repaired(views, truth, models))
-    for kind, mean in agreement.means.items():
-        count, least = len(getattr(agreement, kind)), ROOM_IOU_AT_LEAST[kind]
-        if count >= _ROOM_OBJECTS and mean < least:
-            problems.append(
-                f"its ground truth projects onto its masks with a mean 2D IoU of {mean:.2f} only "
-                f"({count} unoccluded objects): {_likely_cause([check], kind, least)}"
-            )
-    return replace(check, problems=tuple(problems))
+    if wrong:
+        return check
+    if truth is None:
+        bodies = found_bodies(views)
+    else:
+        bodies, found = true_bodies(views, truth, models)
+        problems += found
+    seen = compare(bodies, views)
+    trials = {}
+    if try_causes and seen.agreement.failing():
+        trials = try_repairs(bodies, views)
+    problems += room_problems(bodies, views, seen, [trials] if trials else [])
+    return replace(check, problems=tuple(problems), agreement=seen.agreement, trials=trials)

@@ -65,7 +65,9 @@ def change_room(
     if seal:
         with Shard(path) as shard:
             views = shard.read_room(room_id, images=True)
-            checksum = room_checksum(views, shard.read_ground_truth(room_id))
+            known = shard.has_ground_truth(room_id)
+            truth = shard.read_ground_truth(room_id) if known else None
+            checksum = room_checksum(views, truth)
         with h5py.File(path, "a") as file:
             list(file["rooms"].values())[number].attrs["sha256"] = checksum
     return room_id

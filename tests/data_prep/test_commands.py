@@ -125,12 +125,12 @@ def test_pictures_and_wrong_words(front, tmp_path, prep, cli):
     assert made.exit_code == 3 and "its instanceid, '[/] [bold]'" in made.stdout, made.output
     assert len(list((tmp_path / "shards" / "rgb").glob("*/0000.png"))) == 6
     for words, said in (
-        (("--recipe", "attic"), "No recipe is called 'attic'; there are all, bedroom,"),
+        (("--recipe", "attic"), "No recipe is called 'attic'; there are all, atiss_bedroom,"),
         (
             ("--rule", "max_floor_m=wide"),
             "'max_floor_m': input should be a valid number (got 'wide')",
         ),
-        (("--recipe", "library"), "is of a type that library is about (library)"),
+        (("--recipe", "library"), "is about (library); there are Bedroom (7)"),
     ):
         result = cli(
             "prep-front", "--front", front.front, "--future", front.future,

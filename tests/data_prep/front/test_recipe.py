@@ -13,7 +13,9 @@ def test_recipes_load_and_say_what_is_wrong():
     assert recipe.max_floor_m is None and recipe.views.per_m2 == 3
     assert recipe.of_type("MasterBedroom") and not recipe.of_type("LivingRoom")
     assert load_recipe("living").of_type("LivingDiningRoom")
-    with pytest.raises(InputError, match="No recipe is called 'attic'; there are all, bedroom, d"):
+    with pytest.raises(
+        InputError, match="No recipe is called 'attic'; there are all, atiss_bedroom, atiss_d"
+    ):
         load_recipe("attic")
     with pytest.raises(
         InputError,
@@ -136,8 +138,11 @@ def test_a_recipe_of_the_users_own(tmp_path):
     path.write_text(KITCHEN)
     recipe = load_recipe(str(path), ("views.per_m2=3",))
     assert (recipe.name, recipe.label_set) == ("kitchens", "void,fridge,sink,table")
-    with pytest.raises(InputError, match=r"No recipe is called '.*kitchens'; there are all,"):
-        recipe_text(str(path))  # it is the user's, and there to be read
+    with pytest.raises(
+        InputError,
+        match=r"kitchens\.yaml is a file, not a recipe of the package.*use yours as it is",
+    ):
+        recipe_text(str(path))
     assert recipe.scale_range == (1e-3, 5.0) and recipe.views.per_m2 == 3
     classes = {
         "fridge": "fridge",  # the class of its own name
@@ -169,3 +174,29 @@ def test_files_that_are_no_recipe(tmp_path, name, text, said):
         path.write_text(text)
     with pytest.raises(InputError, match=said):
         load_recipe(str(path))
+
+
+@pytest.mark.parametrize("kind", ["bedroom", "living", "dining"])
+def test_atiss_filters_have_a_recipe_of_their_own(kind):
+    recipe, ours = load_recipe(f"atiss_{kind}"), load_recipe(kind)
+    assert (recipe.min_objects, ours.min_objects) == (3, 2)
+    assert recipe.max_objects == (13 if kind == "bedroom" else 21)
+    assert recipe.max_floor_m == (6 if kind == "bedroom" else 12)
+    assert recipe.furniture_between_m == (-0.005, 4.0) and recipe.max_height_m is None
+    assert not recipe.allow_mirrored and recipe.label_set == ours.label_set
+    beds = ("double_bed", "single_bed", "kids_bed") if kind == "bedroom" else ()
+    assert recipe.required_classes == beds
+    # Every category of its list is known and has a class, so counting all pieces or classes is one.
+    assert len(recipe.allowed_categories) == (30 if kind == "bedroom" else 26)
+    assert set(recipe.allowed_categories) <= set(category_table())
+    assert all(recipe.class_of(category) != "void" for category in recipe.allowed_categories)
+
+
+def test_lists_of_what_is_invalid_are_read_where_the_user_has_them(tmp_path):
+    path = tmp_path / "rooms.txt"
+    path.write_text("Bedroom-2\n\nBedroom-1\n")
+    recipe = load_recipe("bedroom", (f"invalid_rooms={path}", "invalid_models=[a, b]"))
+    assert recipe.invalid_rooms == ("Bedroom-1", "Bedroom-2")
+    assert recipe.invalid_models == ("a", "b")
+    with pytest.raises(InputError, match="invalid_models names no file of ids that can be read"):
+        load_recipe("bedroom", (f"invalid_models={tmp_path / 'none.txt'}",))

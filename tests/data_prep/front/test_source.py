@@ -77,7 +77,7 @@ def test_rooms_of_every_type_become_one_data_set(front, tmp_path):
 
 def test_a_type_that_no_room_has(front):
     flat(front)
-    with pytest.raises(InputError, match=r"is of a type that bedroom is about \(attic\)"):
+    with pytest.raises(InputError, match=r"is about \(attic\); there are .*LivingRoom \(1\)"):
         survey(front, "bedroom", "room_types=[attic]")
 
 
@@ -156,3 +156,13 @@ def test_pieces_and_floors_are_what_the_shared_houses_promise():
         assert len(pieces[kind]) == want["rooms"] and max(pieces[kind]) == want["objects max"]
         assert np.mean(pieces[kind]) == pytest.approx(want["objects mean"], abs=0.0051)
         assert np.mean(areas[kind]) == pytest.approx(want["area mean m2"], abs=0.051)
+
+
+def test_a_room_that_is_asked_for_without_its_house_is_explained(front):
+    flat(front)
+    said = (
+        r"--only takes HOUSE, .*\. A room is named with its house: --only HOUSE/MasterBedroom-1\."
+    )
+    with pytest.raises(InputError, match=said):
+        survey(front, "bedroom", only="MasterBedroom-1")
+    assert len(survey(front, "bedroom", only="flat/MasterBedroom-1").rooms) == 1

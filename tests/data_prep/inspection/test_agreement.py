@@ -8,7 +8,8 @@ from front_files import bedroom
 from front_jobs import front_job, rooms_of
 
 from data_prep.engine.build import build_shards
-from data_prep.inspection.agreement import Agreement, ModelPoints, measure, unoccluded
+from data_prep.inspection.agreement import MARGIN, Agreement, Tally, compare, compare_boxes
+from data_prep.inspection.bodies import ModelHulls, found_bodies, true_bodies
 from sceneprior.errors import ShardError
 
 LARGER = ("views.image_size=[180, 240]", "views.per_m2=2")
@@ -20,15 +21,16 @@ def made(front, tmp_path):
     front.house("house", bedroom("Bedroom-0"))
     build_shards(front_job(front, tmp_path / "shards", rules=LARGER, only="house"))
     (pair,) = rooms_of(tmp_path / "shards").values()
-    return *pair, ModelPoints(tmp_path / "shards" / "models")
+    return *pair, ModelHulls(tmp_path / "shards" / "models")
 
 
 def test_whole_things_are_those_that_nothing_cuts_off(made):
     views, _, _ = made
-    seen = unoccluded(views)
+    bodies, _ = true_bodies(*made)
+    seen = compare(bodies, views)
     height, width = views.image_size
-    assert 3 < seen.sum() < views.visible.sum()
-    for view, k in zip(*np.nonzero(seen), strict=True):
+    assert 3 < seen.whole.sum() < views.visible.sum() and (seen.judged == views.visible).all()
+    for view, k in zip(*np.nonzero(seen.whole), strict=True):
         rows, columns = np.nonzero(views.instance_ids[view] == k + 1)
         assert rows.min() > 0 and rows.max() < height - 1
         assert columns.min() > 0 and columns.max() < width - 1
@@ -36,18 +38,47 @@ def test_whole_things_are_those_that_nothing_cuts_off(made):
 
 
 def test_a_right_room_agrees_to_the_pixel(made):
-    agreement, problems = measure(*made)
-    assert problems == [] and agreement.box == []
-    assert len(agreement.mesh) == unoccluded(made[0]).sum()
-    assert np.mean(agreement.mesh) > 0.95 and min(agreement.mesh) > 0.85
+    bodies, problems = true_bodies(*made)
+    seen = compare(bodies, made[0])
+    assert problems == [] and set(seen.kinds) == {"mesh"}
+    assert seen.iou[seen.judged & seen.whole].min() > 0.85
+    tally = seen.agreement.of("mesh")
+    # What is hidden in part lies within its projection, too.
+    assert tally.share == 1.0 and tally.masks == made[0].visible.sum() and tally.mean_iou > 0.95
 
 
 def test_without_meshes_the_boxes_stand_for_them(made):
     views, truth, models = made
     bare = replace(truth, model_ids=("",) * len(truth.model_ids))
-    agreement, problems = measure(views, bare, models)
+    bodies, problems = true_bodies(views, bare, models)
     # These pieces are boxes themselves, though some are turned in theirs.
-    assert problems == [] and agreement.mesh == [] and np.mean(agreement.box) > 0.85
+    tally = compare(bodies, views).agreement.of("box")
+    assert problems == [] and tally.share == 1.0 and tally.mean_iou > 0.85
+
+
+def test_without_truth_boxes_are_found_from_the_masks(made):
+    bodies = found_bodies(made[0])
+    tally = compare(bodies, made[0]).agreement.of("found")
+    assert tally.mean_iou > 0.85 and tally.share > 0.8
+    true, _ = true_bodies(*made)
+    for body, right in zip(bodies, true, strict=True):
+        low, high = body.hull.points_m.min(axis=0), body.hull.points_m.max(axis=0)
+        np.testing.assert_allclose(low, right.hull.points_m.min(axis=0), atol=0.2)
+        np.testing.assert_allclose(high, right.hull.points_m.max(axis=0), atol=0.2)
+
+
+def test_what_is_undefined_disagrees_and_the_margin_is_what_it_says(made):
+    views, _, _ = made
+    bodies, _ = true_bodies(*made)
+    height, width = views.image_size
+    boxes = views.boxes * np.array([width, height, width, height], dtype=float)
+    margin = MARGIN * width
+    for grow, share in ((0.0, 1.0), (-0.99 * margin, 1.0), (-1.01 * margin, 0.0), (50, 1.0)):
+        wider = boxes + np.array([-grow, -grow, grow, grow])
+        assert compare_boxes(bodies, wider, views).agreement.of("mesh").share == share
+    behind = compare_boxes(bodies, np.full(boxes.shape, np.nan), views).agreement.of("mesh")
+    assert behind.masks == views.visible.sum() and behind.share == behind.mean_iou == 0.0
+    assert Agreement({"mesh": behind}).failing() == ["mesh"]
 
 
 @pytest.mark.parametrize(
@@ -63,8 +94,10 @@ def test_without_meshes_the_boxes_stand_for_them(made):
 def test_a_wrong_axis_does_not_agree(made, wrong):
     views, truth, models = made
     moved = replace(truth, model_to_room=(wrong @ truth.model_to_room).astype(np.float32))
-    agreement, problems = measure(views, moved, models)
-    assert len(agreement.mesh) == unoccluded(views).sum() and np.mean(agreement.mesh) < 0.6
+    bodies, problems = true_bodies(views, moved, models)
+    tally = compare(bodies, views).agreement.of("mesh")
+    assert tally.masks == views.visible.sum() and tally.mean_iou < 0.6
+    assert Agreement({"mesh": tally}).failing() == ["mesh"]
     assert len(problems) >= 2 and "m off the box round its placed mesh" in problems[0]
 
 
@@ -73,20 +106,26 @@ def test_models_that_are_missing_or_damaged_are_named(made):
     path = models.folder / f"{truth.model_ids[0]}.ply"
     whole = path.read_bytes()
     path.write_bytes(whole[:-20])
-    fresh = ModelPoints(models.folder)
+    fresh = ModelHulls(models.folder)
     with pytest.raises(ShardError, match=r"\.ply is damaged \(\w+\), but ground truth stands on"):
         fresh.get(truth.model_ids[0])
     path.unlink()
-    _, problems = measure(views, truth, fresh)
+    bodies, problems = true_bodies(views, truth, fresh)
+    assert None in bodies and not compare(bodies, views).judged[:, bodies.index(None)].any()
     assert problems[0].endswith(".ply is missing, but ground truth stands on it")
     path.write_bytes(whole)
-    assert fresh.get(truth.model_ids[0]).shape[1] == 3
+    assert fresh.get(truth.model_ids[0]).points_m.shape == (8, 3)
     nothing = whole.replace(b"element face 12", b"element face 0 ")
     assert nothing != whole
     path.write_bytes(nothing)
     with pytest.raises(ShardError, match=r"holds no usable faces|is damaged"):
-        ModelPoints(models.folder).get(truth.model_ids[0])
+        ModelHulls(models.folder).get(truth.model_ids[0])
 
 
 def test_agreements_add_up():
-    assert Agreement([1.0], [0.5]) + Agreement([0.5]) == Agreement([1.0, 0.5], [0.5])
+    first, second = Tally(4, 3, 2, 1.5), Tally(6, 6)
+    total = Agreement({"box": first}) + Agreement({"box": second, "mesh": second})
+    assert total.tallies == {"mesh": second, "box": Tally(10, 9, 2, 1.5)}
+    assert total.of("box").share == 0.9 and total.of("box").mean_iou == 0.75
+    assert total.failing() == [] and Agreement({"box": first}).failing() == ["box"]
+    assert Agreement({"box": first}).failing(least=5) == [] and np.isnan(second.mean_iou)

@@ -76,8 +76,8 @@ def test_verify_prints_the_overlap_and_exits_with_3_where_something_is_wrong(sha
     well = cli("inspect", shards, "--verify")
     said = " ".join(well.stdout.split())
     assert well.exit_code == 0, well.output
-    assert "all is well. Checksums, shapes, ranges, 2D boxes and masks agree; the ground" in said
-    assert "mean 2D IoU of 0.9" in said and "worst rooms" in said and "(meshes)" in said
+    assert "all is well. Checksums, shapes, ranges, 2D boxes and masks agree; 100.0% of " in said
+    assert "mean 2D IoU of 0.9" in said and "worst rooms" in said and "meshes" in said
     assert not (shards / "inspect.png").exists()
     paths = sorted((shards / "train").glob("*.h5"))
     with h5py.File(paths[0], "a") as file:
@@ -101,4 +101,5 @@ def test_verify_says_what_it_could_not_check(shards, cli):
                 group["sides_clear"][...] = False
     said = " ".join(cli("inspect", shards, "--verify").stdout.split())
     assert "6 rooms carry no checksum (shards of an earlier release)" in said
-    assert "no object is unoccluded in any view, so no ground truth could be projected" in said
+    # Nothing is seen whole, and all the same every mask lies within its projection.
+    assert said.endswith("masks lie within their projected meshes.") and "100.0% of " in said

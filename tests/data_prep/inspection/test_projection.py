@@ -8,8 +8,10 @@ import pytest
 from data_prep.front.viewpoints import camera_pose
 from data_prep.inspection import projection
 from data_prep.inspection.projection import (
+    Hull,
     box_iou_2d,
     boxes_around,
+    hull_of,
     wire_pixels,
 )
 from sceneprior.geometry.corners import BOX_EDGES, box_corners
@@ -30,7 +32,7 @@ def test_wires_join_projected_points(numbers):
     pixels = pixels[:, :2] / pixels[:, 2:]
     for line, (a, b) in zip(wire_pixels(points, BOX_EDGES, camera, K), BOX_EDGES, strict=True):
         np.testing.assert_allclose(line, [*pixels[a], *pixels[b]], atol=1e-5)  # rounded to 1e-6
-    (box,) = boxes_around(points, camera[None], K[None])
+    (box,) = boxes_around(hull_of(points), camera[None], K[None])
     np.testing.assert_allclose(box, [*pixels.min(axis=0), *pixels.max(axis=0)], atol=1e-9)
 
 
@@ -42,7 +44,37 @@ def test_a_line_through_the_camera_is_cut_where_it_becomes_visible(turned):
     assert ends[0] == pytest.approx((60, 45 + 100 * 0.1 / projection.WIRE_NEAR_M))
     assert ends[1] == pytest.approx((60, 50))
     assert wire_pixels(-np.abs(line), [(0, 1)], np.eye(4), K) == []
-    assert np.isnan(boxes_around(line, np.eye(4)[None], K[None])).all()
+    hull = Hull(line, np.array([[0, 1]]))
+    (box,) = boxes_around(hull, np.eye(4)[None], K[None])
+    assert sorted(box) == pytest.approx(sorted([u1, v1, u2, v2]))
+    behind = hull._replace(points_m=-np.abs(line))
+    assert np.isnan(boxes_around(behind, np.eye(4)[None], K[None])).all()
+
+
+def test_a_hull_projects_as_all_of_its_points_do(numbers):
+    points = numbers.normal(size=(500, 3)) * (1.0, 0.5, 0.1)
+    hull = hull_of(points)
+    assert len(hull.points_m) < 150
+    near = camera_pose(np.array([0.0, 0.1, -0.6]), 0.0, 0.1)  # some points lie behind it
+    for camera in (camera_pose(np.array([0.3, 1.5, -3.0]), 0.2, 0.3), near):
+        here = points @ camera[:3, :3].T + camera[:3, 3]
+        # All lines between points, cut at the near plane: slow, and the same.
+        a, b = (here[rows] for rows in np.triu_indices(len(here), 1))
+        cross = (a[:, 2] < projection.WIRE_NEAR_M) != (b[:, 2] < projection.WIRE_NEAR_M)
+        a, b = a[cross], b[cross]
+        cut = a + (b - a) * ((projection.WIRE_NEAR_M - a[:, 2:]) / (b[:, 2:] - a[:, 2:]))
+        seen = np.concatenate([here[here[:, 2] >= projection.WIRE_NEAR_M], cut]) @ K.T
+        pixels = seen[:, :2] / seen[:, 2:]
+        (box,) = boxes_around(hull, camera[None], K[None])
+        np.testing.assert_allclose(box, [*pixels.min(axis=0), *pixels.max(axis=0)], rtol=1e-6)
+
+
+@pytest.mark.parametrize("flat", [(1, 0, 1), (1, 1, 0), (0, 0, 1), (0, 0, 0)])
+def test_flat_things_have_a_hull(flat, numbers):
+    points = numbers.normal(size=(30, 3)) * flat
+    hull = hull_of(points)
+    np.testing.assert_allclose(hull.points_m.min(axis=0), points.min(axis=0), atol=1e-9)
+    np.testing.assert_allclose(hull.points_m.max(axis=0), points.max(axis=0), atol=1e-9)
 
 
 def test_overlap_of_boxes():

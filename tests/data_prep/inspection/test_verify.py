@@ -11,7 +11,7 @@ from front_jobs import change_room, front_job, three_houses
 from rich.console import Console
 
 from data_prep.engine.build import build_shards
-from data_prep.inspection.agreement import Agreement
+from data_prep.inspection.agreement import Agreement, Tally
 from data_prep.inspection.command import _check_tables
 from data_prep.inspection.verify import FolderCheck, RoomCheck, verify
 from sceneprior.errors import InputError, ShardError
@@ -30,7 +30,8 @@ def test_a_prepared_folder_is_well(shards):
     assert verdict.problems == ()
     rooms = [room for checks in verdict.rooms.values() for room in checks]
     assert len(rooms) == 6 and all(room.has_checksum and room.has_truth for room in rooms)
-    assert np.mean(verdict.agreement.mesh) > 0.9 and not verdict.agreement.box
+    assert [*verdict.agreement.tallies] == ["mesh"]
+    assert verdict.agreement.of("mesh").mean_iou > 0.9 and verdict.agreement.of("mesh").share == 1.0
     index = json.loads((shards / "index.json").read_text())
     assert sum(room.views for room in verdict.rooms["train"]) == index["counts"]["train"]["views"]
     assert verify(shards, workers=2).agreement == verdict.agreement
@@ -38,7 +39,7 @@ def test_a_prepared_folder_is_well(shards):
 
 def test_the_worst_rooms_keep_their_names_in_a_narrow_terminal():
     name = "2bc95aea-aa71-57ad-9ed2-3852b7420110_LivingDiningRoom-1010"
-    check = RoomCheck("train/a.h5", name, agreement=Agreement(mesh=[0.5] * 9))
+    check = RoomCheck("train/a.h5", name, agreement=Agreement({"mesh": Tally(9, 9)}))
     console = Console(width=60, record=True)
     console.print(_check_tables(FolderCheck({"train": [check]}, ()))[1])
     said = "".join(line.split("│")[1].strip() for line in console.export_text().splitlines()[3:-1])
@@ -140,11 +141,7 @@ def test_a_wrong_axis_in_all_rooms_and_in_one(shards):
         for number in range(count):
             change_room(path, sink, number)
     problems = verify(shards).problems
-    assert (
-        "the projected meshes of the ground truth agree with the masks with a mean 2D IoU of"
-        in (problems[-1])
-        and problems[-1].endswith("expected at least 0.85: is an axis or a unit wrong?")
-    )
-    one = [text for text in problems if "projects onto its masks with a mean 2D IoU of 0." in text]
-    assert len(one) == 6
-    assert all(text.endswith("unoccluded objects): is an axis or a unit wrong?") for text in one)
+    assert problems[-1].startswith(f"{shards}: ")
+    assert problems[-1].endswith("is an axis or a unit wrong?")
+    one = [text for text in problems if ", room " in text]
+    assert len(one) == 6 and all("lie within the projected meshes" in text for text in one)

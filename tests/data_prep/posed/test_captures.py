@@ -10,12 +10,12 @@ from PIL import Image
 from posed_files import PosedRoom, Thing, furniture
 from scipy.spatial.transform import Rotation
 
-from data_prep.inspection.agreement import unoccluded
-from data_prep.inspection.projection import box_iou_2d, boxes_around
+from data_prep.inspection.projection import box_iou_2d, boxes_around, hull_of
 from data_prep.posed.recording import Camera
 from data_prep.posed.source import PosedSource
 from data_prep.posed.transforms import read_recording
 from data_prep.posed.views import PosedSettings, prepare_posed
+from data_prep.upright import own_sides
 from sceneprior.errors import InputError
 
 SET = "void,bed,chair"
@@ -41,9 +41,9 @@ def overlaps(views, things, floor=0.0, center=(0.1, -0.2)):
     for k, thing in enumerate(things):
         c = thing.corners
         points = np.stack([c[:, 0] - center[0], c[:, 2] - floor, center[1] - c[:, 1]], axis=1)
-        boxes = boxes_around(points, views.world_to_camera, views.intrinsics)
+        boxes = boxes_around(hull_of(points), views.world_to_camera, views.intrinsics)
         iou = box_iou_2d(boxes, views.boxes[:, k] * np.array([width, height, width, height]))
-        found += iou[unoccluded(views)[:, k]].tolist()
+        found += iou[own_sides(views, views.image_size).all(axis=-1)[:, k]].tolist()
     return np.array(found)
 
 
@@ -206,9 +206,11 @@ def test_a_colmap_capture_with_a_distorted_lens(room, model):
     found = []
     for k, thing in enumerate(room.things[:2]):
         corners = turn.apply(thing.corners - true.mean(axis=0)) + centre.mean(axis=0)
-        boxes = boxes_around(corners, views.world_to_camera, views.intrinsics)
+        boxes = boxes_around(hull_of(corners), views.world_to_camera, views.intrinsics)
         seen = views.boxes[:, k] * np.array([320, 240, 320, 240])
-        found += box_iou_2d(boxes, seen)[unoccluded(views)[:, k]].tolist()
+        found += box_iou_2d(boxes, seen)[
+            own_sides(views, views.image_size).all(axis=-1)[:, k]
+        ].tolist()
     assert len(found) >= 2 and min(found) > 0.94
 
 

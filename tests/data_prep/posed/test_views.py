@@ -7,12 +7,12 @@ import pytest
 from PIL import Image
 from posed_files import PosedRoom, furniture
 
-from data_prep.inspection.agreement import unoccluded
 from data_prep.inspection.checks import array_problems, mask_problems
-from data_prep.inspection.projection import box_iou_2d, boxes_around
+from data_prep.inspection.projection import box_iou_2d, boxes_around, hull_of
 from data_prep.posed.cameras import cameras_in_room, seems_up, upright_cameras
 from data_prep.posed.transforms import read_recording
 from data_prep.posed.views import PosedSettings, prepare_posed
+from data_prep.upright import own_sides
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 
@@ -33,9 +33,9 @@ def overlaps(views, corners):
     height, width = views.image_size
     found = []
     for k, points in enumerate(corners):
-        boxes = boxes_around(points, views.world_to_camera, views.intrinsics)
+        boxes = boxes_around(hull_of(points), views.world_to_camera, views.intrinsics)
         iou = box_iou_2d(boxes, views.boxes[:, k] * np.array([width, height, width, height]))
-        found += iou[unoccluded(views)[:, k]].tolist()
+        found += iou[own_sides(views, views.image_size).all(axis=-1)[:, k]].tolist()
     return np.array(found)
 
 

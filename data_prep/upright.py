@@ -1,0 +1,214 @@
+"""Upright boxes of tracked objects, fitted to their 2D boxes in all views; truth is never asked."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sceneprior.geometry.corners import CUBE_CORNERS
+from sceneprior.shards import Sightings
+
+VIEWS_AT_MOST = 10
+"""Of an object; more only take longer."""
+_VIEWS_AT_LEAST = 3
+_PARALLAX_RAD = np.radians(10)
+"""Between two views of an object at least, or its distance is a guess."""
+_NEAR_M = 0.05
+_STEPS, _PATIENCE = 30, 3
+"""At most, and how many in a row may bring nothing."""
+_DELTA = 1e-5
+"""Of the derivatives, in metres, logarithms and radians."""
+_SIDES_AT_LEAST = 8
+"""Seen clearly, or the seven numbers of a box are a guess."""
+
+
+class UprightBoxes(NamedTuple):
+    """One box an object, which turns about +y alone; NaN where views do not tell."""
+
+    centers_m: np.ndarray
+    """(n, 3) in the cameras' world, whose y points up."""
+    sizes_m: np.ndarray
+    """(n, 3) along the box's own axes."""
+    yaw_rad: np.ndarray
+    """(n,)"""
+    misfit_px: np.ndarray
+    """(n,) mean distance between the projected sides and those that views show clearly."""
+
+    @property
+    def corners_m(self) -> np.ndarray:
+        """(n, 8, 3), in the order of `CUBE_CORNERS`."""
+        return _corners(self._numbers)
+
+    @property
+    def _numbers(self) -> np.ndarray:
+        return np.concatenate([self.centers_m, np.log(self.sizes_m), self.yaw_rad[:, None]], axis=1)
+
+
+class _Given(NamedTuple):
+    """What the boxes of n objects are held against: at most V views of each."""
+
+    boxes_px: np.ndarray
+    """(n, V, 4)"""
+    clear: np.ndarray
+    """(n, V, 4) bool."""
+    chosen: np.ndarray
+    """(n, V) bool; the other rows are filled up."""
+    poses: np.ndarray
+    """(n, V, 4, 4)"""
+    lenses: np.ndarray
+    """(n, V, 3, 3)"""
+
+
+def own_sides(seen: Sightings, image_size: tuple[int, int]) -> np.ndarray:
+    """(T, n, 4) bool: the sides of 2D boxes that are the object's own.
+
+    At the others another object, or the image's border, may cut it off.
+    """
+    height, width = image_size
+    within = np.abs(seen.boxes - 0.5) < 0.5 - 0.5 / np.array([width, height] * 2)
+    return seen.visible[..., None] & seen.sides_clear & within
+
+
+def fit_upright(
+    seen: Sightings,
+    image_size: tuple[int, int],
+    world_to_camera: np.ndarray,
+    intrinsics: np.ndarray,
+) -> UprightBoxes:
+    """The upright box of each object that explains its 2D boxes best.
+
+    Least squares over the clear sides, robust against those that are wrong; of a side that
+    something may hide, only what sticks out of the projected box counts.
+
+    Args:
+        seen: What T views show.
+        image_size: (H, W).
+        world_to_camera: (T, 4, 4), OpenCV axes, metres; the world's y points up.
+        intrinsics: (T, 3, 3) in pixels.
+    """
+    given = _given(seen, image_size, world_to_camera, intrinsics)
+    start, told = _starts(given)
+    best = np.full((len(start), 7), np.nan)
+    misfit = np.full(len(start), np.inf)
+    if told.any():
+        part = _Given(*(array[told] for array in given))
+        for yaw in (0.0, np.pi / 4):  # a valley each
+            first = start[told]
+            first[:, 6] = yaw
+            found = _descend(first, part)
+            off = np.abs(_misfits(found[:, None], part)[:, 0])
+            mean = (off * part.clear).sum(axis=(1, 2)) / part.clear.sum(axis=(1, 2))
+            better = mean < misfit[told]
+            rows = np.flatnonzero(told)[better]
+            best[rows], misfit[rows] = found[better], mean[better]
+    return UprightBoxes(best[:, :3], np.exp(best[:, 3:6]), best[:, 6], misfit)
+
+
+def _given(
+    seen: Sightings, image_size: tuple[int, int], poses: np.ndarray, lenses: np.ndarray
+) -> _Given:
+    """The views that show most of each object's sides."""
+    height, width = image_size
+    clear = own_sides(seen, image_size)
+    # Views that show nothing of an object come last.
+    order = np.argsort(-(clear.sum(axis=2) + seen.visible), axis=0, kind="stable")
+    views = order[:VIEWS_AT_MOST].T
+    items = np.arange(views.shape[0])[:, None]
+    return _Given(
+        seen.boxes[views, items].astype(np.float64) * [width, height, width, height],
+        clear[views, items],
+        seen.visible[views, items],
+        poses[views].astype(np.float64),
+        lenses[views].astype(np.float64),
+    )
+
+
+def _starts(given: _Given) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 7) boxes round the point nearest to the rays through each object's 2D boxes, and (n,)
+    whether its views tell where it is."""
+    pixels = (given.boxes_px[..., :2] + given.boxes_px[..., 2:]) / 2
+    directions = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=2)
+    turns = given.poses[..., :3, :3].swapaxes(-1, -2)
+    rays = (turns @ np.linalg.solve(given.lenses, directions[..., None]))[..., 0]
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    eyes = -(turns @ given.poses[..., :3, 3:])[..., 0]
+    both = given.chosen[:, :, None] & given.chosen[:, None]
+    least = np.where(both, rays @ rays.swapaxes(1, 2), 1.0).min(axis=(1, 2), initial=1.0)
+    told = (given.chosen.sum(axis=1) >= _VIEWS_AT_LEAST) & (least < np.cos(_PARALLAX_RAD))
+    told &= given.clear.sum(axis=(1, 2)) >= _SIDES_AT_LEAST
+    across = (np.eye(3) - rays[..., :, None] * rays[..., None, :]) * given.chosen[..., None, None]
+    weak = 1e-6 * np.eye(3)
+    center = np.linalg.solve(across.sum(axis=1) + weak, (across @ eyes[..., None]).sum(axis=1))[
+        ..., 0
+    ]
+    depth = given.poses[..., 2, :3] @ center[..., None]
+    depth = np.maximum(depth[..., 0] + given.poses[..., 2, 3], 10 * _NEAR_M)
+    focal = given.lenses[..., [0, 1], [0, 1]]
+    sizes = (given.boxes_px[..., 2:] - given.boxes_px[..., :2]) * depth[..., None] / focal
+    sizes = np.where(given.chosen[..., None], sizes, np.nan)
+    wide, tall = np.full((2, len(told)), 1.0)
+    wide[told], tall[told] = np.nanmedian(sizes[told], axis=1).T
+    logs = np.log(np.stack([wide, tall, wide], axis=1))
+    return np.concatenate([center, logs, np.zeros((len(told), 1))], axis=1), told
+
+
+def _descend(numbers: np.ndarray, given: _Given) -> np.ndarray:
+    """Levenberg and Marquardt's steps on all boxes at once."""
+    deltas = np.concatenate([np.zeros((1, 7)), _DELTA * np.eye(7)])
+    damping = np.full(len(numbers), 1e-2)
+    idle = 0
+    off = _misfits(numbers[:, None] + deltas, given).reshape(len(numbers), 8, -1)
+    for _ in range(_STEPS):
+        slopes = (off[:, 1:] - off[:, :1]).swapaxes(1, 2) / _DELTA
+        weights = 1 / np.sqrt(1 + off[:, 0] ** 2)  # soft L1
+        weighted = slopes * weights[..., None]
+        square = weighted.swapaxes(1, 2) @ slopes
+        scale = np.einsum("nii->ni", square) + 1e-9
+        damped = square + np.eye(7) * (damping[:, None] * scale)[:, None]
+        step = np.linalg.solve(damped, (weighted.swapaxes(1, 2) @ off[:, 0, :, None]))[..., 0]
+        tried = numbers - np.clip(step, -1, 1)
+        tried[:, 3:6] = np.clip(tried[:, 3:6], -5, 3)
+        new = _misfits(tried[:, None] + deltas, given).reshape(off.shape)
+        before, after = _cost(off[:, 0]), _cost(new[:, 0])
+        better = after < before
+        numbers = np.where(better[:, None], tried, numbers)
+        off = np.where(better[:, None, None], new, off)
+        damping = np.where(better, damping / 4, damping * 5)
+        idle = 0 if (after < 0.999 * before).any() else idle + 1
+        if idle == _PATIENCE:
+            break
+    return numbers
+
+
+def _cost(off: np.ndarray) -> np.ndarray:
+    return (np.sqrt(1 + off**2) - 1).sum(axis=1)
+
+
+def _misfits(numbers: np.ndarray, given: _Given) -> np.ndarray:
+    """Pixels between each side of projected boxes and of the 2D boxes.
+
+    Args:
+        numbers: (n, C, 7) centre, logarithms of sizes, yaw of C candidates an object.
+
+    Returns:
+        (n, C, V, 4)
+    """
+    corners = _corners(numbers)
+    points = corners[:, :, None] @ given.poses[:, None, :, :3, :3].swapaxes(-1, -2)
+    points += given.poses[:, None, :, None, :3, 3]
+    points[..., 2] = np.maximum(points[..., 2], _NEAR_M)
+    pixels = points @ given.lenses[:, None].swapaxes(-1, -2)
+    pixels = pixels[..., :2] / points[..., 2:]
+    found = np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2)], axis=-1)
+    off = found - given.boxes_px[:, None]
+    # Of a hidden side the mask shows less than there is: the box may only be larger.
+    short = np.concatenate([np.maximum(off[..., :2], 0), np.minimum(off[..., 2:], 0)], axis=-1)
+    off = np.where(given.clear[:, None], off, short)
+    return off * given.chosen[:, None, :, None]
+
+
+def _corners(numbers: np.ndarray) -> np.ndarray:
+    """(..., 8, 3) of boxes (..., 7)."""
+    cos, sin = np.cos(numbers[..., 6:]), np.sin(numbers[..., 6:])
+    x, y, z = np.moveaxis(CUBE_CORNERS / 2 * np.exp(numbers[..., None, 3:6]), -1, 0)
+    turned = np.stack([cos * x + sin * z, y, cos * z - sin * x], axis=-1)
+    return numbers[..., None, :3] + turned
