@@ -35,6 +35,8 @@ BOX_WEIGHT, OCCLUSION_SLACK = 5.0, 0.15
 objects reach behind what hides them in the image, hence the slack."""
 SHORTLIST = 16
 """Rooms, best by 2D boxes, whose masks are then compared."""
+MASK_COLUMNS = 80
+"""About how many pixels wide these masks are, whatever a run trains with."""
 CERTAIN_LOGIT = 30.0
 """Of a class that is known: its probability rounds to 1."""
 ABSENT_M = 1e4
@@ -185,7 +187,7 @@ def _matched(
 def mask_overlap(answer: KnownAnswer, image: ObservedImage, renderer: Renderer) -> float:
     """Mean IoU of an image's masks with those of the objects that answer for them."""
     scene = answer.scene
-    observed = image.sampled_ids(image.mask_step)
+    observed = image.sampled_ids(max(1, round(image.instance_ids.shape[1] / MASK_COLUMNS)))
     height, width = observed.shape
     full = image.instance_ids.shape
     intrinsics = np.diag([width / full[1], height / full[0], 1]) @ image.intrinsics

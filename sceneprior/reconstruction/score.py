@@ -14,7 +14,7 @@ from sceneprior.errors import InputError
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.mesh_metrics import POINTS
 from sceneprior.evaluation.score_table import wide_console
-from sceneprior.evaluation.view_scores import PROTOCOL, ObjectPair, score_views
+from sceneprior.evaluation.view_scores import PROTOCOL, ObjectPair, score_views, surface_note
 from sceneprior.generation.export import load_scene_folder
 from sceneprior.offscreen import open_renderer
 from sceneprior.reconstruction.image import ObservedImage, image_of_room, images_of_split
@@ -199,7 +199,7 @@ def print_view_scores(scores: dict[str, Any], console: Console | None = None) ->
     }
     console = console or wide_console()
     for title, lines in tables.items():
-        table = Table("", "objects", "unmatched", title=title)
+        table = Table("", "objects", "unmatched", "with a surface", title=title)
         for name, _ in COLUMNS.values():
             table.add_column(name, justify="right")
         for label, row in lines.items():
@@ -207,5 +207,9 @@ def print_view_scores(scores: dict[str, Any], console: Console | None = None) ->
                 "–" if row[key] is None else form.format(row[key])
                 for key, (_, form) in COLUMNS.items()
             )
-            table.add_row(label, str(row["objects"]), str(row["unmatched"]), *cells)
+            counts = (str(row[key]) for key in ("objects", "unmatched", "with_surface"))
+            table.add_row(label, *counts, *cells)
         console.print(table)
+    shards = scores["protocol"]["shards"]
+    if note := surface_note(summary["objects"], summary["with_surface"], shards):
+        console.print(f"Note: {note}", highlight=False)
