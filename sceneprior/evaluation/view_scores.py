@@ -119,8 +119,7 @@ def summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
 
 
 def surface_note(objects: int, with_surface: int, shards: str) -> str | None:
-    """Why metrics of surfaces stand on fewer objects than those of boxes; None where they do not.
-    """
+    """Why metrics of surfaces stand on fewer objects than those of boxes; None where they do not."""
     if with_surface == objects:
         return None
     short = f"only of the {with_surface} that do" if with_surface else "not at all"

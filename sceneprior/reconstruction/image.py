@@ -15,6 +15,7 @@ from sceneprior.errors import InputError
 from sceneprior.shards import RoomViews, iterate_rooms, thinned
 from sceneprior.views import SceneViews
 
+
 @dataclass(frozen=True)
 class ObservedImage:
     """Instance masks of one image, of the n objects that it shows, and its camera; the arrays are

@@ -106,15 +106,18 @@ def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
 def turn_scene(scene: Scene, quarter: int) -> Scene:
     """The room turned by so many quarters about the vertical axis: +z goes towards +x."""
     turn = quarter_rotation(quarter)
-
-    def turned(item: SceneObject) -> SceneObject:
-        center_m, size_m = turn @ np.array(item.center_m), np.abs(turn) @ np.array(item.size_m)
-        mesh = item.mesh and Mesh(item.mesh.vertices_m @ turn.T, item.mesh.faces)
-        return SceneObject(item.label, tuple(center_m.tolist()), tuple(size_m.tolist()), mesh)
-
     floor = None if scene.floor_m is None else scene.floor_m @ turn[::2, ::2].T
     extra = {**scene.extra, "turned_degrees": 90 * (quarter % QUARTERS)}
-    return replace(scene, objects=tuple(map(turned, scene.objects)), floor_m=floor, extra=extra)
+    objects = tuple(turn_object(item, quarter) for item in scene.objects)
+    return replace(scene, objects=objects, floor_m=floor, extra=extra)
+
+
+def turn_object(item: SceneObject, quarter: int) -> SceneObject:
+    """An object of a room that is turned by so many quarters."""
+    turn = quarter_rotation(quarter)
+    center_m, size_m = turn @ np.array(item.center_m), np.abs(turn) @ np.array(item.size_m)
+    mesh = item.mesh and Mesh(item.mesh.vertices_m @ turn.T, item.mesh.faces)
+    return SceneObject(item.label, tuple(center_m.tolist()), tuple(size_m.tolist()), mesh)
 
 
 def random_answers(

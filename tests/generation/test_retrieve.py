@@ -160,6 +160,7 @@ def test_classes_without_models_keep_their_objects_and_the_report_says_so(models
     assert report["classes"]["pendant_lamp"]["mean_distance_m"] is None
     assert report["classes"]["sofa"]["models"] == 3 and report["broken_models"] == {"x": "gone"}
 
+
 def test_a_mesh_without_a_model_stays_in_step_with_its_box(models):
     """A plant above the floor, whose class has no model, grows down to it with its box."""
     low, high = np.array([1.0, 0.3, 0.0]), np.array([1.6, 1.1, 0.4])
