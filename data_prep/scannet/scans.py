@@ -135,8 +135,8 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
     if len(segments) != len(mesh.vertices_m):
         raise InputError(
             f"{segments_path} has {len(segments)} segIndices, but {mesh_path.name} "
-            f"{len(mesh.vertices_m)} vertices; they are not of one release, or the mesh is truncated. "
-            "Download both again."
+            f"{len(mesh.vertices_m)} vertices; they are not of one release, or the mesh is "
+            "truncated. Download both again."
         )
     vertices = mesh.vertices_m @ aligned[:3, :3].T + aligned[:3, 3]
     parts = object_parts(groups, segments)

@@ -119,14 +119,14 @@ def summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
 
 
 def surface_note(objects: int, with_surface: int, shards: str) -> str | None:
-    """Why metrics of surfaces stand on fewer objects than those of boxes; None where they do not."""
+    """Why metrics of surfaces stand on fewer objects than those of boxes; None if they do not."""
     if with_surface == objects:
         return None
     short = f"only of the {with_surface} that do" if with_surface else "not at all"
     return (
-        f"{objects - with_surface} of {objects} true objects have a box but no surface, and a right "
-        f"shape would be punished for not being a box: Chamfer distance, F-score and oriented IoU "
-        f"are reported {short}. ScanNet's surfaces come with shards that `sceneprior prep-scannet` "
+        f"{objects - with_surface} of {objects} true objects have a box but no surface, and a "
+        f"right shape would be punished for not being a box: Chamfer distance, F-score and "
+        f"oriented IoU are reported {short}. ScanNet's surfaces come with shards that `sceneprior prep-scannet` "
         f"makes today; {shards} may be older."
     )
 

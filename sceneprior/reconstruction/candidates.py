@@ -80,7 +80,7 @@ def decode_some(
     row: Int[Tensor, " objects"],
     slot: Int[Tensor, " objects"],
 ) -> DecodedScenes:
-    """Training rooms with the shapes of some of their objects, once the shape stage has finished."""
+    """Training rooms with the shapes of some of their objects, after the shape stage."""
     wanted = torch.zeros(len(rooms), int(slot.max()) + 1, dtype=torch.bool)
     wanted[row, slot] = True
     z = trained.prior.latent_space(trained.logits[rooms])

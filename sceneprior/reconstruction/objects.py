@@ -179,7 +179,8 @@ def _objects(
         decoded = decode_some(trained, room[None], torch.zeros_like(mine), mine)
         faces, labels = trained.prior.faces, trained.config.label_set
         scene = scene_of(decoded, 0, mine.tolist(), faces, labels, "")
-        objects |= {(int(room), slot): o for slot, o in zip(mine.tolist(), scene.objects)}
+        pairs = zip(mine.tolist(), scene.objects, strict=True)
+        objects |= {(int(room), slot): item for slot, item in pairs}
     found = []
     for room, slot, quarter, center_m in zip(
         rooms.tolist(), slots.tolist(), chosen.quarter.tolist(), centers_m.tolist(), strict=True
