@@ -25,7 +25,7 @@ from sceneprior.offscreen import open_renderer
 from sceneprior.reconstruction.fit import SCHEDULES, fit_latents
 from sceneprior.reconstruction.image import ObservedImage, as_views, images_of_split
 from sceneprior.reconstruction.known_rooms import known_rooms, nearest_answers
-from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct, starting_latents
+from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct
 from sceneprior.reconstruction.score import Answers
 from sceneprior.training.method import TrainedPrior
 
@@ -40,10 +40,11 @@ def cpu_seconds(what: Callable[[], object]) -> float:
 
 
 def fit_some(trained: TrainedPrior, images: list[ObservedImage], steps: int) -> None:
-    """A few steps of the paper's fit."""
+    """A few steps of the paper's fit, its start given."""
     views = as_views(images, trained.config.data.mask_step)
     schedule = replace(SCHEDULES["paper"], steps=steps, drop_at=steps, patience=0)
-    fit_latents(trained, views, starting_latents(trained, views, 1)[:, 0], schedule)
+    start = trained.prior.latent_space(trained.logits[:1]).expand(len(images), -1)
+    fit_latents(trained, views, start, schedule)
 
 
 def mean_iou(images: list[ObservedImage], answers: Answers, shards: Path) -> float:

@@ -30,7 +30,7 @@ def reconstruct(
     mask: Annotated[Path | None, typer.Option(help="Your own image: a PNG of ids.")] = None,
     classes: Annotated[Path | None, typer.Option(help="Its table: CSV or JSON, id, class.")] = None,
     intrinsics: Annotated[
-        str | None, typer.Option(help="Its camera's: fx,fy,cx,cy in pixels, or a JSON file.")
+        str | None, typer.Option(help="Its camera's: fov=73, 35mm=26, fx,fy,cx,cy or a JSON file.")
     ] = None,
     pose: Annotated[Path | None, typer.Option(help="Its camera in the room frame, JSON.")] = None,
     camera_height: Annotated[

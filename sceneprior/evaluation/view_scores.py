@@ -126,8 +126,8 @@ def surface_note(objects: int, with_surface: int, shards: str) -> str | None:
     return (
         f"{objects - with_surface} of {objects} true objects have a box but no surface, and a "
         f"right shape would be punished for not being a box: Chamfer distance, F-score and "
-        f"oriented IoU are reported {short}. ScanNet's surfaces come with shards that `sceneprior prep-scannet` "
-        f"makes today; {shards} may be older."
+        f"oriented IoU are reported {short}. ScanNet's surfaces come with shards that `sceneprior "
+        f"prep-scannet` makes today; {shards} may be older."
     )
 
 

@@ -1,5 +1,6 @@
 """Read a user's own image: a PNG of instance ids, a table of classes, and the camera."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ CAMERA_HEIGHTS_M = (1.0, 1.2, 1.4, 1.6, 1.8)
 """Of a camera whose pose is not given: someone who sits, to someone who stands."""
 LARGEST_PX = 640
 """Wider or higher pictures are thinned: training's are about so large."""
+FILM_DIAGONAL_MM = math.hypot(36, 24)
 UPSIDE_DOWN = 0.1
 """A camera whose y axis points up by more than this (a sine) is refused; one that looks straight
 down or up is not."""
@@ -113,20 +115,29 @@ def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
 
 
 def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
-    """Intrinsics: `fx,fy,cx,cy`, or a JSON file with `K` (3 x 3), or `fx`, `fy`, `cx` and `cy`.
+    """Intrinsics: `fov=73`, `35mm=26`, `fx,fy,cx,cy`, or a JSON file with `K` (3 x 3), or `fx`,
+    `fy`, `cx` and `cy`.
 
+    `fov` are degrees from the image's left to its right, `35mm` the focal length in millimetres of
+    a camera whose film has the same field of view along the diagonal; the middle is the image's.
     The file may say of which image (`width`, `height`), which is checked.
 
     Raises:
         InputError: neither; not finite; or of an image of another size.
     """
-    expected = 'fx,fy,cx,cy in pixels, or a JSON file: {"fx": 240, "fy": 240, "cx": 240, "cy": 180}'
+    expected = (
+        "fx,fy,cx,cy in pixels, fov=DEGREES, 35mm=MILLIMETRES, or a JSON file: "
+        '{"fx": 240, "fy": 240, "cx": 240, "cy": 180}'
+    )
     path = Path(text)
     in_file = path.suffix.lower() == ".json"
     try:
-        if not in_file:
+        if text.startswith(("fov=", "35mm=")):
+            focal = _focal_px(text, image_size)
+            data: Any = {"fx": focal, "fy": focal, "cx": image_size[1] / 2, "cy": image_size[0] / 2}
+        elif not in_file:
             values = (float(part) for part in text.split(","))
-            data: Any = dict(zip(("fx", "fy", "cx", "cy"), values, strict=True))
+            data = dict(zip(("fx", "fy", "cx", "cy"), values, strict=True))
         else:
             data = read_json(path)
             data = data if isinstance(data, dict) else {"K": data}
@@ -165,6 +176,16 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
             "of another size. Scale it, or the mask."
         )
     return matrix
+
+
+def _focal_px(text: str, image_size: tuple[int, int]) -> float:
+    kind, _, number = text.partition("=")
+    if kind == "35mm":
+        return float(number) * math.hypot(*image_size) / FILM_DIAGONAL_MM
+    half = math.radians(float(number)) / 2
+    if not 0 < half < math.pi / 2:
+        raise ValueError("no field of view")
+    return image_size[1] / 2 / math.tan(half)
 
 
 def read_pose(path: Path) -> np.ndarray:

@@ -111,6 +111,8 @@ def test_intrinsics(tmp_path):
     [
         ("40,40,48", "--intrinsics 40,40,48 is no intrinsics; expected fx,fy,cx,cy in pixels"),
         ("a,b,c,d", "is no intrinsics"),
+        ("fov=wide", "--intrinsics fov=wide is no intrinsics"),
+        ("fov=180", "--intrinsics fov=180 is no intrinsics; expected fx,fy,cx,cy in pixels, fov="),
         ("0,40,48,36", "is no pinhole camera"),
         ("40,nan,48,36", "is no pinhole camera"),
         ('{"fx": 40}', "holds no intrinsics"),
@@ -127,6 +129,18 @@ def test_intrinsics_that_are_none(tmp_path, text, said):
     with pytest.raises(InputError) as error:
         read_intrinsics(text, (72, 96))
     assert said in str(error.value)
+
+
+def test_intrinsics_as_photographers_say_them():
+    """Half the width at 45 degrees; film of 36 x 24 mm at 43.27 mm sees its diagonal at 53."""
+    wide = read_intrinsics("fov=90", (72, 96))
+    np.testing.assert_allclose(wide, [[48, 0, 48], [0, 48, 36], [0, 0, 1]], atol=1e-9)
+    normal = read_intrinsics("35mm=43.2666", (72, 96))
+    np.testing.assert_allclose(normal, [[120, 0, 48], [0, 120, 36], [0, 0, 1]], rtol=1e-5)
+    phone = read_intrinsics("35mm=26", (240, 360))  # of film's own shape
+    assert phone[0, 0] / 360 == pytest.approx(26 / 36)
+    with pytest.raises(InputError, match="--intrinsics 35mm=0 is no pinhole camera"):
+        read_intrinsics("35mm=0", (72, 96))
 
 
 def test_poses(own, seen, tmp_path):
