@@ -13,6 +13,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -83,14 +84,14 @@ def main() -> None:
     reconstruct(trained, picked[:1], FitOptions())
     fit_some(trained, picked[:1], 2)  # compiles the renderer
     scale = FULL / given.steps
-    rows = {
+    rows: dict[str, tuple[Callable[[list[ObservedImage]], object], float]] = {
         "object by object": (lambda some: reconstruct(trained, some, FitOptions()), 1.0),
         f"a latent, {FULL} steps": (lambda some: fit_some(trained, some, given.steps), scale),
     }
     print(f"{len(images)} images, {given.threads} threads, seconds of processor time an image")
     for name, (way, times) in rows.items():
-        alone = times * statistics.mean(cpu_seconds(lambda i=i, w=way: w([i])) for i in picked)
-        many = times * cpu_seconds(lambda w=way: w(images)) / len(images)
+        alone = times * statistics.mean(cpu_seconds(partial(way, [image])) for image in picked)
+        many = times * cpu_seconds(partial(way, images)) / len(images)
         print(f"{name:24s} alone {alone:7.2f}   in a batch {many:7.2f}   {alone / many:5.1f} x")
     found = [one.scene.objects for one in reconstruct(trained, images, FitOptions())]
     nearest = nearest_answers(known_rooms(given.shards), images, open_renderer("auto"))
