@@ -1,6 +1,7 @@
 """The objects of one room in 3D and their JSON, which generation writes and evaluation reads."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,21 @@ class SceneObject:
     center_m: tuple[float, float, float]
     size_m: tuple[float, float, float]
     mesh: Mesh | None = None
+
+    def in_box(self, center_m: Sequence[float], size_m: Sequence[float]) -> "SceneObject":
+        """The same object in another box: its mesh moves and is scaled with its own."""
+        center, size = _triple(center_m), _triple(size_m)
+        mesh = self.mesh
+        if mesh is not None:
+            scale = np.asarray(size) / np.maximum(self.size_m, 1e-9)
+            vertices_m = (mesh.vertices_m - np.asarray(self.center_m)) * scale + np.asarray(center)
+            mesh = Mesh(vertices_m, mesh.faces)
+        return SceneObject(self.label, center, size, mesh)
+
+
+def _triple(values: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return (x, y, z)
 
 
 @dataclass(frozen=True)

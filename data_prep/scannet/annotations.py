@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sceneprior.errors import InputError
+from sceneprior.scene import Mesh
 
 _RIGID_SLACK = 1e-2
 
@@ -117,8 +118,8 @@ def read_segments(path: Path) -> np.ndarray:
     return segments.astype(np.int64)
 
 
-def read_vertices(path: Path) -> np.ndarray:
-    """(vertices, 3) float64 of `<scene>_vh_clean_2.ply`, metres, the scan's own frame, z up.
+def read_mesh(path: Path) -> Mesh:
+    """`<scene>_vh_clean_2.ply` in the scan's own frame, z up: vertices (V, 3) float64, metres.
 
     Raises:
         InputError: the file is missing, truncated, or holds no finite vertices.
@@ -129,10 +130,11 @@ def read_vertices(path: Path) -> np.ndarray:
         raise _unreadable(path, FileNotFoundError("no such file"))
     try:
         # The arrays of the file, not a Trimesh: merged or dropped vertices would no longer be
-        # those of segs.json, and the triangles, which are not needed, would double the memory.
+        # those of segs.json.
         with path.open("rb") as file:
             loaded = load_ply(file, fix_texture=False, skip_materials=True)
         vertices = np.array(loaded["vertices"], dtype=np.float64).reshape(-1, 3)
+        faces = np.array(loaded.get("faces", ()), dtype=np.int64).reshape(-1, 3)
     except Exception as error:  # a damaged PLY surprises trimesh in many ways
         raise InputError(
             f"{path} is not a mesh that can be read ({type(error).__name__}: {error}); "
@@ -140,28 +142,32 @@ def read_vertices(path: Path) -> np.ndarray:
         ) from None
     if not len(vertices) or not np.isfinite(vertices).all():
         raise InputError(f"{path} holds no vertices, or broken ones. Download the scan again.")
-    return vertices
+    if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
+        raise InputError(f"{path} has triangles of vertices it lacks. Download the scan again.")
+    return Mesh(vertices, faces)
 
 
-def object_bounds(
-    groups: list[Group], segments: np.ndarray, vertices_m: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray] | None]:
-    """Lowest and highest corner (3,) of each group's axis-aligned box; None without vertices.
-
-    `segments` (V,) and `vertices_m` (V, 3) are of the mesh; boxes follow the axes of its frame.
-    """
+def object_parts(groups: list[Group], segments: np.ndarray) -> list[np.ndarray]:
+    """Which vertices of the mesh are each group's; `segments` (V,) are the vertices'."""
     order = np.argsort(segments, kind="stable")
     numbers, starts = np.unique(segments[order], return_index=True)
     parts = dict(zip(numbers.tolist(), np.split(order, starts[1:]), strict=True))
-    bounds: list[tuple[np.ndarray, np.ndarray] | None] = []
-    for group in groups:
-        mine = [parts[segment] for segment in sorted(group.segments) if segment in parts]
-        if not mine:
-            bounds.append(None)
-            continue
-        points = vertices_m[np.concatenate(mine)]
-        bounds.append((points.min(axis=0), points.max(axis=0)))
-    return bounds
+    nothing = np.zeros(0, dtype=np.int64)
+    return [
+        np.concatenate([nothing, *(parts[k] for k in sorted(group.segments) if k in parts)])
+        for group in groups
+    ]
+
+
+def surface_of(mesh: Mesh, part: np.ndarray) -> Mesh | None:
+    """The triangles of a mesh that have all corners in a part of its vertices; None without any."""
+    inside = np.zeros(len(mesh.vertices_m), dtype=bool)
+    inside[part] = True
+    faces = mesh.faces[inside[mesh.faces].all(axis=1)]
+    if not len(faces):
+        return None
+    used, numbered = np.unique(faces, return_inverse=True)
+    return Mesh(mesh.vertices_m[used], numbered.reshape(-1, 3))
 
 
 def _is_index(value: Any) -> bool:

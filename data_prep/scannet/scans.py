@@ -8,16 +8,18 @@ import numpy as np
 from data_prep.frames import FrameChoice, choose_frames, mask_intrinsics, room_cameras
 from data_prep.scannet.annotations import (
     axis_alignment,
-    object_bounds,
+    object_parts,
     read_groups,
+    read_mesh,
     read_properties,
     read_segments,
-    read_vertices,
+    surface_of,
 )
 from data_prep.scannet.labels import Labels
 from data_prep.scannet.masks import MASK_FILES, MaskArchive
 from data_prep.scannet.sens import read_recording
 from sceneprior.errors import InputError
+from sceneprior.scene import Mesh
 
 FULL_SIZE = (968, 1296)
 QUARTER_SIZE = (242, 324)
@@ -67,6 +69,8 @@ class Instance:
     lower_m: np.ndarray
     upper_m: np.ndarray
     """(3,) float64 corners of the axis-aligned box."""
+    surface: Mesh | None
+    """What the scan saw of it, in the room frame; None of what has no class."""
 
 
 @dataclass(frozen=True)
@@ -127,15 +131,19 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
         )
     segments_path = folder / f"{name}_vh_clean_2.0.010000.segs.json"
     mesh_path = folder / f"{name}_vh_clean_2.ply"
-    segments, vertices = read_segments(segments_path), read_vertices(mesh_path)
-    if len(segments) != len(vertices):
+    segments, mesh = read_segments(segments_path), read_mesh(mesh_path)
+    if len(segments) != len(mesh.vertices_m):
         raise InputError(
             f"{segments_path} has {len(segments)} segIndices, but {mesh_path.name} "
-            f"{len(vertices)} vertices; they are not of one release, or the mesh is truncated. "
-            "Download both again."
+            f"{len(mesh.vertices_m)} vertices; they are not of one release, or the mesh is "
+            "truncated. Download both again."
         )
-    vertices = vertices @ aligned[:3, :3].T + aligned[:3, 3]
-    bounds = object_bounds(groups, segments, vertices)
+    vertices = mesh.vertices_m @ aligned[:3, :3].T + aligned[:3, 3]
+    parts = object_parts(groups, segments)
+    bounds = [
+        (vertices[part].min(axis=0), vertices[part].max(axis=0)) if len(part) else None
+        for part in parts
+    ]
     whole = vertices.min(axis=0), vertices.max(axis=0)
     boxed = [
         box
@@ -148,8 +156,9 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
     room_from_scan = aligned.copy()
     room_from_scan[:3, 3] -= origin
 
+    mesh = Mesh(vertices - origin, mesh.faces)
     instances = []
-    for group, box in zip(groups, bounds, strict=True):
+    for group, box, part in zip(groups, bounds, parts, strict=True):
         if not labels.knows(group.category):
             notes.append(
                 f"object {group.object_id}: '{group.category}' is not in {labels.source}, so void"
@@ -159,7 +168,9 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
             continue
         kind, is_shell = labels.label(group.category), labels.is_shell(group.category)
         corners = box[0] - origin, box[1] - origin
-        instances.append(Instance(group.object_id, group.category, kind, is_shell, *corners))
+        surface = None if kind == "void" else surface_of(mesh, part)
+        item = Instance(group.object_id, group.category, kind, is_shell, *corners, surface)
+        instances.append(item)
     half = (upper - lower)[[0, 2]] / 2
     choice, world_to_camera, intrinsics, masks = _read_cameras(folder, room_from_scan, settings)
     every = f"of {choice.candidates} frames (every {settings.frame_step})"

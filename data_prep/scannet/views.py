@@ -12,6 +12,7 @@ from data_prep.scannet.masks import MaskArchive
 from data_prep.scannet.scans import Scan
 from sceneprior.classes import label_set
 from sceneprior.instances.observations import observe
+from sceneprior.scene import Mesh
 from sceneprior.shards import RoomGroundTruth
 
 
@@ -82,7 +83,8 @@ def prepare_scan(scan: Scan) -> PreparedRoom | None:
         notes += (f"masks show objects that the aggregation does not have ({listed}): void",)
     views = seen.room_views(scan.scan_id, scan.world_to_camera, scan.intrinsics)
     order = np.concatenate([seen.tracked, seen.unseen])
-    return PreparedRoom(views, _ground_truth(scan, order, classes[order]), notes=notes)
+    truth, models = _ground_truth(scan, order, classes[order])
+    return PreparedRoom(views, truth, models, notes=notes)
 
 
 def _ids_of_values(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
@@ -98,21 +100,35 @@ def _ids_of_values(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
     return table, np.array(known)
 
 
-def _ground_truth(scan: Scan, order: np.ndarray, classes: np.ndarray) -> RoomGroundTruth:
+def _ground_truth(
+    scan: Scan, order: np.ndarray, classes: np.ndarray
+) -> tuple[RoomGroundTruth, dict[str, Mesh]]:
+    """The scan's instances of these rows, and their surfaces as models round the origin."""
     lower = np.array([scan.instances[k].lower_m for k in order])
     upper = np.array([scan.instances[k].upper_m for k in order])
-    places = np.zeros((len(order), 4, 4))
-    # No model is known: the unit cube stands for it, and fills the box.
-    places[:, (0, 1, 2), (0, 1, 2)] = upper - lower
-    places[:, :3, 3] = (lower + upper) / 2
-    places[:, 3, 3] = 1
-    return RoomGroundTruth(
+    centers_m = (lower + upper) / 2
+    models: dict[str, Mesh] = {}
+    model_ids = []
+    places = np.tile(np.eye(4), (len(order), 1, 1))
+    places[:, :3, 3] = centers_m
+    for row, k in enumerate(order):
+        item = scan.instances[k]
+        if item.surface is None:
+            # No model is known: the unit cube stands for it, and fills the box.
+            model_ids.append("")
+            places[row, :3, :3] = np.diag(upper[row] - lower[row])
+            continue
+        model_ids.append(f"{scan.scan_id}_{item.object_id:03d}")
+        surface = Mesh(item.surface.vertices_m - centers_m[row], item.surface.faces)
+        models[model_ids[-1]] = surface
+    truth = RoomGroundTruth(
         object_class=classes,
-        centers_m=((lower + upper) / 2).astype(np.float32),
+        centers_m=centers_m.astype(np.float32),
         sizes_m=(upper - lower).astype(np.float32),
         yaw_rad=np.zeros(len(order), dtype=np.float32),
-        model_ids=("",) * len(order),
+        model_ids=tuple(model_ids),
         model_to_room=places.astype(np.float32),
         floor_m=scan.floor_m.astype(np.float32),
         height_m=scan.height_m,
     )
+    return truth, models

@@ -7,13 +7,14 @@ import typer
 
 from sceneprior.cli.options import CheckpointOption, OverwriteOption, RendererOption, RunOption
 
-ScheduleOption = Annotated[
-    str, typer.Option(help="paper (1,000 steps) or released (the authors' code: 2,000).")
+FitOption = Annotated[
+    str,
+    typer.Option(
+        help="objects (one by one), or one latent an image: paper (1,000 steps) or released "
+        "(the authors' code: 2,000)."
+    ),
 ]
 RestartsOption = Annotated[int, typer.Option(min=1, help="Latents fitted; the best is kept.")]
-StartOption = Annotated[
-    str, typer.Option(help="nearest (training rooms that look alike) or random.")
-]
 
 
 def reconstruct(
@@ -29,16 +30,16 @@ def reconstruct(
     mask: Annotated[Path | None, typer.Option(help="Your own image: a PNG of ids.")] = None,
     classes: Annotated[Path | None, typer.Option(help="Its table: CSV or JSON, id, class.")] = None,
     intrinsics: Annotated[
-        str | None, typer.Option(help="Its camera's: fx,fy,cx,cy in pixels, or a JSON file.")
+        str | None, typer.Option(help="Its camera's: fov=73, 35mm=26, fx,fy,cx,cy or a JSON file.")
     ] = None,
     pose: Annotated[Path | None, typer.Option(help="Its camera in the room frame, JSON.")] = None,
     camera_height: Annotated[
-        float, typer.Option(min=0.1, help="Metres above the floor, without --pose.")
-    ] = 1.6,
-    schedule: ScheduleOption = "paper",
+        float | None,
+        typer.Option(min=0.1, help="Metres above the floor, without --pose (several are tried)."),
+    ] = None,
+    fit: FitOption = "objects",
     restarts: RestartsOption = 1,
-    start: StartOption = "nearest",
-    seed: Annotated[int, typer.Option(min=0, help="Of drawn views and random starts.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of drawn views.")] = 0,
     checkpoint: CheckpointOption = "final",
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "auto",
@@ -47,11 +48,12 @@ def reconstruct(
     from sceneprior.config import load_run
     from sceneprior.errors import InputError
     from sceneprior.generation.export import check_free
+    from sceneprior.geometry.turns import QUARTERS
     from sceneprior.offscreen import open_renderer
     from sceneprior.reconstruction.export import write_reconstructions
     from sceneprior.reconstruction.image import image_from_shards, images_of_split
     from sceneprior.reconstruction.own_image import read_own_image
-    from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct, unlearnt_classes
+    from sceneprior.reconstruction.reconstruct import OBJECTS, FitOptions, reconstruct
 
     ways = [mask is not None, room is not None, split is not None]
     if sum(ways) != 1 or (shards is None) != (mask is not None):
@@ -64,14 +66,16 @@ def reconstruct(
     if (limit is not None and split is None) or (view and room is None):
         raise InputError("--limit belongs to --split, and --view to --room.")
     check_free(out, overwrite)
-    options = FitOptions(schedule, restarts, start, seed=seed)
+    options = FitOptions(fit, restarts)
     trained = load_run(run, checkpoint)
     notes = []
     if shards is None:
         if mask is None or classes is None or intrinsics is None:
             raise InputError("--mask needs --classes and --intrinsics beside it.")
         label_set = trained.config.label_set
-        own = read_own_image(mask, classes, intrinsics, label_set, pose, camera_height)
+        # What is answered object by object looks the same from each side of the room.
+        sides = 1 if fit == OBJECTS else QUARTERS
+        own = read_own_image(mask, classes, intrinsics, label_set, pose, camera_height, sides)
         images, notes = list(own.images), [f"{note}." for note in own.notes]
     elif room is not None:
         images = [image_from_shards(shards, room, view)]
@@ -81,14 +85,13 @@ def reconstruct(
     for note in notes:
         typer.echo(f"Note: {note}", err=True)
     found = reconstruct(trained, images, options)
-    if unlearnt := unlearnt_classes(trained, images):
+    if mask is not None:  # the same picture, of each camera that it may be from
+        found = [min(found, key=lambda one: one.score)]
+    taken_for = {pair for one in found for pair in one.taken_for.items()}
+    for name, other in sorted(taken_for):
         typer.echo(
-            f"Note: the run never generates these classes, so expect little of them: "
-            f"{', '.join(unlearnt)}.",
-            err=True,
+            f"Note: the run never generates the class {name}; a {other} stands for it.", err=True
         )
-    if mask is not None:  # the same picture, from each side of the room
-        found = [min(found, key=lambda side: side.score)]
     write_reconstructions(found, out, open_renderer(renderer))
     typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
 
@@ -104,10 +107,9 @@ def eval_svr(
     out: Annotated[
         Path | None, typer.Option(help="JSON file (default: svr.json in RUN or SCENES).")
     ] = None,
-    schedule: ScheduleOption = "paper",
+    fit: FitOption = "objects",
     restarts: RestartsOption = 1,
-    start: StartOption = "nearest",
-    seed: Annotated[int, typer.Option(min=0, help="Of the views, random starts and rooms.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the views and random rooms.")] = 0,
     checkpoint: CheckpointOption = "final",
     renderer: RendererOption = "auto",
 ) -> None:
@@ -124,14 +126,13 @@ def eval_svr(
 
     protocol = SvrProtocol(shards, split, seed, renderer)
     if run is not None and scenes is None:
-        options = FitOptions(schedule, restarts, start, seed=seed)
+        options = FitOptions(fit, restarts)
         target, scores = run, evaluate_run(run, protocol, options, limit, checkpoint)
     elif scenes is not None and run is None:
-        fitting = (limit, schedule, restarts, start, checkpoint)
-        if fitting != (None, "paper", 1, "nearest", "final"):
+        if (limit, fit, restarts, checkpoint) != (None, "objects", 1, "final"):
             raise InputError(
-                "--limit, --checkpoint, --schedule, --restarts and --start belong to --run; scenes "
-                "are evaluated as they are."
+                "--limit, --checkpoint, --fit and --restarts belong to --run; scenes are evaluated "
+                "as they are."
             )
         target, scores = scenes, evaluate_scenes(scenes, protocol)
     else:

@@ -7,7 +7,7 @@ import numpy as np
 
 from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
 from sceneprior.evaluation.metrics.overlaps import shared_of_smaller
-from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.scene import Scene, SceneObject
 
 BADLY = 0.25
 """A room's own object goes where it shares more than this part of the smaller of the two volumes
@@ -78,8 +78,6 @@ def _mean_apart(room: Scene, given: Scene, partners: dict[int, int]) -> float | 
 
 def _with_mesh(item: SceneObject, lender: SceneObject) -> SceneObject:
     """A given object; where it has no mesh, with another's, moved and scaled into its box."""
-    if item.mesh is not None or lender.mesh is None:
+    if item.mesh is not None:
         return item
-    scale = np.asarray(item.size_m) / np.maximum(lender.size_m, 1e-9)
-    vertices = (lender.mesh.vertices_m - np.asarray(lender.center_m)) * scale
-    return replace(item, mesh=Mesh(vertices + np.asarray(item.center_m), lender.mesh.faces))
+    return replace(item, mesh=lender.in_box(item.center_m, item.size_m).mesh)

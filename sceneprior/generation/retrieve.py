@@ -50,7 +50,8 @@ def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
     """The scene with the mesh of the most similar CAD model in every box.
 
     `extra["retrieval"]` holds, in the order of the objects, {"model_id", "turn_deg", "distance_m"},
-    or None where there is no model of the class: such an object keeps its own mesh.
+    or None where there is no model of the class: such an object keeps its own mesh, extruded with
+    its box.
 
     Raises:
         InputError: a box or a mesh is no finite number.
@@ -59,12 +60,14 @@ def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
     objects: list[SceneObject] = []
     found: list[dict[str, object] | None] = []
     for item in scene.objects:
-        item, told = extruded(item), None
+        box, told = extruded(item), None
         if of_class := models.by_class.get(item.label):
-            best = most_similar(item, of_class, keep)
-            item = replace(item, mesh=placed(models.load(best.model_id), item, best.turn_deg))
+            best = most_similar(box, of_class, keep)
+            mesh = placed(models.load(best.model_id), box, best.turn_deg)
+            objects.append(replace(box, mesh=mesh))
             told = best._asdict() | {"distance_m": round(best.distance_m, 5)}
-        objects.append(item)
+        else:
+            objects.append(item if box is item else item.in_box(box.center_m, box.size_m))
         found.append(told)
     return replace(scene, objects=tuple(objects), extra={**scene.extra, "retrieval": found})
 

@@ -98,13 +98,17 @@ class ScenePrior(nn.Module):
     ) -> DecodedScenes:
         """Decode rooms from points of the latent space; `with_shape` adds meshes or looks.
 
-        `wanted`, the first so many of each room, decodes as many objects as it has columns; where
-        it is false, vertices lie at their box's centre, and all else means nothing. None: all N.
+        `wanted` decodes as many objects as it has columns; where it is false, vertices lie at
+        their box's centre, and behind a room's last wanted object all else means nothing. None:
+        all N.
 
         Layouts stay float32 under autocast: bfloat16 would round 3 m to steps of 2 cm.
         """
         count = self.max_objects if wanted is None else wanted.shape[1]
-        needed = None if wanted is None else wanted.sum(dim=1)
+        needed = None
+        if wanted is not None:
+            numbers = torch.arange(1, wanted.shape[1] + 1, device=wanted.device)
+            needed = (wanted * numbers).amax(dim=1)
         features = self.decoder(z, count, needed)
         with torch.autocast(z.device.type, enabled=False):
             layout, shared = self.layout(features.to(z.dtype))

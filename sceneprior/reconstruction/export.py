@@ -43,8 +43,9 @@ def write_reconstructions(
             "intrinsics": image.intrinsics.tolist(),
             "image_size": list(image.instance_ids.shape),
             "score": round(one.score, 5),
-            "mask_iou": round(one.mask_iou, 4),
+            "mask_iou": None if one.mask_iou is None else round(one.mask_iou, 4),
             "steps": one.steps,
+            "taken_for": one.taken_for,
         }
         write_whole(Path(folder) / f"{image.name}_seen.png", png_bytes(picture(one, renderer)))
         write_scene(replace(one.scene, extra=extra), folder, image.name, renderer)

@@ -145,6 +145,8 @@ def fit_latents(
 
     What moves is z itself, put back onto the sphere before it is decoded, rather than the logits
     that training moves: those reach only what is between the anchors, and reach it slowly.
+    RMSProp's first steps are ten times the later ones and leave the start behind; shorter ones,
+    and the logits, end worse (docs/experiments/2026-11-22-one-image.md).
 
     Images do not know of each other: alone or among others, one takes the same steps, but for
     rounding, which grows over a thousand of them.

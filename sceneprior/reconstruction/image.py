@@ -15,9 +15,6 @@ from sceneprior.errors import InputError
 from sceneprior.shards import RoomViews, iterate_rooms, thinned
 from sceneprior.views import SceneViews
 
-MASK_COLUMNS = 80
-"""About how many pixels wide masks are compared; training's 480 / 6."""
-
 
 @dataclass(frozen=True)
 class ObservedImage:
@@ -37,11 +34,6 @@ class ObservedImage:
     view: int = 0
     rows: tuple[int, ...] = ()
     """Which of the room's tracked objects these are; () where there is no room."""
-
-    @property
-    def mask_step(self) -> int:
-        """Every how many pixels masks are compared, so that about `MASK_COLUMNS` are left."""
-        return max(1, round(self.instance_ids.shape[1] / MASK_COLUMNS))
 
     def sampled_ids(self, step: int) -> Integer[np.ndarray, "rows columns"]:
         """Every `step`-th instance id, from the middle of a block, as shards are for training."""
@@ -131,12 +123,12 @@ def images_of_split(
     return images, blank
 
 
-def as_views(images: Sequence[ObservedImage], mask_step: int | None = None) -> SceneViews:
+def as_views(images: Sequence[ObservedImage], mask_step: int) -> SceneViews:
     """The images as a batch: each a room with one view, objects padded to the fullest image's.
 
     Args:
         images: At least one, all of one size.
-        mask_step: Every how many pixels the instance ids are kept; None takes the images' own.
+        mask_step: Every how many pixels the instance ids are kept: a run's `data.mask_step`.
 
     Raises:
         InputError: the images differ in size.
@@ -147,7 +139,6 @@ def as_views(images: Sequence[ObservedImage], mask_step: int | None = None) -> S
             f"Images that are fitted together have one size, but {sizes[0]} and {sizes[1]} pixels "
             "(height, width) came; reconstruct each size on its own."
         )
-    step = mask_step or images[0].mask_step
 
     def padded(rows: Sequence[np.ndarray]) -> Tensor:
         return pad_sequence([torch.from_numpy(row) for row in rows], batch_first=True)
@@ -166,7 +157,7 @@ def as_views(images: Sequence[ObservedImage], mask_step: int | None = None) -> S
         visible=is_object[:, None],
         sides_clear=padded([image.sides_clear for image in images])[:, None],
         image_size=sizes[0],
-        instance_ids=stacked([image.sampled_ids(step) for image in images], np.int32),
+        instance_ids=stacked([image.sampled_ids(mask_step) for image in images], np.int32),
         room_ids=tuple(image.name for image in images),
     )
 

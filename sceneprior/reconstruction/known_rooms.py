@@ -35,6 +35,8 @@ BOX_WEIGHT, OCCLUSION_SLACK = 5.0, 0.15
 objects reach behind what hides them in the image, hence the slack."""
 SHORTLIST = 16
 """Rooms, best by 2D boxes, whose masks are then compared."""
+MASK_COLUMNS = 80
+"""About how many pixels wide these masks are, whatever a run trains with."""
 CERTAIN_LOGIT = 30.0
 """Of a class that is known: its probability rounds to 1."""
 ABSENT_M = 1e4
@@ -104,15 +106,18 @@ def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
 def turn_scene(scene: Scene, quarter: int) -> Scene:
     """The room turned by so many quarters about the vertical axis: +z goes towards +x."""
     turn = quarter_rotation(quarter)
-
-    def turned(item: SceneObject) -> SceneObject:
-        center_m, size_m = turn @ np.array(item.center_m), np.abs(turn) @ np.array(item.size_m)
-        mesh = item.mesh and Mesh(item.mesh.vertices_m @ turn.T, item.mesh.faces)
-        return SceneObject(item.label, tuple(center_m.tolist()), tuple(size_m.tolist()), mesh)
-
     floor = None if scene.floor_m is None else scene.floor_m @ turn[::2, ::2].T
     extra = {**scene.extra, "turned_degrees": 90 * (quarter % QUARTERS)}
-    return replace(scene, objects=tuple(map(turned, scene.objects)), floor_m=floor, extra=extra)
+    objects = tuple(turn_object(item, quarter) for item in scene.objects)
+    return replace(scene, objects=objects, floor_m=floor, extra=extra)
+
+
+def turn_object(item: SceneObject, quarter: int) -> SceneObject:
+    """An object of a room that is turned by so many quarters."""
+    turn = quarter_rotation(quarter)
+    center_m, size_m = turn @ np.array(item.center_m), np.abs(turn) @ np.array(item.size_m)
+    mesh = item.mesh and Mesh(item.mesh.vertices_m @ turn.T, item.mesh.faces)
+    return SceneObject(item.label, tuple(center_m.tolist()), tuple(size_m.tolist()), mesh)
 
 
 def random_answers(
@@ -185,7 +190,7 @@ def _matched(
 def mask_overlap(answer: KnownAnswer, image: ObservedImage, renderer: Renderer) -> float:
     """Mean IoU of an image's masks with those of the objects that answer for them."""
     scene = answer.scene
-    observed = image.sampled_ids(image.mask_step)
+    observed = image.sampled_ids(max(1, round(image.instance_ids.shape[1] / MASK_COLUMNS)))
     height, width = observed.shape
     full = image.instance_ids.shape
     intrinsics = np.diag([width / full[1], height / full[0], 1]) @ image.intrinsics

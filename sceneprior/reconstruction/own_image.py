@@ -1,5 +1,6 @@
 """Read a user's own image: a PNG of instance ids, a table of classes, and the camera."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,9 +14,16 @@ from sceneprior.instances.observations import observe
 from sceneprior.instances.pngs import read_mask
 from sceneprior.instances.tables import IdTable, read_class_table
 from sceneprior.reconstruction.image import ObservedImage
+from sceneprior.shards import thinned
 
-CAMERA_HEIGHT_M = 1.6
-"""Of a camera whose pose is not given: the middle of what the recipes draw from, 1.4 to 1.8 m."""
+CAMERA_HEIGHTS_M = (1.0, 1.2, 1.4, 1.6, 1.8)
+"""Of a camera whose pose is not given: someone who sits, to someone who stands."""
+LARGEST_PX = 640
+"""Wider or higher pictures are thinned: training's are about so large."""
+FILM_DIAGONAL_MM = math.hypot(36, 24)
+UPSIDE_DOWN = 0.1
+"""A camera whose y axis points up by more than this (a sine) is refused; one that looks straight
+down or up is not."""
 CAMERA_DISTANCE_M = 1.5
 """How far from the middle of the room it stands, which it looks at."""
 
@@ -24,7 +32,7 @@ class OwnImage(NamedTuple):
     """What a user gave, in the room frame."""
 
     images: list[ObservedImage]
-    """The image; without a pose, as seen from each of the room's four sides."""
+    """The image; without a pose, as seen from each height and from several sides of the room."""
     notes: list[str]
     """What was assumed, or left out: sentences to print."""
 
@@ -35,10 +43,12 @@ def read_own_image(
     intrinsics: str,
     label_set: str,
     pose: Path | None = None,
-    camera_height_m: float = CAMERA_HEIGHT_M,
+    camera_height_m: float | None = None,
+    sides: int = QUARTERS,
 ) -> OwnImage:
     """Read an image's masks (`read_mask`, `read_class_table`) and camera (`read_intrinsics`;
-    `read_pose`, or `level_camera` without one). Classes outside the run's label set are void.
+    `read_pose`, or `level_camera` without one, of the given height or of `CAMERA_HEIGHTS_M` and of
+    so many `sides`). Classes outside the run's label set are void.
 
     Raises:
         InputError: a file cannot be used, the sizes differ, or no object is seen.
@@ -46,7 +56,11 @@ def read_own_image(
     values = read_mask(mask)
     table = IdTable(read_class_table(classes), label_set, str(classes))
     camera = read_intrinsics(intrinsics, values.shape)
-    seen = observe(table.ids(values)[None], table.classes)
+    step = -(-max(values.shape) // LARGEST_PX)
+    seen = observe(table.ids(values[thinned(step)])[None], table.classes)
+    # Relative to the image's size, cameras of the small image are the same.
+    small = seen.instance_ids.shape[1:]
+    camera = np.diag([small[1] / values.shape[1], small[0] / values.shape[0], 1]) @ camera
     if not len(seen.tracked):
         raise InputError(
             f"{mask} shows no object: none of its masks is of a class of the run and wider than "
@@ -59,11 +73,13 @@ def read_own_image(
             f"{_some(sorted(table.unlisted))}"
         )
     if pose is None:
+        heights_m = CAMERA_HEIGHTS_M if camera_height_m is None else (camera_height_m,)
+        told = " or ".join(f"{height_m:g}" for height_m in heights_m)
         notes.append(
-            f"without --pose the camera is level, {camera_height_m:g} m above the floor and "
-            f"{CAMERA_DISTANCE_M:g} m from the middle of the room, which it looks at"
+            f"without --pose the camera is level, {told} m above the floor (what fits best is "
+            f"kept) and {CAMERA_DISTANCE_M:g} m from the middle of the room, which it looks at"
         )
-        poses = [level_camera(camera_height_m, quarter) for quarter in range(QUARTERS)]
+        poses = [level_camera(height, side) for height in heights_m for side in range(sides)]
     else:
         poses = [read_pose(pose)]
     images = [
@@ -99,20 +115,29 @@ def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
 
 
 def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
-    """Intrinsics: `fx,fy,cx,cy`, or a JSON file with `K` (3 x 3), or `fx`, `fy`, `cx` and `cy`.
+    """Intrinsics: `fov=73`, `35mm=26`, `fx,fy,cx,cy`, or a JSON file with `K` (3 x 3), or `fx`,
+    `fy`, `cx` and `cy`.
 
+    `fov` are degrees from the image's left to its right, `35mm` the focal length in millimetres of
+    a camera whose film has the same field of view along the diagonal; the middle is the image's.
     The file may say of which image (`width`, `height`), which is checked.
 
     Raises:
         InputError: neither; not finite; or of an image of another size.
     """
-    expected = 'fx,fy,cx,cy in pixels, or a JSON file: {"fx": 240, "fy": 240, "cx": 240, "cy": 180}'
+    expected = (
+        "fx,fy,cx,cy in pixels, fov=DEGREES, 35mm=MILLIMETRES, or a JSON file: "
+        '{"fx": 240, "fy": 240, "cx": 240, "cy": 180}'
+    )
     path = Path(text)
     in_file = path.suffix.lower() == ".json"
     try:
-        if not in_file:
+        if text.startswith(("fov=", "35mm=")):
+            focal = _focal_px(text, image_size)
+            data: Any = {"fx": focal, "fy": focal, "cx": image_size[1] / 2, "cy": image_size[0] / 2}
+        elif not in_file:
             values = (float(part) for part in text.split(","))
-            data: Any = dict(zip(("fx", "fy", "cx", "cy"), values, strict=True))
+            data = dict(zip(("fx", "fy", "cx", "cy"), values, strict=True))
         else:
             data = read_json(path)
             data = data if isinstance(data, dict) else {"K": data}
@@ -143,7 +168,24 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
             f"--intrinsics {text} is no pinhole camera (fx and fy above 0, no skew); "
             f"expected {expected}."
         )
+    width, height = image_size[::-1]
+    if not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
+        raise InputError(
+            f"The middle of the camera's image, cx = {matrix[0, 2]:g} and cy = {matrix[1, 2]:g}, "
+            f"is outside the mask of {width} x {height} pixels; --intrinsics {text} is of an image "
+            "of another size. Scale it, or the mask."
+        )
     return matrix
+
+
+def _focal_px(text: str, image_size: tuple[int, int]) -> float:
+    kind, _, number = text.partition("=")
+    if kind == "35mm":
+        return float(number) * math.hypot(*image_size) / FILM_DIAGONAL_MM
+    half = math.radians(float(number)) / 2
+    if not 0 < half < math.pi / 2:
+        raise ValueError("no field of view")
+    return image_size[1] / 2 / math.tan(half)
 
 
 def read_pose(path: Path) -> np.ndarray:
@@ -152,7 +194,8 @@ def read_pose(path: Path) -> np.ndarray:
     The world is the room frame: metres, y up, the floor y = 0 and its middle the origin.
 
     Raises:
-        InputError: there is no such matrix, or it is no rotation with a translation.
+        InputError: there is no such matrix, it is no rotation with a translation, or the camera is
+            upside down or below the floor.
     """
     data = read_json(path)
     try:
@@ -174,4 +217,17 @@ def read_pose(path: Path) -> np.ndarray:
             '{"camera_to_world": 4 x 4}, a rotation and a translation in metres, camera axes x '
             "right, y down, z forward, in a room with y up and the floor at 0."
         )
-    return matrix if key == "world_to_camera" else np.linalg.inv(matrix)
+    pose = matrix if key == "world_to_camera" else np.linalg.inv(matrix)
+    if pose[1, 1] > UPSIDE_DOWN:
+        raise InputError(
+            f"The camera of {path} is upside down: the room's y axis points down in its image. "
+            "Expected camera axes x right, y down, z forward (OpenCV; Blender's and OpenGL's have "
+            "y up and look along -z), and a room with y up."
+        )
+    eye_m = -pose[:3, :3].T @ pose[:3, 3]
+    if eye_m[1] <= 0:
+        raise InputError(
+            f"The camera of {path} is {-eye_m[1]:g} m below the floor, which is y = 0; move it, or "
+            "turn the room so that y is up."
+        )
+    return pose

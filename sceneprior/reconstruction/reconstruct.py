@@ -1,26 +1,26 @@
-"""Reconstruct rooms from instance masks of single images: starts, fits, the best as a scene."""
+"""Reconstruct rooms from instance masks of single images: object by object, or by latents."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.generation.decode import scene_of
-from sceneprior.generation.sample import sample_latents
 from sceneprior.reconstruction.fit import SCHEDULES, fit_latents, refuse_crowds, view_loss
 from sceneprior.reconstruction.image import ObservedImage, as_views, rows_of
+from sceneprior.reconstruction.objects import answer_images
 from sceneprior.scene import Scene
 from sceneprior.training.method import TrainedPrior
 from sceneprior.views import SceneViews
 
 BATCH = 128
 """Latents fitted at once: images times restarts."""
-STARTS = ("nearest", "random")
+OBJECTS = "objects"
+"""Answers object by object, ours; any other fit is of a latent, by a schedule."""
 START_BATCH = 256
 """Training rooms decoded at once."""
 
@@ -29,16 +29,13 @@ START_BATCH = 256
 class FitOptions:
     """How images are reconstructed."""
 
-    schedule: str = "paper"
-    """A name in `SCHEDULES`."""
+    fit: str = OBJECTS
+    """`objects` (objects.py), or a latent is fitted by one of `SCHEDULES`."""
     restarts: int = 1
-    """Latents fitted to each image; the one with the lowest score is kept."""
-    start: str = "nearest"
-    """Where they begin: see `starting_latents`."""
+    """Latents fitted to each image, from the training rooms nearest to it; the one with the lowest
+    score is kept."""
     masks: bool = True
-    """False fits classes and 2D boxes alone, as always where shapes are occupancy grids."""
-    seed: int = 0
-    """Of random starts."""
+    """False fits latents to classes and 2D boxes alone, as where shapes are occupancy grids."""
 
 
 @dataclass(frozen=True)
@@ -49,32 +46,38 @@ class Reconstruction:
     scene: Scene
     """One object a mask, in the masks' order."""
     score: float
-    """Layout loss plus lambda_S * (1 - mean mask IoU): compares answers to one image."""
-    mask_iou: float
-    """Mean over the image's masks; 0 where masks are not compared."""
-    steps: int
+    """Compares answers to one image, less is better: `ObjectAnswer.energy`, or of a latent layout
+    loss plus lambda_S * (1 - mean mask IoU)."""
+    mask_iou: float | None = None
+    """Mean over the image's masks; None where masks are not compared as pixels."""
+    steps: int | None = None
+    """Of a latent's fit."""
+    taken_for: dict[str, str] = field(default_factory=dict)
+    """See `ObjectAnswer.taken_for`."""
 
 
 def reconstruct(
     trained: TrainedPrior, images: Sequence[ObservedImage], options: FitOptions
 ) -> list[Reconstruction]:
     """Reconstruct images of the run's label set, many at once. Before the run's shape stage scenes
-    are boxes, and masks are not compared; nor are they where shapes are occupancy grids.
+    are boxes.
 
     Raises:
-        InputError: unknown options, a run without latents of rooms, another label set, or more
-            objects than the prior generates.
+        InputError: unknown options, a run without latents of rooms, another label set, or, where
+            latents are fitted, more objects than the prior generates.
     """
-    if options.schedule not in SCHEDULES:
+    if options.fit not in (OBJECTS, *SCHEDULES):
         raise InputError(
-            f"No schedule is called '{options.schedule}'; choose from {', '.join(SCHEDULES)}."
+            f"No fit is called '{options.fit}'; choose from {', '.join((OBJECTS, *SCHEDULES))}."
         )
     if options.restarts < 1:
         raise InputError(f"restarts is {options.restarts}; an image needs at least one.")
+    if options.restarts > 1 and options.fit == OBJECTS:
+        raise InputError("restarts are of latents; name a fit of those, paper or released.")
     if not trained.remembers_rooms:
         raise InputError(
-            f"Fitting starts from training rooms, and a run of `method: {trained.config.method}` "
-            "keeps no latents of them; take a run of `method: ours`."
+            f"Reconstruction starts from training rooms, and a run of `method: "
+            f"{trained.config.method}` keeps no latents of them; take a run of `method: ours`."
         )
     for image in images:
         if image.label_set != trained.config.label_set:
@@ -82,21 +85,18 @@ def reconstruct(
                 f"{image.name} has classes of label set '{image.label_set}', but the run was "
                 f"trained on '{trained.config.label_set}'; prepare the image with that one."
             )
+    if not images:
+        return []
+    if options.fit == OBJECTS:
+        return [
+            Reconstruction(image, answer.scene, answer.energy, taken_for=answer.taken_for)
+            for image, answer in zip(images, answer_images(trained, images), strict=True)
+        ]
     found: dict[int, Reconstruction] = {}
     for rows in _batches(images, max(BATCH // options.restarts, 1)):
         part = [images[row] for row in rows]
         found |= zip(rows, _reconstruct_batch(trained, part, options), strict=True)
     return [found[row] for row in range(len(images))]
-
-
-@torch.no_grad()
-def unlearnt_classes(trained: TrainedPrior, images: Sequence[ObservedImage]) -> list[str]:
-    """Classes of the images that the run gives to no object of any training room it decodes."""
-    names = label_set(trained.config.label_set)
-    rooms = trained.prior(trained.logits, with_shape=False)
-    known = set(rooms.class_logits.argmax(dim=-1).unique().tolist())
-    asked = {int(index) for image in images for index in image.object_class}
-    return [names[index] for index in sorted(asked - known)]
 
 
 def _batches(images: Sequence[ObservedImage], most: int) -> Iterator[list[int]]:
@@ -111,11 +111,11 @@ def _batches(images: Sequence[ObservedImage], most: int) -> Iterator[list[int]]:
 def _reconstruct_batch(
     trained: TrainedPrior, images: Sequence[ObservedImage], options: FitOptions
 ) -> list[Reconstruction]:
-    views = as_views(images)
+    views = as_views(images, trained.config.data.mask_step)
     refuse_crowds(trained, views)
-    starts = starting_latents(trained, views, options.restarts, options.start, options.seed)
+    starts = starting_latents(trained, views, options.restarts)
     repeated = rows_of(views, torch.arange(len(images)).repeat_interleave(options.restarts))
-    schedule = SCHEDULES[options.schedule]
+    schedule = SCHEDULES[options.fit]
     fit = fit_latents(trained, repeated, starts.flatten(0, 1), schedule, options.masks)
     best = fit.loss.score.reshape(len(images), -1).argmin(dim=1)
     rows = best + options.restarts * torch.arange(len(images))
@@ -124,29 +124,23 @@ def _reconstruct_batch(
     def answer(image: ObservedImage, row: int) -> Reconstruction:
         predictions = fit.loss.matches.prediction[row, : len(image.object_class)].tolist()
         scene = scene_of(fit.scenes, row, predictions, trained.prior, labels, image.name)
-        score, mask_iou = float(fit.loss.score[row]), float(fit.loss.mask_iou[row])
-        return Reconstruction(image, scene, score, mask_iou, int(fit.steps[row]))
+        compared = options.masks and fit.scenes.vertices_m is not None
+        mask_iou = float(fit.loss.mask_iou[row]) if compared else None
+        return Reconstruction(
+            image, scene, float(fit.loss.score[row]), mask_iou, int(fit.steps[row])
+        )
 
     return [answer(image, row) for image, row in zip(images, rows.tolist(), strict=True)]
 
 
 def starting_latents(
-    trained: TrainedPrior, views: SceneViews, count: int, kind: str = "nearest", seed: int = 0
+    trained: TrainedPrior, views: SceneViews, count: int
 ) -> Float[Tensor, "images count width"]:
-    """Several starts for each image.
-
-    `nearest` are the training rooms, as decoded, whose layout loss on the image is least; `random`
-    ones are drawn around the training rooms, as new rooms are (the kernel distribution), the same
-    for every image.
+    """For each image, the training rooms whose layout loss on it, as decoded, is least.
 
     Raises:
-        InputError: an unknown kind, or more starts than training rooms.
+        InputError: more starts than training rooms.
     """
-    if kind not in STARTS:
-        raise InputError(f"No start is called '{kind}'; choose from {', '.join(STARTS)}.")
-    if kind == "random":
-        drawn = sample_latents(trained.prior.latent_space, trained.logits, count, seed, "kernel")
-        return drawn.expand(len(views.is_object), -1, -1)
     if count > len(trained.logits):
         raise InputError(
             f"{count} nearest training rooms were asked for, but the run has "

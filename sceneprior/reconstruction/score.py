@@ -1,5 +1,6 @@
 """Score reconstructions from single views against the true rooms, and print the scores."""
 
+import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -14,7 +15,7 @@ from sceneprior.errors import InputError
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.mesh_metrics import POINTS
 from sceneprior.evaluation.score_table import wide_console
-from sceneprior.evaluation.view_scores import PROTOCOL, ObjectPair, score_views
+from sceneprior.evaluation.view_scores import PROTOCOL, ObjectPair, score_views, surface_note
 from sceneprior.generation.export import load_scene_folder
 from sceneprior.offscreen import open_renderer
 from sceneprior.reconstruction.image import ObservedImage, image_of_room, images_of_split
@@ -81,16 +82,21 @@ def evaluate_run(
     shards, split = protocol.shards, protocol.split
     reference_scenes(shards, split, limit=1, meshes=False)  # refuses before any fit
     images, blank = images_of_split(shards, split, protocol.seed, limit)
+    begin = time.process_time()
     fitted = reconstruct(trained, images, options)
-    plain = reconstruct(trained, images, replace(options, masks=False))
+    seconds = time.process_time() - begin
     answers: dict[str, Answers] = {
         "fit": [one.scene.objects for one in fitted],
         "fit_boxes": [one.scene.without_meshes().objects for one in fitted],
-        "layout_fit": [one.scene.without_meshes().objects for one in plain],
     }
+    overlaps = [one.mask_iou for one in fitted if one.mask_iou is not None]
+    if overlaps:
+        plain = reconstruct(trained, images, replace(options, masks=False))
+        answers["layout_fit"] = [one.scene.without_meshes().objects for one in plain]
     return {
         "rows": score_answers(images, answers, protocol),
-        "mask_iou": sum(one.mask_iou for one in fitted) / len(fitted),
+        "mask_iou": sum(overlaps) / len(overlaps) if overlaps else None,
+        "cpu_seconds_an_image": seconds / len(images),
         "protocol": {
             "run": Path(run).resolve().name,
             "checkpoint": checkpoint,
@@ -199,7 +205,7 @@ def print_view_scores(scores: dict[str, Any], console: Console | None = None) ->
     }
     console = console or wide_console()
     for title, lines in tables.items():
-        table = Table("", "objects", "unmatched", title=title)
+        table = Table("", "objects", "unmatched", "with a surface", title=title)
         for name, _ in COLUMNS.values():
             table.add_column(name, justify="right")
         for label, row in lines.items():
@@ -207,5 +213,9 @@ def print_view_scores(scores: dict[str, Any], console: Console | None = None) ->
                 "–" if row[key] is None else form.format(row[key])
                 for key, (_, form) in COLUMNS.items()
             )
-            table.add_row(label, str(row["objects"]), str(row["unmatched"]), *cells)
+            counts = (str(row[key]) for key in ("objects", "unmatched", "with_surface"))
+            table.add_row(label, *counts, *cells)
         console.print(table)
+    shards = scores["protocol"]["shards"]
+    if note := surface_note(summary["objects"], summary["with_surface"], shards):
+        console.print(f"Note: {note}", highlight=False)

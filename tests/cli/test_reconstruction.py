@@ -16,6 +16,9 @@ from sceneprior.reconstruction.image import image_from_shards
 SOFT = ("--renderer", "software")
 
 
+PAPER = ("--fit", "paper")
+
+
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
     monkeypatch.setitem(SCHEDULES, "paper", FitSchedule(steps=6, drop_at=3))
@@ -42,7 +45,7 @@ def files_of(name: str) -> set[str]:
 
 def test_reconstruct_a_view_and_a_split(command, toy_run, toy_shards, tmp_path):
     call = ["reconstruct", "--run", toy_run, "--shards", toy_shards, *SOFT]
-    one = [*call, "--room", "toy/test_01", "--view", 3, "--out", "one"]
+    one = [*call, *PAPER, "--room", "toy/test_01", "--view", 3, "--out", "one"]
     status, out, errors = command(*one)
     assert (status, out) == (0, "Wrote 1 room to one\n"), errors
     name = "toy_test_01_view3"
@@ -70,13 +73,15 @@ def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):
     assert (status, out) == (0, "Wrote 1 room to posed\n"), errors
     assert "without --pose" not in errors and "sofa" not in errors
     assert {path.name for path in (tmp_path / "posed").iterdir()} == files_of("mine")
-    status, _, errors = command(*call, "--out", "level", "--camera-height", 1.4)
+    status, _, errors = command(*call, *PAPER, "--out", "level", "--camera-height", 1.4)
     assert status == 0 and "Note: without --pose the camera is level, 1.4 m above" in errors
     extra = json.loads((tmp_path / "level" / "mine.json").read_text())["extra"]
     rows = (tmp_path / "classes.csv").read_text().splitlines()
     (tmp_path / "classes.csv").write_text("\n".join([*rows[:1], "1,sofa", *rows[2:]]))
     _, _, errors = command(*call, "--out", "sofa", "--pose", "pose.json")
-    assert "Note: the run never generates these classes" in errors and "sofa" in errors
+    assert "Note: the run never generates the class sofa; a " in errors
+    status, _, errors = command(*call, "--out", "heights")
+    assert status == 0 and "is level, 1 or 1.2 or 1.4 or 1.6 or 1.8 m above the floor" in errors
     pose = np.array(extra["world_to_camera"])
     assert (-pose[:3, :3].T @ pose[:3, 3])[1] == pytest.approx(1.4)
 
@@ -94,8 +99,7 @@ def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_pat
         (own[:2], "--mask needs --classes and --intrinsics beside it."),
         ([*shards, "--room", "attic"], "holds no room 'attic'"),
         ([*shards, "--room", "toy/test_00", "--view", 8], "has no view 8; its 8 views are 0 to 7."),
-        ([*shards, "--split", "test", "--schedule", "slow"], "No schedule is called 'slow'"),
-        ([*shards, "--split", "test", "--start", "warm"], "No start is called 'warm'"),
+        ([*shards, "--split", "test", "--fit", "slow"], "No fit is called 'slow'"),
         ([*shards, "--split", "val"], "val"),
     ):
         assert said in one_sentence(command(*call, *arguments)), arguments
@@ -113,12 +117,13 @@ def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_pat
 def test_eval_svr_of_a_run_and_of_its_scenes(command, toy_run, toy_shards, tmp_path):
     call = ["eval-svr", "--shards", toy_shards, *SOFT]
     two = ["--limit", 2]
-    status, out, errors = command(*call, "--run", toy_run, *two, "--out", "run.json")
+    status, out, errors = command(*call, "--run", toy_run, *two, *PAPER, "--out", "run.json")
     assert status == 0, errors
     assert "single views" in out and out.endswith("Wrote run.json\n") and "nan" not in out.lower()
     scores = json.loads((tmp_path / "run.json").read_text())
     assert set(scores["rows"]) == {"fit", "fit_boxes", "layout_fit", "nearest_room", "random_room"}
-    made = ["reconstruct", "--run", toy_run, "--shards", toy_shards, "--split", "test", *two, *SOFT]
+    made = ["reconstruct", "--run", toy_run, "--shards", toy_shards, "--split", "test", *two]
+    made += [*PAPER, *SOFT]
     assert command(*made, "--out", "scenes")[0] == 0
     status, out, errors = command(*call, "--scenes", "scenes")
     assert status == 0 and out.endswith("Wrote scenes/svr.json\n"), errors

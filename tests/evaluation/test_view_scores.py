@@ -7,17 +7,23 @@ import pytest
 
 from sceneprior.errors import InputError
 from sceneprior.evaluation.topdown import box_mesh
-from sceneprior.evaluation.view_scores import ObjectPair, score_pair, score_views
+from sceneprior.evaluation.view_scores import ObjectPair, score_pair, score_views, surface_note
 from sceneprior.scene import SceneObject
 
 POINTS = 4000
-DESK = SceneObject("desk", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
-BED = SceneObject("double_bed", (2.0, 0.5, 0.0), (2.0, 1.0, 2.0))
+
+
+def solid(label, center_m, size_m) -> SceneObject:
+    return SceneObject(label, center_m, size_m, box_mesh(center_m, size_m))
+
+
+DESK = solid("desk", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
+BED = solid("double_bed", (2.0, 0.5, 0.0), (2.0, 1.0, 2.0))
 
 
 def moved(item: SceneObject, x_m: float) -> SceneObject:
     x, y, z = item.center_m
-    return replace(item, center_m=(x + x_m, y, z))
+    return solid(item.label, (x + x_m, y, z), item.size_m)
 
 
 def test_a_box_found_half_aside():
@@ -59,6 +65,7 @@ def test_every_object_weighs_the_same_and_nothing_found_is_no_number():
     scores = score_views(views, POINTS)
     summary = scores["summary"]
     assert (summary["images"], summary["objects"], summary["unmatched"]) == (2, 3, 2)
+    assert summary["with_surface"] == 3
     assert summary["box_iou_3d"] == pytest.approx(1 / 3)
     assert summary["class_accuracy"] == pytest.approx(1 / 3)
     assert summary["chamfer_l2_m"] < 0.1
@@ -66,6 +73,30 @@ def test_every_object_weighs_the_same_and_nothing_found_is_no_number():
     assert bed["chamfer_l2_m"] is None and bed["chamfer_squared_m2"] is None
     assert (bed["box_iou_3d"], bed["f_score"], bed["objects"]) == (0, 0, 1)
     assert scores["classes"]["desk"]["box_iou_3d"] == pytest.approx(0.5)
+
+
+def test_a_box_is_no_surface():
+    """Where truth has a box alone, what is found is compared by its box and its class, with None
+    for the rest; the other objects' figures do not change."""
+    score = score_pair(ObjectPair(replace(DESK, mesh=None), moved(DESK, 0.5)), POINTS)
+    assert (score.box_iou_3d, score.class_right) == (pytest.approx(1 / 3), True)
+    unknown = ("oriented_box_iou_3d", "chamfer_l2_m", "chamfer_squared_m2", "f_score")
+    assert all(getattr(score, name) is None for name in unknown)
+    assert score_pair(ObjectPair(replace(DESK, mesh=None), None), POINTS).f_score is None
+    mixed = [[ObjectPair(BED, moved(BED, 0.1)), ObjectPair(replace(DESK, mesh=None), DESK)]]
+    one, two = (score_views(v, POINTS)["summary"] for v in (mixed, [mixed[0][:1]]))
+    assert (one["objects"], one["with_surface"], two["with_surface"]) == (2, 1, 1)
+    assert all(one[name] == two[name] for name in unknown)
+    bare = score_views([mixed[0][1:]], POINTS)["summary"]
+    assert bare["with_surface"] == 0 and all(bare[name] is None for name in unknown)
+
+
+def test_why_metrics_of_surfaces_stand_on_fewer_objects():
+    assert surface_note(3, 3, "SHARDS") is None
+    some, none = surface_note(5, 3, "SHARDS"), surface_note(5, 0, "SHARDS")
+    assert some.startswith("2 of 5 true objects have a box but no surface")
+    assert "reported only of the 3 that do" in some and "SHARDS may be older" in some
+    assert none.startswith("5 of 5") and "are reported not at all" in none
 
 
 def test_the_same_seed_gives_the_same_scores():

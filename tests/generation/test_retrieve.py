@@ -161,6 +161,19 @@ def test_classes_without_models_keep_their_objects_and_the_report_says_so(models
     assert report["classes"]["sofa"]["models"] == 3 and report["broken_models"] == {"x": "gone"}
 
 
+def test_a_mesh_without_a_model_stays_in_step_with_its_box(models):
+    """A plant above the floor, whose class has no model, grows down to it with its box."""
+    low, high = np.array([1.0, 0.3, 0.0]), np.array([1.6, 1.1, 0.4])
+    center, size = (low + high) / 2, high - low
+    vertices = np.vstack([low, high, [1.1, 0.5, 0.2]])
+    plant = SceneObject("plant", tuple(center), tuple(size), Mesh(vertices, np.array([(0, 1, 2)])))
+    (item,) = retrieve(room(plant), models).objects
+    assert item.center_m == pytest.approx((1.3, 0.55, 0.2))
+    assert item.size_m == pytest.approx((0.6, 1.1, 0.4))
+    grown = vertices * (1, 1.1 / 0.8, 1) - (0, 0.3 * 1.1 / 0.8, 0)
+    np.testing.assert_allclose(item.mesh.vertices_m, grown, atol=1e-12)
+
+
 def test_rooms_without_objects_and_objects_without_volume_have_defined_answers(models):
     assert retrieve(room(), models).extra["retrieval"] == []
     flat = SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, 0.0, 1.0))

@@ -111,6 +111,8 @@ def test_intrinsics(tmp_path):
     [
         ("40,40,48", "--intrinsics 40,40,48 is no intrinsics; expected fx,fy,cx,cy in pixels"),
         ("a,b,c,d", "is no intrinsics"),
+        ("fov=wide", "--intrinsics fov=wide is no intrinsics"),
+        ("fov=180", "--intrinsics fov=180 is no intrinsics; expected fx,fy,cx,cy in pixels, fov="),
         ("0,40,48,36", "is no pinhole camera"),
         ("40,nan,48,36", "is no pinhole camera"),
         ('{"fx": 40}', "holds no intrinsics"),
@@ -129,6 +131,18 @@ def test_intrinsics_that_are_none(tmp_path, text, said):
     assert said in str(error.value)
 
 
+def test_intrinsics_as_photographers_say_them():
+    """Half the width at 45 degrees; film of 36 x 24 mm at 43.27 mm sees its diagonal at 53."""
+    wide = read_intrinsics("fov=90", (72, 96))
+    np.testing.assert_allclose(wide, [[48, 0, 48], [0, 48, 36], [0, 0, 1]], atol=1e-9)
+    normal = read_intrinsics("35mm=43.2666", (72, 96))
+    np.testing.assert_allclose(normal, [[120, 0, 48], [0, 120, 36], [0, 0, 1]], rtol=1e-5)
+    phone = read_intrinsics("35mm=26", (240, 360))  # of film's own shape
+    assert phone[0, 0] / 360 == pytest.approx(26 / 36)
+    with pytest.raises(InputError, match="--intrinsics 35mm=0 is no pinhole camera"):
+        read_intrinsics("35mm=0", (72, 96))
+
+
 def test_poses(own, seen, tmp_path):
     *_, pose = own
     pose.write_text(json.dumps({"camera_to_world": np.linalg.inv(seen.world_to_camera).tolist()}))
@@ -140,3 +154,44 @@ def test_poses(own, seen, tmp_path):
             read_pose(pose)
     with pytest.raises(InputError, match=r"nowhere\.json cannot be read"):
         read_pose(tmp_path / "nowhere.json")
+
+
+def test_a_camera_that_is_upside_down_or_underground(own, seen):
+    """OpenGL's axes, the usual mistake: y up and z backwards."""
+    *_, pose = own
+
+    def said(world_to_camera) -> str:
+        pose.write_text(json.dumps({"world_to_camera": np.asarray(world_to_camera).tolist()}))
+        with pytest.raises(InputError) as error:
+            read_pose(pose)
+        return str(error.value)
+
+    assert "pose.json is upside down" in said(np.diag([1, -1, -1, 1]) @ seen.world_to_camera)
+    sunk = level_camera(1.6)
+    sunk[:3, 3] = -sunk[:3, :3] @ np.array([0, -0.3, 1.5])
+    assert "pose.json is 0.3 m below the floor" in said(sunk)
+    down = np.eye(4)
+    down[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # from above, straight down
+    down[:3, 3] = -down[:3, :3] @ np.array([0, 2.5, 0])
+    pose.write_text(json.dumps({"world_to_camera": down.tolist()}))
+    np.testing.assert_array_equal(read_pose(pose), down)
+
+
+def test_a_mask_of_another_size_than_the_cameras(own):
+    mask, classes, pose = own
+    with pytest.raises(InputError, match=r"cx = 240 and cy = 180, is outside the mask of 96 x 72"):
+        read_own_image(mask, classes, "240,240,240,180", LABELS, pose)
+
+
+def test_large_pictures_are_thinned(own, seen, tmp_path):
+    """Every second pixel of one of 960."""
+    mask, classes, pose = own
+    large = Image.open(mask).resize((960, 720), Image.Resampling.NEAREST)
+    large.save(tmp_path / "large.png")
+    (image,) = read_own_image(
+        tmp_path / "large.png", classes, "480,480,480,360", LABELS, pose
+    ).images
+    (small,) = read_own_image(mask, classes, INTRINSICS, LABELS, pose).images
+    assert image.instance_ids.shape == (360, 480)
+    np.testing.assert_allclose(image.intrinsics, np.diag([5, 5, 1]) @ small.intrinsics)
+    np.testing.assert_array_equal(image.instance_ids[2::5, 2::5], small.instance_ids)

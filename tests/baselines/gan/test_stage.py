@@ -160,7 +160,7 @@ def test_what_needs_latents_of_rooms_says_that_a_gan_has_none(gan_run):
     )
     with pytest.raises(InputError, match="which keeps none"):
         read_latent(trained, "typo")
-    with pytest.raises(InputError, match="Fitting starts from training rooms"):
+    with pytest.raises(InputError, match="Reconstruction starts from training rooms"):
         reconstruct(trained, [], FitOptions())
     for distribution in ("kernel", "geodesic", "gaussian"):
         with pytest.raises(

@@ -4,18 +4,20 @@ import json
 
 import numpy as np
 import pytest
-from scan_files import BOX_FACES, Box, write_ply
+from scan_files import BOX_FACES, write_ply
 
 from data_prep.scannet.annotations import (
     Group,
     axis_alignment,
-    object_bounds,
+    object_parts,
     read_groups,
+    read_mesh,
     read_properties,
     read_segments,
-    read_vertices,
+    surface_of,
 )
 from sceneprior.errors import InputError
+from sceneprior.scene import Mesh
 
 
 @pytest.fixture
@@ -146,9 +148,9 @@ def test_vertices_keep_their_number_and_order(tmp_path, rng):
     vertices = rng.normal(size=(20, 3)).astype(np.float32)
     vertices[7] = vertices[3]
     faces = np.array([(3, 4, 5), (7, 8, 9)])
-    np.testing.assert_array_equal(
-        read_vertices(write_ply(tmp_path / "a.ply", vertices, faces)), vertices
-    )
+    mesh = read_mesh(write_ply(tmp_path / "a.ply", vertices, faces))
+    np.testing.assert_array_equal(mesh.vertices_m, vertices)
+    np.testing.assert_array_equal(mesh.faces, faces)
 
 
 def test_a_mesh_that_is_missing_damaged_or_cut(tmp_path, rng):
@@ -158,31 +160,35 @@ def test_a_mesh_that_is_missing_damaged_or_cut(tmp_path, rng):
     for cut in range(0, len(data), 3):
         path.write_bytes(data[:cut])
         try:
-            count = len(read_vertices(path))
+            mesh = read_mesh(path)
         except InputError as error:
             assert "a.ply is not a mesh" in str(error) or "a.ply holds no vertices" in str(error)
         else:
-            # Triangles are not needed; half the vertices would be noticed beside segs.json.
-            assert count == 8 and cut >= begin + 8 * 16
+            # Half the vertices would be noticed beside segs.json; lost triangles are not.
+            assert len(mesh.vertices_m) == 8 and cut >= begin + 8 * 16
     for _ in range(200):
         damaged = bytearray(data)
         for at in rng.integers(0, len(data), 4):
             damaged[at] = rng.integers(256)
         path.write_bytes(damaged)
         try:
-            read_vertices(path)
+            read_mesh(path)
         except InputError as error:
             assert "a.ply" in str(error)
     with pytest.raises(InputError, match=r"none\.ply cannot be read .no such file"):
-        read_vertices(tmp_path / "none.ply")
+        read_mesh(tmp_path / "none.ply")
     broken = np.full((8, 3), np.nan)
     with pytest.raises(InputError, match="holds no vertices, or broken ones"):
-        read_vertices(write_ply(path, broken, BOX_FACES))
+        read_mesh(write_ply(path, broken, BOX_FACES))
 
 
-def test_bounds_are_those_of_each_objects_segments():
-    box = Box("chair", (0, 1, 2), (3, 4, 5))
-    vertices = np.concatenate([box.corners, box.corners + 10, [[99.0, 99, 99]]])
+def test_triangles_of_vertices_that_are_not_there(tmp_path, rng):
+    faces = np.array([(0, 1, 2), (0, 1, 8)])
+    with pytest.raises(InputError, match=r"a\.ply has triangles of vertices it lacks"):
+        read_mesh(write_ply(tmp_path / "a.ply", rng.normal(size=(8, 3)), faces))
+
+
+def test_parts_are_those_of_each_objects_segments():
     segments = np.array([7] * 4 + [9] * 4 + [3] * 8 + [1])
     groups = [
         Group(0, "chair", frozenset({9, 7, 1000})),
@@ -190,7 +196,15 @@ def test_bounds_are_those_of_each_objects_segments():
         Group(2, "bed", frozenset({3, 9})),
         Group(3, "bed", frozenset()),
     ]
-    whole, none, joined, empty = object_bounds(groups, segments, vertices)
-    np.testing.assert_array_equal(whole, [(0, 1, 2), (3, 4, 5)])
-    assert none is None and empty is None
-    np.testing.assert_array_equal(joined, [(0, 1, 5), (13, 14, 15)])
+    whole, none, joined, empty = object_parts(groups, segments)
+    assert sorted(whole) == [*range(8)] and not len(none) and not len(empty)
+    assert sorted(joined) == [*range(4, 16)]
+
+
+def test_a_parts_surface_is_its_whole_triangles(rng):
+    vertices = rng.normal(size=(16, 3))
+    faces = np.concatenate([BOX_FACES, BOX_FACES + 8, [(7, 8, 9)]])
+    mesh = surface_of(Mesh(vertices, faces), np.arange(8, 16))
+    np.testing.assert_array_equal(mesh.vertices_m[mesh.faces], vertices[BOX_FACES + 8])
+    assert len(mesh.vertices_m) == 8
+    assert surface_of(Mesh(vertices, faces), np.array([0, 7])) is None

@@ -14,6 +14,7 @@ from scan_files import (
     make_scan,
     png,
     sens_header,
+    write_ply,
     write_zip,
 )
 from toy_rooms import write_shard
@@ -145,15 +146,42 @@ def test_a_room_fits_a_shard_and_comes_back(scan, labels, tmp_path):
             np.testing.assert_array_equal(array, getattr(room.views, name))
         truth = shard.read_ground_truth("scene0000_00")
     assert back.image_size == QUARTER_SIZE and back.instance_ids.dtype == np.uint8
-    assert truth.model_ids == ("", "") and truth.floor_m.shape == (4, 2)
-    # The unit cube stands for the model that nobody knows.
+    assert truth.floor_m.shape == (4, 2)
+
+
+def test_what_the_scan_saw_of_an_object_is_its_model(scan, labels):
+    """In the aligned frame the bed fills its box; what has no surface is a unit cube in its box."""
+    room = prepare_scan(read_scan(scan.write().folder, labels, ScanSettings(1)))
+    truth = room.truth
+    assert truth.model_ids == ("scene0000_00_001", "scene0000_00_002") == tuple(room.models)
+    for row, name in enumerate(truth.model_ids):
+        model = room.models[name]
+        assert len(model.vertices_m) == 8 and len(model.faces) == len(BOX_FACES)
+        # The very triangles of the scan, numbered anew.
+        np.testing.assert_array_equal(model.faces, BOX_FACES)
+        placed = np.c_[model.vertices_m, np.ones(8)] @ truth.model_to_room[row].T
+        low, high = placed[:, :3].min(axis=0), placed[:, :3].max(axis=0)
+        np.testing.assert_allclose((low + high) / 2, truth.centers_m[row], atol=1e-6)
+        np.testing.assert_allclose(high - low, truth.sizes_m[row], atol=1e-6)
+
+
+def test_an_object_without_triangles_has_no_model(scan, labels):
+    """The unit cube stands for it; triangles that reach out of an object are no part of it."""
+    scan.write()
+    vertices, faces, _ = scan.mesh
+    bed, chair = faces[12:24], faces[24:36]
+    write_ply(scan.path("_vh_clean_2.ply"), vertices, np.vstack([bed, [(8, 9, 16)]]))
+    room = prepare_scan(read_scan(scan.folder, labels, ScanSettings(1)))
+    assert room.truth.model_ids == ("scene0000_00_001", "")
+    assert len(room.models["scene0000_00_001"].faces) == len(bed) and len(chair) == 12
     cube = np.c_[BITS - 0.5, np.ones(8)]
-    corners = cube @ truth.model_to_room[0].T
+    corners = cube @ room.truth.model_to_room[1].T
+    half = room.truth.sizes_m[1] / 2
     np.testing.assert_allclose(
-        corners[:, :3].min(axis=0), truth.centers_m[0] - truth.sizes_m[0] / 2, atol=1e-6
+        corners[:, :3].min(axis=0), room.truth.centers_m[1] - half, atol=1e-6
     )
     np.testing.assert_allclose(
-        corners[:, :3].max(axis=0), truth.centers_m[0] + truth.sizes_m[0] / 2, atol=1e-6
+        corners[:, :3].max(axis=0), room.truth.centers_m[1] + half, atol=1e-6
     )
 
 
