@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprior.lifting.boxes import lift_boxes, smallest_box
+from sceneprior.lifting.boxes import RAYS, lift_boxes, own_rays, smallest_box
+from sceneprior.lifting.hulls import sightings_of
 from sceneprior.shards import iterate_rooms
 
 
@@ -114,3 +115,33 @@ def test_the_smallest_box_is_that_of_single_steps(seed):
 def test_without_a_hull_the_box_is_the_grid():
     first, last = smallest_box(np.zeros((4, 3, 3), int), np.zeros((4, 3), bool), 5)
     assert first.tolist() == [0, 0, 0] and last.tolist() == [5, 5, 5]
+
+
+def test_rays_go_through_the_objects_own_pixels(rooms):
+    """Through their centres; among them, in every view, an outermost one at each clear side."""
+    views = rooms[0][0]
+    item = int(views.visible.sum(axis=0).argmax())
+    rows = np.flatnonzero(views.visible[:, item])
+    seen = sightings_of(views, rows, item)
+    checked = 0
+    for row, (view, clear) in enumerate(zip(rows, views.sides_clear[rows, item], strict=True)):
+        one = seen._replace(ids=seen.ids[row : row + 1])
+        pose, camera = views.world_to_camera[view].astype(float), views.intrinsics[view]
+        origins, directions = own_rays(
+            one, pose[None], camera[None], clear[None], np.random.default_rng(0)
+        )
+        np.testing.assert_allclose(origins @ pose[:3, :3].T + pose[:3, 3], 0, atol=1e-5)
+        x, y, depth = camera @ pose[:3, :3] @ directions.T
+        place = np.stack([x / depth, y / depth])
+        # Float32 poses: a ten-thousandth of a pixel or so.
+        np.testing.assert_allclose(place % 1, 0.5, rtol=0, atol=1e-2)
+        u, v = np.floor(place).astype(int)
+        mask = seen.ids[row] == item + 1
+        assert mask[v, u].all() and len(u) == RAYS + clear.sum()
+        own_v, own_u = np.nonzero(mask)
+        ends = [own_u.min(), own_v.min(), own_u.max(), own_v.max()]
+        met = [u.min(), v.min(), u.max(), v.max()]
+        assert [end == there for end, there, is_clear in zip(ends, met, clear, strict=True)
+                if is_clear] == [True] * int(clear.sum())  # fmt: skip
+        checked += int(clear.sum())
+    assert checked > 4
