@@ -23,6 +23,7 @@ from sceneprior.generation.decode import decode_training_rooms, synthesize
 from sceneprior.generation.sample import DISTRIBUTIONS
 from sceneprior.lifting import dataset as lifted
 from sceneprior.models.latents import LatentCube
+from sceneprior.models.prototypes import Prototypes
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import RollingCheckpoint
 from sceneprior.training.checkpoints import read_checkpoint
@@ -117,7 +118,7 @@ def test_a_variant_is_decoded_sampled_and_interpolated(variant):
 
 def test_a_stopped_variant_resumes_to_the_same_weights(variant, tmp_path, monkeypatch):
     _, config, whole = variant
-    found = lifted.shape_space
+    found = lifted.choose_prototypes
     run = shutil.copytree(whole, tmp_path / "run")
     shutil.rmtree(run / "shape")
     with monkeypatch.context() as patch:
@@ -125,9 +126,11 @@ def test_a_stopped_variant_resumes_to_the_same_weights(variant, tmp_path, monkey
         with pytest.raises(KeyboardInterrupt):
             fit(config, run, resume=True, trainer_options=CPU)
     assert not (run / "shape" / "final.ckpt").exists()
-    # Another processor finds another basis of the shape space; the checkpoint's is taken.
+    # Another processor finds prototypes in another order; the checkpoint's are taken.
     monkeypatch.setattr(
-        lifted, "shape_space", lambda *given: (s := found(*given))._replace(basis=-s.basis[::-1])
+        lifted,
+        "choose_prototypes",
+        lambda *given: Prototypes(*(part[::-1].copy() for part in found(*given))),
     )
     fit(config, run, resume=True, trainer_options=CPU)
     wanted = read_checkpoint(whole / "shape" / "final.ckpt")["state_dict"]

@@ -139,7 +139,8 @@ def test_a_job_on_damaged_houses_names_every_room(front, tmp_path):
     (front.front / "house98.json").write_bytes(text[:1000])
     (front.front / "house99.json").write_bytes(b"\xff" * 100)
     rules = ("max_floor_m=null", "max_height_m=null", "scale_range=null", "min_objects=null",
-             "required_classes=[]", "views.at_least=2", "views.per_m2=0.1",
+             "required_classes=[]", "min_inside_floor=null", "min_models_share=null",
+             "views.at_least=2", "views.per_m2=0.1",
              "views.image_size=[24, 32]", "views.min_object_pixels=4", "views.tries=2")  # fmt: skip
     summary = build_shards(front_job(front, tmp_path / "shards", rules=rules, rgb=True))
     assert summary.statuses["prepared"] > 30 and summary.statuses["failed"] > 5

@@ -98,7 +98,7 @@ def shards(made_once):
 def test_right_cameras_pass(shards, kind):
     found = verify(shards(kind))
     assert found.problems == ()
-    name = {"homes": "mesh", "scans": "box", "posed": "found"}[kind]
+    name = {"homes": "mesh", "scans": "mesh", "posed": "found"}[kind]
     tally = found.agreement.tallies[name]
     # Also masks that something hides in part, and those at the image's border.
     assert tally.masks > 2 * tally.whole > 0

@@ -40,7 +40,7 @@ def test_scans_become_shards_whose_boxes_project_onto_their_masks(prep, tmp_path
     assert "train 2 rooms, 10 views, 4 objects; test 1 rooms, 5 views, 2 objects" in made.stdout
     checked = prep.inspect("--verify")
     said = " ".join(checked.stdout.split())
-    assert checked.exit_code == 0 and "(meshes)" in said
+    assert checked.exit_code == 0 and "projected meshes" in said
     assert "100.0% of" in said and "mean 2D IoU of 0.9" in said
     assert prep.inspect("--room", "scene0000_00").exit_code == 0
 
