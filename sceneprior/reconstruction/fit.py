@@ -87,7 +87,7 @@ def decode_images(
 ) -> DecodedScenes:
     """As many objects of each latent as the fullest image shows; shapes after the shape stage.
 
-    Without `with_grids` these are meshes alone: occupancy grids are compared with no mask.
+    Without `with_grids` these are meshes alone: looks of occupancy grids are compared with no mask.
     """
     z = trained.prior.latent_space.onto(points)
     with_shape = trained.stage != "layout" and (with_grids or trained.prior.faces is not None)
