@@ -308,11 +308,11 @@ def test_a_signal_to_compare_alone_stops_its_commands_which_save_what_they_have(
         background, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     folder = tmp_path / "out/toy/ours/seed0"
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 400
     while not (folder / "run/layout/last.ckpt").is_file() and time.monotonic() < deadline:
         time.sleep(0.1)
     process.send_signal(signal.Signals[name])
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=400)
     assert process.returncode == 130 and "The same command goes on from here" in said
     assert "Stopped and saved" in (folder / "fit.log").read_text()
     noted = json.loads((folder / "steps.json").read_text())

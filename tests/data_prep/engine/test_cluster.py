@@ -40,7 +40,7 @@ def dask(tmp_path_factory):
             "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
             "--scheduler-file", str(path),
         )  # fmt: skip
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 400
         while time.monotonic() < deadline:
             try:
                 return json.loads(path.read_text())["address"], process
