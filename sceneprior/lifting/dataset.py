@@ -21,13 +21,14 @@ from sceneprior.geometry.turns import turn_boxes
 from sceneprior.lifting.boxes import LiftedBoxes, lift_boxes
 from sceneprior.lifting.rays import RayPool, draw_rays
 from sceneprior.lifting.shapes import ShapeGrid, lift_shapes
+from sceneprior.lifting.symmetry import made_symmetric
 from sceneprior.lifting.thinning import thin_shapes
 from sceneprior.models.prototypes import Prototypes, choose_prototypes, turned_looks
 from sceneprior.shards import RoomViews, Shard, iterate_rooms
 from sceneprior.views import LiftedRooms
 
 VERSION = 1
-SHAPES_VERSION = 2
+SHAPES_VERSION = 3
 """Of what `lift_boxes` and `lift_shapes` find: raise it when the same views give something else."""
 
 RAYS_KEPT = 1024
@@ -206,7 +207,7 @@ def _find_shapes(
             np.concatenate([each.sizes_m for each in boxes]),
             np.concatenate([room.object_class for room in rooms]),
         )
-        return {"bits": _packed(thin)}
+        return {"bits": _packed(made_symmetric(thin))}
 
     key = f"{key} {SHAPES_VERSION} {shape.cells} {shape.margin}"
     return _kept(folder / f"lifted_shapes_{split}.npz", key, find)["bits"]

@@ -22,7 +22,7 @@ class OccupancyConfig(Section):
     """Shapes as occupancy grids, some of them lifted from the training rooms' masks."""
 
     name: Literal["occupancy"] = "occupancy"
-    prototypes: int = Field(512, ge=1)
+    prototypes: int = Field(1024, ge=1)
     """Shapes that stand for those of all objects, at most."""
     codes: int = Field(128, ge=1)
     """Numbers that say which shape it is: looks that are alike have codes that are near."""
@@ -66,12 +66,14 @@ class OccupancyDecoder(nn.Module):
         self.filled: Tensor
         self.sizes_m: Tensor
         self.object_class: Tensor
+        self.common: Tensor
         self.look_codes: Tensor
         self.spread: Tensor
         self.register_buffer("grid_bits", torch.zeros(most, -(-(cells**3) // 8), dtype=torch.uint8))
         self.register_buffer("filled", torch.ones(most))
         self.register_buffer("sizes_m", torch.ones(most, 3))
         self.register_buffer("object_class", torch.full((most,), self.unknown))
+        self.register_buffer("common", torch.zeros(most, dtype=torch.bool))
         self.register_buffer("look_codes", torch.zeros(most * POSES, config.codes))
         self.register_buffer("spread", torch.ones(()))
         self._meshes: dict[int, Mesh] = {}
@@ -84,6 +86,7 @@ class OccupancyDecoder(nn.Module):
         self.filled[:count] = torch.from_numpy(flat.sum(axis=1).clip(min=1).astype(np.float32))
         self.sizes_m[:count] = torch.from_numpy(prototypes.sizes_m)
         self.object_class[:count] = torch.from_numpy(prototypes.object_class)
+        self.common[:count] = torch.from_numpy(prototypes.common)
         codes = looks_apart(prototypes.grids, self.look_codes.shape[1])
         self.look_codes[: count * POSES] = torch.from_numpy(codes)
         self.spread.fill_(float(np.sqrt((codes**2).mean())) or 1.0)
@@ -92,11 +95,13 @@ class OccupancyDecoder(nn.Module):
     def prototypes(self) -> Prototypes:
         """What `learn_prototypes` was given."""
         known = self.object_class != self.unknown
-        bits, sizes_m, labels = (
-            part[known].cpu().numpy() for part in (self.grid_bits, self.sizes_m, self.object_class)
+        bits, sizes_m, labels, common = (
+            part[known].cpu().numpy()
+            for part in (self.grid_bits, self.sizes_m, self.object_class, self.common)
         )
         flat = np.unpackbits(bits, axis=1, count=self.cells**3).view(bool)
-        return Prototypes(flat.reshape(-1, *(self.cells,) * 3), sizes_m.astype(np.float64), labels)
+        grids = flat.reshape(-1, *(self.cells,) * 3)
+        return Prototypes(grids, sizes_m.astype(np.float64), labels, common)
 
     def forward(
         self, features: Float[Tensor, "*objects features"]

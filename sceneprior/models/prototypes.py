@@ -17,8 +17,8 @@ ALIKE = 0.12
 """Two objects look alike that are no farther apart than this: the mean squared difference of their
 coarse grids plus `SIZE_WEIGHT` times the sum of how much their extents' logarithms differ."""
 SIZE_WEIGHT = 0.3
-STANDS_FOR = 3
-"""A prototype looks like at least so many objects, itself among them, or is its class's most
+COMMON = 3
+"""A common prototype looks like at least so many objects, itself among them, or is its class's most
 common one: an odd shape is more often badly lifted than rare."""
 COARSE, PARTS = 8, 4
 """Parts along each axis of the grids that are compared, and of those that the network is shown."""
@@ -30,6 +30,13 @@ class Prototypes(NamedTuple):
     grids: Bool[np.ndarray, "prototypes x y z"]
     sizes_m: Float[np.ndarray, "prototypes 3"]
     object_class: Int[np.ndarray, " prototypes"]
+    """-1 for one that stands for nothing."""
+    common: Bool[np.ndarray, " prototypes"]
+    """Whether it stands for several objects (`COMMON`)."""
+
+    def common_alone(self) -> "Prototypes":
+        """The same, in the same order, of which those that are not common stand for nothing."""
+        return self._replace(object_class=np.where(self.common, self.object_class, -1))
 
     def shown(self) -> Float[np.ndarray, "looks shown"]:
         """What each look looks like to a network: a coarse grid, and logarithms of the extents."""
@@ -69,8 +76,7 @@ def choose_prototypes(
     usable: Bool[np.ndarray, " objects"],
     most: int,
 ) -> Prototypes:
-    """Of each class the objects that look like most others, until every usable one looks like one
-    or like few (`STANDS_FOR`).
+    """Of each class the objects that look like most others, until every usable one looks like one.
 
     `ALIKE` is taken half as large again until there are at most `most`, or one a class.
     """
@@ -79,27 +85,30 @@ def choose_prototypes(
         rows = np.flatnonzero((object_class == label) & usable)
         own = described(grids[rows], sizes_m[rows])
         apart.append((rows, distances(own, own)[0]))
-    alike, items = ALIKE, _covering(apart, ALIKE)
+    alike = ALIKE
+    items, common = _covering(apart, alike)
     while len(items) > max(most, len(apart)):
         alike *= 1.5
-        items = _covering(apart, alike)
-    return Prototypes(grids[items], sizes_m[items], object_class[items])
+        items, common = _covering(apart, alike)
+    return Prototypes(grids[items], sizes_m[items], object_class[items], common)
 
 
 def _covering(
     apart: list[tuple[np.ndarray, np.ndarray]], alike: float
-) -> Int[np.ndarray, " prototypes"]:
-    """`choose_prototypes` from each class's rows and their distances."""
-    items = []
+) -> tuple[Int[np.ndarray, " prototypes"], Bool[np.ndarray, " prototypes"]]:
+    """`choose_prototypes` from each class's rows and their distances, and which are common."""
+    items, common = [], []
     for rows, distance in apart:
         near = (distance <= alike) | np.eye(len(rows), dtype=bool)
         first = True
-        while first or near.sum(axis=0).max() >= STANDS_FOR:
-            best = int(near.sum(axis=0).argmax())
+        while near.any():
+            likes = near.sum(axis=0)
+            best = int(likes.argmax())
             items.append(rows[best])
+            common.append(first or likes[best] >= COMMON)
             near[near[:, best]] = False  # they are spoken for
             first = False
-    return np.array(items, dtype=np.int64)
+    return np.array(items, dtype=np.int64), np.array(common, dtype=bool)
 
 
 def looks_apart(

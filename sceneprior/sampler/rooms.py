@@ -44,9 +44,9 @@ class SamplerRooms:
         self.rooms: RoomBoxes
 
     def see_looks(self, prototypes: Prototypes) -> "SamplerRooms":
-        """Itself, with a look for every object, of prototypes that the prior decodes. Only then
-        are there `rooms`."""
-        lifted = self._lifted
+        """Itself, with a look for every object, of those prototypes that the prior decodes and that
+        are common: odd ones are often badly lifted. Only then are there `rooms`."""
+        lifted, prototypes = self._lifted, prototypes.common_alone()
         counts = [len(room.explained) for room in lifted.boxes]
         boxes_m = np.concatenate([np.hstack([b.centers_m, b.sizes_m]) for b in lifted.boxes])
         looks = lifted.looks_of(prototypes)

@@ -97,7 +97,9 @@ def test_looks_become_meshes_in_the_boxes_of_objects_that_are_kept(decoded, tmp_
     grids[0, :, :4] = True  # the lower half of every frame
     grids[1, :4] = True
     prior = tiny_config(tmp_path, **OCCUPANCY).build_prior()
-    prior.shape.learn_prototypes(Prototypes(grids, np.ones((2, 3)), np.array([9, 13])))
+    prior.shape.learn_prototypes(
+        Prototypes(grids, np.ones((2, 3)), np.array([9, 13]), np.ones(2, dtype=bool))
+    )
     looks = torch.tensor([[0, POSES, 0, 0], [0, 0, 0, 0]])
     chosen = replace(decoded, vertices_m=None, looks=looks)
     scenes = scenes_of(chosen, prior, "front3d_bedroom", ["a", "b"])

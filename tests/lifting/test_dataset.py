@@ -54,7 +54,8 @@ def test_turned_rows_are_turned_rooms(shards, monkeypatch):
     )
     monkeypatch.setattr(module, "write_whole", lambda *_: None)
     data = LiftedDataset(shards, "train", rotations=4, shape=GRID._replace(margin=1.15))
-    prototypes = Prototypes(data.grids(), data.sizes_m, data.object_classes)  # every one its own
+    common = np.ones(len(data.object_classes), dtype=bool)  # every one its own
+    prototypes = Prototypes(data.grids(), data.sizes_m, data.object_classes, common)
     data.see_looks(prototypes)
     plain, turned = data.__getitems__([(4, 0)]), data.__getitems__([(7, 2)])
     assert torch.equal(turned.boxes_m, turn_boxes(plain.boxes_m, torch.tensor([3])))

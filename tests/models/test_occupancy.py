@@ -27,7 +27,8 @@ def prior(tmp_path) -> ScenePrior:
 def prototypes() -> Prototypes:
     """Three shapes without symmetry."""
     rng = np.random.default_rng(0)
-    return Prototypes(rng.random((3, 8, 8, 8)) < 0.5, rng.random((3, 3)), np.array([2, 1, 2]))
+    grids, labels = rng.random((3, 8, 8, 8)) < 0.5, np.array([2, 1, 2])
+    return Prototypes(grids, rng.random((3, 3)), labels, np.array([True, True, False]))
 
 
 @pytest.fixture
@@ -73,7 +74,9 @@ def test_meshes_turn_and_fill_boxes_as_grids_do():
     grids = np.zeros((1, 8, 8, 8), dtype=bool)
     grids[0, 1:, 1:4, 2:7] = True
     grids[0, 2:4, 1:7, 2:4] = True
-    decoder.learn_prototypes(Prototypes(grids, np.ones((1, 3)), np.array([1])))
+    decoder.learn_prototypes(
+        Prototypes(grids, np.ones((1, 3)), np.array([1]), np.ones(1, dtype=bool))
+    )
     box = np.array([*rng.normal(size=3), 2.0, 0.5, 1.0])
     for pose in range(POSES):
         mesh = decoder.mesh(pose, box)

@@ -54,15 +54,18 @@ def test_other_classes_and_other_sizes_are_other_prototypes():
     assert sorted(fewer.object_class.tolist()) == [1, 2]  # one a class stays
 
 
-def test_an_odd_shape_looks_like_one_that_others_share():
+def test_an_odd_shape_is_a_prototype_but_no_common_one():
     grids = np.stack([ODD] * 3 + [~ODD] * 2)
     sizes, labels = np.stack([SIZE] * 5), np.ones(5, dtype=np.int64)
     found = choose_prototypes(grids, sizes, labels, np.ones(5, dtype=bool), most=99)
-    assert len(found.grids) == 1 and np.array_equal(found.grids[0], ODD)
-    assert (found.looks_of(grids, sizes, labels) >= 0).all()
+    assert np.array_equal(found.grids, np.stack([ODD, ~ODD]))
+    assert found.common.tolist() == [True, False]
+    assert (found.looks_of(grids, sizes, labels) // POSES).tolist() == [0, 0, 0, 1, 1]
+    # Of common ones alone, it looks like the one that others share.
+    assert (found.common_alone().looks_of(grids, sizes, labels) // POSES == 0).all()
     # But a class has at least one.
     alone = choose_prototypes(grids[:1], sizes[:1], labels[:1], np.ones(1, dtype=bool), most=99)
-    assert len(alone.grids) == 1
+    assert alone.common.tolist() == [True]
 
 
 def test_what_is_not_usable_is_no_prototype():

@@ -126,3 +126,11 @@ def test_boxes_that_graze_do_not_meet():
         [(boxes.sizes_m[0, 0] + boxes.sizes_m[1, 0]) / 2 - 0.04, 0, 0]
     )
     assert not with_looks(lifted).may_meet(CLASSES).any()
+
+
+def test_rooms_are_drawn_of_common_prototypes_alone(rooms):
+    prototypes = rooms.prototypes._replace(common=np.arange(len(rooms.prototypes.grids)) < 1)
+    prototypes = prototypes._replace(object_class=np.abs(prototypes.object_class))
+    seen = sampler_rooms().see_looks(prototypes)
+    assert seen.prototypes.object_class.tolist()[1:] == [-1] * (len(prototypes.grids) - 1)
+    assert seen.rooms.is_object.any() and (seen.rooms.looks[seen.rooms.is_object] < 8).all()
