@@ -14,7 +14,7 @@ from sceneprior.files import write_json, write_whole
 from sceneprior.offscreen import Renderer, open_renderer
 from sceneprior.pictures import png_bytes
 from sceneprior.scene import FORMAT, Mesh, Scene, read_scene, scene_to_json
-from sceneprior.topdown import object_colors, scene_meshes, topdown
+from sceneprior.topdown import FLOOR_COLOR, object_colors, scene_meshes, topdown
 
 
 def save_scene(scene: Scene, path: Path, renderer: Renderer | None = None) -> None:
@@ -65,12 +65,19 @@ WRITERS: Mapping[str, Callable[[Scene, Path, Renderer | None], None]] = {
 }  # fmt: skip
 
 
-def scene_to_glb(scene: Scene) -> bytes:
-    """The scene as binary glTF 2.0: a named node, mesh and material per object; no cameras."""
-    if not scene.objects:
+def scene_to_glb(scene: Scene, floor: Mesh | None = None) -> bytes:
+    """The scene as binary glTF 2.0: a named node, mesh and material per object; no cameras.
+
+    Args:
+        floor: One node more, `floor`: for pages, since `load_scene` knows no such object.
+    """
+    if not scene.objects and floor is None:
         return _empty_glb()
+    room = _trimesh_of(scene)
+    if floor is not None:
+        _add(room, "floor", "floor", floor, np.array(FLOOR_COLOR))
     # Without normals viewers shade each triangle flat: boxes keep their edges.
-    return bytes(_trimesh_of(scene).export(file_type="glb", include_normals=False))
+    return bytes(room.export(file_type="glb", include_normals=False))
 
 
 def scene_to_obj(scene: Scene, materials: str) -> tuple[str, bytes]:
@@ -89,28 +96,34 @@ def scene_to_obj(scene: Scene, materials: str) -> tuple[str, bytes]:
 
 def _trimesh_of(scene: Scene) -> Any:
     import trimesh
-    from trimesh.visual import TextureVisuals
-    from trimesh.visual.material import PBRMaterial
 
     room = trimesh.Scene(base_frame="room")
     meshes, colors = scene_meshes(scene), object_colors(scene)
     for node, item, mesh, color in zip(_nodes(scene), scene.objects, meshes, colors, strict=True):
-        material = PBRMaterial(
-            name=item.label,
-            baseColorFactor=_linear_rgba(color),
-            metallicFactor=0.0,
-            roughnessFactor=0.9,
-            # A learned mesh may fold over itself; its back should not be a hole.
-            doubleSided=True,
-        )
-        surface = trimesh.Trimesh(
-            np.asarray(mesh.vertices_m, dtype=np.float64),
-            np.asarray(mesh.faces, dtype=np.int64),
-            process=False,
-            visual=TextureVisuals(material=material),
-        )
-        room.add_geometry(surface, node_name=node, geom_name=node)
+        _add(room, node, item.label, mesh, color)
     return room
+
+
+def _add(room: Any, node: str, material: str, mesh: Mesh, color: np.ndarray) -> None:
+    import trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    surface = PBRMaterial(
+        name=material,
+        baseColorFactor=_linear_rgba(color),
+        metallicFactor=0.0,
+        roughnessFactor=0.9,
+        # A learned mesh may fold over itself; its back should not be a hole.
+        doubleSided=True,
+    )
+    geometry = trimesh.Trimesh(
+        np.asarray(mesh.vertices_m, dtype=np.float64),
+        np.asarray(mesh.faces, dtype=np.int64),
+        process=False,
+        visual=TextureVisuals(material=surface),
+    )
+    room.add_geometry(geometry, node_name=node, geom_name=node)
 
 
 def _nodes(scene: Scene) -> list[str]:

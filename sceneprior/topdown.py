@@ -15,6 +15,8 @@ from sceneprior.scene import Mesh, Scene, SceneObject
 BACKGROUND = (255, 255, 255)
 """White: no class colour comes near it, and a page prints it as paper."""
 
+FLOOR_COLOR = (232, 228, 220)
+
 
 @dataclass(frozen=True)
 class TopDownProtocol:
@@ -166,7 +168,7 @@ def perspective(
     """
     view = view or corner_view([scene], image_size)
     colors = object_colors(scene) if colors is None else colors
-    colors = np.concatenate([colors, [[232, 228, 220]]]).astype(np.uint8)
+    colors = np.concatenate([colors, [FLOOR_COLOR]]).astype(np.uint8)
     meshes = [*scene_meshes(scene), view.floor]
     return renderer.shaded(meshes, colors, view.camera, view.image_size, BACKGROUND)
 

@@ -20,6 +20,9 @@ def synthesize(
     count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many rooms.")] = 16,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same rooms.")] = 0,
     distribution: DistributionOption = None,
+    html: Annotated[
+        bool, typer.Option("--html", help="Also rooms.html, one file whose rooms turn.")
+    ] = False,
     checkpoint: CheckpointOption = "final",
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "auto",
@@ -27,7 +30,8 @@ def synthesize(
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents where the method has them."""
     from sceneprior.api import load
     from sceneprior.evaluation.metrics.contents import emptiness
-    from sceneprior.generation.export import check_free, write_scenes
+    from sceneprior.evaluation.rooms_page import write_rooms_page
+    from sceneprior.generation.export import PAGE_FILE, check_free, write_scenes
     from sceneprior.offscreen import open_renderer
 
     check_free(out, overwrite)
@@ -35,7 +39,11 @@ def synthesize(
     artist = open_renderer(renderer)
     scenes = prior.sample(count, seed, distribution)
     write_scenes(scenes, out, artist, overwrite)
-    typer.echo(f"Wrote {count} rooms to {out} (from: {distribution or prior.distribution})")
+    origin = distribution or prior.distribution
+    if html:
+        told = f"run {run.resolve().name} · seed {seed} · from: {origin}"
+        write_rooms_page(out / PAGE_FILE, scenes, artist, title="New rooms", subtitle=told)
+    typer.echo(f"Wrote {count} rooms to {out} (from: {origin})")
     if (warning := emptiness(scenes)) is not None:
         typer.echo(f"Warning: {warning}", err=True)
 

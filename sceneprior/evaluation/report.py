@@ -3,16 +3,14 @@
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 
-from sceneprior import __version__
 from sceneprior.evaluation.ground_truth import known_in_3d, reference_scenes
 from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
+from sceneprior.evaluation.page import faces_per_object, render
 from sceneprior.evaluation.report_pictures import curves_svg, input_views, legend, room_pictures
 from sceneprior.evaluation.score_table import headings, score_rows
 from sceneprior.files import write_whole
@@ -42,7 +40,7 @@ def write_report(
     renderer: Renderer,
     from_boxes: bool = False,
 ) -> None:
-    """Write one HTML file without scripts and without anything outside itself.
+    """Write one HTML file that needs nothing outside itself; rooms turn under the mouse.
 
     A part for which nothing is given is left out. The page names folders, never whole paths,
     so that it can be passed on.
@@ -66,14 +64,10 @@ def write_report(
     along = _spread(unfolding, UNFOLDING_SHOWN)
     pairs = list(decoded)[:DECODED_SHOWN]
     shown = [*generated, *test, *along, *(scene for pair in pairs for scene in pair)]
-    text = files("sceneprior.evaluation").joinpath("report.html.jinja").read_text("utf-8")
-    # A misspelt name in the template is an error, not a blank.
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    page = environment.from_string(text).render(
+    most_faces = faces_per_object([*generated, *test, *(scene for pair in pairs for scene in pair)])
+    page = render(
+        "report.html.jinja",
         title=title,
-        version=__version__,
         run=Path(run).resolve().name,
         shards=Path(shards).resolve().name,
         label_set=names.removeprefix("void,").replace(",", ", ").replace("_", " "),
@@ -81,9 +75,9 @@ def write_report(
         views=[] if from_boxes else input_views(shards, rooms=3, views_per_room=2),
         from_boxes=from_boxes,
         curves=curves_svg(curves) if curves else None,
-        decoded=[_pair(*pair, renderer) for pair in pairs],
-        generated=[room_pictures(scene, renderer) for scene in generated],
-        test=[room_pictures(scene, renderer) for scene in test],
+        decoded=[_pair(*pair, renderer, most_faces) for pair in pairs],
+        generated=[room_pictures(scene, renderer, most_faces) for scene in generated],
+        test=[room_pictures(scene, renderer, most_faces) for scene in test],
         unfolding=[room_pictures(scene, renderer) for scene in along],
         legend=legend(shown),
         headings=headings(scores),
@@ -92,7 +86,7 @@ def write_report(
         note=scores.get("note"),
         commands=commands,
     )
-    write_whole(path, page.encode())
+    write_whole(path, page)
 
 
 def _spread(items: Sequence[_T], count: int) -> list[_T]:
@@ -101,7 +95,7 @@ def _spread(items: Sequence[_T], count: int) -> list[_T]:
     return [items[row] for row in rows]
 
 
-def _pair(decoded: Scene, truth: Scene, renderer: Renderer) -> dict[str, Any]:
+def _pair(decoded: Scene, truth: Scene, renderer: Renderer, most_faces: int) -> dict[str, Any]:
     match = match_scenes(decoded, truth)
     accuracy, iou = match.class_accuracy, match.mean_iou
     summary = (
@@ -111,7 +105,7 @@ def _pair(decoded: Scene, truth: Scene, renderer: Renderer) -> dict[str, Any]:
     )
     # The true floor under both, so that both pictures frame the same room.
     rooms = {"decoded": replace(decoded, floor_m=truth.floor_m), "truth": truth}
-    pictures = {name: room_pictures(scene, renderer) for name, scene in rooms.items()}
+    pictures = {name: room_pictures(scene, renderer, most_faces) for name, scene in rooms.items()}
     return {**pictures, "summary": summary}
 
 

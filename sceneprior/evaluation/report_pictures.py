@@ -1,6 +1,5 @@
 """Pictures of the report page, as data URIs: rooms, input views and learning curves."""
 
-import base64
 import io
 from collections import Counter
 from collections.abc import Sequence
@@ -12,8 +11,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.classes import class_colors, label_set
+from sceneprior.evaluation.page import data_uri, glb_of, png_uri
 from sceneprior.offscreen import Renderer
-from sceneprior.pictures import paint_ids, png_bytes
+from sceneprior.pictures import paint_ids
 from sceneprior.scene import Scene
 from sceneprior.shards import Shard, iterate_rooms
 from sceneprior.topdown import perspective, topdown
@@ -33,10 +33,12 @@ class RoomPictures:
     """Data URI of the flat picture that scores compare, with borders, at half size."""
     perspective: str
     """Data URI of the shaded view from above a corner."""
+    glb: str
+    """Data URI of the model that turns, in place of the shaded view; empty where none was asked."""
 
 
-def room_pictures(scene: Scene, renderer: Renderer) -> RoomPictures:
-    """Draw one scene both ways."""
+def room_pictures(scene: Scene, renderer: Renderer, most_faces: int = 0) -> RoomPictures:
+    """Draw one scene both ways, and make its model, of so many faces an object (0: no model)."""
     counts = Counter(item.label.replace("_", " ") for item in scene.objects)
     words = [name if many == 1 else f"{name} ×{many}" for name, many in sorted(counts.items())]
     flat = Image.fromarray(topdown(scene, renderer, outlines=True))
@@ -44,10 +46,10 @@ def room_pictures(scene: Scene, renderer: Renderer) -> RoomPictures:
     solid = io.BytesIO()
     shaded = Image.fromarray(perspective(scene, renderer, (330, 440)))
     shaded.save(solid, format="JPEG", quality=86, optimize=True)
-    solid_uri = _data_uri("image/jpeg", solid.getvalue())
-    return RoomPictures(
-        scene.name, ", ".join(words) or "nothing", _png(flat.quantize(64)), solid_uri
-    )
+    solid_uri = data_uri("image/jpeg", solid.getvalue())
+    glb = data_uri("model/gltf-binary", glb_of(scene, most_faces)) if most_faces else ""
+    contents = ", ".join(words) or "nothing"
+    return RoomPictures(scene.name, contents, png_uri(flat.quantize(64)), solid_uri, glb)
 
 
 def legend(scenes: Sequence[Scene]) -> list[tuple[str, str]]:
@@ -95,7 +97,7 @@ def _input_view(shard: Shard, room_id: str, view: int) -> tuple[str, str]:
             draw.rectangle((left - 2, top - 2, right + 2, bottom + 2), fill=dark)
             draw.text((x1 + 4, y1 + 3), label, font=font, fill="white")
     count = int(room.visible[view].sum())
-    return f"{room_id}, view {view}: {count} objects", _png(picture.quantize(128))
+    return f"{room_id}, view {view}: {count} objects", png_uri(picture.quantize(128))
 
 
 def curves_svg(curves: dict[str, list[tuple[int, float]]]) -> str:
@@ -134,12 +136,4 @@ def curves_svg(curves: dict[str, list[tuple[int, float]]]) -> str:
     # A fixed salt and no date: the same curves give the same bytes.
     with matplotlib.rc_context({"svg.hashsalt": "sceneprior"}):
         figure.savefig(page, format="svg", metadata={"Date": None})
-    return _data_uri("image/svg+xml", page.getvalue())
-
-
-def _png(image: Image.Image) -> str:
-    return _data_uri("image/png", png_bytes(image, optimize=True))
-
-
-def _data_uri(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+    return data_uri("image/svg+xml", page.getvalue())

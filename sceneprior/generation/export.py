@@ -17,6 +17,7 @@ from sceneprior.scene import FORMAT, Scene
 from sceneprior.scene_files import format_of, save_scene
 from sceneprior.topdown import perspective
 
+PAGE_FILE = "rooms.html"
 OVERVIEW_ROOMS = 12
 OVERVIEW_TILE = (240, 320)
 """Height and width of one room of the overview, in pixels."""
@@ -50,13 +51,14 @@ def check_free(folder: Path, overwrite: bool = False) -> None:
 
 
 def clear_scenes(folder: Path) -> None:
-    """Delete the scenes that a folder holds, with their GLBs, PNGs and latents, and nothing else:
-    the next reader would take them for new ones."""
+    """Delete the scenes that a folder holds, with their GLBs, PNGs, latents and page, and nothing
+    else: the next reader would take them for new ones."""
     for path in Path(folder).glob("*.json"):
         if format_of(path) == FORMAT:
             for ending in (".glb", ".png", ".json"):
                 path.with_suffix(ending).unlink(missing_ok=True)
-    (Path(folder) / LATENTS_FILE).unlink(missing_ok=True)
+    for name in (LATENTS_FILE, PAGE_FILE):
+        (Path(folder) / name).unlink(missing_ok=True)
 
 
 def write_scenes(

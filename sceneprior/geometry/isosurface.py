@@ -1,7 +1,7 @@
 """The surface of an occupancy grid: a closed triangle mesh of few faces."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Integer
 from scipy import ndimage
 
 from sceneprior.geometry.corners import BOX_FACES, CUBE_CORNERS
@@ -42,8 +42,7 @@ def surface_of(
 
     Source:
         Lewiner et al., "Efficient implementation of Marching Cubes' cases with topological
-        guarantees", JGT 2003 (scikit-image); Garland and Heckbert, "Surface Simplification Using
-        Quadric Error Metrics", SIGGRAPH 1997 (fast-simplification).
+        guarantees", JGT 2003 (scikit-image).
 
     Example: half a box.
 
@@ -53,8 +52,7 @@ def surface_of(
         >>> vertices[:, 1].min().item(), vertices[:, 1].max().item()
         (-1.0, 0.0)
     """
-    # Imported here: what decodes meshes of another kind does without both.
-    import fast_simplification
+    # Imported here: what decodes meshes of another kind does without it.
     from skimage.measure import marching_cubes
 
     if not np.isfinite(logits).all():
@@ -76,12 +74,29 @@ def surface_of(
     unit = (vertices + (first - 1.5)) / np.array(logits.shape) - 0.5
     # Flat sides first: decimation spends its faces elsewhere then. It moves corners out a little.
     unit = (unit * margin).clip(-0.5, 0.5)
-    if len(faces) > most_faces:
-        unit, faces = fast_simplification.simplify(
-            unit.astype(np.float32), faces, target_count=most_faces
-        )
-        unit = unit.astype(np.float64).clip(-0.5, 0.5)
-    return unit * size_m + center_m, faces.astype(np.int64)
+    unit, faces = decimate(unit, faces, most_faces)
+    return unit.clip(-0.5, 0.5) * size_m + center_m, faces.astype(np.int64)
+
+
+def decimate(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Integer[np.ndarray, "faces 3"],
+    most_faces: int,
+) -> tuple[Float[np.ndarray, "kept 3"], Integer[np.ndarray, "kept_faces 3"]]:
+    """A mesh of about so many faces, by edges that matter least; a smaller one is itself.
+
+    Source:
+        Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997
+        (fast-simplification).
+    """
+    if len(faces) <= most_faces:
+        return vertices, faces
+    import fast_simplification
+
+    fewer, faces = fast_simplification.simplify(
+        vertices.astype(np.float32), faces, target_count=most_faces
+    )
+    return fewer.astype(np.float64), faces
 
 
 def without_small_pieces(field: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]:

@@ -153,6 +153,9 @@ def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
     said = one_sentence(command(*call, "--out", "other", "--distribution", "guess"))
     assert "No sampling distribution 'guess'; choose from " in said
     assert everything_in(tmp_path) == before
+    assert command(*call, "--out", "made", "--overwrite", "--html")[0] == 0
+    page = (tmp_path / "made" / "rooms.html").read_text()
+    assert page.count("<model-viewer ") == 3 and "seed 5 · from: kernel" in page
     assert command(*call, "--out", "made", "--overwrite")[0] == 0
     assert everything_in(tmp_path) == before
 

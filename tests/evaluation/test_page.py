@@ -1,0 +1,161 @@
+"""Pages of turning rooms: opened from disk in a real browser, and without scripts or WebGL."""
+
+import base64
+import contextlib
+import hashlib
+import io
+import re
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import sceneprior.evaluation
+from sceneprior.evaluation.page import FACES_PER_PAGE, faces_per_object, glb_of
+from sceneprior.evaluation.rooms_page import ROOMS_SHOWN, write_rooms_page
+from sceneprior.geometry.corners import BOX_FACES
+from sceneprior.geometry.isosurface import surface_of
+from sceneprior.scene import Mesh, Scene, SceneObject
+
+VIEWER = Path(sceneprior.evaluation.__file__).parent / "model_viewer"
+WITHOUT_WEBGL = """
+const asked = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+  return kind.startsWith("webgl") ? null : asked.call(this, kind, ...more);
+};
+"""
+
+
+def bedroom(name: str = "mine") -> Scene:
+    ball = 4 - 10 * np.linalg.norm(np.stack(np.mgrid[-1:1:32j, -1:1:32j, -1:1:32j]), axis=0) / 2
+    size_m = (0.6, 0.6, 0.6)
+    surface = Mesh(*surface_of(ball, np.array([1.2, 0.4, 0.0]), np.array(size_m)))
+    return Scene(
+        name,
+        "front3d_bedroom",
+        (
+            SceneObject("double_bed", (-0.5, 0.3, 0.4), (1.8, 0.6, 2.0)),
+            SceneObject("stool", (1.2, 0.4, 0.0), size_m, surface),
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def page(renderer, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "rooms.html"
+    rooms = [bedroom(), replace(bedroom("<other>"), objects=())]
+    write_rooms_page(path, rooms, renderer, title="Rooms & more", subtitle="made by hand")
+    return path
+
+
+def picture_of(browser) -> np.ndarray:
+    """What the browser shows of the first room.
+
+    Chromium gives up on a picture after 10 s, which WebGL in software may need on a busy machine.
+    """
+    from selenium.common.exceptions import TimeoutException
+
+    for _ in range(6):
+        with contextlib.suppress(TimeoutException):
+            shown = browser.find_element("css selector", "model-viewer").screenshot_as_png
+            break
+    return np.asarray(Image.open(io.BytesIO(shown)).convert("RGB")).astype(int)
+
+
+def wait_for(condition, seconds: float = 90) -> None:
+    limit = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < limit, "the browser did not do it in time"
+        time.sleep(0.2)
+
+
+def settled(browser) -> np.ndarray:
+    """The picture once it no longer changes."""
+    before, now = None, picture_of(browser)
+    while before is None or not np.array_equal(before, now):
+        time.sleep(0.5)
+        before, now = now, picture_of(browser)
+    return now
+
+
+def colors_of(picture: np.ndarray) -> int:
+    return len(np.unique((picture // 16).reshape(-1, 3), axis=0))
+
+
+def test_a_room_turns_under_the_mouse(browser, page, tmp_path):
+    from selenium.webdriver import ActionChains
+
+    browser.get_log("browser")
+    browser.get(page.as_uri())
+    room = browser.find_element("css selector", "model-viewer")
+    wait_for(lambda: browser.execute_script("return arguments[0].loaded === true", room))
+    before = settled(browser)
+    assert colors_of(before) > 8  # a room, and no blank canvas
+    turned = "return arguments[0].getCameraOrbit().theta"
+    angle = browser.execute_script(turned, room)
+    ActionChains(browser).drag_and_drop_by_offset(room, 80, 0).perform()
+    after = settled(browser)
+    assert abs(browser.execute_script(turned, room) - angle) > 0.3
+    assert (np.abs(after - before).max(axis=-1) > 40).mean() > 0.05  # of all pixels
+    browser.save_screenshot(str(tmp_path / "turned.png"))
+    # Nothing was asked of any network, and nothing was refused.
+    requests = "return performance.getEntriesByType('resource').map(entry => entry.name)"
+    assert all(name[:5] in ("data:", "blob:") for name in browser.execute_script(requests))
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+@pytest.mark.parametrize("missing", ["JavaScript", "WebGL"])
+def test_pictures_stay_where_something_is_missing(browser, page, missing):
+    if missing == "JavaScript":
+        browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
+    else:
+        script = browser.execute_cdp_cmd(
+            "Page.addScriptToEvaluateOnNewDocument", {"source": WITHOUT_WEBGL}
+        )
+    try:
+        browser.get(page.as_uri())
+        shown = picture_of(browser)
+        assert colors_of(shown) > 8
+        poster = re.search(r'slot="poster" src="data:image/jpeg;base64,([^"]+)"', page.read_text())
+        given = Image.open(io.BytesIO(base64.b64decode(poster[1])))
+        given = np.asarray(given.resize(shown.shape[1::-1])).astype(int)
+        assert np.abs(given - shown).mean() < 8  # scaled, another way
+    finally:
+        if missing == "JavaScript":
+            browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+        else:
+            browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)
+
+
+def test_the_page_is_small_and_forbids_the_network(page):
+    text = page.read_text()
+    assert page.stat().st_size < 1.3e6
+    assert "default-src 'none'" in text and "Rooms &amp; more" in text and "&lt;other&gt;" in text
+
+
+def test_rooms_share_the_faces_of_a_page():
+    rooms = [bedroom()] * 20
+    assert faces_per_object(rooms) == FACES_PER_PAGE // 40
+    assert faces_per_object([]) == FACES_PER_PAGE
+    whole, light = glb_of(bedroom(), 5000), glb_of(bedroom(), 300)
+    faces = len(bedroom().objects[1].mesh.faces)
+    # A closed mesh has half as many vertices as faces: 12 bytes a face, and 12 for each half.
+    assert len(whole) - len(light) == pytest.approx((faces - 300) * 18, rel=0.05)
+
+
+def test_boxes_are_drawn_whole(renderer, tmp_path):
+    """A mesh of 12 triangles is never decimated, however many rooms a page shows."""
+    rooms = [bedroom().without_meshes()] * (ROOMS_SHOWN + 1)
+    assert len(BOX_FACES) < faces_per_object(rooms)
+    write_rooms_page(tmp_path / "a.html", rooms, renderer, title="Boxes", subtitle="")
+    assert (tmp_path / "a.html").read_text().count("<model-viewer ") == ROOMS_SHOWN
+
+
+def test_the_viewer_is_what_its_page_says():
+    told = re.search(r"`([0-9a-f]{64})`", (VIEWER / "README.md").read_text())
+    script = (VIEWER / "model-viewer-umd.min.js").read_bytes()
+    assert told is not None and hashlib.sha256(script).hexdigest() == told[1]
+    assert b"</script" not in script
