@@ -21,7 +21,7 @@ ROWS = {
     "data_prep": 3, "training": 3, "sampler": 3,
     "baselines": 4, "evaluation": 4,
     "config": 5,
-    "generation": 6, "reconstruction": 6, "experiments": 6,
+    "generation": 6, "reconstruction": 6, "experiments": 6, "viewer": 6,
     "cli": 7, "__main__": 7,
 }  # fmt: skip
 FOUNDATION = {name for name, row in ROWS.items() if row <= 1}
@@ -57,6 +57,7 @@ OWNERS = {
         "sceneprior/losses/matching.py", "sceneprior/evaluation/", "data_prep/inspection/causes.py",
     ],
     "cv2": ["data_prep/"],
+    "viser": ["sceneprior/viewer/"],
     "distributed": ["data_prep/engine/cluster.py"],
     "dask": ["data_prep/engine/cluster.py"],
 }  # fmt: skip
