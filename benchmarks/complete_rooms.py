@@ -58,8 +58,7 @@ def main() -> None:
     given = [half(room, rng) for room in tests]
 
     def completed(steps: int) -> list[list[Scene]]:
-        answers = complete(trained, given, arguments.answers, arguments.seed, steps=steps)
-        return [scenes for _, scenes in answers]
+        return complete(trained, given, arguments.answers, arguments.seed, steps=steps)
 
     rows = {
         "completed": completed(STEPS),

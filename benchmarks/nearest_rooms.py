@@ -15,10 +15,10 @@ from PIL import Image
 from sceneprior.config import load_any_run
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.layout_distance import nearest_room
-from sceneprior.evaluation.topdown import corner_view, perspective
-from sceneprior.generation.decode import new_rooms
+from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import open_renderer
 from sceneprior.pictures import contact_sheet
+from sceneprior.topdown import corner_view, perspective
 
 PAIRS, COLUMNS, TILE_PX = 24, 6, (210, 280)
 
@@ -33,19 +33,19 @@ def main() -> None:
     options.add_argument("--renderer", default="auto")
     given = options.parse_args()
     trained = load_any_run(given.run)
-    drawn = new_rooms(trained, PAIRS, given.seed, given.distribution)
+    drawn = synthesize(trained, PAIRS, given.seed, given.distribution)
     training = reference_scenes(Path(trained.config.data.shards), "train")
     renderer = open_renderer(given.renderer)
     tiles, distances = [], []
-    for scene in drawn.scenes:
+    for scene in drawn:
         row, distance = nearest_room(scene, training)
         distances.append(distance)
         for room in (scene, training[row]):
             tiles.append(perspective(room, renderer, view=corner_view([room], TILE_PX)))
     Image.fromarray(contact_sheet(tiles, COLUMNS, gap_px=4)).save(given.sheet, optimize=True)
     print(
-        f"{PAIRS} rooms (from: {drawn.origin}, seed {given.seed}); to the nearest of "
-        f"{len(training)} training rooms: {mean(distances):.2f} m on average, "
+        f"{PAIRS} rooms (from: {given.distribution or trained.distribution}, seed {given.seed}); "
+        f"to the nearest of {len(training)} training rooms: {mean(distances):.2f} m on average, "
         f"{min(distances):.2f} at least"
     )
 

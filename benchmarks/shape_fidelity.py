@@ -24,13 +24,13 @@ from sceneprior.evaluation.metrics.decoded_rooms import match_scenes, reconstruc
 from sceneprior.evaluation.metrics.frechet import FRECHET
 from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
-from sceneprior.evaluation.topdown import box_mesh, corner_view, perspective
 from sceneprior.experiments.evaluate import decoded_and_true
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.geometry.surfaces import chamfer_sum
 from sceneprior.offscreen import open_renderer
 from sceneprior.pictures import contact_sheet
 from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.topdown import box_mesh, corner_view, perspective
 from sceneprior.training.method import TrainedPrior
 
 SPHERE_LEVEL = 3

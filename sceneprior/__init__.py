@@ -1,3 +1,33 @@
-"""Learns 3D scene priors from posed 2D instance masks."""
+"""Learns 3D scene priors from posed 2D instance masks.
+
+`load` opens a trained prior, `load_scene` a room; both are imported when they are first asked for.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sceneprior.api import Prior, load
+    from sceneprior.scene import Scene
+    from sceneprior.scene_files import load_scene
 
 __version__ = "0.1.0"
+__all__ = ["Prior", "Scene", "__version__", "load", "load_scene"]
+
+_HOMES = {
+    "Prior": "sceneprior.api",
+    "Scene": "sceneprior.scene",
+    "load": "sceneprior.api",
+    "load_scene": "sceneprior.scene_files",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'sceneprior' has no attribute '{name}'")
+    import importlib
+
+    return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

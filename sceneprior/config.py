@@ -70,7 +70,7 @@ def check_config(data: dict[str, Any], source: str) -> RunConfig:
     return check_settings(METHODS[method], data, source)
 
 
-def load_any_run(run: Path, checkpoint: str = "final") -> Trained:
+def load_any_run(run: Path | str, checkpoint: str = "final") -> Trained:
     """What a run of any method trained, in evaluation mode; `checkpoint` as in `find_checkpoint`.
 
     For tasks that only want new rooms (`generation.decode.synthesize`).
@@ -82,14 +82,18 @@ def load_any_run(run: Path, checkpoint: str = "final") -> Trained:
     return config.load(*find_checkpoint(Path(run), config.stage_names, checkpoint))
 
 
-def load_run(run: Path, checkpoint: str = "final") -> TrainedPrior:
+def load_run(run: Path | str, checkpoint: str = "final") -> TrainedPrior:
     """The trained prior of a run, in evaluation mode: for tasks that need its latent space.
 
     Raises:
         InputError: the folder is no run, its checkpoint is missing or damaged, or it is the run of
             a baseline without a latent space.
     """
-    trained = load_any_run(run, checkpoint)
+    return with_latents(load_any_run(run, checkpoint), run)
+
+
+def with_latents(trained: Trained, run: Path | str) -> TrainedPrior:
+    """The same; an InputError where it is a baseline's, which has no latent space."""
     if isinstance(trained, TrainedSampler):
         raise InputError(
             f"{run} is a run of `method: {trained.config.method}`, which has no latent space of "
@@ -99,7 +103,7 @@ def load_run(run: Path, checkpoint: str = "final") -> TrainedPrior:
     return trained
 
 
-def run_config(run: Path) -> RunConfig:
+def run_config(run: Path | str) -> RunConfig:
     """The config that a run was trained with; InputError if the folder is no run."""
     path = Path(run) / "config.yaml"
     if not path.is_file():

@@ -1,6 +1,10 @@
 """The objects of one room in 3D and their JSON, which generation writes and evaluation reads."""
 
+import base64
+import html
 import json
+import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -60,6 +64,8 @@ class Scene:
     """(P, 2) outline of the floor as x, z; None where it is unknown (a generated room)."""
     extra: dict[str, Any] = field(default_factory=dict)
     """Where the scene comes from: seed, run, room. Written to the JSON, never interpreted."""
+    latent: np.ndarray | None = field(default=None, compare=False, repr=False)
+    """(D,) the point of a prior's latent space that this is decoded from, where one is."""
 
     @property
     def class_indices(self) -> np.ndarray:
@@ -80,6 +86,61 @@ class Scene:
     def without_meshes(self) -> "Scene":
         """The same boxes, drawn as boxes: for methods that have no meshes."""
         return replace(self, objects=tuple(replace(item, mesh=None) for item in self.objects))
+
+    def save(self, path: Path | str) -> None:
+        """Write the scene to one file: `.json`, `.glb`, `.obj` or `.png`; see `save_scene`.
+
+        >>> from tempfile import TemporaryDirectory
+        >>> bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
+        >>> with TemporaryDirectory() as folder:
+        ...     Scene("mine", "front3d_bedroom", (bed,)).save(f"{folder}/mine.glb")
+        ...     Path(f"{folder}/mine.glb").read_bytes()[:4]
+        b'glTF'
+        """
+        from sceneprior.scene_files import save_scene
+
+        save_scene(self, Path(path))
+
+    def picture(self) -> np.ndarray:
+        """(360, 480, 3) uint8, shaded, from above a corner: for people, not for scores.
+
+        >>> Scene("empty", "front3d_bedroom").picture().shape
+        (360, 480, 3)
+        """
+        from sceneprior.offscreen import open_renderer
+        from sceneprior.topdown import perspective
+
+        return perspective(self, open_renderer())
+
+    def show(self) -> None:
+        """Show the picture in a notebook, wherever in a cell.
+
+        Raises:
+            InputError: this is no notebook.
+        """
+        notebook = sys.modules.get("IPython")
+        if notebook is None or notebook.get_ipython() is None:
+            raise InputError(
+                "Scene.show() draws in a notebook, and this is none; scene.save('room.png') writes "
+                "a picture, and 'room.glb' a model."
+            )
+        notebook.display.display(self)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows of a scene: its picture, and how many objects of which class.
+
+        >>> "no objects" in Scene("empty", "front3d_bedroom")._repr_html_()
+        True
+        """
+        from sceneprior.pictures import png_bytes
+
+        counted = Counter(item.label for item in self.objects).most_common()
+        told = ", ".join(f"{count} {label}" for label, count in counted) or "no objects"
+        picture = base64.b64encode(png_bytes(self.picture())).decode()
+        return (
+            f'<figure><img src="data:image/png;base64,{picture}" alt="a room">'
+            f"<figcaption>{html.escape(self.name)}: {told}</figcaption></figure>"
+        )
 
 
 def scene_to_json(scene: Scene) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import pytest
 
 from sceneprior.classes import LABEL_SETS, class_colors, label_set, label_set_name
 from sceneprior.errors import InputError
-from sceneprior.evaluation.topdown import topdown_protocol
+from sceneprior.topdown import topdown_protocol
 
 
 def test_the_papers_sets():

@@ -25,18 +25,17 @@ def synthesize(
     renderer: RendererOption = "auto",
 ) -> None:
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents where the method has them."""
-    from sceneprior.config import load_any_run
+    from sceneprior.api import load
     from sceneprior.evaluation.metrics.contents import emptiness
-    from sceneprior.generation.decode import new_rooms
     from sceneprior.generation.export import check_free, write_scenes
     from sceneprior.offscreen import open_renderer
 
     check_free(out, overwrite)
-    trained = load_any_run(run, checkpoint)
+    prior = load(run, checkpoint)
     artist = open_renderer(renderer)
-    scenes, z, origin = new_rooms(trained, count, seed, distribution)
-    write_scenes(scenes, out, artist, overwrite, z)
-    typer.echo(f"Wrote {count} rooms to {out} (from: {origin})")
+    scenes = prior.sample(count, seed, distribution)
+    write_scenes(scenes, out, artist, overwrite)
+    typer.echo(f"Wrote {count} rooms to {out} (from: {distribution or prior.distribution})")
     if (warning := emptiness(scenes)) is not None:
         typer.echo(f"Warning: {warning}", err=True)
 
@@ -55,18 +54,17 @@ def interpolate(
     renderer: RendererOption = "auto",
 ) -> None:
     """Walk from one room to another on the sphere: rooms, a strip and an animation."""
-    from sceneprior.config import load_run
+    from sceneprior.api import load
     from sceneprior.generation.export import check_free, write_scenes
-    from sceneprior.generation.interpolate import interpolate as walk
     from sceneprior.generation.interpolate import write_pictures
     from sceneprior.offscreen import open_renderer
 
     check_free(out, overwrite)
-    trained = load_run(run, checkpoint)
-    z, scenes = walk(trained, start, end, steps)
+    prior = load(run, checkpoint)
+    scenes = prior.interpolate(start, end, steps)
     artist = open_renderer(renderer)
-    write_scenes(scenes, out, artist, overwrite, z)
-    write_pictures(trained, z, out, artist)
+    write_scenes(scenes, out, artist, overwrite)
+    write_pictures(prior.with_latents, scenes, out, artist)
     typer.echo(f"Wrote {steps} rooms, strip.png and animation.gif to {out}")
 
 
@@ -86,18 +84,18 @@ def complete(
     renderer: RendererOption = "auto",
 ) -> None:
     """Furnish the rest of a room of which some objects, or its floor, are given."""
-    from sceneprior.config import load_run
-    from sceneprior.generation.complete import complete as furnish
-    from sceneprior.generation.export import check_free, load_scene, write_scenes
+    from sceneprior.api import load
+    from sceneprior.generation.export import check_free, write_scenes
     from sceneprior.offscreen import open_renderer
+    from sceneprior.scene_files import load_scene
 
     check_free(out, overwrite)
     scene = load_scene(given)
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
-    trained = load_run(run, checkpoint)
-    z, scenes = furnish(trained, [scene], count, seed, distribution, classes=wanted)[0]
-    write_scenes(scenes, out, open_renderer(renderer), overwrite, z)
-    how = "drawn by the sampler" if z is None else "of fitted latents"
+    prior = load(run, checkpoint)
+    scenes = prior.complete(scene, count, seed, distribution, wanted)
+    write_scenes(scenes, out, open_renderer(renderer), overwrite)
+    how = "drawn by the sampler" if scenes[0].latent is None else "of fitted latents"
     typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects, {how}, to {out}")
 
 
@@ -119,9 +117,10 @@ def retrieve(
     from sceneprior.evaluation.metrics.contents import common_label_set
     from sceneprior.files import write_json
     from sceneprior.generation.cad_models import default_cache, open_models
-    from sceneprior.generation.export import check_free, load_scene_folder, write_scenes
+    from sceneprior.generation.export import check_free, write_scenes
     from sceneprior.generation.retrieve import retrieval_report, retrieve_all
     from sceneprior.offscreen import open_renderer
+    from sceneprior.scene_files import load_scene_folder
 
     check_free(out, overwrite)
     console = Console(stderr=True)

@@ -45,7 +45,7 @@ def reconstruct(
     renderer: RendererOption = "auto",
 ) -> None:
     """Reconstruct rooms from the instance masks of single images: JSON, GLB and pictures."""
-    from sceneprior.config import load_run
+    from sceneprior.api import load
     from sceneprior.errors import InputError
     from sceneprior.generation.export import check_free
     from sceneprior.geometry.turns import QUARTERS
@@ -53,7 +53,7 @@ def reconstruct(
     from sceneprior.reconstruction.export import write_reconstructions
     from sceneprior.reconstruction.image import image_from_shards, images_of_split
     from sceneprior.reconstruction.own_image import read_own_image
-    from sceneprior.reconstruction.reconstruct import OBJECTS, FitOptions, reconstruct
+    from sceneprior.reconstruction.reconstruct import OBJECTS
 
     ways = [mask is not None, room is not None, split is not None]
     if sum(ways) != 1 or (shards is None) != (mask is not None):
@@ -66,16 +66,14 @@ def reconstruct(
     if (limit is not None and split is None) or (view and room is None):
         raise InputError("--limit belongs to --split, and --view to --room.")
     check_free(out, overwrite)
-    options = FitOptions(fit, restarts)
-    trained = load_run(run, checkpoint)
+    prior = load(run, checkpoint)
     notes = []
     if shards is None:
         if mask is None or classes is None or intrinsics is None:
             raise InputError("--mask needs --classes and --intrinsics beside it.")
-        label_set = trained.config.label_set
         # What is answered object by object looks the same from each side of the room.
         sides = 1 if fit == OBJECTS else QUARTERS
-        own = read_own_image(mask, classes, intrinsics, label_set, pose, camera_height, sides)
+        own = read_own_image(mask, classes, intrinsics, prior.label_set, pose, camera_height, sides)
         images, notes = list(own.images), [f"{note}." for note in own.notes]
     elif room is not None:
         images = [image_from_shards(shards, room, view)]
@@ -84,7 +82,7 @@ def reconstruct(
         notes = [f"no view of room {name} shows an object; it is left out." for name in blank]
     for note in notes:
         typer.echo(f"Note: {note}", err=True)
-    found = reconstruct(trained, images, options)
+    found = prior.reconstruct(images, fit, restarts)
     if mask is not None:  # the same picture, of each camera that it may be from
         found = [min(found, key=lambda one: one.score)]
     taken_for = {pair for one in found for pair in one.taken_for.items()}

@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
-from sceneprior.evaluation.topdown import box_mesh
 from sceneprior.geometry.turns import yaw_rotation
 from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.topdown import box_mesh
 
 NEEDED = ("class_labels", "translations", "sizes", "angles")
 FLOOR = ("floor_plan_vertices", "floor_plan_faces", "floor_plan_centroid")

@@ -26,9 +26,9 @@ from sceneprior.evaluation.networks import (
     inception_features,
     single_threaded,
 )
-from sceneprior.evaluation.topdown import topdown, topdown_protocol
 from sceneprior.offscreen import Renderer
 from sceneprior.scene import Scene
+from sceneprior.topdown import topdown, topdown_protocol
 
 _DRAWN_AT_ONCE = 8
 

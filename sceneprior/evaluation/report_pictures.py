@@ -12,11 +12,11 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.classes import class_colors, label_set
-from sceneprior.evaluation.topdown import perspective, topdown
 from sceneprior.offscreen import Renderer
 from sceneprior.pictures import paint_ids, png_bytes
 from sceneprior.scene import Scene
 from sceneprior.shards import Shard, iterate_rooms
+from sceneprior.topdown import perspective, topdown
 
 _POINTS_PER_CURVE = 400
 _EMPTY = (244, 245, 247)

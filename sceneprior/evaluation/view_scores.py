@@ -16,9 +16,9 @@ from sceneprior.evaluation.metrics.mesh_metrics import (
     oriented_box_iou_3d,
     sample_surface,
 )
-from sceneprior.evaluation.topdown import object_mesh
 from sceneprior.geometry.surfaces import chamfer_sum
 from sceneprior.scene import SceneObject
+from sceneprior.topdown import object_mesh
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ from sceneprior.experiments.evaluate_views import (
 )
 from sceneprior.files import write_json
 from sceneprior.generation.decode import decode_latents, decode_training_rooms, synthesize
-from sceneprior.generation.export import load_scene_folder
 from sceneprior.generation.sample import MARKS
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene
+from sceneprior.scene_files import load_scene_folder
 from sceneprior.training.method import TrainedPrior, TrainedSampler
 
 UNFOLDING_STEPS = 7

@@ -21,7 +21,6 @@ from sceneprior.evaluation.metrics.contents import (
     type_share,
 )
 from sceneprior.evaluation.metrics.overlaps import overlap_pairs
-from sceneprior.evaluation.topdown import topdown, topdown_protocol
 from sceneprior.generation.decode import decode_latents, synthesize
 from sceneprior.generation.sample import sample_latents, uses_sampler
 from sceneprior.geometry.cameras import boxes_of_points
@@ -33,6 +32,7 @@ from sceneprior.pictures import contact_sheet
 from sceneprior.scene import Scene
 from sceneprior.shards import iterate_rooms, list_shards
 from sceneprior.silhouettes.render import render_scene
+from sceneprior.topdown import topdown, topdown_protocol
 from sceneprior.training.method import PriorConfig, RunConfig, TrainedPrior, TrainedSampler
 from sceneprior.training.monitor import EvaluationResult
 from sceneprior.training.ours import PaperConfig

@@ -8,12 +8,12 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from sceneprior.config import load_any_run
 from sceneprior.evaluation.ground_truth import independent_rooms, reference_scenes
 from sceneprior.evaluation.room_sets import without_void
-from sceneprior.evaluation.topdown import topdown
 from sceneprior.experiments.comparison import Comparison, Run, distributions_of
 from sceneprior.files import write_whole
 from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import Renderer
 from sceneprior.pictures import png_bytes
+from sceneprior.topdown import topdown
 
 SHOWN = 8
 DRAWN_FROM = 256

@@ -55,7 +55,7 @@ def complete(
     distribution: str | None = None,
     steps: int = STEPS,
     classes: Sequence[str] | None = None,
-) -> list[tuple[Float[Tensor, "count dimension"] | None, list[Scene]]]:
+) -> list[list[Scene]]:
     """Furnish the rest of rooms; all rooms and all answers in one batch.
 
     Args:
@@ -69,15 +69,14 @@ def complete(
         classes: What to add, and nothing else; None leaves it to the sampler.
 
     Returns:
-        Of each room the answers' latents, None where a sampler did without, and the answers: see
-        `insert`.
+        Of each room the answers: see `insert`.
 
     Raises:
         InputError: a given object cannot be used, or there are more than the run's rooms hold.
     """
     given = gather_given(trained, scenes)
     if uses_sampler(trained, distribution):
-        return [(None, rooms) for rooms in _drawn(trained, scenes, given, count, seed, classes)]
+        return _drawn(trained, scenes, given, count, seed, classes)
     if classes is not None:
         raise InputError(
             "Which classes to add can be asked of a sampler alone, and these rooms come from "
@@ -90,7 +89,7 @@ def complete(
     z = z.view(len(scenes), RESTARTS, count, -1).take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
     names = [f"complete_{k:02d}" for k in range(count)]
     return [
-        (own, [insert(room, scene, seed=seed) for room in decode_latents(trained, own, names)])
+        [insert(room, scene, seed=seed) for room in decode_latents(trained, own, names)]
         for scene, own in zip(scenes, z, strict=True)
     ]
 

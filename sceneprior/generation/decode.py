@@ -1,6 +1,7 @@
 """Decode latents into scenes, of training rooms and of new ones; new rooms of every method."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from sceneprior.classes import VOID, label_set
 from sceneprior.errors import InputError
-from sceneprior.generation.sample import SAMPLER, draw_latents, scene_names, uses_sampler
+from sceneprior.generation.sample import draw_latents, scene_names, uses_sampler
 from sceneprior.generation.sampled import sample_scenes
 from sceneprior.losses.completeness import kept_objects
 from sceneprior.models.occupancy import OccupancyDecoder
@@ -96,7 +97,10 @@ def decode_rooms(
         decoded = trained.prior.decode(z[part], with_shape=trained.stage != "layout")
         target = config.model.completeness_target
         rooms += to_rooms(decoded, trained.prior, config.label_set, names[part], target)
-    return rooms
+    return [
+        room._replace(scene=replace(room.scene, latent=point.cpu().numpy()))
+        for room, point in zip(rooms, z, strict=True)
+    ]
 
 
 def decode_latents(
@@ -117,19 +121,9 @@ def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]
     return decode_latents(trained, trained.prior.latent_space(trained.logits), trained.room_ids)
 
 
-class NewRooms(NamedTuple):
-    """Rooms that a run makes."""
-
-    scenes: list[Scene]
-    latents: Float[Tensor, "rooms width"] | None
-    """None where no latent makes a room."""
-    origin: str
-    """`sampler`, a distribution of latents, or the method."""
-
-
-def new_rooms(
+def synthesize(
     trained: TrainedPrior | TrainedSampler, count: int, seed: int, distribution: str | None = None
-) -> NewRooms:
+) -> list[Scene]:
     """New rooms of a run of any kind; the same seed, the same rooms.
 
     `distribution` says where they come from: `sampler`, or a distribution of latents; None takes
@@ -138,25 +132,16 @@ def new_rooms(
     names = scene_names(count, seed)
     if isinstance(trained, TrainedPrior):
         if uses_sampler(trained, distribution):
-            return NewRooms(sample_scenes(trained, names, seed), None, SAMPLER)
+            return sample_scenes(trained, names, seed)
         z, _ = draw_latents(trained, count, seed, distribution)
-        origin = distribution or trained.latent_distribution
-        return NewRooms(decode_latents(trained, z, names), z, origin)
+        return decode_latents(trained, z, names)
     if distribution is not None:
         raise InputError(
             f"A distribution says where latents of rooms come from, but `method: "
             f"{trained.config.method}` has none; leave out --distribution {distribution}."
         )
     rooms = trained.prior.sample(count, seed)
-    scenes = boxes_to_scenes(rooms, trained.config.label_set, names)
-    return NewRooms(scenes, None, trained.config.method)
-
-
-def synthesize(
-    trained: TrainedPrior | TrainedSampler, count: int, seed: int, distribution: str | None = None
-) -> list[Scene]:
-    """The scenes of `new_rooms`."""
-    return new_rooms(trained, count, seed, distribution).scenes
+    return boxes_to_scenes(rooms, trained.config.label_set, names)
 
 
 def boxes_to_scenes(rooms: RoomBoxes, label_set_name: str, names: Sequence[str]) -> list[Scene]:

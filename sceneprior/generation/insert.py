@@ -48,7 +48,8 @@ def insert(room: Scene, given: Scene, **extra: Any) -> Scene:
         "replaced_off_m": _mean_apart(room, given, partners),
         **extra,
     }
-    return Scene(room.name, room.label_set, (*placed, *added), given.floor_m, marks)
+    objects = (*placed, *added)
+    return replace(room, objects=objects, floor_m=given.floor_m, extra=marks)
 
 
 def _partners(room: Scene, given: Scene) -> dict[int, int]:

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from sceneprior.classes import VOID, class_colors
 from sceneprior.errors import InputError
-from sceneprior.evaluation.topdown import corner_view, perspective
 from sceneprior.files import write_whole
 from sceneprior.generation.decode import DecodedRoom, decode_rooms
-from sceneprior.generation.sample import read_latent
+from sceneprior.generation.sample import Point, latent_of
 from sceneprior.offscreen import Renderer
 from sceneprior.pictures import contact_sheet, png_bytes
 from sceneprior.scene import Scene
+from sceneprior.topdown import corner_view, perspective
 from sceneprior.training.method import TrainedPrior
 
 TILE = (240, 320)
@@ -32,29 +32,32 @@ PAUSE_MS = 700
 """At both ends, where the animation turns round."""
 
 
-def interpolate(
-    trained: TrainedPrior, start: str, end: str, steps: int
-) -> tuple[Float[Tensor, "steps dimension"], list[Scene]]:
-    """Latents from one end to the other, and their rooms `step_00`, `step_01`, ...
+def interpolate(trained: TrainedPrior, start: Point, end: Point, steps: int) -> list[Scene]:
+    """Rooms `step_00`, `step_01`, ... on the way from one latent to another.
 
     `extra` says how far along a room is, and in `slots` which prediction each object comes from:
     what has the same number in two rooms is the same object, moved.
 
     Args:
-        start, end: As `read_latent` reads them.
+        start, end: See `latent_of`.
         steps: Rooms, both ends included; at least 2.
 
     Raises:
         InputError: an end is unknown, or the two are opposite.
     """
-    z = path_latents(trained, read_latent(trained, start), read_latent(trained, end), steps)
+    z = path_latents(trained, latent_of(trained, start), latent_of(trained, end), steps)
     names = [f"step_{k:02d}" for k in range(steps)]
+    ends = {"from": _name_of(start), "to": _name_of(end)}
     scenes = []
     for step, room in enumerate(decode_rooms(trained, z, names)):
         along = round(step / (steps - 1), 6)
-        extra = {"from": start, "to": end, "along": along, "slots": room.predictions}
+        extra = {**ends, "along": along, "slots": room.predictions}
         scenes.append(replace(room.scene, extra=extra))
-    return z, scenes
+    return scenes
+
+
+def _name_of(point: Point) -> str:
+    return point if isinstance(point, str) else getattr(point, "name", None) or "a latent"
 
 
 def path_latents(
@@ -116,13 +119,12 @@ def animation(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bytes:
 
 
 def write_pictures(
-    trained: TrainedPrior,
-    path: Float[Tensor, "steps dimension"],
-    folder: Path,
-    renderer: Renderer,
+    trained: TrainedPrior, scenes: Sequence[Scene], folder: Path, renderer: Renderer
 ) -> None:
-    """Write `strip.png` of the steps and `animation.gif`, which has pictures between them, too."""
-    z = path_latents(trained, path[0], path[-1], (len(path) - 1) * BETWEEN + 1)
+    """Write `strip.png` of the steps of `interpolate` and `animation.gif`, which has pictures
+    between them, too."""
+    start, end = (latent_of(trained, scene) for scene in (scenes[0], scenes[-1]))
+    z = path_latents(trained, start, end, (len(scenes) - 1) * BETWEEN + 1)
     rooms = decode_rooms(trained, z, [""] * len(z))
     view = corner_view([room.scene for room in rooms], TILE)
     pictures = [

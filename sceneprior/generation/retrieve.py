@@ -20,11 +20,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.topdown import box_mesh
 from sceneprior.generation.cad_models import CadModels, ClassModels
 from sceneprior.geometry.surfaces import chamfer_mean, surface_points
 from sceneprior.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.topdown import box_mesh
 
 STANDS_M = 1.0
 """A box whose centre is at most so high stands on the floor."""

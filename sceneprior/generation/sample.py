@@ -3,7 +3,7 @@
 import io
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from torch import Tensor
 from sceneprior.errors import InputError
 from sceneprior.files import write_whole
 from sceneprior.models.latents import LatentSpace
+from sceneprior.scene import Scene
 from sceneprior.training.method import TrainedPrior
 
 NEIGHBOURS = 20
@@ -34,6 +35,8 @@ MARKS = {
 """What tables say of rooms of a distribution that knows training rooms: nothing of `paper`, which
 takes nothing from them."""
 LATENTS_FILE = "latents.npz"
+Point = str | Scene | Float[Tensor, " dimension"] | Float[np.ndarray, " dimension"]
+"""What says a point of a latent space; see `latent_of`."""
 _ENDINGS = (".npz", ".npy", ".json")
 
 
@@ -150,11 +153,49 @@ def scene_names(count: int, seed: int) -> list[str]:
     return [f"seed{seed}_{index:04d}" for index in range(count)]
 
 
-def write_latents(folder: Path, z: Float[Tensor, "rooms dimension"], names: list[str]) -> None:
-    """Write `latents.npz`: `latents`, one row a room, and `names`, those of the rooms' files."""
+def write_latents(folder: Path, scenes: Sequence[Scene]) -> None:
+    """Write `latents.npz`: `latents`, one row a room, and `names`, those of the rooms' files;
+    nothing where a room has no latent."""
+    latents = [scene.latent for scene in scenes if scene.latent is not None]
+    if not latents or len(latents) < len(scenes):
+        return
     buffer = io.BytesIO()
-    np.savez(buffer, latents=z.numpy(), names=np.array(names))
+    np.savez(buffer, latents=np.stack(latents), names=np.array([scene.name for scene in scenes]))
     write_whole(Path(folder) / LATENTS_FILE, buffer.getvalue())
+
+
+def latent_of(trained: TrainedPrior, point: Point) -> Float[Tensor, " dimension"]:
+    """The point of a run's latent space that a name says (`read_latent`), that a scene is decoded
+    from, or that is nearest to a vector.
+
+    Raises:
+        InputError: nothing is called so, the scene has no latent, or the vector another size.
+    """
+    if isinstance(point, str):
+        return read_latent(trained, point)
+    if isinstance(point, Scene):
+        if point.latent is None:
+            raise InputError(
+                f"Room {point.name} comes from no latent (a sampler drew it, or it was read from a "
+                "file); take a room of another distribution (`kernel`, `paper`), or name one, such "
+                "as 'seed:7'."
+            )
+        return _onto(trained, point.latent, f"Room {point.name}")
+    return _onto(trained, np.asarray(point), "The vector")
+
+
+def _onto(trained: TrainedPrior, point: np.ndarray, source: str) -> Float[Tensor, " dimension"]:
+    """The nearest point of the latent space; `source` says whose latent it is."""
+    width = trained.config.model.width
+    if point.shape != (width,):
+        raise InputError(
+            f"{source} has a latent of shape {point.shape}, but this prior's have {width} numbers; "
+            "take latents of the same run."
+        )
+    if not np.isfinite(point).all() or not point.any():
+        raise InputError(f"{source}: a latent is all zeros or holds no numbers; write it again.")
+    space = trained.prior.latent_space
+    return space.onto(torch.from_numpy(point).to(trained.logits.dtype).unsqueeze(0))[0]
 
 
 def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]:
@@ -189,16 +230,7 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
     else:
         known = f"names such as {names[0]}" if names else "no names"
         raise InputError(f"{path} has no latent '{item}': it holds {len(latents)} and {known}.")
-    width = trained.config.model.width
-    if latents.shape[1] != width:
-        raise InputError(
-            f"{path} holds latents of {latents.shape[1]} numbers, but this run's have {width}; "
-            "take latents of the same run."
-        )
-    point = latents[row]
-    if not np.isfinite(point).all() or not point.any():
-        raise InputError(f"{path}: latent {row} is all zeros or holds no numbers; write it again.")
-    return space.onto(torch.from_numpy(point).to(trained.logits.dtype).unsqueeze(0))[0]
+    return _onto(trained, latents[row], f"{path}, row {row},")
 
 
 def _read_latents(path: Path) -> tuple[np.ndarray, list[str]]:

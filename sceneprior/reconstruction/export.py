@@ -9,7 +9,6 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.classes import class_colors, label_set
-from sceneprior.evaluation.topdown import object_colors, scene_meshes, topdown, topdown_protocol
 from sceneprior.files import write_whole
 from sceneprior.generation.export import clear_scenes, write_scene
 from sceneprior.offscreen import Pinhole, Renderer
@@ -17,6 +16,7 @@ from sceneprior.pictures import paint_ids, png_bytes
 from sceneprior.reconstruction.image import ObservedImage
 from sceneprior.reconstruction.reconstruct import Reconstruction
 from sceneprior.scene import Scene
+from sceneprior.topdown import object_colors, scene_meshes, topdown, topdown_protocol
 
 HEIGHT_PX = 360
 """Of each panel; masks are drawn larger or smaller to fit."""

@@ -19,7 +19,6 @@ from torch.nn.utils.rnn import pad_sequence
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.evaluation.ground_truth import reference_scene
-from sceneprior.evaluation.topdown import scene_meshes
 from sceneprior.geometry.cameras import boxes_of_points
 from sceneprior.geometry.corners import box_corners
 from sceneprior.geometry.turns import QUARTERS, quarter_rotation
@@ -28,6 +27,7 @@ from sceneprior.offscreen import Pinhole, Renderer
 from sceneprior.reconstruction.image import ObservedImage, as_views, rows_of
 from sceneprior.scene import Mesh, Scene, SceneObject
 from sceneprior.shards import Shard, iterate_rooms
+from sceneprior.topdown import scene_meshes
 from sceneprior.views import DecodedScenes
 
 BOX_WEIGHT, OCCLUSION_SLACK = 5.0, 0.15

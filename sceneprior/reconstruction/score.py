@@ -16,12 +16,12 @@ from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.mesh_metrics import POINTS
 from sceneprior.evaluation.score_table import wide_console
 from sceneprior.evaluation.view_scores import PROTOCOL, ObjectPair, score_views, surface_note
-from sceneprior.generation.export import load_scene_folder
 from sceneprior.offscreen import open_renderer
 from sceneprior.reconstruction.image import ObservedImage, image_of_room, images_of_split
 from sceneprior.reconstruction.known_rooms import known_rooms, nearest_answers, random_answers
 from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct
 from sceneprior.scene import Scene, SceneObject
+from sceneprior.scene_files import load_scene_folder
 from sceneprior.shards import iterate_rooms
 
 TITLES = {

@@ -259,6 +259,11 @@ class TrainedSampler:
 
     remembers_rooms = False
 
+    @property
+    def distribution(self) -> str:
+        """Where new rooms come from: the method itself."""
+        return self.config.method
+
 
 Trained = TrainedPrior | TrainedSampler
 

@@ -99,11 +99,11 @@ class Board:
             if point is not None:
                 pointed(point, "end" if event.phase == "end" else "drag")
 
-    def mark(self, z: Float[Tensor, " dimension"] | None) -> None:
+    def mark(self, latent: np.ndarray | None) -> None:
         """Show where a latent lies; None hides the mark."""
-        self._here.visible = z is not None
-        if z is not None:
-            place = self.plane.latent_map.place(z.unsqueeze(0))
+        self._here.visible = latent is not None
+        if latent is not None:
+            place = self.plane.latent_map.place(torch.from_numpy(latent).unsqueeze(0))
             self._here.position = self.plane.on_board(place, 0.02 * self.plane.side_m)[0]
 
     def draw_path(self, z: Float[Tensor, "steps dimension"]) -> None:

@@ -5,24 +5,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sceneprior.api import Prior
 from sceneprior.errors import InputError
 from sceneprior.evaluation.layout_distance import nearest_room
 from sceneprior.evaluation.metrics.contents import common_label_set
-from sceneprior.generation.complete import complete
-from sceneprior.generation.decode import decode_latents, new_rooms, to_rooms
+from sceneprior.generation.decode import decode_latents, to_rooms
 from sceneprior.generation.interpolate import path_latents
-from sceneprior.generation.sample import DISTRIBUTIONS, SAMPLER, read_latent
+from sceneprior.generation.sample import DISTRIBUTIONS, SAMPLER
 from sceneprior.models.occupancy import OccupancyDecoder
 from sceneprior.scene import Scene
-from sceneprior.training.method import Trained, TrainedPrior, TrainedSampler
+from sceneprior.training.method import TrainedPrior
 from sceneprior.viewer.latent_map import LatentMap, make_map
 
 PATH_STEPS = 49
-"""Rooms of a path, both ends included: on a path seldom 4 degrees apart."""
+"""Rooms of a path, both ends included: seldom 4 degrees of the sphere apart."""
 HERE = "here"
 """Names the room that is shown as an end of a path."""
 
@@ -34,8 +35,6 @@ class Shown:
     scene: Scene
     origin: str
     """Where it comes from, in words."""
-    z: Float[Tensor, " dimension"] | None = None
-    """Its latent; None where none made it."""
     kept: frozenset[int] = frozenset()
     """Objects that the next completion keeps, by their number in the scene."""
 
@@ -46,7 +45,7 @@ class Shown:
     def given(self) -> Scene:
         """The scene of the kept objects alone."""
         objects = tuple(self.scene.objects[item] for item in sorted(self.kept))
-        return replace(self.scene, objects=objects, extra={})
+        return replace(self.scene, objects=objects, extra={}, latent=None)
 
 
 class Folder:
@@ -60,6 +59,10 @@ class Folder:
         """Of all scenes; an `InputError` where they have several."""
         return common_label_set(self.scenes)
 
+    def some_layouts(self) -> tuple[Scene, ...]:
+        """All of them."""
+        return self.scenes
+
     def room(self, row: int) -> Shown:
         """One of them, counted from 0."""
         scene = self.scenes[row]
@@ -67,69 +70,57 @@ class Folder:
 
 
 class Explorer:
-    """Rooms of a trained prior: sampled, from a place of the map, along a path, or completed.
+    """Rooms of a trained prior: sampled, from a place of the map, along a path, or completed."""
 
-    It knows the room that is shown, since most of what can be asked for starts from it.
-    """
-
-    def __init__(self, trained: Trained):
-        self.trained = trained
-        self.label_set = trained.config.label_set
+    def __init__(self, prior: Prior):
+        self.prior = prior
+        self.label_set = prior.label_set
         self.map: LatentMap | None = None
         self.without_map = ""
         """Why there is no map, where there is none."""
         try:
-            self.map = make_map(self._prior.prior.latent_space, self._training_z)
+            self.map = make_map(prior.with_latents.prior.latent_space, self._training_z)
         except InputError as error:
             self.without_map = str(error)
         self.path: Float[Tensor, "steps dimension"] | None = None
 
     @property
-    def _prior(self) -> TrainedPrior:
-        if isinstance(self.trained, TrainedSampler):
-            raise InputError(
-                f"`method: {self.trained.config.method}` has no latent space, so there is no map, "
-                "no path and nothing to complete; sample rooms instead."
-            )
-        return self.trained
+    def has_latents(self) -> bool:
+        """Whether latents make rooms, so that there are paths, and rooms can be completed."""
+        return isinstance(self.prior.trained, TrainedPrior)
 
     @cached_property
     def _training_z(self) -> Float[Tensor, "rooms dimension"]:
-        prior = self._prior
-        if not prior.remembers_rooms:
+        trained = self.prior.with_latents
+        if not trained.remembers_rooms:
             raise InputError(
                 "This prior keeps no latents of training rooms, so there is no map and no nearest "
                 "room; sample rooms instead."
             )
-        return prior.prior.latent_space(prior.logits)
-
-    @property
-    def has_latents(self) -> bool:
-        """Whether latents make rooms, so that there are paths, and rooms can be completed."""
-        return isinstance(self.trained, TrainedPrior)
+        return trained.prior.latent_space(trained.logits)
 
     @property
     def distributions(self) -> tuple[str, ...]:
         """Where new rooms may come from, the prior's own way first; none for other methods."""
-        if isinstance(self.trained, TrainedSampler):
+        trained = self.prior.trained
+        if not isinstance(trained, TrainedPrior):
             return ()
-        known = DISTRIBUTIONS if len(self.trained.logits) > 1 else ("paper",)
-        known = (SAMPLER, *known) if self.trained.sampler is not None else known
-        own = self.trained.distribution
-        own = own if own in known else known[0]
+        known = DISTRIBUTIONS if len(trained.logits) > 1 else ("paper",)
+        known = (SAMPLER, *known) if trained.sampler is not None else known
+        own = trained.distribution if trained.distribution in known else known[0]
         return (own, *(name for name in known if name != own))
 
     def sample(self, seed: int, distribution: str | None = None) -> Shown:
         """A new room, by the first of `distributions` unless told otherwise: the one that
         `sceneprior synthesize -n 1 --seed SEED` writes."""
         distribution = distribution or next(iter(self.distributions), None)
-        made = new_rooms(self.trained, 1, seed, distribution)
-        z = None if made.latents is None else made.latents[0]
-        return Shown(made.scenes[0], f"seed {seed}, from: {made.origin}", z)
+        origin = distribution or self.prior.trained.config.method
+        scene = self.prior.sample(1, seed, distribution)[0]
+        return Shown(scene, f"seed {seed}, from: {origin}")
 
     def training_room(self, row: int) -> Shown:
         """A training room as the prior remembers it."""
-        room_id = self.trained.room_ids[row]
+        room_id = self.prior.trained.room_ids[row]
         return self._decoded(self._training_z[row], room_id, f"training room {room_id}, decoded")
 
     def at(self, shown: Shown, point: tuple[float, float], click: bool = False) -> Shown:
@@ -138,7 +129,9 @@ class Explorer:
         assert self.map is not None, "there is a map to point at"
         if click and (row := self.map.room_at(point)) is not None:
             return self.training_room(row)
-        z = self.map.moved(self._training_z[0] if shown.z is None else shown.z, point)
+        latent = shown.scene.latent
+        start = self._training_z[0] if latent is None else self.prior.latent(latent)
+        z = self.map.moved(start, point)
         x, y = self.map.place(z.unsqueeze(0))[0].tolist()
         return self._decoded(z, "from_the_map", f"map {x:+.3f}, {y:+.3f}")
 
@@ -151,19 +144,12 @@ class Explorer:
         Raises:
             InputError: an end is unknown, or `HERE` where no latent made the room on show.
         """
-        ends = [self._end(shown, text.strip()) for text in (start, end)]
-        self.path = path_latents(self._prior, ends[0], ends[1], PATH_STEPS)
+        ends = [
+            self.prior.latent(shown.scene if text.strip() == HERE else text.strip())
+            for text in (start, end)
+        ]
+        self.path = path_latents(self.prior.with_latents, ends[0], ends[1], PATH_STEPS)
         return self.path
-
-    def _end(self, shown: Shown, text: str) -> Float[Tensor, " dimension"]:
-        if text != HERE:
-            return read_latent(self._prior, text)
-        if shown.z is None:
-            raise InputError(
-                "The room on show was made without a latent, so no path begins or ends here; "
-                "name a training room or seed:7, or click on the map first."
-            )
-        return shown.z
 
     def step(self, number: int) -> Shown:
         """A room of the path, counted from 0."""
@@ -173,10 +159,9 @@ class Explorer:
 
     def complete(self, shown: Shown, seed: int) -> Shown:
         """Keep the kept objects and furnish the rest anew."""
-        z, rooms = complete(self._prior, [shown.given()], 1, seed)[0]
+        room = self.prior.complete(shown.given(), 1, seed)[0]
         kept = frozenset(range(len(shown.kept)))
-        origin = f"completed round {len(kept)} kept objects, seed {seed}"
-        return Shown(rooms[0], origin, None if z is None else z[0], kept)
+        return Shown(room, f"completed round {len(kept)} kept objects, seed {seed}", kept)
 
     def nearest(self, scene: Scene) -> tuple[Shown, float]:
         """The training room, as the prior remembers it, whose layout is nearest; metres between
@@ -187,19 +172,36 @@ class Explorer:
     @cached_property
     def _layouts(self) -> list[Scene]:
         """The training rooms as the prior remembers them, as boxes."""
-        prior, config = self._prior.prior, self._prior.config
+        trained = self.prior.with_latents
         with torch.no_grad():
-            decoded = prior.decode(self._training_z, with_shape=False)
-        names, target = self._prior.room_ids, config.model.completeness_target
-        return [room.scene for room in to_rooms(decoded, prior, config.label_set, names, target)]
+            decoded = trained.prior.decode(self._training_z, with_shape=False)
+        target = trained.config.model.completeness_target
+        rooms = to_rooms(decoded, trained.prior, self.label_set, trained.room_ids, target)
+        return [room.scene for room in rooms]
+
+    def some_layouts(self) -> list[Scene]:
+        """Rooms as boxes that say how large rooms are."""
+        return self._layouts if self.map is not None else self.prior.sample(16)
 
     def find_meshes(self, stop: threading.Event) -> None:
         """Find the meshes of all shapes that the prior knows, so that no room has to wait."""
-        shapes = self.trained.prior.shape if self.has_latents else None
+        shapes = self.prior.with_latents.prior.shape if self.has_latents else None
         for prototype in shapes.known if isinstance(shapes, OccupancyDecoder) else ():
             if stop.is_set():
                 return
             shapes.surface(prototype)
 
     def _decoded(self, z: Float[Tensor, " dimension"], name: str, origin: str) -> Shown:
-        return Shown(decode_latents(self._prior, z.unsqueeze(0), [name])[0], origin, z)
+        rooms = decode_latents(self.prior.with_latents, z.unsqueeze(0), [name])
+        return Shown(rooms[0], origin)
+
+
+def floor_side_m(scenes: Sequence[Scene]) -> float:
+    """Side of a square of floor round the origin on which nearly all rooms have their furniture:
+    the 95% quantile, in whole metres, at least 4."""
+    reach = [
+        np.abs(scene.centers_m[:, [0, 2]]).max() + scene.sizes_m[:, [0, 2]].max() / 2
+        for scene in scenes
+        if scene.objects
+    ]
+    return max(4.0, float(np.ceil(2 * np.quantile(reach, 0.95)))) if reach else 4.0

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sceneprior.evaluation.topdown import object_colors, object_mesh
 from sceneprior.geometry.corners import BOX_EDGES, box_corners
 from sceneprior.scene import Scene, SceneObject
+from sceneprior.topdown import object_colors, object_mesh
 
 if TYPE_CHECKING:
     import viser

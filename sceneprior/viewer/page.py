@@ -7,13 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.topdown import topdown_protocol
 from sceneprior.generation.cad_models import CadModels
-from sceneprior.generation.export import scene_to_glb
 from sceneprior.generation.retrieve import retrieve
 from sceneprior.scene import Scene
+from sceneprior.scene_files import scene_to_glb
 from sceneprior.viewer.board import Board, BoardPlane, Point
-from sceneprior.viewer.explorer import HERE, PATH_STEPS, Explorer, Folder, Shown
+from sceneprior.viewer.explorer import HERE, PATH_STEPS, Explorer, Folder, Shown, floor_side_m
 from sceneprior.viewer.nodes import RoomNodes, name_and_size
 
 if TYPE_CHECKING:
@@ -48,7 +47,7 @@ class Page:
         self._lock = threading.RLock()
         self._newest: Callable[[], None] | None = None
         self._follower = ThreadPoolExecutor(1)
-        floor_m = topdown_protocol(self.scene.label_set).window_m
+        floor_m = floor_side_m(source.some_layouts())
         self._set_view(floor_m)
         self._room = RoomNodes(server, "/room", 0.0, floor_m, self._clicked)
         self._beside = RoomNodes(server, "/nearest", floor_m * (1 + GAP), floor_m)
@@ -72,7 +71,7 @@ class Page:
             with self.server.atomic():
                 self._room.show(self.scene, shown.kept, self._names.value, self._boxes.value)
                 if self._board is not None:
-                    self._board.mark(shown.z)
+                    self._board.mark(shown.scene.latent)
                 self._said.content = _words(shown, self.scene)
             if settled and self._nearest is not None:
                 self._show_nearest(self.scene if self._nearest.value else None)

@@ -4,9 +4,9 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from sceneprior.config import load_any_run
+from sceneprior.api import load
 from sceneprior.generation.cad_models import default_cache, open_models
-from sceneprior.generation.export import load_scene_folder
+from sceneprior.scene_files import load_scene_folder
 from sceneprior.viewer.explorer import Explorer, Folder
 from sceneprior.viewer.page import Page
 from sceneprior.viewer.server import serving
@@ -53,4 +53,4 @@ def open_source(where: str, checkpoint: str = "final") -> Explorer | Folder:
     folder = Path(where)
     if folder.is_dir() and not (folder / "config.yaml").is_file():
         return Folder(load_scene_folder(folder))
-    return Explorer(load_any_run(folder, checkpoint))
+    return Explorer(load(where, checkpoint))

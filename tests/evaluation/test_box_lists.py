@@ -7,10 +7,11 @@ import pytest
 
 from sceneprior.errors import InputError
 from sceneprior.evaluation.box_lists import read_box_lists, read_boxes, turned_box
-from sceneprior.evaluation.topdown import topdown
-from sceneprior.generation.export import load_scene_folder, write_scenes
+from sceneprior.generation.export import write_scenes
 from sceneprior.offscreen import SoftwareRenderer
 from sceneprior.scene import Scene
+from sceneprior.scene_files import load_scene_folder
+from sceneprior.topdown import topdown
 
 BEDROOM = "front3d_bedroom"
 DESK, BED = 7, 8

@@ -14,8 +14,8 @@ from sceneprior.evaluation.ground_truth import (
     shuffled_rooms,
 )
 from sceneprior.evaluation.metrics.contents import class_frequencies, object_counts
-from sceneprior.evaluation.topdown import topdown
 from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.topdown import topdown
 
 MESH = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 

@@ -12,7 +12,7 @@ from sceneprior.evaluation.networks import (
     inception_features,
     single_threaded,
 )
-from sceneprior.evaluation.topdown import topdown
+from sceneprior.topdown import topdown
 
 
 @pytest.fixture(scope="module")

@@ -23,10 +23,10 @@ from sceneprior.evaluation.registry import METRICS
 from sceneprior.evaluation.room_sets import seeded_rows
 from sceneprior.evaluation.score_table import headings, print_scores, score_rows
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
-from sceneprior.evaluation.topdown import topdown
 from sceneprior.files import write_json
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.topdown import topdown
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.topdown import box_mesh
 from sceneprior.evaluation.view_scores import ObjectPair, score_pair, score_views, surface_note
 from sceneprior.scene import SceneObject
+from sceneprior.topdown import box_mesh
 
 POINTS = 4000
 

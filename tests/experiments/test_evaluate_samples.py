@@ -14,7 +14,6 @@ from sceneprior.errors import InputError
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.contents import category_kl, object_counts
 from sceneprior.evaluation.metrics.overlaps import overlap_pairs
-from sceneprior.evaluation.topdown import box_mesh
 from sceneprior.experiments.evaluate_samples import (
     TILE_PX,
     SampleEvaluator,
@@ -23,6 +22,7 @@ from sceneprior.experiments.evaluate_samples import (
 )
 from sceneprior.generation.decode import decode_training_rooms, synthesize
 from sceneprior.geometry.meshes import place
+from sceneprior.topdown import box_mesh
 from sceneprior.views import DecodedScenes
 
 

@@ -1,28 +1,19 @@
-"""Scene files: what is in them, and that they come back as they went."""
+"""Folders of rooms: what is written over, what is not, and the overview."""
 
-import json
-import struct
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprior.classes import class_colors
-from sceneprior.errors import InputError
-from sceneprior.evaluation.topdown import topdown
 from sceneprior.generation.export import (
     OVERVIEW_TILE,
-    load_scene,
-    load_scene_folder,
     overview,
-    read_glb_meshes,
-    scene_to_glb,
     write_scene,
     write_scenes,
 )
 from sceneprior.offscreen import open_renderer
-from sceneprior.scene import Mesh, Scene, SceneObject, scene_to_json
+from sceneprior.scene import Mesh, Scene, SceneObject
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +38,6 @@ def scene() -> Scene:
     )
 
 
-def glb_json(data: bytes) -> dict:
-    length = struct.unpack("<I", data[12:16])[0]
-    return json.loads(data[20 : 20 + length])
-
-
 def test_new_scenes_leave_none_of_the_old_ones_behind_and_everything_else_alone(
     scene, renderer, tmp_path
 ):
@@ -66,72 +52,6 @@ def test_new_scenes_leave_none_of_the_old_ones_behind_and_everything_else_alone(
     }  # fmt: skip
 
 
-def test_the_glb_has_named_nodes_in_metres_and_class_colours(scene):
-    content = glb_json(scene_to_glb(scene))
-    assert [node["name"] for node in content["nodes"]] == ["0_double_bed", "1_nightstand"]
-    assert not any("matrix" in node or "scale" in node for node in content["nodes"])
-    bounds = [accessor for accessor in content["accessors"] if accessor["type"] == "VEC3"]
-    np.testing.assert_allclose(bounds[0]["max"], [1, 1.5, 1])  # y is up
-    np.testing.assert_allclose(bounds[1]["min"], [1.25, 0, -0.7], atol=1e-6)
-    for label, material in zip((9, 13), content["materials"], strict=True):
-        linear = np.array(material["pbrMetallicRoughness"]["baseColorFactor"][:3])
-        srgb = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
-        # trimesh keeps 8 bits of linear light: up to 6 of 255 steps in a dark channel.
-        np.testing.assert_allclose(srgb * 255, class_colors(22)[label], atol=6)
-
-
-def test_what_is_written_comes_back(scene, tmp_path, renderer):
-    write_scene(scene, tmp_path / "new", "room_0", renderer)
-    files = sorted(path.name for path in (tmp_path / "new").iterdir())
-    assert files == ["room_0.glb", "room_0.json", "room_0.png"]
-    back = load_scene(tmp_path / "new" / "room_0.json")
-    assert (back.name, back.label_set, back.extra) == ("room", "front3d_bedroom", {"seed": 3})
-    np.testing.assert_allclose(back.centers_m, scene.centers_m)
-    bed = back.objects[0].mesh
-    np.testing.assert_array_equal(bed.vertices_m, scene.objects[0].mesh.vertices_m)
-    np.testing.assert_array_equal(bed.faces, scene.objects[0].mesh.faces)
-    low, high = (getattr(back.objects[1].mesh.vertices_m, end)(0) for end in ("min", "max"))
-    np.testing.assert_allclose((high + low) / 2, (1.5, 0.25, -0.5), atol=1e-6)
-    np.testing.assert_allclose(high - low, (0.5, 0.5, 0.4), atol=1e-6)
-    picture = np.asarray(Image.open(tmp_path / "new" / "room_0.png"))
-    np.testing.assert_array_equal(picture, topdown(scene, renderer, outlines=True))
-    np.testing.assert_array_equal(topdown(back, renderer), topdown(scene, renderer))
-
-
-def test_node_transforms_are_applied(tmp_path):
-    import trimesh
-
-    moved = trimesh.Scene()
-    shift = trimesh.transformations.translation_matrix([1.0, 2.0, 3.0])
-    moved.add_geometry(trimesh.creation.box(), node_name="0_desk", transform=shift)
-    (tmp_path / "a.glb").write_bytes(moved.export(file_type="glb"))
-    mesh = read_glb_meshes(tmp_path / "a.glb")["0_desk"]
-    np.testing.assert_allclose(mesh.vertices_m.mean(0), [1, 2, 3], atol=1e-6)
-
-
-def test_the_same_scene_gives_the_same_bytes(scene):
-    assert scene_to_glb(scene) == scene_to_glb(scene)
-
-
-def test_an_empty_room_is_a_valid_glb_and_comes_back_empty(scene, tmp_path, renderer):
-    write_scene(replace(scene, objects=()), tmp_path, "empty", renderer)
-    data = (tmp_path / "empty.glb").read_bytes()
-    assert data[:4] == b"glTF" and struct.unpack("<I", data[8:12])[0] == len(data)
-    assert load_scene(tmp_path / "empty.json").objects == ()
-
-
-def test_a_folder_is_read_in_counting_order_and_other_json_is_passed_over(
-    scene, tmp_path, renderer
-):
-    for index in (10, 2, 1):
-        write_scene(replace(scene, name=f"n{index}"), tmp_path, f"room_{index}", renderer)
-    (tmp_path / "scores.json").write_text('{"format": "sceneprior-scores"}')
-    (tmp_path / "room_2.glb").unlink()
-    scenes = load_scene_folder(tmp_path)
-    assert [item.name for item in scenes] == ["n1", "n2", "n10"]
-    assert scenes[0].objects[0].mesh is not None and scenes[1].objects[0].mesh is None
-
-
 def test_a_failed_write_leaves_nothing_under_the_final_name(scene, tmp_path, renderer, monkeypatch):
     def torn(picture, file, **_):
         file.write(b"half of a PNG")
@@ -144,25 +64,6 @@ def test_a_failed_write_leaves_nothing_under_the_final_name(scene, tmp_path, ren
     assert [path.name for path in tmp_path.iterdir()] == ["room.glb"]
 
 
-def test_bad_folders_and_files_say_what_to_do(scene, tmp_path, renderer):
-    with pytest.raises(InputError, match="No folder of scenes at"):
-        load_scene_folder(tmp_path / "absent")
-    with pytest.raises(InputError, match="holds no scene JSON"):
-        load_scene_folder(tmp_path)
-    with pytest.raises(InputError, match="cannot name a scene's files"):
-        write_scene(scene, tmp_path, "a/b", renderer)
-    write_scene(scene, tmp_path, "room", renderer)
-    (tmp_path / "room.glb").write_bytes(b"glTF nothing")
-    with pytest.raises(InputError, match="cannot be read as a GLB"):
-        load_scene_folder(tmp_path)
-    (tmp_path / "room.glb").write_bytes(scene_to_glb(replace(scene, objects=scene.objects[:1])))
-    with pytest.raises(InputError, match=r"different objects .*1_nightstand"):
-        load_scene_folder(tmp_path)
-    (tmp_path / "room.json").write_text("{")
-    with pytest.raises(InputError, match="is not a scene JSON"):
-        load_scene_folder(tmp_path)
-
-
 def test_an_overview_holds_each_room_in_its_place(renderer):
     empty = Scene("empty", "front3d_bedroom")
     bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
@@ -172,28 +73,3 @@ def test_an_overview_holds_each_room_in_its_place(renderer):
     tiles = sheet.reshape(2, height, 4, width, 3).swapaxes(1, 2).reshape(8, -1, 3)
     colourful = (np.ptp(tiles.astype(int), axis=-1) > 60).sum(axis=1)
     assert colourful[4] > 1000 and not np.delete(colourful, 4).any()
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"center_m": [0.0, float("nan"), 0.0]}, r"a desk has centre \[0\.0, nan, 0\.0\]"),
-        ({"size_m": [1.0, -1.0, 1.0]}, "sizes not below 0"),
-        ({"center_m": [0.0, 1.0]}, "is not a scene JSON"),
-    ],
-)
-def test_numbers_that_no_room_has_are_refused(tmp_path, change, sentence):
-    desk = SceneObject("desk", (0.0, 0.4, 0.0), (1.0, 0.8, 0.5))
-    data = scene_to_json(Scene("a", "front3d_bedroom", (desk,)))
-    data["objects"][0] |= change
-    (tmp_path / "a.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match=sentence):
-        load_scene(tmp_path / "a.json")
-
-
-@pytest.mark.parametrize("floor", [[[0, 0], [1, 0]], [1, 2, 3], "here", [[0, 0], [1], [2, 2]]])
-def test_floors_that_are_no_outline_are_refused(tmp_path, floor):
-    data = scene_to_json(Scene("a", "front3d_bedroom")) | {"floor_m": floor}
-    (tmp_path / "a.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match=r"a\.json(: floor_m has shape| is not a scene JSON)"):
-        load_scene(tmp_path / "a.json")

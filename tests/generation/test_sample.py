@@ -19,6 +19,7 @@ from sceneprior.generation.sample import (
     write_latents,
 )
 from sceneprior.models.latents import LatentCube, LatentSphere
+from sceneprior.scene import Scene
 
 MANY = 20_000
 
@@ -177,9 +178,14 @@ def test_rooms_and_seeds(toy_prior):
     assert not torch.equal(read_latent(toy_prior, "seed:8"), drawn[0])
 
 
+def rooms_of(z, names):
+    pairs = zip(z.numpy(), names, strict=True)
+    return [Scene(name, "front3d_bedroom", latent=latent) for latent, name in pairs]
+
+
 def test_files(toy_prior, tmp_path):
     z, names = draw_latents(toy_prior, 4, seed=2)
-    write_latents(tmp_path, z, names)
+    write_latents(tmp_path, rooms_of(z, names))
     npz = tmp_path / "latents.npz"
     # Close: a file's vector is normalised once more.
     torch.testing.assert_close(read_latent(toy_prior, str(npz)), z[0])
@@ -204,12 +210,14 @@ def test_what_is_no_latent_is_a_sentence(toy_prior, tmp_path):
         "seed:NUMBER, nor a file of latents (.npz, .npy, .json)."
     )
     assert "neither a training room" in said("seed:-1") and "neither" in said(tmp_path)
-    write_latents(tmp_path, torch.eye(16)[:2], ["a", "b"])
+    write_latents(tmp_path, rooms_of(torch.eye(16)[:2], "ab"))
     npz = tmp_path / "latents.npz"
     assert f"{npz} has no latent '2': it holds 2 and names such as a." == said(f"{npz}:2")
     assert "has no latent 'c'" in said(f"{npz}:c")
     np.save(tmp_path / "long.npy", np.ones(17))
-    assert "holds latents of 17 numbers, but this run's have 16" in said(tmp_path / "long.npy")
+    assert "has a latent of shape (17,), but this prior's have 16 numbers" in said(
+        tmp_path / "long.npy"
+    )
     np.save(tmp_path / "zero.npy", np.zeros(16))
     assert "all zeros or holds no numbers" in said(tmp_path / "zero.npy")
     np.save(tmp_path / "nan.npy", np.full(16, np.nan))

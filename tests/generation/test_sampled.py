@@ -9,7 +9,7 @@ import torch
 from sceneprior.config import load_run
 from sceneprior.errors import InputError
 from sceneprior.generation.complete import complete
-from sceneprior.generation.decode import new_rooms, synthesize
+from sceneprior.generation.decode import synthesize
 from sceneprior.generation.sample import draw_latents, read_latent
 from sceneprior.scene import Scene, SceneObject
 
@@ -26,16 +26,17 @@ def scene(*objects: SceneObject, floor=None) -> Scene:
 
 
 def test_new_rooms_come_from_the_sampler_and_others_if_asked(trained):
-    made = new_rooms(trained, 3, 5)
-    assert made.latents is None and len(made.scenes) == 3
-    assert made.scenes[0].name == "seed5_0000"
+    made = synthesize(trained, 3, 5)
+    assert [scene.latent for scene in made] == [None] * 3
+    assert made[0].name == "seed5_0000"
     again = synthesize(trained, 2, 5)
-    for one, other in zip(again, made.scenes[:2], strict=True):
+    for one, other in zip(again, made[:2], strict=True):
         assert [item.label for item in one.objects] == [item.label for item in other.objects]
         assert np.allclose(one.centers_m, other.centers_m, atol=1e-4)
-    assert all(item.mesh is not None for room in made.scenes for item in room.objects)
-    other = new_rooms(trained, 3, 5, "paper")
-    assert other.latents is not None and len(other.latents) == 3
+    assert all(item.mesh is not None for room in made for item in room.objects)
+    z, _ = draw_latents(trained, 3, 5, "paper")
+    latents = [scene.latent for scene in synthesize(trained, 3, 5, "paper")]
+    np.testing.assert_array_equal(np.stack(latents), z)
 
 
 def test_latents_of_such_a_run_are_the_kernel_s(trained):
@@ -54,13 +55,13 @@ def test_runs_without_a_sampler_say_so(toy_run):
 def test_before_its_stage_rooms_come_from_latents(trained):
     early = replace(trained, sampler=None, stage="shape")
     assert early.distribution == "kernel"
-    assert new_rooms(early, 2, 0).latents is not None
+    assert synthesize(early, 2, 0)[0].latent is not None
 
 
 def test_answers_hold_what_is_given_exactly_and_differ(trained):
     given = scene(BED)
-    ((latents, answers),) = complete(trained, [given], count=3, seed=1)
-    assert latents is None and len(answers) == 3
+    (answers,) = complete(trained, [given], count=3, seed=1)
+    assert [answer.latent for answer in answers] == [None] * 3
     for answer in answers:
         first = answer.objects[0]
         assert (first.label, first.center_m, first.size_m) == (BED.label, BED.center_m, BED.size_m)
@@ -68,7 +69,7 @@ def test_answers_hold_what_is_given_exactly_and_differ(trained):
         assert answer.extra["given"] == [0]
     places = {tuple(answer.centers_m.round(3).ravel()) for answer in answers}
     assert len(places) == 3
-    ((_, again),) = complete(trained, [given], count=3, seed=1)
+    (again,) = complete(trained, [given], count=3, seed=1)
     assert places == {tuple(answer.centers_m.round(3).ravel()) for answer in again}
 
 
@@ -77,7 +78,7 @@ def test_classes_and_floor_are_kept_to(trained):
     room = scene(floor=floor)
     known = {item.label for made in synthesize(trained, 20, 0) for item in made.objects}
     wanted = sorted(known)[:2]
-    ((_, answers),) = complete(trained, [room], count=4, seed=0, classes=wanted)
+    (answers,) = complete(trained, [room], count=4, seed=0, classes=wanted)
     for answer in answers:
         assert sorted(item.label for item in answer.objects) == wanted
     with pytest.raises(InputError, match="'piano' is no class"):
@@ -92,11 +93,11 @@ def test_too_many_and_unknown_classes_are_sentences(trained):
     with pytest.raises(InputError, match="no class of this run's training rooms"):
         complete(trained, [scene()], classes=[unseen])
     stool = SceneObject(unseen, (0.0, 0.3, 0.0), (0.5, 0.6, 0.5))
-    ((_, (answer,)),) = complete(trained, [scene(stool)], count=1)
+    ((answer,),) = complete(trained, [scene(stool)], count=1)
     assert answer.objects[0].label == unseen and answer.objects[0].mesh is None
 
 
 def test_several_rooms_are_completed_at_once(trained):
     both = complete(trained, [scene(BED), scene()], count=2)
-    assert [len(answers) for _, answers in both] == [2, 2]
-    assert both[0][1][0].objects[0].label == "double_bed"
+    assert [len(answers) for answers in both] == [2, 2]
+    assert both[0][0].objects[0].label == "double_bed"

@@ -5,7 +5,9 @@ import pytest
 
 from sceneprior.classes import class_colors
 from sceneprior.errors import InputError
-from sceneprior.evaluation.topdown import (
+from sceneprior.offscreen import open_renderer
+from sceneprior.scene import Scene, SceneObject
+from sceneprior.topdown import (
     TopDownProtocol,
     box_mesh,
     look_at,
@@ -13,9 +15,13 @@ from sceneprior.evaluation.topdown import (
     topdown,
     topdown_protocol,
 )
-from sceneprior.scene import Scene, SceneObject
 
 BED, LAMP = 9, 14  # rows of double_bed and pendant_lamp in the bedroom label set
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return open_renderer("software")
 
 
 def bedroom(*objects: SceneObject) -> Scene:
