@@ -6,6 +6,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sceneprior.errors import InputError
 from sceneprior.generation.cad_models import CadModels
 from sceneprior.generation.retrieve import retrieve
@@ -18,6 +20,8 @@ from sceneprior.viewer.nodes import RoomNodes, name_and_size
 if TYPE_CHECKING:
     import viser
 
+FOV_RAD = 0.75
+"""Of the camera, from bottom to top."""
 GAP = 0.15
 """Between the room and what stands beside it, in widths of the room's floor."""
 
@@ -48,17 +52,24 @@ class Page:
         self._newest: Callable[[], None] | None = None
         self._follower = ThreadPoolExecutor(1)
         floor_m = floor_side_m(source.some_layouts())
-        self._set_view(floor_m)
         self._room = RoomNodes(server, "/room", 0.0, floor_m, self._clicked)
-        self._beside = RoomNodes(server, "/nearest", floor_m * (1 + GAP), floor_m)
+        self._beside_m = floor_m * (1 + GAP)
+        self._beside = RoomNodes(server, "/nearest", self._beside_m, floor_m)
         self._beside.visible = False
         self._board: Board | None = None
+        self._left_m, self._right_m = -floor_m / 2, floor_m / 2
         if self.explorer is not None and self.explorer.map is not None:
-            side = 0.75 * floor_m
-            center = (-(floor_m * (0.5 + GAP) + side / 2), 0.35 * side, 0.0)
+            side = 0.85 * floor_m
+            self._left_m -= floor_m * GAP + side
+            center = (self._left_m + side / 2, 0.4 * side, -0.1 * floor_m)
             plane = BoardPlane(self.explorer.map, center, side)
             self._board = Board(server, plane, self._pointed)
+        server.scene.set_up_direction("+y")
+        eye, target = self._view(self._right_m)
+        server.initial_camera.fov = FOV_RAD
+        server.initial_camera.position, server.initial_camera.look_at = eye, target
         server.gui.set_panel_label(title)
+        server.gui.main_panel.dock_right()
         self._add_controls()
         self.show(self.shown)
 
@@ -78,7 +89,11 @@ class Page:
 
     def _show_nearest(self, scene: Scene | None) -> None:
         assert self.explorer is not None
-        self._beside.visible = scene is not None
+        if self._beside.visible != (scene is not None):
+            self._beside.visible = scene is not None
+            eye, target = self._view(self._right_m + (self._beside_m if scene else 0.0))
+            for client in self.server.get_clients().values():
+                client.camera.position, client.camera.look_at = eye, target
         self._nearest_said.content = ""
         if scene is not None:
             room, distance_m = self.explorer.nearest(scene)
@@ -126,13 +141,11 @@ class Page:
             for client in self.server.get_clients().values():
                 client.add_notification(title, str(error), color="red", auto_close_seconds=20)
 
-    def _set_view(self, floor_m: float) -> None:
-        self.server.scene.set_up_direction("+y")
-        camera = self.server.initial_camera
-        beside = 0.0 if isinstance(self.source, Folder) or self.source.map is None else -0.45
-        camera.position = (beside * floor_m, 0.95 * floor_m, 1.35 * floor_m)
-        camera.look_at = (beside * floor_m, 0.0, 0.05 * floor_m)
-        camera.fov = 0.9
+    def _view(self, right_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """An eye in front that sees all from the left edge to here, and what it looks at."""
+        width = right_m - self._left_m
+        middle = np.array([(right_m + self._left_m) / 2, 0.0, 0.0])
+        return middle + 1.15 * width * np.array([0.0, 0.6, 0.8]), middle
 
     # -- The panel ---------------------------------------------------------------------------------
 
@@ -146,9 +159,9 @@ class Page:
             if self.source.map is not None:
                 share = f"{self.source.map.share:.0%}"
                 gui.add_markdown(
-                    "**Map**: drag over the board, or click a dot, which is a training room. It "
-                    "shows the two directions in which training rooms' latents differ most "
-                    f"({share} of their variance); all other coordinates stay as they are."
+                    "**Map**: drag over the board, or click a dot: a training room. It shows the "
+                    f"two directions in which their latents differ most ({share} of the "
+                    "variance); all other coordinates stay."
                 )
             elif self.source.without_map:
                 gui.add_markdown(self.source.without_map)
@@ -163,15 +176,16 @@ class Page:
             if self._board is not None:
                 self._nearest = self._box("Nearest training room", False)
                 self._nearest_said = gui.add_markdown("")
-        self._button("Download GLB", self._download)
+        self._buttons({"Download GLB": self._download})
 
     def _box(self, name: str, value: bool, visible: bool = True) -> Any:
         box = self.server.gui.add_checkbox(name, value, visible=visible)
         box.on_update(lambda _: self._safely(self._again))
         return box
 
-    def _button(self, name: str, task: Callable[[], None]) -> None:
-        self.server.gui.add_button(name).on_click(lambda _: self._safely(task))
+    def _buttons(self, tasks: dict[str, Callable[[], None]]) -> None:
+        group = self.server.gui.add_button_group("", tuple(tasks))
+        group.on_click(lambda _: self._safely(tasks[group.value]))
 
     def _add_folder(self, folder: Folder) -> None:
         names = [scene.name for scene in folder.scenes]
@@ -184,8 +198,7 @@ class Page:
         def turn(by: int) -> None:
             number.value = 1 + (number.value - 1 + by) % len(names)
 
-        self._button("Next room", lambda: turn(1))
-        self._button("Previous room", lambda: turn(-1))
+        self._buttons({"Previous": lambda: turn(-1), "Next": lambda: turn(1)})
 
     def _add_sampling(self, explorer: Explorer) -> None:
         gui = self.server.gui
@@ -203,8 +216,7 @@ class Page:
             for each in (seed, origin):
                 if each is not None:
                     each.on_update(lambda _: self._safely(sample))
-            self._button("Sample", sample)
-            self._button("Next seed", another)
+            self._buttons({"Sample": sample, "Next seed": another})
 
     def _add_path(self, explorer: Explorer) -> None:
         gui = self.server.gui
@@ -230,7 +242,7 @@ class Page:
                     self.show(explorer.step(step.value), settled)
 
             step.on_update(lambda _: self._follow(walk))
-            self._button("Draw path", draw)
+            self._buttons({"Draw path": draw})
 
     def _add_completion(self, explorer: Explorer) -> None:
         gui = self.server.gui
@@ -242,7 +254,7 @@ class Page:
                 self.show(explorer.complete(self.shown, seed.value))
                 seed.value += 1
 
-            self._button("Complete the rest", complete)
+            self._buttons({"Complete the rest": complete})
 
     def _download(self) -> None:
         self.server.send_file_download(f"{self.scene.name}.glb", scene_to_glb(self.scene))

@@ -4,6 +4,8 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import torch
+
 from sceneprior.api import load
 from sceneprior.generation.cad_models import default_cache, open_models
 from sceneprior.scene_files import load_scene_folder
@@ -26,6 +28,8 @@ def serve(
     Raises:
         InputError: there is nothing to show, or its CAD models cannot be read.
     """
+    # One room at a time is too little work to share: several threads spend it on waiting.
+    torch.set_num_threads(1)
     stop = threading.Event()
     try:
         source = open_source(where, checkpoint)
