@@ -20,6 +20,7 @@ import pytest
 import scipy.stats  # noqa: F401
 import sklearn.linear_model  # noqa: F401
 import torch
+from browser import browser  # noqa: F401 (a fixture)
 from threadpoolctl import threadpool_limits
 from tiny_runs import OCCUPANCY, tiny_config, tiny_sampler_config
 from toy_rooms import write_toy_shards
