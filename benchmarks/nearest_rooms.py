@@ -10,12 +10,11 @@ import argparse
 from pathlib import Path
 from statistics import mean
 
-import numpy as np
 from PIL import Image
 
 from sceneprior.config import load_any_run
 from sceneprior.evaluation.ground_truth import reference_scenes
-from sceneprior.evaluation.layout_distance import nearest_distances
+from sceneprior.evaluation.layout_distance import nearest_room
 from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import open_renderer
 from sceneprior.pictures import contact_sheet
@@ -39,10 +38,9 @@ def main() -> None:
     renderer = open_renderer(given.renderer)
     tiles, distances = [], []
     for scene in drawn:
-        apart = [float(nearest_distances([scene], [room])[0]) for room in training]
-        nearest = training[int(np.argmin(apart))]
-        distances.append(min(apart))
-        for room in (scene, nearest):
+        row, distance = nearest_room(scene, training)
+        distances.append(distance)
+        for room in (scene, training[row]):
             tiles.append(perspective(room, renderer, view=corner_view([room], TILE_PX)))
     Image.fromarray(contact_sheet(tiles, COLUMNS, gap_px=4)).save(given.sheet, optimize=True)
     print(

@@ -24,7 +24,7 @@ ROWS = {
     "baselines": 4, "evaluation": 4,
     "config": 5,
     "generation": 6, "reconstruction": 6, "experiments": 6,
-    "api": 7,
+    "api": 7, "viewer": 7,
     "cli": 8, "__main__": 8,
 }  # fmt: skip
 FOUNDATION = {name for name, row in ROWS.items() if row <= 1}
@@ -60,6 +60,7 @@ OWNERS = {
         "sceneprior/losses/matching.py", "sceneprior/evaluation/", "data_prep/inspection/causes.py",
     ],
     "cv2": ["data_prep/"],
+    "viser": ["sceneprior/viewer/"],
     "distributed": ["data_prep/engine/cluster.py"],
     "dask": ["data_prep/engine/cluster.py"],
 }  # fmt: skip

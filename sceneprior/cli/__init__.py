@@ -11,7 +11,7 @@ import typer
 
 from data_prep.cli import add_commands
 from sceneprior import __version__
-from sceneprior.cli import evaluating, experiments, generating, reconstruction, training
+from sceneprior.cli import evaluating, experiments, generating, reconstruction, training, viewing
 from sceneprior.errors import InputError
 
 app = typer.Typer(
@@ -27,7 +27,7 @@ for command in (
     generating.synthesize, generating.interpolate, generating.complete, generating.retrieve,
     reconstruction.reconstruct, reconstruction.eval_svr,
     evaluating.eval_fid, evaluating.convert_boxes,
-    experiments.compare, experiments.demo,
+    experiments.compare, experiments.demo, viewing.view,
 ):  # fmt: skip
     app.command()(command)
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
@@ -77,33 +77,52 @@ def nearest_distances(
     Returns:
         Metres; inf where there is no room to compare with.
     """
-    rooms = [_rows(room) for room in training]
-    counts = np.array([len(room) for room in rooms], dtype=np.int64)
+    rooms = _Rooms(training)
     names = np.array([room.name for room in training])
     contents = [sorted(room.class_indices.tolist()) for room in training]
-    everything = np.concatenate([np.zeros((0, 7)), *rooms])
-    starts = np.cumsum(counts) - counts
     nearest = np.full(len(scenes), np.inf)
     for row, scene in enumerate(scenes):
-        allowed = np.ones(len(rooms), dtype=bool)
+        allowed = np.ones(len(training), dtype=bool)
         if pass_over_own:
             allowed &= names != scene.name
         if same_classes:
             mine = sorted(scene.class_indices.tolist())
             allowed &= np.array([theirs == mine for theirs in contents], dtype=bool)
-        if not allowed.any():
-            continue
-        best, placed = np.inf, _rows(scene)
+        if allowed.any():
+            nearest[row] = rooms.nearest(scene, allowed)[1]
+    return nearest
+
+
+def nearest_room(scene: Scene, training: Sequence[Scene]) -> tuple[int, float]:
+    """Which of at least one training room is nearest to a scene, and its distance in metres; as
+    `nearest_distances`."""
+    return _Rooms(training).nearest(scene, np.ones(len(training), dtype=bool))
+
+
+class _Rooms:
+    """Rooms to search."""
+
+    def __init__(self, rooms: Sequence[Scene]):
+        each = [_rows(room) for room in rooms]
+        self.counts = np.array([len(room) for room in each], dtype=np.int64)
+        self.objects = np.concatenate([np.zeros((0, 7)), *each])
+        self.starts = np.cumsum(self.counts) - self.counts
+
+    def nearest(self, scene: Scene, allowed: Bool[np.ndarray, " rooms"]) -> tuple[int, float]:
+        """The nearest of the allowed rooms (at least one), and its distance."""
+        best, found, placed = np.inf, 0, _rows(scene)
         for turn in TURNS:
-            costs = np.minimum(cdist(_turned(placed, turn), everything), MISSING_M)
-            bounds = np.where(allowed, _lower_bounds(costs, starts, counts), np.inf)
+            costs = np.minimum(cdist(_turned(placed, turn), self.objects), MISSING_M)
+            bounds = _lower_bounds(costs, self.starts, self.counts)
+            bounds = np.where(allowed, bounds, np.inf)
             for room in np.argsort(bounds):
                 if bounds[room] >= best:
                     break
-                candidate = costs[:, starts[room] : starts[room] + counts[room]]
-                best = min(best, _distance(candidate))
-        nearest[row] = best
-    return nearest
+                start = self.starts[room]
+                distance = _distance(costs[:, start : start + self.counts[room]])
+                if distance < best:
+                    best, found = distance, int(room)
+        return found, float(best)
 
 
 def _turned(rows: np.ndarray, turn: np.ndarray) -> np.ndarray:

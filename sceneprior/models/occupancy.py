@@ -123,17 +123,26 @@ class OccupancyDecoder(nn.Module):
         return self.look_codes[looks], self.filled[looks // POSES]
 
     def mesh(self, look: int, box_m: Float[np.ndarray, "6"]) -> Mesh:
-        """A look's surface in a box (centre, full extents). A prototype's is found once: rooms by
-        the thousand share it."""
+        """A look's surface in a box (centre, full extents)."""
         prototype, pose = divmod(look, POSES)
-        if prototype not in self._meshes:
-            bits = self.grid_bits[prototype].cpu().numpy()
-            filled = np.unpackbits(bits, count=self.cells**3).reshape((self.cells,) * 3)
-            surface = surface_of(filled - 0.5, np.zeros(3), np.ones(3), self.margin)
-            self._meshes[prototype] = Mesh(*surface)
-        vertices, faces = self._meshes[prototype].vertices_m, self._meshes[prototype].faces
+        surface = self.surface(prototype)
+        vertices, faces = surface.vertices_m, surface.faces
         quarters, mirrored = turn_of(pose)
         if mirrored:  # turns its faces inside out: pass their corners the other way
             vertices, faces = vertices * [-1, 1, 1], faces[:, ::-1].copy()
         vertices = vertices @ quarter_rotation(quarters).T
         return Mesh(vertices * box_m[3:] + box_m[:3], faces)
+
+    @property
+    def known(self) -> list[int]:
+        """The prototypes that there are, by number."""
+        return (self.object_class != self.unknown).nonzero()[:, 0].tolist()
+
+    def surface(self, prototype: int) -> Mesh:
+        """A prototype's surface in [-0.5, 0.5]^3, found once."""
+        if prototype not in self._meshes:
+            bits = self.grid_bits[prototype].cpu().numpy()
+            filled = np.unpackbits(bits, count=self.cells**3).reshape((self.cells,) * 3)
+            surface = surface_of(filled - 0.5, np.zeros(3), np.ones(3), self.margin)
+            self._meshes[prototype] = Mesh(*surface)
+        return self._meshes[prototype]
