@@ -1,4 +1,4 @@
-"""Composes pictures: contact sheets, instance ids in colours, and the bytes of a PNG."""
+"""Composes pictures: contact sheets, instance ids in colours, and the bytes of a PNG or GIF."""
 
 import io
 from collections.abc import Sequence
@@ -70,4 +70,22 @@ def png_bytes(picture: UInt8[np.ndarray, "height width 3"] | Image.Image, **opti
     buffer = io.BytesIO()
     image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
     image.save(buffer, format="PNG", **options)
+    return buffer.getvalue()
+
+
+def gif_bytes(
+    pictures: Sequence[UInt8[np.ndarray, "height width 3"]], times: Sequence[int]
+) -> bytes:
+    """Pictures of one size as a GIF that goes on for ever; `times` are milliseconds of each."""
+    # One palette for all pictures: with one each, plain areas would shimmer.
+    palette = Image.fromarray(np.concatenate(pictures)).quantize(255, dither=Image.Dither.NONE)
+    frames = [
+        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
+        for picture in pictures
+    ]
+    buffer = io.BytesIO()
+    frames[0].save(
+        buffer, format="GIF", save_all=True, append_images=frames[1:], duration=list(times), loop=0,
+        optimize=False,
+    )  # fmt: skip
     return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Pictures of scenes: straight from above, as scores compare them, and from above a corner."""
+"""Pictures of scenes: from above, as scores compare them, from above a corner, and all round."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -16,6 +16,8 @@ BACKGROUND = (255, 255, 255)
 """White: no class colour comes near it, and a page prints it as paper."""
 
 FLOOR_COLOR = (232, 228, 220)
+DIRECTION = np.array([0.42, 0.62, 0.66])
+"""Of length 1.0, from a room to where `perspective` looks from; pages begin to turn it there."""
 
 
 @dataclass(frozen=True)
@@ -138,8 +140,7 @@ def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480
     meshes = [floor, *(mesh for scene in scenes for mesh in scene_meshes(scene))]
     points = np.concatenate([mesh.vertices_m for mesh in meshes])
     target, diagonal = (points.min(0) + points.max(0)) / 2, np.linalg.norm(np.ptp(points, axis=0))
-    direction = np.array([0.42, 0.62, 0.66])  # of length 1.0
-    world_to_camera = look_at(target + 2 * diagonal * direction, target)
+    world_to_camera = look_at(target + 2 * diagonal * DIRECTION, target)
     x, y, z = world_to_camera[:3, :3] @ points.T + world_to_camera[:3, 3:]
     across, down = x / z, y / z
     height, width = image_size
@@ -171,6 +172,36 @@ def perspective(
     colors = np.concatenate([colors, [FLOOR_COLOR]]).astype(np.uint8)
     meshes = [*scene_meshes(scene), view.floor]
     return renderer.shaded(meshes, colors, view.camera, view.image_size, BACKGROUND)
+
+
+def turntable(
+    scene: Scene,
+    renderer: Renderer,
+    count: int = 36,
+    image_size: tuple[int, int] = (240, 320),
+) -> list[UInt8[np.ndarray, "height width 3"]]:
+    """Shaded pictures from so many places round a room, all of one scale; the first is from where
+    `perspective` looks."""
+    floor = corner_view([scene]).floor
+    points = np.concatenate([mesh.vertices_m for mesh in [*scene_meshes(scene), floor]])
+    target, diagonal = (points.min(0) + points.max(0)) / 2, np.linalg.norm(np.ptp(points, axis=0))
+    poses, reach = [], np.zeros(2)
+    for angle in np.arange(count) * 2 * np.pi / count:
+        turned = np.array(
+            [
+                np.cos(angle) * DIRECTION[0] + np.sin(angle) * DIRECTION[2],
+                DIRECTION[1],
+                np.cos(angle) * DIRECTION[2] - np.sin(angle) * DIRECTION[0],
+            ]
+        )
+        poses.append(look_at(target + 2 * diagonal * turned, target))
+        x, y, z = poses[-1][:3, :3] @ points.T + poses[-1][:3, 3:]
+        reach = np.maximum(reach, np.abs([x / z, y / z]).max(axis=1))
+    height, width = image_size
+    focal = 0.96 * min(width / 2 / reach[0], height / 2 / reach[1])
+    intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    views = [CornerView(Pinhole(pose, intrinsics), image_size, floor) for pose in poses]
+    return [perspective(scene, renderer, view=view) for view in views]
 
 
 def _floor_rectangle(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

@@ -27,8 +27,12 @@ def reconstruct(
         str | None, typer.Option(help="One view of each room of train or test.")
     ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Only the first rooms.")] = None,
-    mask: Annotated[Path | None, typer.Option(help="Your own image: a PNG of ids.")] = None,
-    classes: Annotated[Path | None, typer.Option(help="Its table: CSV or JSON, id, class.")] = None,
+    mask: Annotated[
+        Path | None, typer.Option(help="Your own image: a PNG of ids, or COCO's JSON.")
+    ] = None,
+    classes: Annotated[
+        Path | None, typer.Option(help="Of a PNG: CSV or JSON, id and class.")
+    ] = None,
     intrinsics: Annotated[
         str | None, typer.Option(help="Its camera's: fov=73, 35mm=26, fx,fy,cx,cy or a JSON file.")
     ] = None,
@@ -50,7 +54,7 @@ def reconstruct(
     from sceneprior.generation.export import check_free
     from sceneprior.geometry.turns import QUARTERS
     from sceneprior.offscreen import open_renderer
-    from sceneprior.reconstruction.export import write_reconstructions
+    from sceneprior.reconstruction.export import write_reconstructions, write_turning
     from sceneprior.reconstruction.image import image_from_shards, images_of_split
     from sceneprior.reconstruction.own_image import read_own_image
     from sceneprior.reconstruction.reconstruct import OBJECTS
@@ -59,7 +63,7 @@ def reconstruct(
     if sum(ways) != 1 or (shards is None) != (mask is not None):
         raise InputError(
             "Say what to reconstruct from, in one way: --shards with --room (and --view) or with "
-            "--split; or --mask with --classes and --intrinsics."
+            "--split; or --mask with --intrinsics (and --classes)."
         )
     if mask is None and any(given is not None for given in (classes, intrinsics, pose)):
         raise InputError("--classes, --intrinsics and --pose belong to --mask.")
@@ -69,8 +73,8 @@ def reconstruct(
     prior = load(run, checkpoint)
     notes = []
     if shards is None:
-        if mask is None or classes is None or intrinsics is None:
-            raise InputError("--mask needs --classes and --intrinsics beside it.")
+        if mask is None or intrinsics is None:
+            raise InputError("--mask needs --intrinsics beside it, and a PNG --classes, too.")
         # What is answered object by object looks the same from each side of the room.
         sides = 1 if fit == OBJECTS else QUARTERS
         own = read_own_image(mask, classes, intrinsics, prior.label_set, pose, camera_height, sides)
@@ -85,12 +89,18 @@ def reconstruct(
     found = prior.reconstruct(images, fit, restarts)
     if mask is not None:  # the same picture, of each camera that it may be from
         found = [min(found, key=lambda one: one.score)]
+        if len(images) > 1:
+            height_m = found[0].image.eye_m[1]
+            typer.echo(f"Note: a camera {height_m:g} m above the floor fits best.", err=True)
     taken_for = {pair for one in found for pair in one.taken_for.items()}
     for name, other in sorted(taken_for):
         typer.echo(
             f"Note: the run never generates the class {name}; a {other} stands for it.", err=True
         )
-    write_reconstructions(found, out, open_renderer(renderer))
+    artist = open_renderer(renderer)
+    write_reconstructions(found, out, artist)
+    if mask is not None:
+        write_turning(found[0], out, artist)
     typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
 
 

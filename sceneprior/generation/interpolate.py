@@ -1,6 +1,5 @@
 """Rooms on the geodesic between two latents, as scenes, a strip of pictures and an animation."""
 
-import io
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image
 from torch import Tensor
 
 from sceneprior.classes import VOID, class_colors
@@ -17,7 +15,7 @@ from sceneprior.files import write_whole
 from sceneprior.generation.decode import DecodedRoom, decode_rooms
 from sceneprior.generation.sample import Point, latent_of
 from sceneprior.offscreen import Renderer
-from sceneprior.pictures import contact_sheet, png_bytes
+from sceneprior.pictures import contact_sheet, gif_bytes, png_bytes
 from sceneprior.scene import Scene
 from sceneprior.topdown import corner_view, perspective
 from sceneprior.training.method import TrainedPrior
@@ -100,22 +98,10 @@ def strip(
 
 def animation(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bytes:
     """A GIF that goes along the pictures and back, for ever."""
-    # One palette for all pictures: with one each, plain areas would shimmer.
-    samples = Image.fromarray(np.concatenate(pictures))
-    palette = samples.quantize(255, dither=Image.Dither.NONE)
-    frames = [
-        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
-        for picture in pictures
-    ]
-    times = [FRAME_MS] * len(frames)
+    times = [FRAME_MS] * len(pictures)
     times[0] = times[-1] = PAUSE_MS
-    frames, times = frames + frames[-2:0:-1], times + times[-2:0:-1]
-    buffer = io.BytesIO()
-    frames[0].save(
-        buffer, format="GIF", save_all=True, append_images=frames[1:], duration=times, loop=0,
-        optimize=False,
-    )  # fmt: skip
-    return buffer.getvalue()
+    there_and_back = [*pictures, *pictures[-2:0:-1]]
+    return gif_bytes(there_and_back, times + times[-2:0:-1])
 
 
 def write_pictures(

@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,10 @@ LARGEST_ID = 65_535
 def read_class_table(path: Path) -> dict[int, str]:
     """Instance id -> class name, from a JSON or CSV file.
 
-    JSON is an object `{"1": "bed", "2": "chair"}`; CSV has rows `id,class` under a header or none.
+    JSON is an object `{"1": "bed", "2": "chair"}`, or a list as segmenters write it, alone or under
+    `segments_info` or `labels`: `[{"id": 1, "label": "bed", "score": 0.9}, ...]` (the id may be
+    called `value` or `instance_id`, the class `class`, `class_name` or `name`; a row of id 0 is
+    passed over). CSV has rows `id,class` under a header or none.
 
     Raises:
         InputError: it cannot be read; an id is no number from 1 to 65,535, or is there twice.
@@ -50,16 +54,40 @@ def read_class_table(path: Path) -> dict[int, str]:
     return classes
 
 
+_IDS = ("id", "value", "instance_id")
+_NAMES = ("label", "class", "class_name", "name")
+_ROWS = ("segments_info", "labels")
+
+
 def _json_rows(path: Path, content: str) -> Iterable[tuple[str, str]]:
     # As pairs, so that a repeated key is seen.
-    data = json.loads(content, object_pairs_hook=list)
-    if not isinstance(data, list) or not all(
-        isinstance(row, tuple) and isinstance(row[1], str) for row in data
-    ):
+    data = json.loads(content, object_pairs_hook=_Pairs)
+    if isinstance(data, _Pairs) and (listed := [rows for key, rows in data if key in _ROWS]):
+        data = listed[0]
+    if isinstance(data, list) and not isinstance(data, _Pairs):
+        rows = [_listed_row(row) for row in data]
+    elif isinstance(data, _Pairs):
+        rows = [(key.strip(), name) for key, name in data]
+    else:
+        rows = [("", None)]
+    if not all(isinstance(name, str) for _, name in rows):
         raise InputError(
-            f'{path} is not an object of ids and class names, as {{"1": "bed", "2": "chair"}} is.'
+            f'{path} is not an object of ids and class names, as {{"1": "bed", "2": "chair"}} is, '
+            f'nor a list as [{{"id": 1, "label": "bed"}}] is.'
         )
-    return [(key.strip(), name) for key, name in data]
+    return [(key, str(name)) for key, name in rows if isinstance(data, _Pairs) or key != "0"]
+
+
+class _Pairs(list[tuple[str, Any]]):
+    """A JSON object, told from a list."""
+
+
+def _listed_row(row: Any) -> tuple[str, Any]:
+    """(id, class) of a segmenter's row; the class is None where either is missing."""
+    values = dict(row) if isinstance(row, _Pairs) else {}
+    ids = [values[key] for key in _IDS if key in values]
+    names = [values[key] for key in _NAMES if key in values]
+    return (str(ids[0]), names[0]) if ids and names else ("", None)
 
 
 def _csv_rows(content: str) -> Iterable[tuple[str, str]]:

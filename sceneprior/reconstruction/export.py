@@ -9,19 +9,23 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.classes import class_colors, label_set
+from sceneprior.evaluation.page import png_uri
+from sceneprior.evaluation.rooms_page import write_rooms_page
 from sceneprior.files import write_whole
-from sceneprior.generation.export import clear_scenes, write_scene
+from sceneprior.generation.export import PAGE_FILE, clear_scenes, write_scene
 from sceneprior.offscreen import Pinhole, Renderer
-from sceneprior.pictures import paint_ids, png_bytes
+from sceneprior.pictures import gif_bytes, paint_ids, png_bytes
 from sceneprior.reconstruction.image import ObservedImage
 from sceneprior.reconstruction.reconstruct import Reconstruction
 from sceneprior.scene import Scene
-from sceneprior.topdown import object_colors, scene_meshes, topdown, topdown_protocol
+from sceneprior.topdown import object_colors, scene_meshes, topdown, topdown_protocol, turntable
 
 HEIGHT_PX = 360
 """Of each panel; masks are drawn larger or smaller to fit."""
 GAP_PX, LINE_PX = 8, 24
 PAPER, INK, FRAME = (255, 255, 255), (40, 40, 40), (200, 200, 200)
+TURN_MS = 3600
+"""Of the animation, once round."""
 SIGHT_M = 0.8
 """How far the camera's sides are drawn in the plan."""
 
@@ -49,6 +53,22 @@ def write_reconstructions(
         }
         write_whole(Path(folder) / f"{image.name}_seen.png", png_bytes(picture(one, renderer)))
         write_scene(replace(one.scene, extra=extra), folder, image.name, renderer)
+
+
+def write_turning(found: Reconstruction, folder: Path, renderer: Renderer) -> None:
+    """Write `<name>_turning.gif` and `rooms.html` beside what `write_reconstructions` wrote."""
+    name, frames = found.image.name, turntable(found.scene, renderer)
+    gif = gif_bytes(frames, [TURN_MS // len(frames)] * len(frames))
+    write_whole(Path(folder) / f"{name}_turning.gif", gif)
+    seen = png_uri(Image.fromarray(picture(found, renderer)))
+    write_rooms_page(
+        Path(folder) / PAGE_FILE,
+        [found.scene],
+        renderer,
+        title=name,
+        subtitle="A room from the masks of one image",
+        pictures=[("The masks, what was found from the same camera, and from above", seen)],
+    )
 
 
 def picture(found: Reconstruction, renderer: Renderer) -> UInt8[np.ndarray, "height width 3"]:
@@ -117,8 +137,7 @@ def from_above(
     """The plan of the found objects, with the camera and the sides of what it sees."""
     protocol = replace(topdown_protocol(scene.label_set), image_size=(HEIGHT_PX, HEIGHT_PX))
     plan = Image.fromarray(topdown(scene, renderer, protocol, outlines=True))
-    pose = image.world_to_camera.astype(np.float64)
-    turn, eye = pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+    turn, eye = image.world_to_camera[:3, :3].astype(np.float64), image.eye_m
 
     def pixel(point_m: np.ndarray) -> tuple[float, float]:
         x, z = point_m[[0, 2]] / protocol.metres_per_pixel + HEIGHT_PX / 2

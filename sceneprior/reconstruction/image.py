@@ -35,6 +35,11 @@ class ObservedImage:
     rows: tuple[int, ...] = ()
     """Which of the room's tracked objects these are; () where there is no room."""
 
+    @property
+    def eye_m(self) -> Float[np.ndarray, "3"]:
+        """Where the camera stands in the room."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
     def sampled_ids(self, step: int) -> Integer[np.ndarray, "rows columns"]:
         """Every `step`-th instance id, from the middle of a block, as shards are for training."""
         return self.instance_ids[thinned(step)]

@@ -1,21 +1,42 @@
-"""Read a user's own image: a PNG of instance ids, a table of classes, and the camera."""
+"""Read a user's own image: its masks, their classes, and the camera."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.files import read_json
 from sceneprior.geometry.turns import QUARTERS, quarter_rotation
+from sceneprior.instances.coco import read_coco
 from sceneprior.instances.observations import observe
 from sceneprior.instances.pngs import read_mask
-from sceneprior.instances.tables import IdTable, read_class_table
+from sceneprior.instances.tables import IdTable, read_class_table, tidy
 from sceneprior.reconstruction.image import ObservedImage
 from sceneprior.shards import thinned
 
+SAME_CLASS = {
+    "bed": "double bed",
+    "bookcase": "bookshelf",
+    "closet": "wardrobe",
+    "couch": "sofa",
+    "dining chair": "chair",
+    "dining table": "table",
+    "double bed": "bed",
+    "night stand": "nightstand",
+    "nightstand": "night stand",
+    "office chair": "chair",
+    "refrigerator": "refridgerator",
+    "shelf": "shelves",
+    "shelves": "shelf",
+    "single bed": "bed",
+    "tv": "television",
+}
+"""A class of other data sets (COCO, ADE20K) that a label set lacks -> what it may have instead."""
 CAMERA_HEIGHTS_M = (1.0, 1.2, 1.4, 1.6, 1.8)
 """Of a camera whose pose is not given: someone who sits, to someone who stands."""
 LARGEST_PX = 640
@@ -39,22 +60,32 @@ class OwnImage(NamedTuple):
 
 def read_own_image(
     mask: Path,
-    classes: Path,
+    classes: Path | None,
     intrinsics: str,
-    label_set: str,
+    label_set_name: str,
     pose: Path | None = None,
     camera_height_m: float | None = None,
     sides: int = QUARTERS,
 ) -> OwnImage:
-    """Read an image's masks (`read_mask`, `read_class_table`) and camera (`read_intrinsics`;
-    `read_pose`, or `level_camera` without one, of the given height or of `CAMERA_HEIGHTS_M` and of
-    so many `sides`). Classes outside the run's label set are void.
+    """Read an image's masks (a PNG and its table of classes: `read_mask`, `read_class_table`; or
+    COCO's JSON, which has both: `read_coco`) and camera (`read_intrinsics`; `read_pose`, or
+    `level_camera` without one, of the given height or of `CAMERA_HEIGHTS_M` and of so many
+    `sides`). Classes outside the run's label set are taken for those of `SAME_CLASS`, or void.
 
     Raises:
-        InputError: a file cannot be used, the sizes differ, or no object is seen.
+        InputError: a file cannot be used or is missing, the sizes differ, or no object is seen.
     """
-    values = read_mask(mask)
-    table = IdTable(read_class_table(classes), label_set, str(classes))
+    if mask.suffix.lower() == ".json":
+        if classes is not None:
+            raise InputError(f"{mask} has its classes in itself; leave out --classes {classes}.")
+        values, of_id = read_coco(mask)
+        classes = mask
+    elif classes is None:
+        raise InputError(f"{mask} needs --classes: a table of the class of each of its values.")
+    else:
+        values, of_id = read_mask(mask), read_class_table(classes)
+    of_id, notes = _known_by_another_name(of_id, label_set_name)
+    table = IdTable(of_id, label_set_name, str(classes))
     camera = read_intrinsics(intrinsics, values.shape)
     step = -(-max(values.shape) // LARGEST_PX)
     seen = observe(table.ids(values[thinned(step)])[None], table.classes)
@@ -66,7 +97,7 @@ def read_own_image(
             f"{mask} shows no object: none of its masks is of a class of the run and wider than "
             f"4 pixels. Its values are {_some(np.unique(values))}; {classes} says what they are."
         )
-    notes = list(table.notes)
+    notes += table.notes
     if table.unlisted:
         notes.append(
             f"{mask} has values that {classes} does not list, taken for void: "
@@ -85,7 +116,7 @@ def read_own_image(
     images = [
         ObservedImage(
             name=mask.stem,
-            label_set=label_set,
+            label_set=label_set_name,
             object_class=seen.object_class.astype(np.int64),
             instance_ids=seen.instance_ids[0],
             boxes=seen.boxes[0],
@@ -96,6 +127,23 @@ def read_own_image(
         for world_to_camera in poses
     ]
     return OwnImage(images, notes)
+
+
+def _known_by_another_name(
+    of_id: dict[int, str], label_set_name: str
+) -> tuple[dict[int, str], list[str]]:
+    """The classes as the label set calls them, and what was taken for what."""
+    known = {tidy(name) for name in label_set(label_set_name)}
+    taken: Counter[tuple[str, str]] = Counter()
+    for key, name in of_id.items():
+        other = SAME_CLASS.get(tidy(name))
+        if tidy(name) not in known and other in known:
+            taken[name, other] += 1
+            of_id = of_id | {key: other}
+    return of_id, [
+        f"the label set has no class {name}: taken for {other} ({count})"
+        for (name, other), count in sorted(taken.items())
+    ]
 
 
 def _some(values: Sequence[int] | np.ndarray) -> str:

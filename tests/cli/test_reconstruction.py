@@ -72,7 +72,12 @@ def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):
     status, out, errors = command(*call, "--pose", "pose.json", "--out", "posed")
     assert (status, out) == (0, "Wrote 1 room to posed\n"), errors
     assert "without --pose" not in errors and "sofa" not in errors
-    assert {path.name for path in (tmp_path / "posed").iterdir()} == files_of("mine")
+    made = {"mine_turning.gif", "rooms.html"}
+    assert {path.name for path in (tmp_path / "posed").iterdir()} == files_of("mine") | made
+    gif = Image.open(tmp_path / "posed" / "mine_turning.gif")
+    assert (gif.n_frames, gif.size, gif.info["duration"]) == (36, (320, 240), 100)
+    page = (tmp_path / "posed" / "rooms.html").read_text()
+    assert page.count("<model-viewer ") == 1 and "what was found from the same camera" in page
     status, _, errors = command(*call, *PAPER, "--out", "level", "--camera-height", 1.4)
     assert status == 0 and "Note: without --pose the camera is level, 1.4 m above" in errors
     extra = json.loads((tmp_path / "level" / "mine.json").read_text())["extra"]
@@ -82,8 +87,27 @@ def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):
     assert "Note: the run never generates the class sofa; a " in errors
     status, _, errors = command(*call, "--out", "heights")
     assert status == 0 and "is level, 1 or 1.2 or 1.4 or 1.6 or 1.8 m above the floor" in errors
+    assert re.search(r"Note: a camera 1(\.[2468])? m above the floor fits best\.", errors)
     pose = np.array(extra["world_to_camera"])
     assert (-pose[:3, :3].T @ pose[:3, 3])[1] == pytest.approx(1.4)
+
+
+def test_one_object_at_the_border_is_answered(command, toy_run, own, tmp_path):
+    """A defined answer: one object, of the mask's class, however much of it the border hides."""
+    ids = np.zeros((72, 96), np.uint8)
+    ids[30:50, 80:] = 1
+    Image.fromarray(ids).save(tmp_path / "mine.png")
+    call = ["reconstruct", "--run", toy_run, *own, "--pose", "pose.json", "--out", "one", *SOFT]
+    status, out, errors = command(*call)
+    assert (status, out) == (0, "Wrote 1 room to one\n"), errors
+    label = (tmp_path / "classes.csv").read_text().splitlines()[1].split(",")[1]
+    (item,) = json.loads((tmp_path / "one" / "mine.json").read_text())["objects"]
+    assert item["class"] == label
+    upside_down = json.loads((tmp_path / "pose.json").read_text())["world_to_camera"]
+    flipped = (np.diag([1, -1, -1, 1]) @ np.array(upside_down)).tolist()
+    (tmp_path / "pose.json").write_text(json.dumps({"world_to_camera": flipped}))
+    said = one_sentence(command(*call, "--overwrite"))
+    assert "The camera of pose.json is upside down" in said
 
 
 def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_path):
@@ -96,7 +120,8 @@ def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_pat
         (shards, way),
         ([*shards, "--room", "toy/test_00", "--split", "test"], way),
         ([*shards, *own], way),
-        (own[:2], "--mask needs --classes and --intrinsics beside it."),
+        (own[:2], "--mask needs --intrinsics beside it, and a PNG --classes, too."),
+        ([*own[:2], *own[4:]], "mine.png needs --classes: a table of the class"),
         ([*shards, "--room", "attic"], "holds no room 'attic'"),
         ([*shards, "--room", "toy/test_00", "--view", 8], "has no view 8; its 8 views are 0 to 7."),
         ([*shards, "--split", "test", "--fit", "slow"], "No fit is called 'slow'"),

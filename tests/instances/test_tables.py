@@ -52,3 +52,25 @@ def test_a_table_without_any_class_of_the_set():
         InputError, match=r"here: none of its classes \(teapot\) is in the label set"
     ):
         IdTable({1: "teapot"}, "front3d_bedroom", "here")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[{"id": 1, "label": "bed", "score": 0.9}, {"id": 7, "label": "chair"}]',
+        '[{"value": 0, "label": "background"}, {"value": 1, "label": "bed"}, '
+        '{"value": 7, "label": "chair"}]',
+        '{"segments_info": [{"id": 1, "class_name": "bed"}, {"id": 7, "class_name": "chair"}]}',
+        '{"mask_name": "a.npy", "labels": {"1": "bed", "7": "chair"}}',
+    ],
+)
+def test_tables_as_segmenters_write_them(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    assert read_class_table(tmp_path / "a.json") == {1: "bed", 7: "chair"}
+
+
+def test_rows_of_segmenters_that_name_no_class(tmp_path):
+    for text in ('[{"id": 1, "category_id": 3}]', '[{"label": "bed"}]', '[{"id": 1, "label": 3}]'):
+        (tmp_path / "a.json").write_text(text)
+        with pytest.raises(InputError, match="is not an object of ids and class names"):
+            read_class_table(tmp_path / "a.json")

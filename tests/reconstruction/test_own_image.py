@@ -8,9 +8,11 @@ from PIL import Image
 
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
+from sceneprior.instances.tables import tidy
 from sceneprior.reconstruction.image import images_of_split
 from sceneprior.reconstruction.own_image import (
     CAMERA_DISTANCE_M,
+    SAME_CLASS,
     level_camera,
     read_intrinsics,
     read_own_image,
@@ -195,3 +197,62 @@ def test_large_pictures_are_thinned(own, seen, tmp_path):
     assert image.instance_ids.shape == (360, 480)
     np.testing.assert_allclose(image.intrinsics, np.diag([5, 5, 1]) @ small.intrinsics)
     np.testing.assert_array_equal(image.instance_ids[2::5, 2::5], small.instance_ids)
+
+
+def test_coco_says_the_same_as_a_png_and_its_table(own, seen, tmp_path):
+    mask, classes, pose = own
+    names = label_set(LABELS)
+    rows = []
+    for k, index in enumerate(seen.object_class.tolist()):
+        counts, before = [0], False
+        for pixel in (seen.instance_ids == k + 1).T.ravel().tolist():
+            if pixel != before:
+                counts.append(0)
+                before = pixel
+            counts[-1] += 1
+        segmentation = {"size": list(seen.instance_ids.shape), "counts": counts}
+        rows.append({"image_id": 3, "category_id": index, "segmentation": segmentation})
+    height, width = seen.instance_ids.shape
+    data = {
+        "images": [{"id": 3, "height": height, "width": width}],
+        "categories": [{"id": index, "name": name} for index, name in enumerate(names)],
+        "annotations": rows,
+    }
+    coco = tmp_path / "coco.json"
+    coco.write_text(json.dumps(data))
+    (image,) = read_own_image(coco, None, INTRINSICS, LABELS, pose).images
+    np.testing.assert_array_equal(image.instance_ids, seen.instance_ids)
+    np.testing.assert_array_equal(image.object_class, seen.object_class)
+    with pytest.raises(InputError, match="has its classes in itself; leave out --classes"):
+        read_own_image(coco, classes, INTRINSICS, LABELS, pose)
+    with pytest.raises(InputError, match=r"mask\.png needs --classes: a table of the class"):
+        read_own_image(mask, None, INTRINSICS, LABELS, pose)
+
+
+def test_classes_under_another_name_are_taken_for_the_label_sets(own):
+    mask, classes, pose = own
+    table = json.loads(classes.read_text())
+    table = dict(zip(table, ["couch", "Bed", "hat", *list(table.values())[3:]], strict=False))
+    classes.write_text(json.dumps(table))
+    read = read_own_image(mask, classes, INTRINSICS, LABELS, pose)
+    assert read.notes[:2] == [
+        "the label set has no class Bed: taken for double bed (1)",
+        "the label set has no class couch: taken for sofa (1)",
+    ]
+    assert read.notes[2:] == ["classes outside the label set are void: hat (1)"] * (len(table) > 2)
+    names = label_set(LABELS)
+    found = [names[index] for index in read.images[0].object_class]
+    assert found[:2] == ["sofa", "double_bed"]
+    known = {tidy(name) for each in (LABELS, "scannet") for name in label_set(each)}
+    assert set(SAME_CLASS.values()) <= known
+
+
+def test_one_object_at_the_border(own, tmp_path):
+    """Its side there is not clear: it may go on beyond."""
+    mask, classes, pose = own
+    ids = np.zeros((72, 96), np.uint8)
+    ids[30:50, 80:] = 10
+    Image.fromarray(ids).save(mask)
+    (image,) = read_own_image(mask, classes, INTRINSICS, LABELS, pose).images
+    assert len(image.object_class) == 1
+    np.testing.assert_allclose(image.boxes[0], [80 / 96, 30 / 72, 1, 50 / 72])
