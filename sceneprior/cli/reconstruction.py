@@ -41,6 +41,10 @@ def reconstruct(
         float | None,
         typer.Option(min=0.1, help="Metres above the floor, without --pose (several are tried)."),
     ] = None,
+    gravity: Annotated[
+        str | None,
+        typer.Option(help="Where things fall in its camera's axes, without --pose: x,y,z."),
+    ] = None,
     fit: FitOption = "objects",
     restarts: RestartsOption = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of drawn views.")] = 0,
@@ -65,8 +69,10 @@ def reconstruct(
             "Say what to reconstruct from, in one way: --shards with --room (and --view) or with "
             "--split; or --mask with --intrinsics (and --classes)."
         )
-    if mask is None and any(given is not None for given in (classes, intrinsics, pose)):
-        raise InputError("--classes, --intrinsics and --pose belong to --mask.")
+    if mask is None and any(given is not None for given in (classes, intrinsics, pose, gravity)):
+        raise InputError("--classes, --intrinsics, --pose and --gravity belong to --mask.")
+    if pose is not None and gravity is not None:
+        raise InputError("--pose says where things fall, too; leave out --gravity.")
     if (limit is not None and split is None) or (view and room is None):
         raise InputError("--limit belongs to --split, and --view to --room.")
     check_free(out, overwrite)
@@ -77,7 +83,9 @@ def reconstruct(
             raise InputError("--mask needs --intrinsics beside it, and a PNG --classes, too.")
         # What is answered object by object looks the same from each side of the room.
         sides = 1 if fit == OBJECTS else QUARTERS
-        own = read_own_image(mask, classes, intrinsics, prior.label_set, pose, camera_height, sides)
+        own = read_own_image(
+            mask, classes, intrinsics, prior.label_set, pose, camera_height, sides, gravity
+        )
         images, notes = list(own.images), [f"{note}." for note in own.notes]
     elif room is not None:
         images = [image_from_shards(shards, room, view)]

@@ -26,6 +26,8 @@ GAP_PX, LINE_PX = 8, 24
 PAPER, INK, FRAME = (255, 255, 255), (40, 40, 40), (200, 200, 200)
 TURN_MS = 3600
 """Of the animation, once round."""
+MARGIN_M = 0.3
+"""Round the camera in the plan, at least."""
 SIGHT_M = 0.8
 """How far the camera's sides are drawn in the plan."""
 
@@ -135,9 +137,13 @@ def from_above(
     scene: Scene, image: ObservedImage, renderer: Renderer
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The plan of the found objects, with the camera and the sides of what it sees."""
-    protocol = replace(topdown_protocol(scene.label_set), image_size=(HEIGHT_PX, HEIGHT_PX))
-    plan = Image.fromarray(topdown(scene, renderer, protocol, outlines=True))
     turn, eye = image.world_to_camera[:3, :3].astype(np.float64), image.eye_m
+    reach_m = [np.abs(scene.centers_m) + scene.sizes_m / 2, np.abs(eye) + MARGIN_M]
+    widest_m = 2 * float(np.concatenate([part.reshape(-1, 3) for part in reach_m])[:, [0, 2]].max())
+    protocol = topdown_protocol(scene.label_set)
+    window_m = max(protocol.window_m, widest_m)  # people want to see all of it
+    protocol = replace(protocol, image_size=(HEIGHT_PX, HEIGHT_PX), window_m=window_m)
+    plan = Image.fromarray(topdown(scene, renderer, protocol, outlines=True))
 
     def pixel(point_m: np.ndarray) -> tuple[float, float]:
         x, z = point_m[[0, 2]] / protocol.metres_per_pixel + HEIGHT_PX / 2

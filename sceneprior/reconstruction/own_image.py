@@ -66,11 +66,13 @@ def read_own_image(
     pose: Path | None = None,
     camera_height_m: float | None = None,
     sides: int = QUARTERS,
+    gravity: str | None = None,
 ) -> OwnImage:
     """Read an image's masks (a PNG and its table of classes: `read_mask`, `read_class_table`; or
     COCO's JSON, which has both: `read_coco`) and camera (`read_intrinsics`; `read_pose`, or
-    `level_camera` without one, of the given height or of `CAMERA_HEIGHTS_M` and of so many
-    `sides`). Classes outside the run's label set are taken for those of `SAME_CLASS`, or void.
+    `level_camera` without one, `tilted` by `read_gravity`, of the given height or of
+    `CAMERA_HEIGHTS_M` and of so many `sides`). Classes outside the run's label set are taken for
+    those of `SAME_CLASS`, or void.
 
     Raises:
         InputError: a file cannot be used or is missing, the sizes differ, or no object is seen.
@@ -107,10 +109,12 @@ def read_own_image(
         heights_m = CAMERA_HEIGHTS_M if camera_height_m is None else (camera_height_m,)
         told = " or ".join(f"{height_m:g}" for height_m in heights_m)
         notes.append(
-            f"without --pose the camera is level, {told} m above the floor (what fits best is "
-            f"kept) and {CAMERA_DISTANCE_M:g} m from the middle of the room, which it looks at"
+            f"without --pose the camera is {'level' if gravity is None else 'tilted as given'}, "
+            f"{told} m above the floor (what fits best is kept) and {CAMERA_DISTANCE_M:g} m from "
+            "the middle of the room, which it faces"
         )
-        poses = [level_camera(height, side) for height in heights_m for side in range(sides)]
+        tilt = np.eye(4) if gravity is None else tilted(read_gravity(gravity))
+        poses = [tilt @ level_camera(height, side) for height in heights_m for side in range(sides)]
     else:
         poses = [read_pose(pose)]
     images = [
@@ -159,6 +163,48 @@ def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turn.T  # OpenCV: y down, z into the room
     pose[:3, 3] = -pose[:3, :3] @ eye
+    return pose
+
+
+def read_gravity(text: str) -> np.ndarray:
+    """The direction in which things fall, of length 1, in camera axes (x right, y down, z forward).
+
+    Args:
+        text: `x,y,z`, of any length, as a phone's accelerometer or a horizon detector gives it.
+
+    Raises:
+        InputError: these are no three finite numbers, or the camera is upside down.
+    """
+    try:
+        down = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        down = np.zeros(0)
+    if down.shape != (3,) or not np.isfinite(down).all() or not down.any():
+        raise InputError(
+            f"--gravity {text} is no direction; expected x,y,z in camera axes (x right, y down, z "
+            "forward): 0,1,0 of a level camera, 0,0.9,0.4 of one that looks down a little."
+        )
+    down = down / np.linalg.norm(down)
+    if down[1] < -UPSIDE_DOWN:
+        raise InputError(
+            f"--gravity {text} points up in the image: the camera is upside down. Expected camera "
+            "axes x right, y down, z forward."
+        )
+    return down
+
+
+def tilted(down: np.ndarray) -> np.ndarray:
+    """(4, 4), to be put after a level camera's pose: the least turn after which `down`, a unit
+    vector, is where things fall.
+
+    >>> (tilted(np.array([0.0, 0.6, 0.8]))[:3, :3] @ [0, 1, 0]).round(6).tolist()
+    [0.0, 0.6, 0.8]
+    """
+    x, y, z = down
+    # Rodrigues' formula for the turn of (0, 1, 0) to `down` about their common normal, (z, 0, -x).
+    cross = np.array([[0, x, 0], [-x, 0, -z], [0, z, 0]])
+    pose = np.eye(4)
+    pose[:3, :3] += cross + cross @ cross / (1 + y)
     return pose
 
 

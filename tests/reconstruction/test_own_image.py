@@ -14,9 +14,11 @@ from sceneprior.reconstruction.own_image import (
     CAMERA_DISTANCE_M,
     SAME_CLASS,
     level_camera,
+    read_gravity,
     read_intrinsics,
     read_own_image,
     read_pose,
+    tilted,
 )
 
 LABELS = "front3d_bedroom"
@@ -197,6 +199,30 @@ def test_large_pictures_are_thinned(own, seen, tmp_path):
     assert image.instance_ids.shape == (360, 480)
     np.testing.assert_allclose(image.intrinsics, np.diag([5, 5, 1]) @ small.intrinsics)
     np.testing.assert_array_equal(image.instance_ids[2::5, 2::5], small.instance_ids)
+
+
+def test_gravity_tilts_the_camera_where_it_stands(own):
+    mask, classes, _ = own
+    read = read_own_image(
+        mask, classes, INTRINSICS, LABELS, camera_height_m=1.5, sides=1, gravity="0.2,3,0.8"
+    )
+    assert read.notes[0].startswith("without --pose the camera is tilted as given, 1.5 m above")
+    (image,) = read.images
+    np.testing.assert_allclose(image.eye_m, [0, 1.5, CAMERA_DISTANCE_M], atol=1e-12)
+    down = np.array([0.2, 3, 0.8]) / np.linalg.norm([0.2, 3, 0.8])
+    np.testing.assert_allclose(image.world_to_camera[:3, :3] @ [0, -1, 0], down, atol=1e-12)
+    turn = image.world_to_camera[:3, :3]
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1)
+    np.testing.assert_array_equal(tilted(np.array([0.0, 1.0, 0.0])), np.eye(4))
+
+
+@pytest.mark.parametrize("text", ["down", "0,1", "0,0,0", "0,nan,1", "0,1,0,0"])
+def test_gravity_that_is_no_direction(text):
+    with pytest.raises(InputError, match="is no direction; expected x,y,z in camera axes"):
+        read_gravity(text)
+    with pytest.raises(InputError, match="points up in the image: the camera is upside down"):
+        read_gravity("0,-1,0")
 
 
 def test_coco_says_the_same_as_a_png_and_its_table(own, seen, tmp_path):
