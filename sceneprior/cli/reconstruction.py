@@ -45,7 +45,7 @@ def reconstruct(
     renderer: RendererOption = "auto",
 ) -> None:
     """Reconstruct rooms from the instance masks of single images: JSON, GLB and pictures."""
-    from sceneprior.config import load_run
+    from sceneprior.config import load_any_run
     from sceneprior.errors import InputError
     from sceneprior.generation.export import check_free
     from sceneprior.geometry.turns import QUARTERS
@@ -67,7 +67,7 @@ def reconstruct(
         raise InputError("--limit belongs to --split, and --view to --room.")
     check_free(out, overwrite)
     options = FitOptions(fit, restarts)
-    trained = load_run(run, checkpoint)
+    trained = load_any_run(run, checkpoint)
     notes = []
     if shards is None:
         if mask is None or classes is None or intrinsics is None:
@@ -109,6 +109,10 @@ def eval_svr(
     ] = None,
     fit: FitOption = "objects",
     restarts: RestartsOption = 1,
+    models: Annotated[
+        Path | None,
+        typer.Option(help="Also with CAD models: 3D-FUTURE-model, a folder like it, or shards."),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the views and random rooms.")] = 0,
     checkpoint: CheckpointOption = "final",
     renderer: RendererOption = "auto",
@@ -127,12 +131,13 @@ def eval_svr(
     protocol = SvrProtocol(shards, split, seed, renderer)
     if run is not None and scenes is None:
         options = FitOptions(fit, restarts)
-        target, scores = run, evaluate_run(run, protocol, options, limit, checkpoint)
+        target = run
+        scores = evaluate_run(run, protocol, options, limit, checkpoint, models)
     elif scenes is not None and run is None:
-        if (limit, fit, restarts, checkpoint) != (None, "objects", 1, "final"):
+        if (limit, fit, restarts, checkpoint, models) != (None, "objects", 1, "final", None):
             raise InputError(
-                "--limit, --checkpoint, --fit and --restarts belong to --run; scenes are evaluated "
-                "as they are."
+                "--limit, --checkpoint, --fit, --restarts and --models belong to --run; scenes are "
+                "evaluated as they are."
             )
         target, scores = scenes, evaluate_scenes(scenes, protocol)
     else:
