@@ -119,7 +119,7 @@ class Prior:
         Raises:
             InputError: other classes than the prior's, or it keeps no latents of training rooms.
         """
-        return reconstruct(self.with_latents, images, FitOptions(fit, restarts))
+        return reconstruct(self.trained, images, FitOptions(fit, restarts))
 
     def latent(self, point: Point) -> Float[Tensor, " dimension"]:
         """The latent that an end of `interpolate` is; an `InputError` where it is none."""

@@ -13,13 +13,21 @@ from sceneprior.baselines.atiss.stage import AtissConfig
 from sceneprior.baselines.atiss2d import Atiss2dConfig
 from sceneprior.baselines.gan.stage import GanConfig
 from sceneprior.baselines.lstm import LstmConfig
+from sceneprior.baselines.single_view.im3d import Im3dConfig
+from sceneprior.baselines.single_view.total3d import Total3dConfig
+from sceneprior.baselines.single_view.usl import UslConfig
 from sceneprior.baselines.sync2gen.stage import Sync2genConfig
 from sceneprior.errors import ConfigError, InputError
 from sceneprior.models.prior import ModelConfig
 from sceneprior.models.transformer import TransformerConfig
 from sceneprior.settings import check_settings, read_settings
 from sceneprior.training.checkpoints import find_checkpoint
-from sceneprior.training.method import RunConfig, Trained, TrainedPrior, TrainedSampler
+from sceneprior.training.method import (
+    RunConfig,
+    Trained,
+    TrainedPrior,
+    TrainedReconstructor,
+)
 from sceneprior.training.ours import PaperConfig
 
 
@@ -40,6 +48,9 @@ METHODS: dict[str, type[RunConfig]] = {
     "gan": GanConfig,
     "atiss": AtissConfig,
     "sync2gen": Sync2genConfig,
+    "usl": UslConfig,
+    "total3d": Total3dConfig,
+    "im3d": Im3dConfig,
 }
 """The config of each method, by the value of its key `method`."""
 
@@ -73,7 +84,7 @@ def check_config(data: dict[str, Any], source: str) -> RunConfig:
 def load_any_run(run: Path | str, checkpoint: str = "final") -> Trained:
     """What a run of any method trained, in evaluation mode; `checkpoint` as in `find_checkpoint`.
 
-    For tasks that only want new rooms (`generation.decode.synthesize`).
+    For tasks that do with less than a latent space: they ask what kind of `Trained` it is.
 
     Raises:
         InputError: the folder is no run, or its checkpoint is missing or damaged.
@@ -94,11 +105,14 @@ def load_run(run: Path | str, checkpoint: str = "final") -> TrainedPrior:
 
 def with_latents(trained: Trained, run: Path | str) -> TrainedPrior:
     """The same; an InputError where it is a baseline's, which has no latent space."""
-    if isinstance(trained, TrainedSampler):
+    if not isinstance(trained, TrainedPrior):
+        works = "synthesize`, `eval-fid` and `report"
+        if isinstance(trained, TrainedReconstructor):
+            works = "reconstruct` and `eval-svr"
         raise InputError(
             f"{run} is a run of `method: {trained.config.method}`, which has no latent space of "
             "rooms, and this needs one. Take a run of `method: ours`; with this one, `sceneprior "
-            "synthesize`, `eval-fid` and `report` work."
+            f"{works}` work."
         )
     return trained
 

@@ -152,8 +152,8 @@ def test_a_variant_without_its_section_is_a_sentence(config):
 
 
 def test_a_method_that_does_not_exist_and_a_config_of_before_are_sentences(config):
-    assert refusal(config, "method=usl") == (
-        f"{config}: no method is called 'usl'; choose from {', '.join(METHODS)}."
+    assert refusal(config, "method=nerf") == (
+        f"{config}: no method is called 'nerf'; choose from {', '.join(METHODS)}."
     )
     assert "no method is called '['a']'" in refusal(config, "method=[a]")
     replaced(config, "method: ours", "stages: two")

@@ -91,6 +91,21 @@ TINY_BASELINES: dict[str, dict[str, Any]] = {
         "model": {"width": 32, "latent": 8, "slots": 2, "refine_steps": 5},
         "training": {"epochs": 6, "batch_size": 5, "learning_rate": 3e-3},
     },
+    "usl": {
+        "model": {
+            "width": 16,
+            "shape": {"width": 8, "level": 1, "template": "box", "fit_box": True},
+        },
+        "training": {"epochs": 2, "batch_size": 6},
+    },
+    "total3d": {
+        "model": {"width": 16, "heads": 2, "shape": {"width": 8, "level": 1}},
+        "training": {"epochs": 2, "batch_size": 6},
+    },
+    "im3d": {
+        "model": {"width": 16, "heads": 2, "rounds": 2, "blobs": 8},
+        "training": {"epochs": 2, "batch_size": 6, "points": 32},
+    },
 }
 
 

@@ -22,7 +22,7 @@ def _stopped_by_ctrl_c() -> Iterator[None]:
 
 def compare(
     config: Annotated[
-        str, typer.Option(help="A comparison, such as compare_front_small.yaml.")
+        str, typer.Option(help="compare_front_small.yaml, compare_svr.yaml or your own.")
     ] = "compare_front_small.yaml",
     out: Annotated[Path, typer.Option(help="Folder for runs, tables and pictures.")] = Path(
         "out/compare"
@@ -36,9 +36,9 @@ def compare(
     renderer: RendererOption = "auto",
 ) -> None:
     """Train, evaluate and tabulate methods on the same rooms; run again to go on."""
-    from sceneprior.experiments.compare import CompareOptions
     from sceneprior.experiments.compare import compare as run_comparison
     from sceneprior.experiments.comparison import load_comparison, part_of
+    from sceneprior.experiments.task import CompareOptions
 
     comparison = load_comparison(config)
     part = part_of(comparison, methods, rooms, seeds)

@@ -125,6 +125,10 @@ def eval_svr(
     ] = None,
     fit: FitOption = "objects",
     restarts: RestartsOption = 1,
+    models: Annotated[
+        Path | None,
+        typer.Option(help="Also with CAD models: 3D-FUTURE-model, a folder like it, or shards."),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the views and random rooms.")] = 0,
     checkpoint: CheckpointOption = "final",
     renderer: RendererOption = "auto",
@@ -143,12 +147,13 @@ def eval_svr(
     protocol = SvrProtocol(shards, split, seed, renderer)
     if run is not None and scenes is None:
         options = FitOptions(fit, restarts)
-        target, scores = run, evaluate_run(run, protocol, options, limit, checkpoint)
+        target = run
+        scores = evaluate_run(run, protocol, options, limit, checkpoint, models)
     elif scenes is not None and run is None:
-        if (limit, fit, restarts, checkpoint) != (None, "objects", 1, "final"):
+        if (limit, fit, restarts, checkpoint, models) != (None, "objects", 1, "final", None):
             raise InputError(
-                "--limit, --checkpoint, --fit and --restarts belong to --run; scenes are evaluated "
-                "as they are."
+                "--limit, --checkpoint, --fit, --restarts and --models belong to --run; scenes are "
+                "evaluated as they are."
             )
         target, scores = scenes, evaluate_scenes(scenes, protocol)
     else:

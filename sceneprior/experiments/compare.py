@@ -1,36 +1,27 @@
 """Trains and evaluates the runs of a comparison, and writes its tables and pictures.
 
-A run is a `fit` and an `eval-fid` for each distribution of latents; what is done is kept.
+A run is a `fit` and the commands that score it; what is done is kept.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass
 from pathlib import Path
 
-from sceneprior.config import load_any_run, load_config
+from sceneprior.config import load_config
 from sceneprior.errors import InputError
 from sceneprior.evaluation.networks import check_inception
-from sceneprior.experiments.comparison import Comparison, Run, distributions_of, runs_of
-from sceneprior.experiments.figure import write_figure
-from sceneprior.experiments.steps import Step, is_done, open_runner, read_journal, read_result
-from sceneprior.experiments.table import Row, write_tables
+from sceneprior.experiments.comparison import (
+    Comparison,
+    RoomComparison,
+    Run,
+    ViewComparison,
+    runs_of,
+)
+from sceneprior.experiments.new_rooms import NewRooms
+from sceneprior.experiments.single_views import SingleViews
+from sceneprior.experiments.steps import Step, is_done, open_runner
+from sceneprior.experiments.table import write_tables
+from sceneprior.experiments.task import CompareOptions, Task
 from sceneprior.offscreen import open_renderer
-from sceneprior.shards import iterate_rooms
-from sceneprior.training.checkpoints import read_checkpoint
-
-
-@dataclass(frozen=True)
-class CompareOptions:
-    """How all runs of a comparison are trained and evaluated."""
-
-    renderer: str = "auto"
-    inception: Path | None = None
-    """NVIDIA's `inception-2015-12-05.pt`; None leaves FID out."""
-    accelerator: str = "auto"
-    """That trains the runs, one device each: Lightning's word."""
-    jobs: int = 1
-    """Runs at a time."""
 
 
 @dataclass(frozen=True)
@@ -63,14 +54,7 @@ def compare(
         check_inception(options.inception)
     renderer = open_renderer(options.renderer)
 
-    @cache
-    def count(rooms: str) -> int:
-        """How many rooms each run generates."""
-        shards = Path(load_config(comparison.rooms[rooms].config).data.shards)
-        return comparison.count or sum(1 for _ in iterate_rooms(shards, "train"))
-
-    def scoring(run: Run) -> list[Step]:
-        return scoring_steps(comparison, run, count(run.rooms), options)
+    task = task_of(comparison, options)
 
     def train_and_evaluate(run: Run) -> str | None:
         try:
@@ -79,7 +63,7 @@ def compare(
                     f"{run.folder} holds a run of other settings than the comparison now asks "
                     "for; delete it to train anew, or name another --out."
                 )
-            for step in (training_step(run, options), *scoring(run)):
+            for step in (training_step(run, options), *task.scoring(run)):
                 if not is_done(step, run.folder):
                     runner.do(step, run.folder, run.folder / f"{step.name}.log")
         except InputError as error:
@@ -90,7 +74,7 @@ def compare(
         return None
 
     for rooms in part.rooms:
-        count(rooms)
+        task.check(rooms)
     with open_runner(out, options.jobs) as runner:
         failures = list(runner.pool.map(train_and_evaluate, runs_of(part, out)))
         evaluated = [
@@ -99,21 +83,30 @@ def compare(
             if (run.folder / "scores.json").is_file()
             and keeps_settings(run)
             and is_done(training_step(run, options), run.folder)
-            and is_done(scoring(run)[0], run.folder, as_asked=False)
+            and is_done(task.scoring(run)[0], run.folder, as_asked=False)
         ]
-        done = [run for run in evaluated if all(is_done(step, run.folder) for step in scoring(run))]
+        done = [
+            run for run in evaluated if all(is_done(step, run.folder) for step in task.scoring(run))
+        ]
         if done:
-            rows = [_rows(comparison, run, [step.result for step in scoring(run)]) for run in done]
-            write_tables([row for rows_of_run in rows for row in rows_of_run], out)
+            write_tables([row for run in done for row in task.rows(run)], out, task.form)
         for key in comparison.rooms:
             first = {run.method: run for run in reversed(done) if run.rooms == key}
             if own := [first[method] for method in comparison.methods if method in first]:
-                write_figure(comparison, own, count(key), out / f"{key}.png", renderer)
+                task.draw(key, own, out / f"{key}.png", renderer)
     return Compared(
         out / "table.md" if done else None,
         [failure for failure in failures if failure],
         [run.title for run in evaluated if run not in done],
     )
+
+
+def task_of(comparison: Comparison, options: CompareOptions) -> Task:
+    """How the runs of a comparison are scored."""
+    if isinstance(comparison, ViewComparison):
+        return SingleViews(comparison, options)
+    assert isinstance(comparison, RoomComparison), "one of TASKS"
+    return NewRooms(comparison, options)
 
 
 def training_step(run: Run, options: CompareOptions) -> Step:
@@ -134,27 +127,6 @@ def training_step(run: Run, options: CompareOptions) -> Step:
     )  # fmt: skip
 
 
-def scoring_steps(
-    comparison: Comparison, run: Run, count: int, options: CompareOptions
-) -> list[Step]:
-    """`eval-fid` of a trained run, once for each distribution of its latents.
-
-    They depend on what the rows of one table have in common.
-    """
-    weights = [] if options.inception is None else ["--inception", str(options.inception)]
-    # Some methods decode meshes and some have boxes alone: --boxes compares what all have.
-    alike = ["-n", str(count), "--seed", str(comparison.sampling_seed), "--boxes"]
-    alike += ["--renderer", options.renderer, *weights]
-    steps = []
-    for number, distribution in enumerate(distributions_of(comparison, run)):
-        name = f"scores_{distribution}" if number else "scores"
-        scores = run.folder / f"{name}.json"
-        asked = alike if distribution is None else [*alike, "--distribution", distribution]
-        paths = ["--run", str(run.folder / "run"), "--out", str(scores)]
-        steps.append(Step(name, ["eval-fid", *paths, *asked], result=scores, depends_on=asked))
-    return steps
-
-
 def keeps_settings(run: Run) -> bool:
     """Whether a run's folder is free, or holds a run of the settings that are wanted now."""
     saved = run.folder / "run" / "config.yaml"
@@ -165,48 +137,3 @@ def keeps_settings(run: Run) -> bool:
         return load_config(str(saved)) == wanted
     except InputError:
         return False  # of another version, or damaged
-
-
-def costs_of(run: Run) -> dict[str, float | None]:
-    """What training took: `cpu_s`, `steps` and `parameters`.
-
-    CPU seconds are None where training was killed on the way, or done by hand: nobody knows.
-    """
-    steps = 0
-    for final in (run.folder / "run").glob("*/final.ckpt"):
-        saved = read_checkpoint(final)
-        # Lightning counts updates; two networks that train each other make two a batch.
-        steps += saved["global_step"] // len(saved["optimizer_states"])
-    return {
-        "cpu_s": read_journal(run.folder).get("fit", {}).get("cpu_s"),
-        "steps": steps,
-        "parameters": sum(
-            item.numel() for item in load_any_run(run.folder / "run").prior.parameters()
-        ),
-    }
-
-
-def _rows(comparison: Comparison, run: Run, results: Sequence[Path]) -> list[Row]:
-    """A row for each distribution of latents, and one of decoded training rooms where there are
-    some; what training took stands in the first."""
-    method = comparison.methods[run.method]
-    first = Row(
-        rooms=comparison.rooms[run.rooms].title,
-        group=method.group,
-        title=method.title,
-        latents="",
-        seed=run.seed,
-        scores={},
-        costs=costs_of(run),
-    )
-    rows: list[Row] = []
-    for path in results:
-        scores = read_result(path)
-        latents = scores["protocol"]["latents"]
-        rows.append(
-            replace(first, latents=latents, scores=scores, costs={} if rows else first.costs)
-        )
-    if decoded := rows[0].scores.get("decoded_rooms"):
-        scores = {**decoded, "protocol": rows[0].scores["protocol"]}
-        rows.append(replace(first, latents="of training rooms, decoded", scores=scores, costs={}))
-    return rows

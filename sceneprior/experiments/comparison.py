@@ -3,12 +3,12 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from pydantic import Field, field_validator, model_validator
 
 from sceneprior.config import load_config
-from sceneprior.errors import InputError
+from sceneprior.errors import ConfigError, InputError
 from sceneprior.generation.sample import SAMPLER
 from sceneprior.settings import Section, check_settings, read_settings
 
@@ -43,16 +43,8 @@ class Comparison(Section):
 
     seeds: tuple[int, ...] = Field(min_length=1, strict=False)
     """A run each; the seed of training."""
-    count: int | None = Field(None, ge=2)
-    """Rooms that each run generates and is evaluated by. None: as many as there are training rooms,
-    the numbers at which Frechet distances compare with those of the reference rows."""
     sampling_seed: int = Field(0, ge=0)
-    """Of the generated rooms, the same for every run."""
-    distributions: tuple[Literal["paper", "gaussian", "geodesic", "kernel"], ...] = Field(
-        ("paper", "kernel"), min_length=1, strict=False
-    )
-    """Where the latents of priors that remember training rooms come from, a row each. Pictures show
-    the first. Methods without such latents have their own."""
+    """Of the generated rooms, or of the views that are answered, the same for every run."""
     rooms: dict[str, Rooms] = Field(min_length=1)
     methods: dict[str, Method] = Field(min_length=1)
 
@@ -76,6 +68,36 @@ class Comparison(Section):
                     f"{', '.join(self.rooms)}"
                 )
         return self
+
+
+class RoomComparison(Comparison):
+    """Of new rooms (the paper's Tables 1, 3 and 4)."""
+
+    task: Literal["new_rooms"] = "new_rooms"
+    count: int | None = Field(None, ge=2)
+    """Rooms that each run generates and is evaluated by. None: as many as there are training rooms,
+    the numbers at which Frechet distances compare with those of the reference rows."""
+    distributions: tuple[Literal["paper", "gaussian", "geodesic", "kernel"], ...] = Field(
+        ("paper", "kernel"), min_length=1, strict=False
+    )
+    """Where the latents of priors that remember training rooms come from, a row each. Pictures show
+    the first. Methods without such latents have their own."""
+
+
+class ViewComparison(Comparison):
+    """Of answers to single views (the paper's Table 2)."""
+
+    task: Literal["single_views"] = "single_views"
+    count: int | None = Field(None, ge=1)
+    """Test rooms of which one view each is answered; None: all."""
+    cad_models: str | None = None
+    """What `eval-svr --models` takes: a folder of CAD models, or `shards` for those of the training
+    rooms. Null: no rows with CAD models."""
+
+
+TASKS: dict[str, type[Comparison]] = {"new_rooms": RoomComparison, "single_views": ViewComparison}
+"""What a comparison compares, by the value of its key `task`."""
+C = TypeVar("C", bound=Comparison)
 
 
 @dataclass(frozen=True)
@@ -102,15 +124,16 @@ def load_comparison(name: str) -> Comparison:
         ConfigError: not found, not YAML, an unknown key or a wrong value, in it or in a run.
     """
     path, data = read_settings(name)
-    comparison = check_settings(Comparison, data, str(path))
+    task = data.get("task", "new_rooms")
+    if not isinstance(task, str) or task not in TASKS:
+        raise ConfigError(f"{path}: no task is called '{task}'; choose from {', '.join(TASKS)}.")
+    comparison = check_settings(TASKS[task], data, str(path))
     for run in runs_of(comparison, Path()):
         load_config(run.config, run.settings)
     return comparison
 
 
-def part_of(
-    comparison: Comparison, methods: str | None, rooms: str | None, seeds: str | None
-) -> Comparison:
+def part_of(comparison: C, methods: str | None, rooms: str | None, seeds: str | None) -> C:
     """Some methods, kinds of rooms and seeds of a comparison, each given as `a,b`; None is all.
 
     Raises:
@@ -186,7 +209,7 @@ def _value(data: Any, key: str) -> Any:
     return data
 
 
-def distributions_of(comparison: Comparison, run: Run) -> tuple[str | None, ...]:
+def distributions_of(comparison: RoomComparison, run: Run) -> tuple[str | None, ...]:
     """Where rooms of a run come from, a row of the table each; None is the run's own way, which is
     all that methods without latents have, and comes first where that is a sampler."""
     config = load_config(run.config, run.settings)

@@ -25,7 +25,7 @@ from sceneprior.generation.sample import MARKS
 from sceneprior.offscreen import open_renderer
 from sceneprior.scene import Scene
 from sceneprior.scene_files import load_scene_folder
-from sceneprior.training.method import TrainedPrior, TrainedSampler
+from sceneprior.training.method import Trained, TrainedPrior, TrainedSampler
 
 UNFOLDING_STEPS = 7
 CURVES = (
@@ -103,7 +103,7 @@ def evaluate_folder(
 
 
 def decoded_and_true(
-    trained: TrainedPrior | TrainedSampler, shards: Path, meshes: bool = False
+    trained: Trained, shards: Path, meshes: bool = False
 ) -> list[tuple[Scene, Scene]]:
     """Training rooms as decoded, each with what training never saw: the room in 3D.
 

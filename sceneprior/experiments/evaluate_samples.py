@@ -33,7 +33,7 @@ from sceneprior.scene import Scene
 from sceneprior.shards import iterate_rooms, list_shards
 from sceneprior.silhouettes.render import render_scene
 from sceneprior.topdown import topdown, topdown_protocol
-from sceneprior.training.method import PriorConfig, RunConfig, TrainedPrior, TrainedSampler
+from sceneprior.training.method import PriorConfig, RunConfig, Trained, TrainedPrior
 from sceneprior.training.monitor import EvaluationResult
 from sceneprior.training.ours import PaperConfig
 from sceneprior.views import SceneViews
@@ -89,9 +89,9 @@ class SampleEvaluator:
                 "occupancy; choose category_kl, objects_off, overlaps or type_share."
             )
 
-    def __call__(self, trained: TrainedPrior | TrainedSampler) -> EvaluationResult:
+    def __call__(self, trained: Trained) -> EvaluationResult:
         settings = self.config.samples
-        if isinstance(trained, TrainedSampler) or uses_sampler(trained, None):
+        if not isinstance(trained, TrainedPrior) or uses_sampler(trained, None):
             generated = synthesize(trained, settings.count, settings.seed)
             return EvaluationResult(
                 self._scores(generated), tile(generated[:PICTURED]), self._compared[0]

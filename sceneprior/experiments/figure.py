@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from sceneprior.config import load_any_run
 from sceneprior.evaluation.ground_truth import independent_rooms, reference_scenes
 from sceneprior.evaluation.room_sets import without_void
-from sceneprior.experiments.comparison import Comparison, Run, distributions_of
+from sceneprior.experiments.comparison import RoomComparison, Run, distributions_of
 from sceneprior.files import write_whole
 from sceneprior.generation.decode import synthesize
 from sceneprior.offscreen import Renderer
@@ -23,7 +23,7 @@ MARGIN_PX = 190
 
 
 def write_figure(
-    comparison: Comparison, runs: Sequence[Run], count: int, path: Path, renderer: Renderer
+    comparison: RoomComparison, runs: Sequence[Run], count: int, path: Path, renderer: Renderer
 ) -> None:
     """Draw the first rooms that each run generates, under the real and the independent ones.
 

@@ -16,7 +16,7 @@ from sceneprior.losses.completeness import kept_objects
 from sceneprior.models.occupancy import OccupancyDecoder
 from sceneprior.models.prior import ScenePrior
 from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.training.method import TrainedPrior, TrainedSampler
+from sceneprior.training.method import Trained, TrainedPrior, TrainedReconstructor
 from sceneprior.views import DecodedScenes, RoomBoxes
 
 BATCH = 64
@@ -110,10 +110,10 @@ def decode_latents(
     return [room.scene for room in decode_rooms(trained, z, names)]
 
 
-def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]:
+def decode_training_rooms(trained: Trained) -> list[Scene]:
     """The training rooms as the prior remembers them, named by their ids; an `InputError` for runs
     that keep no latents of them."""
-    if isinstance(trained, TrainedSampler) or not trained.remembers_rooms:
+    if not isinstance(trained, TrainedPrior) or not trained.remembers_rooms:
         raise InputError(
             f"A run of `method: {trained.config.method}` keeps no latents of training rooms, so "
             "none can be decoded; take a run of `method: ours`."
@@ -122,13 +122,18 @@ def decode_training_rooms(trained: TrainedPrior | TrainedSampler) -> list[Scene]
 
 
 def synthesize(
-    trained: TrainedPrior | TrainedSampler, count: int, seed: int, distribution: str | None = None
+    trained: Trained, count: int, seed: int, distribution: str | None = None
 ) -> list[Scene]:
     """New rooms of a run of any kind; the same seed, the same rooms.
 
     `distribution` says where they come from: `sampler`, or a distribution of latents; None takes
-    the run's own. It is an `InputError` for a method that has neither.
+    the run's own. It is an `InputError` for a method that has neither, or that makes no rooms.
     """
+    if isinstance(trained, TrainedReconstructor):
+        raise InputError(
+            f"`method: {trained.config.method}` answers images and makes no new rooms; use "
+            "`sceneprior reconstruct` or `eval-svr`, or a run of another method."
+        )
     names = scene_names(count, seed)
     if isinstance(trained, TrainedPrior):
         if uses_sampler(trained, distribution):

@@ -76,14 +76,9 @@ def write_turning(found: Reconstruction, folder: Path, renderer: Renderer) -> No
 def picture(found: Reconstruction, renderer: Renderer) -> UInt8[np.ndarray, "height width 3"]:
     """Three panels with titles, coloured by class, and the classes' names under them."""
     image, scene = found.image, found.scene
-    colors = class_colors(len(label_set(image.label_set)))[image.object_class]
-    camera = Pinhole(image.world_to_camera.astype(np.float64), image.intrinsics.astype(np.float64))
-    height, wide = image.instance_ids.shape
     panels = {
-        "masks given": paint_ids(image.instance_ids.astype(np.int64), colors, PAPER),
-        "found, same camera": renderer.shaded(
-            scene_meshes(scene), object_colors(scene), camera, (height, wide)
-        ),
+        "masks given": masks_of(image),
+        "found, same camera": from_camera(scene, image, renderer),
         "found, from above": from_above(scene, image, renderer),
     }
     tiles = [_as_tile(panel) for panel in panels.values()]
@@ -103,6 +98,21 @@ def picture(found: Reconstruction, renderer: Renderer) -> UInt8[np.ndarray, "hei
             draw.rectangle((x, y + 6, x + 12, y + 18), color)
             draw.text((x + 17, y + 3), name, INK, font)
     return np.asarray(sheet)
+
+
+def masks_of(image: ObservedImage) -> UInt8[np.ndarray, "height width 3"]:
+    """The masks of an image, in the colours of their classes."""
+    colors = class_colors(len(label_set(image.label_set)))[image.object_class]
+    return paint_ids(image.instance_ids.astype(np.int64), colors, PAPER)
+
+
+def from_camera(
+    scene: Scene, image: ObservedImage, renderer: Renderer
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Objects as the camera of an image sees them."""
+    camera = Pinhole(image.world_to_camera.astype(np.float64), image.intrinsics.astype(np.float64))
+    height, width = image.instance_ids.shape
+    return renderer.shaded(scene_meshes(scene), object_colors(scene), camera, (height, width))
 
 
 def _as_tile(panel: UInt8[np.ndarray, "height width 3"]) -> Image.Image:

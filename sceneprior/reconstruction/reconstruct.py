@@ -8,13 +8,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.generation.decode import scene_of
+from sceneprior.geometry.cameras import boxes_of_points
+from sceneprior.geometry.corners import box_corners
 from sceneprior.reconstruction.fit import SCHEDULES, fit_latents, refuse_crowds, view_loss
 from sceneprior.reconstruction.image import ObservedImage, as_views, rows_of
 from sceneprior.reconstruction.objects import answer_images
-from sceneprior.scene import Scene
-from sceneprior.training.method import TrainedPrior
+from sceneprior.scene import Scene, SceneObject
+from sceneprior.training.method import Trained, TrainedPrior, TrainedReconstructor
 from sceneprior.views import SceneViews
 
 BATCH = 128
@@ -47,7 +50,7 @@ class Reconstruction:
     """One object a mask, in the masks' order."""
     score: float
     """Compares answers to one image, less is better: `ObjectAnswer.energy`, or of a latent layout
-    loss plus lambda_S * (1 - mean mask IoU)."""
+    loss plus lambda_S * (1 - mean mask IoU), or see `_found_directly`."""
     mask_iou: float | None = None
     """Mean over the image's masks; None where masks are not compared as pixels."""
     steps: int | None = None
@@ -57,13 +60,13 @@ class Reconstruction:
 
 
 def reconstruct(
-    trained: TrainedPrior, images: Sequence[ObservedImage], options: FitOptions
+    trained: Trained, images: Sequence[ObservedImage], options: FitOptions
 ) -> list[Reconstruction]:
     """Reconstruct images of the run's label set, many at once. Before the run's shape stage scenes
-    are boxes.
+    are boxes. A run of a baseline that answers images directly does so.
 
     Raises:
-        InputError: unknown options, a run without latents of rooms, another label set, or, where
+        InputError: unknown options, a run that cannot answer images, another label set, or, where
             latents are fitted, more objects than the prior generates.
     """
     if options.fit not in (OBJECTS, *SCHEDULES):
@@ -74,7 +77,13 @@ def reconstruct(
         raise InputError(f"restarts is {options.restarts}; an image needs at least one.")
     if options.restarts > 1 and options.fit == OBJECTS:
         raise InputError("restarts are of latents; name a fit of those, paper or released.")
-    if not trained.remembers_rooms:
+    direct = isinstance(trained, TrainedReconstructor)
+    if direct and options.fit != OBJECTS:
+        raise InputError(
+            f"A run of `method: {trained.config.method}` has no latents to fit; leave out the fit "
+            f"{options.fit}."
+        )
+    if not direct and not trained.remembers_rooms:
         raise InputError(
             f"Reconstruction starts from training rooms, and a run of `method: "
             f"{trained.config.method}` keeps no latents of them; take a run of `method: ours`."
@@ -87,16 +96,43 @@ def reconstruct(
             )
     if not images:
         return []
+    found: dict[int, Reconstruction] = {}
+    if isinstance(trained, TrainedReconstructor):
+        for rows in _batches(images, BATCH):
+            found |= zip(rows, _found_directly(trained, [images[row] for row in rows]), strict=True)
+        return [found[row] for row in range(len(images))]
+    assert isinstance(trained, TrainedPrior), "checked above: it remembers rooms"
     if options.fit == OBJECTS:
         return [
             Reconstruction(image, answer.scene, answer.energy, taken_for=answer.taken_for)
             for image, answer in zip(images, answer_images(trained, images), strict=True)
         ]
-    found: dict[int, Reconstruction] = {}
     for rows in _batches(images, max(BATCH // options.restarts, 1)):
         part = [images[row] for row in rows]
         found |= zip(rows, _reconstruct_batch(trained, part, options), strict=True)
     return [found[row] for row in range(len(images))]
+
+
+def _found_directly(
+    trained: TrainedReconstructor, images: Sequence[ObservedImage]
+) -> list[Reconstruction]:
+    """What a network says of images of one size; `score` is the mean distance of a side of the
+    objects' 2D boxes, relative to the image's size."""
+    views = as_views(images, trained.config.data.mask_step)
+    names = label_set(trained.config.label_set)
+    answers = []
+    for row, (image, found) in enumerate(zip(images, trained.prior.find(views), strict=True)):
+        objects = tuple(
+            SceneObject(names[index], *item)
+            for index, item in zip(image.object_class.tolist(), found, strict=True)
+        )
+        scene = Scene(image.name, image.label_set, objects)
+        corners = box_corners(torch.tensor(scene.centers_m), torch.tensor(scene.sizes_m)).float()
+        camera = (views.world_to_camera[row, None], views.intrinsics[row, None])
+        boxes = boxes_of_points(corners.unsqueeze(0), *camera, views.image_size).boxes[0, 0]
+        apart = (boxes - torch.from_numpy(image.boxes)).abs().mean()
+        answers.append(Reconstruction(image, scene, float(apart)))
+    return answers
 
 
 def _batches(images: Sequence[ObservedImage], most: int) -> Iterator[list[int]]:

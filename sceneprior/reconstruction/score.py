@@ -10,12 +10,14 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from sceneprior.config import load_run
+from sceneprior.config import load_any_run
 from sceneprior.errors import InputError
 from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.mesh_metrics import POINTS
 from sceneprior.evaluation.score_table import wide_console
 from sceneprior.evaluation.view_scores import PROTOCOL, ObjectPair, score_views, surface_note
+from sceneprior.generation.cad_models import default_cache, open_models
+from sceneprior.generation.retrieve import retrieve_all
 from sceneprior.offscreen import open_renderer
 from sceneprior.reconstruction.image import ObservedImage, image_of_room, images_of_split
 from sceneprior.reconstruction.known_rooms import known_rooms, nearest_answers, random_answers
@@ -29,6 +31,7 @@ TITLES = {
     "scenes_boxes": "the same, as boxes",
     "fit": "fitted",
     "fit_boxes": "the same, as boxes",
+    "fit_cad": "the same, with CAD models",
     "layout_fit": "fitted to 2D boxes alone, as boxes",
     "nearest_room": "nearest training room",
     "random_room": "random training room",
@@ -72,13 +75,15 @@ def evaluate_run(
     options: FitOptions,
     limit: int | None = None,
     checkpoint: str = "final",
+    models: Path | None = None,
 ) -> dict[str, Any]:
-    """Reconstruct one view of each room (or the first `limit`) and score it against the truth.
+    """Reconstruct one view of each room (or the first `limit`) and score it against the truth; of
+    CAD `models`, too, one in the place of each object (`generation.retrieve`).
 
     Raises:
         InputError: the run or the shards cannot be used.
     """
-    trained = load_run(run, checkpoint)
+    trained = load_any_run(run, checkpoint)
     shards, split = protocol.shards, protocol.split
     reference_scenes(shards, split, limit=1, meshes=False)  # refuses before any fit
     images, blank = images_of_split(shards, split, protocol.seed, limit)
@@ -89,6 +94,10 @@ def evaluate_run(
         "fit": [one.scene.objects for one in fitted],
         "fit_boxes": [one.scene.without_meshes().objects for one in fitted],
     }
+    if models is not None:
+        cad_models = open_models(models, trained.config.label_set, default_cache())
+        retrieved = retrieve_all([one.scene for one in fitted], cad_models)
+        answers["fit_cad"] = [scene.objects for scene in retrieved]
     overlaps = [one.mask_iou for one in fitted if one.mask_iou is not None]
     if overlaps:
         plain = reconstruct(trained, images, replace(options, masks=False))
@@ -104,6 +113,7 @@ def evaluate_run(
             "views": "one a room, drawn at random from those that show an object",
             "rooms_without_such_a_view": blank,
             "fit": asdict(options),
+            "models": None if models is None else Path(models).resolve().name,
             **protocol.as_dict(),
         },
     }

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import lightning
 import torch
@@ -26,11 +26,12 @@ from sceneprior.lifting.dataset import LiftedDataset
 from sceneprior.lifting.shapes import ShapeGrid
 from sceneprior.models.prior import ModelConfig, ScenePrior
 from sceneprior.sampler.network import RoomSampler
+from sceneprior.scene import Mesh
 from sceneprior.settings import Section
 from sceneprior.shards import Shard, list_shards
 from sceneprior.training.checkpoints import read_networks
 from sceneprior.training.settings import DataConfig, SamplesConfig, TrainConfig
-from sceneprior.views import RoomBoxes
+from sceneprior.views import RoomBoxes, SceneViews
 
 OF_SHARDS = "shards"
 """In place of a label set's name: whatever the training rooms are labelled with."""
@@ -265,7 +266,39 @@ class TrainedSampler:
         return self.config.method
 
 
-Trained = TrainedPrior | TrainedSampler
+class FoundObject(NamedTuple):
+    """What is found in 3D for a mask, in the room frame."""
+
+    center_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]
+    mesh: Mesh
+
+
+@runtime_checkable
+class ViewReconstructor(Protocol):
+    """A network that answers images directly, object by object."""
+
+    def find(self, views: SceneViews) -> list[list[FoundObject]]:
+        """Of each image (a room of one view), what each of its masks is of, in their order."""
+
+    def parameters(self) -> Any: ...
+
+
+@dataclass(frozen=True)
+class TrainedReconstructor:
+    """A trained method that answers images and does nothing else: it makes no new rooms."""
+
+    prior: ViewReconstructor
+    room_ids: tuple[str, ...]
+    config: RunConfig
+    stage: str
+
+    remembers_rooms = False
+    distribution = "none"
+    """It makes no new rooms."""
+
+
+Trained = TrainedPrior | TrainedSampler | TrainedReconstructor
 
 
 def ready_copy(network: Any) -> Any:

@@ -186,7 +186,9 @@ class Explorer:
     def find_meshes(self, stop: threading.Event) -> None:
         """Find the meshes of all shapes that the prior knows, so that no room has to wait."""
         shapes = self.prior.with_latents.prior.shape if self.has_latents else None
-        for prototype in shapes.known if isinstance(shapes, OccupancyDecoder) else ():
+        if not isinstance(shapes, OccupancyDecoder):
+            return
+        for prototype in shapes.known:
             if stop.is_set():
                 return
             shapes.surface(prototype)

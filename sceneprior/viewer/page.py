@@ -77,8 +77,9 @@ class Page:
         """Show a room. While one is dragged it is not `settled`: what takes longer waits."""
         with self._lock:
             self.shown = shown
-            swap = settled and self.models is not None and self._cad.value
-            self.scene = retrieve(shown.scene, self.models) if swap else shown.scene
+            self.scene = shown.scene
+            if settled and self.models is not None and self._cad.value:
+                self.scene = retrieve(shown.scene, self.models)
             with self.server.atomic():
                 self._room.show(self.scene, shown.kept, self._names.value, self._boxes.value)
                 if self._board is not None:

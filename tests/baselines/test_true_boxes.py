@@ -113,11 +113,11 @@ def test_shards_without_ground_truth_are_a_sentence(toy_shards, tmp_path):
         TruthDataset(odd, "train")
 
 
-def test_only_the_two_baselines_come_to_the_ground_truth():
+def test_only_baselines_with_3d_supervision_come_to_the_ground_truth():
     """By name, over the whole package: evaluation reads it; retrieval asks it for the classes of
-    CAD models, not for rooms; and of training one module, which what the two baselines share
-    imports."""
-    readers, importers = set(), set()
+    CAD models, not for rooms; and of training one module for methods that make rooms, and one for
+    those that answer images, which takes meshes by way of evaluation."""
+    readers, importers, of_meshes = set(), set(), set()
     for path in sorted(PACKAGE.rglob("*.py")):
         name = path.relative_to(PACKAGE).as_posix()
         for node in ast.walk(ast.parse(path.read_text())):
@@ -128,10 +128,23 @@ def test_only_the_two_baselines_come_to_the_ground_truth():
                 and node.module == "sceneprior.baselines.true_boxes"
             ):
                 importers.add(name)
+            if (
+                isinstance(node, ast.ImportFrom)
+                and node.module == "sceneprior.evaluation.ground_truth"
+                and name.split("/")[0] in ("data", "models", "losses", "training", "baselines")
+            ):
+                of_meshes.add(name)
+            if isinstance(node, ast.ImportFrom) and str(node.module).endswith("single_view.truth"):
+                of_meshes.add(f"{name} (views)")
     assert readers == {
         "baselines/true_boxes.py", "evaluation/ground_truth.py", "generation/cad_models.py"
     }  # fmt: skip
     assert importers == {"baselines/box_training.py"}
+    assert of_meshes == {
+        "baselines/single_view/truth.py",
+        "baselines/single_view/total3d.py (views)",
+        "baselines/single_view/im3d.py (views)",
+    }
 
 
 @pytest.mark.parametrize("one_stage", [False, True])

@@ -17,15 +17,11 @@ from tiny_runs import tiny_baseline_settings, tiny_sampler_config, write_tiny_co
 
 from sceneprior.config import load_any_run, load_config
 from sceneprior.errors import InputError
-from sceneprior.experiments.compare import (
-    Compared,
-    CompareOptions,
-    compare,
-    costs_of,
-    scoring_steps,
-)
+from sceneprior.experiments.compare import Compared, compare
 from sceneprior.experiments.comparison import distributions_of, load_comparison, part_of, runs_of
+from sceneprior.experiments.new_rooms import scoring_steps
 from sceneprior.experiments.steps import StepRunner
+from sceneprior.experiments.task import CompareOptions, costs_of
 from sceneprior.files import only_writer
 
 SOFTWARE = CompareOptions("software")

@@ -72,7 +72,7 @@ def test_methods_stand_under_their_group_in_the_order_they_came(rows):
 
 
 def test_every_distribution_of_latents_has_a_row_that_names_it(rows):
-    near = replace(rows[0], latents="kernel, near training rooms", costs={})
+    near = replace(rows[0], variant="kernel, near training rooms", costs={})
     near = replace(near, scores=near.scores | {"fd_effnet_lite0": 45.0})
     table = markdown([rows[0], near, *rows[1:]])
     lines = [line for line in table.splitlines() if line.startswith("| Ours ")]

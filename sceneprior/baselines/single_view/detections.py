@@ -1,0 +1,195 @@
+"""What networks are told of each mask of an image, in a frame without what they cannot know.
+
+The frame of an image is the room's, moved to the camera and turned by quarters until the camera
+looks along +z, to within 45 degrees. An answer therefore moves and turns with the room; boxes stay
+axis-aligned, since quarters keep them so.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int, Integer
+from torch import Tensor
+
+from sceneprior.geometry.cameras import camera_centers
+from sceneprior.geometry.turns import QUARTERS, turn_vectors
+from sceneprior.views import SceneViews
+
+CROP = 32
+"""Pixels along each side of a crop."""
+MARGIN = 0.25
+"""Of a box's width and height, that a crop shows around it on each side."""
+CHANNELS = 6
+"""Of a crop: the mask, all other masks, what is inside the image, and the pixels' rays (3)."""
+NUMBERS = 26
+"""What is told of a mask beside its crop and class, see `_numbers`."""
+NEAR_M = 0.1
+"""Nearer to the camera's plane, or behind it, a centre has no place in the image."""
+
+
+@dataclass(frozen=True)
+class Detections:
+    """The visible masks of a batch of images, one a row; those of an image follow each other.
+
+    An image is a view of a room; `SceneViews` of several views are as many images.
+    """
+
+    image: Int[Tensor, " masks"]
+    slot: Int[Tensor, " masks"]
+    """Place among the masks of its image."""
+    room: Int[Tensor, " masks"]
+    item: Int[Tensor, " masks"]
+    """Which object of the room it is of."""
+    object_class: Int[Tensor, " masks"]
+    boxes: Float[Tensor, "masks 4"]
+    """As in `SceneViews`, relative to the image."""
+    quarter: Int[Tensor, " masks"]
+    """By which the room was turned into the image's frame."""
+    eye_m: Float[Tensor, "masks 3"]
+    """Where the camera stands in the room."""
+    frame_to_camera: Float[Tensor, "masks 3 3"]
+    intrinsics: Float[Tensor, "masks 3 3"]
+    """Relative to the image's size."""
+    crops: Float[Tensor, "masks channels rows columns"]
+    numbers: Float[Tensor, "masks numbers"]
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    def rays(self, places: Float[Tensor, "masks points 2"]) -> Float[Tensor, "masks points 3"]:
+        """Unit vectors from the camera through places u, v, in the image's frame."""
+        focal = self.intrinsics[:, None, (0, 1), (0, 1)]
+        middle = self.intrinsics[:, None, :2, 2]
+        on_plane = (places - middle) / focal
+        rays = torch.cat([on_plane, torch.ones_like(on_plane[..., :1])], dim=-1)
+        return torch.nn.functional.normalize(rays @ self.frame_to_camera, dim=-1)
+
+    def centers_at(
+        self, offsets: Float[Tensor, "masks 2"], distances_m: Float[Tensor, " masks"]
+    ) -> Float[Tensor, "masks 3"]:
+        """Centres in the room that are seen at some offset from the middles of 2D boxes, in units
+        of their width and height, at a distance from the camera."""
+        low, high = self.boxes.split(2, dim=-1)
+        place = (low + high) / 2 + offsets * (high - low)
+        away = self.rays(place.unsqueeze(1))[:, 0] * distances_m.unsqueeze(-1)
+        return self.to_room(away) + self.eye_m
+
+    def offsets_and_distances(
+        self, centers_m: Float[Tensor, "masks 3"]
+    ) -> tuple[Float[Tensor, "masks 2"], Float[Tensor, " masks"], Bool[Tensor, " masks"]]:
+        """The other way round; and which centres are in front of the camera, others have no
+        offset."""
+        away = self.to_frame(centers_m - self.eye_m)
+        seen = (self.frame_to_camera @ away.unsqueeze(-1))[..., 0]
+        ahead = seen[:, 2] > NEAR_M
+        scaled = (self.intrinsics @ seen.unsqueeze(-1))[..., 0]
+        place = scaled[:, :2] / scaled[:, 2:].clamp(min=NEAR_M)
+        low, high = self.boxes.split(2, dim=-1)
+        offsets = (place - (low + high) / 2) / (high - low).clamp(min=1e-3)
+        return offsets * ahead.unsqueeze(-1), away.norm(dim=-1), ahead
+
+    def to_frame(self, vectors: Float[Tensor, "masks *many 3"]) -> Float[Tensor, "masks *many 3"]:
+        """Directions of the room in the images' frames."""
+        return turn_vectors(vectors, self.quarter)
+
+    def to_room(self, vectors: Float[Tensor, "masks *many 3"]) -> Float[Tensor, "masks *many 3"]:
+        """Back."""
+        return turn_vectors(vectors, (QUARTERS - self.quarter) % QUARTERS)
+
+    def padded(self, values: Float[Tensor, "masks width"]) -> Float[Tensor, "images most width"]:
+        """Values of each image's masks beside each other; 0 where there are fewer."""
+        images = int(self.image.max()) + 1 if len(self) else 0
+        most = int(self.slot.max()) + 1 if len(self) else 0
+        empty = values.new_zeros(images, most, values.shape[-1])
+        return empty.index_put((self.image, self.slot), values)
+
+    def of_objects(self, values: Tensor, rooms: int, objects: int) -> Tensor:
+        """Values of masks at their room's objects, (rooms, objects, ...): of one view a room."""
+        empty = values.new_zeros(rooms, objects, *values.shape[1:])
+        return empty.index_put((self.room, self.item), values)
+
+
+def one_view(views: SceneViews, first: int, last: int | None = None) -> SceneViews:
+    """A batch with some of its views alone: `first`, or `first` to `last` (not included)."""
+    part = slice(first, first + 1 if last is None else last)
+    return replace(
+        views,
+        world_to_camera=views.world_to_camera[:, part],
+        intrinsics=views.intrinsics[:, part],
+        boxes=views.boxes[:, part],
+        visible=views.visible[:, part],
+        sides_clear=views.sides_clear[:, part],
+        instance_ids=views.observed_ids[:, part],
+    )
+
+
+def detections_of(views: SceneViews) -> Detections:
+    """Every visible mask of every view.
+
+    Raises:
+        ValueError: the views were loaded without their instance ids.
+    """
+    room, view, item = views.visible.nonzero(as_tuple=True)
+    image = room * views.visible.shape[1] + view
+    counts = image.bincount(minlength=1)
+    slot = torch.arange(len(image), device=image.device) - (counts.cumsum(0) - counts)[image]
+    poses = views.world_to_camera[room, view]
+    forward = poses[:, 2, :3]
+    yaw = torch.atan2(forward[:, 0], forward[:, 2])
+    quarter = torch.remainder(-torch.round(yaw / (math.pi / 2)).long(), QUARTERS)
+    height, width = views.image_size
+    scale = views.intrinsics.new_tensor([[1 / width], [1 / height], [1.0]])
+    found = Detections(
+        image=image,
+        slot=slot,
+        room=room,
+        item=item,
+        object_class=views.object_class[room, item],
+        boxes=views.boxes[room, view, item],
+        quarter=quarter,
+        eye_m=camera_centers(poses),
+        frame_to_camera=turn_vectors(poses[:, :3, :3], quarter),
+        intrinsics=views.intrinsics[room, view] * scale,
+        crops=poses.new_zeros(len(image), 0, 0, 0),
+        numbers=poses.new_zeros(len(image), 0),
+    )
+    clear = views.sides_clear[room, view, item]
+    return replace(
+        found,
+        crops=_crops(found, views.observed_ids[room, view]),
+        numbers=_numbers(found, clear),
+    )
+
+
+def _numbers(found: Detections, clear: Bool[Tensor, "masks 4"]) -> Float[Tensor, "masks numbers"]:
+    """The 2D box, the log of its sides, whether these are the object's own (4 each, 2 logs), rays
+    through its middle and corners, and the camera's height."""
+    x1, y1, x2, y2 = found.boxes.unbind(dim=-1)
+    corners = [((x1 + x2) / 2, (y1 + y2) / 2), (x1, y1), (x2, y1), (x1, y2), (x2, y2)]
+    rays = found.rays(torch.stack([torch.stack(place, dim=-1) for place in corners], dim=1))
+    sides = (found.boxes[:, 2:] - found.boxes[:, :2]).clamp(min=1e-3).log()
+    return torch.cat(
+        [found.boxes, sides, clear.to(sides), rays.flatten(1), found.eye_m[:, 1:2]], dim=-1
+    )
+
+
+def _crops(
+    found: Detections, ids: Integer[Tensor, "masks height width"]
+) -> Float[Tensor, "masks channels rows columns"]:
+    """The surroundings of each 2D box, stretched to a square, see `CHANNELS`."""
+    steps = (torch.arange(CROP, device=ids.device) + 0.5) / CROP
+    steps = steps * (1 + 2 * MARGIN) - MARGIN
+    low, high = found.boxes[:, None, :2], found.boxes[:, None, 2:]
+    place = low + steps[:, None] * (high - low)  # masks, steps, (u, v)
+    u, v = (part.expand(-1, CROP, CROP) for part in (place[:, None, :, 0], place[:, :, None, 1]))
+    inside = (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
+    height, width = ids.shape[1:]
+    column = (u * width).long().clamp(0, width - 1)
+    row = (v * height).long().clamp(0, height - 1)
+    seen = ids[torch.arange(len(ids), device=ids.device)[:, None, None], row, column].long()
+    seen = seen * inside
+    own = seen == found.item[:, None, None] + 1
+    rays = found.rays(torch.stack([u, v], dim=-1).flatten(1, 2)).unflatten(1, (CROP, CROP))
+    masks = torch.stack([own, (seen > 0) & ~own, inside], dim=1).to(rays)
+    return torch.cat([masks, rays.movedim(-1, 1)], dim=1)

@@ -1,0 +1,105 @@
+"""USL: what other views teach, and what they leave alone."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny_runs import tiny_baseline
+from torch.testing import assert_close
+
+from sceneprior.baselines.single_view.detections import detections_of, one_view
+from sceneprior.baselines.single_view.usl import other_view_losses, silhouette_loss
+from sceneprior.data.dataset import ViewDataset
+from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.evaluation.metrics.decoded_rooms import box_iou_3d
+
+
+@pytest.fixture(scope="module")
+def views(toy_shards):
+    data = ViewDataset(toy_shards, "train", views_per_room=5, mask_step=2, seed=2)
+    return data.__getitems__([(row, 0) for row in range(4)])
+
+
+@pytest.fixture
+def stage(toy_shards):
+    config = tiny_baseline(toy_shards, "usl")
+    return config.build(config.open_rooms(), None)
+
+
+def test_what_stands_behind_another_object_costs_nothing(views):
+    ids = views.observed_ids
+    objects = torch.arange(1, 1 + views.is_object.shape[1])[:, None, None]
+    perfect = (ids.unsqueeze(2) == objects).float()
+    seen = views.visible
+    assert float(silhouette_loss(perfect, views, seen)) < 1e-5
+    everywhere_else = ((ids.unsqueeze(2) != objects) & (ids.unsqueeze(2) > 0)).float()
+    assert float(silhouette_loss(perfect + everywhere_else, views, seen)) < 1e-5
+    background = (ids == 0).unsqueeze(2).float().expand_as(perfect)
+    assert float(silhouette_loss(perfect + background, views, seen)) > 0.3
+
+
+def test_silhouettes_have_gradients_where_masks_are_missed(views):
+    silhouettes = torch.full(
+        (*views.visible.shape, *views.observed_ids.shape[-2:]), 0.3, dtype=torch.float64
+    ).requires_grad_()
+    silhouette_loss(silhouettes, views, views.visible).backward()
+    room, view, item = views.visible.nonzero()[0].tolist()
+    slope, ids = silhouettes.grad[room, view, item], views.observed_ids[room, view]
+    assert (slope[ids == item + 1] < 0).all() and (slope[ids == 0] > 0).all()
+    assert not slope[(ids != 0) & (ids != item + 1)].any()
+
+
+def test_an_object_that_no_other_view_shows_teaches_nothing(views, stage):
+    found, others = detections_of(one_view(views, 0)), one_view(views, 1, 5)
+    predicted, faces = stage.prior(found), stage.prior.shape.faces
+    hidden = replace(others, visible=others.visible & (torch.arange(others.visible.shape[2]) != 0))
+    losses = other_view_losses(found, predicted, faces, hidden, stage.settings)
+    sum(losses.values()).backward()
+    before = [p.grad.clone() for p in stage.prior.parameters()]
+    assert all(torch.isfinite(slope).all() for slope in before)
+    nobody = replace(others, visible=torch.zeros_like(others.visible))
+    stage.zero_grad()
+    losses = other_view_losses(found, stage.prior(found), faces, nobody, stage.settings)
+    assert {name: loss.item() for name, loss in losses.items()} == dict.fromkeys(losses, 0.0)
+
+
+def test_before_training_boxes_are_seen_as_large_as_their_masks(views, stage):
+    found = detections_of(one_view(views, 0))
+    with torch.no_grad():
+        for layer in (stage.prior.box,):
+            layer.weight.zero_()
+        placed, vertices_m = stage.prior(found)
+    away = (placed.centers_m - found.eye_m).norm(dim=-1)
+    assert_close(away, torch.full_like(away, 3.0), rtol=0, atol=1e-4)
+    low, high = vertices_m.amin(dim=1), vertices_m.amax(dim=1)
+    assert_close((low + high) / 2, placed.centers_m, rtol=0, atol=1e-4)
+    assert_close(high - low, placed.sizes_m, rtol=0, atol=1e-4)
+
+
+def test_a_few_rooms_can_be_learnt_from_their_masks_alone(views, stage, toy_shards):
+    """A descent: boxes in 3D come right, though none was ever shown."""
+    true = {room.name: room for room in reference_scenes(toy_shards, "train", tracked_only=True)}
+
+    def overlap() -> float:
+        first = one_view(views, 0)
+        found = []
+        for row, objects in enumerate(stage.prior.find(first)):
+            room = true[views.room_ids[row]]
+            rows = views.visible[row, 0].nonzero()[:, 0].numpy()
+            boxes = [torch.tensor([getattr(o, k) for o in objects]).double().numpy()
+                     for k in ("center_m", "size_m")]  # fmt: skip
+            found += list(box_iou_3d(room.centers_m[rows], room.sizes_m[rows], *boxes).diagonal())
+        return sum(found) / len(found)
+
+    before = overlap()
+    optimizer = torch.optim.Adam(stage.prior.parameters(), lr=1e-2)
+    found, others = detections_of(one_view(views, 0)), one_view(views, 1, 5)
+    faces = stage.prior.shape.faces
+    for _ in range(50):
+        losses = other_view_losses(found, stage.prior(found), faces, others, stage.settings)
+        loss = 5 * losses["box"] + losses["frustum"] + losses["mask"]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    after = overlap()
+    assert before < 0.1 and after > 0.2, (before, after)
