@@ -42,13 +42,20 @@ class BoardPlane:
         flat = ((places - middle) / latent_map.side * self.side_m).double().numpy()
         return np.hstack([flat, np.full((len(flat), 1), above_m)])
 
+    @property
+    def _turn(self) -> Float[np.ndarray, "3 3"]:
+        cos, sin = math.cos(LEAN_RAD), math.sin(LEAN_RAD)
+        return np.array([[1.0, 0, 0], [0, cos, sin], [0, -sin, cos]])
+
+    def in_scene(self, places: Float[Tensor, "n 2"]) -> Float[np.ndarray, "n 3"]:
+        """Where places of the map are in the scene: on the board's face."""
+        return self.on_board(places, 0.0) @ self._turn.T + np.array(self.center_m)
+
     def hit(self, origin_m: Any, direction: Any) -> Point | None:
         """The place of the map that a ray of the scene meets, drawn in to the board's edge; None
         where the ray runs along the board or away from it."""
-        cos, sin = math.cos(LEAN_RAD), math.sin(LEAN_RAD)
-        to_board = np.array([[1.0, 0, 0], [0, cos, -sin], [0, sin, cos]])
-        start = to_board @ (np.asarray(origin_m, dtype=np.float64) - np.array(self.center_m))
-        way = to_board @ np.asarray(direction, dtype=np.float64)
+        start = (np.asarray(origin_m, dtype=np.float64) - np.array(self.center_m)) @ self._turn
+        way = np.asarray(direction, dtype=np.float64) @ self._turn
         if start[2] * way[2] >= 0:
             return None
         flat = (start - way * (start[2] / way[2]))[:2] / self.side_m
@@ -73,9 +80,10 @@ class Board:
         face = self._scene.add_box(
             "/map/board", color=_BOARD, dimensions=(side, side, 0.02), position=(0, 0, -0.01)
         )
-        dots = plane.on_board(rooms, 0.004)
+        # A dot is a ball: half of it would sink into the face.
+        dots = plane.on_board(rooms, 0.02 * side)
         self._scene.add_point_cloud(
-            "/map/rooms", dots, np.array(_DOT), point_size=0.012 * side, point_shape="circle",
+            "/map/rooms", dots, np.array(_DOT), point_size=0.014 * side, point_shape="circle",
             point_shading="flat", precision="float32",
         )  # fmt: skip
         self._here = self._scene.add_icosphere(
@@ -108,7 +116,7 @@ class Board:
 
     def draw_path(self, z: Float[Tensor, "steps dimension"]) -> None:
         """Draw the line of a path, in place of the one before."""
-        points = self.plane.on_board(self.plane.latent_map.place(z), 0.008)
+        points = self.plane.on_board(self.plane.latent_map.place(z), 0.03 * self.plane.side_m)
         self._scene.add_line_segments(
             "/map/path", np.stack([points[:-1], points[1:]], axis=1), _PATH, thickness=3,
             thickness_units="screen",

@@ -181,7 +181,9 @@ class Explorer:
 
     def some_layouts(self) -> list[Scene]:
         """Rooms as boxes that say how large rooms are."""
-        return self._layouts if self.map is not None else self.prior.sample(16)
+        if self.map is not None:
+            return self._layouts
+        return self.prior.sample(16, 0, next(iter(self.distributions), None))
 
     def find_meshes(self, stop: threading.Event) -> None:
         """Find the meshes of all shapes that the prior knows, so that no room has to wait."""
@@ -199,11 +201,11 @@ class Explorer:
 
 
 def floor_side_m(scenes: Sequence[Scene]) -> float:
-    """Side of a square of floor round the origin on which nearly all rooms have their furniture:
-    the 95% quantile, in whole metres, at least 4."""
+    """Side of a square of floor round the origin on which most rooms have their furniture: the 80%
+    quantile, in whole metres, at least 4."""
     reach = [
         np.abs(scene.centers_m[:, [0, 2]]).max() + scene.sizes_m[:, [0, 2]].max() / 2
         for scene in scenes
         if scene.objects
     ]
-    return max(4.0, float(np.ceil(2 * np.quantile(reach, 0.95)))) if reach else 4.0
+    return max(4.0, float(np.ceil(2 * np.quantile(reach, 0.8)))) if reach else 4.0

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 FOV_RAD = 0.75
 """Of the camera, from bottom to top."""
-GAP = 0.15
+GAP = 0.06
 """Between the room and what stands beside it, in widths of the room's floor."""
 
 
@@ -56,14 +56,15 @@ class Page:
         self._beside_m = floor_m * (1 + GAP)
         self._beside = RoomNodes(server, "/nearest", self._beside_m, floor_m)
         self._beside.visible = False
-        self._board: Board | None = None
+        self.board: Board | None = None
+        """The map; None where there is none."""
         self._left_m, self._right_m = -floor_m / 2, floor_m / 2
         if self.explorer is not None and self.explorer.map is not None:
             side = 0.85 * floor_m
             self._left_m -= floor_m * GAP + side
             center = (self._left_m + side / 2, 0.4 * side, -0.1 * floor_m)
             plane = BoardPlane(self.explorer.map, center, side)
-            self._board = Board(server, plane, self._pointed)
+            self.board = Board(server, plane, self._pointed)
         server.scene.set_up_direction("+y")
         eye, target = self._view(self._right_m)
         server.initial_camera.fov = FOV_RAD
@@ -82,8 +83,8 @@ class Page:
                 self.scene = retrieve(shown.scene, self.models)
             with self.server.atomic():
                 self._room.show(self.scene, shown.kept, self._names.value, self._boxes.value)
-                if self._board is not None:
-                    self._board.mark(shown.scene.latent)
+                if self.board is not None:
+                    self.board.mark(shown.scene.latent)
                 self._said.content = _words(shown, self.scene)
             if settled and self._nearest is not None:
                 self._show_nearest(self.scene if self._nearest.value else None)
@@ -146,7 +147,7 @@ class Page:
         """An eye in front that sees all from the left edge to here, and what it looks at."""
         width = right_m - self._left_m
         middle = np.array([(right_m + self._left_m) / 2, 0.0, 0.0])
-        return middle + 1.15 * width * np.array([0.0, 0.6, 0.8]), middle
+        return middle + 1.02 * width * np.array([0.0, 0.6, 0.8]), middle
 
     # -- The panel ---------------------------------------------------------------------------------
 
@@ -174,7 +175,7 @@ class Page:
             self._boxes = self._box("Boxes", False)
             self._cad = self._box("CAD models", False, visible=self.models is not None)
             self._nearest: Any = None
-            if self._board is not None:
+            if self.board is not None:
                 self._nearest = self._box("Nearest training room", False)
                 self._nearest_said = gui.add_markdown("")
         self._buttons({"Download GLB": self._download})
@@ -231,8 +232,8 @@ class Page:
 
             def draw() -> None:
                 z = explorer.draw_path(self.shown, start.value, end.value)
-                if self._board is not None:
-                    self._board.draw_path(z)
+                if self.board is not None:
+                    self.board.draw_path(z)
                 step.disabled = False
                 step.value = 0
                 self.show(explorer.step(0))
