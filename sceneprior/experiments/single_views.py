@@ -59,7 +59,7 @@ VIEWS = Form(
         "f_score": (arrowed(TableColumn("F at 5 cm", 3), "higher"), 1.0),
         "seconds": (
             arrowed(
-                TableColumn("s an image", 2, "s an image: CPU seconds, all images together"),
+                TableColumn("s an image", 3, "s an image: CPU seconds, all images together"),
                 "lower",
             ),
             1.0,

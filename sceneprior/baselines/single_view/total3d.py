@@ -318,7 +318,11 @@ def mesh_losses(
     back = points - torch.take_along_dim(canonical, of_points[..., None], dim=1)
     edges = canonical[:, faces] - canonical[:, faces.roll(1, dims=1)]
     return {
-        "chamfer": mean_of_masks(there.square().sum(dim=-1))
-        + mean_of_masks(back.square().sum(dim=-1)),
-        "edges": mean_of_masks(edges.square().sum(dim=-1)),
+        "chamfer": mean_of_masks(squared(there)) + mean_of_masks(squared(back)),
+        "edges": mean_of_masks(squared(edges)),
     }
+
+
+def squared(vectors: Float[Tensor, "*many 3"]) -> Float[Tensor, "*many"]:
+    """Of lengths."""
+    return vectors.square().sum(dim=-1)
