@@ -4,7 +4,7 @@ PYTHON ?= python3.11
 MARK ?= not slow
 BIN := .venv/bin
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test lint docs clean
 
 setup: .venv/.ready
 
@@ -27,5 +27,10 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# site/index.html opens from disk, and asks no network for anything.
+docs: setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
+	$(BIN)/python -m mkdocs build
+
 clean:
-	rm -rf .venv out runs build dist
+	rm -rf .venv out runs build dist site

@@ -8,6 +8,8 @@ import ast
 import json
 import re
 import shlex
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -141,7 +143,7 @@ def check_shell(block: Block, folder: Path) -> None:
 
 
 def check_python(block: Block, folder: Path) -> None:
-    """It runs, in a folder where `out/demo/shards` are toy rooms."""
+    """It runs, in a folder where `out/demo/shards` are toy rooms, and `out/demo/run` a tiny run."""
     if (other := RUN_ELSEWHERE.get((name_of(block.page), "python"))) is not None:
         assert block.page.name in (ROOT / other).read_text()
         return
@@ -189,9 +191,12 @@ CHECKS = {
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=block_id)
-def test_every_block_runs(block: Block, tmp_path: Path, toy_shards: Path, monkeypatch):
+def test_every_block_runs(block: Block, tmp_path: Path, toy_shards: Path, monkeypatch, request):
     (tmp_path / "out" / "demo").mkdir(parents=True)
     (tmp_path / "out" / "demo" / "shards").symlink_to(toy_shards)
+    if block.language == "python" and "out/demo/run" in block.text:
+        run = request.getfixturevalue("toy_run")
+        (tmp_path / "out" / "demo" / "run").symlink_to(run)
     for other in blocks_of(block.page):  # a page may show a config, then train with it
         if shown := re.match(r"# (\S+\.yaml)\n", other.text):
             (tmp_path / shown[1]).write_text(other.text)
@@ -204,6 +209,25 @@ def test_few_blocks_are_not_run():
     """Each of them says why; more than a handful would be an excuse."""
     assert len(BLOCKS) > 25
     assert len(ALL_BLOCKS) - len(BLOCKS) <= 6
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path: Path):
+    """Strictly: links, anchors, the menu; nothing on its pages is fetched from a network."""
+    pytest.importorskip("mkdocs", reason="no mkdocs here: pip install -e '.[docs]'")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    for page in tmp_path.rglob("*.html"):
+        fetched = re.findall(
+            r"<(?:script|img|link)[^>]+(?:src|href)=\"(https?:[^\"]+)", page.read_text()
+        )
+        assert fetched == [], page.name
+    commands = (tmp_path / "cli.html").read_text()
+    assert [
+        name for name in get_command(app).commands if f"sceneprior {name}" not in commands
+    ] == []
+    assert "Prior" in (tmp_path / "api.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,9 @@ def test_shipped_configs_are_found_by_name(installed, tmp_path):
 
 
 def test_homes_become_shards_and_the_page_template_is_there(installed, tmp_path):
-    assert list(installed.glob("sceneprior/evaluation/*.jinja"))
+    assert len(list(installed.glob("sceneprior/evaluation/*.jinja"))) == 4
+    viewer = installed / "sceneprior/evaluation/model_viewer"
+    assert list(viewer.glob("*.js")) and len(list(viewer.glob("LICENSE.*"))) == 4
     done = run(installed, "-m", "sceneprior", "make-homes", "homes", "--rooms", "4", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     done = run(

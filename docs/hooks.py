@@ -1,0 +1,17 @@
+"""Pages of the site that are made from code: the reference of all commands."""
+
+import typer.cli
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from typer.main import get_command
+
+from sceneprior.cli import app
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add `cli.md`, as typer writes it from the commands' own help."""
+    command = get_command(app)
+    with command.make_context("sceneprior", [], resilient_parsing=True) as context:
+        text = typer.cli.get_docs_for_click(obj=command, ctx=context, name="sceneprior")
+    files.append(File.generated(config, "cli.md", content=f"# Commands\n\n{text}"))
+    return files
