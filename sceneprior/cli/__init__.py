@@ -11,7 +11,7 @@ import typer
 
 from data_prep.cli import add_commands
 from sceneprior import __version__
-from sceneprior.cli import evaluating, experiments, generating, reconstruction, training
+from sceneprior.cli import evaluating, experiments, generating, reconstruction, sharing, training
 from sceneprior.errors import InputError
 
 app = typer.Typer(
@@ -26,7 +26,8 @@ for command in (
     training.fit, training.report,
     generating.synthesize, generating.interpolate, generating.complete, generating.retrieve,
     reconstruction.reconstruct, reconstruction.eval_svr,
-    evaluating.eval_fid, evaluating.convert_boxes,
+    sharing.pack, sharing.priors, sharing.export,
+    evaluating.eval_fid,
     experiments.compare, experiments.demo,
 ):  # fmt: skip
     app.command()(command)

@@ -67,7 +67,7 @@ class SvrProtocol:
 
 
 def evaluate_run(
-    run: Path,
+    run: str,
     protocol: SvrProtocol,
     options: FitOptions,
     limit: int | None = None,
