@@ -29,7 +29,6 @@ lint: setup
 
 # site/index.html opens from disk, and asks no network for anything.
 docs: setup
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
 	$(BIN)/python -m mkdocs build
 
 clean:

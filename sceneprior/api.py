@@ -24,11 +24,16 @@ def load(where: str | Path, checkpoint: str = "final") -> "Prior":
     """Load a trained prior, on the CPU.
 
     Args:
-        where: The folder of a run that `sceneprior fit` made.
-        checkpoint: `final`, or `best`: what generated best while training.
+        where: The folder of a run that `sceneprior fit` made; a file that `sceneprior pack` made;
+            the name of a prior of the package (`sceneprior priors` lists them); or
+            `hf://OWNER/NAME`, on the Hugging Face Hub.
+        checkpoint: Of a run: `final`, or `best`: what generated best while training.
 
     Raises:
         InputError: there is no prior, or it is damaged; one sentence says what to do.
+
+    >>> load("procthor-bedroom")
+    Prior('procthor-bedroom', front3d_bedroom, rooms from: sampler)
     """
     return Prior(load_any_run(where, checkpoint), str(where))
 
@@ -71,6 +76,10 @@ class Prior:
 
         Raises:
             InputError: the prior has no such distribution.
+
+        >>> rooms = load("procthor-bedroom").sample(2, seed=1)
+        >>> [room.name for room in rooms]
+        ['seed1_0000', 'seed1_0001']
         """
         return synthesize(self.trained, count, seed, distribution)
 
@@ -83,6 +92,10 @@ class Prior:
 
         Raises:
             InputError: an end is no latent of this prior, or the two are opposite.
+
+        >>> way = load("procthor-bedroom").interpolate("seed:1", "seed:2", steps=3)
+        >>> [room.extra["along"] for room in way]
+        [0.0, 0.5, 1.0]
         """
         return interpolate(self.with_latents, start, end, steps)
 
@@ -103,6 +116,13 @@ class Prior:
 
         Raises:
             InputError: an object cannot be used, or there are more than rooms of the prior hold.
+
+        >>> from sceneprior.scene import SceneObject
+        >>> bed = SceneObject("double_bed", (0.0, 0.3, -1.0), (1.8, 0.6, 2.0))
+        >>> given = Scene("mine", "front3d_bedroom", (bed,))
+        >>> (room,) = load("procthor-bedroom").complete(given, count=1, classes=["nightstand"])
+        >>> [item.label for item in room.objects]
+        ['double_bed', 'nightstand']
         """
         return complete(self.with_latents, [scene], count, seed, distribution, classes=classes)[0]
 
@@ -116,13 +136,19 @@ class Prior:
             fit: `objects`, one by one; or `paper` or `released`, which fit a latent to an image.
             restarts: Latents fitted to each image.
 
+        Only priors with latents of their training rooms can: a run, or packed with `--latents`.
+
         Raises:
             InputError: other classes than the prior's, or it keeps no latents of training rooms.
         """
         return reconstruct(self.trained, images, FitOptions(fit, restarts))
 
     def latent(self, point: Point) -> Float[Tensor, " dimension"]:
-        """The latent that an end of `interpolate` is; an `InputError` where it is none."""
+        """The latent that an end of `interpolate` is; an `InputError` where it is none.
+
+        >>> load("procthor-bedroom").latent("seed:1").shape
+        torch.Size([128])
+        """
         return latent_of(self.with_latents, point)
 
     def decode(self, z: Float[Tensor, "rooms dimension"]) -> DecodedScenes:
@@ -130,6 +156,12 @@ class Prior:
 
         Raises:
             InputError: the prior has no latent space.
+
+        >>> prior = load("procthor-bedroom")
+        >>> z = prior.latent("seed:1").unsqueeze(0).requires_grad_()
+        >>> prior.decode(z).sizes_m.sum().backward()
+        >>> bool(z.grad.abs().max() > 0)
+        True
         """
         trained = self.with_latents
         z = z.to(trained.logits.dtype)

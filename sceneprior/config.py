@@ -20,6 +20,8 @@ from sceneprior.baselines.sync2gen.stage import Sync2genConfig
 from sceneprior.errors import ConfigError, InputError
 from sceneprior.models.prior import ModelConfig
 from sceneprior.models.transformer import TransformerConfig
+from sceneprior.priors.packed import is_packed, read_packed, unpack
+from sceneprior.priors.where import find_prior
 from sceneprior.settings import check_settings, read_settings
 from sceneprior.training.checkpoints import find_checkpoint
 from sceneprior.training.method import (
@@ -82,15 +84,27 @@ def check_config(data: dict[str, Any], source: str) -> RunConfig:
 
 
 def load_any_run(run: Path | str, checkpoint: str = "final") -> Trained:
-    """What a run of any method trained, in evaluation mode; `checkpoint` as in `find_checkpoint`.
+    """What a run of any method trained, in evaluation mode.
 
     For tasks that do with less than a latent space: they ask what kind of `Trained` it is.
 
+    Args:
+        run: As `find_prior` finds it: a run's folder, a packed prior, its name, or one on the Hub.
+        checkpoint: Of a run's folder, as in `find_checkpoint`.
+
     Raises:
-        InputError: the folder is no run, or its checkpoint is missing or damaged.
+        InputError: there is nothing of the kind, or its checkpoint is missing or damaged.
     """
-    config = run_config(run)
-    return config.load(*find_checkpoint(Path(run), config.stage_names, checkpoint))
+    path = find_prior(run)
+    if is_packed(path):
+        if checkpoint != "final":
+            raise InputError(
+                f"{run} is a packed prior, which holds one checkpoint; leave out --checkpoint."
+            )
+        packed = read_packed(path)
+        return unpack(packed, check_config(packed.said.settings, str(run)), str(run))
+    config = run_config(path)
+    return config.load(*find_checkpoint(path, config.stage_names, checkpoint))
 
 
 def load_run(run: Path | str, checkpoint: str = "final") -> TrainedPrior:

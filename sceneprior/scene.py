@@ -88,7 +88,7 @@ class Scene:
         return replace(self, objects=tuple(replace(item, mesh=None) for item in self.objects))
 
     def save(self, path: Path | str) -> None:
-        """Write the scene to one file: `.json`, `.glb`, `.obj` or `.png`; see `save_scene`.
+        """Write the scene to a file: `.json`, `.glb`, `.obj`, `.usda` or `.png`; see `save_scene`.
 
         >>> from tempfile import TemporaryDirectory
         >>> bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))

@@ -22,8 +22,9 @@ def save_scene(scene: Scene, path: Path, renderer: Renderer | None = None) -> No
 
     `.json`: classes and boxes. `.glb`: one node per object, called `<index>_<class>`, in the class
     colour; an object without a mesh is written as its box. `.obj`: the same, with the `.mtl` beside
-    it. `.png`: straight from above, what scores compare, with borders between objects. Axes and
-    unit are the room frame's: y up, metres.
+    it. `.usda`: a mesh per object, its class in `userProperties:class`. `.png`: straight from
+    above, what scores compare, with borders between objects. Axes and unit are the room frame's: y
+    up, metres.
 
     Args:
         renderer: For pictures; None opens one.
@@ -60,8 +61,13 @@ def _write_png(scene: Scene, path: Path, renderer: Renderer | None) -> None:
     write_whole(path, png_bytes(picture))
 
 
+def _write_usd(scene: Scene, path: Path, _: Renderer | None) -> None:
+    write_whole(path, scene_to_usd(scene))
+
+
 WRITERS: Mapping[str, Callable[[Scene, Path, Renderer | None], None]] = {
-    ".json": _write_json, ".glb": _write_glb, ".obj": _write_obj, ".png": _write_png,
+    ".json": _write_json, ".glb": _write_glb, ".obj": _write_obj, ".usda": _write_usd,
+    ".png": _write_png,
 }  # fmt: skip
 
 
@@ -92,6 +98,39 @@ def scene_to_obj(scene: Scene, materials: str) -> tuple[str, bytes]:
         header=None,
     )  # fmt: skip
     return text + "\n", files[materials]
+
+
+def scene_to_usd(scene: Scene) -> str:
+    """The scene as the text of a USD stage: y up, metres; `/room` holds a mesh per object.
+
+    Raises:
+        InputError: the package `usd-core` is missing.
+    """
+    try:
+        from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
+    except ImportError:
+        raise InputError("USD needs a package more: pip install 'sceneprior[usd]'.") from None
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/room").GetPrim())
+    meshes, colors = scene_meshes(scene), object_colors(scene)
+    for node, item, mesh, color in zip(_nodes(scene), scene.objects, meshes, colors, strict=True):
+        # Names of USD begin with a letter.
+        prim = UsdGeom.Mesh.Define(
+            stage, Sdf.Path("/room").AppendChild(Tf.MakeValidIdentifier(f"object_{node}"))
+        )
+        vertices = np.ascontiguousarray(mesh.vertices_m, dtype=np.float32)
+        faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
+        prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(vertices))
+        prim.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), 3))
+        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.ravel()))
+        prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([vertices.min(0), vertices.max(0)])))
+        prim.CreateDisplayColorAttr([Gf.Vec3f(*_linear_rgba(color)[:3])])
+        label = prim.GetPrim().CreateAttribute("userProperties:class", Sdf.ValueTypeNames.String)
+        label.Set(item.label)
+    return str(stage.GetRootLayer().ExportToString())
 
 
 def _trimesh_of(scene: Scene) -> Any:

@@ -132,7 +132,7 @@ def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480
     The camera stands two diagonals away. The floor is the rectangle around the known outlines,
     or, where they are not known, around the objects.
     """
-    floors = np.array([_floor_rectangle(scene) for scene in scenes])
+    floors = np.array([floor_rectangle(scene) for scene in scenes])
     low, high = floors[:, 0].min(axis=0), floors[:, 1].max(axis=0)
     # 2 cm below y = 0, so that feet that stand on the floor do not flicker into it.
     center = ((low[0] + high[0]) / 2, -0.03, (low[1] + high[1]) / 2)
@@ -204,7 +204,9 @@ def turntable(
     return [perspective(scene, renderer, view=view) for view in views]
 
 
-def _floor_rectangle(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def floor_rectangle(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper (x, z) of a rectangle around the floor, or around the objects, 20 cm off,
+    where it is not known."""
     if scene.floor_m is not None and len(scene.floor_m):
         outline = np.asarray(scene.floor_m, dtype=np.float64)
         return outline.min(0), outline.max(0)

@@ -21,7 +21,7 @@ ROWS = {
     "pictures": 1, "topdown": 1, "scene_files": 1,
     "data": 2, "models": 2, "losses": 2, "lifting": 2,
     "data_prep": 3, "training": 3, "sampler": 3,
-    "baselines": 4, "evaluation": 4,
+    "baselines": 4, "evaluation": 4, "interchange": 4, "priors": 4,
     "config": 5,
     "generation": 6, "reconstruction": 6, "experiments": 6,
     "api": 7, "viewer": 7,
@@ -38,6 +38,9 @@ OWNERS = {
     "triton": ["sceneprior/silhouettes/"],
     "lightning": ["sceneprior/training/", "sceneprior/sampler/", "sceneprior/baselines/"],
     "wandb": ["sceneprior/training/"],
+    "safetensors": ["sceneprior/priors/"],
+    "huggingface_hub": ["sceneprior/priors/"],
+    "pxr": ["sceneprior/scene_files.py"],
     "yaml": ["sceneprior/settings.py", "data_prep/homes/furniture.py"],
     "pydantic": [
         "sceneprior/settings.py", "sceneprior/scene.py", "sceneprior/models/",

@@ -63,6 +63,16 @@ def test_homes_become_shards_and_the_page_template_is_there(installed, tmp_path)
     assert (tmp_path / "shards/index.json").is_file()
 
 
+def test_a_prior_of_the_package_makes_rooms(installed, tmp_path):
+    done = run(
+        installed, "-m", "sceneprior", "synthesize", "--run", "procthor-bedroom", "-n", "2",
+        "--out", "rooms", "--renderer", "software", cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "Wrote 2 rooms to rooms (from: sampler)\n"
+    assert len(list((tmp_path / "rooms").glob("*.glb"))) == 2
+
+
 def test_a_wrong_name_lists_the_shipped_configs(installed, tmp_path):
     done = run(installed, "-m", "sceneprior", "fit", "--config", "bedrom.yaml", cwd=tmp_path)
     assert done.returncode == 2

@@ -14,7 +14,7 @@ class Atiss2dConfig(DecoderConfig):
     """Size of the encoder; published: 4 layers, 8 heads and an FFN of 1,024 at width 512."""
 
     name: Literal["atiss2d"] = "atiss2d"
-    layers: int = Field(4, ge=1)
+    layers: int = Field(4, ge=1, le=100)
     heads: int = Field(8, ge=1)
     """Attention heads; must divide D_z."""
     hidden: int = Field(1024, ge=8)

@@ -11,7 +11,15 @@ import typer
 
 from data_prep.cli import add_commands
 from sceneprior import __version__
-from sceneprior.cli import evaluating, experiments, generating, reconstruction, training, viewing
+from sceneprior.cli import (
+    evaluating,
+    experiments,
+    generating,
+    reconstruction,
+    sharing,
+    training,
+    viewing,
+)
 from sceneprior.errors import InputError
 
 app = typer.Typer(
@@ -26,7 +34,8 @@ for command in (
     training.fit, training.report,
     generating.synthesize, generating.interpolate, generating.complete, generating.retrieve,
     reconstruction.reconstruct, reconstruction.eval_svr,
-    evaluating.eval_fid, evaluating.convert_boxes,
+    sharing.pack, sharing.priors, sharing.export,
+    evaluating.eval_fid,
     experiments.compare, experiments.demo, viewing.view,
 ):  # fmt: skip
     app.command()(command)

@@ -1,4 +1,4 @@
-"""The commands eval-fid and convert-boxes; what a command needs it imports when called."""
+"""The command eval-fid; what it needs it imports when called."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,8 +9,8 @@ from sceneprior.cli.options import (
     CheckpointOption,
     DistributionOption,
     InceptionOption,
-    OverwriteOption,
     RendererOption,
+    result_file,
 )
 from sceneprior.errors import InputError
 
@@ -19,7 +19,7 @@ GENERATED = 1000
 
 def eval_fid(
     run: Annotated[
-        Path | None, typer.Option(help="Folder of a run that `fit` made; it generates the rooms.")
+        str | None, typer.Option(help="A run or prior, as `synthesize` takes; it makes the rooms.")
     ] = None,
     scenes: Annotated[
         Path | None, typer.Option(help="Instead of a run: a folder of scene JSONs, of any method.")
@@ -77,7 +77,7 @@ def eval_fid(
         )
     options = EvalOptions(seed, inception, alexnet, reference, split, boxes, resamples, renderer)
     if run is not None:
-        target = out or run / "scores.json"
+        target = result_file(run, out, "scores.json")
         rooms = count or GENERATED
         found = evaluate_run(run, rooms, options, target, shards, distribution, checkpoint)
     elif scenes is not None:
@@ -95,28 +95,3 @@ def eval_fid(
         )
     print_scores(found)
     typer.echo(f"Wrote {target}")
-
-
-def convert_boxes(
-    boxes: Annotated[
-        Path, typer.Argument(help="A .npz or .json of boxes, or a folder of them (boxes.npz each).")
-    ],
-    out: Annotated[Path, typer.Option(help="Folder for the scenes.")],
-    label_set: Annotated[str, typer.Option(help="Of the scenes, such as front3d_bedroom.")],
-    classes: Annotated[
-        str | None,
-        typer.Option(help="Names of the columns, comma-separated (default: the label set's)."),
-    ] = None,
-    sizes: Annotated[
-        str, typer.Option(help="half: half extents, as ATISS writes them; full: whole ones.")
-    ] = "half",
-    overwrite: OverwriteOption = False,
-) -> None:
-    """Turn box lists of ATISS and similar methods into scenes that eval-fid evaluates."""
-    from sceneprior.evaluation.box_lists import read_box_lists
-    from sceneprior.generation.export import write_scenes
-    from sceneprior.offscreen import SoftwareRenderer
-
-    rooms = read_box_lists(boxes, label_set, classes, sizes)
-    write_scenes(rooms, out, SoftwareRenderer(), overwrite)
-    typer.echo(f"Wrote {len(rooms)} rooms to {out}")

@@ -41,7 +41,7 @@ def synthesize(
     write_scenes(scenes, out, artist, overwrite)
     origin = distribution or prior.distribution
     if html:
-        told = f"run {run.resolve().name} · seed {seed} · from: {origin}"
+        told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
         write_rooms_page(out / PAGE_FILE, scenes, artist, title="New rooms", subtitle=told)
     typer.echo(f"Wrote {count} rooms to {out} (from: {origin})")
     if (warning := emptiness(scenes)) is not None:

@@ -5,7 +5,13 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.cli.options import CheckpointOption, OverwriteOption, RendererOption, RunOption
+from sceneprior.cli.options import (
+    CheckpointOption,
+    OverwriteOption,
+    RendererOption,
+    RunOption,
+    result_file,
+)
 
 FitOption = Annotated[
     str,
@@ -114,7 +120,7 @@ def reconstruct(
 
 def eval_svr(
     shards: Annotated[Path, typer.Option(help="Shards with 3D ground truth.")],
-    run: Annotated[Path | None, typer.Option(help="A run: its fits are evaluated.")] = None,
+    run: Annotated[str | None, typer.Option(help="A run: its fits are evaluated.")] = None,
     scenes: Annotated[
         Path | None, typer.Option(help="Instead: what reconstruct, or retrieve after it, wrote.")
     ] = None,
@@ -147,18 +153,18 @@ def eval_svr(
     protocol = SvrProtocol(shards, split, seed, renderer)
     if run is not None and scenes is None:
         options = FitOptions(fit, restarts)
-        target = run
-        scores = evaluate_run(run, protocol, options, limit, checkpoint, models)
+        target = result_file(run, out, "svr.json")
+        found = evaluate_run(run, protocol, options, limit, checkpoint, models)
     elif scenes is not None and run is None:
         if (limit, fit, restarts, checkpoint, models) != (None, "objects", 1, "final", None):
             raise InputError(
                 "--limit, --checkpoint, --fit, --restarts and --models belong to --run; scenes are "
                 "evaluated as they are."
             )
-        target, scores = scenes, evaluate_scenes(scenes, protocol)
+        target = out or scenes / "svr.json"
+        found = evaluate_scenes(scenes, protocol)
     else:
         raise InputError("Say what to evaluate: either --run, or --scenes with reconstructions.")
-    target = out or target / "svr.json"
-    write_json(target, scores)
-    print_view_scores(scores)
+    write_json(target, found)
+    print_view_scores(found)
     typer.echo(f"Wrote {target}")

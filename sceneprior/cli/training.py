@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.cli.options import AcceleratorOption, CheckpointOption, RendererOption, RunOption
+from sceneprior.cli.options import AcceleratorOption, CheckpointOption, RendererOption
 
 
 def fit(
@@ -52,7 +52,7 @@ def fit(
 
 
 def report(
-    run: RunOption,
+    run: Annotated[Path, typer.Option(help="Folder of a run that `fit` made.")],
     scores: Annotated[Path | None, typer.Option(help="From eval-fid (RUN/scores.json).")] = None,
     out: Annotated[Path | None, typer.Option(help="HTML file (default: RUN/report.html).")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the generated rooms shown.")] = 0,

@@ -35,7 +35,7 @@ CURVES = (
 
 
 def evaluate_run(
-    run: Path,
+    run: Path | str,
     count: int,
     options: EvalOptions,
     out: Path,
@@ -69,7 +69,7 @@ def evaluate_run(
         if pairs:
             scores |= reconstruction_scores(pairs)
     scores["protocol"] |= {
-        "run": run.resolve().name, "stage": trained.stage, "checkpoint": checkpoint
+        "run": Path(run).name, "stage": trained.stage, "checkpoint": checkpoint
     }  # fmt: skip
     latents = "its own"
     if isinstance(trained, TrainedPrior):

@@ -65,7 +65,7 @@ class LayoutDecoder(nn.Module):
         )
         # Section 3.4: every object starts at the floor centre. Weights are small rather than
         # zero, so that objects can part; y starts a little above 0, where ReLU has a slope.
-        size = float(torch.log(torch.expm1(torch.tensor(INITIAL_SIZE_M))))
+        size = float(torch.log(torch.expm1(torch.tensor(INITIAL_SIZE_M, device="cpu"))))
         starts = (0.0, 0.1, 0.0, size, size, size, 0.0)
         with torch.no_grad():
             for (weight, bias), start in zip(self.mlp2.rows()[-7:], starts, strict=True):

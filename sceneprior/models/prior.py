@@ -21,7 +21,7 @@ from sceneprior.views import DecodedScenes
 class ModelConfig(Section):
     """The network (section 3 and supplement A). `config.py` lists the choices of `decoder`."""
 
-    max_objects: int = Field(ge=1)
+    max_objects: int = Field(ge=1, le=1000)
     """N: 13 for bedrooms, 28 for living rooms, 53 for ScanNet."""
     width: int = Field(512, ge=8)
     """D_z, of latents and object features."""

@@ -86,7 +86,8 @@ def reconstruct(
     if not direct and not trained.remembers_rooms:
         raise InputError(
             f"Reconstruction starts from training rooms, and a run of `method: "
-            f"{trained.config.method}` keeps no latents of them; take a run of `method: ours`."
+            f"{trained.config.method}` keeps no latents of them; take a run of "
+            "`method: ours`, or a prior that was packed with --latents."
         )
     for image in images:
         if image.label_set != trained.config.label_set:

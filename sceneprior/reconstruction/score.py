@@ -70,7 +70,7 @@ class SvrProtocol:
 
 
 def evaluate_run(
-    run: Path,
+    run: str,
     protocol: SvrProtocol,
     options: FitOptions,
     limit: int | None = None,

@@ -14,7 +14,7 @@ class SamplerConfig(TrainConfig):
     clip_gradient: float = Field(1.0, ge=0)
     width: int = Field(128, ge=8)
     """Of the transformer encoder; its inner layers are twice as wide."""
-    layers: int = Field(2, ge=1)
+    layers: int = Field(2, ge=1, le=100)
     heads: int = Field(4, ge=1)
     dropout: float = Field(0.1, ge=0, lt=1)
     val_every: int = Field(10, ge=1)

@@ -228,12 +228,15 @@ class TrainedPrior:
     def distribution(self) -> str:
         """Where new rooms come from unless a task says otherwise: as the config says; before the
         stage of the sampler that it names, from `latent_distribution`."""
-        asked = self.config.distribution
-        return asked if asked != "sampler" or self.sampler is not None else LATENTS_BESIDE
+        with_sampler = self.sampler is not None and self.config.distribution == "sampler"
+        return "sampler" if with_sampler else self.latent_distribution
 
     @property
     def latent_distribution(self) -> str:
-        """Where new latents come from, which a sampler does without."""
+        """Where new latents come from, which a sampler does without; all but `paper` need those of
+        training rooms, which a packed prior may lack."""
+        if not self.remembers_rooms:
+            return "paper"
         asked = self.config.distribution
         return asked if asked != "sampler" else LATENTS_BESIDE
 

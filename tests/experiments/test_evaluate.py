@@ -129,7 +129,7 @@ def test_boxes_are_converted_and_then_evaluated(command, toy_shards, tmp_path):
     (tmp_path / "theirs").mkdir()
     for path in tmp_path.glob("*.npz"):
         path.rename(tmp_path / "theirs" / path.name)
-    call = ["convert-boxes", "theirs", "--out", "ours", "--label-set", "front3d_bedroom"]
+    call = ["export", "theirs", "--to", "scenes", "--out", "ours", "--label-set", "front3d_bedroom"]
     assert command(*call)[:2] == (0, "Wrote 3 rooms to ours\n")
     status, _, errors = command(*call)
     assert status == 2 and "ours is not empty; add --overwrite" in errors

@@ -34,11 +34,11 @@ BATCH = 256
 class AtissModel(Section):
     """Size of the network; the defaults are the published settings."""
 
-    max_objects: int = Field(ge=1)
+    max_objects: int = Field(ge=1, le=1000)
     """Where sampling stops, if the end was not drawn before."""
     width: int = Field(512, ge=8)
     """Of the encoder and the hidden layers."""
-    layers: int = Field(4, ge=1)
+    layers: int = Field(4, ge=1, le=100)
     """Of the transformer encoder."""
     heads: int = Field(8, ge=1)
     hidden: int = Field(1024, ge=8)

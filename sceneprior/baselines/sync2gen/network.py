@@ -31,7 +31,7 @@ class Sync2genModel(Section):
     """Of the hidden layers; a multiple of 8."""
     latent: int = Field(20, ge=1)
     """Numbers that a room is encoded as."""
-    slots: int = Field(8, ge=1)
+    slots: int = Field(8, ge=1, le=1000)
     """Objects of one class that a room can hold (released: 4); further ones are left out, and
     their share is logged as `train/left_out`."""
     refine_steps: int = Field(100, ge=0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sceneprior.errors import InputError
-from sceneprior.evaluation.box_lists import read_box_lists, read_boxes, turned_box
 from sceneprior.generation.export import write_scenes
+from sceneprior.interchange.box_lists import read_box_lists, read_boxes, turned_box
 from sceneprior.offscreen import SoftwareRenderer
 from sceneprior.scene import Scene
 from sceneprior.scene_files import load_scene_folder

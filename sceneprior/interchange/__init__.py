@@ -1,0 +1,1 @@
+"""Rooms in the formats of others, and back."""

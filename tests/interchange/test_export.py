@@ -1,0 +1,113 @@
+"""Rooms go out in other formats and come back: axes, units, classes, floors."""
+
+import numpy as np
+import pytest
+import shapely
+
+from data_prep.front.models import ModelBank
+from data_prep.front.recipe import load_recipe
+from data_prep.front.rooms import read_house
+from sceneprior.errors import InputError
+from sceneprior.interchange.box_lists import read_box_lists
+from sceneprior.interchange.export import export_scenes
+from sceneprior.scene import Mesh, Scene, SceneObject
+
+BEDROOM = "front3d_bedroom"
+FLOOR = np.array([[-2.0, -1.5], [2.0, -1.5], [2.0, 1.5], [0.0, 1.5], [0.0, 0.5], [-2.0, 0.5]])
+"""An L; its bounding box is about the origin."""
+PYRAMID = Mesh(
+    np.array([[-1.0, 0.1, -1], [0.6, 0.1, -1], [0.6, 0.1, 1], [-1.0, 0.1, 1], [-0.2, 0.9, 0.4]]),
+    np.array([[0, 1, 2], [0, 2, 3], [0, 4, 1], [1, 4, 2], [2, 4, 3], [3, 4, 0]]),
+)
+
+
+@pytest.fixture
+def scenes() -> list[Scene]:
+    bed = SceneObject("double_bed", (-0.2, 0.5, 0.0), (1.6, 0.8, 2.0), PYRAMID)
+    lamp = SceneObject("pendant_lamp", (1.0, 2.2, -0.5), (0.3, 0.4, 0.2))
+    return [
+        Scene("first", BEDROOM, (bed, lamp), FLOOR),
+        Scene("second", BEDROOM, (lamp,)),
+    ]
+
+
+def test_box_lists_come_back(scenes, tmp_path):
+    export_scenes([*scenes, Scene("empty", BEDROOM)], "atiss", tmp_path)
+    with np.load(tmp_path / "first" / "boxes.npz", allow_pickle=False) as kept:
+        assert kept["class_labels"].shape == (2, 21 + 2)  # start and end, as ATISS has them
+        np.testing.assert_allclose(kept["sizes"], [[0.8, 0.4, 1.0], [0.15, 0.2, 0.1]])  # half
+        np.testing.assert_allclose(kept["translations"][1], (1.0, 2.2, -0.5))
+        assert not kept["angles"].any()
+    empty, *back = read_box_lists(tmp_path, BEDROOM)
+    assert (empty.name, empty.objects) == ("empty", ())
+    for room, other in zip(scenes, back, strict=True):
+        assert room.name == other.name
+        assert [item.label for item in room.objects] == [item.label for item in other.objects]
+        np.testing.assert_allclose(other.centers_m, room.centers_m)
+        np.testing.assert_allclose(other.sizes_m, room.sizes_m)
+    assert shapely.Polygon(back[0].floor_m).equals_exact(
+        shapely.Polygon(FLOOR), 1e-9, normalize=True
+    )
+    assert back[1].floor_m is None
+
+
+def test_3d_front_s_reader_finds_the_rooms_and_their_models(scenes, tmp_path):
+    export_scenes(scenes, "threed-front", tmp_path)
+    bank, recipe = ModelBank(tmp_path / "3D-FUTURE-model"), load_recipe("bedroom")
+    found = read_house(tmp_path / "3D-FRONT" / "first.json", bank, recipe)
+    assert not found.failures and not found.filtered
+    (room,) = found.rooms
+    assert (room.type, room.room_id) == ("Bedroom", "first_Bedroom-0")
+    assert room.floor.equals_exact(shapely.Polygon(FLOOR), 1e-6, normalize=True) or np.isclose(
+        room.floor.symmetric_difference(shapely.Polygon(FLOOR)).area, 0, atol=1e-6
+    )
+    bed, lamp = room.furniture
+    assert (bed.label, lamp.label) == ("double_bed", "pendant_lamp")
+    np.testing.assert_allclose(bed.mesh.vertices_m, PYRAMID.vertices_m, atol=1e-5)
+    np.testing.assert_array_equal(bed.mesh.faces, PYRAMID.faces)
+    low, high = (getattr(lamp.mesh.vertices_m, end)(axis=0) for end in ("min", "max"))
+    np.testing.assert_allclose((low + high) / 2, (1.0, 2.2, -0.5), atol=1e-5)
+    np.testing.assert_allclose(high - low, (0.3, 0.4, 0.2), atol=1e-5)
+    # Without a floor, one is put under the furniture, and the room is about its centre.
+    (other,) = read_house(tmp_path / "3D-FRONT" / "second.json", bank, recipe).rooms
+    np.testing.assert_allclose(other.furniture[0].mesh.vertices_m.mean(0), (0, 2.2, 0), atol=1e-5)
+
+
+def test_objects_of_unknown_classes_cannot_become_models(tmp_path):
+    room = Scene("a", "void,throne", (SceneObject("throne", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0)),))
+    export_scenes([room], "threed-front", tmp_path / "named")  # the category is the class
+    assert "throne" in (tmp_path / "named" / "3D-FUTURE-model" / "model_info.json").read_text()
+
+
+def test_usd_holds_meshes_in_metres_with_y_up(scenes, tmp_path):
+    usd = pytest.importorskip("pxr.Usd")
+    geometry = pytest.importorskip("pxr.UsdGeom")
+    export_scenes(scenes, "usd", tmp_path)
+    stage = usd.Stage.Open(str(tmp_path / "first.usda"))
+    assert geometry.GetStageUpAxis(stage) == "Y" and geometry.GetStageMetersPerUnit(stage) == 1.0
+    bed, lamp = stage.GetDefaultPrim().GetChildren()
+    assert bed.GetAttribute("userProperties:class").Get() == "double_bed"
+    mesh = geometry.Mesh(bed)
+    np.testing.assert_allclose(np.array(mesh.GetPointsAttr().Get()), PYRAMID.vertices_m, atol=1e-6)
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    np.testing.assert_array_equal(faces, PYRAMID.faces)
+    assert list(mesh.GetFaceVertexCountsAttr().Get()) == [3] * len(faces)
+    low, high = (np.array(corner) for corner in geometry.Mesh(lamp).GetExtentAttr().Get())
+    np.testing.assert_allclose((low + high) / 2, (1.0, 2.2, -0.5), atol=1e-6)
+    assert usd.Stage.Open(str(tmp_path / "second.usda")).GetDefaultPrim().GetName() == "room"
+
+
+def test_obj_is_one_file_a_room(scenes, tmp_path):
+    export_scenes(scenes, "obj", tmp_path)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"first.obj", "first.mtl", "second.obj", "second.mtl"}
+
+
+def test_what_cannot_be_exported_is_a_sentence(scenes, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="No format 'max'; choose from atiss, threed-front, obj"):
+        export_scenes(scenes, "max", tmp_path)
+    with pytest.raises(InputError, match="Two rooms are called 'first'"):
+        export_scenes([scenes[0], scenes[0]], "obj", tmp_path)
+    monkeypatch.setitem(__import__("sys").modules, "pxr", None)
+    with pytest.raises(InputError, match=r"USD needs a package more: pip install 'sceneprior\[usd"):
+        export_scenes(scenes, "usd", tmp_path)

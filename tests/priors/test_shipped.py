@@ -1,0 +1,49 @@
+"""The priors of the package: small, with a card, and without what must not be passed on."""
+
+import zipfile
+
+import pytest
+import torch
+
+from sceneprior.config import load_run
+from sceneprior.generation.decode import synthesize
+from sceneprior.priors.packed import FILES, read_packed
+from sceneprior.priors.where import shipped_priors
+
+SHIPPED = shipped_priors()
+
+
+def test_there_are_some():
+    assert "procthor-bedroom" in SHIPPED
+
+
+@pytest.fixture(params=SHIPPED)
+def name(request) -> str:
+    return request.param
+
+
+def test_they_are_small_and_hold_no_latents_of_training_rooms(name):
+    assert SHIPPED[name].stat().st_size < 3.5e6
+    packed = read_packed(SHIPPED[name])
+    assert packed.said.room_ids == [] and len(packed.tensors["latents.weight"]) == 0
+    assert "/" not in packed.said.settings["data"]["shards"]
+    with zipfile.ZipFile(SHIPPED[name]) as archive:
+        assert tuple(archive.namelist()) == FILES
+
+
+def test_their_cards_credit_the_data_and_say_how_they_were_made_and_how_good_they_are(name):
+    card = read_packed(SHIPPED[name]).card
+    assert SHIPPED[name].with_suffix(".md").read_text() == card  # for readers of the repository
+    for needed in ("## Data, authors and licence", "sceneprior pack", "seed 0", "## Limits"):
+        assert needed in card
+    assert "| Category KL to test rooms" in card and "real test (" in card
+    if name.startswith("procthor"):
+        assert "ProcTHOR" in card and "Sweet Home 3D" in card and "CC-BY-3.0" in card
+
+
+def test_they_make_rooms_with_meshes(name):
+    trained = load_run(SHIPPED[name])
+    rooms = synthesize(trained, 4, 0)
+    assert all(room.objects for room in rooms)
+    assert all(item.mesh is not None for room in rooms for item in room.objects)
+    assert all(value.dtype != torch.float16 for value in trained.prior.state_dict().values())
