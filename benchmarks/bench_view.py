@@ -122,8 +122,8 @@ def dragged(page: Page, points: list[tuple[float, float]]) -> dict[str, float]:
     late = []
     for at, said, _ in came:
         if said:
-            place = tuple(map(float, said.removeprefix("map ").split(",")))
-            late.append(at - sent[min(sent, key=lambda point: math.dist(point, place))])
+            x, y = map(float, said.removeprefix("map ").split(","))
+            late.append(at - sent[min(sent, key=lambda point: math.dist(point, (x, y)))])
     return {
         "events_per_s": round(len(points) / wall, 1),
         "rooms_per_s": round(len(late) / wall, 1),

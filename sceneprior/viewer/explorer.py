@@ -194,11 +194,12 @@ class Explorer:
 
     def find_meshes(self, stop: threading.Event) -> None:
         """Find the meshes of all shapes that the prior knows, so that no room has to wait."""
-        shapes = self.prior.with_latents.prior.shape if self.has_latents else None
-        for prototype in shapes.known if isinstance(shapes, OccupancyDecoder) else ():
-            if stop.is_set():
-                return
-            shapes.surface(prototype)
+        trained = self.prior.trained
+        if isinstance(trained, TrainedPrior) and isinstance(trained.prior.shape, OccupancyDecoder):
+            for prototype in trained.prior.shape.known:
+                if stop.is_set():
+                    return
+                trained.prior.shape.surface(prototype)
 
     def _decoded(self, z: Float[Tensor, " dimension"], name: str, origin: str) -> Shown:
         rooms = decode_latents(self.prior.with_latents, z.unsqueeze(0), [name])

@@ -78,8 +78,9 @@ class Page:
         """Show a room. While one is dragged it is not `settled`: what takes longer waits."""
         with self._lock:
             self.shown = shown
-            swap = settled and self.models is not None and self._cad.value
-            self.scene = retrieve(shown.scene, self.models) if swap else shown.scene
+            self.scene = shown.scene
+            if settled and self.models is not None and self._cad.value:
+                self.scene = retrieve(shown.scene, self.models)
             with self.server.atomic():
                 self._room.show(self.scene, shown.kept, self._names.value, self._boxes.value)
                 if self.board is not None:
@@ -193,7 +194,7 @@ class Page:
         if len(names) < 2:
             return
         gui = self.server.gui
-        number = gui.add_slider("Room", min=1, max=len(names), step=1, initial_value=1)
+        number: Any = gui.add_slider("Room", min=1, max=len(names), step=1, initial_value=1)
         number.on_update(lambda _: self._follow(lambda: self.show(folder.room(number.value - 1))))
 
         def turn(by: int) -> None:
@@ -206,7 +207,7 @@ class Page:
         with gui.add_folder("New room"):
             known = explorer.distributions
             origin = gui.add_dropdown("From", known, initial_value=known[0]) if known else None
-            seed = gui.add_number("Seed", 0, min=0, step=1)
+            seed: Any = gui.add_number("Seed", 0, min=0, step=1)
 
             def sample() -> None:
                 self.show(explorer.sample(seed.value, None if origin is None else origin.value))
@@ -225,7 +226,7 @@ class Page:
             hint = f"A training room's id, seed:7, a file of latents, or {HERE}"
             start = gui.add_text("From", "seed:1", hint=hint)
             end = gui.add_text("To", "seed:2", hint=hint)
-            step = gui.add_slider(
+            step: Any = gui.add_slider(
                 "Step", min=0, max=PATH_STEPS - 1, step=1, initial_value=0, disabled=True
             )
 
@@ -249,7 +250,7 @@ class Page:
         gui = self.server.gui
         with gui.add_folder("Complete"):
             gui.add_markdown("Click objects to keep them; all others are furnished anew.")
-            seed = gui.add_number("Seed ", 0, min=0, step=1)
+            seed: Any = gui.add_number("Seed ", 0, min=0, step=1)
 
             def complete() -> None:
                 self.show(explorer.complete(self.shown, seed.value))
