@@ -24,6 +24,8 @@ from sceneprior.viewer.latent_map import LatentMap, make_map
 
 PATH_STEPS = 49
 """Rooms of a path, both ends included: seldom 4 degrees of the sphere apart."""
+SOME = 64
+"""Training rooms, at most, that say how large rooms are: all of them would take a second."""
 HERE = "here"
 """Names the room that is shown as an end of a path."""
 
@@ -171,29 +173,33 @@ class Explorer:
 
     @cached_property
     def _layouts(self) -> list[Scene]:
-        """The training rooms as the prior remembers them, as boxes."""
+        return self._boxes_of(range(len(self._training_z)))
+
+    def _boxes_of(self, rows: Sequence[int]) -> list[Scene]:
+        """Training rooms as the prior remembers them, without shapes."""
         trained = self.prior.with_latents
         with torch.no_grad():
-            decoded = trained.prior.decode(self._training_z, with_shape=False)
+            decoded = trained.prior.decode(self._training_z[list(rows)], with_shape=False)
+        names = [trained.room_ids[row] for row in rows]
         target = trained.config.model.completeness_target
-        rooms = to_rooms(decoded, trained.prior, self.label_set, trained.room_ids, target)
+        rooms = to_rooms(decoded, trained.prior, self.label_set, names, target)
         return [room.scene for room in rooms]
 
     def some_layouts(self) -> list[Scene]:
         """Rooms as boxes that say how large rooms are."""
         if self.map is not None:
-            return self._layouts
+            most = len(self._training_z)
+            return self._boxes_of(range(0, most, -(-most // SOME)))
         return self.prior.sample(16, 0, next(iter(self.distributions), None))
 
     def find_meshes(self, stop: threading.Event) -> None:
         """Find the meshes of all shapes that the prior knows, so that no room has to wait."""
-        shapes = self.prior.with_latents.prior.shape if self.has_latents else None
-        if not isinstance(shapes, OccupancyDecoder):
-            return
-        for prototype in shapes.known:
-            if stop.is_set():
-                return
-            shapes.surface(prototype)
+        trained = self.prior.trained
+        if isinstance(trained, TrainedPrior) and isinstance(trained.prior.shape, OccupancyDecoder):
+            for prototype in trained.prior.shape.known:
+                if stop.is_set():
+                    return
+                trained.prior.shape.surface(prototype)
 
     def _decoded(self, z: Float[Tensor, " dimension"], name: str, origin: str) -> Shown:
         rooms = decode_latents(self.prior.with_latents, z.unsqueeze(0), [name])

@@ -194,7 +194,7 @@ class Page:
         if len(names) < 2:
             return
         gui = self.server.gui
-        number = gui.add_slider("Room", min=1, max=len(names), step=1, initial_value=1)
+        number: Any = gui.add_slider("Room", min=1, max=len(names), step=1, initial_value=1)
         number.on_update(lambda _: self._follow(lambda: self.show(folder.room(number.value - 1))))
 
         def turn(by: int) -> None:
@@ -207,7 +207,7 @@ class Page:
         with gui.add_folder("New room"):
             known = explorer.distributions
             origin = gui.add_dropdown("From", known, initial_value=known[0]) if known else None
-            seed = gui.add_number("Seed", 0, min=0, step=1)
+            seed: Any = gui.add_number("Seed", 0, min=0, step=1)
 
             def sample() -> None:
                 self.show(explorer.sample(seed.value, None if origin is None else origin.value))
@@ -226,7 +226,7 @@ class Page:
             hint = f"A training room's id, seed:7, a file of latents, or {HERE}"
             start = gui.add_text("From", "seed:1", hint=hint)
             end = gui.add_text("To", "seed:2", hint=hint)
-            step = gui.add_slider(
+            step: Any = gui.add_slider(
                 "Step", min=0, max=PATH_STEPS - 1, step=1, initial_value=0, disabled=True
             )
 
@@ -250,7 +250,7 @@ class Page:
         gui = self.server.gui
         with gui.add_folder("Complete"):
             gui.add_markdown("Click objects to keep them; all others are furnished anew.")
-            seed = gui.add_number("Seed ", 0, min=0, step=1)
+            seed: Any = gui.add_number("Seed ", 0, min=0, step=1)
 
             def complete() -> None:
                 self.show(explorer.complete(self.shown, seed.value))

@@ -117,7 +117,9 @@ def test_the_room_follows_the_pointer(browser, page, monkeypatch):
     np.testing.assert_allclose(found, places[-1], atol=0.02 * latent_map.side)
     wait_for(lambda: last.origin in words(browser), "the panel does not say so")
     wait_for(lambda: (np.abs(canvas(browser) - before).max(axis=-1) > 40).any(), "nothing moved")
-    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+    # viser's own way of handling touches makes chromium complain, once a drag.
+    log = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    assert [said for said in log if "passive event listener" not in said] == []
 
 
 def test_objects_are_kept_by_a_click_and_the_rest_is_completed(browser, page):
