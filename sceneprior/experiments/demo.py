@@ -34,7 +34,8 @@ def run_demo(out: Path, config: str, rooms: int, count: int, renderer: str) -> N
 
 
 def demo_steps(out: Path, config: str, rooms: int, count: int, renderer: str) -> list[Step]:
-    """The demo's commands in order; each is redone when its arguments change."""
+    """The demo's commands in order; each is redone when its arguments change, or what `config`
+    holds."""
     homes, shards, run, scenes = (str(out / name) for name in ("homes", "shards", "run", "scenes"))
     scores, page = str(out / "scores.json"), str(out / "report.html")
     draw = ["--renderer", renderer]
@@ -52,15 +53,17 @@ def demo_steps(out: Path, config: str, rooms: int, count: int, renderer: str) ->
         "scores": ["eval-fid", "--run", run, "-n", str(count), "--out", scores, *draw],
         "report": ["report", "--run", run, "--scores", scores, "--out", page, *draw],
     }  # fmt: skip
-    last = load_config(config).stages()[-1].name
+    settings = load_config(config)
+    last = settings.stages()[-1].name
     results = {
         "homes": "homes", "shards": "shards/index.json", "fit": f"run/{last}/final.ckpt",
         "scenes": "scenes/overview.png", "scores": "scores.json", "report": "report.html",
     }  # fmt: skip
     continues = {"shards": "shards", "fit": "run"}
+    holds = {"fit": [settings.model_dump_json()]}
     return [
         Step(
-            name, arguments, out / results[name], depends_on=arguments,
+            name, arguments, out / results[name], depends_on=arguments + holds.get(name, []),
             continues=out / continues[name] if name in continues else None,
         )
         for name, arguments in commands.items()

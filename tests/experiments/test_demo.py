@@ -8,6 +8,7 @@ import pytest
 from sceneprior.errors import InputError
 from sceneprior.experiments.demo import demo_steps, run_demo
 from sceneprior.experiments.steps import StepRunner
+from sceneprior.settings import find_config
 
 SETTINGS = ("demo.yaml", 20, 4, "auto")
 COMMANDS = ["make-homes", "prep-front", "fit", "synthesize", "eval-fid", "report"]
@@ -105,3 +106,14 @@ def test_a_step_that_was_killed_is_done_again_and_its_costs_are_not_guessed(ran,
     (tmp_path / "steps.json").write_text(json.dumps(noted))
     assert run(tmp_path, called) == ["report"]
     assert json.loads((tmp_path / "scores.json").read_text())["seconds"] == 12.0
+
+
+def test_other_settings_in_the_same_file_are_trained_anew(ran, tmp_path):
+    called, _ = ran
+    config = tmp_path / "mine.yaml"
+    config.write_text(find_config("demo.yaml").read_text())
+    settings = (str(config), *SETTINGS[1:])
+    run(tmp_path, called, settings=settings)
+    assert run(tmp_path, called, settings=settings) == []
+    config.write_text(config.read_text().replace("seed: 0", "seed: 1"))
+    assert run(tmp_path, called, settings=settings) == COMMANDS[2:]
