@@ -35,6 +35,11 @@ AcceleratorOption = Annotated[str, typer.Option(help="cpu, gpu or auto; Lightnin
 def result_file(run: str, out: Path | None, name: str) -> Path:
     """Where a run's results go: into its folder unless told otherwise; an InputError where it has
     none."""
-    if out is None and not Path(run).is_dir():
+    from sceneprior.priors.where import find_prior
+
+    if out is not None:
+        return out
+    folder = find_prior(run)
+    if folder != Path(run) or not folder.is_dir():
         raise InputError(f"{run} is no folder to keep {name} in; name a file with --out.")
-    return out or Path(run) / name
+    return folder / name

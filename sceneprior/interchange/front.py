@@ -94,16 +94,16 @@ def _house(scene: Scene, models: Path) -> tuple[dict[str, Any], list[dict[str, A
 
 
 def category_of_class(label: str, label_set_name: str) -> str:
-    """A category of 3D-FUTURE that has a class.
+    """A category that has a class, as `prep-front` reads it.
 
     >>> category_of_class("double_bed", "front3d_bedroom")
-    'king-size bed'
+    'double bed'
     """
     for category in (label, *category_table()):
         if class_of_category(category, label_set_name) == label:
             return category
     raise InputError(
-        f"No category of 3D-FUTURE is a '{label}' in label set '{label_set_name}'; leave such "
+        f"No category of 3D-FRONT is a '{label}' in label set '{label_set_name}'; leave such "
         "objects out, or export to another format."
     )
 

@@ -83,7 +83,7 @@ def test_folders_that_are_no_run_or_hold_no_checkpoint(command, toy_run, tmp_pat
     name, *rest = words
     call = [name, "--run", "run", *rest, "--renderer", "software"]
     said = one_sentence(command(*call))
-    assert "run is not a run folder (no config.yaml in it); train one with" in said
+    assert "No prior at run; give a run's folder (`sceneprior fit`)" in said
     (tmp_path / "run").mkdir()
     shutil.copy(toy_run / "config.yaml", tmp_path / "run")
     before = everything_in(tmp_path)

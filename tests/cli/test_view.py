@@ -36,7 +36,7 @@ def test_what_cannot_be_shown_is_said(command, tmp_path, port):
         assert f"Port {port} of 127.0.0.1 cannot be had (Address already in use)" in said
         assert f"--port {port + 1}" in said
     call = ["--port", port]
-    assert "nowhere is not a run folder" in one_sentence(command("view", "nowhere", *call))
+    assert "No prior at nowhere;" in one_sentence(command("view", "nowhere", *call))
     (tmp_path / "empty").mkdir()
     said = one_sentence(command("view", "empty", *call))
     assert "empty holds no scene JSON" in said

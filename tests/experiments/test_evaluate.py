@@ -93,7 +93,7 @@ def test_a_run_is_evaluated_with_its_own_shards(command, toy_run, tmp_path):
             "--distribution and --checkpoint belong to",
         ),
         (["--scenes", "b", "--shards", "c"], "No folder of scenes at b;"),
-        (["--run", "a"], "a is not a run folder"),
+        (["--run", "a"], "No prior at a;"),
         (
             ["--run", "a", "--split", "train"],
             "Generated rooms are compared with the split test, or",
