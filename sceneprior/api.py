@@ -32,8 +32,9 @@ def load(where: str | Path, checkpoint: str = "final") -> "Prior":
     Raises:
         InputError: there is no prior, or it is damaged; one sentence says what to do.
 
-    >>> load("procthor-bedroom")
-    Prior('procthor-bedroom', front3d_bedroom, rooms from: sampler)
+    Examples:
+        >>> load("procthor-bedroom")
+        Prior('procthor-bedroom', front3d_bedroom, rooms from: sampler)
     """
     return Prior(load_any_run(where, checkpoint), str(where))
 
@@ -77,9 +78,10 @@ class Prior:
         Raises:
             InputError: the prior has no such distribution.
 
-        >>> rooms = load("procthor-bedroom").sample(2, seed=1)
-        >>> [room.name for room in rooms]
-        ['seed1_0000', 'seed1_0001']
+        Examples:
+            >>> rooms = load("procthor-bedroom").sample(2, seed=1)
+            >>> [room.name for room in rooms]
+            ['seed1_0000', 'seed1_0001']
         """
         return synthesize(self.trained, count, seed, distribution)
 
@@ -93,9 +95,10 @@ class Prior:
         Raises:
             InputError: an end is no latent of this prior, or the two are opposite.
 
-        >>> way = load("procthor-bedroom").interpolate("seed:1", "seed:2", steps=3)
-        >>> [room.extra["along"] for room in way]
-        [0.0, 0.5, 1.0]
+        Examples:
+            >>> way = load("procthor-bedroom").interpolate("seed:1", "seed:2", steps=3)
+            >>> [room.extra["along"] for room in way]
+            [0.0, 0.5, 1.0]
         """
         return interpolate(self.with_latents, start, end, steps)
 
@@ -117,12 +120,13 @@ class Prior:
         Raises:
             InputError: an object cannot be used, or there are more than rooms of the prior hold.
 
-        >>> from sceneprior.scene import SceneObject
-        >>> bed = SceneObject("double_bed", (0.0, 0.3, -1.0), (1.8, 0.6, 2.0))
-        >>> given = Scene("mine", "front3d_bedroom", (bed,))
-        >>> (room,) = load("procthor-bedroom").complete(given, count=1, classes=["nightstand"])
-        >>> [item.label for item in room.objects]
-        ['double_bed', 'nightstand']
+        Examples:
+            >>> from sceneprior.scene import SceneObject
+            >>> bed = SceneObject("double_bed", (0.0, 0.3, -1.0), (1.8, 0.6, 2.0))
+            >>> given = Scene("mine", "front3d_bedroom", (bed,))
+            >>> (room,) = load("procthor-bedroom").complete(given, count=1, classes=["nightstand"])
+            >>> [item.label for item in room.objects]
+            ['double_bed', 'nightstand']
         """
         return complete(self.with_latents, [scene], count, seed, distribution, classes=classes)[0]
 
@@ -146,8 +150,9 @@ class Prior:
     def latent(self, point: Point) -> Float[Tensor, " dimension"]:
         """The latent that an end of `interpolate` is; an `InputError` where it is none.
 
-        >>> load("procthor-bedroom").latent("seed:1").shape
-        torch.Size([128])
+        Examples:
+            >>> load("procthor-bedroom").latent("seed:1").shape
+            torch.Size([128])
         """
         return latent_of(self.with_latents, point)
 
@@ -157,11 +162,12 @@ class Prior:
         Raises:
             InputError: the prior has no latent space.
 
-        >>> prior = load("procthor-bedroom")
-        >>> z = prior.latent("seed:1").unsqueeze(0).requires_grad_()
-        >>> prior.decode(z).sizes_m.sum().backward()
-        >>> bool(z.grad.abs().max() > 0)
-        True
+        Examples:
+            >>> prior = load("procthor-bedroom")
+            >>> z = prior.latent("seed:1").unsqueeze(0).requires_grad_()
+            >>> prior.decode(z).sizes_m.sum().backward()
+            >>> bool(z.grad.abs().max() > 0)
+            True
         """
         trained = self.with_latents
         z = z.to(trained.logits.dtype)
