@@ -65,19 +65,18 @@ def toy_shards(made_once: Callable[..., Path]) -> Path:
 def start() -> Iterator[Callable[..., subprocess.Popen]]:
     """Starts a command in a session of its own, ended with all its children after the test.
 
-    It answers Ctrl-C even where this suite runs in the background, ignoring SIGINT, which children
-    inherit; `background=True` starts it as a shell does there.
+    It answers Ctrl-C and a closed terminal even where this suite runs in the background or under
+    nohup, ignoring SIGINT or SIGHUP, which children inherit; `background=True` starts it as a shell
+    does there.
     """
     begun = []
 
     def start(command, background: bool = False, **options) -> subprocess.Popen:
-        answer = signal.SIG_IGN if background else signal.SIG_DFL
-        process = subprocess.Popen(
-            command,
-            start_new_session=True,
-            preexec_fn=lambda: signal.signal(signal.SIGINT, answer),
-            **options,
-        )
+        def begin() -> None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN if background else signal.SIG_DFL)
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+        process = subprocess.Popen(command, start_new_session=True, preexec_fn=begin, **options)
         begun.append(process)
         return process
 
