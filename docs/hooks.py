@@ -9,9 +9,14 @@ from sceneprior.cli import app
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add `cli.md`, as typer writes it from the commands' own help."""
+    """Add `cli.md`."""
+    files.append(File.generated(config, "cli.md", content=commands_page()))
+    return files
+
+
+def commands_page() -> str:
+    """All commands and their options in Markdown, as typer writes it from their own help."""
     command = get_command(app)
     with command.make_context("sceneprior", [], resilient_parsing=True) as context:
         text = typer.cli.get_docs_for_click(obj=command, ctx=context, name="sceneprior")
-    files.append(File.generated(config, "cli.md", content=f"# Commands\n\n{text}"))
-    return files
+    return f"# Commands\n\n{text}"

@@ -1,5 +1,6 @@
-"""README: its steps run as they are printed, in an empty folder; its table has every command."""
+"""README's two commands, the tutorial's steps as they are printed, and the list of all commands."""
 
+import importlib.util
 import re
 import shlex
 import subprocess
@@ -11,10 +12,9 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def readme_commands(heading: str) -> list[str]:
+def commands_under(page: str, heading: str) -> list[str]:
     """The commands of a section's first block, a line each."""
-    text = (ROOT / "README.md").read_text()
-    section = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    section = (ROOT / page).read_text().split(f"\n## {heading}\n")[1].split("\n## ")[0]
     block = re.search(r"```bash\n(.*?)```", section, re.DOTALL)
     assert block is not None
     lines = block[1].replace("\\\n", "").splitlines()
@@ -23,7 +23,8 @@ def readme_commands(heading: str) -> list[str]:
 
 @pytest.mark.slow
 def test_steps_run_as_printed(tmp_path):
-    for command in readme_commands("Step by step"):
+    commands = commands_under("docs/tutorial.md", "2. Try it on rooms that it makes itself")
+    for command in commands:
         program, *arguments = shlex.split(command)
         assert program == "sceneprior"
         done = subprocess.run(
@@ -33,23 +34,31 @@ def test_steps_run_as_printed(tmp_path):
         assert done.returncode == 0, f"{command}\n{done.stderr[-2000:]}"
     made = tmp_path / "out/small"
     assert len(list((made / "scenes").glob("*.glb"))) == 4
+    assert (made / "scenes/rooms.html").is_file()
     assert (made / "run/report.html").read_text().startswith("<!doctype html>")
     assert (made / "views.png").stat().st_size > 10_000
 
 
 def test_two_commands_are_targets_of_the_makefile():
     makefile = (ROOT / "Makefile").read_text()
-    commands = readme_commands("Two commands")
+    commands = commands_under("README.md", "Two commands")
     assert commands == ["make demo", "make test"]
     for command in commands:
         assert f"\n{command.split()[1]}: setup\n" in makefile
 
 
-def test_every_command_is_in_the_table():
+def test_every_command_is_in_the_reference():
+    """The page that the site makes from the commands' help has each, with what it does."""
+    pytest.importorskip("mkdocs", reason="no mkdocs here: pip install -e '.[docs]'")
     from typer.main import get_command
 
     from sceneprior.cli import app
 
-    text = (ROOT / "README.md").read_text()
-    named = set(re.findall(r"^\| `([a-z-]+)` \|", text, re.MULTILINE))
-    assert named == set(get_command(app).commands)
+    spec = importlib.util.spec_from_file_location("hooks", ROOT / "docs/hooks.py")
+    assert spec is not None and spec.loader is not None
+    hooks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    page = hooks.commands_page()
+    told = dict(re.findall(r"^## `sceneprior ([a-z-]+)`\n\n(.+)$", page, re.MULTILINE))
+    assert set(told) == set(get_command(app).commands)
+    assert all(words.endswith((".", ":")) and len(words) > 20 for words in told.values()), told
