@@ -12,10 +12,10 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 import yaml
+from pages import PAGES, ROOT, Block, blocks_of, commands_of, name_of
 from typer.main import get_command
 
 from data_prep.front.recipe import load_recipe
@@ -25,8 +25,6 @@ from sceneprior.errors import ConfigError
 from sceneprior.experiments.comparison import load_comparison
 from sceneprior.scene import read_scene
 
-ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 LONGEST_LINE = 110
 
 RUN_ELSEWHERE = {("docs/posed_data.md", "python"): "tests/data_prep/posed/test_docs.py"}
@@ -39,39 +37,6 @@ MADE_BY_USERS = {"config.yaml"}
 """Names of YAML files that are no part of the repository."""
 
 
-class Block(NamedTuple):
-    """A fenced block of a page."""
-
-    page: Path
-    line: int
-    language: str
-    text: str
-    not_run: str
-    """Why it is not run; empty where it is."""
-
-
-def name_of(page: Path) -> str:
-    return page.relative_to(ROOT).as_posix()
-
-
-def blocks_of(page: Path) -> list[Block]:
-    found, lines = [], page.read_text().splitlines()
-    start: int | None = None
-    for number, line in enumerate(lines):
-        if not line.startswith("```"):
-            continue
-        if start is None:
-            start = number
-            continue
-        above = re.fullmatch(r"<!-- not run: (.+) -->", lines[start - 1])
-        text = "\n".join(lines[start + 1 : number]) + "\n"
-        language = lines[start].removeprefix("```").strip()
-        found.append(Block(page, start + 1, language, text, above[1] if above else ""))
-        start = None
-    assert start is None, f"{name_of(page)}:{start}: a fence is not closed"
-    return found
-
-
 ALL_BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 BLOCKS = [block for block in ALL_BLOCKS if not block.not_run]
 
@@ -81,13 +46,6 @@ def block_id(block: Block) -> str:
 
 
 # -- Commands --------------------------------------------------------------------------------------
-
-
-def commands_of(text: str) -> list[list[str]]:
-    """The words of each command of a shell block, comments and `srun` left out."""
-    lines = text.replace("\\\n", " ").replace("&&", "\n").splitlines()
-    words = [shlex.split(line, comments=True) for line in lines]
-    return [line[1:] if line[0] == "srun" else line for line in words if line]
 
 
 def values_of(option: str, words: list[str]) -> tuple[str, ...]:
