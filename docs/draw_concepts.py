@@ -2,13 +2,12 @@
 
 python docs/draw_concepts.py [--out docs/images/concepts]
 
-The room is one of the prior's training rooms, so its masks and its latent belong together. Nothing
-is drawn at random but by fixed seeds.
+The room is one of the prior's training rooms, so its masks and its latent belong together.
 """
 
 import argparse
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +28,7 @@ from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
 from data_prep.inspection.pictures import draw_view
 from sceneprior.classes import class_colors, label_set
+from sceneprior.data.dataset import FlatViews
 from sceneprior.generation.decode import decode_latents
 from sceneprior.generation.interpolate import interpolate
 from sceneprior.generation.sample import latent_of
@@ -49,12 +49,10 @@ from sceneprior.views import SceneViews
 
 ROOM = "ec8d5242-490a-5e93-abcb-dabba44460e2_MasterBedroom-1031"
 OTHER_ROOM = "64d75c66-85a5-5a21-babd-22c310a1ae1d_MasterBedroom-1175"
-HOMES = 40
-"""Enough of them to hold `ROOM`."""
 TILE = (180, 240)
-OBSERVED = (22, 7, 2, 29)
+OBSERVED = [22, 7, 2, 29]
 """Views of the room that are drawn."""
-OF_THE_BED = (22, 2, 10, 12, 14, 17, 18, 30, 31, 33)
+OF_THE_BED = [22, 2, 10, 12, 14, 17, 18, 30, 31, 33]
 """Views that show the bed with nothing but a nightstand in front of it; the first is drawn."""
 MASK_STEP = 4
 """Masks are compared at 120 x 90, the paper's size."""
@@ -62,8 +60,6 @@ STEPS, RATE_M = 60, 0.02
 """Of the descent of the sphere's vertices."""
 PULL = 20.0
 """Metres of arrow for a gradient of 1 / m."""
-AWAY = 0.25
-"""How far from the room's point the predictions are decoded that are matched to its masks."""
 
 
 def main() -> None:
@@ -85,10 +81,10 @@ def main() -> None:
 
 @contextmanager
 def training_room() -> Iterator[Shard]:
-    """A shard that holds the room as training saw it."""
+    """A shard that holds the room's views."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        make_homes(folder / "homes", HOMES, "bedroom", seed=0)
+        make_homes(folder / "homes", 40, "bedroom", seed=0)  # enough to hold the room
         front, future = folder / "homes" / "3D-FRONT", folder / "homes" / "3D-FUTURE-model"
         source = FrontSource(front, future, load_recipe("bedroom"), only=ROOM)
         build_shards(Job(source, folder / "shards", renderer="software"))
@@ -104,8 +100,7 @@ def draw_training_input(shard: Shard, path: Path) -> None:
 
 
 def draw_latent_space(prior: TrainedPrior, renderer: Renderer, path: Path) -> None:
-    """Anchors and training rooms on the map, the anchors that one room is mixed from, and what it
-    decodes to."""
+    """Anchors and training rooms on the map, one room's weights, and what it decodes to."""
     space = prior.prior.latent_space
     assert isinstance(space, LatentSphere)
     latent_map = make_map(space, space(prior.logits))
@@ -119,11 +114,10 @@ def draw_latent_space(prior: TrainedPrior, renderer: Renderer, path: Path) -> No
     left.scatter(*latent_map.rooms.T, s=12, c="tab:blue", label="training rooms")
     left.scatter(x, y, s=130, c="tab:red", marker="*", zorder=3, label="a room; lines: its weights")
     left.legend(fontsize=7)
-    left.set(aspect="equal", xticks=[], yticks=[])
-    left.set_title("two directions of the sphere", fontsize=9)
+    left.set(aspect="equal", xticks=[], yticks=[], title="two directions of the sphere")
     (room,) = decode_latents(prior, latent_of(prior, ROOM)[None], ["room"])
     right.imshow(perspective(room, renderer))
-    right.set_title("what the room's point decodes to", fontsize=9)
+    right.set_title("what the room's point decodes to")
     right.axis("off")
     save(figure, path)
 
@@ -180,32 +174,29 @@ def draw_silhouettes(prior: TrainedPrior, views: SceneViews, path: Path) -> None
         axis.set_title(title, fontsize=9)
         axis.set(xticks=[], yticks=[])
     moved = (there - here).norm(dim=1) > 1
-    u, v = here[moved].T
-    axes[2].quiver(
-        u, v, *(there - here)[moved].T, color="tab:red", angles="xy", scale_units="xy", scale=1
-    )
+    places, arrows = here[moved].T, (there - here)[moved].T
+    axes[2].quiver(*places, *arrows, color="tab:red", angles="xy", scale_units="xy", scale=1)
     save(figure, path)
 
 
 @torch.no_grad()
 def draw_matching(prior: TrainedPrior, views: SceneViews, path: Path) -> None:
-    """2D boxes of the predictions of a point near the room's over its masks, and all costs."""
+    """2D boxes of the predictions of a point 0.25 from the room's, over its masks; all costs."""
     names = label_set(prior.config.label_set)
-    z = prior.prior.latent_space.step(latent_of(prior, ROOM)[None], length=AWAY, seed=0)
+    z = prior.prior.latent_space.step(latent_of(prior, ROOM)[None], length=0.25, seed=0)
     decoded = prior.prior.decode(z)
     boxes, loss = proxy_boxes(decoded, views, "beveled_box"), prior.config.loss
     matches = match_objects(decoded, boxes, views, loss.match_box, loss.occlusion_slack)
     cost = matching_cost(decoded, boxes, views, loss.match_box, loss.occlusion_slack)[0]
     labels, count = views.object_class[0].tolist(), len(views.object_class[0])
     colors = class_colors(len(names))[labels]
-    height, width = views.observed_ids.shape[-2:]
-    size = torch.tensor([width, height, width, height])
+    size = torch.tensor(views.observed_ids.shape[-2:]).flip(0).repeat(2)
     figure, axes = plt.subplots(1, 3, figsize=(11.4, 3.2), layout="constrained")
     for view, axis in enumerate(axes[:2]):
         ids = views.observed_ids[0, view].numpy()
         axis.imshow(paint_ids(ids, (colors.astype(int) + 510) // 3, (255, 255, 255)))
         for item, k in enumerate(matches.prediction[0].tolist()):
-            if not (views.visible[0, view, item] and boxes.in_frustum[0, view, k]):
+            if not views.visible[0, view, item]:
                 continue
             x1, y1, x2, y2 = (boxes.boxes[0, view, k] * size).tolist()
             color = colors[item] / 400
@@ -213,8 +204,7 @@ def draw_matching(prior: TrainedPrior, views: SceneViews, path: Path) -> None:
             axis.add_patch(plt.Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, color=color))
             axis.text(x1, y1, str(k + 1), color="white", fontsize=8, va="top", bbox=bbox)
         axis.set(xticks=[], yticks=[], title=f"camera {view + 1}")
-    shown = cost[:count]
-    axes[2].imshow(shown, "viridis_r")
+    axes[2].imshow(cost[:count], "viridis_r")
     axes[2].plot(range(count), matches.prediction[0], "wo", mfc="none", ms=13, mew=2)
     axes[2].set_yticks(range(count), range(1, count + 1))
     axes[2].set_xticks(range(count), [names[label] for label in labels], rotation=40, ha="right")
@@ -231,25 +221,16 @@ def draw_geodesic(prior: TrainedPrior, renderer: Renderer, path: Path) -> None:
     write(contact_sheet(tiles, 5, captions, gap_px=4), path)
 
 
-def views_of(room: RoomViews, numbers: Sequence[int]) -> SceneViews:
+def views_of(room: RoomViews, numbers: list[int]) -> SceneViews:
     """Some views of a room, as the losses read them."""
-    rows, ids = list(numbers), room.instance_ids
-    assert ids is not None, "read_room(images=True)"
-
-    def batch(array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(array)[None]
-
+    assert room.instance_ids is not None, "read_room(images=True)"
+    chosen, none = torch.tensor([numbers]), torch.tensor([0])
+    flat = FlatViews.of([room])
     return SceneViews(
-        room_index=torch.zeros(1, dtype=torch.int64),
-        object_class=batch(room.object_class.astype(np.int64)),
-        is_object=torch.ones(1, len(room.object_class), dtype=torch.bool),
-        world_to_camera=batch(room.world_to_camera[rows]),
-        intrinsics=batch(room.intrinsics[rows]),
-        boxes=batch(room.boxes[rows]),
-        visible=batch(room.visible[rows]),
-        sides_clear=batch(room.sides_clear[rows]),
+        room_index=none,
+        **flat.gather(none, chosen, none, len(room.object_class)),
         image_size=room.image_size,
-        instance_ids=batch(ids[rows][:, *thinned(MASK_STEP)].astype(np.int32)),
+        instance_ids=torch.from_numpy(room.instance_ids[numbers][:, *thinned(MASK_STEP)])[None],
     )
 
 
