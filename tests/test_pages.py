@@ -6,6 +6,7 @@ another test, or not at all, are listed with the reason (`ELSEWHERE`); `tests/te
 the options of all.
 """
 
+import contextlib
 import json
 import os
 import re
@@ -16,7 +17,6 @@ import signal
 import socket
 import sys
 import threading
-import time
 import urllib.request
 from collections.abc import Callable
 from itertools import pairwise
@@ -206,17 +206,26 @@ def run_here(arguments: list[str]) -> None:
         sys.argv = before
 
 
-def look_and_stop(port: int, seen: list[bool]) -> None:
-    """Ask for the page of `view` until it comes, then end it as Ctrl-C does."""
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and not seen:
-        try:
-            with urllib.request.urlopen(f"http://localhost:{port}", timeout=5) as page:
-                seen.append(page.status == 200)
-        except OSError:
-            time.sleep(0.2)
-    time.sleep(0.5)
-    os.kill(os.getpid(), signal.SIGINT)
+def run_view(arguments: list[str]) -> None:
+    """`view` in this process: once its page has come, it is ended as Ctrl-C does."""
+    pytest.importorskip("viser", reason="the extra `view` is not installed")
+    address, came, ended = f"http://localhost:{arguments[-1]}", [], threading.Event()
+
+    def look_and_stop() -> None:
+        while not came and not ended.wait(0.2):
+            with contextlib.suppress(OSError), urllib.request.urlopen(address, timeout=5) as page:
+                came.append(page.status)
+        if not ended.wait(0.5):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    looks = threading.Thread(target=look_and_stop)
+    looks.start()
+    try:
+        run_here(arguments)
+    finally:
+        ended.set()
+        looks.join()
+    assert came == [200]
 
 
 def carry_out(words: list[str], toys: Toys, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -235,14 +244,7 @@ def carry_out(words: list[str], toys: Toys, monkeypatch: pytest.MonkeyPatch) -> 
     else:
         assert program == "sceneprior", program
         arguments += cut_short(arguments, toys)
-        if arguments[0] == "view":
-            pytest.importorskip("viser", reason="the extra `view` is not installed")
-            seen: list[bool] = []
-            threading.Thread(target=look_and_stop, args=(int(arguments[-1]), seen)).start()
-            run_here(arguments)
-            assert seen == [True]
-        else:
-            run_here(arguments)
+        (run_view if arguments[0] == "view" else run_here)(arguments)
 
 
 @pytest.mark.slow
