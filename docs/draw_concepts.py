@@ -6,6 +6,7 @@ The room is one of the prior's training rooms, so its masks and its latent belon
 """
 
 import argparse
+import io
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -54,12 +55,11 @@ OBSERVED = [22, 7, 2, 29]
 """Views of the room that are drawn."""
 OF_THE_BED = [22, 2, 10, 12, 14, 17, 18, 30, 31, 33]
 """Views that show the bed with nothing but a nightstand in front of it; the first is drawn."""
-MASK_STEP = 4
-"""Masks are compared at 120 x 90, the paper's size."""
+MASK_STEP = 4  # masks are compared at 120 x 90, the paper's size
+LAMBDA_B = 5.0  # of Eq. S2
 STEPS, RATE_M = 60, 0.02
 """Of the descent of the sphere's vertices."""
-PULL = 20.0
-"""Metres of arrow for a gradient of 1 / m."""
+PULL = 20.0  # metres of arrow for a gradient of 1 / m
 
 
 def main() -> None:
@@ -185,9 +185,9 @@ def draw_matching(prior: TrainedPrior, views: SceneViews, path: Path) -> None:
     names = label_set(prior.config.label_set)
     z = prior.prior.latent_space.step(latent_of(prior, ROOM)[None], length=0.25, seed=0)
     decoded = prior.prior.decode(z)
-    boxes, loss = proxy_boxes(decoded, views, "beveled_box"), prior.config.loss
-    matches = match_objects(decoded, boxes, views, loss.match_box, loss.occlusion_slack)
-    cost = matching_cost(decoded, boxes, views, loss.match_box, loss.occlusion_slack)[0]
+    boxes = proxy_boxes(decoded, views, "beveled_box")
+    matches = match_objects(decoded, boxes, views, LAMBDA_B)
+    cost = matching_cost(decoded, boxes, views, LAMBDA_B)[0]
     labels, count = views.object_class[0].tolist(), len(views.object_class[0])
     colors = class_colors(len(names))[labels]
     size = torch.tensor(views.observed_ids.shape[-2:]).flip(0).repeat(2)
@@ -225,10 +225,9 @@ def views_of(room: RoomViews, numbers: list[int]) -> SceneViews:
     """Some views of a room, as the losses read them."""
     assert room.instance_ids is not None, "read_room(images=True)"
     chosen, none = torch.tensor([numbers]), torch.tensor([0])
-    flat = FlatViews.of([room])
     return SceneViews(
         room_index=none,
-        **flat.gather(none, chosen, none, len(room.object_class)),
+        **FlatViews.of([room]).gather(none, chosen, none, len(room.object_class)),
         image_size=room.image_size,
         instance_ids=torch.from_numpy(room.instance_ids[numbers][:, *thinned(MASK_STEP)])[None],
     )
@@ -236,8 +235,9 @@ def views_of(room: RoomViews, numbers: list[int]) -> SceneViews:
 
 def save(figure: Figure, path: Path) -> None:
     """A figure as `write` writes pictures."""
-    figure.canvas.draw()
-    write(np.asarray(figure.canvas.buffer_rgba())[..., :3], path)
+    buffer = io.BytesIO()
+    figure.savefig(buffer)
+    write(np.asarray(Image.open(buffer).convert("RGB")), path)
 
 
 def write(picture: np.ndarray, path: Path) -> None:
