@@ -1,4 +1,4 @@
-"""How fast does the room follow the pointer, and how long until the first room is there?
+"""How fast does the room follow the pointer? (bench_startup.py: until the first room is there.)
 
     python benchmarks/bench_view.py RUN [--rooms 200] [--json FILE]
 
@@ -13,8 +13,6 @@ import argparse
 import json
 import math
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -43,16 +41,15 @@ RADIUS = 0.35
 def main() -> None:
     """Measure and print."""
     options = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    options.add_argument("run", type=Path)
+    options.add_argument("run", help="as `sceneprior view` takes it")
     options.add_argument("--rooms", type=int, default=200, help="one round of the circle")
     options.add_argument("--json", type=Path)
     given = options.parse_args()
     measured: dict[str, Any] = {"cores": os.cpu_count(), "load": os.getloadavg()[0]}
-    measured["first_room"] = first_room(given.run)
     torch.set_num_threads(1)  # as the command does
     explorer = Explorer(load(given.run))
     with serving("127.0.0.1", 0) as server:
-        page = Page(server, explorer, given.run.name)
+        page = Page(server, explorer, Path(given.run).name)
         assert explorer.map is not None, "the run has training rooms"
         middle, side = explorer.map.middle, RADIUS * explorer.map.side
         points = [
@@ -143,22 +140,6 @@ def _read(client: ClientConnection, came: list[tuple[float, str, int]]) -> None:
         words = [text for m in window["messages"] for text in m.get("updates", {}).values()]
         said = [text.split("**")[1] for text in words if str(text).startswith("**map")]
         came.append((time.perf_counter(), said[-1] if said else "", len(data)))
-
-
-def first_room(run: Path) -> dict[str, float]:
-    """Seconds from the command to the line that says where the page is."""
-    start = time.perf_counter()
-    command = [sys.executable, "-m", "sceneprior", "view", str(run), "--port", "8089"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    line = process.stdout.readline()
-    wall = time.perf_counter() - start
-    parts = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
-    cpu = sum(map(int, parts[11:13])) / os.sysconf("SC_CLK_TCK")
-    process.terminate()
-    process.wait()
-    assert line.startswith("Open http"), line
-    return {"wall_s": round(wall, 1), "cpu_s": round(cpu, 1)}
 
 
 if __name__ == "__main__":

@@ -4,19 +4,14 @@ A method is listed in `METHODS`, a decoder of object features in `Model`. Each s
 beside what it configures; `training/method.py` says what a method's config has to offer.
 """
 
+import pkgutil
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
-from sceneprior.baselines.atiss.stage import AtissConfig
 from sceneprior.baselines.atiss2d import Atiss2dConfig
-from sceneprior.baselines.gan.stage import GanConfig
 from sceneprior.baselines.lstm import LstmConfig
-from sceneprior.baselines.single_view.im3d import Im3dConfig
-from sceneprior.baselines.single_view.total3d import Total3dConfig
-from sceneprior.baselines.single_view.usl import UslConfig
-from sceneprior.baselines.sync2gen.stage import Sync2genConfig
 from sceneprior.errors import ConfigError, InputError
 from sceneprior.models.prior import ModelConfig
 from sceneprior.models.transformer import TransformerConfig
@@ -45,16 +40,17 @@ class OursConfig(PaperConfig):
     model: Model
 
 
-METHODS: dict[str, type[RunConfig]] = {
-    "ours": OursConfig,
-    "gan": GanConfig,
-    "atiss": AtissConfig,
-    "sync2gen": Sync2genConfig,
-    "usl": UslConfig,
-    "total3d": Total3dConfig,
-    "im3d": Im3dConfig,
+METHODS = {
+    "ours": "sceneprior.config:OursConfig",
+    "gan": "sceneprior.baselines.gan.stage:GanConfig",
+    "atiss": "sceneprior.baselines.atiss.stage:AtissConfig",
+    "sync2gen": "sceneprior.baselines.sync2gen.stage:Sync2genConfig",
+    "usl": "sceneprior.baselines.single_view.usl:UslConfig",
+    "total3d": "sceneprior.baselines.single_view.total3d:Total3dConfig",
+    "im3d": "sceneprior.baselines.single_view.im3d:Im3dConfig",
 }
-"""The config of each method, by the value of its key `method`."""
+"""Where the config of each method is, by the value of its key `method`. It is imported when it is
+asked for: a baseline stands beside its stage, and Lightning takes seconds to import."""
 
 
 def load_config(name: str, overrides: tuple[str, ...] = ()) -> RunConfig:
@@ -80,7 +76,8 @@ def check_config(data: dict[str, Any], source: str) -> RunConfig:
         raise ConfigError(
             f"{source}: no method is called '{method}'; choose from {', '.join(METHODS)}."
         )
-    return check_settings(METHODS[method], data, source)
+    config: type[RunConfig] = pkgutil.resolve_name(METHODS[method])
+    return check_settings(config, data, source)
 
 
 def load_any_run(run: Path | str, checkpoint: str = "final") -> Trained:

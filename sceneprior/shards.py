@@ -6,13 +6,15 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 
 from sceneprior.classes import label_set
 from sceneprior.errors import ShardError
+
+if TYPE_CHECKING:
+    import h5py
 
 FORMAT = "sceneprior-views"
 VERSION = 1
@@ -94,6 +96,8 @@ def shard_bytes(
     Raises:
         ShardError: a room's arrays disagree with each other; `name` is for the message.
     """
+    import h5py
+
     with h5py.File(name, "w", driver="core", backing_store=False) as file:
         file.attrs["format"] = FORMAT
         file.attrs["version"] = VERSION
@@ -108,7 +112,7 @@ def shard_bytes(
         return file.id.get_file_image()
 
 
-def _write_room(group: h5py.Group, views: RoomViews, truth: RoomGroundTruth | None) -> None:
+def _write_room(group: "h5py.Group", views: RoomViews, truth: RoomGroundTruth | None) -> None:
     group.attrs["room_id"] = views.room_id
     group.attrs["image_size"] = views.image_size
     group.attrs["sha256"] = room_checksum(views, truth)
@@ -189,6 +193,8 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
         self.path = Path(path)
         if not self.path.is_file():
             raise ShardError(f"No shard at {path}; {PREPARE} writes shards.")
+        import h5py  # here, so that who loads a prior need not wait for it
+
         try:
             self._file = h5py.File(self.path, "r")
             form, version = self._file.attrs.get("format"), self._file.attrs.get("version")
@@ -219,7 +225,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
         return tuple(self._keys)
 
     @contextlib.contextmanager
-    def _group(self, room_id: str) -> Iterator[h5py.Group]:
+    def _group(self, room_id: str) -> Iterator["h5py.Group"]:
         """A room's group; what cannot be read in it is told as damage."""
         try:
             yield self._file["rooms"][self._keys[room_id]]

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from sceneprior.lifting.boxes import LiftedBoxes
 from sceneprior.lifting.dataset import LiftedDataset
+from sceneprior.lifting.lifted import LiftedBoxes
 from sceneprior.models.occupancy import OccupancyConfig, OccupancyDecoder
 from sceneprior.sampler.network import RoomSampler
 from sceneprior.sampler.rooms import SamplerRooms

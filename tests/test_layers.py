@@ -175,6 +175,29 @@ def test_importing_the_package_loads_nothing_heavy():
     assert not loaded & {"torch", "numpy", "typer", "numba", "lightning", "h5py"}
 
 
+TRAINING = {"lightning", "torchmetrics", "h5py", "sklearn", "matplotlib", "pandas"}
+"""What trains and evaluates; making rooms has nothing to do with it."""
+
+
+def test_making_rooms_loads_nothing_that_trains():
+    code = "import sceneprior; sceneprior.load('demo-bedroom').sample(2)"
+    loaded = loaded_after(code)
+    assert {"torch", "skimage"} <= loaded
+    # sympy stands for torch's compiler, the slowest to import of all.
+    assert not loaded & (TRAINING | {"sympy", "numba", "trimesh", "pyrender"})
+
+
+def test_writing_rooms_takes_the_z_buffer_and_no_gl(tmp_path):
+    command = ["synthesize", "--run", "demo-bedroom", "-n", "1", "--out", str(tmp_path / "rooms")]
+    loaded = loaded_after(
+        f"import sys\nsys.argv = ['sceneprior', *{command!r}]\n"
+        "from sceneprior.cli import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code"
+    )
+    assert {"numba", "trimesh"} <= loaded
+    assert not loaded & (TRAINING | {"sympy", "pyrender", "OpenGL"})
+
+
 @pytest.mark.parametrize("arguments", [["--help"], ["fit", "--help"], ["prep-front", "--help"]])
 def test_help_loads_nothing_heavy(arguments):
     code = (

@@ -1,4 +1,7 @@
-"""Commands that make new rooms, or furnish them anew; each imports what it needs when called."""
+"""Commands that make new rooms, or furnish them anew; each imports what it needs when called.
+
+Pictures are drawn by the z-buffer: without a GPU, GL takes a second to start and is slower.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -25,7 +28,7 @@ def synthesize(
     ] = False,
     checkpoint: CheckpointOption = "final",
     overwrite: OverwriteOption = False,
-    renderer: RendererOption = "auto",
+    renderer: RendererOption = "software",
 ) -> None:
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents where the method has them."""
     from sceneprior.api import load
@@ -59,7 +62,7 @@ def interpolate(
     steps: Annotated[int, typer.Option(min=2, max=1000, help="Rooms, both ends included.")] = 9,
     checkpoint: CheckpointOption = "final",
     overwrite: OverwriteOption = False,
-    renderer: RendererOption = "auto",
+    renderer: RendererOption = "software",
 ) -> None:
     """Walk from one room to another on the sphere: rooms, a strip and an animation."""
     from sceneprior.api import load
@@ -89,7 +92,7 @@ def complete(
     distribution: DistributionOption = None,
     checkpoint: CheckpointOption = "final",
     overwrite: OverwriteOption = False,
-    renderer: RendererOption = "auto",
+    renderer: RendererOption = "software",
 ) -> None:
     """Furnish the rest of a room of which some objects, or its floor, are given."""
     from sceneprior.api import load
@@ -116,7 +119,7 @@ def retrieve(
         typer.Option(help="Folder for the models' points (default: ~/.cache/sceneprior)."),
     ] = None,
     overwrite: OverwriteOption = False,
-    renderer: RendererOption = "auto",
+    renderer: RendererOption = "software",
 ) -> None:
     """Exchange every object for the most similar CAD model of its class."""
     from rich.console import Console

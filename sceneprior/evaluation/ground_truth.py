@@ -9,7 +9,6 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from sceneprior.classes import VOID, label_set
 from sceneprior.errors import InputError, ShardError
@@ -180,6 +179,8 @@ def read_model(path: Path) -> Mesh:
             f"{path} is missing, but a room's ground truth stands on it. Keep `models/` beside "
             "the shards, or run `sceneprior prep-front` again."
         )
+    import trimesh
+
     try:
         model = trimesh.load_mesh(path, process=False)
         return Mesh(np.asarray(model.vertices, dtype=np.float64), np.asarray(model.faces))

@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import cdist
 
 from sceneprior.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.scene import Scene
@@ -41,10 +39,19 @@ def layout_distance(a: Scene, b: Scene) -> float:
         >>> round(layout_distance(room(1.0), room(1.3)), 9)
         0.15
     """
-    return _distance(np.minimum(cdist(_rows(a), _rows(b)), MISSING_M))
+    return _distance(_costs(_rows(a), _rows(b)))
+
+
+def _costs(placed: np.ndarray, others: np.ndarray) -> np.ndarray:
+    # SciPy is imported where something is compared: most commands import this file and do not.
+    from scipy.spatial.distance import cdist
+
+    return np.asarray(np.minimum(cdist(placed, others), MISSING_M))
 
 
 def _distance(costs: np.ndarray) -> float:
+    from scipy.optimize import linear_sum_assignment
+
     larger = max(costs.shape)
     if larger == 0:
         return 0.0
@@ -112,7 +119,7 @@ class _Rooms:
         """The nearest of the allowed rooms (at least one), and its distance."""
         best, found, placed = np.inf, 0, _rows(scene)
         for turn in TURNS:
-            costs = np.minimum(cdist(_turned(placed, turn), self.objects), MISSING_M)
+            costs = _costs(_turned(placed, turn), self.objects)
             bounds = _lower_bounds(costs, self.starts, self.counts)
             bounds = np.where(allowed, bounds, np.inf)
             for room in np.argsort(bounds):

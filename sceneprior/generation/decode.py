@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sceneprior.classes import VOID, label_set
 from sceneprior.errors import InputError
+from sceneprior.evaluation.networks import single_threaded
 from sceneprior.generation.sample import draw_latents, scene_names, uses_sampler
 from sceneprior.generation.sampled import sample_scenes
 from sceneprior.losses.completeness import kept_objects
@@ -85,11 +86,13 @@ def _mesh_of(decoded: DecodedScenes, row: int, item: int, prior: ScenePrior) -> 
     return prior.shape.mesh(int(decoded.looks[row, item]), torch.cat(parts).double().cpu().numpy())
 
 
+@single_threaded()
 @torch.no_grad()
 def decode_rooms(
     trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: Sequence[str]
 ) -> list[DecodedRoom]:
-    """Rooms of latents; with meshes once the shape stage has finished."""
+    """Rooms of latents; with meshes once the shape stage has finished. Networks are too small for
+    several threads to share, and on one the same latents are the same rooms to the bit."""
     config = trained.config
     rooms: list[DecodedRoom] = []
     for start in range(0, len(z), BATCH):
@@ -121,6 +124,7 @@ def decode_training_rooms(trained: Trained) -> list[Scene]:
     return decode_latents(trained, trained.prior.latent_space(trained.logits), trained.room_ids)
 
 
+@single_threaded()
 def synthesize(
     trained: Trained, count: int, seed: int, distribution: str | None = None
 ) -> list[Scene]:

@@ -1,6 +1,8 @@
 """Write rooms to a folder: their files, an overview and their latents."""
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -75,9 +77,12 @@ def write_scenes(
     """
     check_free(folder, overwrite)
     clear_scenes(folder)
-    with Progress(console=Console(stderr=True)) as progress:
-        for scene in progress.track(scenes, description="Writing scenes"):
-            write_scene(scene, folder, scene.name, renderer)
+    with ThreadPoolExecutor(os.cpu_count()) as pool, Progress(console=Console(stderr=True)) as bar:
+        # Drawing, packing and waiting for the disk run beside each other; GL has one thread.
+        each = pool.map if renderer.kind == "software" else map
+        done = each(lambda scene: write_scene(scene, folder, scene.name, renderer), scenes)
+        for _ in bar.track(done, total=len(scenes), description="Writing scenes"):
+            pass
     sheet = overview(scenes[:OVERVIEW_ROOMS], renderer)
     write_whole(Path(folder) / "overview.png", png_bytes(sheet))
     write_latents(folder, scenes)

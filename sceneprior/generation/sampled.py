@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
+from sceneprior.evaluation.networks import single_threaded
 from sceneprior.models.occupancy import OccupancyDecoder
 from sceneprior.sampler.draw import Given, draw_rooms
 from sceneprior.scene import Scene, SceneObject
@@ -16,6 +17,7 @@ from sceneprior.training.method import TrainedPrior
 from sceneprior.views import RoomBoxes
 
 
+@single_threaded()
 def sample_scenes(
     trained: TrainedPrior, names: Sequence[str], seed: int, given: Given | None = None
 ) -> list[Scene]:

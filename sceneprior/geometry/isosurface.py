@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float, Int, Integer
-from scipy import ndimage
 
 from sceneprior.geometry.corners import BOX_FACES, CUBE_CORNERS
 
@@ -52,7 +51,7 @@ def surface_of(
         >>> vertices[:, 1].min().item(), vertices[:, 1].max().item()
         (-1.0, 0.0)
     """
-    # Imported here: what decodes meshes of another kind does without it.
+    # Imported here, and scipy below: what decodes meshes of another kind does without them.
     from skimage.measure import marching_cubes
 
     if not np.isfinite(logits).all():
@@ -104,6 +103,8 @@ def without_small_pieces(field: Float[np.ndarray, "x y z"]) -> Float[np.ndarray,
 
     Cells that share a face are connected.
     """
+    from scipy import ndimage
+
     piece, count = ndimage.label(field > 0)
     if count < 2:
         return field

@@ -1,12 +1,13 @@
 """The smallest 3D box of each tracked object that explains its masks in all views."""
 
-from typing import NamedTuple, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
 from numba import njit
 
 from sceneprior.lifting.hulls import MOST_EMPTY, Sightings, carve, cells_along, sightings_of
+from sceneprior.lifting.lifted import LiftedBoxes
 from sceneprior.shards import RoomViews
 
 GRIDS = ((16, 0.6), (24, 0.6), (40, 0.4))
@@ -18,16 +19,6 @@ TRIM = 0.3
 """Cells that a box's sides lie inside of its outermost cells: those are only partly filled."""
 UNKNOWN_DISTANCE_M = 2.5
 """How far an object is taken to be where its views do not tell, such as a single one."""
-
-
-class LiftedBoxes(NamedTuple):
-    """Axis-aligned boxes in the room frame, one a tracked object."""
-
-    centers_m: Float[np.ndarray, "objects 3"]
-    sizes_m: Float[np.ndarray, "objects 3"]
-    explained: Float[np.ndarray, " objects"]
-    """Share of an object's rays that meet its box; 0 where fewer than two views show it, which tell
-    nothing of its distance: such boxes mean nothing."""
 
 
 def lift_boxes(

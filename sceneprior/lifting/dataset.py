@@ -18,11 +18,7 @@ from sceneprior.classes import VOID
 from sceneprior.data.dataset import BLANK, RoomDataset, allowed_views
 from sceneprior.files import write_whole
 from sceneprior.geometry.turns import turn_boxes
-from sceneprior.lifting.boxes import LiftedBoxes, lift_boxes
-from sceneprior.lifting.rays import RayPool, draw_rays
-from sceneprior.lifting.shapes import ShapeGrid, lift_shapes
-from sceneprior.lifting.symmetry import made_symmetric
-from sceneprior.lifting.thinning import thin_shapes
+from sceneprior.lifting.lifted import LiftedBoxes, ShapeGrid
 from sceneprior.models.prototypes import Prototypes, choose_prototypes, turned_looks
 from sceneprior.shards import RoomViews, Shard, iterate_rooms
 from sceneprior.views import LiftedRooms
@@ -166,6 +162,9 @@ def _find_boxes(
     folder: Path, split: str, key: str, counts: Sequence[int], chosen: Sequence[np.ndarray]
 ) -> list[LiftedBoxes]:
     def find() -> dict[str, np.ndarray]:
+        # Imported where something is lifted, here and below: it takes Numba.
+        from sceneprior.lifting.boxes import lift_boxes
+
         progress = track(chosen, "lifting boxes from masks (rooms)", console=Console(stderr=True))
         found = [
             lift_boxes(shard.read_room(room_id, images=True), views)
@@ -193,6 +192,11 @@ def _find_shapes(
     """Eight cells a byte; see `_unpacked`."""
 
     def find() -> dict[str, np.ndarray]:
+        from sceneprior.lifting.rays import RayPool, draw_rays
+        from sceneprior.lifting.shapes import lift_shapes
+        from sceneprior.lifting.symmetry import made_symmetric
+        from sceneprior.lifting.thinning import thin_shapes
+
         hulls, rays = [], []
         progress = track(boxes, "lifting shapes from masks (rooms)", console=Console(stderr=True))
         for its_boxes, views, (shard, room_id) in zip(

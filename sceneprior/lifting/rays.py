@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numba import njit
 
-from sceneprior.lifting.boxes import LiftedBoxes, pixel_directions
+from sceneprior.lifting.boxes import pixel_directions
 from sceneprior.lifting.hulls import own_in, pass_through, sightings_of
+from sceneprior.lifting.lifted import LiftedBoxes
 from sceneprior.shards import RoomViews
 from sceneprior.silhouettes.cpu.threads import in_threads
 

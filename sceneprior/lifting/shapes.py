@@ -1,12 +1,10 @@
 """What each tracked object may fill of its box, as far as its masks tell."""
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Bool, Int
 
-from sceneprior.lifting.boxes import LiftedBoxes
 from sceneprior.lifting.hulls import carve, sightings_of
+from sceneprior.lifting.lifted import LiftedBoxes, ShapeGrid
 from sceneprior.shards import RoomViews
 
 REACH = 0.4
@@ -14,15 +12,6 @@ REACH = 0.4
 EMPTY = 0.05
 """A cell that more than this share of the views sees past is empty. Less than what `boxes.py`
 forgives: there, one wrong cell moves a side; here, it is one cell."""
-
-
-class ShapeGrid(NamedTuple):
-    """How shapes are described."""
-
-    cells: int
-    """Along each axis of a grid."""
-    margin: float
-    """A grid fills the object's box times this."""
 
 
 def lift_shapes(

@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from sceneprior.geometry.cameras import Boxes2D
@@ -70,6 +69,8 @@ def assign(
     Of each room, the first so many `predictions` take part, and its `objects`, which are no more;
     0 stands for the rest.
     """
+    from scipy.optimize import linear_sum_assignment  # half a second that only training takes
+
     prediction = torch.zeros(len(cost), cost.shape[2], dtype=torch.int64)
     # SciPy refuses what is not a number; the loss will be none either, and its check names rooms.
     matrices = cost.detach().nan_to_num().cpu().numpy()

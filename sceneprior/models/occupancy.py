@@ -112,9 +112,12 @@ class OccupancyDecoder(nn.Module):
 
     def looks(self, codes: Float[Tensor, "*objects codes"]) -> Int[Tensor, "*objects"]:
         """The look whose code is nearest, the first of equal ones; 0 before there are any."""
-        apart = torch.cdist(codes.flatten(0, -2), self.look_codes.to(codes))
-        unknown = (self.object_class == self.unknown).repeat_interleave(POSES)
-        return apart.masked_fill(unknown, torch.inf).argmin(dim=-1).unflatten(0, codes.shape[:-1])
+        known = (self.object_class != self.unknown).repeat_interleave(POSES).nonzero()[:, 0]
+        if not len(known):
+            return torch.zeros(codes.shape[:-1], dtype=torch.int64, device=codes.device)
+        # Of the most that there may be, few are: comparing with them all takes as long as decoding.
+        apart = torch.cdist(codes.flatten(0, -2), self.look_codes[known].to(codes))
+        return known[apart.argmin(dim=-1)].unflatten(0, codes.shape[:-1])
 
     def targets(
         self, looks: Int[Tensor, "*objects"]

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import linalg
 from torch import Tensor
 
 from sceneprior.geometry.turns import QUARTERS, turn_grids
@@ -120,6 +119,8 @@ def looks_apart(
     Source:
         Torgerson, "Multidimensional scaling: I. Theory and method", Psychometrika 1952.
     """
+    from scipy import linalg  # here, since only training finds codes
+
     looks = np.stack([turn_grids(grids, *turn_of(pose)) for pose in range(POSES)], axis=1)
     flat = looks.reshape(len(grids) * POSES, -1).astype(np.float32)
     flat -= flat.mean(axis=0)

@@ -21,6 +21,7 @@ import torch
 from safetensors.torch import load as read_tensors
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from sceneprior.classes import label_set
 from sceneprior.errors import InputError
@@ -112,7 +113,7 @@ def unpack(packed: PackedPrior, config: RunConfig, source: str) -> Trained:
             raise ValueError(f"no stage of its method is called '{packed.said.stage}'")
         build = partial(config.networks, packed.said.stage, len(packed.said.room_ids))
         # Without memory first: settings may ask for networks that no machine holds.
-        with torch.device("meta"):
+        with torch.device("meta"), _ShapesAlone():
             shapes = {name: tensor.shape for name, tensor in build().state_dict().items()}
         found = {name: tensor.shape for name, tensor in packed.tensors.items()}
         different = sorted(name for name in shapes | found if shapes.get(name) != found.get(name))
@@ -132,6 +133,21 @@ def unpack(packed: PackedPrior, config: RunConfig, source: str) -> Trained:
             f"{source}: its weights are not those of its settings ({reason}); have it packed again "
             "with `sceneprior pack`."
         ) from None
+
+
+class _ShapesAlone(TorchFunctionMode):
+    """Leaves out on the device `meta` what gives values and no shapes, and for which torch would
+    import its compiler: that takes as long as all else that loads a prior."""
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if func is nn.init.normal_:
+            return kwargs["tensor"]
+        if func in (nn.functional.normalize, Tensor.div):
+            return args[0]
+        return torch.empty(*args) if func is torch.randn else func(*args, **kwargs)
 
 
 def _check(name: str, tensor: Tensor, classes: int) -> None:

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.geometry.cameras import project
-from sceneprior.silhouettes.cpu.projection import project_in_threads
 from sceneprior.silhouettes.reference import Settings
 
 NEAR_FACE_M = 0.05
@@ -149,6 +148,8 @@ def render_scene(
         backend = backend if backend in BACKENDS else "reference"
     moving_cameras = world_to_camera.requires_grad or intrinsics.requires_grad
     if backend == "cpu" and not moving_cameras:
+        from sceneprior.silhouettes.cpu.projection import project_in_threads  # which takes Numba
+
         pixels, depths = project_in_threads(vertices_m, world_to_camera, intrinsics)
     else:
         projected = project(vertices_m, world_to_camera, intrinsics).flatten(0, 1)

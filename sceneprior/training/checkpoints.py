@@ -10,14 +10,16 @@ RUN/<stage>/metrics.csv    one line an epoch; TensorBoard's files lie beside it
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import lightning
 import torch
 from torch import nn
 
 from sceneprior.errors import InputError
 from sceneprior.files import write_whole
+
+if TYPE_CHECKING:
+    import lightning
 
 CHECKPOINTS = ("final", "best")
 
@@ -51,7 +53,7 @@ def find_checkpoint(
     )
 
 
-def write_checkpoint(trainer: lightning.Trainer, folder: Path, name: str) -> None:
+def write_checkpoint(trainer: "lightning.Trainer", folder: Path, name: str) -> None:
     """Write a checkpoint whole or not at all; all processes call, the first writes."""
     if trainer.is_global_zero:
         write_whole(folder / name, trainer.save_checkpoint)

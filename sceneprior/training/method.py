@@ -11,9 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
-import lightning
 import torch
 from jaxtyping import Float
 from pydantic import Field, model_validator
@@ -23,7 +22,7 @@ from sceneprior.classes import label_set
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError
 from sceneprior.lifting.dataset import LiftedDataset
-from sceneprior.lifting.shapes import ShapeGrid
+from sceneprior.lifting.lifted import ShapeGrid
 from sceneprior.models.prior import ModelConfig, ScenePrior
 from sceneprior.sampler.network import RoomSampler
 from sceneprior.scene import Mesh
@@ -32,6 +31,9 @@ from sceneprior.shards import Shard, list_shards
 from sceneprior.training.checkpoints import read_networks
 from sceneprior.training.settings import DataConfig, SamplesConfig, TrainConfig
 from sceneprior.views import RoomBoxes, SceneViews
+
+if TYPE_CHECKING:
+    import lightning
 
 OF_SHARDS = "shards"
 """In place of a label set's name: whatever the training rooms are labelled with."""
@@ -47,7 +49,7 @@ class Stage:
     open_data: Callable[[], Any]
     """Opens the training rooms: a `ViewDataset`, a `LiftedDataset`, `SamplerRooms`, or a
     `TruthDataset`."""
-    build: Callable[[Any, Path | None], lightning.LightningModule]
+    build: Callable[[Any, Path | None], "lightning.LightningModule"]
     """Makes the module from these rooms and the checkpoint of the stage before."""
     steps_itself: bool = False
     """The module has several optimisers and steps them: in one process, without accumulation."""

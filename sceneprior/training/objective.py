@@ -1,12 +1,11 @@
 """The view loss of decoded scenes; seeds, precision, checks and schedules of all methods."""
 
 import math
+from typing import TYPE_CHECKING
 
-import lightning
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from torch import distributed as dist
 
@@ -19,6 +18,9 @@ from sceneprior.losses.matching import Matches, match_objects
 from sceneprior.silhouettes.render import render_silhouettes
 from sceneprior.training.settings import LiftedShapeConfig, LossConfig, ShapeConfig
 from sceneprior.views import DecodedScenes, LiftedRooms, RoomBoxes, SceneViews
+
+if TYPE_CHECKING:  # Lightning takes longer to import than all else that loads a prior
+    import lightning.pytorch.utilities.types
 
 POINTS_LEVEL = 2
 """`ellipsoid_points` are 162: spheres 0.6% too small, 1.7% in the worst direction."""
@@ -145,7 +147,7 @@ def full_precision(device: torch.device) -> torch.autocast:
     return torch.autocast(device.type, enabled=False)
 
 
-def batch_seed(seed: int, trainer: lightning.Trainer, batch_idx: int) -> int:
+def batch_seed(seed: int, trainer: "lightning.Trainer", batch_idx: int) -> int:
     """A seed of its own for each batch and process, the same when a run is resumed."""
     batch = trainer.current_epoch * int(trainer.num_training_batches) + batch_idx
     sequence = np.random.SeedSequence([seed, batch, trainer.global_rank])
@@ -153,14 +155,16 @@ def batch_seed(seed: int, trainer: lightning.Trainer, batch_idx: int) -> int:
 
 
 def log_losses(
-    module: lightning.LightningModule, values: dict[str, Tensor], total: Tensor, rooms: int
+    module: "lightning.LightningModule", values: dict[str, Tensor], total: Tensor, rooms: int
 ) -> None:
     """Log means over an epoch and all processes, as `train/<name>` and `train/loss`."""
     named = {f"train/{name}": value.detach() for name, value in (values | {"loss": total}).items()}
     module.log_dict(named, on_step=False, on_epoch=True, batch_size=rooms, sync_dist=True)
 
 
-def with_cosine(optimizer: torch.optim.Optimizer, steps: int) -> OptimizerLRSchedulerConfig:
+def with_cosine(
+    optimizer: torch.optim.Optimizer, steps: int
+) -> "lightning.pytorch.utilities.types.OptimizerLRSchedulerConfig":
     """The optimiser with rates that rise for a twentieth of `steps`, then fall to 0 by a cosine."""
     rise = torch.optim.lr_scheduler.OneCycleLR(
         optimizer,

@@ -3,7 +3,7 @@
 import contextlib
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import Field, field_validator, model_validator
@@ -12,12 +12,11 @@ from torch import nn
 from sceneprior.data.dataset import ViewDataset
 from sceneprior.errors import InputError, ShardError
 from sceneprior.lifting.dataset import LiftedDataset
-from sceneprior.lifting.shapes import ShapeGrid
+from sceneprior.lifting.lifted import ShapeGrid
 from sceneprior.models.occupancy import OccupancyConfig, OccupancyDecoder
 from sceneprior.sampler.network import RoomSampler
 from sceneprior.sampler.rooms import SamplerRooms
 from sceneprior.sampler.settings import SamplerConfig
-from sceneprior.sampler.stage import SamplerStage, teach
 from sceneprior.shards import list_shards
 from sceneprior.training.method import PriorConfig, Stage, TrainedPrior
 from sceneprior.training.settings import (
@@ -28,7 +27,10 @@ from sceneprior.training.settings import (
     ShapeConfig,
     StageConfig,
 )
-from sceneprior.training.stages import LayoutStage, LiftedStage, PaperStage, ShapeStage
+
+if TYPE_CHECKING:
+    import sceneprior.sampler.stage
+    import sceneprior.training.stages
 
 
 class PaperConfig(PriorConfig):
@@ -95,10 +97,9 @@ class PaperConfig(PriorConfig):
 
     def _layout_stage(self, stage: LayoutConfig) -> Stage:
         if stage.supervision == "lifted":
-            lifted = partial(self._build, LiftedStage, stage)
-            return Stage("layout", stage, self.open_lifted, lifted)
+            return Stage("layout", stage, self.open_lifted, partial(self._build, stage))
         boxes = partial(self.open_views, self.data.views_per_room, None)
-        return Stage("layout", stage, boxes, partial(self._build, LayoutStage, stage))
+        return Stage("layout", stage, boxes, partial(self._build, stage))
 
     def _sampler_stage(self, stage: SamplerConfig) -> Stage:
         return Stage(
@@ -117,7 +118,9 @@ class PaperConfig(PriorConfig):
 
     def _build_sampler_stage(
         self, stage: SamplerConfig, rooms: SamplerRooms, previous: Path | None
-    ) -> SamplerStage:
+    ) -> "sceneprior.sampler.stage.SamplerStage":
+        from sceneprior.sampler.stage import SamplerStage, teach
+
         assert previous is not None, "the shape stage comes before"
         before = self._before(previous, rooms.room_ids)
         assert isinstance(before.prior.shape, OccupancyDecoder)
@@ -133,19 +136,17 @@ class PaperConfig(PriorConfig):
 
     def _shape_stage(self, stage: ShapeConfig | LiftedShapeConfig) -> Stage:
         if isinstance(stage, LiftedShapeConfig):
-            lifted = partial(self._build, LiftedStage, stage)
-            return Stage("shape", stage, self._lifted_shapes, lifted)
+            return Stage("shape", stage, self._lifted_shapes, partial(self._build, stage))
         views = stage.views_per_room or self.data.views_per_room
         masks = partial(self.open_views, views, self.data.mask_step)
-        return Stage("shape", stage, masks, partial(self._build, ShapeStage, stage))
+        return Stage("shape", stage, masks, partial(self._build, stage))
 
     def _build(
-        self,
-        kind: type[PaperStage],
-        stage: StageConfig,
-        rooms: ViewDataset | LiftedDataset,
-        previous: Path | None,
-    ) -> PaperStage:
+        self, stage: StageConfig, rooms: ViewDataset | LiftedDataset, previous: Path | None
+    ) -> "sceneprior.training.stages.PaperStage":
+        # Imported where something is trained, here and above: Lightning takes seconds.
+        from sceneprior.training.stages import LayoutStage, LiftedStage, ShapeStage
+
         if previous is None:
             prior, latents = self.build_prior(), self.build_latents(len(rooms))
         else:
@@ -157,6 +158,8 @@ class PaperConfig(PriorConfig):
             assert isinstance(self.model.shape, OccupancyConfig)
             prior.shape.learn_prototypes(rooms.find_prototypes(self.model.shape.prototypes))
         target = self.model.completeness_target
+        views_alone = LayoutStage if isinstance(stage, LayoutConfig) else ShapeStage
+        kind = LiftedStage if isinstance(rooms, LiftedDataset) else views_alone
         return kind(prior, latents, rooms, stage, self.loss, target, self.seed)
 
     def _before(self, previous: Path, room_ids: tuple[str, ...]) -> TrainedPrior:

@@ -10,9 +10,11 @@ import torch
 from sceneprior.classes import VOID
 from sceneprior.data.dataset import BLANK, ViewDataset
 from sceneprior.geometry.turns import turn_boxes, turn_grids
+from sceneprior.lifting import boxes, shapes
 from sceneprior.lifting import dataset as module
 from sceneprior.lifting.dataset import LiftedDataset
-from sceneprior.lifting.shapes import ShapeGrid, lift_shapes
+from sceneprior.lifting.lifted import ShapeGrid
+from sceneprior.lifting.shapes import lift_shapes
 from sceneprior.models.prototypes import POSES, Prototypes, turn_of
 from sceneprior.shards import iterate_rooms
 
@@ -48,7 +50,7 @@ def test_rows_and_objects_are_those_of_the_views_and_truth_is_not_needed(shards)
 def test_turned_rows_are_turned_rooms(shards, monkeypatch):
     rng = np.random.default_rng(0)
     monkeypatch.setattr(
-        module,
+        shapes,
         "lift_shapes",
         lambda views, *_: rng.random((len(views.object_class), 8, 8, 8)) < 0.5,
     )
@@ -105,8 +107,8 @@ def test_a_blank_draw_is_a_room_in_which_there_is_nothing(shards):
 def test_shapes_are_found_once_and_again_on_other_grids(shards, monkeypatch):
     LiftedDataset(shards, "train", shape=GRID)
     calls = []
-    find = module.lift_shapes
-    monkeypatch.setattr(module, "lift_shapes", lambda *given: calls.append(1) or find(*given))
+    find = shapes.lift_shapes
+    monkeypatch.setattr(shapes, "lift_shapes", lambda *given: calls.append(1) or find(*given))
     LiftedDataset(shards, "train", shape=GRID)
     assert calls == []
     LiftedDataset(shards, "train", shape=GRID._replace(margin=1.3))
@@ -116,8 +118,8 @@ def test_shapes_are_found_once_and_again_on_other_grids(shards, monkeypatch):
 def test_boxes_are_found_once_and_again_when_views_change(shards, monkeypatch):
     first = LiftedDataset(shards, "train")
     calls = []
-    find = module.lift_boxes
-    monkeypatch.setattr(module, "lift_boxes", lambda *given: calls.append(1) or find(*given))
+    find = boxes.lift_boxes
+    monkeypatch.setattr(boxes, "lift_boxes", lambda *given: calls.append(1) or find(*given))
     second = LiftedDataset(shards, "train")
     assert calls == []
     for one, other in zip(first.boxes, second.boxes, strict=True):

@@ -7,7 +7,8 @@ import pytest
 
 from sceneprior.lifting.boxes import lift_boxes
 from sceneprior.lifting.hulls import carve, sightings_of
-from sceneprior.lifting.shapes import EMPTY, REACH, ShapeGrid, lift_shapes
+from sceneprior.lifting.lifted import ShapeGrid
+from sceneprior.lifting.shapes import EMPTY, REACH, lift_shapes
 from sceneprior.shards import iterate_rooms
 
 GRID = ShapeGrid(cells=10, margin=1.25)

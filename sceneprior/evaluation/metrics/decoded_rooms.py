@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import linear_sum_assignment
 
 from sceneprior.evaluation.metric import Metric, TableColumn
 from sceneprior.evaluation.metrics.contents import common_label_set
@@ -91,6 +90,8 @@ def match_scenes(decoded: Scene, truth: Scene) -> SceneMatch:
     Raises:
         InputError: the scenes use different label sets.
     """
+    from scipy.optimize import linear_sum_assignment
+
     common_label_set([decoded, truth])
     iou = box_iou_3d(decoded.centers_m, decoded.sizes_m, truth.centers_m, truth.sizes_m)
     apart = np.linalg.norm(decoded.centers_m[:, None] - truth.centers_m[None], axis=2)
