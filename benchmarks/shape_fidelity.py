@@ -5,6 +5,10 @@ one stage: as that has them), stand here as the ellipsoids that fill them (the p
 as boxes; the shape stage has meshes. All of them are held against the same true meshes, which
 training never saw. Pairs are chosen by boxes (`match_scenes`), each object counts once, and points
 are drawn with a fixed seed. Two more tables have the same by class.
+
+Two rows say what could be reached: the true solids, moved into the decoded boxes, are what the best
+of views from outside could tell; the true surfaces, drawn again, are how far so many points of one
+surface lie from so many others.
 """
 
 import argparse
@@ -25,6 +29,7 @@ from sceneprior.evaluation.metrics.frechet import FRECHET
 from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.experiments.evaluate import decoded_and_true
+from sceneprior.geometry.isosurface import surface_of
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.geometry.surfaces import chamfer_sum
 from sceneprior.offscreen import open_renderer
@@ -38,19 +43,19 @@ SOLID_CELLS, SOLID_POINTS = 32, 50_000
 SHEET_ROOMS, SHEET_COLUMNS, TILE_PX = 24, 6, (210, 280)
 
 
-def ellipsoid(item: SceneObject) -> Mesh:
+def ellipsoid(item: SceneObject, _: SceneObject) -> Mesh:
     """What fills the object's box smoothly."""
     vertices, faces = icosphere(SPHERE_LEVEL)
     placed = vertices.numpy() * np.array(item.size_m) / 2 + np.array(item.center_m)
     return Mesh(placed, faces.numpy())
 
 
-def box(item: SceneObject) -> Mesh:
+def box(item: SceneObject, _: SceneObject) -> Mesh:
     """The object's box."""
     return box_mesh(item.center_m, item.size_m)
 
 
-def own(item: SceneObject) -> Mesh:
+def own(item: SceneObject, _: SceneObject) -> Mesh:
     """The decoded mesh."""
     assert item.mesh is not None, "the shape stage ends with meshes"
     return item.mesh
@@ -68,36 +73,57 @@ class Fidelity(NamedTuple):
     """See `volume_iou`."""
 
 
+def solid_cells(mesh: Mesh, low_m: np.ndarray, high_m: np.ndarray, cells: int) -> np.ndarray:
+    """Cells of a mesh's surface between two corners, and those between such cells along all three
+    axes: furniture is drawn hollow, open and in pieces. Air below a table or above a seat is not.
+    """
+    points = sample_surface(mesh, SOLID_POINTS, 0)
+    at = ((points - low_m) / (high_m - low_m).clip(1e-9) * cells).astype(int)
+    grid = np.zeros((cells,) * 3, dtype=bool)
+    grid[tuple(at.clip(max=cells - 1).T)] = True
+    return fill_orthographic(DenseEncoding(grid)).dense
+
+
 def volume_iou(a: Mesh, b: Mesh) -> float:
     """Intersection over union of two solids, on 32 cells along each axis of what holds both.
 
-    Furniture is drawn hollow, open and in pieces, so a solid is the cells of its surface and those
-    that lie between such cells along all three axes: air below a table or above a seat is not.
     Cells count in full where a surface only passes: two cubes that share a third have 0.375.
     """
-    points = [sample_surface(mesh, SOLID_POINTS, 0) for mesh in (a, b)]
-    low_m = np.minimum(*(each.min(axis=0) for each in points))
-    high_m = np.maximum(*(each.max(axis=0) for each in points))
-    solids = []
-    for each in points:
-        at = ((each - low_m) / (high_m - low_m).clip(1e-9) * SOLID_CELLS).astype(int)
-        grid = np.zeros((SOLID_CELLS,) * 3, dtype=bool)
-        grid[tuple(at.clip(max=SOLID_CELLS - 1).T)] = True
-        solids.append(fill_orthographic(DenseEncoding(grid)).dense)
-    return float((solids[0] & solids[1]).sum() / (solids[0] | solids[1]).sum())
+    ends = [(mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)) for mesh in (a, b)]
+    low_m, high_m = np.minimum(*(low for low, _ in ends)), np.maximum(*(high for _, high in ends))
+    one, other = (solid_cells(mesh, low_m, high_m, SOLID_CELLS) for mesh in (a, b))
+    return float((one & other).sum() / (one | other).sum())
+
+
+def true_solid(item: SceneObject, truth: SceneObject) -> Mesh:
+    """The true object as a solid of so many cells, in the decoded object's box."""
+    assert truth.mesh is not None, "asked for meshes"
+    corners = truth.mesh.vertices_m
+    filled = solid_cells(truth.mesh, corners.min(axis=0), corners.max(axis=0), SOLID_CELLS)
+    padded = np.pad(filled, 1) - 0.5
+    margin = (SOLID_CELLS + 2) / SOLID_CELLS
+    return Mesh(*surface_of(padded, np.array(item.center_m), np.array(item.size_m), margin))
+
+
+def true_surface(item: SceneObject, truth: SceneObject) -> Mesh:
+    """The true object itself."""
+    assert truth.mesh is not None, "asked for meshes"
+    return truth.mesh
 
 
 def distances(
-    pairs: list[tuple[Scene, Scene]], shape: Callable[[SceneObject], Mesh], points: int
+    pairs: list[tuple[Scene, Scene]],
+    shape: Callable[[SceneObject, SceneObject], Mesh],
+    points: int,
 ) -> list[Fidelity]:
-    """How near `shape` makes every matched object."""
+    """How near `shape`, of a decoded and a true object, makes every matched object."""
     found = []
     for decoded, truth in pairs:
         match = match_scenes(decoded, truth)
         for mine, true in zip(match.decoded, match.truth, strict=True):
             target = truth.objects[true]
             assert target.mesh is not None, "asked for meshes"
-            mesh = shape(decoded.objects[mine])
+            mesh = shape(decoded.objects[mine], target)
             a, b = sample_surface(mesh, points, 0), sample_surface(target.mesh, points, 1)
             volumes = volume_iou(mesh, target.mesh)
             found.append(Fidelity(target.label, chamfer_sum(a, b).l2_m, f_score(a, b), volumes))
@@ -163,6 +189,8 @@ def main() -> None:
         "ellipsoids in the layout's boxes": distances(layout, ellipsoid, given.points),
         "the layout's boxes": distances(layout, box, given.points),
         "the decoded meshes": distances(shaped, own, given.points),
+        "the true solids in decoded boxes": distances(shaped, true_solid, given.points),
+        "the true surfaces, drawn again": distances(shaped, true_surface, given.points),
     }
     base = mean(item.chamfer_m for item in rows["ellipsoids in the layout's boxes"])
     objects = len(rows["the layout's boxes"])

@@ -12,9 +12,10 @@ from sceneprior.geometry.turns import QUARTERS, turn_grids
 POSES = 2 * QUARTERS
 """Of a prototype: pose p is mirrored, x reversed, where p is 4 or more, then turned about +y by
 p % 4 quarters. A look is a prototype times this, plus a pose."""
-ALIKE = 0.12
-"""Two objects look alike that are no farther apart than this: the mean squared difference of their
-coarse grids plus `SIZE_WEIGHT` times the sum of how much their extents' logarithms differ."""
+ALIKE = 0.25
+"""Two objects look alike that are no farther apart than this: the squared difference of their
+coarse grids over what these fill (the geometric mean of both), or a chair's legs would count for
+nothing, plus `SIZE_WEIGHT` times the sum of how much their extents' logarithms differ."""
 SIZE_WEIGHT = 0.3
 COMMON = 3
 """A common prototype looks like at least so many objects, itself among them, or is its class's most
@@ -152,7 +153,9 @@ def distances(
 ) -> tuple[Float[np.ndarray, "objects offered"], Int[np.ndarray, "objects offered"]]:
     """How far each object is from each offered one in its best pose, and which that is; the first
     of equal ones."""
-    own = objects.coarse.reshape(len(objects.coarse), -1).astype(np.float64)
+    own, theirs = (each.coarse.reshape(len(each.coarse), -1) for each in (objects, offered))
+    own = own.astype(np.float64)
+    filled = np.sqrt(np.outer(own.sum(axis=1), theirs.sum(axis=1))).clip(min=1e-9)
     apart = np.full((len(own), len(offered.coarse)), np.inf)
     best = np.zeros(apart.shape, dtype=np.int64)
     for pose in range(POSES):
@@ -160,7 +163,7 @@ def distances(
         squared = (own**2).sum(1)[:, None] + (turned**2).sum(1) - 2 * own @ turned.T
         sizes = turned_extents(offered.log_sizes, pose)
         differ = np.abs(objects.log_sizes[:, None] - sizes).sum(2)
-        found = squared / own.shape[1] + SIZE_WEIGHT * differ
+        found = squared / filled + SIZE_WEIGHT * differ
         better = found < apart - 1e-9
         best[better], apart[better] = pose, found[better]
     return apart, best

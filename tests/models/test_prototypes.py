@@ -86,10 +86,21 @@ def test_distances_are_those_of_a_loop():
             for way in range(POSES):
                 there = pooled(turn_grids(grids[b : b + 1], *turn_of(way)), 8)[0]
                 differ = np.log(sizes[a]) - np.log(turned_extents(sizes[b : b + 1], way)[0])
-                squared = (pooled(grids[a : a + 1], 8)[0] - there) ** 2
-                each.append(squared.mean() + 0.3 * np.abs(differ).sum())
+                here = pooled(grids[a : a + 1], 8)[0]
+                relative = ((here - there) ** 2).sum() / np.sqrt(here.sum() * there.sum())
+                each.append(relative + 0.3 * np.abs(differ).sum())
             assert ours[a, b] == pytest.approx(min(each), abs=1e-6)
             assert each[pose[a, b]] == pytest.approx(min(each), abs=1e-6)
+
+
+@pytest.mark.parametrize("layers", [CELLS // 8, CELLS // 2])
+def test_thin_things_are_as_far_apart_as_full_ones(layers):
+    """A floor from a ceiling, or a lower half from an upper one."""
+    both = np.zeros((2, CELLS, CELLS, CELLS), dtype=bool)
+    both[0, :, :layers], both[1, :, -layers:] = True, True
+    sizes = np.ones((2, 3))
+    apart, _ = distances(described(both, sizes), described(both, sizes))
+    assert apart == pytest.approx(np.array([[0, 2], [2, 0]]))
 
 
 @pytest.mark.parametrize("codes", [3, 40])
