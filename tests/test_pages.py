@@ -47,7 +47,7 @@ WHOLE_PAGES = {
     "docs/own_room_types.md": "tests/data_prep/front/test_own_room_types.py",
 }
 """Guides that tests of their own run as printed, on data of their own."""
-TABLES = ("docs/results.md", "docs/experiments/")
+TABLES = ("docs/results.md", "docs/experiments/", "docs/silhouettes.md")
 """Pages whose commands made the tables on them, in hours, from data that are not here."""
 ELSEWHERE = {
     "make demo": "tests/experiments/test_demo.py runs the command that it is",

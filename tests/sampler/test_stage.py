@@ -105,7 +105,9 @@ def test_a_run_ends_with_a_sampler(sampler_run):
     assert len(trained.room_ids) == len(trained.logits) == 12
 
 
-def test_a_resumed_run_ends_as_one_that_was_never_stopped(sampler_run, toy_shards, tmp_path):
+def test_a_resumed_run_ends_as_one_that_was_never_stopped(
+    sampler_run, toy_shards, tmp_path, monkeypatch
+):
     class StopError(Exception):
         pass
 
@@ -115,14 +117,9 @@ def test_a_resumed_run_ends_as_one_that_was_never_stopped(sampler_run, toy_shard
                 raise StopError
 
     whole, again = load_any_run(sampler_run), tmp_path / "run"
-    from sceneprior.training import ours
-
-    kept, ours.SamplerStage = ours.SamplerStage, Stopped
-    try:
-        with pytest.raises(StopError):
-            fit(tiny_sampler_config(toy_shards), again, trainer_options=CPU)
-    finally:
-        ours.SamplerStage = kept
+    with monkeypatch.context() as patch, pytest.raises(StopError):
+        patch.setattr("sceneprior.sampler.stage.SamplerStage", Stopped)
+        fit(tiny_sampler_config(toy_shards), again, trainer_options=CPU)
     fit(tiny_sampler_config(toy_shards), again, resume=True, trainer_options=CPU)
     for one, other in zip(
         whole.sampler.parameters(), load_any_run(again).sampler.parameters(), strict=True
