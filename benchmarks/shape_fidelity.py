@@ -174,6 +174,7 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("run", type=Path)
     options.add_argument("--points", type=int, default=2000, help="on each surface")
+    options.add_argument("--rooms", type=int, help="compare surfaces in so many, not in all")
     options.add_argument("--json", type=Path, help="also writes five figures")
     options.add_argument("--sheet", type=Path, help="also draws 24 rooms, truth beside them (PNG)")
     options.add_argument("--renderer", default="auto")
@@ -185,16 +186,18 @@ def main() -> None:
         boxes = trained.config.load("layout", given.run / "layout" / "final.ckpt")
         assert isinstance(boxes, TrainedPrior), "load_run refuses runs without latents"
         layout = decoded_and_true(boxes, shards, meshes=True)
+    order = np.random.default_rng(0).permutation(len(shaped))[: given.rooms]
+    flat, full = ([pairs[row] for row in order] for pairs in (layout, shaped))
     rows = {
-        "ellipsoids in the layout's boxes": distances(layout, ellipsoid, given.points),
-        "the layout's boxes": distances(layout, box, given.points),
-        "the decoded meshes": distances(shaped, own, given.points),
-        "the true solids in decoded boxes": distances(shaped, true_solid, given.points),
-        "the true surfaces, drawn again": distances(shaped, true_surface, given.points),
+        "ellipsoids in the layout's boxes": distances(flat, ellipsoid, given.points),
+        "the layout's boxes": distances(flat, box, given.points),
+        "the decoded meshes": distances(full, own, given.points),
+        "the true solids in decoded boxes": distances(full, true_solid, given.points),
+        "the true surfaces, drawn again": distances(full, true_surface, given.points),
     }
     base = mean(item.chamfer_m for item in rows["ellipsoids in the layout's boxes"])
     objects = len(rows["the layout's boxes"])
-    print(f"{given.run.resolve().name}: {len(layout)} training rooms, {objects} objects")
+    print(f"{given.run.resolve().name}: {len(order)} training rooms, {objects} objects")
     columns = "Chamfer distance L2, m", "against the first row", "F-score at 5 cm", "volumetric IoU"
     print(f"| shape | {' | '.join(columns)} |")
     print(f"| --- |{' ---: |' * len(columns)}")
