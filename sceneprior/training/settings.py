@@ -46,6 +46,9 @@ class LossConfig(Section):
     side at its word; 0 lets objects go on behind others without end."""
     iou_gate: float = Field(0.5, ge=0, lt=1)
     """Masks whose IoU with their observation is not above this are left out of L_S."""
+    latents: float = Field(0.0, ge=0)
+    """For training rooms' logits that are spread as the N(0, 1) logits of new rooms are (sliced
+    Wasserstein distance), so that more of the sphere is rooms; the paper: 0."""
 
 
 class TrainConfig(Section):

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from sceneprior.lifting.dataset import LiftedDataset
+from sceneprior.losses.latents import latent_loss
 from sceneprior.losses.lifted import (
     lifted_losses,
     match_lifted,
@@ -100,9 +101,17 @@ class PaperStage(lightning.LightningModule, ABC):
         self,
         losses: dict[str, Tensor],
         views: SceneViews | LiftedRooms,
+        batch_idx: int,
         beside: dict[str, Tensor] | None = None,
     ) -> Tensor:
-        """The weighted sum of the losses, checked and logged; `beside` is logged alone."""
+        """The weighted sum of the losses, the latents' among them, checked and logged; `beside` is
+        logged alone."""
+        if self.loss.latents:
+            draws = torch.Generator().manual_seed(
+                batch_seed(self.seed, self.trainer, batch_idx) + 1  # other numbers than the noise's
+            )
+            spread = latent_loss(self.latents.weight, self.prior.latent_space.shift_free, draws)
+            losses = losses | {"latents": spread}
         total = weighted_sum(losses, self.loss)
         check_finite(total, views)
         log_losses(self, losses | (beside or {}), total, len(views.room_index))
@@ -139,7 +148,7 @@ class LayoutStage(PaperStage):
         with full_precision(self.device):
             boxes = proxy_boxes(scenes, views, self.stage.proxy)
             losses, _ = match_and_score(scenes, boxes, views, self.loss, self.completeness_target)
-            return self.total(losses, views)
+            return self.total(losses, views, batch_idx)
 
 
 class LiftedStage(PaperStage):
@@ -169,7 +178,7 @@ class LiftedStage(PaperStage):
                 known = matches._replace(valid=matches.valid & (rooms.looks >= 0))
                 targets = self.prior.shape.targets(rooms.looks.clamp(min=0))
                 losses["mask"] = shape_code_loss(scenes, known, *targets)
-            return self.total(losses, rooms)
+            return self.total(losses, rooms, batch_idx)
 
 
 class ShapeStage(PaperStage):
@@ -194,4 +203,4 @@ class ShapeStage(PaperStage):
             assert scenes.vertices_m is not None and faces is not None, "masks are of meshes"
             masks = seen_masks(scenes.vertices_m, faces, views, self.stage)
             losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
-            return self.total(losses, views, beside=overlap)
+            return self.total(losses, views, batch_idx, beside=overlap)

@@ -41,7 +41,11 @@ RELEASED = {
     "layout__proxy": "ellipsoid_points",
 }
 VARIANTS = {
-    "c1_uniform": {"model__latent_space": {"name": "cube"}, "layout__latent_noise": 0.1},
+    "c1_uniform": {
+        "model__latent_space": {"name": "cube"},
+        "layout__latent_noise": 0.1,
+        "loss__latents": 1.0,
+    },
     "c2_lstm": {"model__decoder": {"name": "lstm"}},
     "c3_one_stage": {"layout": None, "shape__epochs": 5},
     "beveled_box": {
@@ -50,7 +54,7 @@ VARIANTS = {
         "shape__proxy": "beveled_box",
     },
     "released": RELEASED,
-    "lifted": {"layout__supervision": "lifted"},
+    "lifted": {"layout__supervision": "lifted", "loss__latents": 1.0},
     "occupancy": {"layout__supervision": "lifted", **OCCUPANCY},
     "occupancy_one_stage": {"layout": None, **OCCUPANCY},
 }
