@@ -84,6 +84,31 @@ def test_small_images_are_every_nth_pixel_from_the_middle_of_a_block(tmp_path):
     np.testing.assert_array_equal(small, room.instance_ids[[2, 0], 2::4, 2::4])
 
 
+@pytest.mark.parametrize(
+    "stored",
+    [
+        {"chunks": (1, 60, 80), "compression": "gzip"},
+        {"chunks": (1, 60, 80), "compression": "gzip", "shuffle": True},
+        {"chunks": (2, 30, 80), "compression": "gzip"},
+        {"chunks": (1, 60, 80), "compression": "lzf"},
+        {"chunks": (1, 60, 80)},
+        {},
+    ],
+)
+def test_images_are_read_as_hdf5_reads_them_however_they_are_stored(tmp_path, stored):
+    room = make_room(views=5, size=(60, 80))
+    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, None)])
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        group = file["rooms/house_A"]
+        noise = np.random.default_rng(0).integers(0, 255, (60, 80), dtype=room.instance_ids.dtype)
+        ids = np.concatenate([group["instance_ids"][:-1], noise[None]])
+        del group["instance_ids"]
+        group.create_dataset("instance_ids", data=ids, **stored)
+    with Shard(tmp_path / "a.h5") as shard:
+        read = shard.read_instance_ids("house_A", [4, 1, 0])
+    np.testing.assert_array_equal(read, ids[[4, 1, 0]])
+
+
 def test_same_rooms_same_bytes(tmp_path):
     for name in ("a.h5", "b.h5"):
         write_shard(tmp_path / name, "front3d_bedroom", [(make_room(), make_truth())])
