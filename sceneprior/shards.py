@@ -230,7 +230,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
         """A room's group; what cannot be read in it is told as damage."""
         try:
             yield self._file["rooms"][self._keys[room_id]]
-        except (OSError, KeyError, RuntimeError, zlib_ng.error) as error:
+        except (OSError, KeyError, RuntimeError, zlib_ng.error) as error:  # type: ignore[misc]
             raise _damaged(self.path, error, room_id) from None
 
     def read_room(self, room_id: str, images: bool = False) -> RoomViews:
