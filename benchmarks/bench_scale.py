@@ -1,0 +1,179 @@
+"""What does each step of a data set cost, and how does that grow with rooms and with objects?
+
+    python benchmarks/bench_scale.py [--rooms 500 2000 6000] [--json FILE] [--folder DIR]
+
+For each number of rooms, each a process of its own: bedrooms are made, prepared by two workers and
+inspected; the loader opens them and reads every room's 20 views with masks at a quarter of the
+size, twice; the paper's run (configs/bedroom.yaml) trains a few steps of both stages. Of each: wall
+clock, CPU seconds of the process and its children, peak memory of the largest of them, and the
+power of the number of rooms that the CPU seconds grow with, from each number to the next.
+
+Then a layout step of the paper's size with as many objects as bedrooms, living rooms and ScanNet
+scenes hold (128 rooms of 20 views, one thread), and what both stages of the paper's schedule would
+take on this machine with as many rooms: steps, times the median step.
+"""
+
+import argparse
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+STEPS = 4
+"""Of an epoch, and as many epochs a stage: the first compiles."""
+MANY_OBJECTS = ("bedroom.yaml", "living.yaml", "scannet.yaml")
+SCHEDULE = {"layout": 800, "shape": 500}
+
+
+def child(*words: object) -> dict[str, Any]:
+    """Run a command; seconds, CPU seconds and peak memory of it and what it starts."""
+    began = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    assert process.stdout is not None
+    said = process.stdout.read().decode(errors="replace")
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        sys.exit(f"{' '.join(map(str, words))}\n{said}")
+    found = {
+        "clock_s": time.perf_counter() - began,
+        "cpu_s": used.ru_utime + used.ru_stime,
+        "peak_mb": used.ru_maxrss * 1024 / 1e6,  # this process is small, so theirs counts
+    }
+    last = said.strip().rpartition("\n")[2]
+    return found | (json.loads(last) if last.startswith("{") else {})
+
+
+def data_set(folder: Path, rooms: int) -> dict[str, dict[str, float]]:
+    """Figures of every step, by its name."""
+    homes, shards, command = folder / "homes", folder / "shards", ("-m", "sceneprior")
+    steps: dict[str, tuple[object, ...]] = {
+        "make-homes": (*command, "make-homes", homes, "--rooms", rooms),
+        "prep-front": (
+            *command, "prep-front", "--front", homes / "3D-FRONT",
+            "--future", homes / "3D-FUTURE-model", "--out", shards, "--workers", 2,
+        ),
+        "inspect": (*command, "inspect", shards, "--out", folder / "inspected"),
+        "load": (__file__, "--part", "load", shards),
+        "train": (__file__, "--part", "train", shards),
+    }  # fmt: skip
+    found = {}
+    for name, words in steps.items():
+        found[name] = child(*words)
+        print(f"{rooms:6} {name:12}", _told(found[name]), flush=True)
+    found["prep-front"]["disk_mb"] = sum(
+        path.stat().st_size for path in shards.rglob("*.h5")
+    ) / 1e6  # fmt: skip
+    return found
+
+
+def load(shards: Path) -> dict[str, float]:
+    """Two epochs of the shape stage's batches, without turned copies, which read nothing new."""
+    from sceneprior.data.dataset import ViewDataset
+
+    began = time.perf_counter()
+    rooms = ViewDataset(shards, "train", 20, mask_step=4)
+    marks = [began, time.perf_counter()]
+    for epoch in range(2):
+        for first in range(0, len(rooms), 16):
+            rooms.__getitems__([(row, epoch) for row in range(first, min(first + 16, len(rooms)))])
+        marks.append(time.perf_counter())
+    names = ("open_s", "first_epoch_s", "second_epoch_s")
+    return dict(zip(names, [end - start for start, end in pairwise(marks)], strict=True))
+
+
+def train(shards: Path) -> dict[str, float]:
+    """A few steps of both stages; what the whole schedule would take."""
+    from timed_fit import paper_run, timed_fit
+
+    with tempfile.TemporaryDirectory() as folder:
+        limited = {"limit_train_batches": STEPS, "accelerator": "cpu", "devices": 1}
+        run = paper_run(shards, STEPS, "data.workers=0")
+        stages = timed_fit(run, Path(folder) / "run", limited)
+    found: dict[str, float] = {}
+    for name, times in stages.items():
+        steps = math.ceil(times.rooms / 16) * SCHEDULE[name]
+        found |= {
+            f"{name}_step_s": times.step_s,
+            f"{name}_hours": steps * times.step_s / 3600,
+            f"{name}_rows": times.rooms,
+        }
+    return found
+
+
+def layout_steps(_: Path) -> dict[str, dict[str, float]]:
+    """Median CPU seconds of a layout step, by the config that says how many objects there are."""
+    import torch
+    from bench_layout_step import make_views, our_step
+
+    from sceneprior.config import OursConfig, load_config
+
+    torch.set_num_threads(1)
+    found = {}
+    for name in MANY_OBJECTS:
+        config = load_config(name)
+        assert isinstance(config, OursConfig)
+        objects = config.model.max_objects
+        prior, views = config.build_prior(), make_views(128, 20, objects)
+        logits = torch.randn(128, config.model.logits_per_room)
+        times = []
+        for _ in range(4):
+            prior.zero_grad()
+            began = time.process_time()
+            our_step(prior, prior.latent_space(logits), views, config)
+            times.append(time.process_time() - began)
+        found[name] = {"objects": objects, "cpu_s": statistics.median(times[1:])}
+    return found
+
+
+def powers(counts: list[int], seconds: list[float]) -> list[float]:
+    """p where seconds grow as counts**p, from each to the next."""
+    logs = [(math.log(n), math.log(s)) for n, s in zip(counts, seconds, strict=True)]
+    return [(s1 - s0) / (n1 - n0) for (n0, s0), (n1, s1) in pairwise(logs)]
+
+
+PARTS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    "load": load, "train": train, "objects": layout_steps,
+}  # fmt: skip
+"""What a child does that no command of the package does alone."""
+
+
+def _told(figures: dict[str, float]) -> str:
+    return "  ".join(f"{name} {value:.4g}" for name, value in figures.items())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--rooms", nargs="+", type=int, default=[500, 2000, 6000])
+    parser.add_argument("--json", type=Path, help="write the figures to this file, too")
+    parser.add_argument("--folder", type=Path, help="keep what is made here")
+    parser.add_argument("--part", nargs=2, help=argparse.SUPPRESS)  # what a child does
+    arguments = parser.parse_args()
+    if arguments.part:
+        name, shards = arguments.part
+        print(json.dumps(PARTS[name](Path(shards))))
+        return
+    figures: dict[str, Any] = {"cores": os.cpu_count(), "load_average": os.getloadavg()[0]}
+    with tempfile.TemporaryDirectory() as name:
+        folder = arguments.folder or Path(name)
+        by_rooms = {count: data_set(folder / str(count), count) for count in arguments.rooms}
+    figures |= {"by_rooms": by_rooms, "by_objects": child(__file__, "--part", "objects", ".")}
+    for step in next(iter(by_rooms.values())):
+        seconds = [by_rooms[count][step]["cpu_s"] for count in arguments.rooms]
+        grown = " ".join(f"{power:.2f}" for power in powers(arguments.rooms, seconds))
+        print(f"{step:12} CPU s {' '.join(f'{s:.4g}' for s in seconds)}  power {grown}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
