@@ -29,7 +29,8 @@ from typing import Any
 
 STEPS = 4
 """Of an epoch, and as many epochs a stage: the first compiles."""
-MANY_OBJECTS = ("bedroom.yaml", "living.yaml", "scannet.yaml")
+OBJECTS = (13, 28, 53)
+"""What bedrooms, living rooms and ScanNet scenes hold at most."""
 SCHEDULE = {"layout": 800, "shape": 500}
 
 
@@ -62,7 +63,7 @@ def data_set(folder: Path, rooms: int) -> dict[str, dict[str, float]]:
             *command, "prep-front", "--front", homes / "3D-FRONT",
             "--future", homes / "3D-FUTURE-model", "--out", shards, "--workers", 2,
         ),
-        "inspect": (*command, "inspect", shards, "--out", folder / "inspected"),
+        "inspect": (*command, "inspect", shards, "--verify"),
         "load": (__file__, "--part", "load", shards),
         "train": (__file__, "--part", "train", shards),
     }  # fmt: skip
@@ -110,8 +111,8 @@ def train(shards: Path) -> dict[str, float]:
     return found
 
 
-def layout_steps(_: Path) -> dict[str, dict[str, float]]:
-    """Median CPU seconds of a layout step, by the config that says how many objects there are."""
+def layout_steps(_: Path) -> dict[str, float]:
+    """Median CPU seconds of a layout step, by the number of objects."""
     import torch
     from bench_layout_step import make_views, our_step
 
@@ -119,19 +120,18 @@ def layout_steps(_: Path) -> dict[str, dict[str, float]]:
 
     torch.set_num_threads(1)
     found = {}
-    for name in MANY_OBJECTS:
-        config = load_config(name)
+    for objects in OBJECTS:
+        config = load_config("bedroom.yaml", (f"model.max_objects={objects}",))
         assert isinstance(config, OursConfig)
-        objects = config.model.max_objects
-        prior, views = config.build_prior(), make_views(128, 20, objects)
-        logits = torch.randn(128, config.model.logits_per_room)
+        prior, views = config.build_prior(), make_views(ROOMS, 20, objects)
+        logits = torch.randn(ROOMS, config.model.logits_per_room)
         times = []
         for _ in range(4):
             prior.zero_grad()
             began = time.process_time()
             our_step(prior, prior.latent_space(logits), views, config)
             times.append(time.process_time() - began)
-        found[name] = {"objects": objects, "cpu_s": statistics.median(times[1:])}
+        found[str(objects)] = statistics.median(times[1:])
     return found
 
 
