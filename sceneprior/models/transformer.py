@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sceneprior.models.layers import DecoderConfig
+from sceneprior.models.layers import DecoderConfig, dropout
 from sceneprior.models.released import QuerySelfAttention, StepOutputs
 
 
@@ -43,11 +43,12 @@ class FeedForward(nn.Module):
         self.expand = nn.Linear(width, hidden)
         self.contract = nn.Linear(hidden, width)
         self.norm = nn.LayerNorm(width)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = dropout
 
     def forward(self, x: Float[Tensor, "*batch width"]) -> Float[Tensor, "*batch width"]:
-        inner = self.dropout(F.gelu(self.expand(x)))
-        return self.norm(x + self.dropout(self.contract(inner)))
+        p = self.dropout if self.training else 0.0
+        inner = dropout(F.gelu(self.expand(x)), p)
+        return self.norm(x + dropout(self.contract(inner), p))
 
 
 class SceneTransformer(nn.Module):
@@ -70,25 +71,25 @@ class SceneTransformer(nn.Module):
 
     def __init__(self, width: int, config: TransformerConfig, max_objects: int):
         super().__init__()
-        hidden, dropout = config.hidden, config.dropout
+        hidden = config.hidden
         self.heads = config.heads
-        self.dropout = dropout
+        self.dropout = config.dropout
         self.start = nn.Parameter(torch.randn(width) / width**0.5)
         self.encoder_qkv = nn.Linear(width, 3 * width)
         self.encoder_out = nn.Linear(width, width)
         self.encoder_norm = nn.LayerNorm(width)
-        self.encoder_ff = FeedForward(width, hidden, dropout)
+        self.encoder_ff = FeedForward(width, hidden, config.dropout)
         self.decoder_query = nn.Linear(width, width)
         self.decoder_key = nn.Parameter(nn.Linear(width, width).weight.detach())
         self.decoder_value = nn.Linear(width, width)
         self.decoder_out = nn.Linear(width, width)
         self.decoder_norm = nn.LayerNorm(width)
-        self.decoder_ff = FeedForward(width, hidden, dropout)
+        self.decoder_ff = FeedForward(width, hidden, config.dropout)
         self.encoder_end = nn.LayerNorm(width) if config.final_norm else nn.Identity()
         self.decoder_end = nn.LayerNorm(width) if config.final_norm else nn.Identity()
         self.query: nn.Module = nn.Identity()
         if config.query_self_attention:
-            self.query = QuerySelfAttention(width, config.heads, dropout)
+            self.query = QuerySelfAttention(width, config.heads, config.dropout)
         self.output = StepOutputs(max_objects, width) if config.step_mlps else None
 
     def forward(
@@ -173,4 +174,4 @@ class SceneTransformer(nn.Module):
         return list(packed.reshape(shape).permute(2, 0, 3, 1, 4).unbind(0))
 
     def _drop(self, x: Tensor) -> Tensor:
-        return F.dropout(x, self.dropout, self.training)
+        return dropout(x, self.dropout if self.training else 0.0)

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch import distributed as dist
+from torch.nn import functional as F
 
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.geometry.corners import box_corners
@@ -65,16 +66,23 @@ def match_and_score(
 def seen_boxes(
     scenes: DecodedScenes, views: SceneViews, settings: ShapeConfig | LiftedShapeConfig
 ) -> Boxes2D:
-    """2D boxes of decoded objects: of their meshes where there are any (`ShapeConfig.box_from`)."""
+    """2D boxes of decoded objects: of their meshes where there are any (`ShapeConfig.box_from`).
+
+    Of as many predictions as the fullest room has objects; those after it are matched to none, and
+    have empty boxes.
+    """
     if (
         scenes.vertices_m is None
         or isinstance(settings, LiftedShapeConfig)
         or settings.box_from == "proxy"
     ):
         return proxy_boxes(scenes, views, settings.proxy)
-    return boxes_of_points(
-        scenes.vertices_m, views.world_to_camera, views.intrinsics, views.image_size
+    most = views.is_object.shape[1]
+    boxes, inside = boxes_of_points(
+        scenes.vertices_m[:, :most], views.world_to_camera, views.intrinsics, views.image_size
     )
+    more = scenes.vertices_m.shape[1] - most
+    return Boxes2D(F.pad(boxes, (0, 0, 0, more)), F.pad(inside, (0, more)))
 
 
 def seen_masks(

@@ -1,5 +1,7 @@
 """What stands for an object in 2D before it has a mesh."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -81,5 +83,22 @@ def test_the_shape_stage_takes_boxes_from_where_it_is_told(seen, tmp_path, box_f
         expected = boxes_of_points(
             scenes.vertices_m, views.world_to_camera, views.intrinsics, views.image_size
         )
-    assert_close(found.boxes, expected.boxes, rtol=0, atol=0)
-    assert torch.equal(found.in_frustum, expected.in_frustum)
+    # Of three objects; the fourth prediction is matched to none.
+    assert_close(found.boxes[:, :, :3], expected.boxes[:, :, :3], rtol=0, atol=0)
+    assert torch.equal(found.in_frustum[:, :, :3], expected.in_frustum[:, :, :3])
+
+
+def test_meshes_that_are_matched_to_nothing_are_not_projected(seen):
+    scenes, views = seen
+    generator = torch.Generator().manual_seed(1)
+    whole = replace(scenes, vertices_m=torch.rand(2, 3, 9, 3, generator=generator))
+    fewer = replace(
+        views, object_class=views.object_class[:, :2], is_object=views.is_object[:, :2],
+        boxes=views.boxes[:, :, :2], visible=views.visible[:, :, :2],
+        sides_clear=views.sides_clear[:, :, :2],
+    )  # fmt: skip
+    settings = ShapeConfig(epochs=1)
+    some, every = seen_boxes(whole, fewer, settings), seen_boxes(whole, views, settings)
+    assert torch.equal(some.boxes[:, :, :2], every.boxes[:, :, :2])
+    assert torch.equal(some.in_frustum[:, :, :2], every.in_frustum[:, :, :2])
+    assert every.in_frustum[:, :, 2].all() and not some.in_frustum[:, :, 2].any()
