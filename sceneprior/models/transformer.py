@@ -115,18 +115,15 @@ class SceneTransformer(nn.Module):
         key_query = self._key_query(query)
         features: list[Tensor] = []
         for rooms in going_on:
+            query, key_query, tokens = (_first(each, rooms) for each in (query, key_query, tokens))
+            qkv = [_first(part, rooms) for part in qkv]
             if features:
-                newest = features[-1][:rooms].unsqueeze(1)
-                tokens = torch.cat([tokens[:rooms], newest], dim=1)
+                newest = _first(features[-1], rooms).unsqueeze(1)
+                tokens = torch.cat([tokens, newest], dim=1)
                 added = self._split(self.encoder_qkv(newest))
-                qkv = [
-                    torch.cat([old[:rooms], new], dim=2)
-                    for old, new in zip(qkv, added, strict=True)
-                ]
-            seen = [part[:rooms] for part in qkv]
-            feature = self._next(query[:rooms], key_query[:rooms], tokens[:rooms], seen)
-            features.append(F.pad(feature, (0, 0, 0, len(z) - rooms)))
-        return torch.stack(features, dim=1)
+                qkv = [torch.cat(both, dim=2) for both in zip(qkv, added, strict=True)]
+            features.append(self._next(query, key_query, tokens, qkv))
+        return torch.stack([F.pad(x, (0, 0, 0, len(z) - len(x))) for x in features], dim=1)
 
     def _query(self, z: Tensor) -> Tensor:
         """(rooms, width): z as the query of every step.
@@ -175,3 +172,8 @@ class SceneTransformer(nn.Module):
 
     def _drop(self, x: Tensor) -> Tensor:
         return dropout(x, self.dropout if self.training else 0.0)
+
+
+def _first(values: Tensor, rooms: int) -> Tensor:
+    """`values[:rooms]`; where that is all of them, itself: a slice would cost gradients a copy."""
+    return values if len(values) == rooms else values[:rooms]
