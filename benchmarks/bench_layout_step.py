@@ -6,8 +6,8 @@ size (configs/bedroom.yaml: width 512, 13 objects, 22 classes; 128 rooms of 20 v
 `theirs` projects the 2,562 vertices of an icosphere for every object and takes boxes, matching and
 losses room by room in a Python loop. Decoder, losses and optimiser are ours in both, which flatters
 it, and each room's backward pass runs at once, which saves it the memory of the others. The two
-take turns, so that whatever else the machine does meets both; figures are medians. Where others hold
-the cores, CPU time on one thread (OMP_NUM_THREADS=1) is the one to trust.
+take turns, so that whatever else the machine does meets both; figures are medians. Where others
+hold the cores, CPU time on one thread (OMP_NUM_THREADS=1) is the one to trust.
 """
 
 import argparse

@@ -64,7 +64,7 @@ def measure(config_name: str, burn: bool, repeats: int) -> dict[str, float]:
     }  # fmt: skip
     for process in processes.values():
         step_seconds(process)
-    other = [subprocess.Popen([sys.executable, "-c", BURN])] if burn else []
+    other = [subprocess.Popen([sys.executable, "-c", BURN], text=True)] if burn else []
     try:
         times = [
             {name: step_seconds(process) for name, process in processes.items()}
