@@ -26,7 +26,7 @@ from bench_boxes import SIZE, make_batch
 from torch import Tensor
 
 from sceneprior.config import OursConfig, load_config
-from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
+from sceneprior.geometry.cameras import MIN_DEPTH_M, Boxes2D, project
 from sceneprior.geometry.meshes import icosphere, place
 from sceneprior.models.prior import ScenePrior
 from sceneprior.training.objective import match_and_score, proxy_boxes, weighted_sum
@@ -76,6 +76,17 @@ def our_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: OursConfig
     weighted_sum(losses, config.loss).backward()
 
 
+def their_boxes(points_m: Tensor, views: SceneViews) -> Boxes2D:
+    """`boxes_of_points` with a graph through every point."""
+    height, width = views.image_size
+    pixels = project(points_m, views.world_to_camera, views.intrinsics)
+    size = pixels.new_tensor([width, height])
+    low, high = pixels[..., :2].amin(dim=-2) / size, pixels[..., :2].amax(dim=-2) / size
+    in_front = (pixels[..., 2] > MIN_DEPTH_M).any(dim=-1)
+    meets_image = ((low < 1) & (high > 0)).all(dim=-1)
+    return Boxes2D(torch.cat([low, high], dim=-1).clamp(0, 1), in_front & meets_image)
+
+
 def their_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: OursConfig) -> None:
     scenes = prior.decode(z, with_shape=False)
     names = ("class_logits", "centers_m", "sizes_m", "completeness_logits")
@@ -87,9 +98,7 @@ def their_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: OursConf
     for index in range(len(z)):
         one, seen = room(loose, index), room(views, index)
         points = place(sphere, one.centers_m, one.sizes_m)
-        boxes: Boxes2D = boxes_of_points(
-            points, seen.world_to_camera, seen.intrinsics, seen.image_size
-        )
+        boxes = their_boxes(points, seen)
         losses, _ = match_and_score(one, boxes, seen, config.loss, "first_n")
         (weighted_sum(losses, config.loss) / len(z)).backward()
     torch.autograd.backward(outputs, [leaf.grad for leaf in leaves])
