@@ -3,7 +3,12 @@
 `load` opens a trained prior, `load_scene` a room; both are imported when they are first asked for.
 """
 
+import os
 from typing import TYPE_CHECKING, Any
+
+# Torch's threads that wait for each other by spinning, as OpenMP has them by default, wait for many
+# times a step where another program has the core of one. Read when torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from sceneprior.api import Prior, load

@@ -35,13 +35,14 @@ def project(
     """
     rooms, views = world_to_camera.shape[:2]
     _, objects, points, _ = points_m.shape
-    rotation = intrinsics @ world_to_camera[..., :3, :3]
-    offset = (intrinsics @ world_to_camera[..., :3, 3:]).reshape(rooms, views, 1, 3)
-    flat = points_m.reshape(rooms, 1, objects * points, 3)
-    scaled = flat @ rotation.transpose(-1, -2) + offset
-    depth = scaled[..., 2:]
-    pixels = scaled[..., :2] / depth.clamp(min=MIN_DEPTH_M)
-    return torch.cat([pixels, depth], dim=-1).reshape(rooms, views, objects, points, 3)
+    rows = (intrinsics @ world_to_camera[..., :3, :3]).reshape(rooms, views * 3, 3)
+    offset = (intrinsics @ world_to_camera[..., :3, 3:]).reshape(rooms, views * 3, 1)
+    # Components first: what looks for extremes among many points reads them one after the other.
+    scaled = torch.baddbmm(offset, rows, points_m.reshape(rooms, -1, 3).transpose(1, 2))
+    scaled = scaled.reshape(rooms, views, 3, objects, points)
+    depth = scaled[:, :, 2:]
+    pixels = scaled[:, :, :2] / depth.clamp(min=MIN_DEPTH_M)
+    return torch.cat([pixels, depth], dim=2).movedim(2, -1)
 
 
 def boxes_of_points(
@@ -64,13 +65,23 @@ def boxes_of_points(
         the frustum the clamped box has no useful gradient; the frustum loss takes over there.
     """
     height, width = image_size
-    pixels = project(points_m, world_to_camera, intrinsics)
-    size = pixels.new_tensor([width, height])
-    low = pixels[..., :2].amin(dim=-2) / size
-    high = pixels[..., :2].amax(dim=-2) / size
-    in_front = (pixels[..., 2] > MIN_DEPTH_M).any(dim=-1)
-    meets_image = ((low < 1) & (high > 0)).all(dim=-1)
-    return Boxes2D(torch.cat([low, high], dim=-1).clamp(0, 1), in_front & meets_image)
+    rooms, views = world_to_camera.shape[:2]
+    with torch.no_grad():
+        pixels = project(points_m, world_to_camera, intrinsics)
+        in_front = (pixels[..., 2] > MIN_DEPTH_M).any(dim=-1)
+        pixels = pixels[..., :2]
+        at = torch.cat([pixels.argmin(dim=-2), pixels.argmax(dim=-2)], dim=-1)
+    # Gradients reach four points of each object in a view; all others are gone from the graph.
+    room = torch.arange(rooms, device=at.device).reshape(-1, 1, 1, 1)
+    item = torch.arange(points_m.shape[1], device=at.device).unsqueeze(-1)
+    cameras = (each.flatten(0, 1).unsqueeze(1) for each in (world_to_camera, intrinsics))
+    ends = project(points_m[room, item, at].flatten(0, 1), *cameras)[:, 0]
+    sides = torch.stack([ends[..., k, k % 2] for k in range(4)], dim=-1).unflatten(
+        0, (rooms, views)
+    )
+    boxes = sides / sides.new_tensor([width, height, width, height])
+    meets_image = ((boxes[..., :2] < 1) & (boxes[..., 2:] > 0)).all(dim=-1)
+    return Boxes2D(boxes.clamp(0, 1), in_front & meets_image)
 
 
 def camera_centers(

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from pydantic import Field, field_validator, model_validator
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from sceneprior.geometry.meshes import place
 from sceneprior.models.latents import CubeConfig, LatentSpace, SphereConfig
@@ -93,14 +94,14 @@ class ScenePrior(nn.Module):
     def decode(
         self,
         z: Float[Tensor, "rooms width"],
-        with_shape: bool = True,
+        with_shape: bool | Bool[Tensor, "rooms shaped"] = True,
         wanted: Bool[Tensor, "rooms wanted"] | None = None,
     ) -> DecodedScenes:
         """Decode rooms from points of the latent space; `with_shape` adds meshes or looks.
 
-        `wanted` decodes as many objects as it has columns; where it is false, vertices lie at
-        their box's centre, and behind a room's last wanted object all else means nothing. None:
-        all N.
+        Meshes may be asked for of some objects alone: the others' vertices lie at their box's
+        centre. `wanted` decodes as many objects as it has columns, and meshes where it is true;
+        behind a room's last wanted object all else means nothing. None: all N.
 
         Layouts stay float32 under autocast: bfloat16 would round 3 m to steps of 2 cm.
         """
@@ -115,14 +116,16 @@ class ScenePrior(nn.Module):
         scenes = DecodedScenes(**layout._asdict(), bevels=self.bevels(layout.class_logits))
         if isinstance(self.shape, OccupancyDecoder):
             codes = self.shape(shared).to(z.dtype)
-            looks = self.shape.looks(codes) if with_shape else None
+            looks = None if with_shape is False else self.shape.looks(codes)
             return replace(scenes, shape_codes=codes, looks=looks)
-        if not with_shape:
+        if with_shape is False:
             return scenes
-        if wanted is None:
+        shaped = wanted if with_shape is True else with_shape
+        if shaped is None:
             shapes = self.shape(shared).to(z.dtype)
         else:
-            some = self.shape(shared[wanted].unsqueeze(0))[0].to(z.dtype)
-            shapes = some.new_full((*wanted.shape, *some.shape[1:]), self.shape.nothing)
-            shapes = shapes.index_put((wanted,), some)
+            shaped = F.pad(shaped, (0, count - shaped.shape[1]))
+            some = self.shape(shared[shaped].unsqueeze(0))[0].to(z.dtype)
+            shapes = some.new_full((*shaped.shape, *some.shape[1:]), self.shape.nothing)
+            shapes = shapes.index_put((shaped,), some)
         return replace(scenes, vertices_m=place(shapes, layout.centers_m, layout.sizes_m))

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sceneprior.models.layers import DecoderConfig
+from sceneprior.models.layers import DecoderConfig, dropout
 from sceneprior.models.released import QuerySelfAttention, StepOutputs
 
 
@@ -43,11 +43,12 @@ class FeedForward(nn.Module):
         self.expand = nn.Linear(width, hidden)
         self.contract = nn.Linear(hidden, width)
         self.norm = nn.LayerNorm(width)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = dropout
 
     def forward(self, x: Float[Tensor, "*batch width"]) -> Float[Tensor, "*batch width"]:
-        inner = self.dropout(F.gelu(self.expand(x)))
-        return self.norm(x + self.dropout(self.contract(inner)))
+        p = self.dropout if self.training else 0.0
+        inner = dropout(F.gelu(self.expand(x)), p)
+        return self.norm(x + dropout(self.contract(inner), p))
 
 
 class SceneTransformer(nn.Module):
@@ -70,25 +71,25 @@ class SceneTransformer(nn.Module):
 
     def __init__(self, width: int, config: TransformerConfig, max_objects: int):
         super().__init__()
-        hidden, dropout = config.hidden, config.dropout
+        hidden = config.hidden
         self.heads = config.heads
-        self.dropout = dropout
+        self.dropout = config.dropout
         self.start = nn.Parameter(torch.randn(width) / width**0.5)
         self.encoder_qkv = nn.Linear(width, 3 * width)
         self.encoder_out = nn.Linear(width, width)
         self.encoder_norm = nn.LayerNorm(width)
-        self.encoder_ff = FeedForward(width, hidden, dropout)
+        self.encoder_ff = FeedForward(width, hidden, config.dropout)
         self.decoder_query = nn.Linear(width, width)
         self.decoder_key = nn.Parameter(nn.Linear(width, width).weight.detach())
         self.decoder_value = nn.Linear(width, width)
         self.decoder_out = nn.Linear(width, width)
         self.decoder_norm = nn.LayerNorm(width)
-        self.decoder_ff = FeedForward(width, hidden, dropout)
+        self.decoder_ff = FeedForward(width, hidden, config.dropout)
         self.encoder_end = nn.LayerNorm(width) if config.final_norm else nn.Identity()
         self.decoder_end = nn.LayerNorm(width) if config.final_norm else nn.Identity()
         self.query: nn.Module = nn.Identity()
         if config.query_self_attention:
-            self.query = QuerySelfAttention(width, config.heads, dropout)
+            self.query = QuerySelfAttention(width, config.heads, config.dropout)
         self.output = StepOutputs(max_objects, width) if config.step_mlps else None
 
     def forward(
@@ -114,18 +115,15 @@ class SceneTransformer(nn.Module):
         key_query = self._key_query(query)
         features: list[Tensor] = []
         for rooms in going_on:
+            query, key_query, tokens = (_first(each, rooms) for each in (query, key_query, tokens))
+            qkv = [_first(part, rooms) for part in qkv]
             if features:
-                newest = features[-1][:rooms].unsqueeze(1)
-                tokens = torch.cat([tokens[:rooms], newest], dim=1)
+                newest = _first(features[-1], rooms).unsqueeze(1)
+                tokens = torch.cat([tokens, newest], dim=1)
                 added = self._split(self.encoder_qkv(newest))
-                qkv = [
-                    torch.cat([old[:rooms], new], dim=2)
-                    for old, new in zip(qkv, added, strict=True)
-                ]
-            seen = [part[:rooms] for part in qkv]
-            feature = self._next(query[:rooms], key_query[:rooms], tokens[:rooms], seen)
-            features.append(F.pad(feature, (0, 0, 0, len(z) - rooms)))
-        return torch.stack(features, dim=1)
+                qkv = [torch.cat(both, dim=2) for both in zip(qkv, added, strict=True)]
+            features.append(self._next(query, key_query, tokens, qkv))
+        return torch.stack([F.pad(x, (0, 0, 0, len(z) - len(x))) for x in features], dim=1)
 
     def _query(self, z: Tensor) -> Tensor:
         """(rooms, width): z as the query of every step.
@@ -173,4 +171,9 @@ class SceneTransformer(nn.Module):
         return list(packed.reshape(shape).permute(2, 0, 3, 1, 4).unbind(0))
 
     def _drop(self, x: Tensor) -> Tensor:
-        return F.dropout(x, self.dropout, self.training)
+        return dropout(x, self.dropout if self.training else 0.0)
+
+
+def _first(values: Tensor, rooms: int) -> Tensor:
+    """`values[:rooms]`; where that is all of them, itself: a slice would cost gradients a copy."""
+    return values if len(values) == rooms else values[:rooms]

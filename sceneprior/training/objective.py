@@ -1,13 +1,15 @@
 """The view loss of decoded scenes; seeds, precision, checks and schedules of all methods."""
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch import distributed as dist
+from torch.nn import functional as F
 
 from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
 from sceneprior.geometry.corners import box_corners
@@ -27,20 +29,43 @@ POINTS_LEVEL = 2
 
 
 def proxy_boxes(scenes: DecodedScenes, views: SceneViews, proxy: str) -> Boxes2D:
-    """2D boxes of objects that have no mesh yet; `StageConfig.proxy` says what each stands for."""
-    centers_m, sizes_m = scenes.centers_m, scenes.sizes_m
-    cameras, intrinsics = views.world_to_camera, views.intrinsics
+    """2D boxes of objects that have no mesh yet; `StageConfig.proxy` says what each stands for.
+
+    Of a room with n tracked objects, the first n predictions', as in `seen_boxes`.
+    """
+    objects = (scenes.centers_m, scenes.sizes_m)
     if proxy == "ellipsoid":
-        return boxes_of_ellipsoids(centers_m, sizes_m, cameras, intrinsics, views.image_size)
+        return _of_first(boxes_of_ellipsoids, views, *objects)
     if proxy == "box":
-        points_m = box_corners(centers_m, sizes_m)
+        points_m = box_corners(*objects)
     elif proxy == "beveled_box":
         assert scenes.bevels is not None, "decode() gives every object bevels"
-        points_m = place(beveled_cube(scenes.bevels), centers_m, sizes_m)
+        points_m = place(beveled_cube(scenes.bevels), *objects)
     else:
-        sphere = icosphere(POINTS_LEVEL)[0].to(centers_m)
-        points_m = place(sphere.expand(*centers_m.shape[:2], -1, -1), centers_m, sizes_m)
-    return boxes_of_points(points_m, cameras, intrinsics, views.image_size)
+        sphere = icosphere(POINTS_LEVEL)[0].to(scenes.centers_m)
+        points_m = place(sphere.expand(*scenes.centers_m.shape[:2], -1, -1), *objects)
+    return _of_first(boxes_of_points, views, points_m)
+
+
+def first_predictions(views: SceneViews, slots: int) -> Bool[Tensor, "rooms slots"]:
+    """The first n of each room of n tracked objects, to which alone objects are matched."""
+    return F.pad(views.is_object, (0, slots - views.is_object.shape[1]))
+
+
+def _of_first(project: Callable[..., Boxes2D], views: SceneViews, *objects: Tensor) -> Boxes2D:
+    """`project` the first predictions alone; the others have empty boxes outside of the frustum."""
+    rooms, slots = objects[0].shape[:2]
+    first = first_predictions(views, slots)
+    room = first.nonzero()[:, 0]
+    # Each in a room of its own.
+    cameras = (views.world_to_camera[room], views.intrinsics[room], views.image_size)
+    boxes, inside = project(*(values[first].unsqueeze(1) for values in objects), *cameras)
+    return Boxes2D(*(
+        of.new_zeros(rooms, slots, *of.shape[1:2], *of.shape[3:])
+        .index_put((first,), of[:, :, 0])
+        .transpose(1, 2)
+        for of in (boxes, inside)
+    ))  # fmt: skip
 
 
 def match_and_score(
@@ -65,16 +90,18 @@ def match_and_score(
 def seen_boxes(
     scenes: DecodedScenes, views: SceneViews, settings: ShapeConfig | LiftedShapeConfig
 ) -> Boxes2D:
-    """2D boxes of decoded objects: of their meshes where there are any (`ShapeConfig.box_from`)."""
+    """2D boxes of decoded objects: of their meshes where there are any (`ShapeConfig.box_from`).
+
+    Of a room with n tracked objects, the first n predictions', which are matched; the boxes of the
+    others are empty, and in no frustum.
+    """
     if (
         scenes.vertices_m is None
         or isinstance(settings, LiftedShapeConfig)
         or settings.box_from == "proxy"
     ):
         return proxy_boxes(scenes, views, settings.proxy)
-    return boxes_of_points(
-        scenes.vertices_m, views.world_to_camera, views.intrinsics, views.image_size
-    )
+    return _of_first(boxes_of_points, views, scenes.vertices_m)
 
 
 def seen_masks(
@@ -88,7 +115,6 @@ def seen_masks(
     Only the first n predictions of a room of n objects are drawn: they are matched to objects,
     and the rest would hide them.
     """
-    predictions = torch.arange(vertices_m.shape[1], device=vertices_m.device)
     height, width = views.observed_ids.shape[-2:]
     return render_silhouettes(
         vertices_m,
@@ -99,7 +125,7 @@ def seen_masks(
         sigma_px2=settings.sigma_px2,
         mode=settings.silhouettes,
         compositing=settings.compositing,
-        drawn=predictions < views.is_object.sum(dim=-1, keepdim=True),
+        drawn=first_predictions(views, vertices_m.shape[1]),
     )
 
 

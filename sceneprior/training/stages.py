@@ -191,7 +191,8 @@ class ShapeStage(PaperStage):
         return stage.box_from == "proxy"
 
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
-        scenes = self.prior.decode(self.room_latents(views, batch_idx))
+        # Of n objects, only the first n predictions are drawn and matched.
+        scenes = self.prior.decode(self.room_latents(views, batch_idx), views.is_object)
         with full_precision(self.device):
             boxes = seen_boxes(scenes, views, self.stage)
             losses, matches = match_and_score(

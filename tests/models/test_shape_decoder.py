@@ -63,7 +63,7 @@ def test_the_split_first_layer_is_the_concatenated_one(torch_rng):
                 assert_close(meshes[room, item, k], wanted, rtol=0, atol=1e-12)
 
 
-def test_the_prior_places_meshes_in_the_boxes_of_the_layout(torch_rng):
+def small_prior() -> ScenePrior:
     torch.manual_seed(0)
     config = Model(
         max_objects=4,
@@ -72,7 +72,11 @@ def test_the_prior_places_meshes_in_the_boxes_of_the_layout(torch_rng):
         decoder=TransformerConfig(heads=2, hidden=24, dropout=0.0),
         shape=ShapeDecoderConfig(width=8, level=1, template="box", fit_box=True),
     )
-    prior = ScenePrior(config, classes=5).double()
+    return ScenePrior(config, classes=5).double()
+
+
+def test_the_prior_places_meshes_in_the_boxes_of_the_layout(torch_rng):
+    prior = small_prior()
     logits = torch.randn(3, 9, generator=torch_rng, dtype=torch.float64)
     scenes = prior(logits)
     low, high = scenes.vertices_m.amin(dim=-2), scenes.vertices_m.amax(dim=-2)
@@ -80,3 +84,23 @@ def test_the_prior_places_meshes_in_the_boxes_of_the_layout(torch_rng):
     assert_close(high - low, scenes.sizes_m, rtol=0, atol=1e-12)
     bare = prior(logits, with_shape=False)
     assert bare.vertices_m is None and torch.equal(bare.centers_m, scenes.centers_m)
+
+
+def test_meshes_of_some_objects_are_those_of_all(torch_rng):
+    prior = small_prior()
+    z = prior.latent_space(torch.randn(3, 9, generator=torch_rng, dtype=torch.float64))
+    shaped = torch.tensor([[True, True, True], [True, False, False], [False, False, False]])
+    some, every = prior.decode(z, shaped), prior.decode(z)
+    assert_close(some.centers_m, every.centers_m, rtol=0, atol=0)
+    assert_close(some.vertices_m[:, :3][shaped], every.vertices_m[:, :3][shaped])
+    middle = some.centers_m.unsqueeze(2).expand_as(some.vertices_m)
+    assert_close(some.vertices_m[:, :3][~shaped], middle[:, :3][~shaped])
+    assert_close(some.vertices_m[:, 3], middle[:, 3])
+    weights = torch.randn(4, 42, 3, generator=torch_rng, dtype=torch.float64)
+    learnt = [
+        torch.autograd.grad(
+            (scenes.vertices_m[:, :3][shaped] * weights).sum(), list(prior.shape.parameters())
+        )
+        for scenes in (some, every)
+    ]
+    assert_close(*learnt)
