@@ -79,9 +79,28 @@ def test_both_write_the_same_logs_and_keep_the_same_best(runs):
             read_checkpoint(folder / run / stage / "best.ckpt")["state_dict"]["latents.weight"]
             for run in ("one", "two")
         )
-        # Not every weight: `fit_box` undoes the last bias of the shape decoder, whose gradient
-        # is round-off alone, and Adam takes steps of full length in its direction.
         assert_close(two, one, rtol=0, atol=1e-6)
+
+
+def test_both_end_at_the_same_weights(runs):
+    """Of the layout stage, all of them. In the shape stage `fit_box` undoes the last bias of the
+    shape decoder, whose gradient is round-off alone, and Adam takes steps of full length in its
+    direction."""
+    folder, _, _ = runs
+    ends = [
+        read_checkpoint(folder / run / "layout" / "final.ckpt")["state_dict"]
+        for run in ("one", "two")
+    ]
+    begun = tiny_config(folder / "shards", **changes(6)).build_prior().state_dict()
+    assert ends[0].keys() == ends[1].keys() and len(ends[0]) > 30
+    moved = 0
+    for name, weights in ends[0].items():
+        # Adam's first steps divide gradients by their own size, round-off and all.
+        assert_close(ends[1][name], weights, rtol=0, atol=1e-5, msg=name)
+        moved += name.startswith("prior.") and not torch.equal(
+            weights, begun[name.removeprefix("prior.")]
+        )
+    assert moved > 20
 
 
 def test_a_loss_that_is_no_number_in_one_process_stops_both(runs):
