@@ -83,24 +83,22 @@ def test_both_write_the_same_logs_and_keep_the_same_best(runs):
 
 
 def test_both_end_at_the_same_weights(runs):
-    """Of the layout stage, all of them. In the shape stage `fit_box` undoes the last bias of the
-    shape decoder, whose gradient is round-off alone, and Adam takes steps of full length in its
-    direction."""
-    folder, _, _ = runs
-    ends = [
+    """Of the layout stage, where a gradient is more than round-off, which the keys' bias in an
+    attention never has: Adam takes steps of full length in any direction."""
+    folder, steps, _ = runs
+    one, two = (
         read_checkpoint(folder / run / "layout" / "final.ckpt")["state_dict"]
         for run in ("one", "two")
-    ]
-    begun = tiny_config(folder / "shards", **changes(6)).build_prior().state_dict()
-    assert ends[0].keys() == ends[1].keys() and len(ends[0]) > 30
-    moved = 0
-    for name, weights in ends[0].items():
-        # Adam's first steps divide gradients by their own size, round-off and all.
-        assert_close(ends[1][name], weights, rtol=0, atol=1e-5, msg=name)
-        moved += name.startswith("prior.") and not torch.equal(
-            weights, begun[name.removeprefix("prior.")]
-        )
-    assert moved > 20
+    )
+    compared = 0
+    for name in steps[0]:
+        if name.startswith("gradient/prior."):
+            told = torch.stack([step[name] for step in steps[:6]]).abs().amax(dim=0) > 1e-5
+            name = name.removeprefix("gradient/")
+            # Moved by up to 3e-2: six steps of 5e-3.
+            assert_close(two[name][told], one[name][told], rtol=0, atol=1e-4, msg=name)
+            compared += int(told.sum())
+    assert compared > 1000
 
 
 def test_a_loss_that_is_no_number_in_one_process_stops_both(runs):
