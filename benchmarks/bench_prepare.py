@@ -1,6 +1,6 @@
 """What does preparing cost? CPU time of a view, workers, and memory of a long recording.
 
-    python benchmarks/bench_prepare.py [--only ids workers sens] [--json FILE]
+    python benchmarks/bench_prepare.py [--only ids workers sens] [--rooms N] [--json FILE]
 
 - ids: CPU time (all threads of the process) of one view's instance ids at 480 x 360, in a room of
   12 pieces with 5,120 faces each, 20 views a call, everything a call does included. Median of 9
@@ -21,6 +21,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -90,11 +92,11 @@ def ids(repeats: int = 9) -> dict[str, Any]:
     return found
 
 
-def workers(rooms: int = 240) -> dict[str, float]:
+def workers(rooms: int) -> dict[str, float]:
     """Seconds of `prep-front` with one worker and with two: wall clock and CPU.
 
     CPU seconds bound what an idle machine of two cores would give. Starting two workers takes
-    3 s of CPU, so small jobs gain less.
+    3 s of CPU, so few rooms gain less.
     """
     found: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as name:
@@ -178,10 +180,16 @@ def _sceneprior(*arguments: object) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parts = {"ids": ids, "workers": workers, "sens": sens}
-    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts))
+    names = ["ids", "workers", "sens"]
+    parser.add_argument("--only", nargs="+", choices=names, default=names)
+    parser.add_argument("--rooms", type=int, default=240, help="that the workers prepare")
     parser.add_argument("--json", type=Path, help="write the figures to this file, too")
     arguments = parser.parse_args()
+    parts: dict[str, Callable[[], dict[str, Any]]] = {
+        "ids": ids,
+        "workers": partial(workers, arguments.rooms),
+        "sens": sens,
+    }
     figures: dict[str, Any] = {"cores": os.cpu_count()}
     for name in arguments.only:
         figures[f"{name}_load_average"] = os.getloadavg()[0]

@@ -2,8 +2,8 @@
 
     python benchmarks/bench_silhouettes.py [--json FILE]
 
-Measures the exact and the fast mode on the CPU (and on a GPU where there is one), the plain
-torch reference, the closed-form boxes, and PyTorch3D and nvdiffrast where they are importable.
+Measures the exact and the fast mode on the CPU (`gpu.py` does on a GPU), the plain torch reference,
+the closed-form boxes, and PyTorch3D where it is importable.
 Figures are medians of runs that take turns, so that a noisy neighbour hits all alike; ratios are
 of medians of one run. Compiling is reported apart and never in a median.
 """
@@ -25,7 +25,6 @@ import numpy as np
 import torch
 from bench_boxes import boxes_ratio
 
-from sceneprior.geometry.cameras import project
 from sceneprior.geometry.meshes import icosphere
 from sceneprior.silhouettes import render_scene
 
@@ -155,24 +154,17 @@ def status_mib(name: str) -> float:
     return int(line.split()[1]) / 1024
 
 
-def peers(repeats: int) -> dict[str, float | str]:
-    """PyTorch3D's soft silhouettes of the same room, one joined scene a view, as the authors draw;
-    nvdiffrast's antialiased masks on a GPU."""
-    found: dict[str, float | str] = {}
-    for name in ("pytorch3d", "nvdiffrast"):
-        if importlib.util.find_spec(name) is None:
-            found[name] = "not installed"
-    if "pytorch3d" not in found:
-        found["pytorch3d"] = medians({"it": pytorch3d_step()}, min(repeats, 2))["it"]
-    if "nvdiffrast" not in found:
-        if torch.cuda.is_available():
-            found["nvdiffrast"] = medians({"it": nvdiffrast_step()}, repeats)["it"]
-        else:
-            found["nvdiffrast"] = "installed, but needs a GPU"
-    return found
+def pytorch3d_seconds(repeats: int) -> float | str:
+    """PyTorch3D's soft silhouettes of the same room, one joined scene a view, as the authors draw
+    (nvdiffrast needs a GPU: `gpu.py`)."""
+    if importlib.util.find_spec("pytorch3d") is None:
+        return "not installed"
+    step = pytorch3d_step(furnished_room(3))
+    return medians({"it": step}, min(repeats, 2))["it"]
 
 
-def pytorch3d_step() -> Callable[[], None]:
+def pytorch3d_step(room: dict[str, Any]) -> Callable[[], None]:
+    """The same forward and backward by PyTorch3D, on the device of the room."""
     from pytorch3d.renderer import (
         BlendParams,
         MeshRasterizer,
@@ -183,9 +175,9 @@ def pytorch3d_step() -> Callable[[], None]:
     from pytorch3d.structures import Meshes
     from pytorch3d.utils import cameras_from_opencv_projection
 
-    room = furnished_room(3)
+    device = room["vertices_m"].device
     poses, intrinsics = room["world_to_camera"][0], room["intrinsics"][0]
-    size = torch.tensor([SIZE]).expand(VIEWS, -1)
+    size = torch.tensor([SIZE], device=device).expand(VIEWS, -1)
     cameras = cameras_from_opencv_projection(poses[:, :3, :3], poses[:, :3, 3], intrinsics, size)
     settings = RasterizationSettings(SIZE, np.log(1 / 1e-4 - 1) * 1e-4, 50, bin_size=0)
     renderer = MeshRenderer(
@@ -193,51 +185,17 @@ def pytorch3d_step() -> Callable[[], None]:
     )
     per_object = room["vertices_m"].shape[2]
     faces = torch.cat([room["faces"] + k * per_object for k in range(OBJECTS)])
-    upstream = torch.rand(VIEWS, *SIZE)
+    upstream = torch.rand(VIEWS, *SIZE, device=device)
 
     def step() -> None:
         vertices = room["vertices_m"].clone().requires_grad_()
         joined = vertices.reshape(1, -1, 3).expand(VIEWS, -1, -1)
         masks = renderer(Meshes(joined, faces.expand(VIEWS, -1, -1)))[..., 3]
         masks.backward(upstream)
+        if device.type == "cuda":
+            torch.cuda.synchronize()
 
     return step
-
-
-def nvdiffrast_step() -> Callable[[], None]:
-    import nvdiffrast.torch as dr
-
-    room = furnished_room(3, "cuda")
-    context = dr.RasterizeCudaContext()
-    per_object = room["vertices_m"].shape[2]
-    faces = torch.cat([room["faces"] + k * per_object for k in range(OBJECTS)]).int()
-    ids = torch.eye(OBJECTS, device="cuda").repeat_interleave(per_object, 0)
-    upstream = torch.rand(VIEWS, *SIZE, OBJECTS, device="cuda")
-    half = torch.tensor([SIZE[1] / 2, SIZE[0] / 2], device="cuda")
-
-    def step() -> None:
-        vertices = room["vertices_m"].clone().requires_grad_()
-        seen = project(vertices, room["world_to_camera"], room["intrinsics"])[0].flatten(1, 2)
-        z = seen[..., 2:]
-        clip = torch.cat([(seen[..., :2] / half - 1) * z, z - 0.1, z], dim=-1).contiguous()
-        raster, _ = dr.rasterize(context, clip, faces, SIZE)
-        color, _ = dr.interpolate(ids[None], raster, faces)
-        dr.antialias(color.contiguous(), raster, clip, faces).backward(upstream)
-        torch.cuda.synchronize()
-
-    return step
-
-
-def gpu(repeats: int) -> dict[str, Any]:
-    """16 rooms on the GPU, both modes."""
-    if not torch.cuda.is_available():
-        return {"gpu": "none"}
-    room = furnished_room(3, "cuda", rooms=16)
-    steps = {mode: forward_backward(room, mode=mode) for mode in ("exact", "fast")}
-    times = medians(steps, repeats)
-    return {"gpu": torch.cuda.get_device_name()} | {
-        f"gpu_16_rooms_{mode}_fwd_bwd_s": seconds for mode, seconds in times.items()
-    }
 
 
 def machine() -> dict[str, Any]:
@@ -286,8 +244,7 @@ def main() -> None:
         note(**{f"{mode}_first_call_s": first_call_seconds(mode)})
     reference = reference_seconds()
     note(reference_fwd_bwd_s=reference, reference_ratio=reference / times["exact"])
-    note(**gpu(arguments.repeats))
-    note(**peers(arguments.repeats))
+    note(pytorch3d=pytorch3d_seconds(arguments.repeats))
     if arguments.json:
         arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
 

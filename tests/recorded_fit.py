@@ -12,18 +12,19 @@ import sys
 from pathlib import Path
 
 import torch
+from lightning.pytorch.callbacks import Callback
 
 from sceneprior.config import load_config
 from sceneprior.experiments.evaluate_samples import SampleEvaluator
-from sceneprior.training import fit as train
-from sceneprior.training.callbacks import StepSeed
+from sceneprior.training.fit import fit
 from sceneprior.training.slurm import first_process
 
 
-class Recorder(StepSeed):
+class Recorder(Callback):
     """What every step of every stage saw and did, in `steps`."""
 
-    steps: list[dict[str, torch.Tensor]]
+    def __init__(self) -> None:
+        self.steps: list[dict[str, torch.Tensor]] = []
 
     def on_before_optimizer_step(self, trainer, pl_module, optimizer) -> None:
         gradients = {
@@ -40,10 +41,11 @@ class Recorder(StepSeed):
         self.steps[-1]["loss"] = outputs["loss"].detach()
 
 
-class Poison(StepSeed):
+class Poison(Callback):
     """Spoils the latent of one room."""
 
-    row: int
+    def __init__(self, row: int):
+        self.row = row
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx) -> None:
         with torch.no_grad():
@@ -52,25 +54,17 @@ class Poison(StepSeed):
 
 def record(config, run: Path, devices: int, **options) -> list[dict[str, torch.Tensor]]:
     """The steps of a run, both stages in one list; of several processes, the first's."""
-    Recorder.steps = []
-    usual, train.StepSeed = train.StepSeed, Recorder
-    try:
-        options = {"accelerator": "cpu", "devices": devices, **options}
-        train.fit(
-            config, run, trainer_options=options, loggers=("csv",), evaluate=SampleEvaluator(config)
-        )
-    finally:
-        train.StepSeed = usual
-    return Recorder.steps
+    recorder = Recorder()
+    options = {"accelerator": "cpu", "devices": devices, "callbacks": [recorder], **options}
+    fit(config, run, trainer_options=options, loggers=("csv",), evaluate=SampleEvaluator(config))
+    return recorder.steps
 
 
 def poison(config, run: Path, row: int) -> str:
     """Resume a run by two processes with a spoilt latent; what is said then."""
-    Poison.row = row
-    train.StepSeed = Poison
-    options = {"accelerator": "cpu", "devices": 2}
+    options = {"accelerator": "cpu", "devices": 2, "callbacks": [Poison(row)]}
     try:
-        train.fit(config, run, True, ("csv",), options, SampleEvaluator(config))
+        fit(config, run, True, ("csv",), options, SampleEvaluator(config))
     except FloatingPointError as error:
         return str(error)
     return "nothing"

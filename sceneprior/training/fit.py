@@ -40,7 +40,8 @@ def fit(
         run: Where config, checkpoints and logs go.
         resume: Continue an interrupted run: finished stages are not trained again.
         loggers: Of `csv`, `tensorboard`, `wandb`.
-        trainer_options: Passed on to Lightning's Trainer (devices, accelerator, precision).
+        trainer_options: Passed on to Lightning's Trainer (devices, accelerator, precision); its
+            `callbacks` come after those of `fit`.
         evaluate: Scores what is generated every `samples.every` epochs;
             `experiments.evaluate_samples.SampleEvaluator(config)`.
 
@@ -118,6 +119,7 @@ def _train(
         callbacks.append(SampleMonitor(folder, config, stage.name, room_ids, evaluate))
     said = {"room_ids": list(room_ids), "label_set": config.label_set}
     callbacks.append(RollingCheckpoint(folder, {"sceneprior": said}))
+    callbacks += options.get("callbacks", ())
     _quiet_lightning()
     lightning.seed_everything(config.seed, verbose=False)
     if settings.cpu_threads is not None:
@@ -164,6 +166,7 @@ def _trainer(
         "gradient_clip_val": stage.settings.clip_gradient or None,
         "accumulate_grad_batches": stage.settings.accumulate,
     }
+    options = {name: value for name, value in options.items() if name != "callbacks"}
     try:
         return lightning.Trainer(
             max_epochs=stage.settings.epochs,

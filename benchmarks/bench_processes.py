@@ -1,0 +1,171 @@
+"""What does a second training process bring? The paper's config by one process and by two (DDP).
+
+    python benchmarks/bench_processes.py [--set KEY=VALUE ...] [--json FILE]
+
+Both stages, a few epochs by `fit` itself, one thread a process. Two processes share the batches of
+one (`batch_size` is halved), so that both take the same steps and end at the same weights; dropout,
+which each process draws for itself, is off. The runs take turns; ratios are of rooms a second in
+neighbouring runs, and the median is the figure. Where other programs hold the cores, that says
+little: the CPU seconds of one process over those of each of two bound what idle cores would give.
+Beside them: bytes of gradients, which all processes add up at every step, and seconds of adding
+them up.
+
+With `--device cuda`, both processes share the one GPU, over gloo: NCCL wants a GPU for each.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from bench_boxes import processor
+from lightning.pytorch.strategies import DDPStrategy, StrategyRegistry
+from timed_fit import made_shards, paper_run, timed_fit
+from torch import distributed as dist
+
+from sceneprior.training.checkpoints import read_checkpoint
+from sceneprior.training.slurm import first_process
+
+STAGES = ("layout", "shape")
+
+
+def compare(
+    shards: Path, folder: Path, device: str, epochs: int, repeats: int, changes: tuple[str, ...]
+) -> dict[str, dict[str, float]]:
+    """Figures of each stage; `folder` holds the runs."""
+    runs: list[tuple[dict[str, Any], dict[str, Any]]] = []
+    for repeat in range(repeats):
+        one, two = (
+            _child(shards, folder / f"{repeat}_{processes}", device, epochs, processes, changes)
+            for processes in (1, 2)
+        )
+        runs.append((one, two))
+    found = {}
+    for stage in STAGES:
+        rates = [[side[stage]["rooms_per_s"] for side in run] for run in runs]
+        found[stage] = {
+            "one_rooms_per_s": statistics.median(one for one, _ in rates),
+            "two_rooms_per_s": statistics.median(two for _, two in rates),
+            "two_over_one": statistics.median(two / one for one, two in rates),
+            "bound_by_cpu_time": statistics.median(
+                one[stage]["epoch_cpu_s"] / two[stage]["epoch_cpu_s"] for one, two in runs
+            ),
+            "weights_off": weights_off(folder / "0_1" / stage, folder / "0_2" / stage),
+            **runs[0][1][stage]["bytes"],
+            "all_reduce_s": statistics.median(run[1]["all_reduce_s"][stage] for run in runs),
+            "all_reduce_of_4_bytes_s": statistics.median(run[1]["empty_s"] for run in runs),
+        }
+    return found
+
+
+def weights_off(one: Path, two: Path) -> float:
+    """The largest difference of any weight at the end of a stage, in the unit of the weights."""
+    ends = [read_checkpoint(path / "final.ckpt")["state_dict"] for path in (one, two)]
+    return max(float((ends[0][name] - ends[1][name]).abs().max()) for name in ends[0])
+
+
+def _child(
+    shards: Path, run: Path, device: str, epochs: int, processes: int, changes: tuple[str, ...]
+) -> dict[str, Any]:
+    """What `_train` writes down, in a Python of its own: Lightning starts its script once more."""
+    words = ["--shards", shards, "--child", run, "--device", device, "--epochs", epochs]
+    words += ["--processes", processes, *(word for item in changes for word in ("--set", item))]
+    child = subprocess.run(
+        [sys.executable, __file__, *map(str, words)],
+        env=os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+    if child.returncode:
+        lines = child.stderr.strip().splitlines() or ["it said nothing"]
+        raise RuntimeError(f"{processes} training processes stopped: {lines[-1]}")
+    return json.loads((run / "clock.json").read_text())
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    """One of the runs, in each of its processes."""
+    processes, device = arguments.processes, torch.device(arguments.device)
+    changes = ("model.decoder.dropout=0.0", "layout.cpu_threads=1", "shape.cpu_threads=1")
+    config = paper_run(arguments.shards, arguments.epochs, *changes, *arguments.set)
+    shared = [f"{stage}.batch_size={getattr(config, stage).batch_size // processes}"
+              for stage in STAGES]  # fmt: skip
+    config = paper_run(arguments.shards, arguments.epochs, *changes, *arguments.set, *shared)
+    options: dict[str, Any] = {"accelerator": device.type, "devices": 1}
+    if processes > 1:
+        # Of the strategy, not of Lightning, which would ask for as many GPUs as processes; by a
+        # name, so that each stage's trainer makes its own.
+        places = [torch.device(device.type, 0) if device.type == "cuda" else device] * processes
+        StrategyRegistry.register(
+            "shared", DDPStrategy, parallel_devices=places, process_group_backend="gloo"
+        )
+        options["strategy"] = "shared"
+    stages = timed_fit(config, arguments.child, options)
+    found: dict[str, Any] = {}
+    for name, times in stages.items():
+        sizes = {"network_bytes": times.network_bytes, "latent_bytes": times.latent_bytes}
+        found[name] = times.figures() | {"epoch_cpu_s": times.epoch_cpu_s, "bytes": sizes}
+    if processes > 1:
+        found["all_reduce_s"] = {
+            name: _all_reduce_s(times.network_bytes + times.latent_bytes, device)
+            for name, times in stages.items()
+        }
+        found["empty_s"] = _all_reduce_s(4, device)
+    if first_process():
+        (arguments.child / "clock.json").write_text(json.dumps(found))
+    if processes > 1:
+        dist.destroy_process_group()
+
+
+def _all_reduce_s(size: int, device: torch.device, repeats: int = 20) -> float:
+    """Median seconds of adding up so many bytes of float32 over the processes."""
+    numbers, times = torch.ones(size // 4, device=device), []
+    for _ in range(repeats):
+        dist.barrier()
+        start = time.perf_counter()
+        dist.all_reduce(numbers)
+        if numbers.is_cuda:
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--shards", type=Path, help="view shards; without, homes are made")
+    parser.add_argument("--rooms", type=int, default=24, help="made homes")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--epochs", type=int, default=4, help="of each stage, at least 3")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--set", action="append", default=[], help="shape.silhouettes=fast")
+    parser.add_argument("--json", type=Path, help="write the figures to this file, too")
+    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--processes", type=int, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.child:
+        _train(arguments)
+        return
+    print(f"{processor()}, load {os.getloadavg()[0]:.1f}; torch {torch.__version__}")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shards = arguments.shards or made_shards(folder, arguments.rooms, os.cpu_count() or 1)
+        found = compare(
+            shards.absolute(), folder / "runs", arguments.device, arguments.epochs,
+            arguments.repeats, tuple(arguments.set),
+        )  # fmt: skip
+    for stage, figures in found.items():
+        for name, value in figures.items():
+            shown = f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+            print(f"{stage:8}{name:28}{shown}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(found, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

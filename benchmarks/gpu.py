@@ -1,0 +1,183 @@
+"""All that a GPU is asked for, in one command of at most 40 minutes; a CPU will do for a trial.
+
+    python benchmarks/gpu.py [--out FOLDER] [--only PART ...]
+    python benchmarks/gpu.py --tiny                  # minutes: does each part run on this GPU?
+    python benchmarks/gpu.py --tiny --device cpu
+
+Kernels against the reference, silhouettes against PyTorch3D and nvdiffrast where they are
+installed, both stages of the paper's run (`configs/bedroom.yaml`) on homes made here: steps and
+memory, precision, the whole schedule extrapolated, two processes on one device.
+
+Each part is a process of its own with a limit of its own, so that a kernel that breaks the device's
+context, or hangs, costs that part alone. Its rows are kept as they are measured; one that fails is
+a line of the table. FOLDER/gpu.json and FOLDER/gpu.md (tables for docs/results.md) are written
+after every part; what a part said beside its rows is in FOLDER/parts.
+"""
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gpu_silhouettes
+import gpu_training
+import torch
+from bench_silhouettes import machine
+from gpu_setup import PAPER, TINY, Setup, Sizes
+
+
+class Part(NamedTuple):
+    """What is measured, and how long that may take."""
+
+    measure: Callable[[Setup], None]
+    minutes: float
+    title: str
+
+
+PARTS = {
+    "kernels": Part(gpu_silhouettes.kernels, 3, "Silhouette kernels against the reference"),
+    "homes": Part(gpu_training.homes, 3, "Homes to train on"),
+    "schedule": Part(gpu_training.schedule, 8, "The paper's run"),
+    "speed": Part(gpu_silhouettes.speed, 4, "Silhouettes"),
+    "peers": Part(gpu_silhouettes.peers, 2, "Silhouettes beside other renderers, one room"),
+    "precision": Part(gpu_training.precision, 8, "Precision"),
+    "batches": Part(gpu_training.batches, 5, "A larger batch"),
+    "processes": Part(gpu_training.processes, 7, "Two processes on one device"),
+}
+"""In order, what matters most first; 40 minutes together."""
+
+
+def run(parts: dict[str, Part], out: Path, words: list[str]) -> dict[str, Any]:
+    """Measure the parts one after the other, each in a process of its own; what was found.
+
+    `words` are the options of this run that its parts need, too.
+    """
+    found: dict[str, Any] = {"machine": machine() | device_of(words), "commit": commit()}
+    found["parts"] = {}
+    end = time.monotonic()
+    for name, part in parts.items():
+        print(f"{name} ...", flush=True)
+        start = time.monotonic()
+        end += 60 * part.minutes  # and what those before it did not need
+        problem = run_part(name, out, words, end - start)
+        rows = out / "parts" / f"{name}.jsonl"
+        lines = rows.read_text().splitlines() if rows.is_file() else []
+        found["parts"][name] = {
+            "title": part.title,
+            "seconds": time.monotonic() - start,
+            "rows": [json.loads(line) for line in lines],
+            "failed": problem,
+        }
+        (out / "gpu.json").write_text(json.dumps(found, indent=2) + "\n")
+        (out / "gpu.md").write_text(as_markdown(found))
+    return found
+
+
+def run_part(name: str, out: Path, words: list[str], seconds: float) -> str | None:
+    """Run one part to its end or for so many seconds; what went wrong, in a line."""
+    folder = out / "parts"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.jsonl").unlink(missing_ok=True)
+    log = folder / f"{name}.log"
+    command = [sys.executable, __file__, *words, "--out", str(out), "--part", name]
+    with log.open("w") as said:
+        # A session of its own: training starts processes, which must end with it.
+        child = subprocess.Popen(command, stdout=said, stderr=said, start_new_session=True)
+        try:
+            status = child.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return f"stopped after {seconds / 60:.1f} minutes; the rows are what it had by then"
+        finally:
+            if child.poll() is None:
+                os.killpg(child.pid, signal.SIGKILL)
+                child.wait()
+    if not status:
+        return None
+    lines = log.read_text().strip().splitlines() or [f"exit status {status}"]
+    return lines[-1]
+
+
+def measure(name: str, device: str, sizes: Sizes, out: Path) -> None:
+    """What the process of a part does."""
+    with (out / "parts" / f"{name}.jsonl").open("a") as file:
+
+        def note(what: str, figures: dict[str, float]) -> None:
+            file.write(json.dumps({"what": what, "figures": figures}) + "\n")
+            file.flush()
+
+        PARTS[name].measure(Setup(device, sizes, out, note))
+
+
+def as_markdown(found: dict[str, Any]) -> str:
+    """One table a part, below a line that says on what and of which commit."""
+    about, lines = found["machine"], []
+    lines.append(f"{about['device']}; {about['cores']} cores of {about['cpu']}; ")
+    lines.append(f"torch {about['torch']}, CUDA {about['cuda']}; commit {found['commit']}.\n")
+    for part in found["parts"].values():
+        rows = part["rows"]
+        columns = list(dict.fromkeys(name for row in rows for name in row["figures"]))
+        lines.append(f"\n{part['title']} ({part['seconds']:.0f} s):\n\n")
+        cells = [["what", *(name.replace("_", " ") for name in columns)]]
+        cells.append(["---", *("---:" for _ in columns)])
+        cells += [
+            [row["what"], *(shown(row["figures"].get(name)) for name in columns)] for row in rows
+        ]
+        if part["failed"]:
+            told = part["failed"].replace("|", "/")
+            cells.append([f"**not measured to the end**: {told}", *("" for _ in columns)])
+        lines += [f"| {' | '.join(row)} |\n" for row in cells]
+    return "".join(lines)
+
+
+def shown(value: float | None) -> str:
+    """A figure in a table."""
+    if value is None:
+        return ""
+    return f"{value:,.0f}" if abs(value) >= 1000 or value == int(value) else f"{value:.3g}"
+
+
+def device_of(words: list[str]) -> dict[str, Any]:
+    """The GPU's name; the CPU is named beside it."""
+    on_gpu = "cpu" not in words
+    name = torch.cuda.get_device_name() if on_gpu else "no GPU (a trial on a CPU)"
+    return {"device": name, "cuda": torch.version.cuda}
+
+
+def commit() -> str:
+    """The checkout's commit; `+` after it says that files differ from it."""
+    folder = Path(__file__).parent
+    git = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=10"]
+    try:
+        done = subprocess.run(git, capture_output=True, text=True)
+    except OSError:  # no git there
+        return "unknown"
+    return done.stdout.strip() or "unknown"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("out/gpu"))
+    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+    parser.add_argument("--tiny", action="store_true", help="sizes for a trial of minutes")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.device == "cuda" and not torch.cuda.is_available():
+        parser.error("torch finds no GPU here; for a trial without one: --device cpu --tiny")
+    out = options.out.absolute()
+    if options.part:
+        measure(options.part, options.device, TINY if options.tiny else PAPER, out)
+        return
+    words = ["--device", options.device, *(["--tiny"] if options.tiny else [])]
+    run({name: PARTS[name] for name in options.only}, out, words)
+    print((out / "gpu.md").read_text())
+
+
+if __name__ == "__main__":
+    main()
