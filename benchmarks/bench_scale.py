@@ -29,8 +29,8 @@ from typing import Any
 
 EPOCHS, STEPS = 3, 2
 """Of each stage, and of an epoch; the first epoch compiles, the last evaluates."""
-OBJECTS = (13, 28, 53)
-"""What bedrooms, living rooms and ScanNet scenes hold at most."""
+ROOMS, OBJECTS = 128, (13, 28, 53)
+"""Of a layout step; what bedrooms, living rooms and ScanNet scenes hold at most."""
 SCHEDULE = {"layout": 800, "shape": 500}
 
 
@@ -126,7 +126,7 @@ def layout_steps(_: Path) -> dict[str, float]:
         prior, views = config.build_prior(), make_views(ROOMS, 20, objects)
         logits = torch.randn(ROOMS, config.model.logits_per_room)
         times = []
-        for _ in range(4):
+        for _repeat in range(4):
             prior.zero_grad()
             began = time.process_time()
             our_step(prior, prior.latent_space(logits), views, config)
