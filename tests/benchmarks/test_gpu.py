@@ -83,11 +83,11 @@ def test_what_a_part_measured_before_it_failed_is_kept(folder: Path, monkeypatch
     assert list(rows) == ["layout stage, 4 rooms a batch"]
 
 
-def test_a_part_that_fails_or_hangs_is_a_line_and_the_next_one_runs(tmp_path: Path, monkeypatch):
-    real = gpu.PARTS
+def test_a_part_that_fails_or_hangs_is_a_line_and_the_next_one_runs(tmp_path: Path):
+    # Half an hour: a test machine may be busy.
     parts = {
-        "precision": real["precision"]._replace(minutes=1 / 600),
-        "peers": real["peers"],
+        "precision": gpu.PARTS["precision"]._replace(minutes=1 / 600),
+        "peers": gpu.PARTS["peers"]._replace(minutes=30),
     }
     found = gpu.run(parts, tmp_path, ON_CPU)["parts"]
     assert found["precision"]["failed"].startswith("stopped after 0.0 minutes")
@@ -96,7 +96,7 @@ def test_a_part_that_fails_or_hangs_is_a_line_and_the_next_one_runs(tmp_path: Pa
     table = (tmp_path / "gpu.md").read_text()
     assert "| **not measured to the end**: stopped after" in table
     assert "| pytorch3d: not installed |" in table or "| pytorch3d |" in table
-    said = gpu.run_part("peers", tmp_path, ["--device", "nothing"], 60)
+    said = gpu.run_part("peers", tmp_path, ["--device", "nothing"], 1800)
     assert said is not None and "invalid choice: 'nothing'" in said
 
 
@@ -112,7 +112,10 @@ def test_the_parts_together_take_at_most_40_minutes():
 
 
 @pytest.mark.slow
-def test_all_of_it_on_a_cpu(tmp_path: Path, capsys):
+def test_all_of_it_on_a_cpu(tmp_path: Path, capsys, monkeypatch):
+    # A test machine may be busy.
+    patient = {name: part._replace(minutes=30) for name, part in gpu.PARTS.items()}
+    monkeypatch.setattr(gpu, "PARTS", patient)
     gpu.main([*ON_CPU, "--out", str(tmp_path / "out")])
     found = json.loads((tmp_path / "out" / "gpu.json").read_text())
     assert [part["failed"] for part in found["parts"].values()] == [None] * len(gpu.PARTS)
