@@ -27,7 +27,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-EPOCHS, STEPS = 3, 2
+EPOCHS, STEPS = 3, 1
 """Of each stage, and of an epoch; the first epoch compiles, the last evaluates."""
 ROOMS, OBJECTS = 128, (13, 28, 53)
 """Of a layout step; what bedrooms, living rooms and ScanNet scenes hold at most."""
