@@ -38,7 +38,8 @@ def project(
     rows = (intrinsics @ world_to_camera[..., :3, :3]).reshape(rooms, views * 3, 3)
     offset = (intrinsics @ world_to_camera[..., :3, 3:]).reshape(rooms, views * 3, 1)
     # Components first: what looks for extremes among many points reads them one after the other.
-    scaled = torch.baddbmm(offset, rows, points_m.reshape(rooms, -1, 3).transpose(1, 2))
+    columns = points_m.reshape(rooms, objects * points, 3).transpose(1, 2)
+    scaled = torch.baddbmm(offset, rows, columns)
     scaled = scaled.reshape(rooms, views, 3, objects, points)
     depth = scaled[:, :, 2:]
     pixels = scaled[:, :, :2] / depth.clamp(min=MIN_DEPTH_M)
