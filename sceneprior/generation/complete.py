@@ -37,6 +37,8 @@ DRAWN = 256
 """Latents that starts are chosen from."""
 RESTARTS = 3
 """Starts of each answer."""
+ALIKE = 1e-5
+"""Losses that differ by less are one."""
 STEPS = 150
 RATE = 0.05
 """Length of an early step of Adam, where the sphere's radius is 1; it falls to 0 by a cosine."""
@@ -84,8 +86,10 @@ def complete(
         )
     starts = _starts(trained, given, count * RESTARTS, seed, distribution)
     z, loss = fit_latents(trained, starts, repeated(given, count * RESTARTS), steps)
-    # Starts are in order of promise; dealt out in turn, every answer has good ones.
-    best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
+    # Starts are in order of promise; dealt out in turn, every answer has good ones. Of those that
+    # fit alike, but for last bits, the most promising.
+    later = ALIKE * torch.arange(RESTARTS, device=loss.device).view(1, -1, 1)
+    best = (loss.view(len(scenes), RESTARTS, count) + later).argmin(dim=1, keepdim=True)
     z = z.view(len(scenes), RESTARTS, count, -1).take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
     names = [f"complete_{k:02d}" for k in range(count)]
     return [
