@@ -188,8 +188,8 @@ def fit_latents(
     """Move latents until their rooms hold what is given; the latents, and what is left to win."""
     space, target = trained.prior.latent_space, trained.config.model.completeness_target
     free = starts.clone().requires_grad_()
-    # Adam moves every coordinate by about its rate.
-    optimizer = torch.optim.Adam([free], lr=RATE / math.sqrt(starts.shape[1]))
+    # Adam moves every coordinate by about its rate, but none for a gradient of last bits (eps).
+    optimizer = torch.optim.Adam([free], lr=RATE / math.sqrt(starts.shape[1]), eps=1e-4)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
 
     def loss_of(z: Tensor) -> Float[Tensor, " rooms"]:
