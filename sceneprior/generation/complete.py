@@ -37,8 +37,6 @@ DRAWN = 256
 """Latents that starts are chosen from."""
 RESTARTS = 3
 """Starts of each answer."""
-ALIKE = 1e-5
-"""Losses that differ by less are one."""
 STEPS = 150
 RATE = 0.05
 """Length of an early step of Adam, where the sphere's radius is 1; it falls to 0 by a cosine."""
@@ -86,10 +84,8 @@ def complete(
         )
     starts = _starts(trained, given, count * RESTARTS, seed, distribution)
     z, loss = fit_latents(trained, starts, repeated(given, count * RESTARTS), steps)
-    # Starts are in order of promise; dealt out in turn, every answer has good ones. Of those that
-    # fit alike, but for last bits, the most promising.
-    later = ALIKE * torch.arange(RESTARTS, device=loss.device).view(1, -1, 1)
-    best = (loss.view(len(scenes), RESTARTS, count) + later).argmin(dim=1, keepdim=True)
+    # Starts are in order of promise; dealt out in turn, every answer has good ones.
+    best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
     z = z.view(len(scenes), RESTARTS, count, -1).take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
     names = [f"complete_{k:02d}" for k in range(count)]
     return [
@@ -188,13 +184,15 @@ def fit_latents(
     """Move latents until their rooms hold what is given; the latents, and what is left to win."""
     space, target = trained.prior.latent_space, trained.config.model.completeness_target
     free = starts.clone().requires_grad_()
-    # Adam moves every coordinate by about its rate, but none for a gradient of last bits (eps).
-    optimizer = torch.optim.Adam([free], lr=RATE / math.sqrt(starts.shape[1]), eps=1e-4)
+    # Adam moves every coordinate by about its rate.
+    optimizer = torch.optim.Adam([free], lr=RATE / math.sqrt(starts.shape[1]))
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
 
     def loss_of(z: Tensor) -> Float[Tensor, " rooms"]:
         loss = given_loss(trained.prior.decode(z, with_shape=False), given, target)
-        return loss + START_WEIGHT / 2 * (z - starts).square().sum(dim=-1)
+        # From where it is free: put back onto the sphere, a start may differ in its last bits, and
+        # Adam would follow those.
+        return loss + START_WEIGHT / 2 * (free - starts).square().sum(dim=-1)
 
     for _ in range(steps):
         optimizer.zero_grad()
