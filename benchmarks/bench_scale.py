@@ -31,7 +31,6 @@ EPOCHS, STEPS = 3, 1
 """Of each stage, and of an epoch; the first epoch compiles, the last evaluates."""
 ROOMS, OBJECTS = 128, (13, 28, 53)
 """Of a layout step; what bedrooms, living rooms and ScanNet scenes hold at most."""
-SCHEDULE = {"layout": 800, "shape": 500}
 
 
 def child(*words: object) -> dict[str, Any]:
@@ -94,15 +93,18 @@ def load(shards: Path) -> dict[str, float]:
 
 def train(shards: Path) -> dict[str, float]:
     """A few steps of both stages; what the whole schedule would take."""
-    from timed_fit import paper_run, timed_fit
+    from timed_fit import CONFIG, paper_run, timed_fit
+
+    from sceneprior.config import load_config
 
     with tempfile.TemporaryDirectory() as folder:
         limited = {"limit_train_batches": STEPS, "accelerator": "cpu", "devices": 1}
         run = paper_run(shards, EPOCHS, "data.workers=0")
         stages = timed_fit(run, Path(folder) / "run", limited)
     found: dict[str, float] = {}
-    for name, times in stages.items():
-        steps = math.ceil(times.rooms / 16) * SCHEDULE[name]
+    for stage in load_config(CONFIG).stages():  # with all epochs of the paper
+        name, times = stage.name, stages[stage.name]
+        steps = math.ceil(times.rooms / stage.settings.batch_size) * stage.settings.epochs
         found |= {
             f"{name}_step_s": times.step_s,
             f"{name}_hours": steps * times.step_s / 3600,

@@ -287,7 +287,8 @@ def _select(images: "h5py.Dataset", view: int) -> np.ndarray:
 def _inflate(images: "h5py.Dataset", view: int) -> np.ndarray:
     """The same image, from its one deflated chunk: h5py's selections take longer than unpacking."""
     size = images.dtype.itemsize * images.shape[1] * images.shape[2]
-    unfiltered, chunk = images.id.read_direct_chunk((view, 0, 0))
+    at = range(len(images))[view]  # as h5py reads it: from the end, or an IndexError
+    unfiltered, chunk = images.id.read_direct_chunk((at, 0, 0))
     if unfiltered:  # HDF5 may leave out a filter that gains nothing
         return _select(images, view)
     return np.frombuffer(zlib_ng.decompress(chunk, bufsize=size), images.dtype).reshape(

@@ -105,7 +105,9 @@ def test_images_are_read_as_hdf5_reads_them_however_they_are_stored(tmp_path, st
         del group["instance_ids"]
         group.create_dataset("instance_ids", data=ids, **stored)
     with Shard(tmp_path / "a.h5") as shard:
-        read = shard.read_instance_ids("house_A", [4, 1, 0])
+        read = shard.read_instance_ids("house_A", [4, 1, -5])
+        with pytest.raises((IndexError, ValueError)):
+            shard.read_instance_ids("house_A", [5])
     np.testing.assert_array_equal(read, ids[[4, 1, 0]])
 
 

@@ -188,21 +188,21 @@ def fit_latents(
     optimizer = torch.optim.Adam([free], lr=RATE / math.sqrt(starts.shape[1]))
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
 
-    def loss_of(z: Tensor) -> Float[Tensor, " rooms"]:
-        loss = given_loss(trained.prior.decode(z, with_shape=False), given, target)
-        # From where it is free: put back onto the sphere, a start may differ in its last bits, and
-        # Adam would follow those.
-        return loss + START_WEIGHT / 2 * (free - starts).square().sum(dim=-1)
+    def loss_of(points: Tensor) -> Float[Tensor, " rooms"]:
+        decoded = trained.prior.decode(space.onto(points), with_shape=False)
+        # Not from the sphere: put onto it again, a start may differ in its last bits, and Adam
+        # would follow those.
+        moved = (points - starts).square().sum(dim=-1)
+        return given_loss(decoded, given, target) + START_WEIGHT / 2 * moved
 
     for _ in range(steps):
         optimizer.zero_grad()
         # Summed, not averaged: a room's steps do not depend on who else is in the batch.
-        loss_of(space.onto(free)).sum().backward()
+        loss_of(free).sum().backward()
         optimizer.step()
         schedule.step()
     with torch.no_grad():
-        z = space.onto(free)
-        return z, loss_of(z)
+        return space.onto(free), loss_of(free)
 
 
 def given_loss(
