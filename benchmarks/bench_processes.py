@@ -54,6 +54,9 @@ def compare(
             "one_rooms_per_s": statistics.median(one for one, _ in rates),
             "two_rooms_per_s": statistics.median(two for _, two in rates),
             "two_over_one": statistics.median(two / one for one, two in rates),
+            "two_over_one_in_steps": statistics.median(
+                one[stage]["step_s"] / two[stage]["step_s"] for one, two in runs
+            ),
             "bound_by_cpu_time": statistics.median(
                 one[stage]["epoch_cpu_s"] / two[stage]["epoch_cpu_s"] for one, two in runs
             ),
