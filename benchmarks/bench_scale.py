@@ -93,9 +93,9 @@ def load(shards: Path) -> dict[str, float]:
 
 def train(shards: Path) -> dict[str, float]:
     """A few steps of both stages; what the whole schedule would take."""
-    from timed_fit import CONFIG, paper_run, timed_fit
+    from sceneprior.config import load_config  # before torch, which starts OpenMP
 
-    from sceneprior.config import load_config
+    from timed_fit import CONFIG, paper_run, timed_fit  # isort: skip
 
     with tempfile.TemporaryDirectory() as folder:
         limited = {"limit_train_batches": STEPS, "accelerator": "cpu", "devices": 1}

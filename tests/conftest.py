@@ -13,7 +13,6 @@ from pathlib import Path
 # has compiled from source, since it looks for .pyc files of a name of its own (2,600 modules).
 import beartype  # noqa: F401
 import lightning  # noqa: F401
-import numba
 import numpy as np
 import pydantic  # noqa: F401
 import pytest
@@ -26,12 +25,10 @@ from tiny_runs import OCCUPANCY, tiny_config, tiny_sampler_config
 from toy_rooms import write_toy_shards
 
 # Toy tensors gain nothing from a second thread, and wait for it where cores are shared: thirty
-# times as long. Numba's OpenMP layer would set torch's number of threads back to all cores.
+# times as long.
 torch.set_num_threads(1)
 threadpool_limits(1)  # of BLAS, which was loaded with as many as there are cores
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("NUMBA_THREADING_LAYER", "workqueue")  # in processes that tests start
-numba.config.THREADING_LAYER = os.environ["NUMBA_THREADING_LAYER"]
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # in processes that tests start
 
 
 @pytest.fixture(scope="session")

@@ -23,7 +23,9 @@ def in_threads(function: Callable[..., None], items: int, *arguments: Any) -> No
 
     As many threads as Numba may use (NUMBA_NUM_THREADS, or all cores).
     """
-    threads = numba.get_num_threads()
+    # numba.get_num_threads() would start Numba's own pool, and where that is OpenMP's, as many of
+    # torch's threads, whatever torch was told.
+    threads = numba.config.NUMBA_NUM_THREADS
     parts = min(items, threads * CHUNKS if threads > 1 else 1)
     if parts < 2:
         function(0, items, *arguments)

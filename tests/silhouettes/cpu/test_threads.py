@@ -1,5 +1,8 @@
 """Work for several threads: every item once, errors told, whatever the number of threads."""
 
+import os
+import subprocess
+import sys
 import threading
 
 import numba
@@ -20,15 +23,27 @@ def test_every_item_is_done_once(items):
     assert (times == 2).all()
 
 
-def test_one_thread_stays_in_the_callers():
-    before = numba.get_num_threads()
+def test_one_thread_stays_in_the_callers(monkeypatch):
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
     names = []
-    try:
-        numba.set_num_threads(1)
-        in_threads(lambda first, last: names.append(threading.current_thread().name), 9)
-    finally:
-        numba.set_num_threads(before)
+    in_threads(lambda first, last: names.append(threading.current_thread().name), 9)
     assert names == [threading.current_thread().name]
+
+
+def test_torch_keeps_its_number_of_threads():
+    # In a process of its own: Numba starts its pool, which sets torch's threads, once in each.
+    code = """
+import numba, torch
+from sceneprior.silhouettes.cpu.threads import in_threads
+torch.set_num_threads(1)
+torch.get_num_threads()  # only now, or by a large sum, does torch ask OpenMP for them
+in_threads(lambda first, last: None, 9)
+print(torch.get_num_threads())
+"""
+    threads = {"NUMBA_NUM_THREADS": "2", "NUMBA_THREADING_LAYER": "omp"}
+    say = [sys.executable, "-c", code]
+    said = subprocess.run(say, capture_output=True, text=True, check=True, env=os.environ | threads)
+    assert said.stdout == "1\n"
 
 
 def test_an_error_in_a_thread_is_the_callers():
