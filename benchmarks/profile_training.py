@@ -131,7 +131,7 @@ def profile(name: str, shards: Path, run: Path, threads: int, steps: int) -> lis
         # An epoch of 64 rooms has at least so many steps.
         epochs = -(-(steps + WARM_UP) // max(64 // stage.settings.batch_size, 1))
         changes += [f"{stage.name}.epochs={epochs}", f"{stage.name}.cpu_threads={threads}"]
-    numba.config.NUMBA_NUM_THREADS = threads
+    numba.config.NUMBA_NUM_THREADS = threads  # type: ignore[attr-defined]
     profiler = StepProfiler()
     with watched(profiler):
         fit(

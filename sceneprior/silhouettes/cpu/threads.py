@@ -25,7 +25,7 @@ def in_threads(function: Callable[..., None], items: int, *arguments: Any) -> No
     """
     # numba.get_num_threads() would start Numba's own pool, and where that is OpenMP's, as many of
     # torch's threads, whatever torch was told.
-    threads = numba.config.NUMBA_NUM_THREADS
+    threads: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
     parts = min(items, threads * CHUNKS if threads > 1 else 1)
     if parts < 2:
         function(0, items, *arguments)
