@@ -41,15 +41,18 @@ def scans(folder):
     build_shards(Job(source, folder))
 
 
-def posed(folder):
-    """Four captures: masks and poses alone."""
+def posed(folder, written=lambda poses: poses):
+    """Four captures: masks and poses alone; `written` makes a mistake in transforms.json."""
     data = folder.parent / f"{folder.name}.data"
     for k in range(4):
         things = [*furniture(0.05 * k), Thing(9, "sofa", (-1.6, 1.4, 0.0), (-0.3, 2.0, 0.8))]
         room = PosedRoom(data / f"room_{k}", things, size=(192, 256), focal_px=150.0)
         for eye in [(0.3, 2.9, 1.6), (2.6, 0.2, 1.4), (-2.7, 0.4, 1.8)]:
             room.look(eye, (0.0, 0.2, 0.3))
-        room.write(floor_m=0.0, floor_center_m=[0.0, 0.0])
+        known = {"floor_m": 0.0, "floor_center_m": [0.0, 0.0]}
+        room.write(**known)
+        room.poses = list(written(np.stack(room.poses)))
+        room.write_transforms(room.data | known)
     build_shards(Job(PosedSource(data, "void,bed,chair,sofa,backpack"), folder))
 
 

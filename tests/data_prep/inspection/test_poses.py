@@ -11,6 +11,7 @@ from mutations import (
     longer,
     mutated,
     of_another_size,
+    posed,
     scaled,
     swapped,
     transposed,
@@ -133,6 +134,11 @@ def test_wrong_cameras_of_all_rooms_fail_and_the_likely_cause_is_named(
     if kind != "posed":  # nothing is left out for want of a projection
         (before,), (after,) = right.tallies.values(), wrong.agreement.tallies.values()
         assert (after.masks, after.whole) == (before.masks, before.whole)
+
+
+def test_a_capture_with_the_axes_of_opencv_is_told_as_turned_once_too_often(tmp_path):
+    posed(tmp_path / "shards", written=lambda poses: poses @ OPENGL)
+    assert FLIPPED in verify(tmp_path / "shards").problems[-1]
 
 
 @pytest.mark.parametrize("kind", ["homes", "scans"])
