@@ -6,10 +6,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.parametrizations import spectral_norm
 
+from sceneprior.errors import InputError
 from sceneprior.models.layers import mlp
 
 SLOPE = 0.2
 """Of the leaky ReLUs."""
+
+SMALLEST_PX = 4
+"""Side of a map that two halvings leave a pixel of."""
 
 GAIN = 10
 """Of all scores: spectral norm makes them timid."""
@@ -38,7 +42,17 @@ class MapDiscriminator(nn.Module):
         """Scores of patches and of rooms; a higher score looks more real.
 
         A room is what its views show on average and at most, whatever their order and number.
+
+        Raises:
+            InputError: the maps are smaller than `SMALLEST_PX`.
         """
+        height, width = maps.shape[-2:]
+        if min(height, width) < SMALLEST_PX:
+            raise InputError(
+                f"Semantic maps of {height} x {width} pixels are too small for the GAN, which "
+                f"needs {SMALLEST_PX} x {SMALLEST_PX}; lower data.mask_step, or prepare larger "
+                "images."
+            )
         x = F.leaky_relu(self.layers(maps.flatten(0, 1)), SLOPE)
         patches = self.patch(x)[:, 0].unflatten(0, maps.shape[:2])
         features = x.mean(dim=(2, 3)).unflatten(0, maps.shape[:2])

@@ -217,6 +217,11 @@ def test_a_loss_that_is_no_number_names_its_rooms(toy_shards, tmp_path, monkeypa
     assert not list(tmp_path.rglob("final.ckpt"))
 
 
+def test_maps_that_are_too_small_are_a_sentence(toy_shards, tmp_path):
+    with pytest.raises(InputError, match=r"maps of \d x \d pixels are too small .*mask_step, or"):
+        fit(settings(toy_shards, "gan", data__mask_step=30), tmp_path, trainer_options=CPU)
+
+
 def fresh(shards: Path, **changes) -> GanStage:
     config = settings(shards, "gan", **changes)
     return GanStage(config)
