@@ -24,8 +24,8 @@ POISON = 4
 
 def changes(batch: int) -> dict:
     sections = {"layout__epochs": 2, "shape__epochs": 1, "samples": {"every": 1, "count": 10}}
-    # Along the edges of a box many vertices are all but tied for the side of a 2D box: which of them
-    # gets its gradient would hang on last bits.
+    # Along the edges of a box many vertices are all but tied for the side of a 2D box: which of
+    # them gets its gradient would hang on last bits.
     sections["model__shape__template"] = "sphere"
     return {**sections, "layout__batch_size": batch, "shape__batch_size": batch}
 
