@@ -37,6 +37,11 @@ class SceneObject:
     size_m: tuple[float, float, float]
     mesh: Mesh | None = None
 
+    def __post_init__(self) -> None:
+        # Plain floats, wherever the box comes from: users print them, and JSON takes no others.
+        object.__setattr__(self, "center_m", _triple(self.center_m))
+        object.__setattr__(self, "size_m", _triple(self.size_m))
+
     def in_box(self, center_m: Sequence[float], size_m: Sequence[float]) -> "SceneObject":
         """The same object in another box: its mesh moves and is scaled with its own."""
         center, size = _triple(center_m), _triple(size_m)

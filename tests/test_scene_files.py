@@ -53,6 +53,11 @@ def glb_json(data: bytes) -> dict:
     return json.loads(data[20 : 20 + length])
 
 
+def test_boxes_are_plain_floats_whatever_they_were():
+    item = SceneObject("desk", tuple(np.array([0, 0.5, 0])), tuple(np.ones(3)))
+    assert repr(item.center_m + item.size_m) == "(0.0, 0.5, 0.0, 1.0, 1.0, 1.0)"
+
+
 def test_the_glb_has_named_nodes_in_metres_and_class_colours(scene):
     content = glb_json(scene_to_glb(scene))
     assert [node["name"] for node in content["nodes"]] == ["0_double_bed", "1_nightstand"]
