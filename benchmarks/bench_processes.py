@@ -5,10 +5,10 @@
 Both stages, a few epochs by `fit` itself, one thread a process. Two processes share the batches of
 one (`batch_size` is halved), so that both take the same steps and end at the same weights; dropout,
 which each process draws for itself, is off. The runs take turns; ratios are of rooms a second in
-neighbouring runs, and the median is the figure. Where other programs hold the cores, that says
-little: the CPU seconds of one process over those of each of two bound what idle cores would give.
-Beside them: bytes of gradients, which all processes add up at every step, and seconds of adding
-them up.
+neighbouring runs, or of steps alone, and the median is the figure. Where other programs hold the
+cores, that says little: the CPU seconds of one process over those of each of two bound what idle
+cores would give. Beside them: bytes of gradients, which all processes add up at every step, and
+seconds of adding them up.
 
 With `--device cuda`, both processes share the one GPU, over gloo: NCCL wants a GPU for each.
 """

@@ -38,7 +38,7 @@ class SceneObject:
     mesh: Mesh | None = None
 
     def __post_init__(self) -> None:
-        # Plain floats, wherever the box comes from: users print them, and JSON takes no others.
+        # Plain floats, wherever the box comes from: users print them.
         object.__setattr__(self, "center_m", _triple(self.center_m))
         object.__setattr__(self, "size_m", _triple(self.size_m))
 
@@ -160,8 +160,8 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
         "objects": [
             {
                 "class": item.label,
-                "center_m": [round(float(value), 5) for value in item.center_m],
-                "size_m": [round(float(value), 5) for value in item.size_m],
+                "center_m": [round(value, 5) for value in item.center_m],
+                "size_m": [round(value, 5) for value in item.size_m],
             }
             for item in scene.objects
         ],

@@ -66,6 +66,11 @@ def main() -> None:
     except (InputError, FloatingPointError) as error:
         typer.echo(f"Error: {error}", err=True)
         sys.exit(2)
+    except SystemExit as ended:
+        # Typer ends a command that Ctrl-C stopped with status 130, without a word.
+        if ended.__context__ and isinstance(ended.__context__.__cause__, KeyboardInterrupt):
+            typer.echo("Stopped by Ctrl-C. Every file that was written is whole.", err=True)
+        raise
     except Exception as error:
         if os.environ.get("SCENEPRIOR_DEBUG"):
             raise

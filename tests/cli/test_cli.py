@@ -215,3 +215,12 @@ def test_options_that_lightning_refuses_are_a_sentence_and_leave_nothing(
     said = one_sentence(command(*call, "--accelerator", "quantum"))
     assert "Lightning cannot train with --devices auto, --accelerator quantum" in said
     assert not (tmp_path / "new").exists()
+
+
+def test_ctrl_c_is_a_sentence(command, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sceneprior.api.load", interrupted)
+    status, _, errors = command("synthesize", "--run", "run", "--out", "rooms")
+    assert (status, errors) == (130, "Stopped by Ctrl-C. Every file that was written is whole.\n")
