@@ -28,7 +28,7 @@ from sceneprior.generation.sample import draw_latents, uses_sampler
 from sceneprior.generation.sampled import class_rows, floor_rectangle, sample_scenes
 from sceneprior.losses.layout import take
 from sceneprior.losses.matching import assign
-from sceneprior.sampler.draw import Given
+from sceneprior.sampler.plan import Given
 from sceneprior.scene import Scene
 from sceneprior.training.method import TrainedPrior
 from sceneprior.views import DecodedScenes, RoomBoxes

@@ -11,7 +11,8 @@ from sceneprior.classes import label_set
 from sceneprior.errors import InputError
 from sceneprior.evaluation.networks import single_threaded
 from sceneprior.models.occupancy import OccupancyDecoder
-from sceneprior.sampler.draw import Given, draw_rooms
+from sceneprior.sampler.draw import draw_rooms
+from sceneprior.sampler.plan import Given
 from sceneprior.scene import Scene, SceneObject
 from sceneprior.training.method import TrainedPrior
 from sceneprior.views import RoomBoxes

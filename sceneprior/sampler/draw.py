@@ -1,60 +1,42 @@
 """Draw rooms from a trained sampler: from nothing, or round objects that are given."""
 
-from dataclasses import dataclass
-
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from sceneprior.sampler.contents import END
 from sceneprior.sampler.mixtures import draw_index
-from sceneprior.sampler.network import END, Reading, RoomSampler
-from sceneprior.sampler.rooms import rectangle_sides, rectangles_of, shared_extents
+from sceneprior.sampler.network import Frame, Reading, RoomSampler
+from sceneprior.sampler.plan import (
+    BEYOND_M,
+    Given,
+    Plan,
+    nothing_given,
+    plan_rooms,
+    uniform_numbers,
+)
+from sceneprior.sampler.rooms import FRAME_M, rectangle_sides, rectangles_of, shared_extents
 from sceneprior.views import RoomBoxes
 
 PLACES = 32
 """Places drawn for an object, which takes the first at which nothing is wrong."""
-RECTANGLES = 16
-"""Rectangles drawn for a room, which takes the first that holds what is given."""
 LOOKS = 16
 """Looks drawn for a given object, which takes one by how well its place fits."""
 INTERSECTING = 0.01
 """Two boxes intersect from this share of the smaller one's volume on, as scores have it."""
-BEYOND_M = 0.01
-"""An object may stick out of the rectangle this far."""
+OPEN_M = 3 * FRAME_M
+"""Of 370 sides of training rooms' rectangles one lies further from the furniture."""
 SIZE_RANGE = 0.5
 """An object's extents differ from its look's by this factor's logarithm at most."""
 SIZE_DOUBT = 0.1
 """The same of a given object, as a standard deviation."""
 ROUNDS = 8
-"""Times that a room is begun, at most."""
+"""Times that a room is furnished, at most, before it is planned anew."""
+PLANS = 3
+"""Times that a room is planned, at most."""
 BATCH = 256
 """Rooms drawn at a time."""
-
-
-@dataclass(frozen=True)
-class Given:
-    """What rooms are drawn round; there are as many rooms as are drawn."""
-
-    objects: RoomBoxes
-    """What stands there already; looks need not be known."""
-    rectangle_m: Float[Tensor, "rooms 4"] | None = None
-    """What furniture may fill: centre x, z and extents x, z. None draws it."""
-    coming: Int[Tensor, "rooms wanted"] | None = None
-    """Classes of the objects to add, and of no others, in this order; `END` for none. None leaves
-    it to the sampler."""
-
-    def rows(self, rows: Int[Tensor, " some"]) -> "Given":
-        """Of some rooms."""
-        rest = (None if each is None else each[rows] for each in (self.rectangle_m, self.coming))
-        return Given(self.objects.changed(lambda each: each[rows]), *rest)
-
-
-def nothing_given(rooms: int) -> Given:
-    """To draw whole rooms."""
-    none = torch.zeros(rooms, 0, dtype=torch.int64)
-    return Given(RoomBoxes(none, none > 0, torch.zeros(rooms, 0, 6)))
 
 
 @torch.no_grad()
@@ -63,22 +45,28 @@ def draw_rooms(
 ) -> RoomBoxes:
     """Rooms with looks; given objects come first, with the boxes that they came with.
 
-    A room in which some object finds no place, of `PLACES`, at which it neither intersects what it
-    should not (`RoomSampler.may_meet`) nor sticks out of the rectangle is begun again, `ROUNDS`
-    times at most; in the last, such objects are left out. Objects whose classes were asked for are
-    never left out: there, they take the place with least wrong.
+    What a room holds is drawn first. A room in which some object then finds no place, of `PLACES`,
+    at which it neither intersects what it should not (`RoomSampler.may_meet`) nor sticks out of the
+    rectangle is furnished again, and after `ROUNDS` planned again; in the last round of `PLANS`,
+    such objects are left out. Objects whose classes were asked for are never left out: there, they
+    take the place with least wrong. Furnished again is also what leaves a side of a drawn rectangle
+    open (`OPEN_M`), as no training room does.
 
     The same seed draws the same rooms, the first of them however many follow.
     """
     given = given or nothing_given(count)
-    drawn = _nothing_drawn(count, sampler.max_objects)
-    waiting = torch.arange(count)
-    for number in range(ROUNDS):
-        last = number + 1 == ROUNDS
-        numbers = _numbers(sampler, count, seed, number)
+    keep = given.coming is not None
+    slots, waiting = sampler.max_objects, torch.arange(count)
+    drawn = _nothing_drawn(count, slots)
+    for number in range(PLANS * ROUNDS):
+        last = number + 1 == PLANS * ROUNDS
+        if number % ROUNDS == 0:
+            plan = plan_rooms(sampler, given, count, (seed, number // ROUNDS))
+        numbers = uniform_numbers(count, slots * (7 + 3 * PLACES), (seed, PLANS + number))
+        numbers = numbers.unflatten(1, (slots, -1))
         stuck = []
         for rows in waiting.split(BATCH):
-            found, found_stuck = _draw(sampler, numbers[rows], given.rows(rows), last)
+            found, found_stuck = _draw(sampler, numbers[rows], plan.rows(rows), last, keep)
             for whole, part in zip(_parts(drawn), _parts(found), strict=True):
                 whole[rows] = part
             stuck.append(rows[found_stuck])
@@ -86,17 +74,6 @@ def draw_rooms(
         if last or not len(waiting):
             break
     return drawn
-
-
-def _numbers(
-    sampler: RoomSampler, count: int, seed: int, number: int
-) -> Float[Tensor, "rooms numbers"]:
-    """Uniform numbers of all rooms for one round, drawn in one call: what a room gets does not
-    depend on how many there are."""
-    (state,) = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)
-    generator = torch.Generator().manual_seed(int(state >> np.uint64(1)))
-    each = 2 * sampler.max_objects * (7 + 3 * PLACES) + 5 * RECTANGLES
-    return torch.rand(count, each, generator=generator)
 
 
 def _nothing_drawn(count: int, slots: int) -> RoomBoxes:
@@ -109,76 +86,63 @@ def _parts(rooms: RoomBoxes) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return rooms.object_class, rooms.is_object, rooms.boxes_m, rooms.looks
 
 
-def _holding(tried: Float[Tensor, "rooms tries 4"], objects: RoomBoxes) -> Float[Tensor, "rooms 4"]:
-    """The first rectangle that holds the given objects; if none does, the first, grown to."""
-    if not objects.is_object.any():
-        return tried[:, 0]
-    known = rectangles_of(objects).unsqueeze(1)
-    low, high = rectangle_sides(tried)
-    known_low, known_high = rectangle_sides(known)
-    holds = ((low <= known_low + BEYOND_M) & (high >= known_high - BEYOND_M)).all(dim=-1)
-    first = holds.int().argmax(dim=1)[:, None, None]
-    low = torch.minimum(torch.take_along_dim(low, first, dim=1), known_low)[:, 0]
-    high = torch.maximum(torch.take_along_dim(high, first, dim=1), known_high)[:, 0]
-    grown = torch.cat([(low + high) / 2, high - low], dim=-1)
-    return grown.where(objects.is_object.any(dim=1, keepdim=True), tried[:, 0])
-
-
 def _draw(
-    sampler: RoomSampler, numbers: Float[Tensor, "rooms numbers"], given: Given, last: bool
+    sampler: RoomSampler,
+    uniform: Float[Tensor, "rooms slots numbers"],
+    plan: Plan,
+    last: bool,
+    keep: bool,
 ) -> tuple[RoomBoxes, Bool[Tensor, " rooms"]]:
-    """Rooms, and those in which some object found no place."""
-    frames, uniform = numbers.split([5 * RECTANGLES, numbers.shape[1] - 5 * RECTANGLES], dim=1)
-    uniform = uniform.unflatten(1, (-1, 7 + 3 * PLACES))
-    rectangle_m = given.rectangle_m
-    if rectangle_m is None:
-        choice, *normal = frames.unflatten(1, (RECTANGLES, 5)).unbind(dim=-1)
-        noise = torch.special.ndtri(torch.stack(normal, dim=-1).clamp(1e-6, 1 - 1e-6))
-        rectangle_m = _holding(sampler.rectangles(choice, noise), given.objects)
-    slots, number = sampler.max_objects, given.objects.is_object.sum(dim=1)
-    rooms = _recognised(sampler, uniform, rectangle_m, given.objects)
+    """Rooms, and those in which some object found no place; `keep` places it all the same."""
+    number = plan.objects.is_object.sum(dim=1)
+    rooms = _recognised(sampler, uniform, plan)
     looks = rooms.looks
     assert looks is not None
-    wanted = given.coming
-    going = number < slots
-    added, stuck = torch.zeros_like(number), torch.zeros_like(going)
-    for chance in uniform.unbind(dim=1):
-        reading = _read(sampler, rooms, number, rectangle_m)
-        if wanted is None:
-            label = draw_index(sampler.class_logits(reading), chance[:, 0])
-        else:
-            label = F.pad(wanted, (0, slots)).gather(1, added[:, None])[:, 0]
-        going = going & (label != END) & (number < slots)
+    stuck = torch.zeros_like(number, dtype=torch.bool)
+    added = (plan.coming != END).any(dim=1)
+    for step, chance in enumerate(uniform.unbind(dim=1)):
+        label = plan.coming[:, step]
+        # A room that is furnished again needs no end.
+        going = (label != END) & (last | ~stuck)
         if not going.any():
             break
+        reading = _read(sampler, rooms, number, plan, plan.coming[:, step:])
         some = label.where(going, label[going][0])  # rooms that have ended go along
         look, tried_m = _tried(sampler, reading, some, chance)
         wrong = _wrong(tried_m, some, reading, sampler.may_meet)
         best = wrong.argmin(dim=1, keepdim=True)  # the first of equal ones
         fits = wrong.gather(1, best)[:, 0] == 0
         stuck = stuck | (going & ~fits)
-        # A room that is begun again needs no end.
-        placed = going & fits if wanted is None or not last else going
-        going = going & (fits | last)
+        placed = going & (fits | (last & keep))
         box_m = torch.take_along_dim(tried_m, best.unsqueeze(-1), dim=1)[:, 0]
         at = (placed.nonzero()[:, 0], number[placed])
         rooms.object_class[at], rooms.is_object[at] = some[placed], True
         rooms.boxes_m[at], looks[at] = box_m[placed], look[placed]
-        number, added = number + placed, added + placed
-    return rooms, stuck
+        number = number + placed
+    return rooms, stuck | (added & plan.drawn & (_open_m(rooms, plan.rectangle_m) > OPEN_M))
+
+
+def _open_m(rooms: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]) -> Float[Tensor, " rooms"]:
+    """How far the furniture stays away from the side that it is farthest from."""
+    low, high = rectangle_sides(rectangle_m)
+    own_low, own_high = rectangle_sides(rectangles_of(rooms))
+    return torch.cat([own_low - low, high - own_high], dim=-1).amax(dim=-1)
 
 
 def _read(
     sampler: RoomSampler,
     rooms: RoomBoxes,
     number: Int[Tensor, " rooms"],
-    rectangle_m: Float[Tensor, "rooms 4"],
+    plan: Plan,
+    coming: Int[Tensor, "rooms wanted"],
 ) -> Reading:
-    """Read the first so many objects of each room."""
+    """Read the first so many objects of each room, and what is to come."""
     most = int(number.max())
     first = torch.arange(most, device=number.device) < number[:, None]
     before = rooms.changed(lambda part: part[:, :most]).only(first)
-    return sampler.read(before, rectangle_m, sampler.tokens(before, rectangle_m))
+    still = sampler.contents.before(coming, coming != END)[:, -1]
+    tokens = sampler.tokens(before, plan.rectangle_m)
+    return sampler.read(before, still, Frame.plain(plan.rectangle_m), tokens)
 
 
 def _tried(
@@ -203,13 +167,14 @@ def _tried(
 
 def _recognised(
     sampler: RoomSampler,
-    uniform: Float[Tensor, "rooms attempts numbers"],
-    rectangle_m: Float[Tensor, "rooms 4"],
-    objects: RoomBoxes,
+    uniform: Float[Tensor, "rooms slots numbers"],
+    plan: Plan,
 ) -> RoomBoxes:
     """The given objects in as many slots as rooms have, each with a look: drawn by how likely that
     and the size are, and again by how likely the place is then."""
+    objects = plan.objects
     count, known = objects.is_object.shape
+    still = torch.cat([objects.object_class * objects.is_object, plan.coming], dim=1)
     empty = (0, sampler.max_objects - known)
     looks = torch.zeros(count, sampler.max_objects, dtype=torch.int64)
     rooms = RoomBoxes(
@@ -218,7 +183,7 @@ def _recognised(
     )  # fmt: skip
     for step in range(known):
         here = rooms.is_object[:, step]
-        reading = _read(sampler, rooms, torch.full((count,), step), rectangle_m)
+        reading = _read(sampler, rooms, torch.full((count,), step), plan, still[:, step:])
         label = rooms.object_class[:, step].clamp(min=1)
         centre_m, size_m = rooms.boxes_m[:, step].split(3, dim=-1)
         size_m = size_m.where(here[:, None], 1.0)
@@ -252,6 +217,6 @@ def _wrong(
     share = shared / least.clamp(min=1e-9)
     counts = others.is_object & ~may_meet[label[:, None], others.object_class]
     share = share.where((share > INTERSECTING) & counts.unsqueeze(1), 0.0)
-    middle, extents = reading.rectangle_m.unsqueeze(1).split(2, dim=-1)
+    middle, extents = reading.frame.rectangle_m.unsqueeze(1).split(2, dim=-1)
     beyond = (boxes_m[..., [0, 2]] - middle).abs() + (boxes_m[..., [3, 5]] - extents) / 2
     return share.sum(dim=-1) + (beyond.amax(dim=-1) - BEYOND_M).clamp(min=0)

@@ -1,4 +1,4 @@
-"""The sampler's network: the distribution of a room's next object, given the set of the others."""
+"""The sampler's network: what a room holds, and the next object given the set of the others."""
 
 import math
 from typing import NamedTuple
@@ -6,18 +6,17 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn import functional as F
 
+from sceneprior.geometry.turns import QUARTERS
 from sceneprior.models.layers import mlp
-from sceneprior.models.prototypes import PARTS, POSES
+from sceneprior.models.prototypes import PARTS, POSES, turned_looks
+from sceneprior.sampler.contents import Contents
 from sceneprior.sampler.mixtures import LogisticMixture, draw_index
 from sceneprior.sampler.placement import Placement
-from sceneprior.sampler.rooms import rectangle_sides, rectangles_of
+from sceneprior.sampler.rooms import SYMMETRIES, rectangle_sides, rectangles_of
 from sceneprior.sampler.settings import SamplerConfig
 from sceneprior.views import RoomBoxes
 
-END = 0
-"""The class that ends a room: void, which is no furniture."""
 CLASS_WIDTH = 32
 OCTAVES = 6
 LONGEST_M = 16.0
@@ -35,13 +34,17 @@ MATCH_WIDTH = 64
 
 
 class RoomSampler(nn.Module):
-    """Objects one after the other, each given the set of those before it, whatever their order.
+    """What a room holds (`Contents`); then its objects one after the other, each given the set of
+    those before it, whatever their order, and the classes of those still to come.
 
     A transformer encoder without positional encoding reads the rectangle round the room's
-    furniture, the objects there are, and a learnt query. What it makes of the query gives the class
-    of the next object, or the room's end; then, given the class, its look: a prototype in one of
-    its poses; then how its size differs from that, and the height of its bottom; then its place
-    (`Placement`), which is in relation to the rectangle or to an object.
+    furniture, the objects that stand, and a learnt query. What it makes of the query gives the look
+    of the next object, whose class is known: a prototype in one of its poses; then how its size
+    differs from that, and the height of its bottom; then its place (`Placement`), which is in
+    relation to the rectangle, to the floor's middle or to an object.
+
+    Training rooms are shown in all their `SYMMETRIES`. What hangs on how the data stand, how often
+    each look comes in which pose, is learnt for rooms as they are and turned with them.
 
     Args:
         settings: Its size.
@@ -56,6 +59,8 @@ class RoomSampler(nn.Module):
     rectangle_means: Tensor
     rectangle_factors: Tensor
     may_meet: Tensor
+    footprints_m2: Tensor
+    own_pose: Tensor
 
     def __init__(self, settings: SamplerConfig, classes: int, prototypes: int, max_objects: int):
         super().__init__()
@@ -69,12 +74,15 @@ class RoomSampler(nn.Module):
         self.register_buffer("rectangle_means", torch.zeros(RECTANGLES, 4))
         self.register_buffer("rectangle_factors", torch.zeros(RECTANGLES, 4, 4))
         self.register_buffer("may_meet", torch.zeros(classes, classes, dtype=torch.bool))
+        self.register_buffer("footprints_m2", torch.ones(classes))
+        self.register_buffer("own_pose", own_poses(), persistent=False)
+        self.contents = Contents(classes, width // 2, min(2 * dropout, 0.5))
         self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
         self.look_embedding = nn.Linear(SHOWN, width)
         self.object_embedding = nn.Linear(CLASS_WIDTH + 10 * LENGTHS, width)
         self.rectangle_embedding = nn.Linear(4 * LENGTHS, width)
         self.query = nn.Parameter(torch.randn(width))
-        self.summary_embedding = nn.Linear(classes + 4 * LENGTHS, width)
+        self.summary_embedding = nn.Linear(2 * classes + 4 * LENGTHS, width)
         self.dropout = nn.Dropout(dropout)
         self.encoder = nn.ModuleList(
             nn.TransformerEncoderLayer(
@@ -84,12 +92,9 @@ class RoomSampler(nn.Module):
         )
         self.norm = nn.LayerNorm(width)
         known = width + CLASS_WIDTH
-        self.class_head = _head(width, width, classes)
-        # What is there already says most of what comes; dropout does not touch this way.
-        self.class_by_count = _head(classes + 4 * LENGTHS, width, classes)
         self.wanted_look = _head(known, width, MATCH_WIDTH)
         self.offered_look = _head(SHOWN, width, MATCH_WIDTH)
-        self.frequency = nn.Parameter(torch.zeros(prototypes))
+        self.frequency = nn.Parameter(torch.zeros(prototypes, POSES))
         self.details_head = _head(known + width, width, DETAILS * 9)
         self.place_query = _head(known + width + 4 * LENGTHS, width, width)
         self.placement = Placement(width)
@@ -121,41 +126,34 @@ class RoomSampler(nn.Module):
     def read(
         self,
         before: RoomBoxes,
-        rectangle_m: Float[Tensor, "rooms 4"],
+        coming: Float[Tensor, "rooms classes"],
+        frame: "Frame",
         tokens: Float[Tensor, "rooms objects width"],
     ) -> "Reading":
-        """Read the objects that stand, whatever their order, of `tokens`."""
-        summary = self.summary(before, rectangle_m)
-        query = (self.query + self.summary_embedding(summary)).unsqueeze(1)
-        frame = self.rectangle_embedding(lengths_shown(rectangle_m)).unsqueeze(1)
-        features = self.dropout(torch.cat([query, frame, tokens], dim=1))
+        """Read the objects that stand, whatever their order, of `tokens`, and how many are still to
+        come of each class."""
+        query = self.query + self.summary_embedding(self.summary(before, coming, frame))
+        shown = self.rectangle_embedding(lengths_shown(frame.rectangle_m))
+        features = torch.cat([query.unsqueeze(1), shown.unsqueeze(1), tokens], dim=1)
+        features = self.dropout(features)
         nothing = torch.cat([before.is_object.new_zeros(len(tokens), 2), ~before.is_object], dim=1)
         for layer in self.encoder:
             features = layer(features, src_key_padding_mask=nothing)
         features = self.norm(features)
-        return Reading(before, rectangle_m, summary, features[:, 0], features[:, 2:])
+        return Reading(before, frame, features[:, 0], features[:, 2:])
 
     def summary(
-        self, before: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]
+        self, before: RoomBoxes, coming: Float[Tensor, "rooms classes"], frame: "Frame"
     ) -> Float[Tensor, "rooms summary"]:
-        """What attention would have to count: objects of each class, and how far they all are from
-        each side of the rectangle, which a finished room touches."""
-        counts = rectangle_m.new_zeros(len(rectangle_m), self.class_embedding.num_embeddings)
-        counts = counts.scatter_add(1, before.object_class, before.is_object.to(counts))
-        low, high = rectangle_sides(rectangle_m)
+        """What attention would have to count: objects of each class, those to come, and how far
+        those that stand are from each side of the rectangle, which a finished room touches."""
+        counts = self.contents.before(before.object_class, before.is_object)[:, -1]
+        low, high = rectangle_sides(frame.rectangle_m)
         own_low, own_high = rectangle_sides(rectangles_of(before))
         gaps = torch.cat([own_low - low, high - own_high], dim=-1)
         furnished = before.is_object.any(dim=1, keepdim=True)
         gaps = gaps.where(furnished, torch.cat([high - low] * 2, dim=-1))
-        return torch.cat([counts, lengths_shown(gaps)], dim=-1)
-
-    def class_logits(self, reading: "Reading") -> Float[Tensor, "rooms classes"]:
-        """Of the next object's class, or of `END`; classes without a look are ruled out."""
-        known = torch.zeros_like(self.may_meet[0])
-        known[self.look_class[self.look_class >= 0]] = True
-        known[END] = True
-        logits: Tensor = self.class_head(reading.context) + self.class_by_count(reading.summary)
-        return logits.masked_fill(~known, -torch.inf)
+        return torch.cat([counts, coming, lengths_shown(gaps)], dim=-1)
 
     def look_logits(
         self, reading: "Reading", label: Int[Tensor, " rooms"]
@@ -164,7 +162,8 @@ class RoomSampler(nn.Module):
         known = torch.cat([reading.context, self.class_embedding(label)], dim=-1)
         offered = self.offered_look(self.look_shown)
         logits = self.wanted_look(known) @ offered.T / math.sqrt(MATCH_WIDTH)
-        logits = logits + self.frequency.repeat_interleave(POSES)
+        frequency = self.frequency[:, self.own_pose].transpose(0, 1).flatten(1)
+        logits = logits + frequency[reading.frame.symmetry]
         return logits.masked_fill(self.look_class != label.unsqueeze(-1), -torch.inf)
 
     def details(
@@ -186,19 +185,15 @@ class RoomSampler(nn.Module):
         known = torch.cat([self._known(reading, label, look), lengths], dim=-1)
         footprints = reading.before.boxes_m[..., [0, 2, 3, 5]]
         return self.placement(
-            self.place_query(known), size_m[:, ::2], reading.rectangle_m,
+            self.place_query(known), size_m[:, ::2], reading.frame.rectangle_m,
             reading.objects, footprints, reading.before.is_object,
         )  # fmt: skip
 
     def log_prob(self, reading: "Reading", coming: RoomBoxes) -> dict[str, Float[Tensor, " rooms"]]:
-        """Log-probability of each room's next object, part by part; only of the class where that
-        is `END`. Rooms of `coming` have one object, or none."""
-        label = coming.object_class[:, 0]
-        found = {"class": -F.cross_entropy(self.class_logits(reading), label, reduction="none")}
-        more = label != END
-        reading, label, coming = reading.rows(more), label[more], coming.changed(lambda p: p[more])
+        """Log-probability of each room's next object given its class, part by part. Every room of
+        `coming` has one object."""
         assert coming.looks is not None
-        look = coming.looks[:, 0]
+        label, look = coming.object_class[:, 0], coming.looks[:, 0]
         centre_m, size_m = coming.boxes_m[:, 0].split(3, dim=-1)
         bottom_m = centre_m[:, 1] - size_m[:, 1] / 2
         looks = self.look_logits(reading, label).log_softmax(dim=-1)
@@ -206,13 +201,11 @@ class RoomSampler(nn.Module):
             [size_m.log() - self.look_shown[look, -3:], bottom_m.unsqueeze(-1)], dim=-1
         )
         place = self.place(reading, label, look, size_m, bottom_m)
-        parts = {
+        return {
             "look": looks.gather(-1, look.unsqueeze(-1))[:, 0],
             "size": self.details(reading, label, look).log_prob(details),
             "place": place.log_prob(centre_m[:, ::2]),
         }
-        nothing = found["class"].new_zeros(len(more))
-        return found | {name: nothing.index_put((more,), part) for name, part in parts.items()}
 
     def _known(
         self, reading: "Reading", label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
@@ -221,12 +214,29 @@ class RoomSampler(nn.Module):
         return torch.cat([reading.context, self.class_embedding(label), look_seen], dim=-1)
 
 
+class Frame(NamedTuple):
+    """What is known of rooms before they have any furniture."""
+
+    rectangle_m: Float[Tensor, "rooms 4"]
+    """What furniture may fill: centre x, z and extents x, z."""
+    symmetry: Int[Tensor, " rooms"]
+    """In which of its `SYMMETRIES` each room is shown; 0 as it is."""
+
+    @classmethod
+    def plain(cls, rectangle_m: Float[Tensor, "rooms 4"]) -> "Frame":
+        """Of rooms as they are."""
+        return cls(rectangle_m, rectangle_m.new_zeros(len(rectangle_m), dtype=torch.int64))
+
+    def rows(self, chosen: Tensor) -> "Frame":
+        """Of some of the rooms."""
+        return Frame(self.rectangle_m[chosen], self.symmetry[chosen])
+
+
 class Reading(NamedTuple):
     """What the encoder makes of rooms as far as they are furnished."""
 
     before: RoomBoxes
-    rectangle_m: Float[Tensor, "rooms 4"]
-    summary: Float[Tensor, "rooms summary"]
+    frame: Frame
     context: Float[Tensor, "rooms width"]
     """Of the query: what the set means for the next object."""
     objects: Float[Tensor, "rooms objects width"]
@@ -234,8 +244,8 @@ class Reading(NamedTuple):
 
     def rows(self, chosen: Tensor) -> "Reading":
         """Of some of the rooms."""
-        rest = (part[chosen] for part in self[1:])
-        return Reading(self.before.changed(lambda part: part[chosen]), *rest)
+        before = self.before.changed(lambda part: part[chosen])
+        return Reading(before, self.frame.rows(chosen), self.context[chosen], self.objects[chosen])
 
 
 def lengths_shown(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch shown"]:
@@ -247,3 +257,11 @@ def lengths_shown(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "
 
 def _head(inputs: int, width: int, outputs: int) -> nn.Sequential:
     return mlp(nn.Linear(inputs, width), nn.Linear(width, outputs))
+
+
+def own_poses() -> Int[Tensor, "symmetries poses"]:
+    """In which pose a look stands in the room as it is, by the symmetry in which the room is shown
+    and the pose in which the look is then."""
+    symmetry = torch.arange(SYMMETRIES)
+    own = torch.arange(POSES).expand(SYMMETRIES, -1)
+    return turned_looks(own, symmetry % QUARTERS, symmetry >= QUARTERS).argsort(dim=1)

@@ -8,8 +8,10 @@ from sceneprior.models.layers import mlp
 from sceneprior.sampler.mixtures import LogisticMixture
 
 EDGES = 2
-"""Logistics of each of the nine places that a rectangle knows: along x and along z at either side,
-or in the middle."""
+"""Logistics of each place that a room knows."""
+KNOWN = 4
+"""Places along an axis: at either side of the rectangle, in its middle, and where the floor's
+middle is, the origin. A room knows their pairs."""
 BESIDE = 6
 """Logistics of each object that something may stand in relation to."""
 
@@ -17,8 +19,9 @@ BESIDE = 6
 class Placement(nn.Module):
     """The distribution of a footprint's centre (x, z).
 
-    A mixture of logistics. Some have their means at a place of the room's rectangle: flush with a
-    side or in the middle, along x and along z. The others, of each object that stands already, at
+    A mixture of logistics. Some have their means at a place that the room knows: along x and along
+    z flush with a side of the rectangle, in its middle, or in the middle of the floor. The others,
+    of each object that stands already, at
 
         its centre + a * half the sum of both sizes + b * half their difference + c,
 
@@ -31,7 +34,7 @@ class Placement(nn.Module):
         self.from_query = nn.Linear(width, width)
         self.from_object = nn.Linear(width, width)
         # log-weight, then shift and log-scale of x and z
-        self.of_rectangle = mlp(nn.Linear(width, width), nn.Linear(width, 9 * EDGES * 5))
+        self.of_rectangle = mlp(nn.Linear(width, width), nn.Linear(width, KNOWN**2 * EDGES * 5))
         # log-weight, then a, b, c and log-scale of x and z
         self.of_object = mlp(nn.Linear(width, width), nn.Linear(width, BESIDE * 9))
 
@@ -48,10 +51,13 @@ class Placement(nn.Module):
         objects of features `objects` and footprints `boxes_m`, which are like `rectangle_m`."""
         own = self.from_query(query)
         free = ((rectangle_m[:, 2:] - size_m) / 2).clamp(min=0)
-        steps = torch.cartesian_prod(*[torch.arange(-1, 2, device=query.device)] * 2).to(query)
-        edges = self.of_rectangle(torch.relu(own)).unflatten(-1, (9, EDGES, 5))
-        known = rectangle_m[:, None, None, :2] + (steps * free[:, None])[:, :, None]
-        at_edges = (edges[..., 0], known + edges[..., 1:3], edges[..., 3:])
+        middle = rectangle_m[:, :2]
+        known = torch.stack([middle - free, middle, middle + free, torch.zeros_like(free)], dim=1)
+        x, z = known.unbind(dim=-1)
+        pairs = [x.repeat_interleave(KNOWN, dim=1), z.repeat(1, KNOWN)]
+        edges = self.of_rectangle(torch.relu(own)).unflatten(-1, (KNOWN**2, EDGES, 5))
+        means = torch.stack(pairs, dim=-1).unsqueeze(2) + edges[..., 1:3]
+        at_edges = (edges[..., 0], means, edges[..., 3:])
 
         pair = torch.relu(own.unsqueeze(1) + self.from_object(objects))
         weight, a, b, c, scale = (

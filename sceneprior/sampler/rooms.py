@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -15,6 +15,10 @@ from sceneprior.views import RoomBoxes
 
 GRAZE_M = 0.05
 """Lifted boxes that share no more than this along some axis may do so for want of accuracy."""
+SYMMETRIES = 2 * QUARTERS
+"""Of a room: mirrored or not, and turned by quarters; 0 is the room as it is."""
+LOOSELY = 2.0
+"""See `large_first`."""
 FRAME_M = 0.15
 """See `frames_of`."""
 PLAUSIBLE_SHARE = 0.2
@@ -143,12 +147,11 @@ def rectangle_sides(
     return middle - extents / 2, middle + extents / 2
 
 
-def turned_rooms(rooms: RoomBoxes, generator: torch.Generator) -> RoomBoxes:
-    """Every room in one of its eight symmetries: mirrored or not, and turned by quarters."""
+def turned_rooms(rooms: RoomBoxes, symmetry: Int[Tensor, " rooms"]) -> RoomBoxes:
+    """Every room in one of its `SYMMETRIES`: from the fifth on mirrored, then turned by as many
+    quarters as the remainder says."""
     assert rooms.looks is not None
-    device = rooms.boxes_m.device
-    quarters = torch.randint(QUARTERS, (len(rooms.boxes_m),), generator=generator).to(device)
-    mirrored = (torch.rand(len(rooms.boxes_m), generator=generator) < 0.5).to(device)
+    quarters, mirrored = symmetry % QUARTERS, symmetry >= QUARTERS
     return replace(
         rooms,
         boxes_m=turn_boxes(rooms.boxes_m, quarters, mirrored),
@@ -160,3 +163,18 @@ def shuffled(rooms: RoomBoxes, generator: torch.Generator) -> RoomBoxes:
     """Every room's objects in a random order, followed by its padding."""
     tickets = torch.rand(rooms.is_object.shape, generator=generator).to(rooms.boxes_m.device)
     return rooms.take(tickets.masked_fill(~rooms.is_object, 2.0).argsort(dim=1))
+
+
+def large_first(
+    object_class: Int[Tensor, "rooms objects"],
+    footprints_m2: Float[Tensor, " classes"],
+    uniform: Float[Tensor, "rooms objects"],
+) -> Int[Tensor, "rooms objects"]:
+    """An order in which what is usually large tends to come first, of uniform numbers; padding
+    comes last.
+
+    Tends to: a class overtakes one that fills up to exp(`LOOSELY`) times as much of the floor now
+    and then, so that the network also knows rooms of which small things are given.
+    """
+    tickets = LOOSELY * uniform - footprints_m2.log()[object_class]
+    return tickets.masked_fill(object_class == 0, torch.inf).argsort(dim=1)

@@ -60,16 +60,16 @@ def test_before_its_stage_rooms_come_from_latents(trained):
 
 def test_answers_hold_what_is_given_exactly_and_differ(trained):
     given = scene(BED)
-    (answers,) = complete(trained, [given], count=3, seed=1)
-    assert [answer.latent for answer in answers] == [None] * 3
+    (answers,) = complete(trained, [given], count=9, seed=1)
+    assert [answer.latent for answer in answers] == [None] * 9
     for answer in answers:
         first = answer.objects[0]
         assert (first.label, first.center_m, first.size_m) == (BED.label, BED.center_m, BED.size_m)
         assert first.mesh is not None  # of the look that was recognised
         assert answer.extra["given"] == [0]
     places = {tuple(answer.centers_m.round(3).ravel()) for answer in answers}
-    assert len(places) == 3
-    (again,) = complete(trained, [given], count=3, seed=1)
+    assert len(places) > 3
+    (again,) = complete(trained, [given], count=9, seed=1)
     assert places == {tuple(answer.centers_m.round(3).ravel()) for answer in again}
 
 

@@ -7,10 +7,20 @@ import torch
 from rooms_of_boxes import sampler_rooms, small_sampler
 from torch.testing import assert_close
 
+from sceneprior.geometry.turns import QUARTERS
+from sceneprior.models.prototypes import turned_looks
+from sceneprior.sampler.contents import END
 from sceneprior.sampler.likelihood import negative_log_likelihood
-from sceneprior.sampler.network import END, Reading
-from sceneprior.sampler.placement import Placement
-from sceneprior.sampler.rooms import SamplerRooms, frames_of, rectangles_of, shuffled
+from sceneprior.sampler.network import Frame
+from sceneprior.sampler.placement import BESIDE, EDGES, KNOWN, Placement
+from sceneprior.sampler.rooms import (
+    SYMMETRIES,
+    SamplerRooms,
+    frames_of,
+    large_first,
+    rectangles_of,
+    shuffled,
+)
 from sceneprior.views import RoomBoxes
 
 
@@ -28,8 +38,15 @@ def in_float64(rooms: RoomBoxes) -> RoomBoxes:
     return rooms.changed(lambda part: part.double() if part.is_floating_point() else part)
 
 
-def read(sampler, rooms: RoomBoxes, rectangle_m: torch.Tensor) -> Reading:
-    return sampler.read(rooms, rectangle_m, sampler.tokens(rooms, rectangle_m))
+def as_they_are(rooms: RoomBoxes) -> torch.Tensor:
+    return torch.zeros(len(rooms.boxes_m), dtype=torch.int64)
+
+
+def read(sampler, rooms: RoomBoxes, rectangle_m: torch.Tensor, coming=None, symmetry=None):
+    if coming is None:
+        coming = torch.zeros(len(rooms.boxes_m), len(sampler.may_meet)).double()
+    frame = Frame(rectangle_m, as_they_are(rooms) if symmetry is None else symmetry)
+    return sampler.read(rooms, coming, frame, sampler.tokens(rooms, rectangle_m))
 
 
 def test_order_and_padding_change_nothing(sampler, rooms):
@@ -46,34 +63,75 @@ def test_order_and_padding_change_nothing(sampler, rooms):
     assert torch.equal(read(sampler, filled, frame).context, plain.context)
 
 
+@torch.no_grad()
 def test_likelihoods_are_those_of_one_object_after_the_other(sampler, rooms):
     whole = in_float64(rooms.rooms)
-    fast = negative_log_likelihood(sampler, whole, torch.Generator().manual_seed(4))
+    symmetry = torch.arange(len(whole.boxes_m))
+    fast = negative_log_likelihood(sampler, whole, symmetry, torch.Generator().manual_seed(4))
     generator = torch.Generator().manual_seed(4)
-    mixed = shuffled(whole, generator)
+    listed = shuffled(whole, generator)
+    uniform = torch.rand(whole.is_object.shape, generator=generator).double()
+    mixed = whole.take(large_first(whole.object_class, sampler.footprints_m2, uniform))
     frames = frames_of(mixed, generator)
+    classes = len(sampler.may_meet)
     for row in range(len(whole.boxes_m)):
         one = mixed.changed(lambda part, row=row: part[row : row + 1])
         frame, count = frames[row : row + 1], int(one.is_object.sum())
         slow = dict.fromkeys(fast, 0.0)
         for step in range(count + 1):
+            labels = [*listed.object_class[row, :count].tolist(), END]
+            counts = torch.tensor(labels[:step], dtype=torch.int64).bincount(minlength=classes)
+            logits = sampler.contents(counts[None].double(), frame[:, 2:]).log_softmax(dim=-1)
+            slow["class"] -= float(logits[0, labels[step]])
+        for step in range(count):
+            rest = one.object_class[0, step:count]
             before = one.changed(lambda part, step=step: part[:, :step])
-            coming = one.changed(
-                lambda part, step=step, n=count: part[:, min(step, n - 1)][:, None]
-            )
-            coming = coming.only(torch.tensor([[step < count]]))
-            found = sampler.log_prob(read(sampler, before, frame), coming)
-            slow = {name: slow[name] - float(found[name]) for name in slow}
+            following = one.changed(lambda part, step=step: part[:, step : step + 1])
+            coming = rest.bincount(minlength=classes)[None].double()
+            reading = read(sampler, before, frame, coming, symmetry[row : row + 1])
+            for name, value in sampler.log_prob(reading, following).items():
+                slow[name] -= float(value)
         for name, value in slow.items():
             assert value == pytest.approx(float(fast[name][row]), rel=1e-9), name
 
 
-def test_the_end_of_a_room_has_a_class_and_nothing_else(sampler, rooms):
-    whole = in_float64(rooms.rooms)
-    nothing = whole.changed(lambda part: part[:, :1]).only(torch.zeros(len(rooms), 1).bool())
-    found = sampler.log_prob(read(sampler, whole, rectangles_of(whole)), nothing)
-    assert (found["class"] < 0).all()
+def test_rooms_without_objects_hold_nothing_and_are_likely_for_it(sampler, rooms):
+    nothing = in_float64(rooms.rooms).only(torch.zeros(len(rooms), 1).bool())
+    found = negative_log_likelihood(
+        sampler, nothing, as_they_are(nothing), torch.Generator().manual_seed(0)
+    )
+    assert (found["class"] > 0).all()
     assert not any(found[name].any() for name in ("look", "size", "place"))
+
+
+def test_how_often_a_look_comes_turns_with_the_room(sampler, rooms):
+    """A look that is likely in a room as it is, is as likely turned where the room is turned."""
+    whole = in_float64(rooms.rooms).changed(lambda part: part[:1])
+    frame = rectangles_of(whole)
+    plain = read(sampler, whole, frame)
+    label = torch.tensor([1])
+    before = sampler.look_logits(plain, label)
+    with torch.no_grad():
+        sampler.frequency[0, 2] += 3.0
+    try:
+        for number in range(SYMMETRIES):
+            shown = torch.tensor([number])
+            reading = plain._replace(frame=Frame(frame, shown))
+            gain = sampler.look_logits(reading, label) - before
+            at = turned_looks(torch.tensor([[2]]), shown % QUARTERS, shown >= QUARTERS)
+            likelier = (gain > 1.5) & before.isfinite()
+            assert likelier.nonzero()[:, 1].tolist() == at[0].tolist()
+    finally:
+        with torch.no_grad():
+            sampler.frequency[0, 2] -= 3.0
+
+
+def test_the_network_knows_what_is_to_come(sampler, rooms):
+    whole = in_float64(rooms.rooms)
+    coming = torch.eye(len(sampler.may_meet)).double()[1].expand(len(rooms), -1)
+    frame = rectangles_of(whole)
+    alone, more = read(sampler, whole, frame).context, read(sampler, whole, frame, coming).context
+    assert not torch.isclose(alone, more).all(dim=-1).any()
 
 
 def test_looks_of_other_classes_are_ruled_out(sampler, rooms):
@@ -105,11 +163,13 @@ class _Likelihood(torch.nn.Module):
         self.sampler = copy.deepcopy(sampler)
 
     def forward(self, rooms: RoomBoxes) -> dict[str, torch.Tensor]:
-        return negative_log_likelihood(self.sampler, rooms, torch.Generator().manual_seed(0))
+        generator = torch.Generator().manual_seed(0)
+        return negative_log_likelihood(self.sampler, rooms, as_they_are(rooms), generator)
 
 
 def test_places_move_with_the_room():
-    """A rectangle and objects that move by a metre move the places; nothing else does."""
+    """A rectangle and objects that move by a metre move the places, but for those at the middle of
+    the floor; nothing else does."""
     torch.manual_seed(0)
     placement = Placement(8).double()
     rng = torch.Generator().manual_seed(1)
@@ -121,20 +181,28 @@ def test_places_move_with_the_room():
     before = placement(query, size_m, frame, objects, boxes_m, here)
     by = torch.tensor([1.0, -2.0, 0.0, 0.0]).double()
     after = placement(query, size_m, frame + by, objects, boxes_m + by, here)
-    assert_close(after.means, before.means + by[:2])
+    at_floor = torch.arange(KNOWN) == KNOWN - 1
+    x = ~at_floor.repeat_interleave(KNOWN * EDGES)
+    z = ~at_floor.repeat_interleave(EDGES).repeat(KNOWN)
+    beside = torch.ones(2 * BESIDE, dtype=torch.bool)
+    moves = torch.stack([torch.cat([x, beside]), torch.cat([z, beside])], dim=-1)
+    assert_close(after.means, before.means + by[:2] * moves)
     assert torch.equal(after.weight_logits, before.weight_logits)
-    assert before.weight_logits[2].isfinite().sum() == before.weight_logits[2, :18].numel()
+    assert before.weight_logits[2].isfinite().sum() == KNOWN**2 * EDGES
 
 
 def test_an_object_larger_than_the_rectangle_stands_in_its_middle():
     placement = Placement(8)
     nothing = torch.zeros(1, 0, 8), torch.zeros(1, 0, 4), torch.zeros(1, 0, dtype=torch.bool)
     frame = torch.tensor([[1.0, 2.0, 0.5, 0.5]])
+    # Along either axis three places of the rectangle, and the floor's middle.
+    middles = torch.cartesian_prod(torch.tensor([1.0, 1, 1, 0]), torch.tensor([2.0, 2, 2, 0]))
+    middles = middles.unsqueeze(1)
     for name, weight in placement.named_parameters():
         if name.startswith("of_rectangle.2"):
             torch.nn.init.zeros_(weight)
     found = placement(torch.randn(1, 8), torch.full((1, 2), 3.0), frame, *nothing)
-    assert_close(found.means, torch.tensor([1.0, 2.0]).expand(1, 18, 2))
+    assert_close(found.means, middles.expand(1, -1, EDGES, 2).flatten(1, 2))
 
 
 def test_void_ends_a_room(sampler):

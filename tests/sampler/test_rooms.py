@@ -1,5 +1,7 @@
 """What the sampler learns from: sets of lifted objects, turned and mirrored exactly."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -9,8 +11,11 @@ from torch.testing import assert_close
 from sceneprior.lifting.dataset import LiftedDataset
 from sceneprior.sampler.rooms import (
     FRAME_M,
+    LOOSELY,
+    SYMMETRIES,
     SamplerRooms,
     frames_of,
+    large_first,
     rectangle_sides,
     rectangles_of,
     shared_extents,
@@ -80,10 +85,9 @@ def test_boxes_share_what_they_do_along_each_axis():
 
 def test_symmetries_move_boxes_looks_and_rectangles_together(rooms):
     batch = rooms.rooms
-    generator = torch.Generator().manual_seed(0)
     seen = set()
-    for _ in range(40):
-        turned = turned_rooms(batch, generator)
+    for number in range(SYMMETRIES):
+        turned = turned_rooms(batch, torch.full((len(rooms),), number))
         assert torch.equal(turned.object_class, batch.object_class)
         sizes = batch.boxes_m[..., 3:].sort(dim=-1).values
         assert torch.equal(turned.boxes_m[..., 3:].sort(dim=-1).values, sizes)
@@ -91,8 +95,10 @@ def test_symmetries_move_boxes_looks_and_rectangles_together(rooms):
         shown = torch.from_numpy(rooms.prototypes.shown())[turned.looks][..., -3:]
         off = (shown.exp() - turned.boxes_m[..., 3:]).abs() / turned.boxes_m[..., 3:]
         assert off[turned.is_object].max() < 0.1
+        same = torch.equal(turned.boxes_m, batch.boxes_m) and torch.equal(turned.looks, batch.looks)
+        assert same == (number == 0)
         seen.add(int(turned.looks[0, 0] % 8))
-    assert len(seen) > 4
+    assert len(seen) == SYMMETRIES
 
 
 def test_shuffling_keeps_the_set_and_puts_padding_last(rooms):
@@ -134,3 +140,16 @@ def test_rooms_are_drawn_of_common_prototypes_alone(rooms):
     seen = sampler_rooms().see_looks(prototypes)
     assert seen.prototypes.object_class.tolist()[1:] == [-1] * (len(prototypes.grids) - 1)
     assert seen.rooms.is_object.any() and (seen.rooms.looks[seen.rooms.is_object] < 8).all()
+
+
+def test_what_is_large_tends_to_come_first_and_padding_comes_last():
+    footprints_m2 = torch.tensor([1.0, 4.0, 1.0, 0.5 / math.exp(LOOSELY)])
+    labels = torch.tensor([[3, 2, 1, 0, 2]]).expand(4000, -1)
+    uniform = torch.rand(labels.shape, generator=torch.Generator().manual_seed(0))
+    ordered = labels.gather(1, large_first(labels, footprints_m2, uniform))
+    assert (ordered[:, 4] == 0).all() and (ordered[:, 3] == 3).all()
+    first = (ordered[:, 0] == 1).float().mean()
+    assert 0.5 < first < 1, "four times as large: mostly"
+    same = torch.tensor([[1, 1]]).expand(4000, -1)
+    swapped = large_first(same, footprints_m2, uniform[:, :2])[:, 0].float().mean()
+    assert abs(swapped - 0.5) < 0.05

@@ -40,8 +40,9 @@ def test_rooms_become_likelier():
     stage = stage_of(rooms, None, epochs=40, learning_rate=5e-3)
 
     def unlikely() -> float:
+        plain = torch.zeros(len(rooms), dtype=torch.int64)
         parts = negative_log_likelihood(
-            stage.sampler, rooms.rooms, torch.Generator().manual_seed(0)
+            stage.sampler, rooms.rooms, plain, torch.Generator().manual_seed(0)
         )
         return float(torch.stack(list(parts.values())).sum(dim=0).mean())
 
