@@ -27,11 +27,11 @@ class Contents(nn.Module):
     """
 
     known: Tensor
-    """Which classes may come, and `END`."""
+    """Which classes may come, `END` among them: found from the training rooms."""
 
     def __init__(self, classes: int, width: int, dropout: float):
         super().__init__()
-        self.register_buffer("known", torch.arange(classes) == END)
+        self.register_buffer("known", torch.zeros(classes, dtype=torch.bool))
         self.layers = nn.Sequential(
             nn.Linear((1 + MANY) * classes + 3, width), nn.ReLU(), nn.Dropout(dropout),
             nn.Linear(width, width), nn.ReLU(), nn.Dropout(dropout),

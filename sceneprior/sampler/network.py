@@ -33,6 +33,16 @@ MATCH_WIDTH = 64
 """Width in which looks are compared with what is wanted."""
 
 
+def _own_pose() -> Int[Tensor, "symmetries poses"]:
+    symmetry, own = torch.arange(SYMMETRIES), torch.arange(POSES).expand(SYMMETRIES, -1)
+    return turned_looks(own, symmetry % QUARTERS, symmetry >= QUARTERS).argsort(dim=1)
+
+
+OWN_POSE = _own_pose()
+"""In which pose a look stands in the room as it is, by the symmetry in which the room is shown and
+the pose in which the look is then."""
+
+
 class RoomSampler(nn.Module):
     """What a room holds (`Contents`); then its objects one after the other, each given the set of
     those before it, whatever their order, and the classes of those still to come.
@@ -60,7 +70,6 @@ class RoomSampler(nn.Module):
     rectangle_factors: Tensor
     may_meet: Tensor
     footprints_m2: Tensor
-    own_pose: Tensor
 
     def __init__(self, settings: SamplerConfig, classes: int, prototypes: int, max_objects: int):
         super().__init__()
@@ -75,7 +84,6 @@ class RoomSampler(nn.Module):
         self.register_buffer("rectangle_factors", torch.zeros(RECTANGLES, 4, 4))
         self.register_buffer("may_meet", torch.zeros(classes, classes, dtype=torch.bool))
         self.register_buffer("footprints_m2", torch.ones(classes))
-        self.register_buffer("own_pose", own_poses(), persistent=False)
         self.contents = Contents(classes, width // 2, min(2 * dropout, 0.5))
         self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
         self.look_embedding = nn.Linear(SHOWN, width)
@@ -162,7 +170,8 @@ class RoomSampler(nn.Module):
         known = torch.cat([reading.context, self.class_embedding(label)], dim=-1)
         offered = self.offered_look(self.look_shown)
         logits = self.wanted_look(known) @ offered.T / math.sqrt(MATCH_WIDTH)
-        frequency = self.frequency[:, self.own_pose].transpose(0, 1).flatten(1)
+        own_pose = OWN_POSE.to(self.frequency.device)
+        frequency = self.frequency[:, own_pose].transpose(0, 1).flatten(1)
         logits = logits + frequency[reading.frame.symmetry]
         return logits.masked_fill(self.look_class != label.unsqueeze(-1), -torch.inf)
 
@@ -257,11 +266,3 @@ def lengths_shown(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "
 
 def _head(inputs: int, width: int, outputs: int) -> nn.Sequential:
     return mlp(nn.Linear(inputs, width), nn.Linear(width, outputs))
-
-
-def own_poses() -> Int[Tensor, "symmetries poses"]:
-    """In which pose a look stands in the room as it is, by the symmetry in which the room is shown
-    and the pose in which the look is then."""
-    symmetry = torch.arange(SYMMETRIES)
-    own = torch.arange(POSES).expand(SYMMETRIES, -1)
-    return turned_looks(own, symmetry % QUARTERS, symmetry >= QUARTERS).argsort(dim=1)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from sceneprior.losses.averages import share_of_batch
 from sceneprior.models.prior import ScenePrior
 from sceneprior.models.prototypes import POSES
+from sceneprior.sampler.contents import END
 from sceneprior.sampler.likelihood import negative_log_likelihood
 from sceneprior.sampler.network import RECTANGLES, RoomSampler
 from sceneprior.sampler.rooms import SYMMETRIES, SamplerRooms, frames_of, turned_rooms
@@ -134,6 +135,7 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     labels = torch.from_numpy(prototypes.object_class)
     sampler.look_class[: len(looks)] = labels.repeat_interleave(POSES)
     sampler.contents.known[labels[labels >= 0]] = True
+    sampler.contents.known[END] = True
     sampler.may_meet.copy_(rooms.may_meet(len(sampler.may_meet)))
     here = rooms.rooms.is_object
     areas_m2 = rooms.rooms.boxes_m[here][:, [3, 5]].prod(dim=-1)

@@ -13,7 +13,7 @@ CLASSES, SLOTS = 5, 4
 def contents(torch_rng) -> Contents:
     """Of four classes, of which one is unknown."""
     found = Contents(CLASSES, 16, 0.0).eval()
-    found.known[[1, 2, 4]] = True
+    found.known[[END, 1, 2, 4]] = True
     return found
 
 
