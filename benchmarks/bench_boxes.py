@@ -1,8 +1,8 @@
-"""Time 2D boxes of ellipsoids: in closed form against the authors' 2,562 projected vertices.
+"""Time of 2D boxes of ellipsoids: closed form against the authors' 2,562 projected vertices.
 
 Run `python benchmarks/bench_boxes.py`. A step is forward and backward, on the CPU, of a batch of
-the layout stage: 128 rooms (32 with 2,562 vertices: more need 6 GB), 13 objects, 20 views. The two
-take turns, so that whatever else the machine does meets both; the figure is the median.
+the layout stage: 128 rooms (32 with 2,562 vertices, since more need 6 GB), 13 objects, 20 views.
+The two variants take turns, so that other load on the machine affects both; values are medians.
 """
 
 import os
@@ -15,15 +15,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sceneprior.geometry.cameras import Boxes2D, boxes_of_points
-from sceneprior.geometry.ellipsoids import boxes_of_ellipsoids
-from sceneprior.geometry.meshes import icosphere, place
+from sceneprior.core.geometry.cameras import Boxes2D, boxes_of_points
+from sceneprior.core.geometry.ellipsoids import boxes_of_ellipsoids
+from sceneprior.core.geometry.meshes import icosphere, place
 
 SIZE = (480, 640)
 
 
 def make_batch(rooms: int, views: int, objects: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Centres, sizes and cameras inside of 5 m rooms: some objects are behind, some are cut."""
+    """Centres, sizes, poses and intrinsics in 5 m rooms, with some objects behind the camera."""
     generator = torch.Generator().manual_seed(0)
     centers = torch.rand(rooms, objects, 3, generator=generator) * 5 - 2.5
     sizes = torch.rand(rooms, objects, 3, generator=generator) * 1.5 + 0.2
@@ -45,13 +45,13 @@ def boxes_ratio(
     level: int = 4,
     threads: int | None = None,
 ) -> dict[str, float]:
-    """Median seconds of a step in closed form and with an icosphere, and how many times as fast.
+    """Median seconds of a step in closed form and with an icosphere, and their ratio.
 
     Args:
-        repeats: Steps of each; one more warms up.
-        rooms, views, objects: Of the batch.
-        level: Of the icosphere; 4 is the authors'.
-        threads: For torch; None leaves what it has.
+        repeats: Timed steps of each variant, after one warm-up step.
+        rooms, views, objects: Size of the batch.
+        level: Level of the icosphere; 4 is the authors'.
+        threads: Number of torch threads; None keeps the current number.
 
     Returns:
         `closed_s`, `points_s` and `ratio` = points_s / closed_s.
@@ -86,14 +86,14 @@ def _boxes_ratio(
     for repeat in range(repeats + 1):
         for name, boxes_of in (("closed", closed), ("points", points)):
             spent = seconds(boxes_of)
-            if repeat:  # the first turn warms up
+            if repeat:  # the first repeat warms up
                 times[name].append(spent)
     closed_s, points_s = (statistics.median(times[name]) for name in ("closed", "points"))
     return {"closed_s": closed_s, "points_s": points_s, "ratio": points_s / closed_s}
 
 
 def processor() -> str:
-    """The CPU's own name where Linux tells it."""
+    """Number of cores and CPU model, on Linux."""
     path = Path("/proc/cpuinfo")
     lines = path.read_text().splitlines() if path.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -1,8 +1,7 @@
-"""Time the evaluation of rooms: synthesize, draw, read, score; where the seconds go.
+"""Time of evaluating rooms: synthesis and scoring, with and without a reference file.
 
-Run `python benchmarks/bench_evaluation.py --run RUN [--shards SHARDS] [-n 1000]`. CPU seconds
-of all threads are stated beside wall-clock seconds: on a busy machine only the former mean
-something.
+Run `python benchmarks/bench_evaluation.py --run RUN [--shards SHARDS] [-n 1000]`. Both CPU seconds
+of all threads and wall-clock seconds are listed; on a busy machine only the former are meaningful.
 """
 
 import argparse
@@ -16,16 +15,16 @@ from typing import Any, TypeVar
 from rich.console import Console
 from rich.table import Table
 
-from sceneprior.config import load_run
+from sceneprior.apps.config import load_run
+from sceneprior.apps.sample import sample_rooms
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
-from sceneprior.generation.decode import synthesize
-from sceneprior.offscreen import open_renderer
+from sceneprior.render.offscreen import open_renderer
 
 T = TypeVar("T")
 
 
 def measure(work: Callable[[], T]) -> tuple[T, dict[str, float]]:
-    """The result, and seconds of this process's threads and of the clock."""
+    """Run `work`; returns its result, and CPU and wall-clock seconds."""
     cpu, wall = time.process_time(), time.perf_counter()
     result = work()
     return result, {
@@ -39,7 +38,7 @@ def time_evaluation(run: Path, shards: Path | None, count: int, renderer: str) -
 
     Returns:
         `synthesize`, `score`, `write_reference` (its first use), `score_with_reference` and
-        `without_intervals`, each with `cpu_s` and `wall_s`; printed as they come, too.
+        `without_intervals`, each with `cpu_s` and `wall_s`; they are also printed as measured.
     """
     seconds: dict[str, Any] = {}
 
@@ -50,7 +49,7 @@ def time_evaluation(run: Path, shards: Path | None, count: int, renderer: str) -
 
     trained = timed("load", lambda: load_run(run))
     folder = shards or Path(trained.config.data.shards)
-    scenes = timed("synthesize", lambda: synthesize(trained, count, seed=0))
+    scenes = timed("synthesize", lambda: sample_rooms(trained, count, seed=0))
     screen = open_renderer(renderer)
 
     def score(name: str, **options: Any) -> None:
@@ -71,7 +70,7 @@ def time_evaluation(run: Path, shards: Path | None, count: int, renderer: str) -
 
 
 def main() -> None:
-    """Print the table, and write it as JSON where asked."""
+    """Print the table, and write it as JSON if `--json` is given."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, required=True)
     parser.add_argument("--shards", type=Path)

@@ -1,13 +1,14 @@
-"""Time a training step of the layout stage: as it is here, and as the authors do it.
+"""Time of a training step of the layout stage, in this package and in the authors' way.
 
-Run `python benchmarks/bench_layout_step.py`. Forward, losses, backward and Adam at the paper's
-size (configs/bedroom.yaml: width 512, 13 objects, 22 classes; 128 rooms of 20 views) on the CPU.
+Run `python benchmarks/bench_layout_step.py`. A step is forward, losses, backward and Adam at the
+paper's size (configs/paper/bedroom.yaml: width 512, 13 objects, 22 classes; 128 rooms of 20 views)
+on the CPU.
 
-`theirs` projects the 2,562 vertices of an icosphere for every object and takes boxes, matching and
-losses room by room in a Python loop. Decoder, losses and optimiser are ours in both, which flatters
-it, and each room's backward pass runs at once, which saves it the memory of the others. The two
-take turns, so that whatever else the machine does meets both; figures are medians. Where others
-hold the cores, CPU time on one thread (OMP_NUM_THREADS=1) is the one to trust.
+`theirs` projects the 2,562 vertices of an icosphere for every object, and computes boxes, matching
+and losses room by room in a Python loop. Both variants use this package's decoder, losses and
+optimiser, and `theirs` runs the backward pass room by room, which saves memory; both choices are in
+its favour. The variants take turns, so that other load affects both; values are medians. On a busy
+machine, rely on CPU time with one thread (OMP_NUM_THREADS=1).
 """
 
 import argparse
@@ -25,20 +26,22 @@ import torch
 from bench_boxes import SIZE, make_batch
 from torch import Tensor
 
-from sceneprior.config import OursConfig, load_config
-from sceneprior.geometry.cameras import MIN_DEPTH_M, Boxes2D, project
-from sceneprior.geometry.meshes import icosphere, place
-from sceneprior.models.prior import ScenePrior
-from sceneprior.training.objective import match_and_score, proxy_boxes, weighted_sum
-from sceneprior.views import DecodedScenes, SceneViews
+from sceneprior.apps.config import load_config
+from sceneprior.core.geometry.cameras import MIN_DEPTH_M, Boxes2D, project
+from sceneprior.core.geometry.meshes import icosphere, place
+from sceneprior.core.views import DecodedScenes, SceneViews
+from sceneprior.paper.config import PaperConfig
+from sceneprior.paper.prior import ScenePrior
+from sceneprior.paper.view_loss import match_and_score, proxy_boxes
+from sceneprior.training.steps import weighted_sum
 
 CLASSES = 22
-CONFIG = Path(__file__).parents[1] / "configs" / "bedroom.yaml"
+CONFIG = Path(__file__).parents[1] / "configs" / "paper/bedroom.yaml"
 Batch = TypeVar("Batch", SceneViews, DecodedScenes)
 
 
 def make_views(rooms: int, views: int, objects: int) -> SceneViews:
-    """What the cameras see of rooms full of ellipsoids."""
+    """Synthetic observations: 2D boxes of random ellipsoids in all views."""
     centers, sizes, cameras, lens = make_batch(rooms, views, objects)
     with torch.no_grad():
         empty = DecodedScenes(
@@ -69,7 +72,7 @@ def room(batch: Batch, index: int) -> Batch:
     return replace(batch, **part)
 
 
-def our_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: OursConfig) -> None:
+def our_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: PaperConfig) -> None:
     scenes = prior.decode(z, with_shape=False)
     boxes = proxy_boxes(scenes, views, "ellipsoid")
     losses, _ = match_and_score(scenes, boxes, views, config.loss, "first_n")
@@ -77,7 +80,7 @@ def our_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: OursConfig
 
 
 def their_boxes(points_m: Tensor, views: SceneViews) -> Boxes2D:
-    """`boxes_of_points` with a graph through every point."""
+    """`boxes_of_points` with an autograd graph through every point."""
     height, width = views.image_size
     pixels = project(points_m, views.world_to_camera, views.intrinsics)
     size = pixels.new_tensor([width, height])
@@ -87,7 +90,7 @@ def their_boxes(points_m: Tensor, views: SceneViews) -> Boxes2D:
     return Boxes2D(torch.cat([low, high], dim=-1).clamp(0, 1), in_front & meets_image)
 
 
-def their_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: OursConfig) -> None:
+def their_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: PaperConfig) -> None:
     scenes = prior.decode(z, with_shape=False)
     names = ("class_logits", "centers_m", "sizes_m", "completeness_logits")
     outputs = [getattr(scenes, name) for name in names]
@@ -104,13 +107,13 @@ def their_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: OursConf
     torch.autograd.backward(outputs, [leaf.grad for leaf in leaves])
 
 
-Step = Callable[[ScenePrior, Tensor, SceneViews, OursConfig], None]
+Step = Callable[[ScenePrior, Tensor, SceneViews, PaperConfig], None]
 
 
 def step_ratio(rooms: int = 128, views: int = 20, repeats: int = 5) -> dict[str, float]:
-    """Median seconds of a step in both ways, by the clock and of CPU time, and their ratios."""
+    """Median wall-clock and CPU seconds of both variants, and their ratios."""
     config = load_config(str(CONFIG))
-    assert isinstance(config, OursConfig)
+    assert isinstance(config, PaperConfig)
     objects = config.model.max_objects
     batch = make_views(rooms, views, objects)
     prior = config.build_prior()

@@ -1,14 +1,14 @@
-"""What does preparing cost? CPU time of a view, workers, and memory of a long recording.
+"""Cost of data preparation: CPU time per view, scaling to workers, memory of a long recording.
 
     python benchmarks/bench_prepare.py [--only ids workers sens] [--rooms N] [--json FILE]
 
 - ids: CPU time (all threads of the process) of one view's instance ids at 480 x 360, in a room of
-  12 pieces with 5,120 faces each, 20 views a call, everything a call does included. Median of 9
-  calls; the renderers take turns.
-- workers: the same homes prepared by one worker and by two, wall clock, whole commands. It says
-  nothing where other programs hold the cores: the load average is printed.
-- sens: a `.sens` of 1,000 frames of 1296 x 968 (payloads as large as the release's) through
-  `prep-scannet`; peak memory of the whole process. Its scan is written by the tests' writer.
+  12 objects with 5,120 faces each, with 20 views per call; the median of 9 calls, in which the
+  renderers take turns.
+- workers: wall clock of preparing the same homes with one worker and with two, whole commands. It
+  is meaningless on a busy machine, so the load average is printed.
+- sens: peak memory of `prep-scannet` on a `.sens` of 1,000 frames of 1296 x 968, with payloads as
+  large as the release's. The scan is written by the tests' writer.
 """
 
 import argparse
@@ -28,10 +28,10 @@ from typing import Any
 
 import numpy as np
 
-from sceneprior.errors import InputError
-from sceneprior.geometry.meshes import icosphere
-from sceneprior.offscreen import Pinhole, open_renderer
-from sceneprior.scene import Mesh
+from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.core.scene import Mesh
+from sceneprior.render.offscreen import Pinhole, open_renderer
 
 SIZE = (360, 480)
 PIECES, VIEWS = 12, 20
@@ -48,7 +48,7 @@ def furnished_room() -> list[Mesh]:
 
 
 def looking_in(angle: float) -> Pinhole:
-    """A camera 2.6 m from the middle and 1.6 m up, 90 degrees wide."""
+    """A camera 2.6 m from the middle and 1.6 m up, with a field of view of 90 degrees."""
     eye = np.array([2.6 * np.cos(angle), 1.6, 2.6 * np.sin(angle)])
     forward = np.array([0, 0.6, 0]) - eye
     forward /= np.linalg.norm(forward)
@@ -64,7 +64,7 @@ def looking_in(angle: float) -> Pinhole:
 
 
 def ids(repeats: int = 9) -> dict[str, Any]:
-    """CPU milliseconds a view of each renderer, and how many of their pixels agree."""
+    """CPU milliseconds per view of each renderer, and the share of pixels that agree."""
     meshes = furnished_room()
     cameras = [looking_in(2 * np.pi * view / VIEWS) for view in range(VIEWS)]
     renderers = {}
@@ -95,8 +95,8 @@ def ids(repeats: int = 9) -> dict[str, Any]:
 def workers(rooms: int) -> dict[str, float]:
     """Seconds of `prep-front` with one worker and with two: wall clock and CPU.
 
-    CPU seconds bound what an idle machine of two cores would give. Starting two workers takes
-    3 s of CPU, so few rooms gain less.
+    The CPU seconds bound the speed-up on an idle machine with two cores. Starting two workers takes
+    3 s of CPU, so the speed-up is smaller with few rooms.
     """
     found: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as name:
@@ -157,20 +157,20 @@ def sens(
     return {"sens_file_mb": size / 1e6, "sens_peak_mb": peak, "sens_s": seconds}
 
 
-# Linux's ru_maxrss remembers the process that started a command, VmHWM does not.
+# On Linux, ru_maxrss includes the memory of the parent before `exec`; VmHWM does not.
 _CHILD = """
 import atexit, sys
 def say():
     lines = open("/proc/self/status").read().splitlines()
     print(next(line.split()[1] for line in lines if line.startswith("VmHWM")))
 atexit.register(say)
-from sceneprior.cli import main
+from sceneprior.apps.cli import main
 sys.exit(main())
 """
 
 
 def _sceneprior(*arguments: object) -> float:
-    """Run a command of the package; its peak memory in MB, without its worker processes."""
+    """Run a command of the package; returns its peak memory in MB, without worker processes."""
     words = [sys.executable, "-c", _CHILD, *map(str, arguments)]
     child = subprocess.run(words, capture_output=True, text=True, check=False)
     if child.returncode:

@@ -1,16 +1,15 @@
-"""What does a second training process bring? The paper's config by one process and by two (DDP).
+"""Speed-up by a second training process: the paper's config with one and with two processes (DDP).
 
     python benchmarks/bench_processes.py [--set KEY=VALUE ...] [--json FILE]
 
-Both stages, a few epochs by `fit` itself, one thread a process. Two processes share the batches of
-one (`batch_size` is halved), so that both take the same steps and end at the same weights; dropout,
-which each process draws for itself, is off. The runs take turns; ratios are of rooms a second in
-neighbouring runs, or of steps alone, and the median is the figure. Where other programs hold the
-cores, that says little: the CPU seconds of one process over those of each of two bound what idle
-cores would give. Beside them: bytes of gradients, which all processes add up at every step, and
-seconds of adding them up.
+Both stages are trained for a few epochs by `fit`, with one thread per process. Two processes share
+each batch (`batch_size` is halved), so that both variants take the same steps and end with the same
+weights; dropout, which differs between processes, is off. The variants take turns. Speed-ups are
+medians of the ratios of neighbouring runs, in rooms per second and in steps. On a busy machine the
+ratio of CPU seconds per process bounds the speed-up on idle cores. The bytes of gradients, which
+are summed over processes at every step, and the seconds of this all-reduce are listed too.
 
-With `--device cuda`, both processes share the one GPU, over gloo: NCCL wants a GPU for each.
+With `--device cuda`, both processes share one GPU by gloo, since NCCL needs one GPU per process.
 """
 
 import argparse
@@ -39,7 +38,7 @@ STAGES = ("layout", "shape")
 def compare(
     shards: Path, folder: Path, device: str, epochs: int, repeats: int, changes: tuple[str, ...]
 ) -> dict[str, dict[str, float]]:
-    """Figures of each stage; `folder` holds the runs."""
+    """Measurements of each stage; the runs are stored in `folder`."""
     runs: list[tuple[dict[str, Any], dict[str, Any]]] = []
     for repeat in range(repeats):
         one, two = (
@@ -69,7 +68,7 @@ def compare(
 
 
 def weights_off(one: Path, two: Path) -> float:
-    """The largest difference of any weight at the end of a stage, in the unit of the weights."""
+    """The largest absolute difference of any weight between two runs at the end of a stage."""
     ends = [read_checkpoint(path / "final.ckpt")["state_dict"] for path in (one, two)]
     return max(float((ends[0][name] - ends[1][name]).abs().max()) for name in ends[0])
 
@@ -77,7 +76,7 @@ def weights_off(one: Path, two: Path) -> float:
 def _child(
     shards: Path, run: Path, device: str, epochs: int, processes: int, changes: tuple[str, ...]
 ) -> dict[str, Any]:
-    """What `_train` writes down, in a Python of its own: Lightning starts its script once more."""
+    """Run `_train` in a child process, whose script Lightning restarts; returns its results."""
     words = ["--shards", shards, "--child", run, "--device", device, "--epochs", epochs]
     words += ["--processes", processes, *(word for item in changes for word in ("--set", item))]
     child = subprocess.run(
@@ -93,7 +92,7 @@ def _child(
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    """One of the runs, in each of its processes."""
+    """Train one run; executed in each of its processes."""
     processes, device = arguments.processes, torch.device(arguments.device)
     changes = ("model.decoder.dropout=0.0", "layout.cpu_threads=1", "shape.cpu_threads=1")
     config = paper_run(arguments.shards, arguments.epochs, *changes, *arguments.set)
@@ -102,8 +101,8 @@ def _train(arguments: argparse.Namespace) -> None:
     config = paper_run(arguments.shards, arguments.epochs, *changes, *arguments.set, *shared)
     options: dict[str, Any] = {"accelerator": device.type, "devices": 1}
     if processes > 1:
-        # Of the strategy, not of Lightning, which would ask for as many GPUs as processes; by a
-        # name, so that each stage's trainer makes its own.
+        # The devices are set in the strategy, since Lightning would require one GPU per process.
+        # The strategy is registered by name, so that each stage's trainer creates its own.
         places = [torch.device(device.type, 0) if device.type == "cuda" else device] * processes
         StrategyRegistry.register(
             "shared", DDPStrategy, parallel_devices=places, process_group_backend="gloo"
@@ -127,7 +126,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _all_reduce_s(size: int, device: torch.device, repeats: int = 20) -> float:
-    """Median seconds of adding up so many bytes of float32 over the processes."""
+    """Median seconds of an all-reduce of `size` bytes of float32 over the processes."""
     numbers, times = torch.ones(size // 4, device=device), []
     for _ in range(repeats):
         dist.barrier()

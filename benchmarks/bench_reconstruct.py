@@ -1,11 +1,11 @@
-"""Reconstruction from single views: 3D box IoU, and the time of one image alone and in a batch.
+"""Single-view reconstruction: 3D box IoU, and time per image alone and in a batch.
 
-Run `python benchmarks/bench_reconstruct.py --run RUN --shards SHARDS`. Images are one view of each
-test room. IoU is of axis-aligned boxes, every object of every image with the same weight; beside it
-the training room nearest by masks, as `eval-svr` chooses it. The fit of latents as in the paper is
-timed by a few steps (`--steps`), scaled to 1,000, without early stopping.
+Run `python benchmarks/bench_reconstruct.py --run RUN --shards SHARDS`. The images are one view of
+each test room. The IoU is of axis-aligned boxes, with the same weight for every object; the
+baseline is the training room nearest by masks, as in `eval-svr`. The paper's latent fit is timed
+over a few steps (`--steps`) and scaled to 1,000, without early stopping.
 
-Processor time is what is compared: on a machine that others use, it says what wall time hides.
+CPU time is compared, since wall time depends on the machine's other load.
 """
 
 import argparse
@@ -19,29 +19,29 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sceneprior.config import load_run
-from sceneprior.evaluation.ground_truth import reference_scenes
-from sceneprior.evaluation.metrics.decoded_rooms import box_iou_3d
-from sceneprior.offscreen import open_renderer
-from sceneprior.reconstruction.fit import SCHEDULES, fit_latents
-from sceneprior.reconstruction.image import ObservedImage, as_views, images_of_split
-from sceneprior.reconstruction.known_rooms import known_rooms, nearest_answers
-from sceneprior.reconstruction.reconstruct import FitOptions, reconstruct
-from sceneprior.reconstruction.score import Answers
-from sceneprior.training.method import TrainedPrior
+from sceneprior.apps.config import load_run
+from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
+from sceneprior.apps.reconstruction.score import Answers
+from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.observed_image import ObservedImage, as_views, images_of_split
+from sceneprior.core.overlaps import box_iou_3d
+from sceneprior.lifted.reconstruction.known_rooms import known_rooms, nearest_answers
+from sceneprior.paper.fit_image import SCHEDULES, fit_latents
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.render.offscreen import open_renderer
 
 FULL = SCHEDULES["paper"].steps
 
 
 def cpu_seconds(what: Callable[[], object]) -> float:
-    """Processor time of a call."""
+    """CPU seconds of a call."""
     begin = time.process_time()
     what()
     return time.process_time() - begin
 
 
 def fit_some(trained: TrainedPrior, images: list[ObservedImage], steps: int) -> None:
-    """A few steps of the paper's fit, its start given."""
+    """Run a few steps of the paper's fit, from a given start."""
     views = as_views(images, trained.config.data.mask_step)
     schedule = replace(SCHEDULES["paper"], steps=steps, drop_at=steps, patience=0)
     start = trained.prior.latent_space(trained.logits[:1]).expand(len(images), -1)
@@ -49,7 +49,7 @@ def fit_some(trained: TrainedPrior, images: list[ObservedImage], steps: int) -> 
 
 
 def mean_iou(images: list[ObservedImage], answers: Answers, shards: Path) -> float:
-    """Over all objects of all images; 0 for what was not found."""
+    """Mean 3D box IoU over all objects of all images; an object that is not found counts as 0."""
     rooms = reference_scenes(shards, "test", tracked_only=True, meshes=False)
     truth = {scene.name: scene.objects for scene in rooms}
     ious = []
@@ -78,7 +78,7 @@ def main() -> None:
     torch.set_num_threads(given.threads)
     trained = load_run(given.run)
     images, _ = images_of_split(given.shards, "test", limit=given.images)
-    # Evenly over the images by their number of objects, so that the few stand for all.
+    # A sample that is spread evenly over the numbers of objects.
     ordered = sorted(images, key=lambda image: len(image.object_class))
     picked = ordered[:: max(1, len(images) // given.singles)]
     reconstruct(trained, picked[:1], FitOptions())

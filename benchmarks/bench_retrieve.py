@@ -1,12 +1,13 @@
-"""How long do 1,000 scenes of 6 objects against 5,000 CAD models take, and is the winner right?
+"""Time and accuracy of CAD retrieval: 1,000 scenes of 6 objects against 5,000 models.
 
     python benchmarks/bench_retrieve.py [--scenes 1000] [--models 5000] [--checked 40] [--json FILE]
 
-Made in memory by --seed: models are pieces of two to seven blocks, objects are spheres of 2,562
-vertices drawn onto other such pieces, much as the shape decoder's meshes lie on furniture. Models
-fall to the classes as 3D-FUTURE's do (the table that ships with the package), and so do objects, so
-that large classes are asked most. Timed is the search alone, meshes in, meshes out: `retrieve_all`,
-a thread a core. --checked objects are searched again the slow way, all models by all points.
+The data are made in memory by --seed. Models are furniture-like unions of two to seven blocks;
+objects are spheres of 2,562 vertices wrapped around other such unions, similar to the shape
+decoder's meshes. The classes of models and objects are distributed like those of 3D-FUTURE (by the
+table that the package ships), so that large classes have most queries. Only the search is timed,
+from meshes to meshes: `retrieve_all`, with one thread per core. For --checked objects, the result
+is compared with an exhaustive search over all models by all points.
 """
 
 import argparse
@@ -19,12 +20,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sceneprior.furniture import CATEGORY_TABLE
-from sceneprior.generation.cad_models import POINTS, CadModels, ClassModels, unit_mesh
-from sceneprior.generation.retrieve import extruded, most_similar, retrieve_all
-from sceneprior.geometry.meshes import icosphere
-from sceneprior.geometry.surfaces import surface_points
-from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.apps.retrieval.cad_models import POINTS, CadModels, ClassModels, unit_mesh
+from sceneprior.apps.retrieval.retrieve import extruded, most_similar, retrieve_all
+from sceneprior.core.furniture import CATEGORY_TABLE
+from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.core.geometry.surfaces import surface_points
+from sceneprior.core.scene import Mesh, Scene, SceneObject
 
 OBJECTS = 6
 LABEL_SET = "front3d_bedroom"
@@ -75,7 +76,7 @@ def main() -> None:
 
 
 def class_shares() -> dict[str, float]:
-    """How 3D-FUTURE's models fall to the classes of bedrooms."""
+    """Shares of 3D-FUTURE's models in the classes of bedrooms."""
     counts: dict[str, int] = {}
     with CATEGORY_TABLE.open(newline="") as file:
         for row in csv.DictReader(file):
@@ -101,7 +102,7 @@ def make_bank(models: int, shares: dict[str, float], rng: np.random.Generator) -
 
 
 def piece(rng: np.random.Generator) -> Mesh:
-    """Two to seven blocks, filling the unit box."""
+    """A union of two to seven blocks that fills the unit box."""
     count = rng.integers(2, 8)
     middles, sides = rng.uniform(-0.5, 0.5, (count, 1, 3)), rng.uniform(0.05, 1.0, (count, 1, 3))
     vertices = (middles + sides * _CUBE).reshape(-1, 3)
@@ -125,7 +126,7 @@ def make_scene(name: str, shares: dict[str, float], rng: np.random.Generator) ->
 
 
 def check(scenes: list[Scene], cad_models: CadModels, count: int) -> dict[str, float]:
-    """How often the fast search finds the winner of the slow one, and by how much it is off."""
+    """Agreement of the fast search with the exhaustive one, and its largest excess distance."""
     items = [extruded(item) for scene in scenes for item in scene.objects][:count]
     pairs = []
     for item in items:

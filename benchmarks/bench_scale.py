@@ -1,16 +1,16 @@
-"""What does each step of a data set cost, and how does that grow with rooms and with objects?
+"""Cost of each step from data to training, and its growth with numbers of rooms and objects.
 
     python benchmarks/bench_scale.py [--rooms 500 2000 6000] [--json FILE] [--folder DIR]
 
-For each number of rooms, each a process of its own: bedrooms are made, prepared by two workers and
-inspected; the loader opens them and reads every room's 20 views with masks at a quarter of the
-size, twice; the paper's run (configs/bedroom.yaml) trains a few steps of both stages. Of each: wall
-clock, CPU seconds of the process and its children, peak memory of the largest of them, and the
-power of the number of rooms that the CPU seconds grow with, from each number to the next.
+For each number of rooms, separate processes make bedrooms, prepare them with two workers, and
+inspect them; load every room's 20 views with masks at a quarter of the size, twice; and train a few
+steps of both stages of the paper's run (configs/paper/bedroom.yaml). For each step, the table lists
+wall clock, CPU seconds of the process and its children, peak memory of the largest of them, and the
+exponent of the growth of CPU seconds from each number of rooms to the next.
 
-Then a layout step of the paper's size with as many objects as bedrooms, living rooms and ScanNet
-scenes hold (128 rooms of 20 views, one thread), and what both stages of the paper's schedule would
-take on this machine with as many rooms: steps, times the median step.
+The benchmark also times a layout step of the paper's size with as many objects as bedrooms, living
+rooms and ScanNet scenes hold (128 rooms of 20 views, one thread), and extrapolates the paper's full
+schedule on this machine: number of steps times the median step.
 """
 
 import argparse
@@ -28,13 +28,13 @@ from pathlib import Path
 from typing import Any
 
 EPOCHS, STEPS = 3, 1
-"""Of each stage, and of an epoch; the first epoch compiles, the last evaluates."""
+"""Epochs per stage, of which the first compiles and the last evaluates; and steps per epoch."""
 ROOMS, OBJECTS = 128, (13, 28, 53)
-"""Of a layout step; what bedrooms, living rooms and ScanNet scenes hold at most."""
+"""Rooms of a layout step; largest numbers of objects in bedrooms, living rooms and ScanNet."""
 
 
 def child(*words: object) -> dict[str, Any]:
-    """Run a command; seconds, CPU seconds and peak memory of it and what it starts."""
+    """Run a command; returns the seconds, CPU seconds and peak memory of it and its children."""
     began = time.perf_counter()
     process = subprocess.Popen(
         [sys.executable, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
@@ -47,14 +47,14 @@ def child(*words: object) -> dict[str, Any]:
     found = {
         "clock_s": time.perf_counter() - began,
         "cpu_s": used.ru_utime + used.ru_stime,
-        "peak_mb": used.ru_maxrss * 1024 / 1e6,  # this process is small, so theirs counts
+        "peak_mb": used.ru_maxrss * 1024 / 1e6,  # includes this process, which is smaller
     }
     last = said.strip().rpartition("\n")[2]
     return found | (json.loads(last) if last.startswith("{") else {})
 
 
 def data_set(folder: Path, rooms: int) -> dict[str, dict[str, float]]:
-    """Figures of every step, by its name."""
+    """Measurements of every step, by name."""
     homes, shards, command = folder / "homes", folder / "shards", ("-m", "sceneprior")
     steps: dict[str, tuple[object, ...]] = {
         "make-homes": (*command, "make-homes", homes, "--rooms", rooms),
@@ -77,8 +77,8 @@ def data_set(folder: Path, rooms: int) -> dict[str, dict[str, float]]:
 
 
 def load(shards: Path) -> dict[str, float]:
-    """Two epochs of the shape stage's batches, without turned copies, which read nothing new."""
-    from sceneprior.data.dataset import ViewDataset
+    """Time two epochs of the shape stage's batches, without turned copies, which read no files."""
+    from sceneprior.core.data.dataset import ViewDataset
 
     began = time.perf_counter()
     rooms = ViewDataset(shards, "train", 20, mask_step=4)
@@ -92,8 +92,8 @@ def load(shards: Path) -> dict[str, float]:
 
 
 def train(shards: Path) -> dict[str, float]:
-    """A few steps of both stages; what the whole schedule would take."""
-    from sceneprior.config import load_config  # before torch, which starts OpenMP
+    """Time a few steps of both stages, and extrapolate the full schedule."""
+    from sceneprior.apps.config import load_config  # before torch, which starts OpenMP
 
     from timed_fit import CONFIG, paper_run, timed_fit  # isort: skip
 
@@ -118,13 +118,14 @@ def layout_steps(_: Path) -> dict[str, float]:
     import torch
     from bench_layout_step import make_views, our_step
 
-    from sceneprior.config import OursConfig, load_config
+    from sceneprior.apps.config import load_config
+    from sceneprior.paper.config import PaperConfig
 
     torch.set_num_threads(1)
     found = {}
     for objects in OBJECTS:
         config = load_config("bedroom.yaml", (f"model.max_objects={objects}",))
-        assert isinstance(config, OursConfig)
+        assert isinstance(config, PaperConfig)
         prior, views = config.build_prior(), make_views(ROOMS, 20, objects)
         logits = torch.randn(ROOMS, config.model.logits_per_room)
         times = []
@@ -138,7 +139,7 @@ def layout_steps(_: Path) -> dict[str, float]:
 
 
 def powers(counts: list[int], seconds: list[float]) -> list[float]:
-    """p where seconds grow as counts**p, from each to the next."""
+    """Exponents p of the growth seconds ~ counts**p, from each count to the next."""
     logs = [(math.log(n), math.log(s)) for n, s in zip(counts, seconds, strict=True)]
     return [(s1 - s0) / (n1 - n0) for (n0, s0), (n1, s1) in pairwise(logs)]
 
@@ -146,7 +147,7 @@ def powers(counts: list[int], seconds: list[float]) -> list[float]:
 PARTS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "load": load, "train": train, "objects": layout_steps,
 }  # fmt: skip
-"""What a child does that no command of the package does alone."""
+"""Tasks of child processes that are not commands of the package."""
 
 
 def _told(figures: dict[str, float]) -> str:
@@ -158,7 +159,7 @@ def main() -> None:
     parser.add_argument("--rooms", nargs="+", type=int, default=[500, 2000, 6000])
     parser.add_argument("--json", type=Path, help="write the figures to this file, too")
     parser.add_argument("--folder", type=Path, help="keep what is made here")
-    parser.add_argument("--part", nargs=2, help=argparse.SUPPRESS)  # what a child does
+    parser.add_argument("--part", nargs=2, help=argparse.SUPPRESS)  # for child processes
     arguments = parser.parse_args()
     if arguments.part:
         name, shards = arguments.part

@@ -1,18 +1,18 @@
-"""How big are shards, and how fast do batches come out of them?
+"""Size of shards, and speed of loading batches from them.
 
     python benchmarks/bench_shards.py [--shards DIR] [--json FILE]
 
-Without `--shards` it prepares 48 bedrooms of this package's own homes first. Batches are 16 scenes
-x 20 views with masks at a quarter of the size, read and collated, one process. They are timed
+Without `--shards`, 48 bedrooms of procedural homes are prepared first. A batch has 16 scenes x 20
+views with masks at a quarter of the size, read and collated by one process. The variants are
 
-- cold: no view was read before (the file is in the operating system's cache, as below);
+- cold: no view was read before (but all files are in the operating system's cache);
 - again: masks are in the loader's packed store, as in every epoch but the first;
 - layout: 16 and 128 scenes without masks, from memory;
-- per-view files: the same views from one HDF5 file each, read as the authors' released loader
-  reads theirs: every object's box, class, track and mask on its own, drawn into an image,
-  reduced, stacked view by view and room by room.
+- per-view files: one HDF5 file per view, read like the authors' released loader: each object's box,
+  class, track and mask is read separately, drawn into an image, downsampled, and stacked view by
+  view and room by room.
 
-All take turns; figures are medians, ratios are of one run.
+The variants take turns; values are medians, ratios are within one run.
 """
 
 import argparse
@@ -33,15 +33,15 @@ import numpy as np
 import torch
 from torch.utils.data import default_collate
 
-from sceneprior.data.dataset import FlatViews, ViewDataset
-from sceneprior.shards import RoomViews, iterate_rooms, list_shards
+from sceneprior.core.data.dataset import FlatViews, ViewDataset
+from sceneprior.core.shards import RoomViews, iterate_rooms, list_shards
 
 SCENES, VIEWS, STEP = 16, 20, 4
 CLASSES = 22
 
 
 def prepare(folder: Path, rooms: int) -> Path:
-    """Shards of homes made by this package."""
+    """Make and prepare procedural homes; returns the shards."""
     homes, out = folder / "homes", folder / "shards"
     commands = (
         ["make-homes", str(homes), "--rooms", str(rooms)],
@@ -54,7 +54,7 @@ def prepare(folder: Path, rooms: int) -> Path:
 
 
 def sizes(shards: Path) -> dict[str, float]:
-    """Bytes of the shard files a view, and what of them the images take."""
+    """Bytes per view of the shard files, and of the images in them."""
     paths = list_shards(shards, "train")
     total, images, views = sum(path.stat().st_size for path in paths), 0, 0
     for path in paths:
@@ -71,7 +71,7 @@ def sizes(shards: Path) -> dict[str, float]:
 
 
 def memory(shards: Path) -> dict[str, float]:
-    """What the loader holds of 100,000 views such as these."""
+    """Memory in MB that the loader needs per 100,000 such views."""
     flat = FlatViews.of([shard.read_room(room) for shard, room in iterate_rooms(shards, "train")])
     views = len(flat.world_to_camera)
     data = ViewDataset(shards, "train", VIEWS, mask_step=STEP)
@@ -85,7 +85,7 @@ def memory(shards: Path) -> dict[str, float]:
 
 
 def write_view_files(folder: Path, room: RoomViews) -> list[Path]:
-    """One HDF5 file a view: pose, lens and, for each visible object, box, class, track and mask."""
+    """Write one HDF5 file per view: camera, and each visible object's box, class, track, mask."""
     assert room.instance_ids is not None
     height, width = room.image_size
     paths = []
@@ -108,7 +108,7 @@ def write_view_files(folder: Path, room: RoomViews) -> list[Path]:
 
 
 def read_view_file(path: Path, objects: int, image_size: tuple[int, int]) -> dict[str, Any]:
-    """One view as arrays, padded to the room's tracked objects."""
+    """Read one view as arrays, padded to the room's number of tracked objects."""
     with h5py.File(path, "r") as file:
         _ = file["room_type"][0].decode()
         pose, lens = file["cam_T"][:], file["cam_K"][:]
@@ -139,7 +139,7 @@ def read_view_file(path: Path, objects: int, image_size: tuple[int, int]) -> dic
 def batch_from_view_files(
     rooms: list[tuple[list[Path], int, tuple[int, int]]], seed: int
 ) -> dict[str, torch.Tensor]:
-    """20 random views of each room, padded to the fullest and stacked."""
+    """Stack 20 random views of each room, padded to the largest number of objects."""
     rng = np.random.default_rng(seed)
     widest = max(objects for _, objects, _ in rooms)
     scenes = []
@@ -155,7 +155,7 @@ def batch_from_view_files(
 
 
 def speeds(shards: Path, folder: Path, repeats: int) -> dict[str, float]:
-    """Median milliseconds of a batch, each way."""
+    """Median milliseconds per batch of each variant."""
     chosen = []
     for shard, room_id in iterate_rooms(shards, "train"):
         room = shard.read_room(room_id, images=True)

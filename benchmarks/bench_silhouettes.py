@@ -1,11 +1,11 @@
-"""How fast are the silhouettes? A room of 13 meshes in 20 views, forward and backward.
+"""Speed of the silhouettes: a room of 13 meshes in 20 views, forward and backward.
 
     python benchmarks/bench_silhouettes.py [--json FILE]
 
-Measures the exact and the fast mode on the CPU (`gpu.py` does on a GPU), the plain torch reference,
-the closed-form boxes, and PyTorch3D where it is importable.
-Figures are medians of runs that take turns, so that a noisy neighbour hits all alike; ratios are
-of medians of one run. Compiling is reported apart and never in a median.
+The script measures the exact and the fast mode on the CPU (`gpu.py` measures a GPU), the torch
+reference, the closed-form boxes, and PyTorch3D if it is installed. Values are medians of runs that
+take turns, so that other load affects all alike; ratios are between medians of one run. Compilation
+is reported separately and not included in medians.
 """
 
 import argparse
@@ -25,15 +25,15 @@ import numpy as np
 import torch
 from bench_boxes import boxes_ratio
 
-from sceneprior.geometry.meshes import icosphere
-from sceneprior.silhouettes import render_scene
+from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.render.silhouettes import render_scene
 
 SIZE = (90, 120)
 OBJECTS, VIEWS = 13, 20
 
 
 def furnished_room(level: int, device: str = "cpu", rooms: int = 1) -> dict[str, Any]:
-    """Ellipsoids the size of furniture in a room of 4 x 4 m, cameras on a circle looking in."""
+    """Ellipsoids the size of furniture in a room of 4 x 4 m, and cameras on a circle around it."""
     generator = np.random.default_rng(0)
     sphere, faces = icosphere(level)
     place = generator.uniform((-2, 0.2, -2), (2, 1.2, 2), (rooms, OBJECTS, 3))
@@ -52,7 +52,7 @@ def furnished_room(level: int, device: str = "cpu", rooms: int = 1) -> dict[str,
 
 
 def looking_in(angle: float) -> np.ndarray:
-    """World to camera of a camera 2.6 m from the middle and 1.6 m up (OpenCV axes)."""
+    """`world_to_camera` of a camera 2.6 m from the middle and 1.6 m up (OpenCV axes)."""
     eye = np.array([2.6 * np.cos(angle), 1.6, 2.6 * np.sin(angle)])
     forward = np.array([0, 0.6, 0]) - eye
     forward /= np.linalg.norm(forward)
@@ -65,7 +65,7 @@ def looking_in(angle: float) -> np.ndarray:
 
 
 def forward_backward(room: dict[str, Any], **options: Any) -> Callable[[], None]:
-    """One training step's worth of drawing: masks, front-most ids, and the vertices' gradient."""
+    """A step that draws like training: masks, front-most ids, and the vertices' gradient."""
     shape = (*room["world_to_camera"].shape[:2], room["vertices_m"].shape[1], *SIZE)
     upstream = torch.rand(shape, device=room["vertices_m"].device)
 
@@ -80,7 +80,7 @@ def forward_backward(room: dict[str, Any], **options: Any) -> Callable[[], None]
 
 
 def medians(steps: dict[str, Callable[[], None]], repeats: int) -> dict[str, float]:
-    """Median seconds of each step; they take turns."""
+    """Median seconds of each step; the steps take turns."""
     times: dict[str, list[float]] = {name: [] for name in steps}
     for step in steps.values():
         step()
@@ -93,8 +93,11 @@ def medians(steps: dict[str, Callable[[], None]], repeats: int) -> dict[str, flo
 
 
 def reference_seconds() -> float:
-    """The plain torch reference on one object in one view, times 13 x 20: it takes them in turn,
-    and holds every pair of face and pixel, so that a whole room needs tens of GiB."""
+    """Seconds of the torch reference on one object in one view, times 13 x 20.
+
+    The reference draws objects one by one, and stores every pair of face and pixel, so that a whole
+    room would need tens of GiB.
+    """
     room = furnished_room(3)
     part = room | {key: room[key][:, :1] for key in ("world_to_camera", "intrinsics", "vertices_m")}
     step = forward_backward(part, backend="reference")
@@ -102,7 +105,7 @@ def reference_seconds() -> float:
 
 
 def first_call_seconds(mode: str) -> dict[str, float]:
-    """A new process's first forward and backward: compiling, and once more from the cache."""
+    """Seconds of the first step of a new process, when compiling and with a warm cache."""
     code = (
         "import time, sys; sys.path.insert(0, sys.argv[1]); import bench_silhouettes as b; "
         "step = b.forward_backward(b.furnished_room(1), mode=sys.argv[2]); "
@@ -123,7 +126,7 @@ def first_call_seconds(mode: str) -> dict[str, float]:
 
 
 def peak_extra_mib(**options: Any) -> float:
-    """Peak memory of one forward and backward, dense masks and their gradient included."""
+    """Peak memory of one forward and backward, including dense masks and their gradient."""
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); import bench_silhouettes as b; "
         f"print(b.memory_growth(**{options!r}))"
@@ -138,12 +141,12 @@ def peak_extra_mib(**options: Any) -> float:
 
 
 def memory_growth(**options: Any) -> float:
-    """Peak resident MiB of one forward and backward above what is resident before it (Linux)."""
+    """Growth of the peak resident memory by one forward and backward, in MiB (Linux)."""
     room = furnished_room(3)
     one = room | {key: room[key][:, :1] for key in ("world_to_camera", "intrinsics")}
     forward_backward(one, **options)()  # loads all code
     step = forward_backward(room, **options)
-    Path("/proc/self/clear_refs").write_text("5")  # forgets the peak so far
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     before = status_mib("VmRSS")
     step()
     return status_mib("VmHWM") - before
@@ -155,8 +158,8 @@ def status_mib(name: str) -> float:
 
 
 def pytorch3d_seconds(repeats: int) -> float | str:
-    """PyTorch3D's soft silhouettes of the same room, one joined scene a view, as the authors draw
-    (nvdiffrast needs a GPU: `gpu.py`)."""
+    """Seconds of PyTorch3D's soft silhouettes of the same room, one joined mesh per view, as in the
+    authors' code (nvdiffrast needs a GPU; see `gpu.py`)."""
     if importlib.util.find_spec("pytorch3d") is None:
         return "not installed"
     step = pytorch3d_step(furnished_room(3))
@@ -164,7 +167,7 @@ def pytorch3d_seconds(repeats: int) -> float | str:
 
 
 def pytorch3d_step(room: dict[str, Any]) -> Callable[[], None]:
-    """The same forward and backward by PyTorch3D, on the device of the room."""
+    """A forward and backward step by PyTorch3D, on the device of the room."""
     from pytorch3d.renderer import (
         BlendParams,
         MeshRasterizer,
@@ -199,7 +202,7 @@ def pytorch3d_step(room: dict[str, Any]) -> Callable[[], None]:
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were taken on."""
+    """Description of the machine and the software."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():

@@ -1,11 +1,11 @@
-"""How long do short commands take, from the shell's prompt to their end?
+"""Time of short commands, from start to end.
 
     python benchmarks/bench_startup.py [--run demo-bedroom] [--rooms 1000] [--json FILE]
 
-`help`, `import_torch` (which none of the others can do without), `synthesize` of 4 rooms and of
-many, and `view` until it says where the page is: wall and CPU seconds (user and system), medians of
-3 fresh processes. `synthesize_first` is with an empty folder for Numba's kernels, as after an
-installation: it compiles those that draw. On a busy machine the CPU seconds count.
+The commands are `help`, `import_torch` (a lower limit for the others), `synthesize` of 4 rooms and
+of many, and `view` until it prints the page's address. Values are wall-clock and CPU seconds (user
+and system), medians of 3 new processes. `synthesize_first` starts with an empty Numba cache, as
+after an installation, and compiles the kernels that draw. On a busy machine, rely on CPU seconds.
 """
 
 import argparse
@@ -48,11 +48,11 @@ def main() -> None:
 
 
 def timed(*arguments: str, new_kernels: bool = False, until_said: bool = False) -> dict[str, float]:
-    """Median seconds of Python with these arguments; `ROOMS` stands for a new folder.
+    """Median seconds of Python with these arguments, in which `ROOMS` is replaced by a new folder.
 
     Args:
-        new_kernels: Numba finds an empty cache.
-        until_said: Stop it at its first line.
+        new_kernels: Start with an empty Numba cache.
+        until_said: Stop the process at its first line of output.
     """
     walls, cpus = [], []
     for _ in range(REPEATS):

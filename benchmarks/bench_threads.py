@@ -1,8 +1,8 @@
-"""Two torch threads against one, alone and while another program burns a core.
+"""Speed of two torch threads against one, on an idle machine and with another core in use.
 
-Run `python benchmarks/bench_threads.py`. A layout step by the clock, of the small configs' size (64
-rooms) and of the paper's (32 rooms), each setting in a process of its own. They take turns, step
-by step, so that whatever else the machine does meets all; figures are medians.
+Run `python benchmarks/bench_threads.py`. It measures the wall clock of a layout step of the small
+configs' size (64 rooms) and of the paper's size (32 rooms), each setting in a separate process. The
+settings take turns, step by step, so that other load affects all; values are medians.
 """
 
 import argparse
@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 
-SIZES = {"front_bedroom_small.yaml": 64, "bedroom.yaml": 32}
+SIZES = {"paper/bedroom_small.yaml": 64, "bedroom.yaml": 32}
 SETTINGS: dict[str, tuple[int, dict[str, str]]] = {
     "one thread": (1, {}),
     "two": (2, {}),
@@ -24,7 +24,8 @@ BURN = "while True: pass"
 
 def answer_steps(config_name: str, threads: int) -> None:
     """Time one step for every line on standard input."""
-    from sceneprior.config import OursConfig, load_config  # before torch, which starts OpenMP
+    from sceneprior.apps.config import load_config
+    from sceneprior.paper.config import PaperConfig  # before torch, which starts OpenMP
 
     import torch  # isort: skip
     from bench_layout_step import make_views, our_step
@@ -32,7 +33,7 @@ def answer_steps(config_name: str, threads: int) -> None:
     torch.set_num_threads(threads)
     rooms = SIZES[config_name]
     config = load_config(config_name, ("label_set=front3d_bedroom",))
-    assert isinstance(config, OursConfig)
+    assert isinstance(config, PaperConfig)
     views, prior = make_views(rooms, 20, config.model.max_objects), config.build_prior()
     logits = torch.randn(rooms, config.model.logits_per_room, requires_grad=True)
     optimizer = torch.optim.Adam([*prior.parameters(), logits], lr=1e-4, fused=True)
@@ -45,7 +46,7 @@ def answer_steps(config_name: str, threads: int) -> None:
 
 
 def step_seconds(process: "subprocess.Popen[str]") -> float:
-    """Ask a process for a step."""
+    """Let a process run one step; returns its seconds."""
     asked, answered = process.stdin, process.stdout
     assert asked is not None and answered is not None
     asked.write("step\n")
@@ -54,7 +55,7 @@ def step_seconds(process: "subprocess.Popen[str]") -> float:
 
 
 def measure(config_name: str, burn: bool, repeats: int) -> dict[str, float]:
-    """Median seconds a step of each setting."""
+    """Median seconds per step of each setting."""
     processes = {
         name: subprocess.Popen(
             [sys.executable, __file__, "--answer", config_name, str(threads)],

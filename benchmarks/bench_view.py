@@ -1,12 +1,13 @@
-"""How fast does the room follow the pointer? (bench_startup.py: until the first room is there.)
+"""Responsiveness of the viewer while dragging over the map (bench_startup.py times its start).
 
     python benchmarks/bench_view.py RUN [--rooms 200] [--json FILE]
 
-Rooms are asked for along a circle through the training rooms of the map. `cold` and `warm` are
-rounds without a browser: decoded, made into meshes, and queued; in the first, meshes are found of
-shapes that no room had before. `drag` is a third round, over a websocket as a browser drags (an
-event every 50 ms): rooms that arrive whole, and how long after their events. CPU time stands beside
-the wall clock, since on a busy machine the two differ; what the browser needs to draw is not in it.
+Rooms are requested along a circle on the map, among the training rooms. `cold` and `warm` are
+rounds without a browser, in which rooms are decoded, meshed and queued; the first round also
+extracts the meshes of new shapes. `drag` is a third round over a websocket, with an event every
+50 ms as from a browser's drag; it measures the rooms that arrive completely, and their delay. CPU
+time is listed with the wall clock, since the two differ on a busy machine; the browser's drawing is
+not included.
 """
 
 import argparse
@@ -27,15 +28,15 @@ import zstandard
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from sceneprior.api import load
-from sceneprior.viewer.explorer import Explorer
-from sceneprior.viewer.page import Page
-from sceneprior.viewer.server import serving
+from sceneprior.apps.api import load
+from sceneprior.apps.viewer.explorer import Explorer
+from sceneprior.apps.viewer.page import Page
+from sceneprior.apps.viewer.server import serving
 
 EVENT_S = 0.05
-"""Browsers send an event of a drag at most so often."""
+"""Shortest interval between the drag events of a browser."""
 RADIUS = 0.35
-"""Of the circle, in sides of the map."""
+"""Radius of the circle, relative to the side of the map."""
 
 
 def main() -> None:
@@ -46,7 +47,7 @@ def main() -> None:
     options.add_argument("--json", type=Path)
     given = options.parse_args()
     measured: dict[str, Any] = {"cores": os.cpu_count(), "load": os.getloadavg()[0]}
-    torch.set_num_threads(1)  # as the command does
+    torch.set_num_threads(1)  # as in `sceneprior view`
     explorer = Explorer(load(given.run))
     with serving("127.0.0.1", 0) as server:
         page = Page(server, explorer, Path(given.run).name)
@@ -70,7 +71,7 @@ def main() -> None:
 
 
 def timed(task: Callable[[], None], rooms: int) -> dict[str, float]:
-    """Rates of a task that shows so many rooms."""
+    """Rates of a task that shows `rooms` rooms."""
     wall, cpu = time.perf_counter(), time.process_time()
     task()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
@@ -82,7 +83,7 @@ def timed(task: Callable[[], None], rooms: int) -> dict[str, float]:
 
 
 def dragged(page: Page, points: list[tuple[float, float]]) -> dict[str, float]:
-    """Rooms that reach a client while it drags over the board, as fast as browsers send events."""
+    """Rates and delays of rooms at a client that drags over the board at a browser's rate."""
     assert page.board is not None, "the run has a map"
     eye = (0.0, 8.0, 10.0)
     camera = {
@@ -100,7 +101,7 @@ def dragged(page: Page, points: list[tuple[float, float]]) -> dict[str, float]:
         client.send(msgspec.msgpack.encode(camera))
         while not page.server.get_clients():
             time.sleep(0.01)
-        time.sleep(1)  # until all that was there has come
+        time.sleep(1)  # until the initial messages have arrived
         came.clear()
         sent, cpu, start = {}, time.process_time(), time.perf_counter()
         for number, (point, place) in enumerate(zip(target, points, strict=True)):
@@ -131,7 +132,7 @@ def dragged(page: Page, points: list[tuple[float, float]]) -> dict[str, float]:
 
 
 def _read(client: ClientConnection, came: list[tuple[float, str, int]]) -> None:
-    """Note when which room's words arrive, and how many bytes with every message."""
+    """Record each message's arrival time, room text (if any) and size in bytes."""
     unpack = zstandard.ZstdDecompressor()
     for data in client:
         assert isinstance(data, bytes)

@@ -1,21 +1,23 @@
-"""Are completed rooms better than the nearest training room with the given objects put in?
+"""Scores of completed rooms, compared with the nearest training room and other baselines.
 
     python benchmarks/complete_rooms.py --run RUN --shards SHARDS [--answers 4] [--seed 0]
 
-Of each test room half of the objects are given, rounded down and at least one, drawn by --seed; the
-rest is hidden. Rows of the table:
+Half of the objects of each test room, rounded down and at least one, are given, drawn by --seed;
+the rest is hidden. The rows of the table are
 
-- completed: `complete`, --answers a room;
-- untouched start: the same without the fit (0 steps): the best drawn rooms with the given put in;
+- completed: results of `complete`, --answers per room;
+- untouched start: the same without the fit (0 steps): the best sampled rooms, with the given
+  objects inserted;
 - nearest training room: the real training room (its 3D ground truth, which the prior never saw)
-  whose objects are nearest to the given ones of their class; one answer a room;
-- test rooms: themselves.
+  whose objects are nearest to the given ones of their class, with these inserted; one per room;
+- test rooms: the test rooms themselves.
 
-`overlaps` are intersecting pairs of boxes a room, `beds` the share of rooms with what their type
-stands for (a bed in bedrooms), `found` the share of given objects that the room had by itself, in
-class, and `off_m` how far from where they are (mean over centre and sides); `differ` is the mean
-over pairs of answers to one room of 1 - matched IoU of what they add over the larger number; 0 is
-alike.
+`overlaps` is the mean number of intersecting pairs of boxes, and `beds` the share of rooms with the
+furniture of their type (a bed in bedrooms). `found` is the share of given objects for which the
+room already had an object of the class, and `off_m` the mean distance between the two (over centres
+and sides). `differ` is the diversity of the completions of one room: the mean over pairs of 1 - the
+summed IoU of matched added objects of the same class, divided by the larger number of added
+objects; 0 means equal.
 """
 
 import argparse
@@ -28,14 +30,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sceneprior.config import load_run
-from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.apps.config import load_run
+from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.overlaps import match_scenes
+from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metrics.contents import category_kl, object_counts, type_share
-from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
 from sceneprior.evaluation.metrics.overlaps import overlap_pairs
-from sceneprior.generation.complete import STEPS, complete
-from sceneprior.generation.insert import insert
-from sceneprior.scene import Scene
+from sceneprior.lifted.complete import STEPS, complete
+from sceneprior.lifted.insert import insert
 
 
 def main() -> None:
@@ -81,14 +83,17 @@ def without_meshes(room: Scene) -> Scene:
 
 
 def half(room: Scene, rng: np.random.Generator) -> Scene:
-    """Half of the objects, rounded down, at least one."""
+    """A room with half of its objects, rounded down, at least one."""
     count = max(1, len(room.objects) // 2)
     rows = sorted(rng.permutation(len(room.objects))[:count])
     return replace(room, objects=tuple(room.objects[row] for row in rows))
 
 
 def nearest(training: Sequence[Scene], given: Scene) -> Scene:
-    """By the mean distance of centres and sides; a missing object costs as much as 2 m."""
+    """The training room nearest to the given objects, by the mean difference of centres and sides.
+
+    A missing object costs 2 m.
+    """
 
     def cost(room: Scene) -> float:
         total = 0.0

@@ -1,17 +1,17 @@
-"""What finds shapes best in masks, with no network in between? Meshes fitted, or shapes lifted.
+"""Shapes from masks without a network: fitted meshes by renderer mode, and lifted shapes.
 
     sceneprior make-homes out/fit/homes --rooms 48 --room-type bedroom --seed 0
     sceneprior prep-front --front out/fit/homes/3D-FRONT --future out/fit/homes/3D-FUTURE-model \
         --recipe bedroom --out out/fit/shards
     python benchmarks/fit_shapes.py --shards out/fit/shards --rooms 24 --steps 150 --seed 0
 
-Two views in five of each room are fitted. A mesh starts as a sphere in its object's true box, moved
-by about 15 cm and scaled by about a quarter, and its vertices and box follow the mask loss alone
-(masks at 120 x 90, the paper's sigma); all variants take the same steps on the same views from the
-same start. `lifted` knows no box and takes no steps: boxes and occupancy grids are found in masks
-at full size, as `fit` finds them. Judged are the other views: IoU of each object's visible hard
-mask, and IoU of the mesh's bounding box with the true one. --image-step is the share of the pixels
-that is kept.
+Two fifths of the views of each room are fitted, the others are held out. A mesh starts as a sphere
+in its object's true box, moved by about 15 cm and scaled by about a quarter, and its vertices and
+box are optimised by the mask loss alone (masks at 120 x 90, the paper's sigma). All variants take
+the same steps on the same views from the same start. `lifted` uses neither true boxes nor steps:
+boxes and occupancy grids are computed from full-size masks, as in `fit`. The scores are the IoU of
+each object's visible hard mask in held-out views, and the IoU of the mesh's bounding box with the
+true one. With --image-step k every k-th pixel of the masks is used along each axis.
 """
 
 import argparse
@@ -24,19 +24,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sceneprior.data.dataset import ViewDataset
-from sceneprior.evaluation.metrics.decoded_rooms import box_iou_3d
-from sceneprior.geometry.isosurface import surface_of
-from sceneprior.geometry.meshes import icosphere, place
-from sceneprior.lifting.dataset import LiftedDataset
-from sceneprior.lifting.shapes import ShapeGrid
-from sceneprior.losses.matching import Matches
-from sceneprior.losses.shape import mask_loss
-from sceneprior.offscreen.renderer import Pinhole, SoftwareRenderer
-from sceneprior.scene import Mesh
-from sceneprior.shards import iterate_rooms
-from sceneprior.silhouettes import render_silhouettes
-from sceneprior.views import SceneViews
+from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.geometry.isosurface import surface_of
+from sceneprior.core.geometry.meshes import icosphere, place
+from sceneprior.core.overlaps import box_iou_3d
+from sceneprior.core.scene import Mesh
+from sceneprior.core.shards import iterate_rooms
+from sceneprior.core.views import SceneViews
+from sceneprior.lifted.lifting.dataset import LiftedDataset
+from sceneprior.lifted.lifting.shapes import ShapeGrid
+from sceneprior.paper.losses.matching import Matches
+from sceneprior.paper.losses.shape import mask_loss
+from sceneprior.render.offscreen.renderer import Pinhole, SoftwareRenderer
+from sceneprior.render.silhouettes import render_silhouettes
 
 LIFTED = "lifted"
 VARIANTS = (LIFTED, "exact/layered", "exact/paper", "fast/layered", "fast/paper")
@@ -92,8 +92,8 @@ def main() -> None:
 
 
 def lift_rooms(shards: Path, seed: int) -> list[list[Mesh]]:
-    """All rooms' objects as lifting finds them; nothing for one that no view shows."""
-    with tempfile.TemporaryDirectory() as name:  # what is kept beside the shards is of all views
+    """Meshes of all rooms' objects by lifting; empty for an object that no view shows."""
+    with tempfile.TemporaryDirectory() as name:  # the cache next to the shards is of all views
         for each in shards.iterdir():
             if not each.name.startswith("lifted_"):
                 (Path(name) / each.name).symlink_to(each.resolve())
@@ -151,7 +151,7 @@ def fit_rooms(dataset, truths, rows, mode, compositing, arguments) -> list[list[
 
 
 def judge(meshes: Sequence[Mesh], judged, row, truth) -> tuple[np.ndarray, np.ndarray]:
-    """Mask IoUs (object, view) of a room's views that were not fitted, and its box IoUs."""
+    """Mask IoUs of a room in held-out views, one per (object, view), and its box IoUs."""
     views = judged.__getitems__([(row, 0)])
     poses, intrinsics, image_size = cameras(views)
     ids = SoftwareRenderer().instance_ids_of_views(

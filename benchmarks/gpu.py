@@ -1,17 +1,18 @@
-"""All that a GPU is asked for, in one command of at most 40 minutes; a CPU will do for a trial.
+"""All GPU benchmarks in one command of at most 40 minutes; a CPU suffices for a trial.
 
     python benchmarks/gpu.py [--out FOLDER] [--only PART ...]
-    python benchmarks/gpu.py --tiny                  # minutes: does each part run on this GPU?
+    python benchmarks/gpu.py --tiny                  # a trial of all parts, in minutes
     python benchmarks/gpu.py --tiny --device cpu
 
-Kernels against the reference, silhouettes against PyTorch3D and nvdiffrast where they are
-installed, both stages of the paper's run (`configs/bedroom.yaml`) on homes made here: steps and
-memory, precision, the whole schedule extrapolated, two processes on one device.
+The parts compare kernels with the reference, and silhouettes with PyTorch3D and nvdiffrast if these
+are installed. On procedural homes they train both stages of the paper's run
+(`configs/paper/bedroom.yaml`), measure steps, memory, precision and two processes on one device,
+and extrapolate the whole schedule.
 
-Each part is a process of its own with a limit of its own, so that a kernel that breaks the device's
-context, or hangs, costs that part alone. Its rows are kept as they are measured; one that fails is
-a line of the table. FOLDER/gpu.json and FOLDER/gpu.md (tables for docs/results.md) are written
-after every part; what a part said beside its rows is in FOLDER/parts.
+Each part runs in a separate process with a time limit, so that a kernel that breaks the device's
+context, or hangs, affects only that part. Rows are written as they are measured; a failure is a
+row of the table. FOLDER/gpu.json and FOLDER/gpu.md (tables for docs/performance.md) are written
+after every part; the output of each part is in FOLDER/parts.
 """
 
 import argparse
@@ -33,7 +34,7 @@ from gpu_setup import PAPER, TINY, Setup, Sizes
 
 
 class Part(NamedTuple):
-    """What is measured, and how long that may take."""
+    """A part of the benchmark, with its time limit and title."""
 
     measure: Callable[[Setup], None]
     minutes: float
@@ -50,13 +51,13 @@ PARTS = {
     "batches": Part(gpu_training.batches, 5, "A larger batch"),
     "processes": Part(gpu_training.processes, 7, "Two processes on one device"),
 }
-"""In order, what matters most first; 40 minutes together."""
+"""The parts in order of importance; their limits add up to 40 minutes."""
 
 
 def run(parts: dict[str, Part], out: Path, words: list[str]) -> dict[str, Any]:
-    """Measure the parts one after the other, each in a process of its own; what was found.
+    """Measure the parts one after the other, each in a separate process; returns the results.
 
-    `words` are the options of this run that its parts need, too.
+    `words` are the options of this run that are passed on to the parts.
     """
     found: dict[str, Any] = {"machine": machine() | device_of(words), "commit": commit()}
     found["parts"] = {}
@@ -64,7 +65,7 @@ def run(parts: dict[str, Part], out: Path, words: list[str]) -> dict[str, Any]:
     for name, part in parts.items():
         print(f"{name} ...", flush=True)
         start = time.monotonic()
-        end += 60 * part.minutes  # and what those before it did not need
+        end += 60 * part.minutes  # time that earlier parts left may be used too
         problem = run_part(name, out, words, end - start)
         rows = out / "parts" / f"{name}.jsonl"
         lines = rows.read_text().splitlines() if rows.is_file() else []
@@ -80,14 +81,14 @@ def run(parts: dict[str, Part], out: Path, words: list[str]) -> dict[str, Any]:
 
 
 def run_part(name: str, out: Path, words: list[str], seconds: float) -> str | None:
-    """Run one part to its end or for so many seconds; what went wrong, in a line."""
+    """Run one part, for at most `seconds`; returns a line on its failure, or None."""
     folder = out / "parts"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.jsonl").unlink(missing_ok=True)
     log = folder / f"{name}.log"
     command = [sys.executable, __file__, *words, "--out", str(out), "--part", name]
     with log.open("w") as said:
-        # A session of its own: training starts processes, which must end with it.
+        # In a new session, so that the processes that training starts can be killed with it.
         child = subprocess.Popen(command, stdout=said, stderr=said, start_new_session=True)
         try:
             status = child.wait(seconds)
@@ -104,7 +105,7 @@ def run_part(name: str, out: Path, words: list[str], seconds: float) -> str | No
 
 
 def measure(name: str, device: str, sizes: Sizes, out: Path) -> None:
-    """What the process of a part does."""
+    """Measure one part, in its own process."""
     with (out / "parts" / f"{name}.jsonl").open("a") as file:
 
         def note(what: str, figures: dict[str, float]) -> None:
@@ -115,7 +116,7 @@ def measure(name: str, device: str, sizes: Sizes, out: Path) -> None:
 
 
 def as_markdown(found: dict[str, Any]) -> str:
-    """One table a part, below a line that says on what and of which commit."""
+    """One table per part, below a line on the machine and the commit."""
     about, lines = found["machine"], []
     lines.append(f"{about['device']}; {about['cores']} cores of {about['cpu']}; ")
     lines.append(f"torch {about['torch']}, CUDA {about['cuda']}; commit {found['commit']}.\n")
@@ -136,21 +137,21 @@ def as_markdown(found: dict[str, Any]) -> str:
 
 
 def shown(value: float | None) -> str:
-    """A figure in a table."""
+    """A value as text for a table."""
     if value is None:
         return ""
     return f"{value:,.0f}" if abs(value) >= 1000 or value == int(value) else f"{value:.3g}"
 
 
 def device_of(words: list[str]) -> dict[str, Any]:
-    """The GPU's name; the CPU is named beside it."""
+    """The GPU's name, and the CUDA version."""
     on_gpu = "cpu" not in words
     name = torch.cuda.get_device_name() if on_gpu else "no GPU (a trial on a CPU)"
     return {"device": name, "cuda": torch.version.cuda}
 
 
 def commit() -> str:
-    """The checkout's commit; `+` after it says that files differ from it."""
+    """The checkout's commit, followed by `+` if files differ from it."""
     folder = Path(__file__).parent
     git = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=10"]
     try:

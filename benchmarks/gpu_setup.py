@@ -1,4 +1,4 @@
-"""What the parts of `gpu.py` share: how much is measured, where, and who is told."""
+"""Shared settings of the parts of `gpu.py`: sizes, device, and the function that notes results."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,26 +10,26 @@ import torch
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured."""
+    """Sizes of the measurements."""
 
     compared_level: int = 2
-    """Of the icospheres that kernels and reference draw: 320 faces."""
+    """Level of the icospheres in the comparison with the reference; 2 has 320 faces."""
     compared_objects: int = 3
     compared_views: int = 2
     compared_shrink: int = 2
-    """Their images are 120 x 90 divided by this."""
+    """Divisor of the image size, 120 x 90, in that comparison."""
     levels: tuple[int, ...] = (3, 4)
-    """Of the icospheres that are timed: 1,280 faces, and the paper's 5,120."""
+    """Levels of the icospheres that are timed: 1,280 faces, and the paper's 5,120."""
     rooms: int = 16
-    """Rooms a batch, of which silhouettes are timed and the paper's run is trained."""
+    """Rooms per batch, for timing silhouettes and for training the paper's run."""
     large_batch: int = 128
-    """Rooms a batch beside it, for memory."""
+    """Rooms per batch of an additional run, for memory."""
     repeats: int = 15
     homes: int = 96
-    """Made homes, 67 of them for training: 268 rows with their turned copies."""
+    """Procedural homes, 67 of them for training: 268 rows with their turned copies."""
     epochs: int = 5
     changes: tuple[str, ...] = ()
-    """To the paper's config."""
+    """Changes to the paper's config."""
 
 
 PAPER = Sizes()
@@ -39,28 +39,28 @@ TINY = Sizes(
     changes=(
         "model.width=16", "model.decoder.heads=2", "model.decoder.hidden=16", "data.workers=0",
         "model.latent_space.anchors=10", "model.shape.width=8", "model.shape.level=1",
-        "data.views_per_room=2", "samples.count=4", "layout.cpu_threads=1", "shape.cpu_threads=1",
+        "data.views_per_room=2", "layout.cpu_threads=1", "shape.cpu_threads=1",
     ),
 )  # fmt: skip
-"""What a CPU does in a test."""
+"""Sizes for a test on a CPU."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Where a part measures."""
+    """Settings that a part is called with."""
 
     device: str
     sizes: Sizes
     folder: Path
-    """Of the parts together: made homes stay there from one to the next."""
+    """Folder shared by all parts, which keeps the homes."""
     note: Callable[[str, dict[str, float]], None]
-    """Takes a row of the part's table: what was measured, and figures by names that end in units.
-    A row is kept whatever comes after it."""
+    """Writes a row of the part's table at once: its title, and values by names that end in units.
+    """
 
 
 @contextmanager
 def peak_mib(device: str) -> Iterator[Callable[[], float]]:
-    """Gives a function of the most MiB that tensors took on a GPU within; 0 on a CPU."""
+    """Yield a function that returns the peak MiB of tensors on the GPU since then; 0 on a CPU."""
     if device == "cpu":
         yield lambda: 0.0
         return

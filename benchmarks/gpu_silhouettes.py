@@ -1,4 +1,4 @@
-"""Silhouettes on a device: right against the reference, fast against others; parts of `gpu.py`."""
+"""Correctness and speed of silhouettes on a device; parts of `gpu.py`."""
 
 import importlib.util
 import time
@@ -19,16 +19,16 @@ from bench_silhouettes import (
 from gpu_setup import Setup, peak_mib
 from torch import Tensor
 
-from sceneprior.geometry.cameras import project
-from sceneprior.silhouettes import render_scene
-from sceneprior.silhouettes.render import COMPOSITING, MODES
+from sceneprior.core.geometry.cameras import project
+from sceneprior.render.silhouettes import render_scene
+from sceneprior.render.silhouettes.render import COMPOSITING, MODES
 
 SIGMA_PX2 = 0.25
-"""The same in float32, to which compiled kernels round it."""
+"""A sigma that float32 represents exactly, since compiled kernels round it to float32."""
 
 
 def kernels(setup: Setup) -> None:
-    """Every mode, compositing and precision against the float64 reference on the same device."""
+    """Compare every mode, compositing and precision with the float64 reference on the device."""
     room, dtypes = _small_room(setup), (torch.float32, torch.float64)
     for mode, compositing, dtype in product(MODES, COMPOSITING, dtypes):
         how = {"mode": mode, "compositing": compositing, "sigma_px2": SIGMA_PX2}
@@ -60,7 +60,7 @@ def _is_real(value: Any) -> bool:
 
 
 def _small_room(setup: Setup) -> dict[str, Any]:
-    """A few objects in a few views: the reference holds every pair of face and pixel."""
+    """A room of few objects and views, since the reference stores every pair of face and pixel."""
     sizes = setup.sizes
     room = furnished_room(sizes.compared_level, setup.device)
     room["vertices_m"] = room["vertices_m"][:, : sizes.compared_objects]
@@ -86,7 +86,7 @@ def _drawn(room: dict[str, Any], **how: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def speed(setup: Setup) -> None:
-    """Forward and backward of 13 objects in 20 views at 120 x 90; one room also on the CPU."""
+    """Time forward and backward of 13 objects in 20 views at 120 x 90; one room also on the CPU."""
     for level, rooms in product(setup.sizes.levels, (1, setup.sizes.rooms)):
         room = furnished_room(level, setup.device, rooms)
         for mode in MODES:
@@ -103,8 +103,7 @@ def speed(setup: Setup) -> None:
 
 
 def peers(setup: Setup) -> None:
-    """PyTorch3D's silhouettes as the authors draw them and nvdiffrast's, of the same room in the
-    same run as ours."""
+    """Time PyTorch3D, with the authors' settings, and nvdiffrast on the same room, if installed."""
     level = setup.sizes.levels[0]
     steps: dict[str, Callable[[], None]] = {
         mode: forward_backward(furnished_room(level, setup.device), mode=mode) for mode in MODES
@@ -117,7 +116,7 @@ def peers(setup: Setup) -> None:
         try:
             theirs = make(furnished_room(level, setup.device))
             times = medians(steps | {name: theirs}, setup.sizes.repeats)
-        except Exception as error:  # one that is built for another GPU must not cost the next one
+        except Exception as error:  # e.g. built for another GPU; the next one is still measured
             setup.note(f"{name}: {' '.join(str(error).split())[:200]}", {})
             continue
         ratios = {f"over_{mode}": times[name] / times[mode] for mode in MODES}
@@ -125,7 +124,7 @@ def peers(setup: Setup) -> None:
 
 
 def nvdiffrast_step(room: dict[str, Any]) -> Callable[[], None]:
-    """Antialiased masks of one room on a GPU, and their gradient."""
+    """A step that draws nvdiffrast's antialiased masks of one room, with their gradient."""
     import nvdiffrast.torch as dr
 
     device = room["vertices_m"].device

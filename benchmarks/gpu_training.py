@@ -1,5 +1,7 @@
-"""The paper's run on a device: steps, memory, precision, the whole schedule, two processes at once;
-parts of `gpu.py`. All train on the made homes that the first of them prepares."""
+"""Training benchmarks of `gpu.py`: steps, memory, precision, full schedule and two processes.
+
+All parts train the paper's run on the procedural homes that the part `homes` prepares.
+"""
 
 import os
 import tempfile
@@ -10,14 +12,11 @@ from bench_processes import compare
 from gpu_setup import Setup
 from timed_fit import CONFIG, StageTimes, made_shards, paper_run, timed_fit
 
-from sceneprior.config import load_config
-from sceneprior.experiments.evaluate_samples import SampleEvaluator
-from sceneprior.settings import find_config
-from sceneprior.training.method import Trained
-from sceneprior.training.monitor import EvaluationResult
+from sceneprior.apps.config import load_config
+from sceneprior.core.settings import find_config
 
 PAPER_ROOMS = 3530
-"""Training bedrooms of the paper: nine in ten of 3,922."""
+"""Number of the paper's training bedrooms: 90% of 3,922."""
 PRECISIONS = {
     "float32": ("32-true", "highest"),
     "TF32, as `fit` does": ("32-true", "high"),
@@ -26,7 +25,7 @@ PRECISIONS = {
 
 
 def homes(setup: Setup) -> None:
-    """Made homes and their shards, which takes CPUs alone."""
+    """Make homes and prepare their shards, on the CPU."""
     start = time.perf_counter()
     made_shards(setup.folder, setup.sizes.homes, len(os.sched_getaffinity(0)))
     seconds = time.perf_counter() - start
@@ -34,19 +33,11 @@ def homes(setup: Setup) -> None:
 
 
 def schedule(setup: Setup) -> None:
-    """The paper's run, its samples evaluated at each stage's end; from it, the whole schedule."""
+    """Time a few epochs of the paper's run; extrapolate to the whole schedule."""
     whole = load_config(str(find_config(CONFIG)))
     epochs = {stage.name: stage.settings.epochs for stage in whole.stages()}
     config = paper_run(_shards(setup), setup.sizes.epochs, *_changes(setup, setup.sizes.rooms))
-    evaluator = SampleEvaluator(config)
     hours: dict[str, float] = {}
-    spent_s: list[float] = []
-
-    def evaluate(trained: Trained) -> EvaluationResult:
-        start = time.perf_counter()
-        result = evaluator(trained)
-        spent_s.append(time.perf_counter() - start)
-        return result
 
     def ended(stage: str, times: StageTimes) -> None:
         hours[stage] = whole_epochs_s(times, epochs[stage], whole.data.rotations) / 3600
@@ -55,29 +46,24 @@ def schedule(setup: Setup) -> None:
 
     with tempfile.TemporaryDirectory() as name:
         options = {"accelerator": setup.device, "devices": 1}
-        timed_fit(config, Path(name) / "run", options, evaluate=evaluate, ended=ended)
-    count = sum(each // whole.samples.every for each in epochs.values())
-    hours["samples"] = count * max(spent_s) / 3600
-    setup.note(
-        f"{count} evaluations of {config.samples.count} samples", {"whole_h": hours["samples"]}
-    )
+        timed_fit(config, Path(name) / "run", options, ended=ended)
     what = f"all of {CONFIG} on {PAPER_ROOMS:,} rooms, extrapolated"
     setup.note(what, {"whole_h": sum(hours.values())})
 
 
 def whole_epochs_s(times: StageTimes, epochs: int, rotations: int) -> float:
-    """Seconds of so many epochs on the paper's rooms: each row takes what it took here."""
+    """Seconds of `epochs` epochs on the paper's rooms, extrapolated at equal time per row."""
     return epochs * times.epoch_s * PAPER_ROOMS * rotations / times.rooms
 
 
 def batches(setup: Setup) -> None:
-    """The same steps with more rooms a batch."""
+    """Time the steps with more rooms per batch."""
     batch = setup.sizes.large_batch
     _time(setup, f"{batch} rooms a batch", "32-true", "high", batch)
 
 
 def precision(setup: Setup) -> None:
-    """Both stages in each precision."""
+    """Time both stages in each precision."""
     for name, (bits, matmul) in PRECISIONS.items():
         _time(setup, name, bits, matmul, setup.sizes.rooms)
 
@@ -93,7 +79,7 @@ def _time(setup: Setup, what: str, bits: str, matmul: str, batch: int) -> None:
 
 
 def processes(setup: Setup) -> None:
-    """Two processes that share batches, and the device, against one."""
+    """Compare two processes, which share each batch and the device, with one."""
     shards, sizes = _shards(setup), setup.sizes
     with tempfile.TemporaryDirectory() as name:
         changes = _changes(setup, sizes.rooms)

@@ -1,9 +1,9 @@
-"""Draw new rooms, each beside the real training room that is nearest to it.
+"""Picture of sampled rooms, each next to its nearest real training room.
 
     python benchmarks/nearest_rooms.py RUN --sheet sheet.png [--distribution paper]
 
-A picture of 24 pairs, the drawn room on the left, and the mean layout distance. Memory shows: a
-copy stands beside itself.
+The picture has 24 pairs, with the sampled room on the left; the mean layout distance is printed.
+Memorised training rooms show as pairs of equal rooms.
 """
 
 import argparse
@@ -12,19 +12,19 @@ from statistics import mean
 
 from PIL import Image
 
-from sceneprior.config import load_any_run
-from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.apps.config import load_any_run
+from sceneprior.apps.sample import sample_rooms
+from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.evaluation.layout_distance import nearest_room
-from sceneprior.generation.decode import synthesize
-from sceneprior.offscreen import open_renderer
-from sceneprior.pictures import contact_sheet
-from sceneprior.topdown import corner_view, perspective
+from sceneprior.render.offscreen import open_renderer
+from sceneprior.render.pictures import contact_sheet
+from sceneprior.render.topdown import corner_view, perspective
 
 PAIRS, COLUMNS, TILE_PX = 24, 6, (210, 280)
 
 
 def main() -> None:
-    """Write the picture, print the distance."""
+    """Write the picture, and print the distance."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("run", type=Path)
     options.add_argument("--sheet", type=Path, required=True, help="where the picture goes (PNG)")
@@ -33,7 +33,7 @@ def main() -> None:
     options.add_argument("--renderer", default="auto")
     given = options.parse_args()
     trained = load_any_run(given.run)
-    drawn = synthesize(trained, PAIRS, given.seed, given.distribution)
+    drawn = sample_rooms(trained, PAIRS, given.seed, given.distribution)
     training = reference_scenes(Path(trained.config.data.shards), "train")
     renderer = open_renderer(given.renderer)
     tiles, distances = [], []

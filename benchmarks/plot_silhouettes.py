@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from bench_silhouettes import furnished_room
 
-from sceneprior.geometry.meshes import icosphere
-from sceneprior.silhouettes import render_scene, render_silhouettes
+from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.render.silhouettes import render_scene, render_silhouettes
 
 RADIUS_PX = 12.0
 STEP_PX = 0.05
@@ -30,7 +30,8 @@ def main() -> None:
 
 
 def disc(level: int, mode: str, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Coverage of a far small sphere, and each pixel's distance outside a circle of RADIUS_PX."""
+    """Coverage of a small distant sphere, and each pixel's signed distance to its circle of
+    RADIUS_PX, positive outside."""
     sphere, faces = icosphere(level)
     focal, depth = 1000.0, 100.0
     intrinsics = torch.tensor([[focal, 0, 20.13], [0, focal, 15.37], [0, 0, 1]]).double()
@@ -41,7 +42,7 @@ def disc(level: int, mode: str, radius_px: float) -> tuple[np.ndarray, np.ndarra
         torch.eye(4).double()[None, None],
         intrinsics[None, None],
         (30, 40),
-        sigma_px2=0.2025,  # the paper's at 120 x 90
+        sigma_px2=0.2025,  # the paper's sigma at 120 x 90
         mode=mode,
     )
     rows, columns = np.mgrid[:30, :40] + 0.5
@@ -50,7 +51,7 @@ def disc(level: int, mode: str, radius_px: float) -> tuple[np.ndarray, np.ndarra
 
 
 def plot_profiles(path: Path) -> None:
-    """Coverage, and what one pixel of growth adds to it, across the outline of a sphere."""
+    """Plot coverage, and its derivative by the radius, across the outline of a sphere."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.4), layout="constrained")
     for mode, line in (("exact", "-"), ("fast", "--")):
         for level, color in ((2, "tab:blue"), (3, "tab:orange"), (4, "tab:green")):
@@ -76,7 +77,7 @@ def plot_profiles(path: Path) -> None:
 
 
 def plot_room(path: Path) -> None:
-    """One view of the benchmark's room: who is in front, and the two compositings near an edge."""
+    """Plot one view of the benchmark's room: front-most objects, and both compositing modes."""
     room = furnished_room(3)
     room = room | {key: room[key][:, 3:4] for key in ("world_to_camera", "intrinsics")}
     colors = torch.from_numpy(plt.get_cmap("tab20")(np.arange(13))[:, :3]).float()

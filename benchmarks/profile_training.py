@@ -1,13 +1,13 @@
-"""Where does the time of a training step go? Every stage of a run, part by part.
+"""Profile of training steps: the time of every part of a step, for each stage of a run.
 
     python benchmarks/profile_training.py [CONFIG ...] [--threads 1 2] [--steps 20] [--shards DIR]
 
-Trains a few steps of every stage of shipped configs by `fit`, in batches as large as theirs, on 64
-bedrooms that are made and prepared first, unless `--shards` has some. Lifting before the first
-stage takes minutes, once a folder. Milliseconds are medians over the steps, without the first
-ones, in which kernels compile: CPU time of all threads, which other programs change little, and
-the whole step by the clock. What no part below owns is `rest`: latents, the end of an epoch with
-its checkpoint and logs, Lightning itself.
+The script trains a few steps of every stage of shipped configs by `fit`, with their batch sizes, on
+64 bedrooms that are made and prepared first, unless `--shards` is given. Lifting before the first
+stage takes minutes, once per folder. Values are medians in milliseconds over the steps, without the
+first ones, in which kernels compile: CPU time of all threads, which other load affects little, and
+the wall clock of the whole step. `rest` is the time outside all parts below: latents, the end of an
+epoch with its checkpoint and logs, and Lightning itself.
 """
 
 import argparse
@@ -29,35 +29,36 @@ import numba
 import torch
 from lightning.pytorch.profilers import Profiler
 
-from sceneprior.config import load_config
-from sceneprior.models.prior import ScenePrior
-from sceneprior.sampler import stage as sampler_stage
-from sceneprior.training import objective, stages
+from sceneprior.apps.config import load_config
+from sceneprior.lifted import stages as lifted_stages
+from sceneprior.lifted.sampler import stage as sampler_stage
+from sceneprior.paper import stages, view_loss
+from sceneprior.paper.prior import ScenePrior
 from sceneprior.training.fit import fit
 
-CONFIGS = ("front_bedroom_small.yaml", "front_bedroom_large.yaml", "bedroom.yaml")
+CONFIGS = ("paper/bedroom_small.yaml", "lifted/bedroom.yaml", "bedroom.yaml")
 ROOMS = 91  # 64 of them to train on
 WARM_UP = 5
 PARTS = {
     "decode": ((ScenePrior, "decode"),),
-    "projection": ((stages, "proxy_boxes"), (objective, "proxy_boxes"), (stages, "seen_boxes")),
-    "matching": ((objective, "match_objects"), (stages, "match_lifted")),
+    "projection": ((stages, "proxy_boxes"), (view_loss, "proxy_boxes"), (stages, "seen_boxes")),
+    "matching": ((view_loss, "match_objects"), (lifted_stages, "match_lifted")),
     "silhouettes": ((stages, "seen_masks"),),
     "loss": (
-        (objective, "layout_losses"), (stages, "mask_loss"), (stages, "lifted_losses"),
-        (stages, "shape_code_loss"), (sampler_stage, "negative_log_likelihood"),
+        (view_loss, "layout_losses"), (stages, "mask_loss"), (lifted_stages, "lifted_losses"),
+        (lifted_stages, "shape_code_loss"), (sampler_stage, "negative_log_likelihood"),
     ),
 }  # fmt: skip
-"""The functions of each part of a step, by the module or class that looks them up."""
+"""The functions of each part of a step, each with the module or class in which it is patched."""
 LIGHTNING = {
     "train_dataloader_next": "data", ".backward": "backward", ".optimizer_step": "optimiser",
 }  # fmt: skip
-"""Ends of the names that Lightning gives to what it does, and our words for them."""
+"""Suffixes of the names of Lightning's actions, and the parts that they count as."""
 SHOWN = ("data", *PARTS, "backward", "optimiser", "rest")
 
 
 class StepProfiler(Profiler):
-    """CPU seconds of each part of each step; of parts within parts, the inner one has them."""
+    """CPU seconds of each part of each step; the time of nested parts goes to the inner one."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,14 +68,14 @@ class StepProfiler(Profiler):
         self._cpu, self._clock = time.process_time(), time.perf_counter()
 
     def setup(self, *arguments: Any, **options: Any) -> None:
-        """A stage begins."""
+        """Begin a stage."""
         super().setup(*arguments, **options)
         self.stages.append([])
 
     def start(self, action_name: str) -> None:
         self._charge()
         known = (part for end, part in LIGHTNING.items() if action_name.endswith(end))
-        # The optimiser's action holds the closure that does all of the step.
+        # The optimiser's action contains the closure that runs the whole step.
         around = "rest" if action_name.endswith(".training_step") else self._parts[-1]
         self._parts.append(action_name if action_name in PARTS else next(known, around))
 
@@ -95,7 +96,7 @@ class StepProfiler(Profiler):
 
 @contextmanager
 def watched(profiler: StepProfiler) -> Iterator[None]:
-    """Let the functions of `PARTS` tell the profiler."""
+    """Patch the functions of `PARTS` to report to the profiler."""
 
     def timed(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **options: Any) -> Any:
@@ -113,7 +114,7 @@ def watched(profiler: StepProfiler) -> Iterator[None]:
 
 
 def make_shards(folder: Path) -> Path:
-    """Bedrooms, made and prepared."""
+    """Make and prepare procedural bedrooms; returns the shards."""
     homes, shards = folder / "homes", folder / "shards"
     for words in (
         ["make-homes", homes, "--rooms", ROOMS],
@@ -125,10 +126,10 @@ def make_shards(folder: Path) -> Path:
 
 
 def profile(name: str, shards: Path, run: Path, threads: int, steps: int) -> list[dict[str, float]]:
-    """Train a few steps of each stage; each one's medians in ms."""
-    changes = [f"data.shards={shards}", "data.workers=0", "samples.every=0"]
+    """Train a few steps of each stage; returns the medians in ms by stage and part."""
+    changes = [f"data.shards={shards}", "data.workers=0"]
     for stage in load_config(name).stages():
-        # An epoch of 64 rooms has at least so many steps.
+        # Enough epochs of 64 rooms for all steps.
         epochs = -(-(steps + WARM_UP) // max(64 // stage.settings.batch_size, 1))
         changes += [f"{stage.name}.epochs={epochs}", f"{stage.name}.cpu_threads={threads}"]
     numba.config.NUMBA_NUM_THREADS = threads  # type: ignore[attr-defined]
@@ -144,7 +145,7 @@ def profile(name: str, shards: Path, run: Path, threads: int, steps: int) -> lis
 
 
 def medians_ms(steps: list[dict[str, float]]) -> dict[str, float]:
-    """The median of each part; last, all parts together and the clock."""
+    """Median ms of each part, of all parts together (CPU) and of the wall clock."""
     found = {part: statistics.median(step[part] for step in steps) for part in SHOWN}
     found["CPU"] = statistics.median(sum(step.values()) - step["clock"] for step in steps)
     found["clock"] = statistics.median(step["clock"] for step in steps)

@@ -1,9 +1,9 @@
-"""Train on spoilt masks and poses; print what was learnt beside what clean ones teach.
+"""Robustness to noise: scores after training on corrupted masks and poses, and on clean ones.
 
-Run `python benchmarks/robustness.py --shards DIR [--seeds 0 1]`. Observations of the training split
-are spoilt in memory, the same way in every row of a seed; the truth in 3D, which the scores are
-taken from, stays as it is. Each row trains the layout stage alone, from the same start and for as
-many steps, on rooms of at most four objects: a short decoder makes short steps.
+Run `python benchmarks/robustness.py --shards DIR [--seeds 0 1]`. The observations of the training
+split are corrupted in memory, by the same noise in every row of a seed; the 3D ground truth of the
+scores stays unchanged. Each row trains the layout stage alone, from the same initialisation and for
+the same number of steps, on rooms of at most four objects, for which a step is fast.
 """
 
 import argparse
@@ -18,17 +18,18 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from sceneprior.config import OursConfig, load_config
-from sceneprior.data.datamodule import make_loader
-from sceneprior.data.dataset import FlatViews, ViewDataset
-from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.apps.config import load_config
+from sceneprior.core.data.datamodule import make_loader
+from sceneprior.core.data.dataset import FlatViews, ViewDataset
+from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.views import SceneViews
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
-from sceneprior.generation.decode import decode_training_rooms
-from sceneprior.training.method import TrainedPrior
-from sceneprior.training.stages import LayoutStage
-from sceneprior.views import SceneViews
+from sceneprior.paper.config import PaperConfig
+from sceneprior.paper.decode import decode_training_rooms
+from sceneprior.paper.stages import LayoutStage
+from sceneprior.paper.trained import TrainedPrior
 
-BASE = Path(__file__).parents[1] / "configs" / "front_bedroom_small.yaml"
+BASE = Path(__file__).parents[1] / "configs" / "paper/bedroom_small.yaml"
 SETTINGS = (
     "data.views_per_room=12",
     "model.max_objects=4",
@@ -39,17 +40,17 @@ SETTINGS = (
     "layout.latent_noise=0.04",
 )
 WRONG = 0.2
-"""Share of the sightings whose mask is wrong; as many more are not seen at all."""
+"""Share of observations with a wrong mask; another share of the same size is dropped."""
 DEGREES, METRES = 2.0, 0.05
-"""Root mean square of how far cameras are turned and moved."""
+"""Root mean square rotation and translation of the cameras."""
 
 
 def spoil_masks(flat: FlatViews, seed: int) -> FlatViews:
-    """Jitter every 2D box by 1% of the image, make `WRONG` of them wrong, and lose as many.
+    """Jitter all 2D boxes by 1% of the image, corrupt a share `WRONG` of them, and drop as many.
 
-    A third of the wrong ones are moved by up to a quarter of the image, a third lose half their
-    width or height, as masks that fall apart, and a third take the next sighting's box, which is
-    another object's, as where ids are swapped.
+    A third of the corrupted boxes are moved by up to a quarter of the image, a third lose half
+    their width or height, like fragmented masks, and a third take the box of the next observation,
+    like swapped ids.
     """
     generator = torch.Generator().manual_seed(seed)
     count = len(flat.boxes)
@@ -75,7 +76,7 @@ def spoil_masks(flat: FlatViews, seed: int) -> FlatViews:
 
 
 def spoil_poses(flat: FlatViews, seed: int) -> FlatViews:
-    """Turn each camera about a random axis and move it, by normally distributed amounts."""
+    """Rotate each camera about a random axis and translate it, by normally distributed amounts."""
     generator = torch.Generator().manual_seed(seed)
     count = len(flat.world_to_camera)
     turn = torch.randn(count, 3, generator=generator) * (DEGREES * torch.pi / 180 / 3**0.5)
@@ -89,7 +90,7 @@ def spoil_poses(flat: FlatViews, seed: int) -> FlatViews:
 
 
 class SmallRooms(Dataset):
-    """The first `count` training rooms of at most `objects` objects."""
+    """The first `count` training rooms with at most `objects` objects."""
 
     masks = None
 
@@ -106,8 +107,8 @@ class SmallRooms(Dataset):
         return replace(batch, room_index=torch.tensor([row for row, _ in draws]))
 
 
-def train(config: OursConfig, rooms: SmallRooms) -> TrainedPrior:
-    """The layout stage alone, on what is in memory."""
+def train(config: PaperConfig, rooms: SmallRooms) -> TrainedPrior:
+    """Train the layout stage alone, on observations in memory."""
     assert config.layout is not None, "BASE has a layout stage"
     lightning.seed_everything(config.seed, verbose=False)
     prior, latents = config.build_prior(), config.build_latents(len(rooms))
@@ -126,8 +127,8 @@ def train(config: OursConfig, rooms: SmallRooms) -> TrainedPrior:
     return TrainedPrior(prior, latents.weight.detach(), rooms.room_ids, config, "layout")
 
 
-def row(name: str, config: OursConfig, rooms: int, masks: bool, poses: bool) -> None:
-    """Train on some rooms, spoilt or not, and print how well they are remembered."""
+def row(name: str, config: PaperConfig, rooms: int, masks: bool, poses: bool) -> None:
+    """Train on some rooms, corrupted or not, and print the scores of their reconstruction."""
     folder = Path(config.data.shards)
     data = ViewDataset(folder, "train", config.data.views_per_room, seed=config.seed)
     if masks:
@@ -170,5 +171,5 @@ if __name__ == "__main__":
                 f"data.shards={options.shards}", f"layout.epochs={options.epochs}", f"seed={seed}"
             )  # fmt: skip
             config = load_config(str(BASE), SETTINGS + changes).with_label_set()
-            assert isinstance(config, OursConfig)
+            assert isinstance(config, PaperConfig)
             row(said, config, options.rooms, masks, poses)

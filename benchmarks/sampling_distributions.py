@@ -1,9 +1,9 @@
-"""How far from the test rooms are a run's decoded training rooms, and new ones by distribution?
+"""Frechet distances to the test rooms of decoded training rooms, and of samples by distribution.
 
-Run `python benchmarks/sampling_distributions.py RUN [RUN ...]`. What a prior generates can hardly
-be nearer to test rooms than what it decodes from the latents it was trained with: the difference is
-what sampling costs, the rest is how well it decodes. Frechet distances of EfficientNet-Lite0
-features (not FID), seed 0, as many rooms as training rooms; in brackets all rooms drawn as boxes.
+Run `python benchmarks/sampling_distributions.py RUN [RUN ...]`. Decoded training rooms are a limit
+for generated rooms: their distance measures the decoder, and the difference to it measures the
+sampling distribution. The distances are in EfficientNet-Lite0 features (not FID), seed 0, with as
+many rooms as training rooms; in brackets, with all rooms drawn as boxes.
 """
 
 import argparse
@@ -12,17 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprior.config import load_run
+from sceneprior.apps.config import load_run
+from sceneprior.apps.experiments.evaluate import decoded_and_true
+from sceneprior.apps.sample import sample_rooms
+from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.scene import Scene
 from sceneprior.evaluation.features import Drawing
-from sceneprior.evaluation.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.frechet import frechet_distance
 from sceneprior.evaluation.room_sets import without_void
-from sceneprior.experiments.evaluate import decoded_and_true
-from sceneprior.generation.decode import synthesize
-from sceneprior.offscreen import open_renderer
-from sceneprior.scene import Scene
+from sceneprior.render.offscreen import open_renderer
 
-DISTRIBUTIONS = ("kernel", "geodesic", "paper")
+DISTRIBUTIONS = ("kernel", "paper")
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def main() -> None:
         real = features(test), features([scene.without_meshes() for scene in test])
         rooms = {"decoded": [decoded for decoded, _ in decoded_and_true(trained, shards)]}
         for distribution in DISTRIBUTIONS:
-            rooms[distribution] = synthesize(trained, len(rooms["decoded"]), 0, distribution)
+            rooms[distribution] = sample_rooms(trained, len(rooms["decoded"]), 0, distribution)
         for what, scenes in rooms.items():
             boxes = features([scene.without_meshes() for scene in scenes])
             apart = frechet_distance(features(scenes), real[0]), frechet_distance(boxes, real[1])

@@ -1,14 +1,14 @@
-"""Chamfer distance and volumetric IoU of decoded training objects to true ones, by class.
+"""Chamfer distance and volumetric IoU between decoded training objects and true ones, by class.
 
-Run `python benchmarks/shape_fidelity.py RUN`. Boxes alone, as the layout stage has them (a run of
-one stage: as that has them), stand here as the ellipsoids that fill them (the paper's proxy) and
-as boxes; the shape stage has meshes. All of them are held against the same true meshes, which
-training never saw. Pairs are chosen by boxes (`match_scenes`), each object counts once, and points
-are drawn with a fixed seed. Two more tables have the same by class.
+Run `python benchmarks/shape_fidelity.py RUN`. The rows compare three kinds of decoded shapes with
+the true meshes, which training never saw: the layout stage's boxes, drawn as the inscribed
+ellipsoids (the paper's proxy) and as boxes (in a run of one stage, that stage's boxes), and the
+final meshes. Objects are matched by boxes (`match_scenes`), each object has the same weight, and
+points are sampled with a fixed seed. Two more tables list the distance and the IoU by class.
 
-Two rows say what could be reached: the true solids, moved into the decoded boxes, are what the best
-of views from outside could tell; the true surfaces, drawn again, are how far so many points of one
-surface lie from so many others.
+Two rows are limits: the true solids, scaled into the decoded boxes, show the best shape that
+outside views could give; the true surfaces, sampled again, show the distance that remains between
+two samples of one surface.
 """
 
 import argparse
@@ -23,20 +23,21 @@ from PIL import Image
 from trimesh.voxel.encoding import DenseEncoding
 from trimesh.voxel.morphology import fill_orthographic
 
-from sceneprior.config import load_run
-from sceneprior.evaluation.metrics.decoded_rooms import match_scenes, reconstruction_scores
+from sceneprior.apps.config import load_run
+from sceneprior.apps.experiments.evaluate import decoded_and_true
+from sceneprior.core.geometry.isosurface import surface_of
+from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.core.geometry.surfaces import chamfer_sum
+from sceneprior.core.overlaps import match_scenes
+from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.evaluation.metrics.frechet import FRECHET
 from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
-from sceneprior.experiments.evaluate import decoded_and_true
-from sceneprior.geometry.isosurface import surface_of
-from sceneprior.geometry.meshes import icosphere
-from sceneprior.geometry.surfaces import chamfer_sum
-from sceneprior.offscreen import open_renderer
-from sceneprior.pictures import contact_sheet
-from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.topdown import box_mesh, corner_view, perspective
-from sceneprior.training.method import TrainedPrior
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.render.offscreen import open_renderer
+from sceneprior.render.pictures import contact_sheet
+from sceneprior.render.topdown import box_mesh, corner_view, perspective
 
 SPHERE_LEVEL = 3
 SOLID_CELLS, SOLID_POINTS = 32, 50_000
@@ -44,7 +45,7 @@ SHEET_ROOMS, SHEET_COLUMNS, TILE_PX = 24, 6, (210, 280)
 
 
 def ellipsoid(item: SceneObject, _: SceneObject) -> Mesh:
-    """What fills the object's box smoothly."""
+    """The ellipsoid inscribed in the object's box."""
     vertices, faces = icosphere(SPHERE_LEVEL)
     placed = vertices.numpy() * np.array(item.size_m) / 2 + np.array(item.center_m)
     return Mesh(placed, faces.numpy())
@@ -62,20 +63,22 @@ def own(item: SceneObject, _: SceneObject) -> Mesh:
 
 
 class Fidelity(NamedTuple):
-    """How near one object's surface is to the true one, and its volume."""
+    """Scores of one object's shape against the true one."""
 
     label: str
     """The true class."""
     chamfer_m: float
-    """L2, both ways added."""
+    """Chamfer distance L2, the sum of both directions."""
     f_score: float
     volume_iou: float
-    """See `volume_iou`."""
+    """See the function `volume_iou`."""
 
 
 def solid_cells(mesh: Mesh, low_m: np.ndarray, high_m: np.ndarray, cells: int) -> np.ndarray:
-    """Cells of a mesh's surface between two corners, and those between such cells along all three
-    axes: furniture is drawn hollow, open and in pieces. Air below a table or above a seat is not.
+    """Voxels of a mesh as a solid, in a grid between two corners.
+
+    A voxel is solid if it contains surface, or lies between such voxels along all three axes. This
+    fills furniture that is modelled hollow, open or in pieces, but not the air below a table.
     """
     points = sample_surface(mesh, SOLID_POINTS, 0)
     at = ((points - low_m) / (high_m - low_m).clip(1e-9) * cells).astype(int)
@@ -85,9 +88,9 @@ def solid_cells(mesh: Mesh, low_m: np.ndarray, high_m: np.ndarray, cells: int) -
 
 
 def volume_iou(a: Mesh, b: Mesh) -> float:
-    """Intersection over union of two solids, on 32 cells along each axis of what holds both.
+    """Intersection over union of two solids, on 32 voxels along each axis of their joint box.
 
-    Cells count in full where a surface only passes: two cubes that share a third have 0.375.
+    A voxel that contains surface counts as full: two cubes with an IoU of 1 / 3 get 0.375.
     """
     ends = [(mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)) for mesh in (a, b)]
     low_m, high_m = np.minimum(*(low for low, _ in ends)), np.maximum(*(high for _, high in ends))
@@ -96,7 +99,7 @@ def volume_iou(a: Mesh, b: Mesh) -> float:
 
 
 def true_solid(item: SceneObject, truth: SceneObject) -> Mesh:
-    """The true object as a solid of so many cells, in the decoded object's box."""
+    """The true object as a voxelised solid, scaled into the decoded object's box."""
     assert truth.mesh is not None, "asked for meshes"
     corners = truth.mesh.vertices_m
     filled = solid_cells(truth.mesh, corners.min(axis=0), corners.max(axis=0), SOLID_CELLS)
@@ -116,7 +119,7 @@ def distances(
     shape: Callable[[SceneObject, SceneObject], Mesh],
     points: int,
 ) -> list[Fidelity]:
-    """How near `shape`, of a decoded and a true object, makes every matched object."""
+    """Scores of every matched object, with a shape computed by `shape(decoded, true)`."""
     found = []
     for decoded, truth in pairs:
         match = match_scenes(decoded, truth)
@@ -133,8 +136,10 @@ def distances(
 def figures(
     pairs: list[tuple[Scene, Scene]], shards: Path, renderer: str
 ) -> dict[str, float | None]:
-    """3D box IoU of decoded training rooms, and the Frechet distances (EfficientNet-Lite0) of their
-    pictures and of the true training rooms' to the test rooms'."""
+    """3D box IoU of decoded training rooms, and Frechet distances to the test rooms.
+
+    The distances, in EfficientNet-Lite0 features, are of the decoded and the true training rooms.
+    """
     options = EvalOptions(renderer=renderer, resamples=0)
     scores = evaluate_synthesis([decoded for decoded, _ in pairs], shards, options)
     key = FRECHET["effnet_lite0"]
@@ -146,7 +151,7 @@ def figures(
 
 
 def sheet(pairs: list[tuple[Scene, Scene]], renderer: str) -> Image.Image:
-    """Training rooms drawn by a fixed seed, each as it is and, to the right of it, as decoded."""
+    """Contact sheet of random training rooms, each with its decoded version to the right."""
     rows = np.random.default_rng(0).permutation(len(pairs))[:SHEET_ROOMS]
     opened = open_renderer(renderer)
     tiles = []
@@ -158,7 +163,7 @@ def sheet(pairs: list[tuple[Scene, Scene]], renderer: str) -> Image.Image:
 
 
 def print_by_class(rows: dict[str, list[Fidelity]], figure: Callable[[Fidelity], float]) -> None:
-    """A table in Markdown: a class a line, a shape a column."""
+    """Print a Markdown table with one row per class and one column per shape."""
     print(f"\n| class | objects | {' | '.join(rows)} |")
     print(f"| --- | ---: |{' ---: |' * len(rows)}")
     for label in sorted({item.label for found in rows.values() for item in found}):

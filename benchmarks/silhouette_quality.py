@@ -1,12 +1,12 @@
-"""Which silhouettes teach shapes best? The shape stage from one layout, at equal steps.
+"""Quality of shapes by renderer mode and compositing: the shape stage, from one layout checkpoint.
 
-    sceneprior fit --config front_bedroom_small.yaml --run out/small     # once: for the layout
+    sceneprior fit --config paper/bedroom_small.yaml --run out/small     # once: for the layout
     python benchmarks/silhouette_quality.py --run out/small --epochs 10 --seed 0
 
-Every variant of renderer and compositing starts from the same layout checkpoint and sees the same
-batches. Afterwards all are judged alike: the decoded training rooms are drawn hard, and each
-object's visible mask is compared with what the camera saw (mask IoU, mean over objects and
-views), and its 3D box with the truth (mean over objects).
+Every variant starts from the same layout checkpoint and trains on the same batches. The decoded
+training rooms are then rasterised hard, and each object's visible mask is compared with the
+observed one (mask IoU, mean over objects and views), and its 3D box with the truth (mean over
+objects).
 """
 
 import argparse
@@ -17,16 +17,16 @@ from pathlib import Path
 
 import torch
 
-from sceneprior.config import load_config, load_run
-from sceneprior.data.datamodule import make_loader
-from sceneprior.data.dataset import ViewDataset
+from sceneprior.apps.config import load_config, load_run
+from sceneprior.apps.experiments.evaluate import decoded_and_true
+from sceneprior.core.data.datamodule import make_loader
+from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.geometry.cameras import boxes_of_points
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
-from sceneprior.experiments.evaluate import decoded_and_true
-from sceneprior.geometry.cameras import boxes_of_points
-from sceneprior.losses.matching import match_objects
-from sceneprior.silhouettes import render_scene
+from sceneprior.paper.losses.matching import match_objects
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.render.silhouettes import render_scene
 from sceneprior.training.fit import fit
-from sceneprior.training.method import TrainedPrior
 
 VARIANTS = ("exact/layered", "exact/paper", "fast/layered", "fast/paper")
 

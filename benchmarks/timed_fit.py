@@ -1,4 +1,4 @@
-"""Training under a clock: `fit` itself, a few epochs of a paper-sized run on made homes."""
+"""Timing of `fit`: a few epochs of a paper-sized run on procedural homes."""
 
 import statistics
 import time
@@ -15,20 +15,19 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
-from sceneprior.config import load_config
-from sceneprior.settings import find_config
+from sceneprior.apps.config import load_config
+from sceneprior.core.settings import find_config
 from sceneprior.training.fit import fit
 from sceneprior.training.method import RunConfig
-from sceneprior.training.monitor import Evaluate
 
 CONFIG = "bedroom.yaml"
 """The paper's settings for bedrooms."""
 
 
 def made_shards(folder: Path, rooms: int, workers: int) -> Path:
-    """View shards of so many made bedrooms, seven in ten of them for training."""
+    """Shards of `rooms` procedural bedrooms, 70% of them for training."""
     shards, homes = folder / "shards", folder / "homes"
-    if not (shards / "index.json").is_file():  # the last thing written
+    if not (shards / "index.json").is_file():  # written last
         if not homes.is_dir():
             make_homes(homes, rooms, "bedroom", seed=0)
         front, future = homes / "3D-FRONT", homes / "3D-FUTURE-model"
@@ -39,32 +38,31 @@ def made_shards(folder: Path, rooms: int, workers: int) -> Path:
 
 
 def paper_run(shards: Path, epochs: int, *changes: str) -> RunConfig:
-    """The paper's run on other shards, with both stages cut to a few epochs.
-
-    What it generates is evaluated at each stage's end, or never where nothing evaluates.
-    """
-    short = (f"layout.epochs={epochs}", f"shape.epochs={epochs}", "samples.every=1000")
+    """The paper's run on other shards, with both stages cut to a few epochs."""
+    short = (f"layout.epochs={epochs}", f"shape.epochs={epochs}")
     return load_config(str(find_config(CONFIG)), (f"data.shards={shards}", *short, *changes))
 
 
 @dataclass
 class StageTimes:
-    """What the clock saw of a stage."""
+    """Measurements of a stage."""
 
     rooms: int = 0
-    """Rows an epoch, turned copies included, of all processes."""
+    """Rows per epoch over all processes, turned copies included."""
     network_bytes: int = 0
+    """Bytes of the network's gradients, which processes sum at each step."""
     latent_bytes: int = 0
-    """Of gradients, which several processes add up at each step."""
+    """Bytes of the latents' gradients, which processes sum at each step."""
     starts_s: list[float] = field(default_factory=list)
-    """Of epochs, by the clock; and the CPU seconds that the process had taken by then."""
+    """Start times of the epochs by the wall clock."""
     starts_cpu_s: list[float] = field(default_factory=list)
+    """CPU seconds of the process at these times."""
     steps_s: list[list[float]] = field(default_factory=list)
-    """By epoch."""
+    """Seconds of the steps, by epoch."""
     peak_mib: float = 0.0
-    """The most that tensors took on the GPU; 0 on a CPU."""
+    """Peak memory of tensors on the GPU; 0 on a CPU."""
     loss: float = 0.0
-    """Of the last epoch."""
+    """Loss of the last epoch."""
 
     @property
     def first_epoch_s(self) -> float:
@@ -72,22 +70,22 @@ class StageTimes:
 
     @property
     def epoch_s(self) -> float:
-        """Median without the first, which compiles and reads images, and without the last, at whose
-        end what is generated is evaluated."""
+        """Median seconds of an epoch, without the first, which compiles and reads images, and
+        without the last, which ends with the stage."""
         return _between(self.starts_s)
 
     @property
     def epoch_cpu_s(self) -> float:
-        """CPU seconds of this process in such an epoch, loader processes aside."""
+        """Median CPU seconds of these epochs in this process, without loader processes."""
         return _between(self.starts_cpu_s)
 
     @property
     def step_s(self) -> float:
-        """Median of the same epochs: loss, backward and update, without waiting for data."""
+        """Median seconds of a step in these epochs: loss, backward and update, without loading."""
         return statistics.median(step for epoch in self.steps_s[1:-1] for step in epoch)
 
     def figures(self) -> dict[str, float]:
-        """The figures of a table's row."""
+        """The values of a table's row."""
         waiting = self.epoch_s - self.step_s * len(self.steps_s[1])
         return {
             "step_s": self.step_s,
@@ -104,7 +102,7 @@ StageEnded = Callable[[str, StageTimes], None]
 
 
 class Clock(Callback):
-    """Times every step and epoch of each stage; of several processes, each its own."""
+    """Times every step and epoch of each stage, separately in each process."""
 
     def __init__(self, matmul: str, ended: StageEnded) -> None:
         self.matmul, self.ended = matmul, ended
@@ -112,7 +110,7 @@ class Clock(Callback):
         self._began = 0.0
 
     def on_train_start(self, trainer, pl_module) -> None:
-        torch.set_float32_matmul_precision(self.matmul)  # after `fit`, which sets "high"
+        torch.set_float32_matmul_precision(self.matmul)  # overrides "high", which `fit` sets
         trained = {n: p.nbytes for n, p in pl_module.named_parameters() if p.requires_grad}
         latents = sum(size for name, size in trained.items() if name.startswith("latents."))
         self._now = StageTimes(len(pl_module.rooms), sum(trained.values()) - latents, latents)
@@ -144,7 +142,7 @@ def _between(marks: list[float]) -> float:
 
 
 def _now_s() -> float:
-    # A step already waits for its loss (`check_finite`), so waiting again changes little.
+    # Each step synchronises for its loss anyway (`check_finite`), so this changes little.
     if torch.cuda.is_available():
         torch.cuda.synchronize()
     return time.perf_counter()
@@ -155,24 +153,20 @@ def timed_fit(
     run: Path,
     options: dict[str, Any],
     matmul: str = "high",
-    evaluate: Evaluate | None = None,
     ended: StageEnded = lambda name, times: None,
 ) -> dict[str, StageTimes]:
-    """Train a run from its start, at least 3 epochs a stage; what the clock saw, by stage.
+    """Train a run from its start, at least 3 epochs per stage; returns the times by stage.
 
     Args:
         config: The run; see `paper_run`.
         run: A folder that does not exist yet.
-        options: Lightning's: accelerator, devices, precision.
-        matmul: How exact float32 matrix products are: `high` is TF32 where a GPU has it, and what
-            `fit` uses; `highest` is float32.
-        evaluate: What evaluates samples at each stage's end, if that is measured, too.
-        ended: Told of each stage as soon as it is over: the next may be too much for the device.
+        options: Lightning's options: accelerator, devices, precision.
+        matmul: Precision of float32 matrix products: `high`, which `fit` uses, is TF32 on GPUs that
+            have it; `highest` is float32.
+        ended: Called with the name and times of each stage as soon as it ends, since the next stage
+            may exceed the device's memory.
     """
     clock = Clock(matmul, ended)
-    if evaluate is None:
-        unwatched = config.samples.model_copy(update={"every": 0})
-        config = config.model_copy(update={"samples": unwatched})
     options = options | {"callbacks": [clock]}
-    fit(config, run, loggers=("csv",), trainer_options=options, evaluate=evaluate)
+    fit(config, run, loggers=("csv",), trainer_options=options)
     return clock.stages

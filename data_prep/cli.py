@@ -1,4 +1,7 @@
-"""The commands that prepare data; `sceneprior.cli` mounts them. Heavy imports wait inside."""
+"""Commands that prepare data, mounted by `sceneprior.apps.cli`.
+
+Heavy imports stand inside the functions, so that the command line starts quickly.
+"""
 
 import os
 from pathlib import Path
@@ -8,6 +11,7 @@ import typer
 
 from data_prep.homes.command import make_homes_command
 from data_prep.inspection.command import inspect_command
+from sceneprior.core.seeds import LARGEST_SEED
 
 if TYPE_CHECKING:
     from data_prep.engine.source import Source
@@ -60,7 +64,7 @@ def prep_front(
     rule: Annotated[
         list[str] | None, typer.Option(help="Change a rule of the recipe: max_floor_m=8, or null.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same bytes.")] = 0,
     rgb: Annotated[
         bool, typer.Option("--rgb", help="Also draw shaded pictures: OUT/rgb/ROOM/VIEW.png.")
     ] = False,
@@ -112,7 +116,7 @@ def prep_scannet(
         Path | None,
         typer.Option(help="scannetv2_val.txt: the test split. Without lists, a seeded 9:1."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the 9:1.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the 9:1.")] = 0,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
     only: Annotated[str | None, typer.Option(help="One scan, or the beginning of names.")] = None,
@@ -165,7 +169,7 @@ def prep_posed(
     ] = None,
     max_views: Annotated[int, typer.Option(help="Frames are thinned to this many.")] = 100,
     test_share: Annotated[float, typer.Option(help="Share of rooms in the test split.")] = 0.1,
-    seed: Annotated[int, typer.Option(help="Of the split.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the split.")] = 0,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
     only: Annotated[str | None, typer.Option(help="One room, or the beginning of names.")] = None,
@@ -196,10 +200,10 @@ def run_job(
     strict: bool,
     retry_failed: bool,
 ) -> None:
-    """Build shards from a source, print the report, and exit as every `prep-*` command does.
+    """Build shards from a source and print the report, for every `prep-*` command.
 
     Raises:
-        InputError: see `build_shards`; `main` prints it and exits with 2.
+        InputError: see `build_shards`; `main` prints it and exits with status 2.
         typer.Exit: 3 if rooms failed, 130 after Ctrl-C.
     """
     from rich.console import Console

@@ -5,18 +5,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 _ROTATION_SLACK = 1e-2
-"""A pose whose axes are further than this from right angles and unit length is damage. Fused
-poses of the release, rounded to float32, are a thousand times better."""
+"""Largest deviation of R^T R from the identity in a valid pose. The fused poses of ScanNet's
+release, rounded to float32, deviate a thousand times less."""
+_FARTHEST = 1e9
+"""Upper bound on the absolute value of a pose's entries, in any unit; NaN fails it, too."""
 _ASPECT_SLACK = 0.02
-"""1296 x 968 and 640 x 480 differ by 0.4% in shape and still show the same picture."""
+"""Largest relative difference between the aspect ratios of masks and colour frames; 1296 x 968
+and 640 x 480 differ by 0.4% and show the same picture."""
 
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """The frames that become views, and how many candidates could not."""
+    """The frames that become views, and the number of rejected candidates."""
 
     frames: tuple[int, ...]
     candidates: int
@@ -29,10 +32,11 @@ class FrameChoice:
 def choose_frames(
     camera_to_world: np.ndarray, with_mask: Collection[int], step: int = 15, at_most: int = 100
 ) -> FrameChoice:
-    """Every `step`-th frame, less those that cannot be used, then at most `at_most` of them.
+    """Choose every `step`-th usable frame, at most `at_most` of them.
 
-    What is left is thinned evenly, first and last frame kept. Frames are dropped before they are
-    thinned, so that a recording that lost its track keeps as many views as it can.
+    Frames with a bad pose or without a mask are dropped first, so that a recording that lost
+    tracking keeps as many views as possible. The rest is thinned evenly; the first and the last
+    frame stay.
 
     Args:
         camera_to_world: (frames, 4, 4), as recorded.
@@ -53,7 +57,7 @@ def choose_frames(
     usable = [frame for frame in posed if frame in masked]
     frames = usable
     if len(usable) > at_most:
-        # Half up rather than to even, so that the steps are as equal as they can be.
+        # Rounding half up, not to even, keeps the steps as equal as possible.
         places = np.floor(np.linspace(0, len(usable) - 1, at_most) + 0.5).astype(int)
         frames = [usable[place] for place in places]
     return FrameChoice(
@@ -62,15 +66,38 @@ def choose_frames(
 
 
 def is_pose(camera_to_world: np.ndarray) -> np.ndarray:
-    """(frames,) bool: each (4, 4) is finite, and a rotation with a translation."""
-    poses = np.asarray(camera_to_world, dtype=np.float64)
-    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    """Test which (4, 4) matrices are rigid transforms with finite, plausible entries: (frames,)."""
+    with np.errstate(invalid="ignore"):  # some bit patterns of NaN
+        poses = np.asarray(camera_to_world, dtype=np.float64)
+    finite = np.asarray((np.abs(poses) < _FARTHEST).all(axis=(1, 2)))
     safe = np.where(finite[:, None, None], poses, 0.0)
     turn = safe[:, :3, :3]
     off = np.abs(turn.transpose(0, 2, 1) @ turn - np.eye(3)).max(axis=(1, 2))
     bottom = np.abs(safe[:, 3] - (0, 0, 0, 1)).max(axis=1)
     right_handed = np.linalg.det(turn) > 0
     return finite & (off < _ROTATION_SLACK) & (bottom < _ROTATION_SLACK) & right_handed
+
+
+def pose_fault(camera_to_world: np.ndarray) -> str:
+    """Describe the fault of a (4, 4) pose that `is_pose` rejects.
+
+    >>> pose_fault(np.diag([1.0, 1, -1, 1]))
+    'it is left-handed, a mirror'
+    """
+    pose = np.asarray(camera_to_world, dtype=np.float64)
+    if not np.isfinite(pose).all():
+        return "it holds NaN or infinity"
+    if np.abs(pose).max() >= _FARTHEST:
+        return f"it holds {np.abs(pose).max():.3g}"
+    if not is_pose(pose[None])[0] and is_pose(pose.T[None])[0]:
+        return "it is transposed: its translation is in the last row"
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() >= _ROTATION_SLACK:
+        return "its last row is not 0, 0, 0, 1"
+    determinant = float(np.linalg.det(pose[:3, :3]))
+    scale = abs(determinant) ** (1 / 3)
+    if scale and is_pose((pose * [*[1 / scale] * 3, 1])[None])[0]:
+        return f"its axes have the length {scale:.3g}, expected 1"
+    return "it is left-handed, a mirror" if determinant < 0 else "its axes are no rotation"
 
 
 def room_cameras(camera_to_world: np.ndarray, room_from_scan: np.ndarray) -> np.ndarray:
@@ -95,9 +122,10 @@ def room_cameras(camera_to_world: np.ndarray, room_from_scan: np.ndarray) -> np.
 
 
 def sampled_lines(source: int, target: int) -> np.ndarray:
-    """(target,) which of `source` rows (or columns) stand for the `target` rows of a small image.
+    """Indices of the `source` rows (or columns) that downsampling to `target` keeps, (target,).
 
-    The nearest to where the small pixel's centre lies, the later one where two are equally near.
+    Each is the row nearest to the centre of a downsampled pixel; of two equally near rows, the
+    later.
 
         >>> sampled_lines(12, 3).tolist()
         [2, 6, 10]
@@ -111,29 +139,29 @@ def mask_intrinsics(
     mask_size: tuple[int, int],
     image_size: tuple[int, int],
 ) -> np.ndarray:
-    """The intrinsics of an image of `image_size`, sampled at `sampled_lines` of a mask's lines.
+    """Intrinsics of a mask that was downsampled to `image_size` with `sampled_lines`.
 
-    Colour frames, masks and what is stored may all differ in size; this is the one place that
-    minds it. Three steps, each exact:
+    Colour frames, masks and stored images may all differ in size; only this function converts
+    between them. Three steps, each exact:
 
-    - ScanNet counts pixel centres in whole numbers, docs/conventions.md puts them at i + 0.5:
-      half a pixel is added to the centre of projection.
-    - A mask shows what the colour frame shows: u scales with the widths, v with the heights.
-    - A sampled pixel is one of the mask's pixels, whose centre need not be the small pixel's own:
-      every fourth line from the third on is 0.5 full-size pixels late. The mean offset moves
-      the centre of projection, so that points fall on the pixels that show them.
+    - ScanNet puts pixel centres at integers, docs/conventions.md at i + 0.5, so half a pixel is
+      added to the principal point.
+    - Masks and colour frames show the same picture: u scales with the widths, v with the heights.
+    - A downsampled pixel copies one mask pixel, whose centre may be off its own: keeping every
+      fourth row from the third on shifts the image by 0.5 full-size pixels. The principal point
+      moves by the mean offset, so that points project onto the pixels that show them.
 
     Args:
-        intrinsic_color: (4, 4) of the `.sens`, pixels of the colour frame.
+        intrinsic_color: (4, 4) matrix of the `.sens` file, in pixels of the colour frame.
         color_size, mask_size, image_size: (height, width).
 
     Returns:
         (3, 3) float64, pixels of the stored image.
 
     Raises:
-        InputError: masks and colour frames are not of one shape.
+        InputError: masks and colour frames differ in aspect ratio.
 
-    Example: half size; the second of each two pixels stays, 0.25 small pixels right of the centre.
+    Example: half size; the second pixel of each pair stays, 0.25 small pixels right of the centre.
 
         >>> K = np.diag([8.0, 8, 1, 1])
         >>> K[:2, 2] = 3.5  # the middle of 8 pixels that are counted from centre to centre
@@ -150,7 +178,7 @@ def mask_intrinsics(
     intrinsics = np.array(intrinsic_color[:3, :3], dtype=np.float64)
     intrinsics[2] = 0, 0, 1
     intrinsics[:2, 2] += 0.5
-    # Axis 0 is u, along the width; axis 1 is v.
+    # Axis 0 is u (width), axis 1 is v (height).
     for axis, line in enumerate((1, 0)):
         intrinsics[axis] *= mask_size[line] / color_size[line]
         step = mask_size[line] / image_size[line]

@@ -1,28 +1,31 @@
-"""Upright boxes of tracked objects, fitted to their 2D boxes in all views; truth is never asked."""
+"""Upright 3D boxes of tracked objects, fitted to their 2D boxes in all views, without ground truth.
+
+Each box has seven parameters: centre (3), logarithms of the sizes (3), yaw.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from sceneprior.geometry.corners import CUBE_CORNERS
-from sceneprior.shards import Sightings
+from sceneprior.core.geometry.corners import CUBE_CORNERS
+from sceneprior.core.shards import Sightings
 
 VIEWS_AT_MOST = 10
-"""Of an object; more only take longer."""
+"""Views used per object; more only take longer."""
 _VIEWS_AT_LEAST = 3
 _PARALLAX_RAD = np.radians(10)
-"""Between two views of an object at least, or its distance is a guess."""
+"""The widest angle between two rays to an object must exceed this, or its distance is a guess."""
 _NEAR_M = 0.05
 _STEPS, _PATIENCE = 30, 3
-"""At most, and how many in a row may bring nothing."""
+"""Maximum number of steps, and of consecutive steps without progress."""
 _DELTA = 1e-5
-"""Of the derivatives, in metres, logarithms and radians."""
+"""Step of the finite differences, in metres, logarithms and radians."""
 _SIDES_AT_LEAST = 8
-"""Seen clearly, or the seven numbers of a box are a guess."""
+"""Unoccluded sides, over all views, that determine the seven parameters of a box."""
 
 
 class UprightBoxes(NamedTuple):
-    """One box an object, which turns about +y alone; NaN where views do not tell."""
+    """One box per object, rotated about +y only; NaN where the views do not determine it."""
 
     centers_m: np.ndarray
     """(n, 3) in the cameras' world, whose y points up."""
@@ -31,11 +34,11 @@ class UprightBoxes(NamedTuple):
     yaw_rad: np.ndarray
     """(n,)"""
     misfit_px: np.ndarray
-    """(n,) mean distance between the projected sides and those that views show clearly."""
+    """(n,) mean distance between the projected sides and the unoccluded sides of the 2D boxes."""
 
     @property
     def corners_m(self) -> np.ndarray:
-        """(n, 8, 3), in the order of `CUBE_CORNERS`."""
+        """Corners, (n, 8, 3), in the order of `CUBE_CORNERS`."""
         return _corners(self._numbers)
 
     @property
@@ -44,14 +47,14 @@ class UprightBoxes(NamedTuple):
 
 
 class _Given(NamedTuple):
-    """What the boxes of n objects are held against: at most V views of each."""
+    """Observations that the boxes of n objects are fitted to, at most V views of each."""
 
     boxes_px: np.ndarray
     """(n, V, 4)"""
     clear: np.ndarray
-    """(n, V, 4) bool."""
+    """(n, V, 4) bool: the side is unoccluded (`own_sides`)."""
     chosen: np.ndarray
-    """(n, V) bool; the other rows are filled up."""
+    """(n, V) bool; false rows are padding."""
     poses: np.ndarray
     """(n, V, 4, 4)"""
     lenses: np.ndarray
@@ -59,9 +62,9 @@ class _Given(NamedTuple):
 
 
 def own_sides(seen: Sightings, image_size: tuple[int, int]) -> np.ndarray:
-    """(T, n, 4) bool: the sides of 2D boxes that are the object's own.
+    """Find the sides of the 2D boxes at which the object itself ends: (T, n, 4) bool.
 
-    At the others another object, or the image's border, may cut it off.
+    At the other sides, another object or the image border may cut it off.
     """
     height, width = image_size
     within = np.abs(seen.boxes - 0.5) < 0.5 - 0.5 / np.array([width, height] * 2)
@@ -74,13 +77,13 @@ def fit_upright(
     world_to_camera: np.ndarray,
     intrinsics: np.ndarray,
 ) -> UprightBoxes:
-    """The upright box of each object that explains its 2D boxes best.
+    """Fit an upright box to the 2D boxes of each object.
 
-    Least squares over the clear sides, robust against those that are wrong; of a side that
-    something may hide, only what sticks out of the projected box counts.
+    Robust least squares over the distances between the sides of the projected box and of the 2D
+    box. A side that may be occluded counts only where the 2D box reaches beyond the projected box.
 
     Args:
-        seen: What T views show.
+        seen: Observations in T views.
         image_size: (H, W).
         world_to_camera: (T, 4, 4), OpenCV axes, metres; the world's y points up.
         intrinsics: (T, 3, 3) in pixels.
@@ -91,7 +94,7 @@ def fit_upright(
     misfit = np.full(len(start), np.inf)
     if told.any():
         part = _Given(*(array[told] for array in given))
-        for yaw in (0.0, np.pi / 4):  # a valley each
+        for yaw in (0.0, np.pi / 4):  # each may lead to another local minimum
             first = start[told]
             first[:, 6] = yaw
             found = _descend(first, part)
@@ -106,10 +109,10 @@ def fit_upright(
 def _given(
     seen: Sightings, image_size: tuple[int, int], poses: np.ndarray, lenses: np.ndarray
 ) -> _Given:
-    """The views that show most of each object's sides."""
+    """Choose the views in which most sides of an object are unoccluded."""
     height, width = image_size
     clear = own_sides(seen, image_size)
-    # Views that show nothing of an object come last.
+    # Views in which the object is invisible come last.
     order = np.argsort(-(clear.sum(axis=2) + seen.visible), axis=0, kind="stable")
     views = order[:VIEWS_AT_MOST].T
     items = np.arange(views.shape[0])[:, None]
@@ -123,8 +126,10 @@ def _given(
 
 
 def _starts(given: _Given) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 7) boxes round the point nearest to the rays through each object's 2D boxes, and (n,)
-    whether its views tell where it is."""
+    """Initial boxes, (n, 7), and whether an object's views determine its position, (n,).
+
+    A box is centred on the point nearest to the rays through the centres of the 2D boxes.
+    """
     pixels = (given.boxes_px[..., :2] + given.boxes_px[..., 2:]) / 2
     directions = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=2)
     turns = given.poses[..., :3, :3].swapaxes(-1, -2)
@@ -152,7 +157,7 @@ def _starts(given: _Given) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _descend(numbers: np.ndarray, given: _Given) -> np.ndarray:
-    """Levenberg and Marquardt's steps on all boxes at once."""
+    """Refine all boxes at once by the Levenberg-Marquardt method."""
     deltas = np.concatenate([np.zeros((1, 7)), _DELTA * np.eye(7)])
     damping = np.full(len(numbers), 1e-2)
     idle = 0
@@ -184,10 +189,10 @@ def _cost(off: np.ndarray) -> np.ndarray:
 
 
 def _misfits(numbers: np.ndarray, given: _Given) -> np.ndarray:
-    """Pixels between each side of projected boxes and of the 2D boxes.
+    """Signed distances in pixels from the sides of the 2D boxes to those of the projected boxes.
 
     Args:
-        numbers: (n, C, 7) centre, logarithms of sizes, yaw of C candidates an object.
+        numbers: (n, C, 7) parameters of C candidate boxes per object.
 
     Returns:
         (n, C, V, 4)
@@ -200,14 +205,14 @@ def _misfits(numbers: np.ndarray, given: _Given) -> np.ndarray:
     pixels = pixels[..., :2] / points[..., 2:]
     found = np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2)], axis=-1)
     off = found - given.boxes_px[:, None]
-    # Of a hidden side the mask shows less than there is: the box may only be larger.
+    # An occluded mask ends too early: the projected box may be larger, not smaller.
     short = np.concatenate([np.maximum(off[..., :2], 0), np.minimum(off[..., 2:], 0)], axis=-1)
     off = np.where(given.clear[:, None], off, short)
     return off * given.chosen[:, None, :, None]
 
 
 def _corners(numbers: np.ndarray) -> np.ndarray:
-    """(..., 8, 3) of boxes (..., 7)."""
+    """Corners, (..., 8, 3), of boxes with parameters (..., 7)."""
     cos, sin = np.cos(numbers[..., 6:]), np.sin(numbers[..., 6:])
     x, y, z = np.moveaxis(CUBE_CORNERS / 2 * np.exp(numbers[..., None, 3:6]), -1, 0)
     turned = np.stack([cos * x + sin * z, y, cos * z - sin * x], axis=-1)

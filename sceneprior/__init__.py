@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
-    from sceneprior.api import Prior, load
-    from sceneprior.scene import Scene
-    from sceneprior.scene_files import load_scene
+    from sceneprior.apps.api import Prior, load
+    from sceneprior.core.scene import Scene
+    from sceneprior.render.scene_files import load_scene
 
 __version__ = "0.1.0"
 __all__ = ["Prior", "Scene", "__version__", "load", "load_scene"]
 
 _HOMES = {
-    "Prior": "sceneprior.api",
-    "Scene": "sceneprior.scene",
-    "load": "sceneprior.api",
-    "load_scene": "sceneprior.scene_files",
+    "Prior": "sceneprior.apps.api",
+    "Scene": "sceneprior.core.scene",
+    "load": "sceneprior.apps.api",
+    "load_scene": "sceneprior.render.scene_files",
 }
 
 

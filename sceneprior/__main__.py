@@ -1,5 +1,5 @@
 """`python -m sceneprior`: the same as the console script."""
 
-from sceneprior.cli import main
+from sceneprior.apps.cli import main
 
 main()

@@ -21,7 +21,7 @@ import sklearn.linear_model  # noqa: F401
 import torch
 from browser import browser  # noqa: F401 (a fixture)
 from threadpoolctl import threadpool_limits
-from tiny_runs import OCCUPANCY, tiny_config, tiny_sampler_config
+from tiny_runs import tiny_config, tiny_lifted, tiny_sampler_config
 from toy_rooms import write_toy_shards
 
 # Toy tensors gain nothing from a second thread, and wait for it where cores are shared: thirty
@@ -117,15 +117,15 @@ def sampler_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
 @pytest.fixture
 def grid_prior(toy_run: Path):
     """The toy run's prior with occupancy grids for shapes, which are untrained."""
-    from sceneprior.config import load_run
-    from sceneprior.training.method import TrainedPrior
+    from sceneprior.apps.config import load_run
+    from sceneprior.lifted.trained import TrainedLifted
 
     trained = load_run(toy_run)
     shards = Path(trained.config.data.shards)
-    config = tiny_config(shards, **OCCUPANCY)
+    config = tiny_lifted(shards)
     prior = config.build_prior()
     layout = trained.prior.state_dict()
     kept = {name: value for name, value in layout.items() if not name.startswith("shape.")}
     prior.load_state_dict(kept, strict=False)
     prior.eval().requires_grad_(False)
-    return TrainedPrior(prior, trained.logits, trained.room_ids, config, "shape")
+    return TrainedLifted(prior, trained.logits, trained.room_ids, config, "shape")

@@ -14,8 +14,7 @@ from pathlib import Path
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from sceneprior.config import load_config
-from sceneprior.experiments.evaluate_samples import SampleEvaluator
+from sceneprior.apps.config import load_config
 from sceneprior.training.fit import fit
 from sceneprior.training.slurm import first_process
 
@@ -56,7 +55,7 @@ def record(config, run: Path, devices: int, **options) -> list[dict[str, torch.T
     """The steps of a run, both stages in one list; of several processes, the first's."""
     recorder = Recorder()
     options = {"accelerator": "cpu", "devices": devices, "callbacks": [recorder], **options}
-    fit(config, run, trainer_options=options, loggers=("csv",), evaluate=SampleEvaluator(config))
+    fit(config, run, trainer_options=options, loggers=("csv",))
     return recorder.steps
 
 
@@ -64,7 +63,7 @@ def poison(config, run: Path, row: int) -> str:
     """Resume a run by two processes with a spoilt latent; what is said then."""
     options = {"accelerator": "cpu", "devices": 2, "callbacks": [Poison(row)]}
     try:
-        fit(config, run, True, ("csv",), options, SampleEvaluator(config))
+        fit(config, run, True, ("csv",), options)
     except FloatingPointError as error:
         return str(error)
     return "nothing"

@@ -3,13 +3,13 @@
 import numpy as np
 import torch
 
-from sceneprior.lifting.dataset import LiftedDataset
-from sceneprior.lifting.lifted import LiftedBoxes
-from sceneprior.models.occupancy import OccupancyConfig, OccupancyDecoder
-from sceneprior.sampler.network import RoomSampler
-from sceneprior.sampler.rooms import SamplerRooms
-from sceneprior.sampler.settings import SamplerConfig
-from sceneprior.sampler.stage import teach
+from sceneprior.lifted.lifting.dataset import LiftedDataset
+from sceneprior.lifted.lifting.lifted import LiftedBoxes
+from sceneprior.lifted.occupancy import OccupancyConfig, OccupancyDecoder
+from sceneprior.lifted.sampler.network import RoomSampler
+from sceneprior.lifted.sampler.rooms import SamplerRooms
+from sceneprior.lifted.sampler.settings import SamplerConfig
+from sceneprior.lifted.sampler.stage import teach
 
 CLASSES, CODES, CELLS, PROTOTYPES = 5, 7, 8, 12
 TINY = {"epochs": 2, "width": 16, "layers": 1, "heads": 2, "dropout": 0.0}

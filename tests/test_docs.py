@@ -19,11 +19,11 @@ from pages import PAGES, ROOT, Block, blocks_of, commands_of, name_of
 from typer.main import get_command
 
 from data_prep.front.recipe import load_recipe
-from sceneprior.cli import app
-from sceneprior.config import load_config
-from sceneprior.errors import ConfigError
-from sceneprior.experiments.comparison import load_comparison
-from sceneprior.scene import read_scene
+from sceneprior.apps.cli.commands import app
+from sceneprior.apps.config import load_config
+from sceneprior.apps.experiments.comparison import load_comparison
+from sceneprior.core.errors import ConfigError
+from sceneprior.core.scene import read_scene
 
 LONGEST_LINE = 110
 

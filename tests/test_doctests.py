@@ -19,8 +19,8 @@ def test_docstring_examples():
     assert not [name for name, result in results.items() if result.failed]
     having = {name for name, result in results.items() if result.attempted}
     assert {
-        "sceneprior.api",
-        "sceneprior.silhouettes.render",
-        "sceneprior.offscreen.zbuffer",
+        "sceneprior.apps.api",
+        "sceneprior.render.silhouettes.render",
+        "sceneprior.render.offscreen.zbuffer",
         "data_prep.front.viewpoints",
     } <= having

@@ -31,10 +31,10 @@ from PIL import Image
 from posed_files import PosedRoom, furniture
 
 from data_prep.homes.make import make_homes
-from sceneprior import cli
-from sceneprior.classes import label_set
-from sceneprior.config import load_config
-from sceneprior.reconstruction.image import image_from_shards
+from sceneprior.apps import cli
+from sceneprior.apps.config import load_config
+from sceneprior.core.classes import label_set
+from sceneprior.core.observed_image import image_from_shards
 
 RUN_HERE = [
     "README.md", "docs/index.md", "docs/tutorial.md", "docs/concepts.md", "docs/uses.md",
@@ -47,14 +47,14 @@ WHOLE_PAGES = {
     "docs/own_room_types.md": "tests/data_prep/front/test_own_room_types.py",
 }
 """Guides that tests of their own run as printed, on data of their own."""
-TABLES = ("docs/results.md", "docs/experiments/", "docs/silhouettes.md")
+TABLES = ("docs/results.md", "docs/performance.md", "docs/experiments/", "docs/silhouettes.md")
 """Pages whose commands made the tables on them, in hours, from data that are not here."""
 ELSEWHERE = {
-    "make demo": "tests/experiments/test_demo.py runs the command that it is",
+    "make demo": "tests/apps/experiments/test_demo.py runs the command that it is",
     "make test": "this is it",
     "out/small/": "tests/test_readme.py runs the block with nothing cut short",
-    "compare_front_small.yaml": "tests/experiments/test_compare.py compares toys",
-    "compare_svr.yaml": "tests/experiments/test_compare_views.py compares toys",
+    "compare/new_rooms_small.yaml": "tests/apps/experiments/test_compare.py compares toys",
+    "compare/single_view.yaml": "tests/apps/experiments/test_compare_views.py compares toys",
     "--devices 2": "tests/training/test_processes.py trains in two processes",
     "--devices 4 --resume": "tests/training/test_slurm.py is stopped and queued again as there",
     "python benchmarks/": "a measurement, of runs that take hours",
@@ -152,7 +152,7 @@ TOYS: dict[str, Callable[[Path, Toys], None]] = {
 
 TINY = {
     "layout.epochs": 1, "shape.epochs": 1, "sampler.epochs": 1, "training.epochs": 1,
-    "samples.every": 0, "data.workers": 0, "data.augment_rotations": False,
+    "data.workers": 0, "data.augment_rotations": False,
     "data.views_per_room": 2, "data.mask_step": 2, "model.width": 32, "model.decoder.hidden": 32,
     "model.shape.width": 8, "model.shape.level": 1, "model.shape.prototypes": 20,
     "model.shape.codes": 6, "model.shape.cells": 8, "sampler.width": 16, "sampler.layers": 1,

@@ -52,7 +52,7 @@ def test_every_command_is_in_the_reference():
     pytest.importorskip("mkdocs", reason="no mkdocs here: pip install -e '.[docs]'")
     from typer.main import get_command
 
-    from sceneprior.cli import app
+    from sceneprior.apps.cli.commands import app
 
     spec = importlib.util.spec_from_file_location("hooks", ROOT / "docs/hooks.py")
     assert spec is not None and spec.loader is not None

@@ -38,7 +38,7 @@ def run(installed: Path, *arguments: str, cwd: Path) -> subprocess.CompletedProc
 def test_shipped_configs_are_found_by_name(installed, tmp_path):
     code = (
         "import sceneprior, data_prep.front.recipe\n"
-        "from sceneprior.config import load_config\n"
+        "from sceneprior.apps.config import load_config\n"
         "assert load_config('bedroom.yaml').model.max_objects == 13\n"
         "assert data_prep.front.recipe.load_recipe('bedroom')\n"
         "print(sceneprior.__file__)"

@@ -6,19 +6,7 @@ from typing import Any
 
 import yaml
 
-from sceneprior.config import RunConfig, check_config
-
-OCCUPANCY: dict[str, Any] = {
-    "model__shape": {"name": "occupancy", "prototypes": 20, "codes": 6, "width": 8, "cells": 8},
-    "shape": {
-        "supervision": "lifted",
-        "epochs": 3,
-        "batch_size": 6,
-        "learning_rate": 2e-3,
-        "latent_learning_rate": 2e-3,
-    },
-}
-"""Changes to a run whose shapes are occupancy grids."""
+from sceneprior.apps.config import RunConfig, check_config
 
 
 def tiny_model() -> dict[str, Any]:
@@ -35,7 +23,7 @@ def tiny_model() -> dict[str, Any]:
 def tiny_settings(shards: Path, **changes: Any) -> dict[str, Any]:
     """Plain data for a config; changes are written `layout__epochs=2`."""
     data = {
-        "method": "ours",
+        "method": "paper",
         "label_set": "front3d_bedroom",
         "seed": 3,
         "data": {
@@ -51,8 +39,8 @@ def tiny_settings(shards: Path, **changes: Any) -> dict[str, Any]:
             "batch_size": 5,
             "learning_rate": 5e-3,
             "latent_learning_rate": 5e-2,
-            "milestones": [4],
-            "proxy": "box",
+            "schedule": {"name": "steps", "milestones": [4]},
+            "proxy": "beveled_box",
         },
         "shape": {
             "epochs": 3,
@@ -60,7 +48,7 @@ def tiny_settings(shards: Path, **changes: Any) -> dict[str, Any]:
             "learning_rate": 2e-3,
             "latent_learning_rate": 2e-3,
             "views_per_room": 3,
-            "proxy": "box",
+            "proxy": "beveled_box",
             "compositing": "layered",
             "sigma_px2": 0.3,
         },
@@ -68,6 +56,33 @@ def tiny_settings(shards: Path, **changes: Any) -> dict[str, Any]:
     return _changed(data, changes)
 
 
+def tiny_lifted_settings(shards: Path, **changes: Any) -> dict[str, Any]:
+    """Plain data for a run of the lifted method, without a sampler."""
+    paper = tiny_settings(shards)
+    data = {
+        "method": "lifted",
+        "label_set": "front3d_bedroom",
+        "seed": 3,
+        "data": {key: value for key, value in paper["data"].items() if key != "views_per_room"},
+        "model": tiny_model() | {"shape": {"prototypes": 20, "codes": 6, "width": 8, "cells": 8}},
+        "loss": {},
+        "shape": {
+            "epochs": 3,
+            "batch_size": 6,
+            "learning_rate": 2e-3,
+            "latent_learning_rate": 2e-3,
+        },
+    }
+    return _changed(data, changes)
+
+
+def tiny_lifted(shards: Path, **changes: Any) -> RunConfig:
+    """The same, checked."""
+    return check_config(tiny_lifted_settings(shards, **changes), "tiny")
+
+
+VIEWLESS = ("gan", "atiss", "sync2gen")
+"""Baselines that draw no views by `data.views_per_room`."""
 TINY_BASELINES: dict[str, dict[str, Any]] = {
     "gan": {
         "model": {
@@ -111,8 +126,8 @@ TINY_BASELINES: dict[str, dict[str, Any]] = {
 
 def tiny_baseline_settings(shards: Path, method: str, **changes: Any) -> dict[str, Any]:
     """Plain data for a baseline's config; changes are written `training__epochs=2`."""
-    ours = tiny_settings(shards)
-    shared = {key: ours[key] for key in ("label_set", "seed", "data")}
+    whose = tiny_lifted_settings if method in VIEWLESS else tiny_settings
+    shared = {key: whose(shards)[key] for key in ("label_set", "seed", "data")}
     data = {"method": method, **shared, **copy.deepcopy(TINY_BASELINES[method])}
     return _changed(data, changes)
 
@@ -138,11 +153,9 @@ def tiny_config(shards: Path, **changes: Any) -> RunConfig:
 
 
 def tiny_sampler_config(shards: Path, **changes: Any) -> RunConfig:
-    """A run of one stage and a sampler; `changes` are the sampler's."""
+    """A run of the lifted method with a sampler; `changes` are the sampler's."""
     sampler = {"epochs": 3, "width": 16, "layers": 1, "heads": 2, "val_every": 1, **changes}
-    return tiny_config(
-        shards, **OCCUPANCY, layout=None, sampler=sampler, sampling={"distribution": "sampler"}
-    )
+    return tiny_lifted(shards, sampler=sampler, sampling={"distribution": "sampler"})
 
 
 def write_tiny_config(path: Path, shards: Path, **changes: Any) -> Path:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from sceneprior.classes import label_set
+from sceneprior.core.classes import label_set
+from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.evaluation.bootstrap import resample_counts
 from sceneprior.evaluation.layout_distance import nearest_known
 from sceneprior.evaluation.metric import Comparison, RoomSet
 from sceneprior.evaluation.metrics import classifier, layout_classifier
-from sceneprior.scene import Scene, SceneObject
 
 UNIT = (1.0, 1.0, 1.0)
 
@@ -69,5 +69,5 @@ def compared_with(test: RoomSet, **known) -> Comparison:
     """A comparison with these test rooms; `known` is what the metric under test needs."""
     classes = len(label_set("front3d_bedroom"))
     plausible = np.zeros((classes, classes), dtype=bool)
-    given = {"plausible_pairs": plausible, "near_copy_m": 0.0} | known
-    return Comparison(test=test, fair=test, seed=0, alexnet=None, **given)
+    given = {"plausible_pairs": plausible, "near_copy_m": 0.0, "real": []} | known
+    return Comparison(test=test, seed=0, alexnet=None, **given)

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from sceneprior.classes import label_set
-from sceneprior.files import write_whole
-from sceneprior.offscreen import Pinhole, SoftwareRenderer
-from sceneprior.scene import Mesh
-from sceneprior.shards import RoomGroundTruth, RoomViews, shard_bytes
+from sceneprior.core.classes import label_set
+from sceneprior.core.files import write_whole
+from sceneprior.core.scene import Mesh
+from sceneprior.core.shards import RoomGroundTruth, RoomViews, shard_bytes
+from sceneprior.render.offscreen import Pinhole, SoftwareRenderer
 
 LABEL_SET = "front3d_bedroom"
 IMAGE_SIZE = (72, 96)

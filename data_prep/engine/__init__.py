@@ -1,1 +1,1 @@
-"""Plans, workers, shards and reports of preparing; knows no data set."""
+"""Plans, workers, shards and reports of data preparation, independent of the data set."""

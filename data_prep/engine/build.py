@@ -1,7 +1,8 @@
-"""Builds a folder of shards from a source: planned once, made in parallel, resumed, reported.
+"""Builds a folder of shards from a source, in parallel and resumable.
 
-The engine of every `prep-*` command. It runs the source's rooms shard by shard (shard_job.py) on
-this machine's processes (workers.py) or on a cluster (cluster.py), and ends with the report.
+Every `prep-*` command runs this engine. It prepares the source's rooms shard by shard
+(shard_job.py) in processes on this machine (workers.py) or on a cluster (cluster.py), and writes
+a report at the end.
 """
 
 from collections.abc import Iterable
@@ -18,40 +19,41 @@ from data_prep.engine.selection import is_asked_for
 from data_prep.engine.shard_job import RoomFailedError, ShardReport, make_shard, read_finished
 from data_prep.engine.source import Source
 from data_prep.engine.workers import Run, pool
-from sceneprior.errors import InputError
-from sceneprior.offscreen import open_renderer
+from sceneprior.core.errors import InputError
+from sceneprior.render.offscreen import open_renderer
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a `prep-*` command was asked for. Only `source` and `renderer` decide the bytes."""
+    """Arguments of a `prep-*` command. Only `source` and `renderer` affect the bytes written."""
 
     source: Source
     out: Path
     workers: int = 1
-    """Processes on this machine; 1 is this process itself."""
+    """Number of processes on this machine; 1 works in this process."""
     scheduler: str | None = None
-    """Address of a Dask scheduler, whose workers do the work instead."""
+    """Address of a Dask scheduler whose workers are used instead of local processes."""
     renderer: str = "auto"
     strict: bool = False
     """Stop at the first room that fails."""
     retry_failed: bool = False
-    """Make shards again in which rooms failed before."""
+    """Rebuild shards in which rooms failed before."""
 
 
 def build_shards(job: Job) -> Summary:
-    """Prepare a data set. A second run with the same settings makes only what is missing.
+    """Prepare a data set. A second run with the same settings makes only the missing shards.
 
     Raises:
         RoomFailedError: a room failed, with `strict`.
-        InputError: a folder is wrong, a split is empty, `out` holds shards of other settings, is
-            being written by another run, or cannot be written; the cluster cannot be reached.
+        InputError: an input folder is wrong; a split is empty; `out` holds shards made with other
+            settings, is being written by another run, or cannot be written; the cluster cannot be
+            reached.
     """
     source, out = job.source, Path(job.out)
     if job.scheduler:
-        # A worker has a working folder of its own.
+        # The workers' working directories differ from this process's.
         source, out = _with_absolute_paths(source), out.absolute()
-    settings = job_settings(source, source.only)  # tells a wrong folder before one is made
+    settings = job_settings(source, source.only)  # rejects wrong input folders before `out` exists
     engine = cluster(job.scheduler) if job.scheduler else pool(job.workers)
     with claimed(out), engine as run:
         plan = read_plan(out, source, settings, job.renderer)
@@ -88,7 +90,7 @@ def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
     missing = [shard for shard in _asked_for(source, plan, shards) if shard.name not in reports]
     if missing:
         with writing(out):
-            # Until the last shard is there again, the folder must not look finished.
+            # The folder must not look finished until its last shard is there again.
             for name in REPORT_FILES:
                 (out / name).unlink(missing_ok=True)
     kind = plan.settings["renderer"]
@@ -105,13 +107,13 @@ def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
         finish(out, plan, totals)
     if plan.settings["only"] == source.only:
         return totals
-    # A part of a folder was asked for, so speak of this part.
+    # With `--only` in a larger folder, the summary covers the requested part alone.
     asked = [line for line in lines if is_asked_for(source.only, line.room_id, line.house)]
     return replace(totals, lines=asked)
 
 
 def _asked_for(source: Source, plan: Plan, shards: list[ShardPlan]) -> list[ShardPlan]:
-    """The shards that hold a room asked for: `--only` in a folder begun for everything."""
+    """Shards with a requested room, where `--only` works on a folder planned without it."""
     if plan.settings["only"] == source.only:
         return shards
     chosen = [

@@ -1,4 +1,4 @@
-"""Runs functions in worker processes on other machines, of a Dask cluster, as workers.py does."""
+"""Runs functions on the workers of a Dask cluster; the interface is that of workers.py."""
 
 import contextlib
 import os
@@ -8,7 +8,7 @@ from typing import Any
 
 from data_prep.engine.workers import Run, progress
 from sceneprior import __version__
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 _CONNECT_S = 20
 _WORKERS_S = 60
@@ -17,16 +17,16 @@ _KEPT = "Finished shards are kept: run the same command again to go on."
 
 @contextlib.contextmanager
 def cluster(address: str) -> Iterator[Run]:
-    """Give `run(function, argument_lists, title)`, which yields the results in order.
+    """Open a cluster as `run(function, argument_lists, title)`, which yields results in order.
 
-    It connects when it is first called. Start the cluster with `dask scheduler` and, on each
-    machine, `dask worker tcp://... --nworkers auto --nthreads 1`; every machine needs this package
-    and the folders of data and shards under the same paths. A task whose worker dies is given to
-    another.
+    `run` connects when it is first called. Start the cluster with `dask scheduler` and, on each
+    machine, `dask worker tcp://... --nworkers auto --nthreads 1`. Every machine needs this package,
+    and the folders of data and shards under the same paths. If a worker dies, another takes over
+    its task.
 
     Raises:
-        InputError: dask is not installed, nothing answers at `address`, there are no workers, they
-            lack this package or have another version of it, or the cluster is lost.
+        InputError: dask is not installed; nothing answers at `address`; there are no workers; the
+            workers lack this package or have another version of it; or the connection is lost.
     """
     with contextlib.ExitStack() as stack:
         clients: list[Any] = []
@@ -52,7 +52,7 @@ def _run(
     from distributed import CancelledError, KilledWorker
     from distributed.comm import CommClosedError
 
-    # Not pure: a task is never answered from what an earlier job left in the scheduler.
+    # pure=False: the scheduler must not return cached results of an earlier job.
     futures = [
         client.submit(_in_one_thread, function, *item, pure=False, priority=-index)
         for index, item in enumerate(arguments)
@@ -124,7 +124,10 @@ _thread = ThreadPoolExecutor(max_workers=1)
 
 
 def _in_one_thread(function: Callable[..., Any], *arguments: Any) -> Any:
-    """In a worker, whatever threads it has: GL contexts belong to one, caches are for one."""
-    # llvmpipe's own threads would fight with the other workers for the same cores.
+    """Call the function in the worker's single task thread.
+
+    A worker may have several threads, but GL contexts and our caches belong to one.
+    """
+    # llvmpipe's own threads would compete with the other workers for the same cores.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     return _thread.submit(function, *arguments).result()

@@ -1,4 +1,4 @@
-"""The end of a job: writes report.json, report.csv and, last of all, index.json."""
+"""Finishes a job: writes report.json, report.csv and, last, index.json."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -9,14 +9,14 @@ from data_prep.engine.output import writing
 from data_prep.engine.plan import Plan
 from data_prep.engine.report import Line, count_splits, make_report, report_csv
 from data_prep.engine.source import Source
-from sceneprior.errors import InputError
-from sceneprior.files import json_text, write_changed
-from sceneprior.shards import INDEX_NAME
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import json_text, write_changed
+from sceneprior.core.shards import INDEX_NAME
 
 REPORT_NAME = "report.json"
 TABLE_NAME = "report.csv"
 REPORT_FILES = (INDEX_NAME, REPORT_NAME, TABLE_NAME)
-"""In the order in which they go when the folder is no longer finished."""
+"""Files of a finished folder, in the order of their deletion when work begins again."""
 
 
 @dataclass(frozen=True)
@@ -25,27 +25,27 @@ class Summary:
 
     source: Source
     lines: list[Line]
-    """Every room that was looked at; those asked for, with `--only` in a larger folder."""
+    """One per room considered; with `--only` in a larger folder, one per requested room."""
     renderer: str | None
-    """Its name; None where nothing was drawn."""
+    """Name of the renderer; None if nothing was drawn."""
     shards_made: int
     shards_kept: int
     shards_open: int
-    """Shards of the plan that `--only` left for later; with them the folder is not finished."""
+    """Planned shards that `--only` left for later; the folder is unfinished while there are any."""
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
-        """Per split: rooms, views, objects."""
+        """Numbers of rooms, views and objects per split."""
         return count_splits(self.lines)
 
     @property
     def statuses(self) -> dict[str, int]:
-        """How many rooms were prepared, filtered, failed."""
+        """Numbers of rooms that were prepared, filtered, failed."""
         return dict(Counter(line.status for line in self.lines))
 
     @property
     def report(self) -> dict[str, Any]:
-        """What `report.json` says."""
+        """Contents of `report.json`."""
         about = {
             "source": self.source.name,
             "room_type": self.source.room_type,
@@ -53,7 +53,7 @@ class Summary:
             "renderer": self.renderer,
             "summary": str(self),
         }
-        # A part of a data set has no expected counts.
+        # The expected counts are those of the whole data set.
         expected = self.source.expected if self.source.only is None else None
         return make_report(self.lines, about, expected)
 
@@ -72,19 +72,20 @@ class Summary:
 
 
 def finish(out: Path, plan: Plan, totals: Summary) -> None:
-    """Write the report, then the index, which says that the folder is finished.
+    """Write the report, then the index, which marks the folder as finished.
 
     Raises:
-        InputError: `train`, or everything, failed (the report is there); `out` cannot be written.
+        InputError: no room of `train`, or none at all, was prepared (the report is written all the
+            same); `out` cannot be written.
     """
     if plan.settings["only"] is None and totals.source.only is not None:
-        # `--only` made the last missing part: the files are those of the whole.
+        # A run with `--only` made the last missing shard: report on the whole data set.
         whole: Any = replace(totals.source, only=None)  # type: ignore[type-var]
         totals = replace(totals, source=whole)
     with writing(out):
         write_changed(out / REPORT_NAME, json_text(totals.report))
         write_changed(out / TABLE_NAME, report_csv(totals.lines))
-    # Rules that ask where meshes are may leave a small `val` or `test` empty, but not `train`.
+    # Rules on mesh positions may leave a small `val` or `test` empty, but not `train`.
     planned = any(room.split == "train" for room in plan.rooms) and plan.settings["only"] is None
     if planned and not totals.counts["train"]["rooms"]:
         raise InputError(

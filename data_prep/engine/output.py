@@ -1,50 +1,42 @@
-"""Guards the folder that a job writes: one run at a time, and a sentence if writing fails."""
+"""Guards the output folder of a job: one run at a time, readable errors if writing fails."""
 
 import contextlib
 import errno
 from collections.abc import Iterator
 from pathlib import Path
 
-from sceneprior.errors import InputError
-from sceneprior.files import only_writer, remove_parts
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import only_writer, remove_parts
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextlib.contextmanager
 def claimed(out: Path) -> Iterator[None]:
-    """Be the only run that writes to `out`; begin without the leftovers of a killed one.
-
-    Folders made for this go again if nothing came to lie in them.
+    """Lock `out` for this run, and remove the partial files of a killed run.
 
     Raises:
-        InputError: another run writes there, or it cannot be written.
+        InputError: another run writes to `out`, or it cannot be written.
     """
-    made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    try:
-        with contextlib.ExitStack() as until_done:
-            with writing(out):
-                until_done.enter_context(only_writer(out))
-                remove_parts(out)
-            yield
-            with writing(out):
-                remove_parts(out)  # of workers that died on the way
-    finally:
-        with contextlib.suppress(OSError):
-            for folder in made:
-                folder.rmdir()
+    with contextlib.ExitStack() as until_done:
+        with writing(out):
+            until_done.enter_context(only_writer(out))
+            remove_parts(out)
+        yield
+        with writing(out):
+            remove_parts(out)  # partial files of workers that died
 
 
 @contextlib.contextmanager
 def writing(out: Path, what: str = "") -> Iterator[None]:
-    """Turn an OSError of writing into a sentence that says what is kept and how to go on.
+    """Turn an OSError into an InputError that says which work is kept and how to go on.
 
     Args:
-        out: The folder of the job.
-        what: What is lost, such as the rooms of a shard.
+        out: Output folder of the job.
+        what: Work that is lost, such as the rooms of a shard.
 
     Raises:
-        InputError: the sentence.
+        InputError: the block raised an OSError.
     """
     try:
         yield

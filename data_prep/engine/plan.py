@@ -1,4 +1,4 @@
-"""plan.json: which rooms go into which shard, fixed before the first one is drawn."""
+"""plan.json: the assignment of rooms to shards, fixed before the first room is drawn."""
 
 import hashlib
 import json
@@ -11,36 +11,36 @@ from pydantic import TypeAdapter, ValidationError
 
 from data_prep.engine.report import Line
 from data_prep.engine.source import SPLITS, RoomTask, Source
-from sceneprior.errors import InputError
-from sceneprior.files import write_json
-from sceneprior.shards import INDEX_NAME
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import write_json
+from sceneprior.core.shards import INDEX_NAME
 
 PLAN_NAME = "plan.json"
-PLAN_VERSION = 2
+PLAN_VERSION = 3
 ROOMS_PER_SHARD = 8
 
 
 @dataclass(frozen=True)
 class ShardPlan:
-    """One shard: the unit of work, and of what a stop can lose."""
+    """One shard: the unit of work, so an interrupted run loses at most one per worker."""
 
     name: str
-    """`train/bedroom_0000.h5`, within the output folder."""
+    """Path within the output folder: `train/bedroom_0000.h5`."""
     rooms: tuple[RoomTask, ...]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All that a run, and every later run in the same folder, will do."""
+    """All work of a run, and of later runs in the same folder."""
 
     settings: dict[str, Any]
-    """Of the source, and the renderer's kind (None where nothing is drawn)."""
+    """Settings of the source, and the type of renderer (None if nothing is drawn)."""
     rooms: tuple[RoomTask, ...]
     left_out: tuple[Line, ...]
     """Rooms that the survey left out."""
 
     def shards(self, room_type: str) -> list[ShardPlan]:
-        """A few rooms a shard, in the order of the rooms."""
+        """Group the rooms of each split, in order, into shards of `ROOMS_PER_SHARD`."""
         shards = []
         for split in SPLITS:
             rooms = tuple(room for room in self.rooms if room.split == split)
@@ -51,7 +51,7 @@ class Plan:
 
 
 def job_settings(source: Source, only: str | None) -> dict[str, Any]:
-    """What must be equal for a run to go on with a folder, but for the renderer.
+    """Settings that must be equal for a run to resume in a folder; the renderer is checked apart.
 
     Raises:
         InputError: the source's folders are wrong.
@@ -66,10 +66,10 @@ def write_plan(out: Path, plan: Plan) -> None:
 
 
 def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str) -> Plan | None:
-    """The plan of an earlier run with these settings (`job_settings`), or None if there was none.
+    """Read the plan of an earlier run with the same `job_settings`; None if there was none.
 
-    `--renderer auto` goes on with the renderer that run had; `--only` works on a part of a folder
-    that was begun for everything.
+    `--renderer auto` resumes with the renderer of that run; `--only` may work on part of a folder
+    that was begun without it.
 
     Raises:
         InputError: the folder was begun with other settings, or its plan is damaged.
@@ -103,12 +103,12 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
 
 
 def digest(text: str) -> str:
-    """A short fingerprint, for settings that are long."""
+    """Hash a long setting to a short fingerprint."""
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def digest_of_files(paths: Sequence[Path]) -> str:
-    """A fingerprint of names and sizes: enough to notice another release, and quick.
+    """Fingerprint of names and sizes: quick, and enough to notice another release.
 
     Raises:
         InputError: a file is gone.

@@ -1,4 +1,4 @@
-"""What became of every room, as report.json and report.csv tell it: the same bytes each run."""
+"""The outcome of every room, as written to report.json and report.csv; deterministic."""
 
 import csv
 import io
@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from data_prep.engine.source import SPLITS, Expected, LeftOut, PreparedRoom, RoomTask
-from sceneprior.classes import label_set
+from sceneprior.core.classes import label_set
 
 _COLUMNS = ("room_id", "house", "split", "status", "rule", "reason", "views", "objects", "notes")
 
@@ -23,26 +23,26 @@ class Line:
     status: str
     """prepared, filtered or failed."""
     rule: str = ""
-    """Of a filtered room."""
+    """Rule that filtered the room."""
     reason: str = ""
     split: str = ""
     views: int = 0
     objects: int = 0
-    """Tracked objects: those that at least one view shows."""
+    """Tracked objects: those visible in at least one view."""
     visible: int = 0
     """Objects visible in a view, summed over the views."""
     notes: list[str] = field(default_factory=list)
-    """What was left out of the room, and why."""
+    """Parts of the room that were left out, with reasons."""
     classes: dict[str, int] = field(default_factory=dict)
     """Tracked objects of each class."""
     unknown_categories: dict[str, int] = field(default_factory=dict)
-    """See `PreparedRoom`."""
+    """Number of pieces per unknown category; see `PreparedRoom`."""
 
 
 def line_of(
     result: PreparedRoom | LeftOut, task: RoomTask | None = None, label_set_name: str = ""
 ) -> Line:
-    """The line of a prepared room, or of one left out, by the survey (no task) or later."""
+    """Line of a prepared room, or of one left out by the survey (no task) or later."""
     if isinstance(result, LeftOut):
         return Line(
             result.room_id, result.house, result.status, result.rule, result.reason,
@@ -67,7 +67,7 @@ def line_of(
 
 
 def count_splits(lines: Iterable[Line]) -> dict[str, dict[str, int]]:
-    """Per split: rooms, views, objects."""
+    """Numbers of rooms, views and objects per split."""
     prepared = [line for line in lines if line.status == "prepared"]
     return {
         split: {
@@ -82,12 +82,12 @@ def count_splits(lines: Iterable[Line]) -> dict[str, dict[str, int]]:
 def make_report(
     lines: Sequence[Line], about: dict[str, Any], expected: Expected | None = None
 ) -> dict[str, Any]:
-    """Everything worth saying about a job; nothing in it depends on time, workers or stops.
+    """Build the report of a job; it does not depend on time, workers or interruptions.
 
     Args:
-        lines: Every room that was looked at.
-        about: Source, recipe, renderer and the like; stands at the beginning.
-        expected: The recipe's counts, to compare with.
+        lines: One per room considered.
+        about: Entries at the top of the report, such as source, recipe and renderer.
+        expected: Counts stated in the recipe, for comparison.
     """
     prepared = [line for line in lines if line.status == "prepared"]
     filtered: dict[str, list[str]] = {}
@@ -123,7 +123,7 @@ def make_report(
 
 
 def compare(expected: Expected, prepared: Sequence[Line]) -> list[dict[str, Any]]:
-    """Each count that the recipe states: what, expected, found, difference."""
+    """Compare each count stated in the recipe: one row of name, expected, found, difference."""
     found = {
         "rooms": len(prepared),
         **{split: sum(line.split == split for line in prepared) for split in SPLITS},
@@ -138,7 +138,7 @@ def compare(expected: Expected, prepared: Sequence[Line]) -> list[dict[str, Any]
 
 
 def _kinds_of_notes(lines: Sequence[Line]) -> dict[str, int]:
-    """Notes without their names and numbers -> rooms, most first."""
+    """Numbers of rooms per kind of note (names and numbers masked), most frequent first."""
     kinds: Counter[str] = Counter()
     for line in lines:
         kinds.update({re.sub(r"'[^']*'|\S*\d\S*", "...", note) for note in line.notes})
@@ -172,7 +172,7 @@ def _sums(counts: Iterable[dict[str, int]]) -> dict[str, int]:
 
 
 def report_csv(lines: Iterable[Line]) -> str:
-    """One row a room, for spreadsheets and grep."""
+    """CSV table with one row per room, for spreadsheets and grep."""
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(_COLUMNS)

@@ -10,10 +10,10 @@ _NOTES_SHOWN = 10
 
 
 def report_tables(report: dict[str, Any]) -> list[Table]:
-    """What became of the rooms, what is in each split, what has no class, and what was expected.
+    """Format the report as tables: outcomes, splits, classes, notes, failures, expected counts.
 
     Args:
-        report: What `make_report` made.
+        report: The report from `make_report`.
     """
     tables = [_outcome(report), _splits(report), _classes(report)]
     if report["notes"]:
@@ -84,7 +84,7 @@ def _unknown(pieces: dict[str, int]) -> Table:
 def _failures(failed: list[dict[str, str]]) -> Table:
     table = Table(Column("failed", overflow="fold"), "why")
     for item in failed[:_FAILURES_SHOWN]:
-        # Text, not a string: rich reads [brackets] in strings as markup.
+        # Text, because rich parses [brackets] in plain strings as markup.
         table.add_row(Text(item["room_id"]), Text(item["reason"]))
     if len(failed) > _FAILURES_SHOWN:
         table.add_row(f"and {len(failed) - _FAILURES_SHOWN} more", "report.csv has them all")

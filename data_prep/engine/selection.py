@@ -1,4 +1,4 @@
-"""Which rooms are asked for (`--only`), and which split each is in."""
+"""Selects rooms (`--only`) and assigns them to splits."""
 
 import csv
 import hashlib
@@ -9,16 +9,16 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from data_prep.engine.source import LeftOut, Survey
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 
 def house_may_match(only: str | None, house: str) -> bool:
-    """Whether a house can hold what `--only` names; the beginning of its name is enough."""
+    """Test whether `--only` may select rooms of a house; a prefix of its name suffices."""
     return only is None or house.startswith(only.partition("/")[0]) or only.startswith(f"{house}_")
 
 
 def is_asked_for(only: str | None, room_id: str, house: str) -> bool:
-    """Whether `--only HOUSE`, `HOUSE/ROOM` or a room id names this room (None names all).
+    """Test whether `--only HOUSE`, `HOUSE/ROOM` or a room id selects this room (None: all).
 
     Example:
 
@@ -34,8 +34,7 @@ def is_asked_for(only: str | None, room_id: str, house: str) -> bool:
 
 
 def read_splits(path: Path) -> dict[str, str]:
-    """Room id -> split, from a CSV of `room id,split`; rows of other shapes (a header) are passed
-    over.
+    """Read the split of each room id from a CSV of `room id,split`; other rows are skipped.
 
     Raises:
         InputError: the file cannot be read, or has no such row.
@@ -58,10 +57,10 @@ def read_splits(path: Path) -> dict[str, str]:
 def seeded_split(
     room_ids: Iterable[str], seed: int, test_share: float = 0.1, val_share: float = 0.0
 ) -> dict[str, str]:
-    """Room id -> split; an id keeps its place in the order whatever else is there.
+    """Assign room ids to splits in the order of a seeded hash of each id.
 
-    A split whose share is not 0 has a room at least, as long as one is left to train on; `test`
-    comes first.
+    The relative order of two ids does not depend on the others. A split with a nonzero share gets
+    at least one room, `test` before `val`, as long as one is left for `train`.
     """
     order = sorted(room_ids, key=lambda item: hashlib.sha256(f"{seed}:{item}".encode()).digest())
     tests = _size(test_share, len(order), len(order))
@@ -75,17 +74,18 @@ def _size(share: float, rooms: int, left: int) -> int:
 
 
 def select(survey: Survey, only: str | None, where: str, splits: str = "") -> Survey:
-    """The part of a survey that `--only` asks for.
+    """Reduce a survey to the rooms that `--only` selects.
 
     Args:
-        survey: What was found.
-        only: As given.
-        where: "FOLDER passes the recipe NAME": the end of "No room of ...".
-        splits: What decides on the splits of a whole data set, which must have rooms to train on;
-            "": our own, which always leave one. `val` and `test` may be empty.
+        survey: Rooms of the whole data set.
+        only: Value of `--only`.
+        where: End of the sentence "No room of ...": "FOLDER passes the recipe NAME".
+        splits: Origin of the splits, named in the error if `train` is empty; "" for seeded splits,
+            whose `train` never is. `val` and `test` may be empty.
 
     Raises:
-        InputError: nothing is left to prepare, with the most frequent reason; or to train on.
+        InputError: no room is left to prepare (the most frequent reason is given), or none to
+            train on.
     """
     rooms = tuple(room for room in survey.rooms if is_asked_for(only, room.room_id, room.house))
     left_out = tuple(
@@ -104,7 +104,7 @@ def select(survey: Survey, only: str | None, where: str, splits: str = "") -> Su
 
 def _in_words(left_out: Iterable[LeftOut]) -> str:
     reasons = [item.reason for item in left_out]
-    # Reasons that differ only in their numbers are one; the first stands for all.
+    # Reasons that differ only in numbers count as one; the first is quoted.
     shapes = Counter(re.sub(r"[\d.]+", "#", reason) for reason in reasons)
     often = ""
     if shapes:

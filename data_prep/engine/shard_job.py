@@ -1,4 +1,4 @@
-"""Makes one shard: prepares its rooms, and writes their models, the shard's report, the shard."""
+"""Makes one shard: prepares its rooms, then writes their models, a report, and the shard."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -10,30 +10,30 @@ from data_prep.engine.output import writing
 from data_prep.engine.plan import PLAN_NAME, ShardPlan
 from data_prep.engine.report import Line, line_of
 from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Source, sentence_of
-from sceneprior.errors import InputError
-from sceneprior.files import write_json, write_whole
-from sceneprior.offscreen import Renderer, open_renderer
-from sceneprior.scene import Mesh
-from sceneprior.shards import (
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import write_json, write_whole
+from sceneprior.core.scene import Mesh
+from sceneprior.core.shards import (
     MODELS_FOLDER,
     RoomGroundTruth,
     RoomViews,
     check_views,
     shard_bytes,
 )
+from sceneprior.render.offscreen import Renderer, open_renderer
 
 
 @dataclass(frozen=True)
 class ShardReport:
-    """What became of a shard's rooms, as `<shard>.report.json` keeps it."""
+    """Outcome of a shard's rooms, as stored in `<shard>.report.json`."""
 
     renderer: str | None
-    """Its name; None where nothing was drawn."""
+    """Name of the renderer; None if nothing was drawn."""
     lines: list[Line]
-    """One a room."""
+    """One per room."""
 
     def has(self, status: str) -> bool:
-        """Whether a room was prepared, filtered or failed."""
+        """Test whether any room has this status: prepared, filtered or failed."""
         return any(line.status == status for line in self.lines)
 
 
@@ -42,7 +42,7 @@ class RoomFailedError(InputError):
 
     @classmethod
     def of(cls, line: Line) -> "RoomFailedError":
-        """The sentence about a failed line."""
+        """Error for the line of a failed room."""
         return cls(
             f"Room {line.room_id} failed: {line.reason.rstrip('.')}. --strict stops here; finished "
             "shards are kept, and the same command without --strict goes on."
@@ -54,12 +54,12 @@ def make_shard(
 ) -> ShardReport:
     """Prepare the rooms of one shard and write it.
 
-    Models come first, then the shard's report, then the shard: where report and shard are, all of
-    it is there (`read_finished`).
+    Models are written first, then the report, then the shard, so that a shard with a report is
+    complete (`read_finished`).
 
     Raises:
-        RoomFailedError: a room failed, with `strict`; nothing of the shard is written.
-        InputError: `out` cannot be written, or is not the folder that the job sees.
+        RoomFailedError: a room failed, with `strict`; neither report nor shard is written.
+        InputError: `out` cannot be written, or is not the job's folder as this worker sees it.
     """
     if not (out / PLAN_NAME).is_file():
         raise InputError(
@@ -69,7 +69,7 @@ def make_shard(
     path = out / shard.name
     first, last = shard.rooms[0].room_id, shard.rooms[-1].room_id
     with writing(out, f"rooms {first} to {last}"):
-        # A report without its shard is "not finished" whatever stops us from here on.
+        # The report goes first: without it, the shard counts as unfinished if we stop here.
         _report_path(path).unlink(missing_ok=True)
         path.unlink(missing_ok=True)
         renderer = None if renderer_kind is None else open_renderer(renderer_kind)
@@ -83,7 +83,7 @@ def make_shard(
 
 
 def read_finished(shard: Path) -> ShardReport | None:
-    """The report of a shard that is whole; None if there is work to do."""
+    """Read the report of a finished shard; None if the shard must still be made."""
     try:
         report = TypeAdapter(ShardReport).validate_json(_report_path(shard).read_bytes())
     except (OSError, ValidationError):
@@ -103,7 +103,7 @@ def _prepared(
     strict: bool,
     lines: list[Line],
 ) -> Iterator[tuple[RoomViews, RoomGroundTruth | None]]:
-    """The shard's rooms one by one, their models written; what becomes of each goes to `lines`."""
+    """Prepare the shard's rooms one by one, write their models, append outcomes to `lines`."""
     for task in shard.rooms:
         result = _prepare(source, task, renderer)
         line = line_of(result, task, source.label_set)
@@ -120,7 +120,7 @@ def _prepared(
 
 
 def _prepare(source: Source, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
-    """One room; whatever goes wrong with it is this room's failure and no other's."""
+    """Prepare one room; any exception becomes the failure of this room alone."""
     try:
         result = source.prepare(task, renderer)
         if isinstance(result, PreparedRoom):

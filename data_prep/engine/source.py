@@ -1,7 +1,7 @@
-"""What a data set tells the engine (`Source`), and what the engine asks of it.
+"""The interface between a data set (`Source`) and the engine.
 
-A source knows a data set's files and nothing of processes, shards and reports; the engine
-(build.py) knows those and nothing of data sets. 3D-FRONT's is `front/source.py`.
+A source reads the files of a data set and knows no processes, shards or reports; the engine
+(build.py) handles those and knows no data set. `front/source.py` is the source for 3D-FRONT.
 """
 
 import os
@@ -10,22 +10,22 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 from data_prep.engine.workers import Run
-from sceneprior.errors import InputError
-from sceneprior.offscreen import Renderer
-from sceneprior.scene import Mesh
-from sceneprior.settings import Section
-from sceneprior.shards import RoomGroundTruth, RoomViews
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Mesh
+from sceneprior.core.settings import Section
+from sceneprior.core.shards import RoomGroundTruth, RoomViews
+from sceneprior.render.offscreen import Renderer
 
 SPLITS = ("train", "val", "test")
-"""Rooms to learn from, to choose settings and checkpoints on, and to report results on."""
+"""Rooms for training, for choosing settings and checkpoints, and for reporting results."""
 _DEBUG_VARIABLE = "SCENEPRIOR_DEBUG"
 
 
 class Expected(Section):
-    """The known counts of a finished job on the real data set."""
+    """Known counts of a finished job on the real data set."""
 
     of: str = ""
-    """Which data these counts are of, and who counted: "3D-FRONT, ATISS's index"."""
+    """Origin of the counts, data and author: "3D-FRONT, ATISS's index"."""
     rooms: int | None = None
     """Prepared rooms."""
     train: int | None = None
@@ -38,43 +38,43 @@ class Expected(Section):
 
 @dataclass(frozen=True)
 class RoomTask:
-    """One room worth preparing, as `plan.json` keeps it."""
+    """One room to prepare, as stored in `plan.json`."""
 
     room_id: str
     house: str
-    """The file or folder the room is read from: a house, a scan."""
+    """File or folder the room is read from: a house, a scan."""
     split: str
-    """train or test."""
+    """One of `SPLITS`."""
     views: int = 0
-    """How many views to draw; 0 where the data set has its own."""
+    """Number of views to draw; 0 if the data set has its own."""
     extra: dict[str, Any] = field(default_factory=dict)
-    """Whatever else the source needs to read the room; plain JSON."""
+    """Further JSON values that the source needs to read the room."""
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A room, or a whole house, that gives nothing, and why."""
+    """A room, or a whole house, that is not prepared, and the reason."""
 
     room_id: str
-    """The house's name where not even its rooms could be read."""
+    """Id of the room; the house's name if its list of rooms could not be read."""
     house: str
     status: Literal["filtered", "failed"]
-    """filtered: a rule says so, all is well; failed: something is wrong with the files."""
+    """filtered: excluded by a rule; failed: the files are faulty."""
     reason: str
     """A sentence."""
     rule: str = ""
-    """What filters it: a rule of the recipe by its name, or `split`, `no_view`, ..."""
+    """Name of the rule that filters it: a rule of the recipe, or `split`, `no_view`, ..."""
     notes: tuple[str, ...] = ()
     unknown_categories: Mapping[str, int] = field(default_factory=dict)
-    """As in `PreparedRoom`."""
+    """Number of pieces per unknown category, as in `PreparedRoom`."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What a first look at the whole data set found."""
+    """Result of the first pass over the whole data set."""
 
     rooms: tuple[RoomTask, ...]
-    """In the order in which shards hold them; each id once."""
+    """Rooms in the order of the shards, with unique ids."""
     left_out: tuple[LeftOut, ...] = ()
 
 
@@ -84,64 +84,63 @@ class PreparedRoom:
 
     views: RoomViews
     truth: RoomGroundTruth | None = None
-    """None where the source does not know the room in 3D."""
+    """3D ground truth; None if the source has none."""
     models: Mapping[str, Mesh] = field(default_factory=dict)
-    """Id -> mesh in its own frame, for `models/<id>.ply`."""
+    """Meshes by id, each in its own frame, for `models/<id>.ply`."""
     files: Mapping[str, bytes] = field(default_factory=dict)
-    """More files: path within the output folder -> bytes (`rgb/<room>/0000.png`)."""
+    """Contents of further files by path within the output folder (`rgb/<room>/0000.png`)."""
     notes: tuple[str, ...] = ()
-    """What was left out of the room, and why."""
+    """Parts of the room that were left out, with reasons."""
     unknown_categories: Mapping[str, int] = field(default_factory=dict)
-    """What the data set calls furniture that is void because the recipe says nothing about it ->
-    how many pieces."""
+    """Number of pieces per category that is void because the recipe does not mention it."""
 
 
 class Source(Protocol):
-    """A data set under a recipe. A frozen dataclass of paths and settings: it travels to workers.
+    """A data set and its recipe: a frozen dataclass of paths and settings, sent to the workers.
 
-    What a method does may depend on the source's fields, on the files, and on nothing else: not on
-    what was asked before, nor on the process it runs in.
+    Methods may depend only on the source's fields and on the files, not on earlier calls or on the
+    process they run in.
     """
 
     @property
     def name(self) -> str:
-        """The data set, as `index.json` calls it: "3d-front"."""
+        """Name of the data set in `index.json`: "3d-front"."""
 
     @property
     def label_set(self) -> str:
-        """As `sceneprior.classes.label_set` takes it."""
+        """Name of the label set, for `sceneprior.core.classes.label_set`."""
 
     @property
     def room_type(self) -> str:
-        """What shards are called after, too: `train/<room_type>_0000.h5`."""
+        """Type of the rooms; also in the shards' names: `train/<room_type>_0000.h5`."""
 
     @property
     def draws(self) -> bool:
-        """Whether `prepare` wants a renderer; without, it is given None."""
+        """True if `prepare` needs a renderer; otherwise it gets None."""
 
     @property
     def only(self) -> str | None:
-        """HOUSE, HOUSE/ROOM or a room id, where not everything is wanted (selection.py)."""
+        """Requested part: HOUSE, HOUSE/ROOM or a room id (selection.py); None for everything."""
 
     @property
     def expected(self) -> Expected | None:
-        """The counts that the recipe expects, for the report."""
+        """Counts that the recipe expects, for the report."""
 
     def settings(self, only: str | None) -> dict[str, Any]:
-        """What the shards' bytes depend on, as JSON; paths do not belong there.
+        """Settings that the shards' bytes depend on, as JSON, without paths.
 
-        Called first of all, in the main process, so it also refuses wrong folders. A run goes on
-        with a folder whose settings are equal. `recipe` and `seed` are repeated in `index.json`.
+        Called first, in the main process, so it also rejects wrong folders. A run may resume in a
+        folder only if its settings are equal. `index.json` repeats `recipe` and `seed`.
 
         Args:
-            only: As if this had been asked for; the source's own, or None for everything.
+            only: Value of `--only` to assume: the source's own, or None for everything.
 
         Raises:
-            InputError: the data set is not where the source says.
+            InputError: the data set is not at the source's paths.
         """
 
     def survey(self, run: Run) -> Survey:
-        """Look at everything once, cheaply, and say which rooms are worth preparing.
+        """Make one cheap pass over the data set and list the rooms to prepare.
 
         Args:
             run: `run(function, argument_lists, title)` does the work in worker processes and
@@ -152,15 +151,15 @@ class Source(Protocol):
         """
 
     def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
-        """Read one room and see it through its cameras, in a worker process.
+        """Read one room and observe it in all its views, in a worker process.
 
-        The same task gives the same arrays, whatever was prepared before, and wherever. Raising
-        instead of returning LeftOut is fine, too: the engine makes a failed room of it.
+        The result depends on the task alone, not on the worker or on earlier tasks. An exception
+        counts as a failed room, like LeftOut with status "failed".
         """
 
 
 def sentence_of(error: Exception) -> str:
-    """Why a room failed, in words; SCENEPRIOR_DEBUG=1 lets what is unforeseen through."""
+    """Describe why a room failed; SCENEPRIOR_DEBUG=1 re-raises unexpected errors instead."""
     if isinstance(error, InputError):
         return str(error)
     if isinstance(error, OSError) and error.filename:

@@ -13,7 +13,7 @@ from multiprocessing.connection import wait
 from multiprocessing.synchronize import Event
 from typing import Any
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 Run = Callable[..., Iterator[Any]]
 
@@ -23,9 +23,9 @@ _START_METHOD = "spawn"
 
 @contextlib.contextmanager
 def pool(workers: int) -> Iterator[Run]:
-    """Give `run(function, argument_lists, title)`, which yields the results in order.
+    """Open a process pool as `run(function, argument_lists, title)`, which yields results in order.
 
-    One worker is this process itself. Progress bars go to stderr; without a title there is none.
+    A single worker is this process itself. A progress bar goes to stderr if there is a title.
 
     Raises:
         InputError: a worker process died.
@@ -51,7 +51,7 @@ def pool(workers: int) -> Iterator[Run]:
         function: Callable[..., Any], arguments: list[Any], title: str | None
     ) -> Iterator[Any]:
         with progress(title, len(arguments)) as advance:
-            # Ctrl-C is for this process to answer; a worker is born with the signal blocked.
+            # Only this process handles Ctrl-C; workers inherit the blocked signal.
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             try:
                 futures: list[Future[Any]] = [
@@ -72,13 +72,13 @@ def pool(workers: int) -> Iterator[Run]:
             "run the same command again, perhaps with fewer --workers."
         ) from None
     except BaseException:
-        stop.set()  # a few tasks are past cancelling: let the workers skip them
+        stop.set()  # lets workers skip the queued tasks that can no longer be cancelled
         raise
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
 
 
-_stop: Event | None = None  # in a worker: set when the job is given up
+_stop: Event | None = None  # in a worker: set when the job is abandoned
 
 
 def _unless_stopped(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -88,7 +88,7 @@ def _unless_stopped(function: Callable[..., Any], *arguments: Any) -> Any:
 def _start_worker(stop: Event) -> None:
     global _stop
     _stop = stop
-    # llvmpipe's own threads would fight with the other workers for the same cores.
+    # llvmpipe's own threads would compete with the other workers for the same cores.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     parent = multiprocessing.parent_process()
 
@@ -101,7 +101,7 @@ def _start_worker(stop: Event) -> None:
 
 @contextlib.contextmanager
 def progress(title: str | None, total: int) -> Iterator[Callable[[], None]]:
-    """A bar on stderr; gives a function that moves it on by one. Without a title there is none."""
+    """Show a progress bar on stderr if there is a title; yields the function that advances it."""
     if title is None or not total:
         yield lambda: None
         return

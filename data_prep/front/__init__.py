@@ -1,1 +1,1 @@
-"""3D-FRONT houses and 3D-FUTURE models, or homes in their format, as a source of rooms."""
+"""Source for 3D-FRONT houses with 3D-FUTURE models, and for homes in the same format."""

@@ -1,4 +1,4 @@
-"""Draws the views of one room in 3D and labels what they show."""
+"""Renders the views of one 3D room and labels the objects visible in them."""
 
 import hashlib
 from collections.abc import Sequence
@@ -8,19 +8,19 @@ import numpy as np
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import Recipe, ViewRules
 from data_prep.front.viewpoints import Viewpoints, intrinsics, sees_enough
-from sceneprior.classes import VOID, label_set
-from sceneprior.instances.observations import observe, pixel_counts
-from sceneprior.offscreen import Renderer
-from sceneprior.scene import Mesh
-from sceneprior.shards import RoomGroundTruth, RoomViews
+from sceneprior.core.classes import VOID, label_set
+from sceneprior.core.instances.observations import observe, pixel_counts
+from sceneprior.core.scene import Mesh
+from sceneprior.core.shards import RoomGroundTruth, RoomViews
+from sceneprior.render.offscreen import Renderer
 
 
 def prepare_room(
     room: Room, count: int, recipe: Recipe, seed: int, renderer: Renderer
 ) -> tuple[RoomViews, RoomGroundTruth] | None:
-    """Draw one room and measure what was seen; None if no view shows an object.
+    """Render one room and measure the visible objects; None if no view shows an object.
 
-    The same seed and room give the same arrays, whatever was prepared before.
+    The result depends on the seed and the room alone.
     """
     word = hashlib.sha256(f"{seed}:{room.room_id}".encode()).digest()
     rng = np.random.default_rng(int.from_bytes(word[:16], "little"))
@@ -58,7 +58,7 @@ def _draw_views(
     rules: ViewRules,
     renderer: Renderer,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw `count` views; those that see too little are drawn again, and the best try stays."""
+    """Render `count` views; a rejected view (`sees_enough`) is redrawn, and the best try stays."""
     cameras = [spots.draw() for _ in range(count)]
     images = renderer.instance_ids_of_views(meshes, cameras, rules.image_size)
     scores = np.zeros(count)

@@ -1,10 +1,10 @@
-"""Finds 3D-FRONT's house files, and shows the texts in them."""
+"""Finds 3D-FRONT's house files, and makes texts from them printable."""
 
 from pathlib import Path
 from typing import Any
 
-from sceneprior.errors import InputError
-from sceneprior.files import is_name
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import is_name
 
 
 def house_files(folder: Path) -> list[Path]:
@@ -29,7 +29,7 @@ def house_files(folder: Path) -> list[Path]:
 
 
 def shown(text: Any) -> str:
-    """A text out of a file as a report can show it: printable and short."""
+    """Make a text from a file printable and short, for reports."""
     if is_name(text):
         return str(text)
     try:

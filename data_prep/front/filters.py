@@ -1,4 +1,4 @@
-"""The rules of a recipe that leave rooms out."""
+"""Checks rooms against the rules of a recipe."""
 
 from collections import Counter
 
@@ -7,35 +7,38 @@ import shapely
 
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import Recipe
+from sceneprior.core.instances.checked import shown
 
 
 def broken_rule(room: Room, recipe: Recipe) -> tuple[str, str] | None:
-    """The name of the first rule that the room breaks, and a sentence; None if it breaks none."""
+    """First rule that the room breaks: its name and a sentence; None if it breaks none."""
     labels = [piece.label for piece in room.furniture if piece.label != "void"]
     x1, z1, x2, z2 = room.floor.bounds
     if not room.furniture:
         why = f" ({room.notes[0]})" if room.notes else ""
         return "no_furniture", f"no usable furniture stands in it{why}"
-    parts = room.room_id.split("_")  # which house and room may have in them, too
+    parts = room.room_id.split("_")  # names of houses and rooms may contain "_", too
     ids = {"_".join(parts[k:]) for k in range(len(parts))}
     if not ids.isdisjoint(recipe.invalid_rooms):
         return "invalid_rooms", "it is among the invalid_rooms"
-    pieces = len(room.furniture) + room.without_model
+    pieces = len(room.furniture) + len(room.without_model)
     least = recipe.min_models_share
     if least is not None and len(room.furniture) < least * pieces:
-        known = f"there are models of {len(room.furniture)} of its {pieces} pieces"
-        return "min_models_share", f"{known}, min_models_share is {least:g}"
+        known_ones = f"there are models of {len(room.furniture)} of its {pieces} pieces"
+        return "min_models_share", f"{known_ones}, min_models_share is {least:g}"
     if recipe.min_objects is not None and len(labels) < recipe.min_objects:
         unknown = ", ".join(unknown_categories(room, recipe))
         why = f" (of no class: {unknown})" if unknown else ""
         return "min_objects", f"{len(labels)} objects, min_objects is {recipe.min_objects}{why}"
     if recipe.max_objects is not None and len(labels) > recipe.max_objects:
         return "max_objects", f"{len(labels)} objects, max_objects is {recipe.max_objects}"
-    for piece in room.furniture:
-        if recipe.allowed_categories and piece.category not in recipe.allowed_categories:
-            return "allowed_categories", f"'{piece.category}' is none of allowed_categories"
-        if piece.model_id in recipe.invalid_models:
-            return "invalid_models", f"'{piece.model_id}' is among the invalid_models"
+    # These two rules also apply to pieces without a model.
+    known = [(piece.model_id, piece.category) for piece in room.furniture]
+    for model_id, category in (*known, *room.without_model):
+        if recipe.allowed_categories and category not in recipe.allowed_categories:
+            return "allowed_categories", f"{shown(category)} is none of allowed_categories"
+        if model_id in recipe.invalid_models:
+            return "invalid_models", f"{shown(model_id)} is among the invalid_models"
     if recipe.required_classes and not set(labels) & set(recipe.required_classes):
         names = ", ".join(recipe.required_classes)
         return "required_classes", f"none of {names}, which required_classes asks for"
@@ -49,7 +52,7 @@ def broken_rule(room: Room, recipe: Recipe) -> tuple[str, str] | None:
 
 
 def _broken_by_meshes(room: Room, recipe: Recipe) -> tuple[str, str] | None:
-    """The same of rules that ask where meshes are, of a room that is read with them."""
+    """First broken rule on mesh positions; None for a room that was read without meshes."""
     boxes = boxes_m(room)
     if not len(boxes):
         return None
@@ -68,18 +71,18 @@ def _broken_by_meshes(room: Room, recipe: Recipe) -> tuple[str, str] | None:
 
 
 def boxes_m(room: Room) -> np.ndarray:
-    """(pieces, 2, 3) lowest and highest corner of each mesh; (0, 2, 3) where none was read."""
+    """Lower and upper corner of each mesh, (pieces, 2, 3); (0, 2, 3) if no mesh was read."""
     meshes = [piece.mesh.vertices_m for piece in room.furniture if len(piece.model.vertices_m)]
     return np.array([(mesh.min(axis=0), mesh.max(axis=0)) for mesh in meshes]).reshape(-1, 2, 3)
 
 
 def outside_floor(room: Room) -> int:
-    """How many pieces have their middle not above the floor."""
+    """Number of pieces whose centre is not above the floor."""
     middles = boxes_m(room).mean(axis=1)
     return int((~shapely.covers(room.floor, shapely.points(middles[:, [0, 2]]))).sum())
 
 
 def unknown_categories(room: Room, recipe: Recipe) -> dict[str, int]:
-    """Category -> pieces that are void because the recipe says nothing about it, most first."""
+    """Number of pieces per category that the recipe does not mention, most frequent first."""
     pieces = Counter(piece.category for piece in room.furniture if not recipe.knows(piece.category))
     return dict(pieces.most_common())

@@ -1,4 +1,4 @@
-"""Placements, surfaces, the floor and the room's own frame, from the numbers of a house's JSON."""
+"""Computes placements, surfaces, the floor and the room's frame from a house's JSON."""
 
 import math
 from collections.abc import Iterable
@@ -9,12 +9,12 @@ import numpy as np
 import shapely
 import shapely.affinity
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 FAR_M = 1e5
-"""No house is this large; such numbers are damage."""
+"""Coordinates beyond this are damage: no house is so large."""
 DEFAULT_HEIGHT_M = 2.8
-"""Ceiling height of the few rooms with neither inner walls nor a ceiling."""
+"""Height of the few rooms that have neither inner walls nor a ceiling."""
 _LEAST_FLOOR_M2 = 0.1
 _CRACK_M = 0.1
 
@@ -23,12 +23,12 @@ Floor: TypeAlias = shapely.Polygon | shapely.MultiPolygon
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a child of a room stands in the house."""
+    """Pose and scale of a room's child in the house."""
 
     matrix: np.ndarray
-    """(4, 4) float64: scale, turn, place."""
+    """(4, 4) float64: scale, rotation, translation."""
     scale: np.ndarray
-    """(3,) as the file states it; negative where mirrored."""
+    """(3,) as stated in the file; negative if mirrored."""
 
 
 @dataclass(frozen=True)
@@ -38,16 +38,16 @@ class Surface:
     vertices_m: np.ndarray
     """(V, 3)."""
     faces: np.ndarray
-    """(F, 3); may be none."""
+    """(F, 3); F may be 0."""
     unusable: int
-    """Triangles whose corners are no places, or are not there."""
+    """Number of triangles with missing vertices or implausible coordinates."""
 
 
 def numbers(values: Any) -> np.ndarray:
-    """Numbers, or strings of numbers, or one string with all of them.
+    """Parse a list of numbers, a list of strings of numbers, or one string with all of them.
 
     Raises:
-        InputError: they are something else.
+        InputError: `values` is something else.
     """
     if isinstance(values, str):
         values = values.replace(",", " ").strip("[]() ").split()
@@ -60,14 +60,14 @@ def numbers(values: Any) -> np.ndarray:
 
 
 def placement_of(child: dict[str, Any], required: tuple[str, ...] = ()) -> Placement:
-    """Where a child stands; quaternions are x, y, z, w, of any length but zero.
+    """Read the placement of a child; quaternions are (x, y, z, w), of any nonzero length.
 
     Args:
-        child: `pos`, `rot` and `scale` default to none at all.
-        required: Keys without a default.
+        child: Entry with `pos`, `rot` and `scale`, which default to the identity.
+        required: Keys that must be present.
 
     Raises:
-        InputError: it is incomplete, or holds numbers that are no places.
+        InputError: the placement is incomplete, or its numbers are implausible.
     """
     for key in required:
         if child.get(key) is None:
@@ -77,7 +77,7 @@ def placement_of(child: dict[str, Any], required: tuple[str, ...] = ()) -> Place
     scale = numbers(child.get("scale", [1, 1, 1]))
     if len(place) != 3 or len(quaternion) != 4 or len(scale) != 3:
         raise InputError("its placement is incomplete")
-    if not (np.abs([*place, *scale, *quaternion]) < FAR_M).all():  # NaN is not smaller, either
+    if not (np.abs([*place, *scale, *quaternion]) < FAR_M).all():  # NaN fails, too
         raise InputError("its placement holds numbers that are no places")
     length = float(quaternion @ quaternion)
     if length < 1e-12:
@@ -98,10 +98,10 @@ def placement_of(child: dict[str, Any], required: tuple[str, ...] = ()) -> Place
 
 
 def surface_of(mesh: dict[str, Any], child: dict[str, Any]) -> Surface:
-    """A `mesh` entry's triangles where its child puts them; one without faces has none.
+    """Triangles of a `mesh` entry in the house's frame, placed as its child says.
 
     Raises:
-        InputError: its numbers are none.
+        InputError: the entry holds something other than numbers.
     """
     vertices = numbers(mesh.get("xyz") or [])
     faces = numbers(mesh.get("faces") or [])
@@ -116,10 +116,10 @@ def surface_of(mesh: dict[str, Any], child: dict[str, Any]) -> Surface:
 
 
 def floor_of(surfaces: Iterable[Surface]) -> tuple[Floor, float]:
-    """The union of all floor triangles in x and z, and the height of the largest floor mesh.
+    """Union of all floor triangles in x and z, and the height of the largest floor mesh.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no floor.
     """
     triangles = [surface.vertices_m[surface.faces] for surface in surfaces if len(surface.faces)]
     polygons = [shapely.polygons(corners[:, :, [0, 2]]) for corners in triangles]
@@ -137,17 +137,17 @@ def floor_of(surfaces: Iterable[Surface]) -> tuple[Floor, float]:
 
 
 def _without_cracks(floor: Floor) -> Floor:
-    """Neighbouring floor meshes often leave a crack of rounding or of a door sill, 10 cm at most.
+    """Close cracks of up to 10 cm between floor meshes, left by rounding or by door sills.
 
-    Widening and narrowing closes it. Mitred joins keep right angles; at the tip of a sliver they
-    are cut off, and what they still add outside of the hull was never floor.
+    The floor is dilated, then eroded. Mitred joins keep right angles, but may add spikes at the
+    tips of slivers; the mitre limit and the intersection with the convex hull cut them off.
     """
     mitre = {"join_style": "mitre", "mitre_limit": 1.5}
     return floor.buffer(_CRACK_M / 2, **mitre).buffer(-_CRACK_M / 2, **mitre) & floor.convex_hull
 
 
 def room_frame(floor: Floor, floor_y: float) -> np.ndarray:
-    """The 4 x 4 matrix that lays walls along the axes and the floor's centre on the origin."""
+    """Matrix (4, 4) that aligns the walls with the axes and moves the floor's centre to 0."""
     angle = _wall_angle(floor)
     cos, sin = (math.cos(angle), math.sin(angle)) if abs(angle) > 1e-4 else (1.0, 0.0)
     matrix = np.array([[cos, 0, sin, 0], [0, 1, 0, -floor_y], [-sin, 0, cos, 0], [0, 0, 0, 1.0]])
@@ -157,21 +157,21 @@ def room_frame(floor: Floor, floor_y: float) -> np.ndarray:
 
 
 def in_frame(floor: Floor, room_from_house: np.ndarray) -> Floor:
-    """The floor in the room's frame."""
+    """Transform the floor to the room's frame."""
     xz = [0, 2]
     turn, place = room_from_house[xz][:, xz], room_from_house[xz, 3]
     return shapely.affinity.affine_transform(floor, [*turn.ravel(), *place])
 
 
 def _wall_angle(floor: Floor) -> float:
-    """The turn, at most 45 degrees, after which most of the outline runs along x or z."""
+    """Rotation, at most 45 degrees, that aligns most of the floor's outline with x or z."""
     parts = getattr(floor, "geoms", [floor])
     edges = np.concatenate([np.diff(np.asarray(part.exterior.coords), axis=0) for part in parts])
     lengths = np.linalg.norm(edges, axis=1)
-    # A turn by +a about y takes (x, z) = (cos t, sin t) to the angle t - a, so a = t.
+    # A rotation by +a about y takes (x, z) = (cos t, sin t) to the angle t - a, so a = t.
     angles = np.arctan2(edges[:, 1], edges[:, 0])
     folded = (angles + math.pi / 4) % (math.pi / 2) - math.pi / 4
-    # The direction that most length agrees with, then the mean of those that agree within 1 degree.
+    # Pick the edge direction with the most length within 1 degree of it; average those edges.
     close = np.abs((folded[:, None] - folded + math.pi / 4) % (math.pi / 2) - math.pi / 4) < 0.0175
     best = folded[int(np.argmax((close * lengths).sum(axis=1)))]
     offset = (folded - best + math.pi / 4) % (math.pi / 2) - math.pi / 4
@@ -180,7 +180,7 @@ def _wall_angle(floor: Floor) -> float:
 
 
 def height_of(surfaces: dict[str, list[Surface]], floor_y: float) -> float:
-    """Floor to ceiling: the top of the inner walls, else the ceiling's, else the usual height."""
+    """Room height: up to the top of the inner walls, else of the ceiling, else the default."""
     for kind in ("WallInner", "Ceiling"):
         tops = [
             float(surface.vertices_m[surface.faces][..., 1].max())

@@ -1,25 +1,25 @@
-"""Parses a house's JSON file, checked as far as all its rooms need it."""
+"""Parses a house's JSON file and checks the parts that all its rooms share."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sceneprior.errors import InputError
-from sceneprior.files import read_json
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json
 
 
 @dataclass(frozen=True)
 class House:
-    """One house file, parsed, its rooms not read yet."""
+    """A parsed house file, before its rooms are read."""
 
     name: str
     """`<house uid>`, from the file's name."""
     rooms: list[Any]
-    """Entries of `scene.room`, as they are."""
+    """Entries of `scene.room`, unchecked."""
     furniture: dict[str, dict[str, Any]]
-    """By uid."""
+    """Furniture entries by uid."""
     meshes: dict[str, dict[str, Any]]
-    """By uid."""
+    """Mesh entries by uid."""
 
 
 def parse_house(path: Path) -> House:
@@ -47,18 +47,18 @@ def _inside(data: Any, key: str) -> Any:
 
 
 def is_valid(entry: dict[str, Any]) -> bool:
-    """Whether 3D-FRONT keeps a furniture entry: where not, `valid` is absent, null or false."""
+    """Test whether 3D-FRONT marks a furniture entry as valid; absent, null and false mean no."""
     value = entry.get("valid")
     return value.strip().lower() in ("true", "1") if isinstance(value, str) else bool(value)
 
 
 def key_of(uid: Any) -> str:
-    """What `uid` and `ref` have in common: a text, now and then a number; else nothing."""
+    """Normalise a `uid` or `ref`, usually a string, sometimes a number; "" for anything else."""
     return str(uid) if isinstance(uid, str | int) and uid != "" else ""
 
 
 def _by_uid(entries: list[Any]) -> dict[str, dict[str, Any]]:
-    """A repeated uid carries the same model, but not always the same `valid`: a valid one wins."""
+    """Index entries by uid. Entries that repeat a uid may differ in `valid`: a valid one wins."""
     found: dict[str, dict[str, Any]] = {}
     for entry in entries:
         key = key_of(entry.get("uid")) if isinstance(entry, dict) else ""

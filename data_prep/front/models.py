@@ -1,4 +1,4 @@
-"""The furniture models of 3D-FUTURE: categories, meshes in metres, colours."""
+"""Furniture models of 3D-FUTURE: categories, meshes in metres, colours."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,20 +7,20 @@ from typing import Any
 import numpy as np
 from cachetools import LRUCache, cachedmethod
 
-from sceneprior.files import file_stamp, is_name
-from sceneprior.furniture import MODEL_FILE, model_categories, read_obj
-from sceneprior.scene import Mesh
+from sceneprior.core.files import file_stamp, is_name
+from sceneprior.core.furniture import MODEL_FILE, model_categories, read_obj
+from sceneprior.core.scene import Mesh
 
 _NO_FURNITURE_M = 10.0
-"""No piece of furniture is 10 m long; nearly all oversized models (100 times too large) are."""
+"""Longest plausible side of a model; nearly all models in centimetres exceed it."""
 _OVERSIZED = (50.0, 200.0)
-"""A model's longest side, divided by the one its house states, where its file is in centimetres."""
+"""Range of the ratio longest side / longest side stated by the house for a file in centimetres."""
 _CACHE_BYTES = 512 * 2**20
-"""Meshes a process keeps: some two thousand models of 3D-FUTURE's usual size."""
+"""Size of a process's mesh cache: about two thousand models of 3D-FUTURE's usual size."""
 
 
 class ModelBank:
-    """3D-FUTURE: categories of all models, meshes on demand; `cache_bytes` of them are kept.
+    """3D-FUTURE's models: all categories, and meshes on demand in a cache of `cache_bytes`.
 
     Raises:
         InputError: the folder is missing, or is not 3D-FUTURE's.
@@ -34,21 +34,25 @@ class ModelBank:
         )
 
     def category(self, model_id: str) -> str:
-        """Lower case, "a / b" as "a/b"; "others" where the release says nothing."""
+        """Category of a model: lower case, "a / b" as "a/b"; "others" if the release has none."""
         return self._categories.get(model_id, "others")
 
+    def lists(self, model_id: str) -> bool:
+        """Test whether the release's list has this model; its mesh may be missing all the same."""
+        return model_id in self._categories
+
     def has(self, model_id: str) -> bool:
-        """Whether the release holds a mesh for this model."""
+        """Test whether the release has a mesh of this model."""
         return is_name(model_id) and (self.folder / model_id / MODEL_FILE).is_file()
 
     def load(self, model_id: str) -> Mesh:
-        """The mesh in metres. A file is read again if it has changed, or fell out of the cache.
+        """Load a mesh in metres. A file is read again if it changed or was evicted from the cache.
 
-        About a hundred models of the release are 100 times too large. One with a side of more than
-        10 m is, and is handed out at a hundredth; `unit_of` finds small ones by comparison.
+        About a hundred models of the release are in centimetres. A model with a side longer than
+        10 m is taken for one of them and scaled by 0.01; `unit_of` finds those that are smaller.
 
         Raises:
-            InputError: there is none, or it is damaged.
+            InputError: the mesh is missing or damaged.
         """
         path = self.folder / model_id / MODEL_FILE
         return self._read(path, file_stamp(path))
@@ -61,19 +65,20 @@ class ModelBank:
         return mesh
 
     def color(self, model_id: str) -> tuple[int, int, int] | None:
-        """One RGB colour for the whole model: the mean of its texture, or its material's; None
-        where the release says nothing. For pictures only, so damage is no failure."""
+        """One RGB colour for the whole model: the mean of its texture, else its material's colour.
+
+        None if the release has neither or they are damaged; colours are only used in pictures.
+        """
         return _mean_of_texture(self.folder / model_id) or _material(self.folder / model_id)
 
 
 def unit_of(mesh: Mesh, entry: dict[str, Any]) -> float:
-    """Metres per unit of a loaded mesh, by what the house's furniture entry says of its size: 1,
-    or 0.01 if the mesh is 50 to 200 times as long as stated.
+    """Metres per unit of a loaded mesh: 0.01 if it is 50 to 200 times as long as stated, else 1.
 
-    `size` and `bbox` mix orders of axes between entries, so only longest sides are compared. This
-    finds what `ModelBank.load` cannot: a model in centimetres that is shorter than 10 m as metres.
-    The factor belongs to the placement, not to the mesh, so that one model is one mesh whatever
-    its houses say.
+    The length is stated by the house's furniture entry. The order of axes in `size` and `bbox`
+    varies between entries, so only the longest sides are compared. This finds models in
+    centimetres that `ModelBank.load` misses because they are below 10 units long. The factor goes
+    into the placement, not into the mesh, so that a model has the same mesh in all houses.
     """
     if not len(mesh.vertices_m):
         return 1.0

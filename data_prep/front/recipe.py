@@ -1,4 +1,4 @@
-"""Recipes: which rooms of 3D-FRONT are kept, under which classes, and how cameras stand in them."""
+"""Recipes: rules that select rooms of 3D-FRONT, assign classes and place cameras."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -6,16 +6,16 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from data_prep.engine.source import Expected
-from sceneprior.classes import LABEL_SETS, label_set, label_set_name
-from sceneprior.errors import InputError
-from sceneprior.files import is_name
-from sceneprior.furniture import category_table, class_of_category, tidy_category
-from sceneprior.settings import Section, apply_override, check_settings, read_yaml
+from sceneprior.core.classes import LABEL_SETS, label_set, label_set_name
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import is_name
+from sceneprior.core.furniture import category_table, class_of_category, tidy_category
+from sceneprior.core.settings import Section, apply_override, check_settings, read_yaml
 
 FOLDER = Path(__file__).parents[1] / "recipes"
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-# YAML has lists where we have tuples.
+# strict=False: YAML gives lists for our tuples.
 Range = Annotated[tuple[Finite, Finite], Field(strict=False)]
 Names = Annotated[tuple[str, ...], Field(strict=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
@@ -24,41 +24,41 @@ Side = Annotated[int, Field(ge=8, le=8192)]
 
 
 class ViewRules(Section):
-    """Where cameras stand, and which views are good enough."""
+    """Rules that place cameras and reject poor views."""
 
     per_m2: Finite = Field(2.0, gt=0)
-    """Views for each square metre of floor."""
+    """Views per square metre of floor."""
     at_least: int = Field(8, gt=0)
-    """Views of the smallest room."""
+    """Minimum number of views of a room."""
     per_house_at_most: int = Field(100, gt=0)
-    """Shared among the house's rooms by floor area."""
+    """Maximum number of views of a house, shared among its rooms by floor area."""
     image_size: Annotated[tuple[Side, Side], Field(strict=False)] = (360, 480)
     """(height, width) in pixels."""
     fov_deg: float = Field(90.0, ge=1, le=170)
     """Horizontal field of view."""
     eye_height_m: Range = (1.4, 1.8)
     pitch_deg: Range = (5.0, 25.0)
-    """Downwards."""
+    """Range of pitch angles, positive downwards."""
     wall_margin_m: Finite = 0.3
-    """Cameras keep this far from walls, where the room allows it."""
+    """Distance that cameras keep from walls, if the room allows it."""
     furniture_margin_m: Finite = 0.15
-    """Cameras keep this far from the box of a piece that reaches up to the eye."""
+    """Distance that cameras keep from the bounding boxes of furniture."""
     target_distance_m: Finite = 1.0
-    """The piece a camera turns to is at least this far away, measured along the floor."""
+    """Minimum horizontal distance between a camera and the object it is aimed at."""
     clear_ahead_m: Finite = 0.35
-    """No such box may begin nearer than this in the viewing direction."""
+    """Distance in the viewing direction within which no furniture's bounding box may lie."""
     min_objects: int = 2
-    """A view that sees fewer objects (of those the room has) is drawn again ..."""
+    """A view with fewer visible objects is redrawn, unless the room has fewer."""
     min_object_pixels: int = 300
-    """... where an object counts from this many pixels on ..."""
+    """Pixels from which on an object counts as visible for `min_objects`."""
     max_object_share: Finite = 0.6
-    """... and so is one that is mostly one object."""
+    """A view is redrawn if one object covers more than this share of it."""
     tries: int = Field(8, gt=0)
-    """After so many tries the best view drawn stays."""
+    """Number of tries, after which the best view drawn stays."""
 
 
 def _named(given: Any) -> Any:
-    """A list of classes as the name of a label set; anything else as it is."""
+    """Turn a list of classes into the name of a label set; leave anything else unchanged."""
     if isinstance(given, list) and all(isinstance(name, str) for name in given):
         return label_set_name([name for name in given if name != "void"])
     return given
@@ -71,64 +71,67 @@ def _tidied(given: Any) -> Any:
 
 
 class Recipe(Section):
-    """One data set's rules for one type of room; each rule is off where it is null."""
+    """Rules for one type of room; a rule that is null is off."""
 
     name: str
-    """Of its file, without the ending; shards are called after it."""
+    """Name of the recipe's file without the suffix; also in the shards' names."""
     label_set: Annotated[str, BeforeValidator(_named)]
-    """A name in `sceneprior/classes.py`, or the user's own list: `[bed, chair]`."""
+    """A name in `sceneprior/core/classes.py`, or the user's own list: `[bed, chair]`."""
     categories: Annotated[dict[str, str], BeforeValidator(_tidied)] = Field(default_factory=dict)
-    """The data set's category -> class, where `class_of_category` does not say so already."""
+    """Class per category of the data set; overrides `class_of_category`."""
     room_types: Names | None
-    """A room is of this recipe if its type contains one of these, whatever the case; null: all."""
+    """Substrings of the accepted room types, in any case; null accepts all types."""
     min_objects: int | None = 2
-    """Objects of the label set; void does not count."""
+    """Minimum number of objects of the label set; void does not count."""
     max_objects: int | None = None
     max_floor_m: Finite | None = None
-    """Longest side of the floor's bounding box."""
+    """Maximum length of the floor's bounding box."""
     max_height_m: Finite | None = 4.0
     required_classes: Listed = ()
-    """One of these must be there; null is as good as none."""
+    """Classes of which at least one must be present; an empty list or null is off."""
     allowed_categories: Listed = ()
-    """A room with a piece of another category is left out; none or null: every piece is allowed."""
+    """Rooms with pieces of other categories are left out; an empty list or null is off."""
     furniture_between_m: Range | None = None
-    """Above the floor: a room with a piece that reaches lower or higher is left out."""
+    """Heights above the floor; rooms with furniture beyond this range are left out."""
     min_inside_floor: Share | None = None
-    """Share of the furniture whose middle lies above the floor, at least."""
+    """Minimum share of the furniture whose centre lies above the floor."""
     min_models_share: Share | None = None
-    """Share of the furniture for which there is a model, at least."""
+    """Minimum share of the furniture that has a model."""
     invalid_rooms: Listed = ()
-    """Room ids, with their house or without; in a recipe, also a file with one a line."""
+    """Ids of rooms to leave out, with or without their house; or a file with one id per line."""
     invalid_models: Listed = ()
-    """A room with one of these models is left out; a list, or a file."""
+    """Rooms with one of these models are left out; a list, or a file with one id per line."""
     scale_range: Range | None = (1e-5, 5.0)
-    """A room with a piece scaled beyond this (absolute value, each axis) is left out."""
+    """Rooms with furniture scaled beyond this (absolute value, any axis) are left out."""
     allow_mirrored: bool = True
-    """False leaves out a room with a piece of negative scale."""
+    """False leaves out rooms with furniture of negative scale."""
     views: ViewRules = Field(default_factory=ViewRules)
     expected: Expected | None = None
-    """What the report compares with; it decides nothing."""
+    """Counts that the report compares with; no effect on the shards."""
 
     def of_type(self, room_type: str) -> bool:
-        """Whether a room of this type is what the recipe is about."""
+        """Test whether the recipe accepts this type of room."""
         if self.room_types is None:
             return True
         return any(word.lower() in room_type.lower() for word in self.room_types)
 
     def class_of(self, category: str) -> str:
-        """The class of a category; `void` where it has none."""
+        """Class of a category; `void` if it has none."""
         return self.categories.get(category) or class_of_category(category, self.label_set)
 
     def knows(self, category: str) -> bool:
-        """Whether this category's class, void or not, is stated: by `categories`, by a class of its
-        name, or by the paper's table in a label set of the package."""
+        """Test whether the class of this category (void included) is stated anywhere.
+
+        It may be stated by `categories`, by a class of the same name or, for a label set of the
+        package, by the paper's table.
+        """
         if category in self.categories or self.class_of(category) != "void":
             return True
         return self.label_set in LABEL_SETS and category in category_table()
 
 
 def find_recipe(text: str) -> Path:
-    """The file of a recipe: a path that ends in .yaml, or the name of one that ships.
+    """Find the file of a recipe, given a path that ends in .yaml or the name of a bundled recipe.
 
     Raises:
         InputError: there is no such recipe.
@@ -148,7 +151,7 @@ def load_recipe(text: str, changes: tuple[str, ...] = ()) -> Recipe:
     """Read a recipe (`find_recipe`), with changes such as `views.per_m2=3` or `max_floor_m=null`.
 
     Raises:
-        InputError: no such recipe, a rule that recipes do not have, or a class outside of its
+        InputError: there is no such recipe, it has an unknown rule, or it uses a class outside its
             label set.
     """
     path = find_recipe(text)
@@ -178,11 +181,10 @@ def _lines(path: Path, key: str) -> list[str]:
 
 
 def recipe_text(name: str) -> str:
-    """A recipe that ships as a text to start from: with the classes of 3D-FUTURE's categories
-    written out.
+    """Text of a bundled recipe with all its categories written out, as a template.
 
     Raises:
-        InputError: none of this name ships.
+        InputError: no bundled recipe has this name.
     """
     if Path(name).suffix in (".yaml", ".yml"):
         raise InputError(

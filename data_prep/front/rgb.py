@@ -1,7 +1,7 @@
-"""Pictures of a prepared room for people and for later work: its views, shaded, as PNG files.
+"""Shaded PNG pictures of a prepared room's views.
 
-The room's floor, walls and ceiling are a backdrop only: as in the instance ids, no wall hides a
-piece, so that picture and masks of a view agree pixel by pixel.
+Floor, walls and ceiling are only a backdrop and occlude no furniture, as in the instance ids, so
+that the picture and the masks of a view agree pixel by pixel.
 """
 
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ import numpy as np
 import shapely
 
 from data_prep.front.furnished import Room
-from sceneprior.classes import class_colors, label_set
-from sceneprior.offscreen import Pinhole, Renderer
-from sceneprior.pictures import png_bytes
-from sceneprior.scene import Mesh
-from sceneprior.shards import RoomViews
+from sceneprior.core.classes import class_colors, label_set
+from sceneprior.core.scene import Mesh
+from sceneprior.core.shards import RoomViews
+from sceneprior.render.offscreen import Pinhole, Renderer
+from sceneprior.render.pictures import png_bytes
 
 FOLDER = "rgb"
 _FLOOR, _WALL, _CEILING = (196, 178, 153), (226, 224, 218), (244, 244, 242)
@@ -28,10 +28,10 @@ def rgb_files(
     label_set_name: str,
     renderer: Renderer,
 ) -> dict[str, bytes]:
-    """`rgb/<room>/<view>.png` -> its bytes, for every view.
+    """Render every view; returns the PNG bytes by path, `rgb/<room>/<view>.png`.
 
-    Void furniture is drawn, too. `colors` has one of each piece; None: its class's. The renderer
-    draws the same picture whatever its kind (`Renderer.shaded`).
+    Void furniture is drawn, too. `colors` has one entry per piece; None means the colour of its
+    class. All types of renderers draw the same picture (`Renderer.shaded`).
     """
     names = label_set(label_set_name)
     of_class = class_colors(len(names))
@@ -74,7 +74,7 @@ def shell_of(room: Room) -> list[Mesh]:
 
 
 def _sides(ring: np.ndarray) -> np.ndarray:
-    """(n + 1, 2) closed outline -> (n, 2, 2) its sides."""
+    """Split a closed outline (n + 1, 2) into its sides (n, 2, 2)."""
     return np.stack([ring[:-1], ring[1:]], axis=1)
 
 

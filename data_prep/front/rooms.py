@@ -1,4 +1,4 @@
-"""Reads the rooms of a parsed house, whatever the quirks of the files."""
+"""Reads the rooms of a parsed house, and tolerates the quirks of the files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,10 +22,10 @@ from data_prep.front.geometry import (
 from data_prep.front.houses import House, is_valid, key_of, parse_house
 from data_prep.front.models import ModelBank, unit_of
 from data_prep.front.recipe import Recipe
-from sceneprior.errors import InputError
-from sceneprior.files import is_name
-from sceneprior.furniture import MODEL_FILE
-from sceneprior.scene import Mesh
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import is_name
+from sceneprior.core.furniture import MODEL_FILE, tidy_category
+from sceneprior.core.scene import Mesh
 
 _NO_MESH = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
 _FLAT = 1e-9
@@ -33,17 +33,17 @@ _FLAT = 1e-9
 
 @dataclass
 class HouseRooms:
-    """What one house file gave."""
+    """Rooms of one house file."""
 
     rooms: list[Room] = field(default_factory=list)
     failures: list[tuple[str, str]] = field(default_factory=list)
-    """(room id, why it cannot be used)."""
+    """Unusable rooms: (room id, reason)."""
     filtered: list[tuple[str, str, str]] = field(default_factory=list)
-    """(room id, the rule that leaves it out, a sentence)."""
+    """Rooms left out by a rule: (room id, rule, sentence)."""
 
 
 class _FilteredError(Exception):
-    """A rule leaves the room out: its name, and a sentence."""
+    """A rule leaves the room out; the arguments are the rule's name and a sentence."""
 
 
 def read_house(
@@ -56,10 +56,10 @@ def read_house(
     """Read the wanted rooms of one house.
 
     Args:
-        house: `<house uid>.json`, or what `parse_house` made of it.
-        models: The furniture's meshes; `load_models=False` leaves every mesh empty (a survey).
-        recipe: Says which class a category is, and which scales are allowed.
-        wanted: Called with (room id, room type).
+        house: `<house uid>.json`, or the result of `parse_house`.
+        models: Meshes of the furniture; `load_models=False` leaves every mesh empty (a survey).
+        recipe: Maps categories to classes and limits the scales.
+        wanted: Predicate of (room id, room type).
 
     Raises:
         InputError: the file is not a house.
@@ -118,14 +118,14 @@ class _RoomReader:
         placed = [
             (child, entry)
             for child in children
-            # The others are surfaces, dangling references, and furniture 3D-FRONT itself rejects.
+            # Skips surfaces, dangling references, and furniture that 3D-FRONT marks as invalid.
             if (entry := self.house.furniture.get(key_of(child.get("ref")))) and is_valid(entry)
         ]
         if not placed:
             raise _FilteredError("no_furniture", "no furniture stands in it")
         meshes = [self.house.meshes.get(key_of(child.get("ref")), {}) for child in children]
         if not any(mesh.get("type") == "Floor" for mesh in meshes):
-            # As in many an OtherRoom, which collects what stands in no room.
+            # Common for OtherRoom, which collects the furniture that stands in no room.
             raise _FilteredError("no_floor", "no floor belongs to it")
         notes: list[str] = []
         surfaces = self._surfaces(children, notes)
@@ -138,8 +138,10 @@ class _RoomReader:
             height_of(surfaces, floor_y),
             tuple(self._furniture(placed, room_from_house, notes)),
             tuple(notes),
-            without_model=sum(
-                not self.models.has(str(entry.get("jid") or "")) for _, entry in placed
+            without_model=tuple(
+                (model_id, self._category(model_id, entry))
+                for _, entry in placed
+                if not self.models.has(model_id := str(entry.get("jid") or ""))
             ),
         )
 
@@ -198,7 +200,7 @@ class _RoomReader:
         return pieces
 
     def _check_scale(self, model_id: str, scale: np.ndarray) -> None:
-        """Two rules of the recipe; without them, only what is flat is left out."""
+        """Apply the recipe's two rules on scales; a piece scaled to zero is always left out."""
         limits, text = self.recipe.scale_range, ", ".join(f"{value:g}" for value in scale)
         if limits and not all(limits[0] <= abs(value) <= limits[1] for value in scale):
             why = f"{shown(model_id)} is scaled by {text}, beyond scale_range"
@@ -208,6 +210,13 @@ class _RoomReader:
             raise _FilteredError("allow_mirrored", why)
         if (np.abs(scale) < _FLAT).any():
             raise InputError(f"it is scaled by {text}, to nothing")
+
+    def _category(self, model_id: str, entry: dict[str, Any]) -> str:
+        """Category of a piece without a model: from the release's list, else from the house."""
+        said = entry.get("category")
+        if not self.models.lists(model_id) and isinstance(said, str) and said.strip():
+            return tidy_category(said)
+        return self.models.category(model_id)
 
     def _model(self, model_id: str) -> Mesh:
         if not self.models.has(model_id):

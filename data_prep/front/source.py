@@ -1,4 +1,4 @@
-"""3D-FRONT (or homes in its format) as a source of rooms: surveyed by house, drawn by room."""
+"""Source for 3D-FRONT and homes in its format: surveys house by house, renders room by room."""
 
 import contextlib
 import functools
@@ -29,17 +29,17 @@ from data_prep.front.recipe import Recipe
 from data_prep.front.rgb import rgb_files
 from data_prep.front.rooms import HouseRooms, read_house
 from data_prep.front.viewpoints import view_counts
-from sceneprior.errors import InputError
-from sceneprior.files import file_stamp
-from sceneprior.furniture import model_categories, model_info_path
-from sceneprior.offscreen import Renderer
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import file_stamp
+from sceneprior.core.furniture import model_categories, model_info_path
+from sceneprior.render.offscreen import Renderer
 
 _HOUSES_PER_TASK = 8
 
 
 @dataclass(frozen=True)
 class FrontSource:
-    """What `prep-front` reads: a `Source` (data_prep/engine/source.py)."""
+    """The `Source` (data_prep/engine/source.py) behind `prep-front`."""
 
     name: ClassVar = "3d-front"
     draws: ClassVar = True
@@ -49,12 +49,12 @@ class FrontSource:
     """Folder of furniture models."""
     recipe: Recipe
     splits: Path | None = None
-    """CSV of `room id,split`; None: a seeded 8:1:1 of train, val and test."""
+    """CSV of `room id,split`; None splits 8:1:1 into train, val and test, seeded."""
     seed: int = 0
     only: str | None = None
-    """HOUSE, HOUSE/ROOM or a room id; the beginning of a house's name is enough."""
+    """HOUSE, HOUSE/ROOM or a room id; a prefix of the house's name suffices."""
     rgb: bool = False
-    """Also draw shaded pictures, `rgb/<room>/<view>.png` (rgb.py). The shards do not change."""
+    """True also renders shaded pictures, `rgb/<room>/<view>.png` (rgb.py); no effect on shards."""
 
     @property
     def label_set(self) -> str:
@@ -71,13 +71,13 @@ class FrontSource:
     def settings(self, only: str | None) -> dict[str, Any]:
         """See `Source.settings`."""
         info = model_info_path(Path(self.future))
-        model_categories(Path(self.future))  # else a wrong list would be told once a house
+        model_categories(Path(self.future))  # reports a bad list here, not once per house
         if self.splits is not None:
             read_splits(self.splits)
         return {
             "recipe": {
                 **self.recipe.model_dump(exclude={"expected"}),
-                # They may be thousands.
+                # Hashed, because they may be thousands.
                 "invalid_rooms": _digest_of_ids(self.recipe.invalid_rooms),
                 "invalid_models": _digest_of_ids(self.recipe.invalid_models),
             },
@@ -89,7 +89,7 @@ class FrontSource:
         }
 
     def survey(self, run: Run) -> Survey:
-        """Read every house once, without meshes, and decide which rooms are worth drawing."""
+        """Read every house once, without meshes, and list the rooms to draw."""
         files = self._houses(self.only)
         found: list[tuple[str, str, int]] = []
         left_out: list[LeftOut] = []
@@ -134,7 +134,7 @@ class FrontSource:
             why = reasons[0] if reasons else "its house lost it meanwhile"
             return LeftOut(task.room_id, task.house, "failed", why)
         room = read.rooms[0]
-        # The survey saw no meshes: a model that turns out unreadable may leave too little.
+        # Checked again, now with meshes: unreadable models may leave too little furniture.
         broken = broken_rule(room, self.recipe)
         made = None
         if broken is None:
@@ -157,7 +157,7 @@ class FrontSource:
         )  # fmt: skip
 
     def read(self, house: House, load_models: bool, room_id: str | None = None) -> HouseRooms:
-        """The rooms of a house that are of the recipe's type, or the one with this id."""
+        """Read the rooms of a house that are of the recipe's type, or the one with this id."""
         return read_house(
             house,
             self._bank,
@@ -188,8 +188,8 @@ def _digest_of_ids(ids: tuple[str, ...]) -> str | None:
     return digest("\n".join(ids)) if ids else None
 
 
-# Kept from room to room within a process. The stamps make a worker that outlives the job, as those
-# of a cluster do, read a mended file again.
+# Cached from room to room within a process. The stamps make workers that outlive the job, such as
+# those of a cluster, reread a file that was repaired.
 @functools.lru_cache(maxsize=1)
 def _bank(future: Path, stamp: tuple[int, int]) -> ModelBank:
     return ModelBank(future)
@@ -201,10 +201,10 @@ def _parsed(path: Path, stamp: tuple[int, int]) -> House:
 
 
 def _room_types(files: list[Path]) -> list[str]:
-    """The types of rooms in these houses, most frequent first, with their counts."""
+    """Room types in these houses with their counts, most frequent first."""
     types: Counter[str] = Counter()
     for path in files:
-        with contextlib.suppress(InputError):  # it is in the report, if there is one
+        with contextlib.suppress(InputError):  # the report, if there is one, has the failure
             entries = [entry for entry in parse_house(path).rooms if isinstance(entry, dict)]
             types.update(str(entry.get("type") or "?") for entry in entries)
     return [f"{name} ({count})" for name, count in types.most_common()]
@@ -218,7 +218,7 @@ def _filtered(room: Room, house: str, recipe: Recipe, rule: str, reason: str) ->
 def _survey_houses(
     source: FrontSource, files: list[Path]
 ) -> tuple[list[tuple[str, str, int]], list[LeftOut]]:
-    """(room id, house, views) of the rooms to draw, and the others with the reason."""
+    """Read houses; returns (room id, house, views) of the rooms to draw, and the rooms left out."""
     found: list[tuple[str, str, int]] = []
     left_out: list[LeftOut] = []
     for path in files:

@@ -1,4 +1,4 @@
-"""Draws the cameras of a room: where they stand and what they turn to."""
+"""Samples the cameras of a room: positions, and objects they are aimed at."""
 
 import math
 from collections.abc import Sequence
@@ -8,18 +8,18 @@ import shapely
 
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import ViewRules
-from sceneprior.offscreen import Pinhole
+from sceneprior.render.offscreen import Pinhole
 
-_PLACES = 200  # random places tried before a rule about the place is relaxed
-_DARTS = 10_000  # random points tried before one is taken that is known to lie inside
+_PLACES = 200  # random positions tried before a rule is relaxed
+_DARTS = 10_000  # random points tried before a point known to lie inside is taken
 
 
 def view_counts(floor_areas_m2: Sequence[float], rules: ViewRules) -> list[int]:
-    """Views of each room of one house: in proportion to its floor, within the house's share.
+    """Numbers of views of the rooms of one house, in proportion to their floor areas.
 
-    A house whose rooms would get more than `per_house_at_most` shares that number by area. No room
-    gets fewer than `at_least`, unless the house has so many rooms that an equal share is less; no
-    room gets none.
+    If they would sum to more than `per_house_at_most`, this number is shared by area. Every room
+    gets at least `at_least` views, or an equal share if the house has too many rooms for that, but
+    never fewer than one.
 
     Example:
 
@@ -41,16 +41,18 @@ def view_counts(floor_areas_m2: Sequence[float], rules: ViewRules) -> list[int]:
 
 
 def intrinsics(rules: ViewRules) -> np.ndarray:
-    """(3, 3) float64, pixels: square pixels, the optical axis through the image's centre."""
+    """Intrinsics, (3, 3) float64 in pixels: square pixels, principal point at the image centre."""
     height, width = rules.image_size
     focal_px = width / 2 / math.tan(math.radians(rules.fov_deg) / 2)
     return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
 
 
 def camera_pose(eye_m: np.ndarray, yaw_rad: float, pitch_rad: float) -> np.ndarray:
-    """World to camera (4, 4) of an eye that looks along +z turned by yaw, and down by pitch.
+    """World-to-camera matrix (4, 4) of a camera that looks along +z, rotated by yaw and pitch.
 
-    Example: looking along +z, +x is on the left and what is above the eye has a negative camera y.
+    Positive pitch looks down.
+
+    Example: looking along +z, +x is on the left; points above the camera have a negative camera y.
 
         >>> (camera_pose(np.zeros(3), 0.0, 0.0) @ [1, 2, 3, 1]).tolist()
         [-1.0, -2.0, 3.0, 1.0]
@@ -68,12 +70,12 @@ def camera_pose(eye_m: np.ndarray, yaw_rad: float, pitch_rad: float) -> np.ndarr
 
 
 class Viewpoints:
-    """Draws cameras for one room, turning to one piece of furniture after the other.
+    """Samples cameras in one room, aimed at one object after the other.
 
     Args:
-        room: Its floor bounds where cameras stand.
-        boxes_m: (objects, 2, 3) lower and upper corners of all furniture in the room frame.
-        targets_m: (k, 3) centres of what is worth looking at.
+        room: Cameras stand on its floor.
+        boxes_m: (pieces, 2, 3) lower and upper corners of all furniture in the room frame.
+        targets_m: (k, 3) centres of the objects to aim at.
     """
 
     def __init__(
@@ -92,7 +94,7 @@ class Viewpoints:
         self._enough = min(rules.min_objects, len(self._targets))
         self._queue: list[int] = []
         self._area = room.floor
-        # A narrow room has no place far from every wall: come as close as it takes.
+        # Narrow rooms have no point far from every wall, so the margin shrinks.
         for margin in (rules.wall_margin_m, rules.wall_margin_m / 2, 0.05):
             inner = room.floor.buffer(-margin)
             if inner.area > 0.05:
@@ -101,7 +103,7 @@ class Viewpoints:
         shapely.prepare(self._area)
 
     def draw(self) -> Pinhole:
-        """One more camera."""
+        """Sample one more camera."""
         rules, rng = self._rules, self._rng
         target = self._next_target()
         for attempt in range(3 * _PLACES):
@@ -111,8 +113,8 @@ class Viewpoints:
             away = math.hypot(target[0] - eye[0], target[2] - eye[2])
             pitch = self._pitch(math.atan2(target[1] - eye[1], away))
             camera = Pinhole(camera_pose(eye, yaw, pitch), self._intrinsics)
-            # Some rooms have no view with enough in it, and some are so full that no place is
-            # clear: a third of the attempts each, then the rule is given up.
+            # Some rooms have no view of enough objects, and some are too full for the margins:
+            # each third of the attempts drops one more of these requirements.
             poor = away < rules.target_distance_m or self._in_view(camera) < self._enough
             if attempt < _PLACES and poor:
                 continue
@@ -133,25 +135,25 @@ class Viewpoints:
             x, z = self._rng.uniform((x1, z1), (x2, z2))
             if shapely.contains_xy(self._area, x, z):
                 return np.array([x, self._rng.uniform(*self._rules.eye_height_m), z])
-        # Slivers of floor, far apart: from now on every camera stands at one place that is inside.
+        # The floor consists of slivers far apart: put all further cameras at one interior point.
         self._area = self._area.representative_point().buffer(1e-3)
         return self._place()
 
     def _pitch(self, elevation_rad: float) -> float:
-        """A slight look down, raised as far as it takes to keep a lamp on the ceiling in view."""
+        """Sample a pitch, raised if needed to keep a high target (a ceiling lamp) in view."""
         pitch = math.radians(self._rng.uniform(*self._rules.pitch_deg))
         half_view = math.atan2(self._rules.image_size[0] / 2, self._intrinsics[1, 1])
         return max(min(pitch, 0.75 * half_view - elevation_rad), math.radians(-10))
 
     def _in_view(self, camera: Pinhole) -> int:
-        """How many centres of objects fall into the picture: a guess that costs no rendering."""
+        """Count the object centres inside the image: a cheap estimate of the visible objects."""
         points = self._targets @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         height, width = self._rules.image_size
         limits = np.array([width / 2, height / 2]) / self._intrinsics[0, 0]
         return int((np.abs(points[:, :2]) < limits * points[:, 2:]).all(axis=1).sum())
 
     def _blocked(self, camera: Pinhole, eye: np.ndarray, strict: bool) -> bool:
-        """Whether the eye is inside a piece's box, or looks straight into one."""
+        """Test whether the camera is inside a piece's box, or a box lies just ahead of it."""
         margin = self._rules.furniture_margin_m if strict else 0.02
         ahead = self._rules.clear_ahead_m if strict else 0.0
         points = eye + np.linspace(0.0, ahead, 4)[:, None] * camera.world_to_camera[2, :3]
@@ -162,8 +164,11 @@ class Viewpoints:
 
 
 def sees_enough(pixels: np.ndarray, rules: ViewRules) -> tuple[bool, float]:
-    """Whether a view stays, by the visible pixels of each tracked object, and a score that ranks
-    those that do not."""
+    """Test whether a view is accepted, and score it; scores rank the rejected views.
+
+    Args:
+        pixels: Visible pixels of each object.
+    """
     height, width = rules.image_size
     seen = int((pixels >= rules.min_object_pixels).sum())
     share = float(pixels.max(initial=0)) / (height * width)

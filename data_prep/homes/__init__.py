@@ -1,1 +1,1 @@
-"""Furnished homes that the package makes itself, in 3D-FRONT's on-disk format."""
+"""Procedurally generated furnished homes in 3D-FRONT's on-disk format."""

@@ -1,4 +1,4 @@
-"""Draws the furniture of a bedroom and says where it is placed."""
+"""Samples the furniture of a bedroom and the rules that place it."""
 
 import numpy as np
 
@@ -16,13 +16,15 @@ from data_prep.homes.placement import Furnisher
 
 COUNTS = {2: 157, 3: 782, 4: 1731, 5: 2057, 6: 1296, 7: 821, 8: 419, 9: 234, 10: 112, 11: 58,
           12: 21, 13: 7}  # fmt: skip
-"""Pieces in a room -> how many of the authors' 7,835 bedrooms have so many; those of one piece
-and of more than 13 are left out there, too."""
+"""Histogram of the number of pieces per room over the paper authors' 7,835 bedrooms.
+
+Rooms with one piece or more than 13 are left out here, too.
+"""
 
 BEDS = {"double_bed": 0.70, "single_bed": 0.18, "kids_bed": 0.12}
 
 ANGLED = 0.8
-"""Chance that a seat or a stool stands askew; it makes one piece in ten of them all."""
+"""Chance that a seat is rotated off the axes; this makes one piece in ten of all furniture."""
 LAMP_ANGLED = 0.3
 
 EXTRAS: Offers = {
@@ -45,7 +47,7 @@ EXTRAS: Offers = {
     "children_cabinet": (1, 0.08),
     "bedside lamps": (2, 0.10),
 }
-"""What stands in a bedroom beyond bed, nightstands, wardrobe and lamp."""
+"""Furniture of a bedroom besides bed, nightstands, wardrobe and lamp."""
 
 
 def _draw_bed(rng: np.random.Generator) -> str:
@@ -68,7 +70,10 @@ def _draw_groups(rng: np.random.Generator, count: int, bed: str) -> list[str]:
 
 
 def _place_bed(room: Furnisher, groups: list[str]) -> Piece | None:
-    """Headboard on a wall: near its middle for two, often in a corner for one."""
+    """Place the bed's headboard at a wall: near its middle, or often in a corner.
+
+    Double beds and beds with nightstands stand near the middle.
+    """
     wall, models = room.long_wall(), room.catalog[groups[0]]
     if groups[0] == "double_bed" or any("nightstands" in group for group in groups):
         where = wall.length * room.rng.uniform(0.42, 0.58)
@@ -95,7 +100,7 @@ def _sofa(room: Furnisher, group: str) -> bool:
 
 
 def _bench(room: Furnisher, group: str) -> bool:
-    """At the bed's end; a small stool may stand anywhere."""
+    """Place a bench at the foot of the bed, or a small stool anywhere."""
     if room.rng.random() < 0.6:
         long = room.models("stool", above=0.8)
         if room.before(room.anchor, long, (0.03, 0.12), tries=6):
@@ -104,7 +109,7 @@ def _bench(room: Furnisher, group: str) -> bool:
 
 
 def _armchair(room: Furnisher, group: str) -> bool:
-    """Near a wall, turned to the middle of the room; perhaps a small table with it."""
+    """Place an armchair near a wall, facing the middle of the room, perhaps with a small table."""
     middle = (room.plan.width / 2, room.plan.depth / 2)
     chair = room.standing_free(room.catalog["armchair"], ANGLED, middle)
     _, _, companion = group.partition(" and ")
@@ -118,7 +123,7 @@ def _armchair(room: Furnisher, group: str) -> bool:
 
 
 def _lamp(room: Furnisher, group: str) -> bool:
-    """Over the middle of the room, where one walks under it, or over the bed."""
+    """Hang a lamp over the middle of the room, or between there and the bed."""
     kind = "pendant_lamp" if room.rng.random() < 0.76 else "ceiling_lamp"
     x, z = room.lamp_position()
     if room.rng.random() < 0.35:

@@ -1,4 +1,4 @@
-"""Makes the catalogue of furniture: for each class a dozen models with sizes like the real ones."""
+"""Makes the furniture catalogue: a dozen models per class, with realistic sizes."""
 
 import csv
 import uuid
@@ -13,33 +13,33 @@ import trimesh
 
 from data_prep.homes.furniture import DEEP_SOFA_M, DINING_WIDTH_M, build
 from data_prep.homes.solids import Parts, Vector, fit_to
-from sceneprior.classes import label_set
+from sceneprior.core.classes import label_set
 
 VARIANTS = 12
-"""Models of each class in one data set; five is the least the demo promises."""
+"""Models per class in one data set; the demo promises at least five."""
 
 HEIGHT_CORRELATION = {"stool": 0.4, "table": 0.75, "ceiling_lamp": 0.2}
-"""How strongly height (and depth, unless listed below) goes with width, where it is not 0.3."""
+"""Correlation of height (and of depth, unless listed below) with width, where it is not 0.3."""
 
 DEPTH_CORRELATION = {
     "table": 0.9, "stool": 0.8, "ceiling_lamp": 0.97, "sofa": 0.75, "armchair": 0.8, "chair": 0.7,
     "dressing_chair": 0.8, "pendant_lamp": 0.6,
 }  # fmt: skip
-"""How strongly depth goes with width."""
+"""Correlation of depth with width."""
 
 Percentiles = tuple[tuple[float, ...], ...]
-"""Percentiles 10, 50 and 90 of width, of height and of depth in metres."""
+"""The 10th, 50th and 90th percentiles of width, of height and of depth, in metres."""
 
-# Half of the 41 real models filed as dressing chairs are wider than 2.29 m: no chair is, so we
-# take those for sets of table, mirror and seat (not checked). The seat alone is what a person
-# means by the name, and it lies near their 10th percentile.
+# Half of 3D-FUTURE's 41 dressing chairs are wider than 2.29 m, so they are presumably sets of
+# table, mirror and seat (not checked). We want the seat alone, which lies near their 10th
+# percentile.
 SIZES_OF_OURS: dict[str, Percentiles] = {
     "dressing_chair": ((0.50, 0.53, 0.62), (0.53, 0.68, 0.85), (0.50, 0.575, 0.64))
 }
 
 _LOUNGE_CHAIR = "Lounge Chair / Cafe Chair / Office Chair"
 
-# 3D-FUTURE's own spelling: super-category, then categories that models take in turn.
+# Super-category, then the categories that models take in turn, in 3D-FUTURE's spelling.
 _CATEGORIES = {
     "armchair": ("Sofa", "armchair"),
     "bookshelf": ("Cabinet/Shelf/Desk", "Bookcase / jewelry Armoire"),
@@ -69,22 +69,22 @@ _CATEGORIES = {
 
 @dataclass(frozen=True)
 class Model:
-    """One product: what `model_info.json` says of it, its size, and how it is built."""
+    """One product: its entry in `model_info.json`, its size, and the seed it is built from."""
 
     jid: str
     name: str
-    """Its class in the label sets."""
+    """Class in the label sets."""
     category: str
     super_category: str
     style_name: str
     size_m: Vector
-    """Width, height, depth: full extents along x, y, z."""
+    """Width, height and depth: full extents along x, y, z."""
     style: int
     seed: tuple[int, ...]
 
     @cached_property
     def parts(self) -> Parts:
-        """Closed solids that fill `size_m`, centred, bottom at y = 0."""
+        """Closed solids whose bounding box is `size_m`, centred, bottom at y = 0."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed))
         return fit_to(build(self.name, self.size_m, self.style, rng), self.size_m)
 
@@ -98,12 +98,12 @@ class Model:
 
 
 Catalog = dict[str, list[Model]]
-"""Class -> its models."""
+"""Models of each class."""
 
 
-@lru_cache(maxsize=4)  # meshes are built once a process
+@lru_cache(maxsize=4)  # meshes are built once per process
 def make_catalog(seed: int, label_set_name: str) -> Catalog:
-    """`VARIANTS` models for every class but void; a class looks the same in both label sets."""
+    """Make `VARIANTS` models of every class but void; a class has the same in all label sets."""
     return {name: _variants(seed, name) for name in label_set(label_set_name)[1:]}
 
 
@@ -129,7 +129,7 @@ def _variants(seed: int, name: str) -> list[Model]:
 
 
 def _category(name: str, size_m: Vector, index: int) -> tuple[str, str]:
-    """How 3D-FUTURE would file a model of this class and size: super-category, category."""
+    """3D-FUTURE's super-category and category for a model of this class and size."""
     width, _, depth = size_m
     if name == "sofa":
         short = "Loveseat Sofa" if width < 1.9 else "Three-Seat / Multi-seat Sofa"
@@ -142,10 +142,10 @@ def _category(name: str, size_m: Vector, index: int) -> tuple[str, str]:
 
 
 def _sizes(name: str, rng: np.random.Generator) -> list[Vector]:
-    """Sizes whose three marginals meet the real 10th, 50th and 90th percentiles.
+    """Sample sizes whose three marginals match the real 10th, 50th and 90th percentiles.
 
-    Width, height and depth are correlated normal scores, each moved in order onto evenly
-    spread quantiles, so that a dozen models cover the range as a thousand would.
+    Width, height and depth are correlated normal scores. Their ranks are mapped to evenly spaced
+    quantiles, so that a dozen models cover the range as well as a thousand would.
     """
     high_with = HEIGHT_CORRELATION.get(name, 0.3)
     deep_with = DEPTH_CORRELATION.get(name, high_with)
@@ -161,9 +161,9 @@ def _sizes(name: str, rng: np.random.Generator) -> list[Vector]:
 
 
 def at_score(low: float, middle: float, high: float, score: float) -> float:
-    """Two half log-normals joined at the median, cut 1.7 deviations out.
+    """Map a standard normal score to a size: two half log-normals joined at the median.
 
-    `score` is standard normal: -1.2816, 0 and 1.2816 give back `low`, `middle` and `high`.
+    Scores are clipped to +-1.7; -1.2816, 0 and 1.2816 give `low`, `middle` and `high`.
     """
     score = float(np.clip(score, -1.7, 1.7))
     end = low if score < 0 else high
@@ -172,7 +172,7 @@ def at_score(low: float, middle: float, high: float, score: float) -> float:
 
 @lru_cache(maxsize=1)
 def real_sizes() -> dict[str, Percentiles]:
-    """The percentiles of the sizes of every class."""
+    """Percentiles of the sizes of every class."""
     text = files("data_prep.recipes").joinpath("furniture_sizes.csv").read_text()
     sizes: dict[str, Percentiles] = {}
     for row in csv.DictReader(text.splitlines()):

@@ -1,4 +1,4 @@
-"""Places a dining table out on the floor, ringed by equal chairs that stand just clear of it."""
+"""Places a dining table away from the walls, surrounded by identical chairs just clear of it."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from data_prep.homes.layout import Piece, Plan
 from data_prep.homes.placement import Furnisher
 
 CHAIR_ANGLED = 0.12
-"""Chance that a dining chair was left askew."""
+"""Chance that a dining chair is rotated off the axes."""
 
 
 def place_dining(room: Furnisher, group: str) -> bool:
-    """ "dining 6": a table with six chairs, rather not between the sofa and what it faces."""
+    """Place "dining 6", a table with six chairs, preferably not in front of the sofa."""
     plan, rng = room.plan, room.rng
     count = int(group.split(" ")[1])
     tables = room.models("table", above=1.5 if count > 4 else 1.0)
@@ -41,7 +41,7 @@ def place_dining(room: Furnisher, group: str) -> bool:
 
 
 def _is_before(sofa: Piece, table: Piece) -> bool:
-    """Whether the table stands where those on the sofa look."""
+    """Test whether the table stands in front of the sofa."""
     sin, cos = np.sin(sofa.yaw_rad), np.cos(sofa.yaw_rad)
     dx, dz = table.x - sofa.x, table.z - sofa.z
     half = table.half_extent(table.yaw_rad - sofa.yaw_rad)[0]
@@ -50,7 +50,7 @@ def _is_before(sofa: Piece, table: Piece) -> bool:
 
 
 def _chair_places(table: Piece, width: float, count: int) -> list[tuple[float, float]]:
-    """(turn, sideways) of up to `count` chairs: the long sides in pairs, then the ends."""
+    """Places (rotation, sideways) of up to `count` chairs: long sides in pairs, then the ends."""
     long = int((table.size_m[0] + 0.05) // (width + 0.06))
     row = max(1, min(long, count // 2 if count <= 4 else (count - 1) // 2))
     step = table.size_m[0] / row

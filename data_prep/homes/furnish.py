@@ -1,4 +1,4 @@
-"""Furnishes a room: draws what stands in it, then an empty room, and places all until it works."""
+"""Furnishes a room: samples its furniture and an empty room, and retries until all pieces fit."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,44 +11,45 @@ from data_prep.homes.placement import Furnisher
 from data_prep.homes.rooms import empty_room, is_liveable
 
 Offers = dict[str, tuple[int, float]]
-"""Group of pieces, such as "desk and chair" -> how many pieces it has, its weight in the draw."""
+"""Number of pieces and sampling weight per group of pieces, such as "desk and chair"."""
 
 Rule = Callable[[Furnisher, str], bool]
-"""Places the pieces of a group; False where one of them finds no place."""
+"""Places the pieces of a group; returns False if one of them does not fit."""
 
 
 @dataclass(frozen=True)
 class RoomType:
-    """How rooms of one type are furnished.
+    """Procedure that furnishes rooms of one type.
 
-    A group is what is drawn and placed together; the first word of its name says by which rule.
+    A group is a set of pieces that are sampled and placed together; the first word of its name
+    selects the rule that places it.
     """
 
     name: str
     label_set: str
     counts: dict[int, int]
-    """Pieces in a room -> weight."""
+    """Sampling weight per number of pieces in a room."""
     draw_first: Callable[[np.random.Generator], str]
-    """Draws the group that is placed first, of one piece."""
+    """Samples the group that is placed first; it has one piece."""
     draw_groups: Callable[[np.random.Generator, int, str], list[str]]
-    """Draws the other groups for a number of pieces; given are that number and the first group."""
+    """Samples the other groups, given their total number of pieces and the first group."""
     place_first: Callable[[Furnisher, list[str]], Piece | None]
-    """Places the first of all groups."""
+    """Places the first group, given all groups."""
     rules: dict[str, Rule]
-    """First word of a group -> its rule, in the order of placing."""
+    """Rules by the first word of a group's name, in the order of placement."""
     area_m2: tuple[float, float]
-    """Floor area of a room without pieces, and for each piece more."""
+    """Floor area: base, and increment per piece."""
     growing_tries: int
-    """For so many failed tries the room grows by 2 % of its area."""
+    """Number of failed tries after each of which the room grows by 2% of its initial area."""
     sides_m: tuple[float, float]
-    """The shortest and the longest side of a room."""
+    """Shortest and longest side of a room."""
     l_shaped_chance: float
     reach: tuple[str, ...]
-    """Classes that one must be able to walk to from the door."""
+    """Classes that must be reachable on foot from the door."""
 
 
 def furnish(room_type: RoomType, catalog: Catalog, rng: np.random.Generator, share: float) -> Plan:
-    """A furnished room in which one can walk; this share of all rooms has fewer pieces."""
+    """Make a furnished, walkable room; `share` is the quantile of its number of pieces."""
     count = count_at(room_type.counts, share)
     first = room_type.draw_first(rng)
     order = list(room_type.rules)
@@ -70,7 +71,7 @@ def furnish(room_type: RoomType, catalog: Catalog, rng: np.random.Generator, sha
 
 
 def count_at(histogram: dict[int, int], share: float) -> int:
-    """The number of pieces below which this share in [0, 1) of the histogram lies."""
+    """Number of pieces at the quantile `share`, in [0, 1), of a histogram."""
     total = np.cumsum(list(histogram.values()))
     return list(histogram)[int(np.searchsorted(total, share * total[-1], side="right"))]
 
@@ -86,7 +87,7 @@ def _arrange(room_type: RoomType, furnisher: Furnisher, groups: list[str]) -> bo
 def draw_basics(
     rng: np.random.Generator, basics: list[tuple[str, int, float]], left: int
 ) -> tuple[list[str], int]:
-    """Groups out of (name, pieces, chance), in random order, and the pieces still left."""
+    """Sample groups from (name, pieces, chance); returns them and the number of pieces left."""
     groups = []
     for name, pieces, chance in [basics[k] for k in rng.permutation(len(basics))]:
         if 0 < pieces <= left and rng.random() < chance:
@@ -103,10 +104,10 @@ def draw_extras(
     fallback: Offers,
     twice: tuple[str, ...] = (),
 ) -> list[str]:
-    """The groups and more of those on offer until no pieces are left.
+    """Extend the groups with samples from `offers` until no pieces are left.
 
-    A first word is drawn once (one desk, one sofa is enough) but for the groups of `twice`.
-    Where nothing on offer fits any more, `fallback` is on offer.
+    Groups with the same first word are sampled once (one desk is enough), those of `twice` up to
+    twice. When no offer fits any more, `fallback` replaces the offers.
     """
     groups = list(groups)
     while left:
@@ -125,7 +126,7 @@ def draw_extras(
 
 
 def along_wall(clearance: float) -> Rule:
-    """A rule: one piece of the class that the group is named after, its back to a wall."""
+    """Make a rule that places one piece of the class named by the group, its back to a wall."""
 
     def place(furnisher: Furnisher, group: str) -> bool:
         return furnisher.against_wall(furnisher.catalog[group], clearance) is not None
@@ -134,10 +135,10 @@ def along_wall(clearance: float) -> Rule:
 
 
 def table_and_seat(angled: float) -> Rule:
-    """A rule for "desk and chair" and the like; `angled` is the chance that the seat is askew."""
+    """Make a rule for groups such as "desk and chair"; `angled` is the chance of a rotated seat."""
     return lambda furnisher, group: furnisher.pair_along_wall(group, angled)
 
 
 def opposite_the_anchor(furnisher: Furnisher, group: str) -> bool:
-    """A rule: one piece of the class that the group is named after, facing the bed or the sofa."""
+    """Place one piece of the class named by the group, facing the bed or the sofa (a `Rule`)."""
     return furnisher.opposite(furnisher.anchor, furnisher.catalog[group]) is not None

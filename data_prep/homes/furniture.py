@@ -1,22 +1,22 @@
 """Builds furniture from tables of parts: `beds.yaml`, `seats.yaml` and the other YAML files here.
 
-A table is a name and a list of rows. A row is an expression that makes one part or several
-(a solid of `solids.py`, or another table), perhaps once for each value of something:
+A table is a name and a list of rows. A row is an expression that makes one or more parts (a solid
+of `solids.py`, or another table), optionally repeated with `for`:
 
     desk:
     - box(w, 0.04, d, y=h - 0.04)
     - box(0.05, h, 0.05, x, 0, z) for x, z in corners(w/2 - 0.1, d/2 - 0.1)
 
-It may use the piece's width, height and depth `w`, `h`, `d` in metres, the number of its `style`,
-all of `VOCABULARY`, and the random draws `uniform`, `random`, `integers` and `books`. A table
-that others use names its parameters, as in `door(w, h, x, y, z, handle_x)`. Where a list of rows
-is not enough, a table or a row is a mapping of these keys, worked out in this order:
+A row may use the piece's width, height and depth `w`, `h`, `d` in metres, the index of its `style`,
+all of `VOCABULARY`, and the random functions `uniform`, `random`, `integers` and `books`. A table
+that other tables call names its parameters, as in `door(w, h, x, y, z, handle_x)`. Instead of a
+list of rows, a table or a row may be a mapping with these keys, evaluated in this order:
 
-    for:     `x in both(w/4)`: do all that follows once for each
+    for:     loop over all keys below, such as `x in both(w/4)`
     let:     names for values that several rows use
     parts:   rows
-    styles:  styles by name, each with rows of its own; used is number `style`, modulo their count
-    last:    rows that come after those of the style
+    styles:  rows of each style, by name; the entry `style`, modulo their number, is used
+    last:    rows after those of the style
 
 The front of a piece is at +z, and its bottom at y = 0.
 """
@@ -36,10 +36,10 @@ import yaml
 from data_prep.homes.solids import PARTS, Parts, Vector, box
 
 DEEP_SOFA_M = 1.3
-"""A sofa this deep has a chaise: no seat for one row of people is deeper."""
+"""Depth from which on a sofa has a chaise; sofas with a single row of seats are less deep."""
 
 DINING_WIDTH_M = 1.0
-"""A table at least this wide is one to eat at; below, one beside a seat."""
+"""Width from which on a table is a dining table; narrower ones are side tables."""
 
 
 def _around(count: int, x: float, z: float) -> list[tuple[float, float]]:
@@ -52,14 +52,14 @@ VOCABULARY: dict[str, Any] = {
     **{each: getattr(np, each) for each in ("arange", "array", "clip", "cos", "linspace", "sin")},
     "pi": np.pi,
     "product": product,
-    # The places of what stands left and right, in four corners, or in a ring.
+    # Positions of parts on both sides, in the four corners, or in a ring.
     "both": lambda x: (-x, x),
     "corners": lambda x, z: ((-x, -z), (-x, z), (x, -z), (x, z)),
     "around": _around,
     "DEEP_SOFA_M": DEEP_SOFA_M,
     "DINING_WIDTH_M": DINING_WIDTH_M,
 }
-"""What the rows of every table may use, beside Python's own `min`, `max`, `round` and so on."""
+"""Names that the rows of every table may use, besides Python's `min`, `max`, `round` and so on."""
 
 Names = dict[str, Any]
 Rows = str | list[Any] | dict[str, Any]
@@ -68,7 +68,7 @@ _KEYS = {"for", "let", "parts", "styles", "last"}
 
 @dataclass(frozen=True)
 class Table:
-    """One table of parts; `bind` gives its parameters the values of a call."""
+    """One table of parts; `bind` maps its parameters to the arguments of a call."""
 
     name: str
     bind: Callable[..., Names]
@@ -76,18 +76,18 @@ class Table:
 
     @classmethod
     def parse(cls, heading: str, rows: Rows) -> "Table":
-        """A table from its heading, `name` or `name(w, h, t=0.025)`, and its rows."""
+        """Parse a table from its heading, `name` or `name(w, h, t=0.025)`, and its rows."""
         name, _, parameters = heading.rstrip(")").partition("(")
         return cls(name, eval(f"lambda {parameters or 'w, h, d, style'}: locals()"), rows)
 
     def build(self, names: Names, *values: Any) -> Parts:
-        """The parts for these values of the parameters."""
+        """Build the parts for these values of the parameters."""
         return list(_parts(self.rows, names | self.bind(*values), self.name))
 
 
 @cache
 def furniture_tables() -> dict[str, Table]:
-    """Every table by its name."""
+    """Load all tables, by name."""
     found: dict[str, Table] = {}
     for file in files("data_prep.homes").iterdir():
         if file.name.endswith(".yaml"):
@@ -103,13 +103,13 @@ def build(
     rng: np.random.Generator,
     tables: dict[str, Table] | None = None,
 ) -> Parts:
-    """The parts of one piece of furniture, about as large as `size_m`.
+    """Build the parts of one piece of furniture, about as large as `size_m`.
 
     Args:
-        tables: The tables it is looked up in; those of this package if None.
+        tables: Tables by name; those of this package if None.
 
     Raises:
-        ValueError: a row cannot be worked out; the table and the row are named.
+        ValueError: a row cannot be evaluated; the message names the table and the row.
     """
     names = VOCABULARY | {draw: getattr(rng, draw) for draw in ("uniform", "random", "integers")}
     names["books"] = partial(_books, rng)
@@ -160,7 +160,7 @@ def _compiled(expression: str) -> CodeType:
 
 
 def _books(rng: np.random.Generator, w: float, h: float, d: float, x: float, y: float) -> Parts:
-    """Runs of books of unequal height from the left; the rest of the shelf stays empty."""
+    """Fill a shelf from the left with runs of books of unequal heights; the rest stays empty."""
     parts, edge = [], x - w / 2 + 0.01
     limit = x + w / 2 - rng.uniform(0.05, 0.4) * w
     while edge < limit:

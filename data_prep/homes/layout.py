@@ -1,8 +1,8 @@
-"""The plan of a room: its walls, the pieces in it, and whether one more fits.
+"""Plan of a room: its walls, its pieces, and the test whether another piece fits.
 
-Floor coordinates are x and z in metres, the room's outer rectangle from (0, 0). A yaw of a
-radians turns a piece's front from +z towards +x. No two boxes may overlap, seen along the
-room's own axes: stricter than a shopper's eye, and it keeps 3D ground truth free of overlap.
+Floor coordinates are x and z in metres; the room's outer rectangle starts at (0, 0). A positive
+yaw rotates a piece's front from +z towards +x. The axis-aligned bounding boxes of two pieces may
+not overlap: stricter than necessary, but it keeps the 3D ground truth free of overlaps.
 """
 
 from dataclasses import dataclass, field, replace
@@ -13,15 +13,15 @@ from data_prep.homes.catalog import Model
 from data_prep.homes.solids import Vector
 
 Rect = tuple[float, float, float, float]
-"""x0, z0, x1, z1 on the floor."""
+"""Rectangle on the floor: x0, z0, x1, z1."""
 
 CEILING_GAP_M = 0.03
-"""Room left between a tall piece and the ceiling."""
+"""Minimum gap between a tall piece and the ceiling."""
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A model at its place: middle of its bottom, yaw, and a scale for each of its axes."""
+    """A placed model: centre of its bottom, yaw, and a scale per axis."""
 
     model: Model
     scale: Vector
@@ -31,39 +31,39 @@ class Piece:
     y: float = 0.0
 
     def at(self, x: float, z: float, yaw_rad: float, y: float = 0.0) -> "Piece":
-        """The same model and scale at another place."""
+        """Copy of the piece at another place."""
         return replace(self, x=float(x), z=float(z), yaw_rad=float(yaw_rad), y=float(y))
 
     @property
     def size_m(self) -> Vector:
-        """Width, height, depth after scaling, along the piece's own axes."""
+        """Width, height and depth after scaling, along the piece's own axes."""
         (w, h, d), (kx, ky, kz) = self.model.size_m, self.scale
         return w * kx, h * ky, d * kz
 
     @property
     def rect(self) -> Rect:
-        """Its box on the floor, along the room's axes."""
+        """Axis-aligned bounding rectangle on the floor."""
         half_x, half_z = self.half_extent(self.yaw_rad)
         return self.x - half_x, self.z - half_z, self.x + half_x, self.z + half_z
 
     @property
     def top(self) -> float:
-        """Height of its highest point."""
+        """Height of the highest point."""
         return self.y + self.size_m[1]
 
     def half_extent(self, yaw_rad: float) -> tuple[float, float]:
-        """Half extents of its box, turned by this yaw, along x and z."""
+        """Half extents along x and z of the piece's box, rotated by this yaw."""
         sin, cos = abs(np.sin(yaw_rad)), abs(np.cos(yaw_rad))
         width, _, depth = self.size_m
         return (width * cos + depth * sin) / 2, (width * sin + depth * cos) / 2
 
     def ahead(self, forward: float, sideways: float = 0.0) -> tuple[float, float]:
-        """The floor point `forward` before its middle and `sideways` to its own +x."""
+        """Point on the floor `forward` metres in front of the centre, `sideways` along its +x."""
         sin, cos = np.sin(self.yaw_rad), np.cos(self.yaw_rad)
         return self.x + forward * sin + sideways * cos, self.z + forward * cos - sideways * sin
 
     def clearance(self, reach: float) -> Rect:
-        """The floor before a piece that stands square to the room, as wide as it, `reach` deep."""
+        """Floor in front of an axis-aligned piece, as wide as the piece and `reach` deep."""
         half_width, half_depth = self.size_m[0] / 2, self.size_m[2] / 2
         xa, za = self.ahead(half_depth, -half_width)
         xb, zb = self.ahead(half_depth + reach, half_width)
@@ -72,23 +72,23 @@ class Piece:
 
 @dataclass(frozen=True)
 class Wall:
-    """A straight wall: where it starts, which way it runs, how far, and the way it faces."""
+    """A straight wall: its start, direction, length, and the yaw it faces."""
 
     x: float
     z: float
     along: tuple[int, int]
     length: float
     yaw_rad: float
-    """The yaw of a piece whose back is to this wall."""
+    """Yaw of a piece whose back is to this wall."""
 
     def point(self, along: float, off: float) -> tuple[float, float]:
-        """The floor point `along` metres from the wall's start and `off` metres from the wall."""
+        """Point on the floor `along` metres from the wall's start, `off` metres from the wall."""
         run_x, run_z = self.along
         return self.x + run_x * along - run_z * off, self.z + run_z * along + run_x * off
 
 
 def overlaps(a: Rect, b: Rect, gap: float = 0.0) -> bool:
-    """Whether two rectangles come closer than `gap`."""
+    """Test whether two rectangles are closer than `gap`."""
     in_x = a[0] < b[2] + gap and b[0] < a[2] + gap
     return in_x and a[1] < b[3] + gap and b[1] < a[3] + gap
 
@@ -101,10 +101,10 @@ class Plan:
     depth: float
     height: float
     notch: Rect | None
-    """The corner that an L-shaped room lacks."""
+    """Corner rectangle cut out of an L-shaped room."""
     pieces: list[Piece] = field(default_factory=list)
     kept_clear: list[Rect] = field(default_factory=list)
-    """Floor where nothing may stand: first before the door, then before wardrobe doors."""
+    """Floor that stays empty: first the door's, then that in front of pieces with a clearance."""
 
     @property
     def area(self) -> float:
@@ -114,7 +114,7 @@ class Plan:
 
     @property
     def beside_notch(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The ranges of x and of z that the notch leaves; the whole room's without a notch."""
+        """Ranges of x and of z beside the notch; the whole room's without a notch."""
         if self.notch is None:
             return (0.0, self.width), (0.0, self.depth)
         x0, z0, x1, z1 = self.notch
@@ -131,24 +131,24 @@ class Plan:
         x0, z0, x1, z1 = self.notch
         notch = [(x0, z0), (x1, z0), (x1, z1), (x0, z1)]
         hit = next(k for k, corner in enumerate(corners) if corner in notch)
-        # Walk into the notch: the corner gives way to three, of which the middle is its far one.
+        # The notch replaces this corner by three; the middle one is the corner opposite to it.
         inner = [notch[(hit + step) % 4] for step in (-1, 2, 1)]
         return [*corners[:hit], *inner, *corners[hit + 1 :]]
 
     @property
     def walls(self) -> list[Wall]:
-        """One wall for each side of the outline."""
+        """Walls, one per side of the outline."""
         corners = self.outline
         walls = []
         for (x0, z0), (x1, z1) in zip(corners, corners[1:] + corners[:1], strict=True):
             length = abs(x1 - x0) + abs(z1 - z0)
             along = (int(np.sign(x1 - x0)), int(np.sign(z1 - z0)))
-            # Inside lies to the left of the walk: the normal is (-along_z, along_x).
+            # The interior is on the wall's left: the inward normal is (-along_z, along_x).
             walls.append(Wall(x0, z0, along, length, float(np.arctan2(-along[1], along[0]))))
         return walls
 
     def fits(self, piece: Piece, crowding: bool = False) -> bool:
-        """Whether the piece stands free inside; `crowding` lets it block all but the door."""
+        """Test whether the piece fits; with `crowding`, only the door's floor must stay clear."""
         rect = piece.rect
         hangs = piece.y > 0
         if not self._holds(rect, 0.004) or piece.top > self.height - (
@@ -163,7 +163,7 @@ class Plan:
         return hangs or not any(overlaps(rect, clear) for clear in closed)
 
     def add(self, piece: Piece, clearance: float = 0.0, crowding: bool = False) -> bool:
-        """Stand the piece there if it fits, and keep `clearance` metres before it clear."""
+        """Add the piece if it fits, and keep `clearance` metres in front of it clear."""
         if not self.fits(piece, crowding):
             return False
         if clearance:
@@ -176,7 +176,7 @@ class Plan:
         return True
 
     def _holds(self, rect: Rect, gap: float = 0.0) -> bool:
-        """Whether the rectangle lies inside the room, `gap` off its walls."""
+        """Test whether the rectangle lies inside the room, at least `gap` from its walls."""
         x0, z0, x1, z1 = rect
         if x0 < gap or z0 < gap or x1 > self.width - gap or z1 > self.depth - gap:
             return False

@@ -1,4 +1,4 @@
-"""Draws the furniture of a living room and says where it is placed."""
+"""Samples the furniture of a living room and the rules that place it."""
 
 from dataclasses import replace
 
@@ -19,10 +19,11 @@ from data_prep.homes.placement import Furnisher
 
 COUNTS = {4: 40, 5: 65, 6: 90, 7: 110, 8: 120, 9: 120, 10: 110, 11: 95, 12: 78, 13: 60, 14: 44,
           15: 32, 16: 23, 17: 16, 18: 11, 19: 8, 20: 5, 21: 3}  # fmt: skip
-"""Pieces in a room -> weight: mean 9.8, at most ATISS's 21. Ours: we know no real histogram."""
+"""Weight per number of pieces in a room: mean 9.8, maximum ATISS's 21. The weights are our choice,
+for lack of a real histogram."""
 
 SEAT_ANGLED = 0.55
-"""Chance that a seat stands askew."""
+"""Chance that a seat is rotated off the axes."""
 LAMP_ANGLED = 0.12
 
 EXTRAS: Offers = {
@@ -39,7 +40,7 @@ EXTRAS: Offers = {
     "sofa": (1, 0.15),
     "chair": (1, 0.1),
 }
-"""What joins sofa, coffee table, TV stand and dining table."""
+"""Furniture of a living room besides sofa, coffee table, TV stand and dining table."""
 
 
 def _draw_groups(rng: np.random.Generator, count: int, first: str) -> list[str]:
@@ -54,7 +55,7 @@ def _draw_groups(rng: np.random.Generator, count: int, first: str) -> list[str]:
 
 def _place_sofa(room: Furnisher, groups: list[str]) -> Piece | None:
     wall, share = room.long_wall(), room.rng.uniform(0.35, 0.65)
-    if any(group.startswith("dining") for group in groups):  # leave one end to the table
+    if any(group.startswith("dining") for group in groups):  # leaves one end to the table
         share = float(room.rng.choice([0.0, 1.0]) + room.rng.uniform(-0.3, 0.3))
     where = wall.length * share
     return room.against_wall(room.catalog["sofa"], 0.5, [wall], where=where, tries=10)
@@ -74,7 +75,7 @@ def _side_tables(room: Furnisher, group: str) -> bool:
 
 
 def _armchair(room: Furnisher, group: str) -> bool:
-    """Beside the coffee table, looking at it, or near a wall."""
+    """Place an armchair at a side of the coffee table, facing it, or near a wall."""
     tables = [piece for piece in room.plan.pieces if piece.model.name == "coffee_table"]
     chairs, sofa = room.catalog["armchair"], room.anchor
     for side in room.rng.permutation([-1, 1]) if tables else ():
@@ -89,14 +90,14 @@ def _armchair(room: Furnisher, group: str) -> bool:
 
 
 def _second_sofa(room: Furnisher, group: str) -> bool:
-    """A short one along another wall."""
+    """Place a short second sofa at a wall perpendicular to the first's."""
     yaw = room.anchor.yaw_rad
     across = [wall for wall in room.plan.walls if abs(np.cos(wall.yaw_rad - yaw)) < 0.5]
     return room.against_wall(room.models("sofa", below=2.2), 0.4, across) is not None
 
 
 def _lamp(room: Furnisher, group: str) -> bool:
-    """Over the dining table first, then over the coffee table, then over the room's middle."""
+    """Hang a lamp: first over the dining table, then over the coffee table, then mid-room."""
     plan, rng = room.plan, room.rng
     hanging = [piece for piece in plan.pieces if piece.y > 0]
     large = [p for p in plan.pieces if p.model.name == "table" and p.size_m[0] > 0.95]

@@ -2,7 +2,6 @@
 
 import shutil
 import uuid
-from os import getpid
 from pathlib import Path
 from zlib import crc32
 
@@ -16,53 +15,57 @@ from data_prep.homes.furnish import furnish
 from data_prep.homes.layout import Plan
 from data_prep.homes.living import LIVING_ROOM
 from data_prep.homes.write import PlacedRoom, house_json, model_record, write_json, write_model
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import only_writer
 
 ROOM_TYPES = {"bedroom": BEDROOM, "living": LIVING_ROOM}
 
 ROOMS_IN_HOUSE = {1: 0.75, 2: 0.13, 3: 0.08, 4: 0.04}
-"""Rooms of a house -> share of the houses."""
+"""Share of houses per number of rooms."""
 
 TEST_SHARE, VAL_SHARE = 0.2, 0.1
-"""Of all rooms. A few hundred rooms need no more to train on, and fewer test rooms than some fifty
-differ from each other by more than methods do."""
+"""Shares of all rooms. With fewer than about fifty test rooms, results vary more between test sets
+than between methods; the rest suffices for training."""
 
 _GOLDEN = (5**0.5 - 1) / 2
 
 
 def make_homes(out: Path, rooms: int, room_type: str, seed: int) -> None:
-    """Write furnished homes and their furniture as 3D-FRONT and 3D-FUTURE lay them out.
+    """Write furnished homes and their furniture in the layout of 3D-FRONT and 3D-FUTURE.
 
         OUT/3D-FRONT/<house uid>.json
         OUT/3D-FUTURE-model/<jid>/raw_model.obj, OUT/3D-FUTURE-model/model_info.json
         OUT/splits/<room type>.csv    rows `<house uid>_<room instanceid>,train|val|test`
 
     The same arguments write the same bytes, and room k does not depend on `rooms`. The folder
-    appears whole or not at all.
+    appears only when it is complete.
 
     Args:
         out: A folder that does not exist yet, or an empty one.
-        rooms: How many rooms, at least 2; seven in ten are for training.
+        rooms: Number of rooms, at least 2; 70% are for training.
         room_type: "bedroom" or "living".
         seed: 0 or more.
 
     Raises:
-        InputError: an argument is out of its range, or `out` holds files or cannot be written.
+        InputError: an argument is out of its range, `out` holds files, or another process writes
+            there.
+        OSError: `out` cannot be written; `filename` is set.
     """
     out = Path(out).expanduser().absolute()
     _check(out, rooms, room_type, seed)
-    staging = out.with_name(f".{out.name}.{getpid()}.partial")
-    try:
-        staging.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(
-            f"Cannot write beside {out} ({error.strerror}); choose a folder you may write to."
-        ) from error
-    try:
-        _write(staging, rooms, room_type, seed)
-        staging.replace(out)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
+    staging = out.with_name(f".{out.name}.partial")
+    with only_writer(out):
+        _check(out, rooms, room_type, seed)  # again: another process may have finished just now
+        try:
+            shutil.rmtree(staging, ignore_errors=True)  # left by a process that was killed
+            staging.mkdir()
+            _write(staging, rooms, room_type, seed)
+            staging.replace(out)
+        except OSError as error:
+            error.filename = error.filename or str(out)
+            raise
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
 
 
 def _check(out: Path, rooms: int, room_type: str, seed: int) -> None:
@@ -109,13 +112,13 @@ def _write(folder: Path, rooms: int, room_type: str, seed: int) -> None:
 
 
 def _seeded(seed: int, *stream: int | str) -> np.random.Generator:
-    """A generator of its own for each thing drawn: room 7 is the same in any number of rooms."""
+    """Random generator of one stream, so that room 7 is the same in any number of rooms."""
     words = [crc32(str(word).encode()) for word in stream]
     return np.random.default_rng(np.random.SeedSequence([seed, *words]))
 
 
 def _houses(rooms: int, room_type: str, seed: int) -> list[range]:
-    """The numbers of the rooms of each house."""
+    """Split the room numbers into houses."""
     rng = _seeded(seed, room_type, "houses")
     houses: list[range] = []
     first = 0
@@ -146,7 +149,7 @@ def _house(
 
 
 def _kind(plan: Plan, taken: set[str]) -> str:
-    """3D-FRONT's name for such a room; one master bedroom a house."""
+    """3D-FRONT's type of such a room; a house has one master bedroom."""
     names = {piece.model.name for piece in plan.pieces}
     if not names & set(BEDS):
         dining = any(p.model.name == "table" and p.model.size_m[0] > 1.0 for p in plan.pieces)
@@ -158,11 +161,11 @@ def _kind(plan: Plan, taken: set[str]) -> str:
 
 
 def _write_split(path: Path, contents: dict[str, list[str]], seed: int) -> None:
-    """Every fifth room of a list in which alike rooms are neighbours is a test room, and of the
-    others every eighth a val room.
+    """Split the rooms, stratified by bed, number of pieces and furniture.
 
-    So a few dozen test rooms have the beds, counts and furniture of all the rooms; drawn
-    without such strata, 51 of 512 bedrooms were 0.05 nats from the training rooms themselves.
+    Of the list sorted by these, every fifth room is a test room, and every eighth of the others a
+    val room, so that a few dozen test rooms represent all rooms. An unstratified draw of 51 from
+    512 bedrooms was 0.05 nats away from the training rooms.
     """
 
     def kind(room: str) -> tuple[list[str], int, list[str]]:

@@ -1,4 +1,4 @@
-"""Ways to place one piece in a room: against a wall, before or beside another, free, or hung."""
+"""Places single pieces: against a wall, in front of or beside another piece, free, or hanging."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,41 +12,41 @@ from data_prep.homes.solids import Vector
 
 
 def random_scale(rng: np.random.Generator) -> Vector:
-    """A few percent along each axis: no real cupboard is exactly the catalogue's."""
+    """Sample a scale within a few percent of 1 per axis, so that copies of a model differ."""
     x, y, z = np.clip(rng.normal(1.0, 0.035, 3), 0.92, 1.08).round(4).tolist()
     return x, y, z
 
 
 @dataclass
 class Furnisher:
-    """Furnishes one plan from a catalogue with its own random draws.
+    """Places furniture from a catalogue in one plan.
 
-    Each way of placing tries a few models, scales and places, and returns the piece that now
-    stands in the plan, or None.
+    Each placing method tries several models, scales and positions, and returns the piece that it
+    added to the plan, or None.
     """
 
     plan: Plan
     catalog: Catalog
     rng: np.random.Generator
     anchor: Piece = field(init=False)
-    """The piece that the others are arranged around: the bed, or the sofa."""
+    """Piece that the others are arranged around: the bed, or the sofa."""
 
     def models(self, name: str, below: float = inf, above: float = 0.0) -> list[Model]:
-        """The models of a class whose width in metres lies between these."""
+        """Models of a class whose width in metres lies between `above` and `below`."""
         return [model for model in self.catalog[name] if above < model.size_m[0] < below]
 
     def pick(self, models: list[Model]) -> Piece:
-        """One of the models, scaled; it has no place yet."""
+        """Sample one of the models and a scale, without a place."""
         return Piece(models[self.rng.integers(len(models))], random_scale(self.rng))
 
     def random_turn(self, chance: float) -> float:
-        """With this chance a turn by 10 to 40 degrees to either side, else none; in radians."""
+        """Sample a rotation in radians: with this chance by 10 to 40 degrees, else 0."""
         if self.rng.random() >= chance:
             return 0.0
         return float(np.radians(self.rng.uniform(10, 40)) * self.rng.choice([-1, 1]))
 
     def long_wall(self) -> Wall:
-        """One of the four longest walls."""
+        """Sample one of the four longest walls."""
         walls = sorted(self.plan.walls, key=lambda wall: -wall.length)[:4]
         return walls[self.rng.integers(len(walls))]
 
@@ -73,12 +73,14 @@ class Furnisher:
         tries: int = 40,
         where: float | None = None,
     ) -> Piece | None:
-        """A piece with its back to a wall; `corner` is the chance to try the wall's ends.
+        """Place a piece with its back to a wall.
 
         Args:
-            clearance: Metres that stay clear before it.
-            walls: Only these; all of the plan's if None.
-            where: Metres along the wall where its middle should come, give or take 0.3.
+            clearance: Metres that stay clear in front of it.
+            walls: Walls to choose from; all of the plan's if None.
+            corner: Chance to try an end of the wall.
+            where: Desired position of its centre along the wall in metres, with a standard
+                deviation of 0.15.
         """
         choice = self.plan.walls if walls is None else walls
         lengths = np.array([wall.length for wall in choice])
@@ -100,7 +102,7 @@ class Furnisher:
         return self._try(models, tries, propose, clearance)
 
     def opposite(self, anchor: Piece, models: list[Model]) -> Piece | None:
-        """A piece against the wall that the anchor looks at, on its axis."""
+        """Place a piece against the wall that the anchor faces, on the anchor's axis."""
         facing = [
             wall
             for wall in self.plan.walls
@@ -122,7 +124,10 @@ class Furnisher:
         angled: float = 0.0,
         tries: int = 15,
     ) -> Piece | None:
-        """A piece `gap` metres in front of another, looking back at it; `angled` may turn it."""
+        """Place a piece `gap` metres in front of another, facing it.
+
+        `angled` is the chance of a random rotation.
+        """
 
         def propose(piece: Piece) -> Piece:
             yaw = anchor.yaw_rad + np.pi + self.random_turn(angled)
@@ -133,7 +138,7 @@ class Furnisher:
         return self._try(models, tries, propose, crowding=True)
 
     def beside(self, anchor: Piece, piece: Piece, side: int) -> Piece | None:
-        """The piece at the anchor's side (+1: its own +x), their backs on one line."""
+        """Place the piece beside the anchor (side +1: the anchor's +x), with aligned backs."""
         width, _, depth = piece.size_m
         for _ in range(4):
             off = anchor.size_m[0] / 2 + width / 2 + self.rng.uniform(0.02, 0.12)
@@ -144,7 +149,7 @@ class Furnisher:
         return None
 
     def twins_beside(self, models: list[Model], count: int) -> bool:
-        """The same piece at both sides of the anchor, or at one if `count` is 1."""
+        """Place two copies of a piece on both sides of the anchor, or one if `count` is 1."""
         piece = self.pick(models)
         sides = [int(side) for side in self.rng.permutation([-1, 1])]
         if count == 2:
@@ -154,7 +159,7 @@ class Furnisher:
     def standing_free(
         self, models: list[Model], angled: float, towards: tuple[float, float] | None = None
     ) -> Piece | None:
-        """A light piece near a wall or a corner, turned to a point or along the room's axes."""
+        """Place a light piece near a wall, facing a point or along one of the room's axes."""
 
         def propose(piece: Piece) -> Piece:
             width, depth = self.plan.width, self.plan.depth
@@ -180,7 +185,7 @@ class Furnisher:
         angled: float,
         yaw_rad: float = 0.0,
     ) -> Piece | None:
-        """A lamp that hangs from the ceiling above `place`, with nothing of it below `lowest`."""
+        """Hang a lamp from the ceiling above `place`, no part of it below `lowest`."""
 
         def propose(piece: Piece) -> Piece | None:
             bottom = self.plan.height - piece.size_m[1]
@@ -193,7 +198,7 @@ class Furnisher:
         return self._try(models, 20, propose)
 
     def pair_along_wall(self, group: str, angled: float) -> bool:
-        """ "desk and chair": the first along a wall, the second before it, looking at it."""
+        """Place "desk and chair": the first against a wall, the second in front, facing it."""
         first, _, seat = group.partition(" and ")
         table = self.against_wall(self.catalog[first], clearance=0.75 if seat else 0.5)
         if table is None or not seat:
@@ -202,7 +207,7 @@ class Furnisher:
         return self.before(table, seats, (0.02, 0.12), angled=angled) is not None
 
     def lamp_position(self) -> tuple[float, float]:
-        """The middle of the largest rectangle of the floor."""
+        """Centre of the largest rectangle of the floor."""
         width, depth = self.plan.width, self.plan.depth
         range_x, range_z = self.plan.beside_notch
         if (range_x[1] - range_x[0]) * depth > (range_z[1] - range_z[0]) * width:

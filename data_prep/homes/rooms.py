@@ -1,4 +1,4 @@
-"""Draws an empty room, and says whether a furnished one can be lived in."""
+"""Samples empty rooms, and checks that a furnished room is walkable."""
 
 import numpy as np
 from shapely import box
@@ -8,19 +8,22 @@ from shapely.ops import unary_union
 from data_prep.homes.layout import Plan, Rect
 
 DOOR_M = 0.9
-"""Width of a door, and how far before it the floor stays clear."""
+"""Width of a door, and depth of the clear floor in front of it."""
 
 FREE_SHARE = 0.45
-"""Least share of the floor that no piece stands on."""
+"""Minimum share of the floor without furniture."""
 
 SHOULDERS_M = 0.2
-"""Half of how wide a passage must be."""
+"""Half of the minimum width of a passage."""
 
 
 def empty_room(
     rng: np.random.Generator, area_m2: float, sides_m: tuple[float, float], l_shaped_chance: float
 ) -> Plan:
-    """A rectangle of about this area with a door, sometimes L-shaped; no side beyond `sides_m`."""
+    """Sample a rectangular or L-shaped room of about this area, with a door.
+
+    The sides of its bounding rectangle lie within `sides_m`.
+    """
     aspect = rng.uniform(1.0, 1.55)
     long = float(np.clip(np.sqrt(area_m2 * aspect), *sides_m))
     short = float(np.clip(area_m2 / long, *sides_m))
@@ -39,7 +42,7 @@ def empty_room(
 
 
 def _door(plan: Plan, rng: np.random.Generator) -> Rect:
-    """Clear floor inside a door near one end of a wall."""
+    """Sample a door near one end of a wall; returns the floor to keep clear in front of it."""
     walls = [wall for wall in plan.walls if wall.length > 1.8]
     wall = walls[rng.integers(len(walls))]
     middle = 0.1 + DOOR_M / 2
@@ -50,7 +53,7 @@ def _door(plan: Plan, rng: np.random.Generator) -> Rect:
 
 
 def is_liveable(plan: Plan, reach: tuple[str, ...]) -> bool:
-    """Whether enough floor is free, and one can walk from the door to each class in `reach`."""
+    """Test whether enough floor is free and each class in `reach` is reachable from the door."""
     standing = [piece for piece in plan.pieces if piece.y == 0]
     covered = sum(piece.size_m[0] * piece.size_m[2] for piece in standing)
     if covered > (1 - FREE_SHARE) * plan.area:

@@ -1,7 +1,7 @@
-"""Closed solids with outward-facing triangles, which all furniture is made of; sizes in metres.
+"""Closed solids with outward-facing triangles, the parts of all furniture; sizes in metres.
 
-Every solid stands on its own `y`: furniture is described from the floor up. Most are a loft:
-rings of equally many points, joined ring to ring and capped at both ends.
+The `y` of a solid is its bottom, since furniture is described from the floor up. Most solids are
+lofts: rings with equal numbers of points, joined ring to ring and capped at both ends.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import ArrayLike
 
 Parts = list[trimesh.Trimesh]
-"""A piece of furniture: closed solids, which may interpenetrate."""
+"""A piece of furniture: closed solids, which may intersect."""
 
 Vector = tuple[float, float, float]
 
@@ -29,7 +29,7 @@ def loft(rings: ArrayLike) -> trimesh.Trimesh:
     triangles = np.concatenate([*faces, fan[:, ::-1], fan + (count - 1) * points])
     vertices = rings.reshape(-1, 3)
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    if np.einsum("ij,ij->", a, np.cross(b, c)) < 0:  # six times the volume: the faces look inwards
+    if np.einsum("ij,ij->", a, np.cross(b, c)) < 0:  # six times the signed volume
         triangles = triangles[:, ::-1]
     return trimesh.Trimesh(vertices, triangles, process=False)
 
@@ -37,7 +37,7 @@ def loft(rings: ArrayLike) -> trimesh.Trimesh:
 def box(
     w: float, h: float, d: float, x: float = 0.0, y: float = 0.0, z: float = 0.0
 ) -> trimesh.Trimesh:
-    """A box, w x h x d, that stands with the middle of its bottom at (x, y, z)."""
+    """Make a w x h x d box with the centre of its bottom at (x, y, z)."""
     bounds = [[x - w / 2, y, z - d / 2], [x + w / 2, y + h, z + d / 2]]
     return trimesh.creation.box(bounds=bounds)
 
@@ -52,7 +52,7 @@ def beveled_box(
     bevel: float = 0.05,
     steps: int = 2,
 ) -> trimesh.Trimesh:
-    """A box whose edges are rounded off by `bevel` (60 triangles for steps = 2)."""
+    """Make a box with edges rounded by `bevel` (60 triangles for steps = 2)."""
     bevel = min(bevel, 0.49 * min(w, h, d))
     rings: list[np.ndarray] = []
     angles = np.linspace(0, 1.2, steps)
@@ -77,11 +77,11 @@ def _rounded_rectangle(half_x: float, half_z: float, radius: float, steps: int) 
 def lathe(
     profile: list[tuple[float, float]], x: float = 0.0, z: float = 0.0, segments: int = 20
 ) -> trimesh.Trimesh:
-    """Turn a profile of (radius, height) pairs about the upright axis through (x, z)."""
+    """Rotate a profile of (radius, height) pairs about the vertical axis through (x, z)."""
     turn = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     rings = []
     for radius, height in profile:
-        radius = max(radius, 2e-3)  # a ring of one point would make empty triangles
+        radius = max(radius, 2e-3)  # a ring of radius 0 would make degenerate triangles
         rings.append(curve(x + radius * np.cos(turn), height, z + radius * np.sin(turn)))
     return loft(rings)
 
@@ -89,43 +89,43 @@ def lathe(
 def cylinder(
     radius: float, h: float, x: float = 0.0, y: float = 0.0, z: float = 0.0, segments: int = 20
 ) -> trimesh.Trimesh:
-    """An upright cylinder that stands at (x, y, z)."""
+    """Make a vertical cylinder with the centre of its bottom at (x, y, z)."""
     return lathe([(radius, y), (radius, y + h)], x, z, segments)
 
 
 def sphere(
     radius: float, x: float = 0.0, y: float = 0.0, z: float = 0.0, rows: int = 8
 ) -> trimesh.Trimesh:
-    """A sphere that stands at (x, y, z)."""
+    """Make a sphere with its lowest point at (x, y, z)."""
     polar = np.linspace(0.08, np.pi - 0.08, rows)
     profile = [(radius * np.sin(a), y + radius * (1 - np.cos(a))) for a in polar]
     return lathe(profile, x, z, 2 * rows)
 
 
 def torus(radius: float, thickness: float, y: float = 0.0) -> trimesh.Trimesh:
-    """A torus lying flat, standing on y; `radius` reaches to its outer edge."""
+    """Make a horizontal torus with its bottom at y and outer radius `radius`."""
     sections = {"major_sections": 28, "minor_sections": 8}
     part = trimesh.creation.torus(radius - thickness / 2, thickness / 2, **sections)
     return shifted(tilted(part, np.pi / 2), y=y + thickness / 2)
 
 
 def panel(outline_xy: ArrayLike, thickness: float, z: float = 0.0) -> trimesh.Trimesh:
-    """A convex outline in the x-y plane, `thickness` deep along z, its middle at z."""
+    """Extrude a convex outline in the x-y plane by `thickness` along z, centred at z."""
     outline = np.asarray(outline_xy, dtype=float)
     return loft([np.insert(outline, 2, z + side * thickness / 2, axis=1) for side in (-1, 1)])
 
 
 def slab(outline_xz: ArrayLike, h: float, y: float = 0.0) -> trimesh.Trimesh:
-    """A convex outline seen from above, `h` thick, its underside at y."""
+    """Extrude a convex outline in the x-z plane by `h` upwards, from y."""
     outline = np.asarray(outline_xz, dtype=float)
     return loft([np.insert(outline, 1, level, axis=1) for level in (y, y + h)])
 
 
 def tube(points: ArrayLike, radius: float, segments: int = 8) -> trimesh.Trimesh:
-    """A round bar along (points, 3), which must not double back."""
+    """Make a round bar along a path (points, 3) without sharp reversals."""
     points = np.asarray(points, dtype=float)
     along = _directions(points)
-    # One reference for the whole bar keeps its rings from twisting.
+    # A single reference vector for all rings avoids twist.
     reference = np.eye(3)[np.argmin(np.abs(along).max(axis=0))]
     rings = []
     for point, direction in zip(points, along, strict=True):
@@ -136,7 +136,7 @@ def tube(points: ArrayLike, radius: float, segments: int = 8) -> trimesh.Trimesh
 def rod(
     start: ArrayLike, end: ArrayLike, radius: float, end_radius: float | None = None
 ) -> trimesh.Trimesh:
-    """A straight round bar, tapering to `end_radius`; 6 sides."""
+    """Make a straight bar with 6 sides, tapering to `end_radius`."""
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     along = (end - start) / np.linalg.norm(end - start)
     circle = _circle(along, np.cross(along, np.eye(3)[np.argmin(np.abs(along))]), 6)
@@ -144,20 +144,20 @@ def rod(
 
 
 def _circle(axis: np.ndarray, side: np.ndarray, segments: int) -> np.ndarray:
-    """(segments, 3) points of the unit circle about an axis, the first one towards `side`."""
+    """Points of the unit circle about an axis, (segments, 3), starting towards `side`."""
     side = side / np.linalg.norm(side)
     turn = np.linspace(0, 2 * np.pi, segments, endpoint=False)[:, None]
     return np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
 
 
 def _directions(points: np.ndarray) -> np.ndarray:
-    """The unit direction of a path at each of its points."""
+    """Unit tangents of a path at its points."""
     along = np.gradient(points, axis=0)
     return along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
 def ribbon(path_xz: ArrayLike, y0: float, y1: ArrayLike, thickness: float) -> trimesh.Trimesh:
-    """A wall that follows (points, 2) seen from above, from y0 up to y1 (one or one a point)."""
+    """Make a wall along a path (points, 2) in x and z, from y0 to y1 (one value or per point)."""
     path = np.asarray(path_xz, dtype=float)
     along = _directions(path)
     across = curve(along[:, 1], -along[:, 0]) * thickness / 2
@@ -166,12 +166,12 @@ def ribbon(path_xz: ArrayLike, y0: float, y1: ArrayLike, thickness: float) -> tr
 
 
 def curve(*coordinates: ArrayLike) -> np.ndarray:
-    """(points, 2 or 3) from one array for each coordinate; a number is the same at every point."""
+    """Stack coordinates to points, (points, 2 or 3); a single number is broadcast."""
     return np.stack(np.broadcast_arrays(*coordinates), axis=1)
 
 
 def oval(w: float, d: float, segments: int = 24, power: float = 2.0) -> np.ndarray:
-    """(segments, 2) outline of a (super)ellipse; a power above 2 squares its corners."""
+    """Outline of a (super)ellipse, (segments, 2); a power above 2 makes it more rectangular."""
     turn = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     cos, sin = np.cos(turn), np.sin(turn)
     x = w / 2 * np.sign(cos) * np.abs(cos) ** (2 / power)
@@ -179,14 +179,14 @@ def oval(w: float, d: float, segments: int = 24, power: float = 2.0) -> np.ndarr
 
 
 def arch(w: float, h: float, shoulder: float, steps: int = 10) -> np.ndarray:
-    """(steps + 2, 2) outline of a panel w wide whose top curves from `shoulder` up to h."""
+    """Outline of a panel of width w, (steps + 2, 2), whose top curves from `shoulder` up to h."""
     turn = np.linspace(0, np.pi, steps)
     top = curve(w / 2 * np.cos(turn), shoulder + (h - shoulder) * np.sin(turn))
     return np.concatenate([top, [[-w / 2, 0.0], [w / 2, 0.0]]])
 
 
 def shifted(part: trimesh.Trimesh, x: float = 0.0, y: float = 0.0, z: float = 0.0):
-    """The part, or each part of a list, moved in place."""
+    """Translate a part, or each part of a list, in place."""
     for each in part if isinstance(part, list) else [part]:
         each.apply_translation([x, y, z])
     return part
@@ -195,19 +195,19 @@ def shifted(part: trimesh.Trimesh, x: float = 0.0, y: float = 0.0, z: float = 0.
 def tilted(
     part: trimesh.Trimesh, angle_rad: float, about: ArrayLike = (0.0, 0.0, 0.0)
 ) -> trimesh.Trimesh:
-    """The part, turned in place about the x axis through a point."""
+    """Rotate the part in place about the x axis through a point."""
     return part.apply_transform(
         trimesh.transformations.rotation_matrix(angle_rad, [1, 0, 0], about)
     )
 
 
 def scaled(part: trimesh.Trimesh, factors: ArrayLike) -> trimesh.Trimesh:
-    """The part, stretched in place along x, y and z."""
+    """Scale the part in place along x, y and z."""
     return part.apply_scale(factors)
 
 
 def fit_to(parts: Parts, size_m: ArrayLike) -> Parts:
-    """Stretch the parts together into a box of this size, centred, bottom at y = 0."""
+    """Scale the parts together to a bounding box of this size, centred, bottom at y = 0."""
     low = np.min([part.vertices.min(axis=0) for part in parts], axis=0)
     high = np.max([part.vertices.max(axis=0) for part in parts], axis=0)
     anchor = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
@@ -225,4 +225,4 @@ PARTS = {
         curve, oval, arch, shifted, tilted, scaled,
     )
 }  # fmt: skip
-"""What a table of parts may use, by name."""
+"""Functions that a table of parts may use, by name."""

@@ -1,4 +1,4 @@
-"""Writes homes and furniture to disk as 3D-FRONT and 3D-FUTURE lay them out."""
+"""Writes homes and furniture to disk in the layout of 3D-FRONT and 3D-FUTURE."""
 
 import json
 import uuid
@@ -12,14 +12,14 @@ from data_prep.homes.catalog import Model
 from data_prep.homes.layout import Piece, Plan, Rect
 
 WALL_M = 0.12
-"""How thick a wall is."""
+"""Thickness of a wall."""
 
 _IDENTITY = {"pos": [0, 0, 0], "rot": [0, 0, 0, 1], "scale": [1, 1, 1]}
 
 
 @dataclass(frozen=True)
 class PlacedRoom:
-    """A furnished room, its names in the data set, and where its corner lies in the house."""
+    """A furnished room, its names in the data set, and the position of its corner in the house."""
 
     plan: Plan
     kind: str
@@ -29,7 +29,7 @@ class PlacedRoom:
 
 
 def write_model(folder: Path, model: Model) -> None:
-    """`<jid>/raw_model.obj`, metres, y up, front +z."""
+    """Write `<jid>/raw_model.obj`: metres, y up, front +z."""
     home = folder / model.jid
     home.mkdir(parents=True)
     lines = [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in model.mesh.vertices.tolist()]
@@ -38,7 +38,7 @@ def write_model(folder: Path, model: Model) -> None:
 
 
 def model_record(model: Model) -> dict[str, Any]:
-    """What `model_info.json` says of a model."""
+    """Entry of a model in `model_info.json`."""
     return {
         "model_id": model.jid,
         "super-category": model.super_category,
@@ -50,7 +50,7 @@ def model_record(model: Model) -> dict[str, Any]:
 
 
 def house_json(uid: str, rooms: list[PlacedRoom]) -> dict[str, Any]:
-    """A house file; its children's poses are in the house's frame, as in 3D-FRONT."""
+    """Content of a house file; poses of children are in the house's frame, as in 3D-FRONT."""
     meshes: list[dict[str, Any]] = []
     catalog: dict[str, dict[str, Any]] = {}
     room_entries = []
@@ -96,9 +96,9 @@ def house_json(uid: str, rooms: list[PlacedRoom]) -> dict[str, Any]:
 
 
 def shell(plan: Plan) -> list[tuple[str, np.ndarray]]:
-    """(type, (triangles, 3, 3)) of floor, ceiling and walls in the room's own frame.
+    """Floor, ceiling and walls in the room's frame, each as (type, (triangles, 3, 3)).
 
-    Floor, ceiling and inner walls face the room, outer walls face away from it.
+    Floor, ceiling and inner walls face the room; outer walls face away from it.
     """
     tiles = np.concatenate([_tile(rect) for rect in _rectangles(plan)])
     ceiling = tiles[:, ::-1] + np.array([0.0, plan.height, 0.0])
@@ -112,7 +112,7 @@ def shell(plan: Plan) -> list[tuple[str, np.ndarray]]:
 
 
 def _rectangles(plan: Plan) -> list[Rect]:
-    """The floor as one rectangle, or as two where it is L-shaped."""
+    """Split the floor into rectangles: one, or two if it is L-shaped."""
     (x0, x1), (z0, z1) = plan.beside_notch
     if plan.notch is None:
         return [(x0, z0, x1, z1)]
@@ -120,21 +120,21 @@ def _rectangles(plan: Plan) -> list[Rect]:
 
 
 def _tile(rect: Rect) -> np.ndarray:
-    """Two triangles that face up."""
+    """Make a rectangle of two triangles that face up."""
     x0, z0, x1, z1 = rect
     a, b, c, d = (x0, 0.0, z0), (x0, 0.0, z1), (x1, 0.0, z1), (x1, 0.0, z0)
     return np.array([[a, b, c], [a, c, d]])
 
 
 def _wall(start: np.ndarray, end: np.ndarray, height: float) -> np.ndarray:
-    """Two triangles that face to the left of the way from start to end, seen in (x, z)."""
+    """Make a wall of two triangles; it faces left of the direction start to end in (x, z)."""
     (x0, z0), (x1, z1) = start, end
     a, b, c, d = (x0, 0.0, z0), (x1, 0.0, z1), (x1, height, z1), (x0, height, z0)
     return np.array([[a, b, c], [a, c, d]])
 
 
 def _offset(corners: np.ndarray, distance: float) -> np.ndarray:
-    """The rectilinear outline, every side moved outwards."""
+    """Move every side of a rectilinear outline outwards."""
     sides = np.roll(corners, -1, axis=0) - corners
     sides /= np.linalg.norm(sides, axis=1, keepdims=True)
     outward = np.stack([sides[:, 1], -sides[:, 0]], axis=1)
@@ -192,5 +192,5 @@ def _rounded(values: np.ndarray) -> list[float]:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Compact JSON, the same bytes for the same content."""
+    """Write compact JSON; the same content gives the same bytes."""
     path.write_text(json.dumps(content, separators=(",", ":")) + "\n")

@@ -1,1 +1,1 @@
-"""What `inspect` prints, draws and verifies of a folder of shards."""
+"""The `inspect` command: prints, draws and verifies the contents of a folder of shards."""

@@ -1,4 +1,4 @@
-"""How well what is known of a room in 3D, projected, agrees with the masks in 2D."""
+"""Agreement between the projected 3D objects of a room and their 2D masks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,21 +9,22 @@ import numpy as np
 from data_prep.inspection.bodies import KINDS, Body
 from data_prep.inspection.projection import box_iou_2d, boxes_around
 from data_prep.upright import own_sides
-from sceneprior.shards import RoomViews
+from sceneprior.core.shards import RoomViews
 
 MARGIN = 0.02
-"""Of the image's longer side: how far a mask may stick out of its object's projection. Poses that
-are 5 cm off do that 2.5 m away in views of 90 degrees."""
+"""Tolerance by which a mask may exceed its object's projection, relative to the image's longer
+side. A pose error of 5 cm has this effect at a distance of 2.5 m, in views of 90 degrees."""
 HELD_AT_LEAST = {"mesh": 0.95, "box": 0.8, "found": 0.5}
-"""Share of the masks that lie within their projections. Occluders and the image's border only
-make masks smaller, so every mask of right poses does, but for those of found boxes: these
-fall short of pieces that are never seen whole. Cameras dealt out at random reach 0.07 to 0.15."""
+"""Minimum share of masks that lie within their projections. Occluders and the image border only
+shrink masks, so with correct poses all should. Boxes found from the masks are an exception: they
+are too small for objects that are never fully visible. Shuffled cameras reach 0.07 to 0.15."""
 IOU_AT_LEAST = {"mesh": 0.85, "box": 0.5, "found": 0.7}
-"""Mean over what is seen whole. A mesh and its own mask agree to the pixel but for parts thinner
-than one. The corners of a 3D box reach beyond the silhouette of what is in it, and annotated boxes
-are those of a partial scan."""
+"""Minimum mean IoU of the 2D boxes of fully visible objects. A mesh and its mask agree to the
+pixel, except for parts thinner than a pixel. The corners of a 3D box project beyond its object's
+silhouette, and annotated boxes are fitted to incomplete scans."""
 ROOM_SHARE = 0.7
-"""Of both, what one room has to reach: so one wrong room does not hide among many right ones."""
+"""Share of both minima that each room must reach, so that one wrong room does not go unnoticed
+among many correct ones."""
 
 
 class Tally(NamedTuple):
@@ -31,45 +32,48 @@ class Tally(NamedTuple):
 
     masks: int = 0
     held: int = 0
-    """Masks within their projections."""
+    """Number of masks within their projections."""
     whole: int = 0
-    """Masks of which nothing is cut off."""
+    """Number of masks of fully visible objects."""
     iou: float = 0.0
-    """Sum over these of the IoU of mask and projection, as 2D boxes."""
+    """IoU between the 2D boxes of mask and projection, summed over the fully visible objects."""
 
     @property
     def share(self) -> float:
-        """Of the masks, those that are held."""
+        """Share of the masks that lie within their projections."""
         return self.held / max(self.masks, 1)
 
     @property
     def mean_iou(self) -> float:
-        """NaN where nothing is seen whole."""
+        """Mean IoU over the fully visible objects; NaN if there are none."""
         return self.iou / self.whole if self.whole else float("nan")
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """By what stands for the objects, a key of `KINDS`."""
+    """Sums of comparisons, by type of 3D representation."""
 
     tallies: dict[str, Tally] = field(default_factory=dict)
+    """One per key of `KINDS` that occurs."""
 
     def __add__(self, other: "Agreement") -> "Agreement":
         kinds = [kind for kind in KINDS if kind in self.tallies or kind in other.tallies]
         return Agreement({kind: _sum(self.of(kind), other.of(kind)) for kind in kinds})
 
     def of(self, kind: str) -> Tally:
-        """Empty where nothing of the kind is there."""
+        """Tally of one kind; empty if it does not occur."""
         return self.tallies.get(kind, Tally())
 
     def failing(self, share: float = 1.0, least: int = 1) -> list[str]:
-        """The kinds that reach less than this share of what is expected, measured where there are
-        at least so many masks of it."""
+        """Kinds that reach less than `share` of the minima.
+
+        A measure counts only if it is taken over at least `least` masks.
+        """
         return [kind for kind in self.tallies if not passes(kind, self.of(kind), share, least)]
 
 
 def passes(kind: str, tally: Tally, share: float = 1.0, least: int = 1) -> bool:
-    """Whether both measures reach this share of what is expected; see `Agreement.failing`."""
+    """Test whether both measures reach this share of the minima; see `Agreement.failing`."""
     if tally.masks >= least and tally.share < share * HELD_AT_LEAST[kind]:
         return False
     return tally.whole < least or tally.mean_iou >= share * IOU_AT_LEAST[kind]
@@ -80,22 +84,23 @@ def _sum(a: Tally, b: Tally) -> Tally:
 
 
 class Comparison(NamedTuple):
-    """Each object in each view."""
+    """Comparison of projection and mask for each object in each view."""
 
     kinds: tuple[str, ...]
-    """(n,) "" where nothing stands for the object."""
+    """(n,) keys of `KINDS`; "" for an object without a 3D representation."""
     judged: np.ndarray
-    """(T, n) bool: the view has a mask, and something stands for the object."""
+    """(T, n) bool: the view has a mask of the object, and the object has a 3D representation."""
     held: np.ndarray
     """(T, n) bool: the mask lies within the projection; False where that is undefined."""
     whole: np.ndarray
-    """(T, n) bool: nothing is cut off the mask, so its box is the object's own."""
+    """(T, n) bool: the object is fully visible, that is, cut off neither by the image border nor
+    by another object nor, where the ground truth tells, by anything else in the room."""
     iou: np.ndarray
-    """(T, n) of the mask's box and the projection's; 0 where that is undefined."""
+    """(T, n) IoU of the 2D boxes of mask and projection; 0 where that is undefined."""
 
     @property
     def agreement(self) -> Agreement:
-        """Summed up."""
+        """Sums over objects and views."""
         tallies = {}
         for kind in KINDS:
             of = np.array([name == kind for name in self.kinds], dtype=bool)
@@ -111,7 +116,7 @@ class Comparison(NamedTuple):
 
 
 def projections(bodies: Sequence[Body | None], views: RoomViews) -> np.ndarray:
-    """(T, n, 4) pixels: the 2D box round each body in each view; NaN where it is behind."""
+    """Project each body to a 2D box in each view: (T, n, 4) pixels, NaN behind the camera."""
     boxes = np.full((len(views.visible), len(bodies), 4), np.nan)
     for k, body in enumerate(bodies):
         if body is not None:
@@ -120,21 +125,24 @@ def projections(bodies: Sequence[Body | None], views: RoomViews) -> np.ndarray:
 
 
 def compare(bodies: Sequence[Body | None], views: RoomViews) -> Comparison:
-    """Hold the projections of objects against their masks, in every view that has one."""
+    """Compare the projections of objects with their masks in all views."""
     return compare_boxes(bodies, projections(bodies, views), views)
 
 
 def compare_boxes(
     bodies: Sequence[Body | None], boxes_px: np.ndarray, views: RoomViews
 ) -> Comparison:
-    """The same of given projections, (..., T, n, 4)."""
+    """Compare given projections, (..., T, n, 4), with the masks."""
     height, width = views.image_size
     masks = views.boxes * np.array([width, height, width, height], dtype=np.float64)
     margin = MARGIN * max(height, width)
-    # Comparisons with NaN, behind the camera, are false: what is undefined disagrees.
+    # Comparisons with NaN (behind the camera) are false: undefined projections disagree.
     begins = (boxes_px[..., :2] <= masks[..., :2] + margin).all(axis=-1)
     held = np.logical_and(begins, (boxes_px[..., 2:] >= masks[..., 2:] - margin).all(axis=-1))
     whole = np.asarray(own_sides(views, views.image_size).all(axis=-1))
+    for k, body in enumerate(bodies):
+        if body is not None and body.unoccluded is not None:
+            whole[:, k] &= body.unoccluded
     there = np.array([body is not None for body in bodies], dtype=bool)
     return Comparison(
         tuple(body.kind if body else "" for body in bodies),

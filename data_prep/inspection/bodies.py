@@ -1,4 +1,4 @@
-"""What stands for each object of a room in 3D: its mesh, its 3D box, or a box found from masks."""
+"""3D representation of each object of a room: its mesh, its 3D box, or a box found from masks."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -9,15 +9,15 @@ from cachetools import LRUCache, cachedmethod
 
 from data_prep.inspection.projection import Hull, hull_of
 from data_prep.upright import fit_upright
-from sceneprior.errors import ShardError
-from sceneprior.geometry.corners import BOX_EDGES, box_corners
-from sceneprior.shards import RoomGroundTruth, RoomViews
+from sceneprior.core.errors import ShardError
+from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
+from sceneprior.core.shards import RoomGroundTruth, RoomViews
 
 KINDS = {"mesh": "meshes", "box": "3D boxes", "found": "boxes found from the masks"}
-"""What stands for an object -> in words."""
+"""Names of the types of 3D representations, for messages."""
 _MODEL_BYTES = 256 << 20
 _BOX_SLACK_M = 0.005
-"""The stored box against the placed mesh: vertices are float32 in metres."""
+"""Tolerance between the stored box and the placed mesh, whose vertices are float32."""
 
 
 class Body(NamedTuple):
@@ -26,10 +26,12 @@ class Body(NamedTuple):
     kind: str
     """A key of `KINDS`."""
     hull: Hull
+    unoccluded: np.ndarray | None = None
+    """(T,) bool, as in `RoomGroundTruth`; None if only tracked objects can occlude it."""
 
 
 class ModelHulls:
-    """The convex hulls of `models/<id>.ply` in a folder of shards, the last used ones kept."""
+    """Convex hulls of `models/<id>.ply` in a folder of shards, with a cache."""
 
     def __init__(self, folder: Path):
         self.folder = Path(folder)
@@ -39,7 +41,7 @@ class ModelHulls:
 
     @cachedmethod(lambda self: self._cache, key=lambda self, model_id: model_id)
     def get(self, model_id: str) -> Hull:
-        """In the model's frame, of vertices that a face uses.
+        """Hull of all vertices in the model's frame; the ground truth's boxes use all, too.
 
         Raises:
             ShardError: the file is missing or damaged.
@@ -47,11 +49,11 @@ class ModelHulls:
         path = self.folder / f"{model_id}.ply"
         try:
             mesh = trimesh.load_mesh(path, process=False)
-            points = np.asarray(mesh.vertices, dtype=np.float64)[np.unique(mesh.faces)]
-        except Exception as error:  # what trimesh raises depends on which byte is damaged
+            points = np.asarray(mesh.vertices, dtype=np.float64)
+        except Exception as error:  # the type that trimesh raises depends on the damage
             why = "is missing" if not path.is_file() else f"is damaged ({type(error).__name__})"
             raise ShardError(f"{path} {why}, but ground truth stands on it.") from None
-        if not len(points) or not np.isfinite(points).all():
+        if not len(mesh.faces) or not np.isfinite(points).all():
             raise ShardError(f"{path} holds no usable faces, but ground truth stands on it.")
         return hull_of(points)
 
@@ -59,8 +61,10 @@ class ModelHulls:
 def true_bodies(
     views: RoomViews, truth: RoomGroundTruth, models: ModelHulls
 ) -> tuple[list[Body | None], list[str]]:
-    """The tracked objects as the ground truth has them, None where it cannot be read, and what is
-    wrong with the ground truth itself, as sentences."""
+    """Tracked objects according to the ground truth, and faults of the ground truth as sentences.
+
+    Objects whose model cannot be read are None.
+    """
     bodies: list[Body | None] = []
     problems: list[str] = []
     for k, model_id in enumerate(truth.model_ids):
@@ -73,12 +77,14 @@ def true_bodies(
             except ShardError as error:
                 body = None
                 problems.append(str(error).removesuffix("."))
+        if body is not None and truth.unoccluded is not None and k < truth.unoccluded.shape[1]:
+            body = body._replace(unoccluded=truth.unoccluded[:, k])
         bodies.append(body)
     return bodies[: len(views.object_class)], problems
 
 
 def found_bodies(views: RoomViews) -> list[Body | None]:
-    """Upright boxes found from the masks alone; None where the views do not tell."""
+    """Upright boxes found from the masks alone; None if the views do not determine them."""
     found = fit_upright(views, views.image_size, views.world_to_camera, views.intrinsics)
     return [
         Body("found", Hull(corners, np.array(BOX_EDGES))) if np.isfinite(corners).all() else None
@@ -87,7 +93,7 @@ def found_bodies(views: RoomViews) -> list[Body | None]:
 
 
 def _placed(hull: Hull, model_to_room: np.ndarray) -> Hull:
-    """A model's hull where the piece stands."""
+    """Transform a model's hull to the room frame."""
     matrix = np.asarray(model_to_room, dtype=np.float64)
     return hull._replace(points_m=hull.points_m @ matrix[:3, :3].T + matrix[:3, 3])
 

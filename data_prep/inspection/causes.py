@@ -1,4 +1,4 @@
-"""What is often wrong with cameras, undone on trial: which mistake would explain the masks?"""
+"""Diagnoses camera errors: undoes common mistakes on trial and compares the result with masks."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -16,29 +16,29 @@ from data_prep.inspection.agreement import (
     projections,
 )
 from data_prep.inspection.bodies import Body, found_bodies
-from sceneprior.shards import RoomViews
+from sceneprior.core.shards import RoomViews
 
 Bodies = Sequence[Body | None]
 
 CHANCE = "chance"
-"""No mistake: cameras dealt out at random, for comparison."""
+"""Not a mistake but the baseline: shuffled cameras."""
 _OPENGL_AXES = np.diag(np.array([1, -1, -1, 1], dtype=np.float32))
 _Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float32)
-"""From a world with y up to one with z up."""
+"""Rotation from a world with y up to one with z up."""
 
 
 class Trial(NamedTuple):
-    """What one repair gives."""
+    """Result of one repair."""
 
     agreement: Agreement
     factor: float = 1.0
-    """Where the repair finds one."""
+    """Scale factor, if the repair estimates one."""
 
 
 def try_repairs(bodies: Bodies, views: RoomViews) -> dict[str, Trial]:
-    """The agreement that each repair of a room's cameras would give, by cause.
+    """Measure the agreement after each repair of a room's cameras, by cause.
 
-    Boxes that were found from masks are found anew, as the cameras decide on them.
+    Boxes found from masks depend on the cameras, so they are found again after each repair.
     """
     found = any(body is not None and body.kind == "found" for body in bodies)
     repairs = {**_ANY, **(_OF_FOUND if found else {})}
@@ -58,12 +58,12 @@ def try_repairs(bodies: Bodies, views: RoomViews) -> dict[str, Trial]:
 def likely_cause(
     trials: Iterable[dict[str, Trial]], kind: str, share: float = 1.0, least: int = 1
 ) -> str:
-    """The end of a sentence: the mistake without which the masks would agree (`passes`)."""
+    """Name the mistake whose repair makes the masks agree (`passes`), as the end of a sentence."""
     sums: dict[str, Trial] = {}
     for tried in trials:
         for cause, trial in tried.items():
             before = sums.get(cause, Trial(Agreement(), trial.factor))
-            # Of several rooms' factors any: they differ by less than is printed.
+            # The factors of different rooms differ by less than is printed: keep the first.
             sums[cause] = Trial(before.agreement + trial.agreement, before.factor)
     good = {
         cause: trial for cause, trial in sums.items()
@@ -80,25 +80,53 @@ def likely_cause(
 
 
 def chance_of(trials: Iterable[dict[str, Trial]], kind: str) -> float:
-    """Share of the masks that agree with cameras dealt out at random; NaN where not tried."""
+    """Share of the masks that agree with shuffled cameras; NaN if that was not tried."""
     tallies = [tried[CHANCE].agreement.of(kind) for tried in trials if CHANCE in tried]
     masks = sum(tally.masks for tally in tallies)
     return sum(tally.held for tally in tallies) / masks if masks else float("nan")
 
 
 def out_of_order(bodies: Bodies, views: RoomViews) -> tuple[np.ndarray, Comparison]:
-    """(T,) the frame whose camera fits each frame's masks best, each used once, and what they give.
+    """Match cameras to frames one to one, so that they fit the masks best.
 
-    A frame keeps its own where that is as good as the others.
+    Returns:
+        For each frame, the index of the frame whose camera fits, (T,), its own if no other fits
+        better; and the comparison with these cameras.
     """
-    boxes = projections(bodies, views)[:, None]  # by camera, and the same for every frame
+    boxes = projections(bodies, views)[:, None]  # one per camera, the same for all frames
     frames = len(views.visible)
     boxes = np.broadcast_to(boxes, (frames, frames, *boxes.shape[2:]))
     pairs = compare_boxes(bodies, boxes, views)
     gain = ((pairs.held + pairs.iou) * pairs.judged).sum(axis=-1) + 1e-3 * np.eye(frames)
     order = linear_sum_assignment(gain.T, maximize=True)[1]
-    own = np.arange(frames)
-    return order, pairs._replace(held=pairs.held[order, own], iou=pairs.iou[order, own])
+    moved = [
+        body if body is None or body.unoccluded is None
+        else body._replace(unoccluded=body.unoccluded[order])
+        for body in bodies
+    ]  # fmt: skip
+    return order, compare_boxes(moved, boxes[order, 0], views)
+
+
+def _other_ids(bodies: Bodies, views: RoomViews) -> Trial | None:
+    """Match masks to the objects that they fit best.
+
+    Masks that fit no object are left out, as ids may have been shifted onto walls; None if the
+    others are less than a quarter of all masks.
+    """
+    boxes = projections(bodies, views)
+    pairs = [
+        compare_boxes(bodies, np.broadcast_to(boxes[:, k : k + 1], boxes.shape), views)
+        for k in range(len(bodies))
+    ]
+    seen = views.visible.sum(axis=0)
+    held = np.stack([(pair.held & views.visible).sum(axis=0) for pair in pairs], axis=1)
+    iou = np.stack([(pair.iou * views.visible).sum(axis=0) for pair in pairs], axis=1)
+    rows, others = linear_sum_assignment(held + iou, maximize=True)
+    fits = held[rows, others] > seen / 2
+    if seen[fits].sum() < seen.sum() / 4:
+        return None
+    exchanged = [bodies[other] if fit else None for other, fit in zip(others, fits, strict=True)]
+    return Trial(compare(exchanged, views).agreement)
 
 
 def _posed(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[RoomViews], RoomViews]:
@@ -106,7 +134,7 @@ def _posed(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[RoomViews], 
 
 
 def _inverse(poses: np.ndarray) -> np.ndarray:
-    """Of rigid transforms, (T, 4, 4)."""
+    """Invert rigid transforms, (T, 4, 4)."""
     inverse = _transposed(poses)
     inverse[:, :3, 3:] = -inverse[:, :3, :3] @ poses[:, :3, 3:]
     return inverse
@@ -119,7 +147,7 @@ def _transposed(poses: np.ndarray) -> np.ndarray:
 
 
 def _dealt_out(poses: np.ndarray) -> np.ndarray:
-    """In another order, in which no camera keeps its frame."""
+    """Shuffle the poses so that no camera keeps its frame."""
     order = np.random.default_rng(0).permutation(len(poses))
     dealt = np.empty_like(poses)
     dealt[order] = poses[np.roll(order, 1)]
@@ -127,7 +155,7 @@ def _dealt_out(poses: np.ndarray) -> np.ndarray:
 
 
 def _of_this_size(views: RoomViews) -> RoomViews | None:
-    """Intrinsics scaled so that the principal point lies in the middle; None where it does."""
+    """Scale intrinsics so that the principal point becomes central; None if it already is."""
     height, width = views.image_size
     middle = views.intrinsics[:, :2, 2]
     scale = np.array([width, height]) / 2 / np.where(middle > 0, middle, np.inf)
@@ -139,7 +167,7 @@ def _of_this_size(views: RoomViews) -> RoomViews | None:
 
 
 def _focal_factor(bodies: Bodies, views: RoomViews) -> Trial | None:
-    """How far from the principal point objects are, and would be."""
+    """Estimate the scale of the focal lengths from distances of objects to the principal point."""
     height, width = views.image_size
     boxes = projections(bodies, views)
     seen = compare_boxes(bodies, boxes, views)
@@ -147,14 +175,14 @@ def _focal_factor(bodies: Bodies, views: RoomViews) -> Trial | None:
     masks, boxes = views.boxes[rows, items] * [width, height, width, height], boxes[rows, items]
     middle = views.intrinsics[rows, :2, 2]
     is_at, would_be = (((sides[:, :2] + sides[:, 2:]) / 2 - middle) for sides in (masks, boxes))
-    # Near the principal point pixels decide, not focal lengths.
+    # Near the principal point, positions hardly depend on the focal length.
     far = np.linalg.norm(would_be, axis=1) > width / 20
     ratios = (is_at * would_be).sum(axis=1)[far] / (would_be**2).sum(axis=1)[far]
     return _scaled(bodies, views, ratios, "intrinsics")
 
 
 def _unit_factor(bodies: Bodies, views: RoomViews) -> Trial | None:
-    """Rays through 2D boxes meet their objects at one length of the translations."""
+    """Estimate the scale of the translations at which rays through 2D boxes meet their objects."""
     height, width = views.image_size
     pairs = np.argwhere(compare(bodies, views).judged)
     if not len(pairs):
@@ -179,7 +207,7 @@ def _unit_factor(bodies: Bodies, views: RoomViews) -> Trial | None:
 
 
 def _scaled(bodies: Bodies, views: RoomViews, ratios: np.ndarray, array: str) -> Trial | None:
-    """Focal lengths or translations times about the median of what the pairs say."""
+    """Scale focal lengths or translations by the best factor near the median of `ratios`."""
     ratios = ratios[np.isfinite(ratios)]
     factor = float(np.median(ratios)) if len(ratios) else 0.0
     if factor <= 0:
@@ -191,7 +219,7 @@ def _scaled(bodies: Bodies, views: RoomViews, ratios: np.ndarray, array: str) ->
         changed[part] *= factor
         return Trial(compare(bodies, replace(views, **{array: changed})).agreement, factor)
 
-    # Middles of 2D boxes are not those of what stands there: the best nearby counts.
+    # Centres of 2D boxes are not exactly those of the objects, so the factor is refined.
     for step in (1.12, 1.04, 1.015):
         factor = max((tried(factor * step**k) for k in (0, -1, 1, -2, 2)), key=_how_well).factor
     return tried(factor)
@@ -212,7 +240,7 @@ _ANY: dict[str, Callable[[RoomViews], RoomViews | None]] = {
     "the intrinsics seem to be those of pictures of another size; scaled to these": _of_this_size,
     CHANCE: _posed(_dealt_out),
 }
-"""Cause, as a sentence up to what would agree -> the views without it; None where it is not so."""
+"""Repairs by cause, the beginning of a sentence; a repair returns None if it does not apply."""
 _OF_FOUND: dict[str, Callable[[RoomViews], RoomViews | None]] = {
     "each frame seems to have the camera of the frame before; with that of the next": _posed(
         lambda poses: np.roll(poses, -1, axis=0)
@@ -234,5 +262,8 @@ _OF_TRUTH: dict[str, Callable[[Bodies, RoomViews], Trial | None]] = {
     "frames and cameras seem to be out of order; with cameras of other frames of the room": (
         lambda bodies, views: Trial(out_of_order(bodies, views)[1].agreement)
     ),
+    "the instance ids of the masks seem to be those of other objects; with ids exchanged": (
+        _other_ids
+    ),
 }
-"""What only 3D that does not depend on the cameras can tell."""
+"""Repairs that need 3D objects that do not depend on the cameras."""

@@ -1,23 +1,23 @@
-"""Finds what is wrong with the arrays of one room, as sentences."""
+"""Finds faults in the arrays of one room, as sentences."""
 
 from collections.abc import Iterator
 
 import numpy as np
 from scipy import ndimage
 
-from sceneprior.instances.observations import MIN_BOX_SIDE_PX, clear_sides, pixel_counts
-from sceneprior.shards import RoomGroundTruth, RoomViews
+from sceneprior.core.instances.observations import MIN_BOX_SIDE_PX, clear_sides, pixel_counts
+from sceneprior.core.shards import RoomGroundTruth, RoomViews
 
 
 def array_problems(views: RoomViews, classes: int) -> Iterator[str]:
-    """Sentences about values out of range in what cameras saw."""
+    """Report values out of range in the views."""
     known = views.object_class
     if ((known < 1) | (known >= classes)).any():
         yield f"a class index is outside 1 to {classes - 1}"
     turn = views.world_to_camera[:, :3, :3].astype(np.float64)
     off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
     flat = np.abs(views.world_to_camera[:, 3] - (0, 0, 0, 1)).max(axis=1, initial=0)
-    # Written so that NaN is wrong, too.
+    # Written so that NaN counts as a fault.
     with np.errstate(invalid="ignore"):
         good = (off < 1e-3) & (flat < 1e-6) & (np.linalg.det(turn) > 0)
     if not (good & np.isfinite(views.world_to_camera).all(axis=(1, 2))).all():
@@ -36,7 +36,7 @@ def array_problems(views: RoomViews, classes: int) -> Iterator[str]:
 
 
 def mask_problems(views: RoomViews) -> Iterator[str]:
-    """Sentences about 2D boxes, pixel counts and sides that are not those of the masks."""
+    """Report 2D boxes, pixel counts and clear sides that disagree with the masks."""
     assert views.instance_ids is not None
     height, width = views.image_size
     objects = len(views.object_class)
@@ -65,19 +65,23 @@ def mask_problems(views: RoomViews) -> Iterator[str]:
                     f"{views.mask_pixels[view, k]}"
                 )
                 return
-            # Void furniture is 0 in the image, and touches sides all the same: fewer may be clear.
+            # Objects too narrow to be visible in any view (and, in shards of version 1, void
+            # furniture) are 0 in the image but can touch a side: fewer sides may be clear.
             if (views.sides_clear[view, k] & ~np.array(clear_sides(image, k + 1, *found))).any():
                 yield f"{what}: another object touches a side of its box that is said to be clear"
                 return
 
 
 def truth_problems(views: RoomViews, truth: RoomGroundTruth) -> Iterator[str]:
-    """Sentences about a ground truth that disagrees with itself or with the tracked objects."""
+    """Report ground truth that is inconsistent in itself or with the tracked objects."""
     rows, tracked = len(truth.object_class), len(views.object_class)
     expected = {
         "centers_m": (rows, 3), "sizes_m": (rows, 3), "yaw_rad": (rows,),
         "model_to_room": (rows, 4, 4),
     }  # fmt: skip
+    if truth.unoccluded is not None and truth.unoccluded.shape != views.visible.shape:
+        came = truth.unoccluded.shape
+        yield f"ground truth: unoccluded has shape {came}, expected {views.visible.shape}"
     for name, shape in expected.items():
         if getattr(truth, name).shape != shape:
             yield f"ground truth: {name} has shape {getattr(truth, name).shape}, expected {shape}"

@@ -38,9 +38,9 @@ def inspect_command(
     from rich.console import Console
 
     from data_prep.inspection.contents import draw_sheet
-    from sceneprior.errors import InputError
-    from sceneprior.files import write_whole
-    from sceneprior.pictures import png_bytes
+    from sceneprior.core.errors import InputError
+    from sceneprior.core.files import write_whole
+    from sceneprior.render.pictures import png_bytes
 
     console = Console()
     if verify:
@@ -147,7 +147,7 @@ def _check_tables(found: "FolderCheck") -> "list[Table]":
             check.room_id,
         ),
     )
-    # Folded, or a narrow terminal would cut off the end of an id, which is the room's name.
+    # Folded, because the end of an id, its room's name, must survive narrow terminals.
     table = Table(Column("worst rooms", overflow="fold"), *judged)
     for check in worst[:_WORST_SHOWN]:
         table.add_row(check.room_id, *_judged(check.agreement))
@@ -155,7 +155,7 @@ def _check_tables(found: "FolderCheck") -> "list[Table]":
 
 
 def _judged(agreement: "Agreement") -> tuple[str, str, str]:
-    """What stands for the objects, masks within its projection, IoU of unoccluded ones."""
+    """Table cells: 3D representation, share of masks within projections, IoU if fully visible."""
     from data_prep.inspection.bodies import KINDS
 
     tallies = agreement.tallies

@@ -1,4 +1,4 @@
-"""What a folder of shards holds: counts, a room's objects, and a sheet of pictures."""
+"""Contents of a folder of shards: counts, a room's objects, and a sheet of pictures."""
 
 import textwrap
 from collections import Counter
@@ -10,10 +10,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from data_prep.engine.source import SPLITS
 from data_prep.inspection.pictures import draw_plan, draw_view
-from sceneprior.classes import label_set
-from sceneprior.errors import InputError
-from sceneprior.pictures import contact_sheet
-from sceneprior.shards import Shard, iterate_rooms, list_shards, read_index
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.shards import Shard, iterate_rooms, list_shards, read_index
+from sceneprior.render.pictures import contact_sheet
 
 LEGEND = (
     "Filled: instance masks in class colours. Coloured frames: their 2D boxes. Black wires: 3D "
@@ -25,8 +25,12 @@ _GAP_PX, _LINE_PX = 8, 15
 
 
 def count_shards(folder: Path) -> dict[str, dict[str, Any]]:
-    """Per split: rooms, views, objects, seen (visible objects a view), with_truth (rooms known in
-    3D), image_sizes ("480 x 360" -> rooms), classes (a histogram).
+    """Count the contents of each split.
+
+    Returns:
+        Per split: rooms, views, objects, seen (visible objects per view), with_truth (rooms with
+        3D ground truth), image_sizes (rooms per size such as "480 x 360"), classes (objects per
+        class).
 
     Raises:
         ShardError: the folder is not a finished folder of shards, or a shard is damaged.
@@ -35,7 +39,7 @@ def count_shards(folder: Path) -> dict[str, dict[str, Any]]:
     table: dict[str, dict[str, Any]] = {}
     for split in SPLITS:
         if not any((Path(folder) / split).glob("*.h5")):
-            continue  # made with --only
+            continue  # the folder was made with --only
         rooms, known = [], 0
         for shard, room_id in iterate_rooms(folder, split):
             rooms.append(shard.read_room(room_id))
@@ -56,8 +60,11 @@ def count_shards(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def describe_room(folder: Path, room_id: str) -> list[dict[str, Any]]:
-    """Per object of a room: class, views that show it, mean share of the image there (its 2D box),
-    and center_m, size_m where the room is known in 3D.
+    """Describe the objects of a room.
+
+    Returns:
+        Per object: class, views (number that show it), share (mean area of its 2D box relative to
+        the image), and center_m and size_m, which are None without 3D ground truth.
 
     Raises:
         InputError: no room has this id.
@@ -87,13 +94,13 @@ def describe_room(folder: Path, room_id: str) -> list[dict[str, Any]]:
 def draw_sheet(
     folder: Path, room_id: str | None = None, pictures: int = 24, boxes_3d: bool = True
 ) -> Image.Image:
-    """Views of a folder, or of one room and its plan, on one sheet; `LEGEND` says what is drawn.
+    """Draw views of a folder, or of one room and its plan, on one sheet; see `LEGEND`.
 
     Args:
-        folder: Shards.
-        room_id: Views of this room; None: some views of rooms throughout the folder.
-        pictures: How many views.
-        boxes_3d: Also the ground truth's 3D boxes, where there is one.
+        folder: Folder of shards.
+        room_id: Room to show; None samples rooms throughout the folder.
+        pictures: Number of views.
+        boxes_3d: Also draw the ground truth's 3D boxes.
 
     Raises:
         InputError: no room has this id.
@@ -126,7 +133,7 @@ def _choose(folder: Path, room_id: str | None, pictures: int) -> list[tuple[Path
         with Shard(path) as shard:
             rooms += [(path, name) for name in shard.room_ids]
     if not rooms:
-        list_shards(folder, "train")  # says what is wrong
+        list_shards(folder, "train")  # raises the error that explains why
     if room_id is not None:
         rooms = [room for room in rooms if room[1] == room_id]
         if not rooms:
@@ -138,7 +145,7 @@ def _choose(folder: Path, room_id: str | None, pictures: int) -> list[tuple[Path
         share = pictures // len(rooms) + (i < pictures % len(rooms))
         with Shard(path) as shard:
             views = len(shard.read_room(name).visible)
-        # Evenly over the room's views, which a recording has in the order it was walked.
+        # Evenly spaced, because the views of a recording are in temporal order.
         places = np.unique(np.linspace(0, views, min(share, views), endpoint=False).astype(int))
         chosen += [(path, name, int(view)) for view in places]
     return chosen

@@ -1,4 +1,4 @@
-"""Draws one view, or the plan, of a room in a shard."""
+"""Draws a view or the floor plan of a room in a shard."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -7,10 +7,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from data_prep.inspection.projection import Segment, to_camera, wire_pixels
-from sceneprior.classes import class_colors, label_set
-from sceneprior.geometry.corners import BOX_EDGES, box_corners
-from sceneprior.pictures import paint_ids
-from sceneprior.shards import RoomGroundTruth, RoomViews, Shard
+from sceneprior.core.classes import class_colors, label_set
+from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
+from sceneprior.core.shards import RoomGroundTruth, RoomViews, Shard
+from sceneprior.render.pictures import paint_ids
 
 BACKGROUND = (246, 246, 246)
 GRID = (206, 206, 206)
@@ -27,12 +27,11 @@ Color = tuple[int, int, int]
 def draw_view(
     shard: Shard, room_id: str, view: int, boxes_3d: bool = True, width_px: int = 480
 ) -> Image.Image:
-    """One view: masks in class colours with their 2D boxes, and where the room is known in 3D,
-    its boxes as black wires with a bar ahead of each piece's front.
+    """Draw one view: masks in class colours and 2D boxes; ground-truth 3D boxes as black wires.
 
-    The floor (y = 0) is a grid of metres with the axes of the room frame, so that a wrong floor,
-    axis or unit shows even where nothing is known in 3D. Lines and names keep their size whatever
-    the picture's, `width_px`.
+    A bar in front of each wire box marks the piece's front. The floor (y = 0) is a metric grid
+    with the axes of the room frame, so that a wrong floor, axis or unit shows even without 3D
+    ground truth. Line widths and font sizes do not depend on `width_px`.
     """
     room = shard.read_room(room_id)
     truth = _truth(shard, room_id) if boxes_3d else None
@@ -48,7 +47,7 @@ def draw_view(
     ids = Image.fromarray(shard.read_instance_ids(room_id, [view])[0].astype(np.int32))
     large = np.asarray(ids.resize(size, Image.Resampling.NEAREST))
     palette = class_colors(len(names))[room.object_class]
-    # Halfway to white, so that wires and names stand out.
+    # Colours are mixed with white, so that wires and names stand out.
     pale = (palette.astype(np.int32) + 255) // 2
     painted = Image.fromarray(paint_ids(large, pale, BACKGROUND))
     picture.paste(painted, mask=Image.fromarray(large > 0))
@@ -70,7 +69,7 @@ def draw_view(
 
 
 def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 360) -> Image.Image:
-    """The room from above (right is +x, down is +z): floor, boxes, fronts, and the cameras."""
+    """Draw the room from above (+x right, +z down): floor, boxes, fronts, cameras."""
     room, truth = shard.read_room(room_id), _truth(shard, room_id)
     names = label_set(shard.label_set)
     colors = class_colors(len(names))
@@ -117,7 +116,7 @@ def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 
 
 @dataclass(frozen=True)
 class _Wires:
-    """Lines of the room drawn into one view."""
+    """Draws lines of the room into one view."""
 
     draw: ImageDraw.ImageDraw
     world_to_camera: np.ndarray
@@ -144,7 +143,7 @@ class _Wires:
         for color, width in (("white", 3), ("black", 1)):
             for line in lines:
                 self.draw.line(line, fill=color, width=width)
-        if truth.model_ids[k]:  # without a mesh no front is known
+        if truth.model_ids[k]:  # the front is unknown without a mesh
             self.line(np.stack(_front(truth, k)), (0, 0, 0), 3)
 
 
@@ -153,7 +152,7 @@ def _truth(shard: Shard, room_id: str) -> RoomGroundTruth | None:
 
 
 def _floor_bounds(room: RoomViews, truth: RoomGroundTruth | None) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest x, z of the floor, or of the cameras where the floor is unknown."""
+    """Bounds in x and z of the floor and the objects, or of the cameras without ground truth."""
     points = np.zeros((0, 2))
     if truth is not None:
         half = truth.sizes_m[:, (0, 2)] / 2
@@ -163,7 +162,7 @@ def _floor_bounds(room: RoomViews, truth: RoomGroundTruth | None) -> tuple[np.nd
         turn, place = room.world_to_camera[:, :3, :3], room.world_to_camera[:, :3, 3]
         points = -np.einsum("tij,ti->tj", turn, place)[:, (0, 2)]
         points = np.concatenate([points - 1, points + 1])
-    # A unit that is wrong by a thousand must not ask for a million lines.
+    # Clipped, because a unit wrong by a factor of a thousand would need a million lines.
     return (
         np.clip(points.min(axis=0), -_LARGEST_GRID_M, -_GRID_M).astype(np.float64),
         np.clip(points.max(axis=0), _GRID_M, _LARGEST_GRID_M).astype(np.float64),
@@ -171,7 +170,7 @@ def _floor_bounds(room: RoomViews, truth: RoomGroundTruth | None) -> tuple[np.nd
 
 
 def _grid(low: np.ndarray, high: np.ndarray) -> list[tuple[Sequence[float], Sequence[float]]]:
-    """Lines of whole metres on the floor; a line a metre long each, so that a cut costs little."""
+    """Metric grid on the floor, in segments of 1 m, so that clipping one loses little."""
     (x1, z1), (x2, z2) = np.floor(low).astype(int).tolist(), np.ceil(high).astype(int).tolist()
     lines = [((x, 0.0, z), (x, 0.0, z + 1)) for x in range(x1, x2 + 1) for z in range(z1, z2)]
     lines += [((x, 0.0, z), (x + 1, 0.0, z)) for z in range(z1, z2 + 1) for x in range(x1, x2)]
@@ -179,7 +178,7 @@ def _grid(low: np.ndarray, high: np.ndarray) -> list[tuple[Sequence[float], Sequ
 
 
 def _front(truth: RoomGroundTruth, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """A bar from the middle of the piece's front on the floor, a third of a metre ahead."""
+    """Endpoints of a bar on the floor, 0.3 m long, from the centre of the piece's front."""
     yaw, half = float(truth.yaw_rad[k]), truth.sizes_m[k].astype(np.float64) / 2
     ahead = np.array([np.sin(yaw), 0.0, np.cos(yaw)])
     reach = min(half[0] / max(abs(ahead[0]), 1e-9), half[2] / max(abs(ahead[2]), 1e-9))

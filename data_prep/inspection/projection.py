@@ -1,4 +1,4 @@
-"""Projects points and wires of a room into its views, in numpy: for pictures and checks."""
+"""Projects points and wireframes of a room into its views with numpy, for pictures and checks."""
 
 import warnings
 from collections.abc import Iterable
@@ -7,16 +7,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from sceneprior.geometry.corners import BOX_EDGES, box_corners
+from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 
 WIRE_NEAR_M = 0.05
-"""Lines are cut where they come nearer to the camera than this."""
+"""Depth of the near plane, at which lines are clipped."""
 
 Segment = tuple[float, float, float, float]
 
 
 def to_camera(points_m: np.ndarray, world_to_camera: np.ndarray) -> np.ndarray:
-    """(P, 3) points in a camera's own axes (OpenCV), float64."""
+    """Transform points, (P, 3), to a camera's axes (OpenCV), float64."""
     matrix = np.asarray(world_to_camera, dtype=np.float64)
     return np.asarray(points_m, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
 
@@ -27,7 +27,7 @@ def wire_pixels(
     world_to_camera: np.ndarray,
     intrinsics: np.ndarray,
 ) -> list[Segment]:
-    """The edges as lines on the image, each cut at the near plane or left out behind it.
+    """Project edges to lines in the image, clipped at the near plane.
 
     Args:
         points_m: (P, 3) in the room frame.
@@ -36,9 +36,9 @@ def wire_pixels(
         intrinsics: (3, 3), pixels.
 
     Returns:
-        u1, v1, u2, v2 of every edge of which something lies in front of the camera.
+        u1, v1, u2, v2 of every edge that lies at least partly beyond the near plane.
 
-    Example: a line that begins 1 m behind the camera is seen from the near plane on.
+    Example: a line that begins 1 m behind the camera is visible from the near plane on.
 
         >>> line = np.array([[0.0, 0, -1], [0.2, 0, 2]])
         >>> wire_pixels(line, [(0, 1)], np.eye(4), np.diag([10.0, 10, 1]))
@@ -61,12 +61,12 @@ def wire_pixels(
 
 
 def _cut(behind: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Where a line crosses the near plane."""
+    """Intersection of a line with the near plane."""
     return behind + (ahead - behind) * (WIRE_NEAR_M - behind[2]) / (ahead[2] - behind[2])
 
 
 class Hull(NamedTuple):
-    """The corners of a convex body, and its edges as pairs of rows."""
+    """Vertices of a convex body, and its edges as pairs of rows."""
 
     points_m: np.ndarray
     """(P, 3)"""
@@ -75,10 +75,10 @@ class Hull(NamedTuple):
 
 
 def hull_of(points_m: np.ndarray) -> Hull:
-    """The convex hull of (P, 3) points: it projects into the same 2D box with fewer of them."""
+    """Convex hull of points, (P, 3): it has the same projected 2D box with fewer points."""
     low, high = points_m.min(axis=0), points_m.max(axis=0)
     try:
-        # Joggled, for what is flat has no hull of its own.
+        # Joggled (QJ), because flat point sets have no hull of their own.
         found = ConvexHull(points_m, qhull_options="QJ")
     except QhullError:
         return Hull(box_corners((low + high) / 2, high - low), np.array(BOX_EDGES))
@@ -89,21 +89,21 @@ def hull_of(points_m: np.ndarray) -> Hull:
 
 
 def boxes_around(hull: Hull, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """The 2D box round a projected body in each view, beyond the image's borders, too.
+    """2D bounding box of a projected body in each view, not clipped at the image borders.
 
     Args:
-        hull: In the room frame.
+        hull: Body in the room frame.
         world_to_camera: (T, 4, 4).
         intrinsics: (T, 3, 3), pixels.
 
     Returns:
-        (T, 4) x1, y1, x2, y2 in pixels, of what lies beyond the near plane; NaN where nothing does.
+        (T, 4) x1, y1, x2, y2 in pixels, of the part beyond the near plane; NaN if there is none.
     """
     poses = np.asarray(world_to_camera, dtype=np.float64)
     camera = hull.points_m @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
     ahead = camera[..., 2] >= WIRE_NEAR_M
     pixels = _pixels(np.where(ahead[..., None], camera, np.nan), intrinsics)
-    with warnings.catch_warnings():  # views that are behind the camera altogether
+    with warnings.catch_warnings():  # nanmin warns if the whole body is behind the camera
         warnings.simplefilter("ignore", RuntimeWarning)
         boxes = np.concatenate([np.nanmin(pixels, axis=1), np.nanmax(pixels, axis=1)], axis=1)
     for view in np.flatnonzero(ahead.any(axis=1) & ~ahead.all(axis=1)):
@@ -117,15 +117,15 @@ def boxes_around(hull: Hull, world_to_camera: np.ndarray, intrinsics: np.ndarray
 
 
 def _pixels(camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """(T, P, 2) of (T, P, 3) points in the cameras' axes."""
+    """Project points in the cameras' axes, (T, P, 3), to pixels, (T, P, 2)."""
     lenses = np.asarray(intrinsics, dtype=np.float64)
     return ((camera / camera[..., 2:]) @ lenses.transpose(0, 2, 1))[..., :2]
 
 
 def box_iou_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Intersection over union of rows of 2D boxes; NaN where a box is NaN, or both are empty.
+    """Intersection over union of 2D boxes, row by row; NaN if a box is NaN or both are empty.
 
-    Example: two squares that share one half.
+    Example: two squares that overlap by one half.
 
         >>> box_iou_2d(np.array([[0.0, 0, 2, 2]]), np.array([[1.0, 0, 3, 2]])).round(3).tolist()
         [0.333]

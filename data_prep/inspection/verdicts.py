@@ -1,4 +1,4 @@
-"""What the agreement of 3D and masks says about a room or a folder, in sentences."""
+"""Turns the agreement of 3D objects and masks into sentences about a room or a folder."""
 
 from collections.abc import Iterator, Sequence
 
@@ -13,15 +13,16 @@ from data_prep.inspection.agreement import (
 )
 from data_prep.inspection.bodies import KINDS, Body
 from data_prep.inspection.causes import Trial, chance_of, likely_cause, out_of_order
-from sceneprior.shards import RoomViews
+from sceneprior.core.shards import RoomViews
 
 _ROOM_MASKS = 5
-"""Fewer say nothing about a room."""
+"""Minimum number of masks for a statement about a room."""
 _OUTLIER = 0.5
-"""A view or an object of a room that agrees otherwise is named if less of its masks agree."""
+"""In a room that agrees as a whole, views and objects with a smaller share of agreeing masks are
+reported."""
 _CAMERA_HEIGHTS_M = 0.2, 4.0
 _OBJECT_SIZES_M = 0.15, 6.0
-"""Of the middle one of a room: nobody holds cameras elsewhere, nor is furniture of other sizes."""
+"""Plausible ranges of a room's median camera height and median object length."""
 
 Trials = Sequence[dict[str, Trial]]
 
@@ -29,7 +30,7 @@ Trials = Sequence[dict[str, Trial]]
 def disagreement(
     agreement: Agreement, kind: str, trials: Trials, share: float = 1.0, least: int = 1
 ) -> str:
-    """That the masks do not lie where the 3D is, and the likely cause, up to the full stop."""
+    """Say that masks and 3D objects disagree, and name the likely cause; without the full stop."""
     tally = agreement.of(kind)
     text = (
         f"{tally.share:.0%} of {tally.masks} masks lie within the projected {KINDS[kind]}, "
@@ -49,7 +50,10 @@ def disagreement(
 def room_problems(
     bodies: Sequence[Body | None], views: RoomViews, seen: Comparison, trials: Trials
 ) -> Iterator[str]:
-    """Sentences without the room's name; what is found from masks alone says less."""
+    """Report the problems of a room as sentences without its name.
+
+    For boxes found from the masks, units are checked instead of single views and objects.
+    """
     agreement = seen.agreement
     failing = agreement.failing(ROOM_SHARE, _ROOM_MASKS)
     for kind in failing:
@@ -61,7 +65,7 @@ def room_problems(
 
 
 def _outliers(bodies: Sequence[Body | None], views: RoomViews, seen: Comparison) -> Iterator[str]:
-    """Views and objects that do not fit into a room that does."""
+    """Report views and objects that disagree in a room that agrees as a whole."""
     count, held = seen.judged.sum(axis=1), (seen.judged & seen.held).sum(axis=1)
     wrong = np.flatnonzero((count >= 2) & (held < _OUTLIER * count))
     if len(wrong):
@@ -91,7 +95,10 @@ def _listed(numbers: np.ndarray) -> str:
 
 
 def _unit_problems(bodies: Sequence[Body | None], views: RoomViews) -> Iterator[str]:
-    """Masks and poses alone have any size; the floor and the furniture have not."""
+    """Report implausible camera heights and object sizes.
+
+    Masks and poses alone do not determine the scale, but floor and furniture have typical sizes.
+    """
     poses = views.world_to_camera.astype(np.float64)
     eyes = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
     height = float(np.median(eyes[:, 1]))

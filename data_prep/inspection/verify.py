@@ -1,4 +1,4 @@
-"""Checks a folder of shards: checksums, shapes, ranges, boxes, masks, ground truth in 3D."""
+"""Checks a folder of shards: checksums, shapes, ranges, boxes, masks and 3D ground truth."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -12,24 +12,23 @@ from data_prep.inspection.bodies import ModelHulls, found_bodies, true_bodies
 from data_prep.inspection.causes import Trial, try_repairs
 from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
 from data_prep.inspection.verdicts import disagreement, room_problems
-from sceneprior.classes import label_set
-from sceneprior.errors import InputError, ShardError
-from sceneprior.shards import (
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError, ShardError
+from sceneprior.core.shards import (
     MODELS_FOLDER,
     Shard,
-    check_views,
     list_shards,
     read_index,
     room_checksum,
 )
 
 _TRIED_ROOMS = 2
-"""Of a shard, in which repairs of the cameras are tried; the others are wrong in the same way."""
+"""Rooms per shard in which camera repairs are tried; the others likely have the same fault."""
 
 
 @dataclass(frozen=True)
 class RoomCheck:
-    """What was found in one room."""
+    """Results of checking one room."""
 
     shard: str
     room_id: str
@@ -39,34 +38,34 @@ class RoomCheck:
     """Sentences without the room's name."""
     agreement: Agreement = field(default_factory=Agreement)
     trials: dict[str, Trial] = field(default_factory=dict)
-    """By likely cause, what is gained without it; tried in some rooms that do not agree."""
+    """Results of repairs by cause, tried in some of the rooms that disagree."""
     has_truth: bool = False
     has_checksum: bool = False
 
 
 @dataclass(frozen=True)
 class FolderCheck:
-    """What was found in a folder."""
+    """Results of checking a folder."""
 
     rooms: dict[str, list[RoomCheck]]
-    """By split."""
+    """Rooms by split."""
     problems: tuple[str, ...]
-    """Sentences, each with the place; empty: all is well."""
+    """Sentences, each with its place; empty if all is well."""
 
     @property
     def agreement(self) -> Agreement:
-        """Over all rooms."""
+        """Agreement summed over all rooms."""
         every = [room.agreement for rooms in self.rooms.values() for room in rooms]
         return sum(every, Agreement())
 
 
 def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> FolderCheck:
-    """Read everything in a folder of shards and hold it against itself.
+    """Check the consistency of a folder of shards.
 
-    With `room_id` only this room; the index's counts are then left alone.
+    With `room_id`, only this room is checked, and the counts of the index are not.
 
     Raises:
-        InputError: it is no finished folder of shards, or holds no such room.
+        InputError: it is not a finished folder of shards, or holds no such room.
     """
     folder = Path(folder)
     index = read_index(folder)
@@ -93,11 +92,11 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
         path = str(folder / room.shard)
         where = path + (f", room {room.room_id}" if room.room_id else "")
         for sentence in room.problems:
-            # What could not be read says itself where it is.
+            # Sentences about unreadable shards name their place themselves.
             text = sentence if sentence.startswith(path) else f"{where}: {sentence}"
             problems.append(text if text.endswith("?") else f"{text}.")
     if room_id is None:
-        if all(room.views for room in every):  # else it is said already why something is missing
+        if all(room.views for room in every):  # otherwise a problem already says what is missing
             problems += _count_problems(folder, index, rooms)
         agreement = sum((room.agreement for room in every), Agreement())
         trials = [room.trials for room in every if room.trials]
@@ -128,7 +127,7 @@ def _count_problems(
 def _check_shard(
     folder: Path, path: Path, label_set_name: str, only: str | None
 ) -> list[RoomCheck]:
-    """Every room of a shard, or the one asked for; a shard that cannot be read is one problem."""
+    """Check every room of a shard, or only `only`; an unreadable shard is one problem."""
     name = str(path.relative_to(folder))
     models = ModelHulls(folder / MODELS_FOLDER)
     checks: list[RoomCheck] = []
@@ -152,7 +151,6 @@ def _check_room(
     truth = None
     try:
         views = shard.read_room(room_id, images=True)
-        check_views(str(shard.path), views)
         if shard.has_ground_truth(room_id):
             truth = shard.read_ground_truth(room_id)
         stored = shard.read_checksum(room_id)

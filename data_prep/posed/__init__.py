@@ -1,1 +1,1 @@
-"""The user's own data: posed pictures with tracked instance masks (docs/posed_data.md)."""
+"""Source for the user's own data: posed pictures with tracked masks (docs/posed_data.md)."""

@@ -1,35 +1,38 @@
-"""Puts the cameras of a posed room into the room frame: up, the floor, the middle."""
+"""Transforms the cameras of a posed room to the room frame: up direction, floor, origin."""
 
 import numpy as np
 
 from data_prep.frames import is_pose, room_cameras
 from data_prep.posed.recording import Recording
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 UP = ("auto", "z", "y", "cameras")
 _GL_TO_CV = np.diag([1.0, -1, -1, 1])
 _Y_UP = {
     "y": np.eye(4),
-    # (x, y, z) with z up -> (x, z, -y); right-handed as before.
+    # (x, y, z) with z up -> (x, z, -y); stays right-handed.
     "z": np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
 }
 _LARGEST_SPREAD_M = 100.0
 _LEAST_TURN = 0.1
-"""Of the cameras' sideways axes, the second of their singular values relative to the first: cameras
-that all look the same way do not tell how they were tilted."""
+"""Minimum ratio of the second to the first singular value of the cameras' sideways axes; if all
+cameras look the same way, their tilt cannot be determined."""
 
 
 def upright_cameras(
     recording: Recording, frames: list[int], up: str, metres_per_unit: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cameras in a world whose y points up, in metres: camera-to-world, (views, 4, 4), OpenCV axes,
-    and (4, 4) from the file's world (in metres) to this one.
+    """Rotate cameras to a world whose y points up, in metres.
 
     Args:
-        up: One of `UP`; `auto` is z, but `cameras` for a world without an axis that points up.
+        up: One of `UP`; `auto` is z, or `cameras` for a world without an axis that points up.
+
+    Returns:
+        Camera-to-world matrices, (views, 4, 4) with OpenCV axes, and the (4, 4) transform from the
+        file's world (in metres) to this one.
 
     Raises:
-        InputError: the cameras are spread too far for metres, or do not tell which way is up.
+        InputError: the cameras are too far apart for metres, or do not determine the up direction.
     """
     poses = np.stack([recording.frames[i].camera_to_world for i in frames])
     poses[:, :3, 3] *= recording.metres_per_unit or metres_per_unit
@@ -47,8 +50,11 @@ def upright_cameras(
 
 
 def _turn_of_cameras(recording: Recording, poses: np.ndarray) -> np.ndarray:
-    """Cameras that are held upright have sideways axes that are level, however they look up or
-    down: up is the direction at right angles to all of them."""
+    """Rotation (4, 4) that makes y the up direction of cameras that were held upright.
+
+    The sideways axes of such cameras are horizontal, whatever their pitch, so up is the direction
+    perpendicular to all of them.
+    """
     _, strength, axes = np.linalg.svd(poses[:, :3, 0])
     if len(strength) < 2 or strength[1] < _LEAST_TURN * strength[0]:
         raise InputError(
@@ -69,12 +75,12 @@ def cameras_in_room(
 ) -> np.ndarray:
     """World-to-camera transforms in the room frame, (views, 4, 4).
 
-    The room frame: y up; the floor at 0; the origin below the middle of the cameras, where the file
-    gives no `floor_center_m`.
+    In the room frame, y points up, the floor is at y = 0, and the origin is at `floor_center_m` or,
+    without one, below the centre of the cameras' bounding box.
 
     Args:
         upright, turn: See `upright_cameras`.
-        floor: Height of the floor in that world.
+        floor: Height of the floor in the upright world.
 
     Raises:
         InputError: the lowest camera is below the floor.
@@ -105,7 +111,7 @@ def cameras_in_room(
 
 
 def seems_up(recording: Recording) -> str | None:
-    """Which axis the tops of the pictures point along, `y` or `z`; None where neither is clear."""
+    """Axis along which the cameras' up vectors point, `y` or `z`; None if neither is clear."""
     poses = np.stack([frame.camera_to_world for frame in recording.frames])
     tops = poses[is_pose(poses), :3, 1]
     if not len(tops):

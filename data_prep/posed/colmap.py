@@ -1,4 +1,4 @@
-"""Reads COLMAP's own models, binary or text: cameras and the poses of images, not the points.
+"""Reads COLMAP's models, binary or text: cameras and poses of images, without the points.
 
 Source: COLMAP's documentation of its output format, and `src/colmap/sensor/models.h`.
 """
@@ -12,10 +12,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
+from sceneprior.core.instances.checked import plain
 
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
-"""Where a room's model may lie: as COLMAP's own commands, or nerfstudio's, leave it."""
+"""Folders in which COLMAP or nerfstudio put a model."""
 _MODELS = {
     0: ("SIMPLE_PINHOLE", "f cx cy"),
     1: ("PINHOLE", "fl_x fl_y cx cy"),
@@ -26,25 +27,25 @@ _MODELS = {
     8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
     9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
 }
-"""COLMAP's number of a camera model -> its name, and its parameters as transforms.json calls them;
-`f` is both focal lengths."""
+"""Name and parameters of a camera model by COLMAP's number. Parameters have their names in
+transforms.json; `f` stands for both focal lengths."""
 _BYTES_A_POINT = 24
 _LONGEST_NAME = 4096
 
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """An image of a model."""
+    """A posed image of a model."""
 
     name: str
     camera_to_world: np.ndarray
-    """(4, 4) float64, OpenGL axes as in transforms.json, the model's units."""
+    """(4, 4) float64, OpenGL axes as in transforms.json, in the model's units."""
     camera: dict[str, Any]
-    """The keys that transforms.json would have."""
+    """Camera keys as in transforms.json."""
 
 
 def model_files(folder: Path) -> tuple[Path, Path] | None:
-    """The cameras' and the images' file of a room's model, binary before text; None without one."""
+    """Find a model's files of cameras and of images, preferably binary; None without a model."""
     for name in FOLDERS:
         for ending in ("bin", "txt"):
             paths = (folder / name / f"cameras.{ending}", folder / name / f"images.{ending}")
@@ -54,10 +55,10 @@ def model_files(folder: Path) -> tuple[Path, Path] | None:
 
 
 def read_model(cameras: Path, images: Path) -> list[ColmapImage]:
-    """The images of a model in the order of their names.
+    """Read the images of a model, sorted by name.
 
     Raises:
-        InputError: a file is damaged, or a camera is of a model that is not read.
+        InputError: a file is damaged, or a camera model is not supported.
     """
     binary = cameras.suffix == ".bin"
     try:
@@ -72,7 +73,7 @@ def read_model(cameras: Path, images: Path) -> list[ColmapImage]:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"{cameras.parent} holds no COLMAP model that can be read ({str(error)[:120]})."
+            f"{cameras.parent} holds no COLMAP model that can be read ({plain(str(error), 120)})."
         ) from None
     return sorted(made, key=lambda image: image.name)
 
@@ -81,12 +82,12 @@ def _camera(path: Path, model: str, size: tuple[int, int], values: list[float]) 
     names = next((text.split() for name, text in _MODELS.values() if name == model), None)
     if names is None:
         raise InputError(
-            f"{path}: its camera model {model} is not read; `colmap image_undistorter` makes "
-            "pinhole pictures and a model of them (the masks are then of those), or model again "
-            "with OPENCV or OPENCV_FISHEYE."
+            f"{path}: its camera model {plain(model)} is not read; `colmap image_undistorter` "
+            "makes pinhole pictures and a model of them (the masks are then of those), or model "
+            "again with OPENCV or OPENCV_FISHEYE."
         )
     if len(values) != len(names):
-        raise ValueError(f"{model} has {len(names)} parameters, not {len(values)}")
+        raise ValueError(f"{plain(model)} has {len(names)} parameters, not {len(values)}")
     keys = dict(zip(names, values, strict=True))
     if "f" in keys:
         keys["fl_x"] = keys["fl_y"] = keys.pop("f")
@@ -94,7 +95,11 @@ def _camera(path: Path, model: str, size: tuple[int, int], values: list[float]) 
 
 
 def _camera_to_world(pose: list[float]) -> np.ndarray:
-    """Of a quaternion w, x, y, z and a translation, from the world to OpenCV's camera axes."""
+    """Camera-to-world matrix (OpenGL axes) of COLMAP's pose.
+
+    COLMAP stores the world-to-camera rotation as a quaternion (w, x, y, z), then the translation,
+    for OpenCV axes.
+    """
     matrix = np.eye(4)
     w, x, y, z = pose[:4]
     matrix[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix().T
@@ -116,7 +121,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _text_images(path: Path) -> Iterator[tuple[str, list[float], int]]:
-    # Each image has a second line, of its points, which may be empty.
+    # Each image has a second line with its points, which may be empty.
     for line in _text_rows(path)[::2]:
         if line.strip():
             words = line.split(maxsplit=9)

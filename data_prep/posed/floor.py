@@ -1,7 +1,7 @@
-"""Finds the floor of a room that nobody measured: below the lowest pieces that cameras tracked.
+"""Estimates the height of an unknown floor from the lowest tracked pieces of furniture.
 
-Each piece is a box that stands upright, fitted to its 2D boxes in all views; the floor is where the
-lowest of them end. Nothing else is taken from these boxes.
+An upright 3D box is fitted to the 2D boxes of each piece in all views; the floor is at the bottom
+of the lowest boxes. The boxes are used for nothing else.
 """
 
 from dataclasses import dataclass
@@ -9,34 +9,34 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_prep.upright import fit_upright, own_sides
-from sceneprior.instances.observations import Observations
+from sceneprior.core.instances.observations import Observations
 
 _MISFIT_SHARE = 0.01
-"""Mean distance between a box and its 2D boxes, of the image's longer side, above which its lower
-end is not believed."""
+"""Maximum mean distance between a projected box and its 2D boxes, relative to the image's longer
+side, for its bottom to be used."""
 _AGREE_M = 0.1
-"""Pieces whose lower ends are this near to each other stand on the same floor."""
+"""Maximum height difference between the bottoms of pieces on the same floor."""
 _LOWER_SIDES = 2
-"""Of a piece, seen clearly, at least."""
+"""Minimum number of views in which the lower side of a piece is unoccluded."""
 
 
 @dataclass(frozen=True)
 class FoundFloor:
-    """Where the floor is, and what says so."""
+    """Height of the floor, and its evidence."""
 
     height_m: float
-    """Along the up axis of the cameras' world."""
+    """Height along the up axis of the cameras' world."""
     pieces: int
-    """How many end there."""
+    """Number of pieces that stand on it."""
 
 
 def find_floor(
     seen: Observations, world_to_camera: np.ndarray, intrinsics: np.ndarray
 ) -> FoundFloor | None:
-    """The height at which the lowest pieces end; None where fewer than two pieces agree.
+    """Find the height at which the lowest pieces end; None if fewer than two pieces agree.
 
     Args:
-        seen: What the views show; boxes relative to the image.
+        seen: Observations in the views; boxes are relative to the image.
         world_to_camera: (views, 4, 4), OpenCV axes, metres; the world's y points up.
         intrinsics: (views, 3, 3) in pixels.
     """
@@ -47,6 +47,6 @@ def find_floor(
     ends = (boxes.centers_m[:, 1] - boxes.sizes_m[:, 1] / 2)[believed].tolist()
     for end in sorted(ends):
         same = [other for other in ends if 0 <= other - end <= _AGREE_M]
-        if len(same) >= max(2, len(ends) / 4):  # a single one may be a rug's, or wrong
+        if len(same) >= max(2, len(ends) / 4):  # a single one may be wrong
             return FoundFloor(float(np.median(same)), len(same))
     return None

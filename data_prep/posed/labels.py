@@ -1,27 +1,27 @@
-"""Reads the user's label set, and finds a room's table of classes."""
+"""Reads the user's label set, and finds a room's class table."""
 
 import json
 from pathlib import Path
 
 from data_prep.posed.panoptic import FILE_NAME as PANOPTIC
-from sceneprior.classes import LABEL_SETS, label_set_name
-from sceneprior.errors import InputError
+from sceneprior.core.classes import LABEL_SETS, label_set_name
+from sceneprior.core.errors import InputError
 
 TABLES = ("classes.json", "classes.csv", PANOPTIC)
 
 
 def read_label_set(text: str) -> str:
-    """The name of the label set that `--label-set` names, or lists in a file.
+    """Resolve `--label-set` to the name of a label set.
 
     Args:
-        text: A label set's name, or a file: one class a line, or a JSON list. `void` need not be
-            in it; a line that begins with # is passed over.
+        text: Name of a label set, or a file with one class per line or a JSON list. The file need
+            not contain `void`; lines that begin with # are skipped.
 
     Returns:
-        What `sceneprior.classes.label_set` understands, and a config's `label_set` takes.
+        Name for `sceneprior.core.classes.label_set` and for `label_set` in a config.
 
     Raises:
-        InputError: neither; or the file holds no proper list.
+        InputError: `text` is neither, or the file holds no valid list.
     """
     path = Path(text)
     if not path.is_file():
@@ -53,8 +53,9 @@ def read_label_set(text: str) -> str:
 
 
 def find_table(folder: Path) -> Path:
-    """Where a room says of which classes its ids are: `classes.json`, `classes.csv`, or COCO's
-    `panoptic.json`.
+    """Find the table that maps a room's ids to classes.
+
+    It is `classes.json`, `classes.csv`, or COCO's `panoptic.json`.
 
     Raises:
         InputError: there is none, or more than one.

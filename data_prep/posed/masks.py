@@ -1,4 +1,4 @@
-"""Reads the masks of a room: ids of its instances, through straightened lenses, sampled down."""
+"""Reads a room's masks of instance ids, undistorts and downsamples them."""
 
 from pathlib import Path
 
@@ -10,24 +10,25 @@ from data_prep.posed.lens import Lens, Straightened, straighten
 from data_prep.posed.panoptic import FILE_NAME as PANOPTIC
 from data_prep.posed.panoptic import read_panoptic
 from data_prep.posed.recording import PosedFrame, frame_intrinsics
-from sceneprior.errors import InputError
-from sceneprior.instances.pngs import mask_size, read_mask
-from sceneprior.instances.tables import IdTable, read_class_table
+from sceneprior.core.errors import InputError
+from sceneprior.core.instances.checked import shown
+from sceneprior.core.instances.pngs import mask_size, read_mask
+from sceneprior.core.instances.tables import IdTable, read_class_table
 
 
 def png_size(folder: Path, frame: PosedFrame) -> tuple[int, int]:
-    """(height, width) of a frame's PNG of ids."""
+    """Size, (height, width), of a frame's PNG of ids."""
     return mask_size(frame.instances, rgb=find_table(folder).name == PANOPTIC)
 
 
 class RoomMasks:
-    """The masks of one room, all of one size, and what there is to say about them.
+    """Masks of one room, all of one size, and notes about them.
 
     Args:
-        folder: The room's.
-        label_set_name: As `sceneprior.classes.label_set` takes it.
+        folder: Folder of the room.
+        label_set_name: Name for `sceneprior.core.classes.label_set`.
         size: (height, width) of every PNG.
-        stored: (height, width) of the images that are made of them.
+        stored: (height, width) of the downsampled images.
 
     Raises:
         InputError: the room's table of classes cannot be used.
@@ -48,7 +49,7 @@ class RoomMasks:
 
     @property
     def notes(self) -> list[str]:
-        """What has been left out or changed so far."""
+        """Notes on everything left out or changed so far."""
         notes = list(self.table.notes)
         if self.table.unlisted:
             listed = ", ".join(map(str, sorted(self.table.unlisted)[:20]))
@@ -59,14 +60,17 @@ class RoomMasks:
         return notes
 
     def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray]:
-        """(height, width) uint32 ids for `observe`, as stored, and (3, 3) intrinsics of them.
+        """Read a frame's ids for `observe` and their intrinsics.
+
+        Returns:
+            (height, width) uint32 ids at the stored size, and (3, 3) intrinsics.
 
         Raises:
             InputError: a PNG is missing, damaged or of another size, or the camera cannot be used.
         """
         values = self._values(frame)
         K, picture = frame_intrinsics(frame, self._size)
-        # That function counts pixel centres in whole numbers, as ScanNet does.
+        # `mask_intrinsics` expects pixel centres at integers, as in ScanNet.
         K = mask_intrinsics(_counted_from_0(K), picture, self._size, self._size)
         if not (lens := frame.camera.lens).is_straight:
             key = lens, K.tobytes()
@@ -74,7 +78,7 @@ class RoomMasks:
                 try:
                     self._views[key] = straighten(lens, K, self._size)
                 except InputError as error:
-                    raise InputError(f"frame '{frame.name}': {error}") from None
+                    raise InputError(f"frame {shown(frame.name)}: {error}") from None
             view = self._views[key]
             K, values = view.intrinsics, values[view.rows, view.columns]
         lines = [sampled_lines(*sides) for sides in zip(self._size, self._stored, strict=True)]
@@ -82,7 +86,7 @@ class RoomMasks:
         return self.table.ids(values[np.ix_(*lines)]), sampled
 
     def _values(self, frame: PosedFrame) -> np.ndarray:
-        """Ids of one frame, int32; -1 where nothing is known."""
+        """Read the ids of one frame, int32; -1 where they are unknown."""
         ids = self._read(frame.instances).astype(np.int32)
         size = self._size
         if ids.shape != size:

@@ -1,7 +1,7 @@
-"""Reads COCO's panoptic format: PNGs whose colours are segment ids, and one JSON for all of them.
+"""Reads COCO's panoptic format: PNGs whose colours encode segment ids, and one JSON for all PNGs.
 
-Ids must be tracked: the same id is the same object in all frames, as video segmenters write them.
-Those of COCO's own single images are not.
+Ids must be tracked: an object has the same id in all frames, as in the output of video segmenters.
+The ids of COCO's own single images are not tracked.
 """
 
 from dataclasses import dataclass
@@ -11,16 +11,16 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from data_prep.posed.recording import checked
-from sceneprior.classes import label_set
-from sceneprior.errors import InputError
-from sceneprior.files import read_json
-from sceneprior.instances.pngs import read_rgb
-from sceneprior.instances.tables import LARGEST_ID, tidy
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json
+from sceneprior.core.instances.checked import checked
+from sceneprior.core.instances.pngs import read_rgb
+from sceneprior.core.instances.tables import LARGEST_ID, tidy
 
 FILE_NAME = "panoptic.json"
 _CROWD = "crowd"
-"""Class of segments that are no single object."""
+"""Class of segments that are not a single object."""
 _STUFF = "background"
 
 _Id = Annotated[int, Field(ge=0, lt=2**24)]
@@ -58,16 +58,21 @@ class _Panoptic(BaseModel):
 
 @dataclass(frozen=True)
 class PanopticIds:
-    """The segments of a room's frames, numbered anew."""
+    """Segments of a room, renumbered to consecutive ids."""
 
     segments: np.ndarray
-    """(n,) their ids, ascending."""
+    """(n,) segment ids, ascending."""
     classes: dict[int, str]
-    """k + 1 of the k-th -> its class; "background" for stuff, such as walls and floors."""
+    """Class by new id: k + 1 for the k-th segment; "background" for stuff (walls, floors)."""
 
     def read(self, path: Path) -> np.ndarray:
-        """(height, width) int32 of a PNG: k + 1 of the k-th segment, 0 for nothing, n + 1 for ids
-        that the JSON does not have. An `InputError` where it is no RGB PNG."""
+        """Read a PNG as new ids, (height, width) int32.
+
+        0 is background, k + 1 the k-th segment, n + 1 any id that is missing from the JSON.
+
+        Raises:
+            InputError: the file is not an RGB PNG.
+        """
         red, green, blue = np.moveaxis(read_rgb(path).astype(np.int64), 2, 0)
         ids = red + 256 * green + 65536 * blue
         place = np.searchsorted(self.segments, ids)
@@ -77,7 +82,7 @@ class PanopticIds:
 
 
 def read_panoptic(path: Path, label_set_name: str) -> PanopticIds:
-    """Read a room's JSON of panoptic annotations. Stuff is nothing unless the label set has it.
+    """Read a room's panoptic annotations. Stuff is background, unless the label set has its class.
 
     Raises:
         InputError: the file is damaged, or its ids are not tracked over frames.

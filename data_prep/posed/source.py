@@ -1,4 +1,4 @@
-"""Folders of posed pictures as a source of rooms: a folder with poses and masks is a room."""
+"""Source for folders of posed pictures; a folder with poses and masks is a room."""
 
 from collections import Counter
 from dataclasses import asdict, dataclass, field
@@ -14,14 +14,14 @@ from data_prep.posed.labels import TABLES
 from data_prep.posed.recording import INSTANCES, room_name
 from data_prep.posed.transforms import FILE_NAME, read_recording, room_files
 from data_prep.posed.views import PosedSettings, prepare_posed, stored_size
-from sceneprior.classes import label_set
-from sceneprior.errors import InputError
-from sceneprior.offscreen import Renderer
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.render.offscreen import Renderer
 
 
 @dataclass(frozen=True)
 class PosedSource:
-    """What `prep-posed` reads: a `Source` (data_prep/engine/source.py)."""
+    """The `Source` (data_prep/engine/source.py) behind `prep-posed`."""
 
     name: ClassVar = "posed"
     room_type: ClassVar = "posed"
@@ -30,17 +30,20 @@ class PosedSource:
     folder: Path
     """One room, or a folder of rooms."""
     label_set: str
-    """As `sceneprior.classes.label_set` takes it."""
+    """Name for `sceneprior.core.classes.label_set`."""
     posed_settings: PosedSettings = field(default_factory=PosedSettings)
     test_share: float = 0.1
-    """Share of the rooms in the split `test`, at least one of several; 0: all rooms train."""
+    """Share of rooms in the split `test`, at least one of several; 0 puts all rooms in `train`."""
     seed: int = 0
     only: str | None = None
-    """A room; the beginning of its name is enough."""
+    """Name of a room; a prefix suffices."""
 
     def settings(self, only: str | None) -> dict[str, Any]:
-        """See `Source.settings`. The files' names and sizes take part, so that mended masks or
-        classes are not answered with the shards of before."""
+        """See `Source.settings`.
+
+        The names and sizes of files are part of the settings, so that the shards of earlier masks
+        or classes are not kept.
+        """
         label_set(self.label_set)
         if not 0 <= self.test_share < 1:
             raise InputError(
@@ -76,7 +79,7 @@ class PosedSource:
                 left_out.append(LeftOut(name, name, "failed", found))
             else:
                 sizes[name] = found
-        # A batch holds several rooms, and images of one size.
+        # Batches hold images of several rooms, so all must have one size.
         usual = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
         for name, size in sizes.items():
             if size != usual:
@@ -104,27 +107,37 @@ class PosedSource:
         return made
 
     def assumptions(self) -> list[str]:
-        """Sentences about what the files do not say, for the user to read before the work."""
+        """Sentences about values that the files lack and that are assumed, to print first."""
         recordings = []
         for room in find_rooms(self.folder):
             try:
                 recordings.append(read_recording(room))
             except InputError:
-                continue  # the report will say it
+                continue  # the report will have the error
         settings, count = self.posed_settings, len(recordings)
         sentences = []
         unknown = sum(recording.floor_m is None for recording in recordings)
         if unknown and settings.floor_m is None:
             sentences.append(
                 f"{unknown} of {count} rooms give no floor_m: the floor is where the lowest pieces "
-                f"end, or else {settings.camera_height_m:g} m below the lowest camera "
-                "(--camera-height-m); report.csv says which."
+                f"end (1 to 2 cm off in the median, where tried), or else "
+                f"{settings.camera_height_m:g} m below the lowest camera (21 cm off); report.csv "
+                "says which. Measure the floor and give floor_m or --floor-m, or at least the "
+                "lowest camera's height with --camera-height-m."
             )
         unknown = sum(recording.metres_per_unit is None for recording in recordings)
         if unknown and settings.metres_per_unit == 1:
             sentences.append(
                 f"{unknown} of {count} rooms give no metres_per_unit: poses are taken as metres; "
                 "those of COLMAP are not."
+            )
+        lying = sum(not recording.leveled for recording in recordings)
+        if lying and settings.up == "auto":
+            sentences.append(
+                f"{lying} of {count} rooms say nothing of up: it is taken from the cameras, as if "
+                "they were held upright. Where they roll by 5 degrees it is 1.3 degrees off in the "
+                "median, so that floors rise by 5 cm in 2 m. Turn the poses until an axis points "
+                "up, and name it with --up."
             )
         taken = "z" if settings.up == "auto" else settings.up
         tops = [seems_up(recording) for recording in recordings if recording.leveled]
@@ -139,8 +152,9 @@ class PosedSource:
 
 
 def find_rooms(folder: Path) -> list[Path]:
-    """The folder itself if it holds poses (`room_files`), else its sub-folders that do; sorted.
-    Those with `instances/` alone are among them, for the report to name them.
+    """Find rooms: the folder itself if it holds poses (`room_files`), else its sub-folders, sorted.
+
+    Sub-folders with `instances/` but no poses are included, so that the report mentions them.
 
     Raises:
         InputError: there is no room.
@@ -164,7 +178,7 @@ def find_rooms(folder: Path) -> list[Path]:
 
 
 def _look(source: PosedSource, room: Path) -> tuple[int, int] | str:
-    """The size at which a room would be stored, or why it cannot be."""
+    """Size at which a room would be stored, or the reason why it cannot be prepared."""
     try:
         recording = read_recording(room)
         return stored_size(recording, source.posed_settings)

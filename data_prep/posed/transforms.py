@@ -1,16 +1,16 @@
-"""Reads a room's files: nerfstudio-style transforms.json, its split files, or COLMAP's own model.
+"""Reads a room's files: nerfstudio-style transforms.json, its split files, or a COLMAP model.
 
-Read, of a JSON: `frames`; camera keys (see Camera) for all frames; `floor_m`, `floor_center_m`,
-`metres_per_unit`. Of a frame: `file_path`, `transform_matrix`, `instance_path`, `mask_path`, and
-camera keys, which win over the file's. All others are passed over, and the pictures themselves are
-never opened.
+The keys of a JSON are `frames`, camera keys (see Camera) for all frames, `floor_m`,
+`floor_center_m` and `metres_per_unit`. The keys of a frame are `file_path`, `transform_matrix`,
+`instance_path`, `mask_path`, and camera keys, which override the file's. Other keys are ignored,
+and the pictures themselves are never opened.
 """
 
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from data_prep.posed.colmap import model_files, read_model
 from data_prep.posed.recording import (
@@ -19,15 +19,16 @@ from data_prep.posed.recording import (
     PosedFrame,
     Recording,
     check_one_png_a_frame,
-    checked,
     ids_path,
+    path_text,
 )
-from sceneprior.errors import InputError
-from sceneprior.files import read_json
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json
+from sceneprior.core.instances.checked import checked, number_array, shown
 
 FILE_NAME = "transforms.json"
 
-PathText = Annotated[str, Field(min_length=1, pattern=r"^[^\x00]*$")]
+PathText = Annotated[str, AfterValidator(path_text)]
 
 
 class _FrameEntry(Camera):
@@ -44,9 +45,11 @@ class _RoomEntry(BaseModel):
 
 
 def room_files(folder: Path) -> list[Path]:
-    """What the poses of a room are read from, for a room that is one: transforms.json; else
-    transforms_train.json and the like; else the files of COLMAP's model, and a transforms.json of
-    keys about the room, if there is one."""
+    """Files that the poses of a room are read from; empty if the folder is not a room.
+
+    They are transforms.json; else transforms_*.json (one per split); else the files of a COLMAP
+    model, with an optional transforms.json that has no frames but keys about the room.
+    """
     whole = folder / FILE_NAME
     parts = sorted(folder.glob("transforms_*.json"))
     model = model_files(folder)
@@ -57,7 +60,7 @@ def room_files(folder: Path) -> list[Path]:
     try:
         data = read_json(whole)
     except InputError:
-        return [whole]  # to be refused when it is read
+        return [whole]  # reading it will raise the error
     return [*model, whole] if isinstance(data, dict) and "frames" not in data else [whole]
 
 
@@ -65,8 +68,8 @@ def read_recording(folder: Path) -> Recording:
     """Read the frames of one room (`room_files`).
 
     Raises:
-        InputError: a file is missing or damaged, misses a key or has one of a wrong type, or a
-            lens is of a model that is not read; the message names the file, the frame and the key.
+        InputError: a file is missing or damaged, a key is missing or of a wrong type, or a camera
+            model is not supported; the message names the file, the frame and the key.
     """
     files = room_files(Path(folder)) or [Path(folder) / FILE_NAME]
     jsons = [(path, read_json(path)) for path in files if path.suffix == ".json"]
@@ -78,7 +81,7 @@ def read_recording(folder: Path) -> Recording:
     frames: list[PosedFrame] = []
     if model:
         for image in read_model(model[0], model[1]):
-            camera = checked(Camera, image.camera, f"{model[1]}, image '{image.name}'")
+            camera = checked(Camera, image.camera, f"{model[1]}, image {shown(image.name)}")
             ids = ids_path(Path(folder), image.name)
             frames.append(PosedFrame(image.name, image.camera_to_world, ids, None, camera))
         if not frames:
@@ -99,7 +102,7 @@ def read_recording(folder: Path) -> Recording:
 
 
 def _one(key: str, rooms: list[tuple[Path, _RoomEntry]]) -> Any:
-    """What the files of a room say of a key; they agree."""
+    """Value of a key that all files of a room with this key must share; None if there is none."""
     said = [(path.name, getattr(room, key)) for path, room in rooms]
     said = [(name, value) for name, value in said if value is not None]
     for name, value in said[1:]:
@@ -122,24 +125,28 @@ def _frame(path: Path, data: dict[str, Any], number: int) -> PosedFrame:
     if not isinstance(item, dict) or not isinstance(item.get("file_path"), str):
         raise InputError(f"{path}, frame {number}: it has no `file_path`.")
     name = item["file_path"]
-    where = f"{path}, frame '{name}'"
+    where = f"{path}, frame {shown(name)}"
+    try:
+        ids = ids_path(path.parent, name)
+    except InputError as error:
+        raise InputError(f"{path}, frame {number}: `file_path` {error}") from None
     own = {key: value for key, value in item.items() if value is not None}
     of_file = {key: data[key] for key in Camera.model_fields if data.get(key) is not None}
     entry = checked(_FrameEntry, of_file | own, where)
     return PosedFrame(
         name,
         _matrix(where, item.get("transform_matrix")),
-        path.parent / entry.instance_path if entry.instance_path else ids_path(path.parent, name),
+        path.parent / entry.instance_path if entry.instance_path else ids,
         path.parent / entry.mask_path if entry.mask_path else None,
         entry,
     )
 
 
 def _matrix(where: str, value: Any) -> np.ndarray:
-    """(4, 4); a row (0, 0, 0, 1) that is left out is added. NaN may be in it: a lost pose."""
+    """Parse a (4, 4) matrix, which may lack its last row. NaN (a lost pose) is allowed."""
     try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
+        matrix = number_array(value)
+    except (TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.shape == (3, 4):
         matrix = np.concatenate([matrix, [[0, 0, 0, 1]]])

@@ -1,4 +1,4 @@
-"""Labels the views of one room of posed pictures, in the arrays that shards store."""
+"""Labels the views of one posed room and returns the arrays stored in shards."""
 
 import math
 from dataclasses import dataclass
@@ -6,32 +6,33 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_prep.engine.source import PreparedRoom
-from data_prep.frames import choose_frames, room_cameras
+from data_prep.frames import choose_frames, is_pose, pose_fault, room_cameras
 from data_prep.posed.cameras import UP, cameras_in_room, upright_cameras
 from data_prep.posed.floor import find_floor
 from data_prep.posed.masks import RoomMasks, png_size
 from data_prep.posed.recording import PosedFrame, Recording, room_name
-from sceneprior.errors import InputError
-from sceneprior.instances.observations import Observations, observe
+from sceneprior.core.errors import InputError
+from sceneprior.core.instances.checked import shown
+from sceneprior.core.instances.observations import Observations, observe
 
 
 @dataclass(frozen=True)
 class PosedSettings:
-    """How posed pictures become views."""
+    """Settings that turn posed pictures into views."""
 
     up: str = "auto"
-    """Which axis of the poses' world points up, z or y; `cameras`: up is where cameras that were
-    held upright agree it is. `auto` is z, as in nerfstudio's files, and `cameras` for COLMAP's."""
+    """Up direction of the poses' world: the axis `z` or `y`, or `cameras`, which estimates it from
+    cameras held upright. `auto` is z, as in nerfstudio's files, or `cameras` for COLMAP's."""
     floor_m: float | None = None
-    """Height of the floor in rooms whose file does not say; None: found, see `find_floor`."""
+    """Height of the floor in rooms whose file has none; None estimates it (`find_floor`)."""
     camera_height_m: float = 1.2
-    """Where it cannot be found, the lowest camera is taken to be this far above the floor."""
+    """Height of the lowest camera above the floor, assumed if the floor cannot be estimated."""
     metres_per_unit: float = 1.0
-    """In rooms whose file does not say. Poses from pictures alone (COLMAP) have no unit."""
+    """Scale in rooms whose file has none. Poses from pictures alone (COLMAP) have no unit."""
     max_side: int | None = None
-    """Larger masks are sampled down until no side is longer."""
+    """Maximum side in pixels; larger masks are downsampled."""
     max_views: int = 100
-    """More frames than this are thinned evenly (paper: 100)."""
+    """Maximum number of views; more frames are thinned evenly (paper: 100)."""
 
     def __post_init__(self) -> None:
         if self.up not in UP:
@@ -48,7 +49,7 @@ class PosedSettings:
 
 
 def usable_frames(recording: Recording) -> list[PosedFrame]:
-    """Frames with a PNG of ids, in the file's order; poses may still be lost.
+    """Frames with a PNG of ids, in the file's order; their poses may be invalid.
 
     Raises:
         InputError: there is none.
@@ -63,7 +64,7 @@ def usable_frames(recording: Recording) -> list[PosedFrame]:
 
 
 def stored_size(recording: Recording, settings: PosedSettings) -> tuple[int, int]:
-    """(height, width) at which a room is stored: that of its PNGs, or less by `max_side`."""
+    """Size, (height, width), at which a room is stored: that of its PNGs, limited by `max_side`."""
     height, width = png_size(recording.folder, usable_frames(recording)[0])
     shrink = 1.0 if settings.max_side is None else min(1, settings.max_side / max(height, width))
     return max(1, round(height * shrink)), max(1, round(width * shrink))
@@ -72,8 +73,10 @@ def stored_size(recording: Recording, settings: PosedSettings) -> tuple[int, int
 def prepare_posed(
     recording: Recording, label_set_name: str, settings: PosedSettings
 ) -> PreparedRoom | None:
-    """Label the views of one room, which has no ground truth in 3D; None if no view shows an
-    object of the label set.
+    """Label the views of one room, without 3D ground truth.
+
+    Returns:
+        The room; None if no view shows an object of the label set.
 
     Raises:
         InputError: a file is missing, damaged, or does not fit the others.
@@ -85,7 +88,8 @@ def prepare_posed(
     if not choice.frames:
         raise InputError(
             f"{recording.path} has no usable frame: {choice.bad_poses} of {choice.candidates} have "
-            f"no usable pose (a rotation with a translation), {choice.without_mask} no PNG of ids."
+            f"no usable pose (a rotation with a translation), {choice.without_mask} no PNG of ids"
+            f"{_first_fault(recording)}."
         )
     notes = [
         f"{count} of {choice.candidates} frames have {what}; skipped"
@@ -113,10 +117,17 @@ def prepare_posed(
     return PreparedRoom(views, notes=tuple(notes))
 
 
+def _first_fault(recording: Recording) -> str:
+    for frame in recording.frames:
+        if not is_pose(frame.camera_to_world[None])[0]:
+            return f"; frame {shown(frame.name)}: {pose_fault(frame.camera_to_world)}"
+    return ""
+
+
 def _unsaid_floor(
     seen: Observations, upright: np.ndarray, intrinsics: np.ndarray, settings: PosedSettings
 ) -> tuple[float, str]:
-    """The height of a floor that nobody measured, and a sentence about it."""
+    """Estimate or assume the height of an unknown floor, with a note that says which."""
     lowest = float(upright[:, 1, 3].min())
     found = find_floor(seen, room_cameras(upright, np.eye(4)), intrinsics)
     if found is not None and found.height_m < lowest:

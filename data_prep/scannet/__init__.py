@@ -1,1 +1,1 @@
-"""ScanNet as a source of rooms: its raw scan folders (.sens, zips, JSON, PLY)."""
+"""Source for ScanNet's raw scan folders (.sens, zips, JSON, PLY)."""

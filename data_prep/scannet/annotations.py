@@ -1,31 +1,31 @@
-"""Reads a scan's alignment and each object's vertices, from its `.txt`, JSONs and mesh."""
+"""Reads a scan's alignment, objects and mesh from its `.txt`, JSON and PLY files."""
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sceneprior.errors import InputError
-from sceneprior.scene import Mesh
+from sceneprior.core.errors import InputError
+from sceneprior.core.instances.checked import shown
+from sceneprior.core.scene import Mesh
 
 _RIGID_SLACK = 1e-2
 
 
 @dataclass(frozen=True)
 class Group:
-    """One annotated object: `segGroups[]` of the aggregation."""
+    """One annotated object: an entry of the aggregation's `segGroups`."""
 
     object_id: int
     category: str
-    """The annotators' word for it."""
+    """Raw category chosen by the annotators."""
     segments: frozenset[int]
 
 
 def read_properties(path: Path) -> dict[str, str]:
-    """The `key = value` lines of `<scene>.txt`.
+    """Read the `key = value` lines of `<scene>.txt`.
 
     Raises:
         InputError: the file is missing or not text.
@@ -39,12 +39,12 @@ def read_properties(path: Path) -> dict[str, str]:
 
 
 def axis_alignment(path: Path, properties: dict[str, str]) -> np.ndarray:
-    """(4, 4) float64, from the scan's frame to one with its walls along the axes, z up.
+    """Rigid transform, (4, 4) float64, that aligns the scan's walls with the axes; z is up.
 
-    The identity where the file has none: scans of version 1, and test scans.
+    The identity if the file has none, as for scans of version 1 and test scans.
 
     Raises:
-        InputError: it is not 16 numbers, or does not move the scan rigidly.
+        InputError: it is not 16 numbers, or not a rigid transform.
     """
     if "axisAlignment" not in properties:
         return np.eye(4)
@@ -61,17 +61,21 @@ def axis_alignment(path: Path, properties: dict[str, str]) -> np.ndarray:
         not np.isfinite(matrix).all()
         or np.abs(turn.T @ turn - np.eye(3)).max() > _RIGID_SLACK
         or np.abs(matrix[3] - (0, 0, 0, 1)).max() > _RIGID_SLACK
-        or np.linalg.det(turn) < 0
     ):
         raise InputError(
             f"{path}: axisAlignment does not turn and move the scan, it distorts it; "
             "the file is damaged. Download the scan again."
         )
+    if np.linalg.det(turn) < 0:
+        raise InputError(
+            f"{path}: axisAlignment mirrors the scan (its determinant is -1, expected 1); the file "
+            "is damaged, or an axis was flipped. Download the scan again."
+        )
     return matrix
 
 
 def read_groups(path: Path) -> tuple[list[Group], list[str]]:
-    """The objects of `<scene>.aggregation.json`, by object id, and what was odd about them.
+    """Read the objects of `<scene>.aggregation.json`, sorted by id, with notes on oddities.
 
     Raises:
         InputError: the file is missing, truncated, or not an aggregation.
@@ -83,7 +87,7 @@ def read_groups(path: Path) -> tuple[list[Group], list[str]]:
         for entry in data["segGroups"]:
             number, category = entry["objectId"], entry["label"]
             if not _is_index(number) or not isinstance(category, str):
-                raise TypeError(f"objectId {number!r} with label {category!r}")
+                raise TypeError(f"objectId {shown(number)} with label {shown(category)}")
             segments = frozenset(entry["segments"])
             if not all(_is_index(segment) for segment in segments):
                 raise TypeError(f"the segments of object {number} are not all whole numbers")
@@ -100,7 +104,7 @@ def read_groups(path: Path) -> tuple[list[Group], list[str]]:
 
 
 def read_segments(path: Path) -> np.ndarray:
-    """(vertices,) int64, the segment of each mesh vertex, from `<scene>_vh_clean_2...segs.json`.
+    """Read the segment of each mesh vertex from `<scene>_vh_clean_2...segs.json`: (V,) int64.
 
     Raises:
         InputError: the file is missing, truncated, or not a segmentation.
@@ -119,7 +123,7 @@ def read_segments(path: Path) -> np.ndarray:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """`<scene>_vh_clean_2.ply` in the scan's own frame, z up: vertices (V, 3) float64, metres.
+    """Read `<scene>_vh_clean_2.ply` in the scan's frame, z up: vertices float64, metres.
 
     Raises:
         InputError: the file is missing, truncated, or holds no finite vertices.
@@ -129,13 +133,12 @@ def read_mesh(path: Path) -> Mesh:
     if not path.is_file():
         raise _unreadable(path, FileNotFoundError("no such file"))
     try:
-        # The arrays of the file, not a Trimesh: merged or dropped vertices would no longer be
-        # those of segs.json.
+        # Load raw arrays, not a Trimesh, which may merge or drop vertices: segs.json indexes them.
         with path.open("rb") as file:
             loaded = load_ply(file, fix_texture=False, skip_materials=True)
         vertices = np.array(loaded["vertices"], dtype=np.float64).reshape(-1, 3)
         faces = np.array(loaded.get("faces", ()), dtype=np.int64).reshape(-1, 3)
-    except Exception as error:  # a damaged PLY surprises trimesh in many ways
+    except Exception as error:  # trimesh raises many types for damaged files
         raise InputError(
             f"{path} is not a mesh that can be read ({type(error).__name__}: {error}); "
             "it is truncated or damaged. Download the scan again."
@@ -148,7 +151,7 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def object_parts(groups: list[Group], segments: np.ndarray) -> list[np.ndarray]:
-    """Which vertices of the mesh are each group's; `segments` (V,) are the vertices'."""
+    """Indices of each group's mesh vertices; `segments` (V,) has the segment of each vertex."""
     order = np.argsort(segments, kind="stable")
     numbers, starts = np.unique(segments[order], return_index=True)
     parts = dict(zip(numbers.tolist(), np.split(order, starts[1:]), strict=True))
@@ -160,19 +163,22 @@ def object_parts(groups: list[Group], segments: np.ndarray) -> list[np.ndarray]:
 
 
 def surface_of(mesh: Mesh, part: np.ndarray) -> Mesh | None:
-    """The triangles of a mesh that have all corners in a part of its vertices; None without any."""
-    inside = np.zeros(len(mesh.vertices_m), dtype=bool)
-    inside[part] = True
-    faces = mesh.faces[inside[mesh.faces].all(axis=1)]
-    if not len(faces):
-        return None
-    used, numbered = np.unique(faces, return_inverse=True)
-    return Mesh(mesh.vertices_m[used], numbered.reshape(-1, 3))
+    """Cut the submesh with the vertices `part` out of a mesh; None if it has no triangles.
+
+    All vertices of the part are kept, even if no triangle uses them, as at borders with other
+    objects, so that the surface has the same bounding box as the object.
+    """
+    part = np.sort(part)
+    number = np.full(len(mesh.vertices_m), -1)
+    number[part] = np.arange(len(part))
+    faces = number[mesh.faces]
+    faces = faces[(faces >= 0).all(axis=1)]
+    return Mesh(mesh.vertices_m[part], faces) if len(faces) else None
 
 
 def _is_index(value: Any) -> bool:
-    # JSON's true is Python's 1; a float is no index even where it is whole.
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < math.inf
+    # bool is a subclass of int; a float is no index, even if it is a whole number.
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
 
 
 def _read_json(path: Path, why: str) -> Any:

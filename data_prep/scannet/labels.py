@@ -1,45 +1,45 @@
-"""The class of every raw category of ScanNet, from its label table."""
+"""Maps ScanNet's raw categories to classes by its label table."""
 
 import csv
 from dataclasses import dataclass
 from pathlib import Path
 
-from sceneprior.classes import label_set
-from sceneprior.errors import InputError
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
 
 LABEL_SET = "scannet"
 SHELL = frozenset(
     ["wall", "floor", "ceiling", "door", "window", "blinds", "floor mat", "mirror", "picture"]
 )
-"""NYU40 classes of the room itself. Every piece of furniture stands against one of them in the
-image, and none of them hides it: they are drawn as nothing."""
+"""NYU40 classes of the room itself. They have id 0 in the images, because they surround all
+furniture and rarely occlude it."""
 
 
 @dataclass(frozen=True)
 class Labels:
-    """What the raw categories of the annotators mean."""
+    """Classes of the annotators' raw categories."""
 
     nyu40: dict[str, str]
-    """Raw category -> NYU40 class, both in lower case."""
+    """NYU40 class by raw category, both in lower case."""
     source: str
     """Name of the table, for messages."""
 
     def knows(self, category: str) -> bool:
-        """Whether the table lists a raw category."""
+        """Test whether the table lists a raw category."""
         return _tidy(category) in self.nyu40
 
     def label(self, category: str) -> str:
-        """Class in the label set `scannet`; `void` for anything outside the 19."""
+        """Class in the label set `scannet`; `void` for anything outside its 19 classes."""
         name = self.nyu40.get(_tidy(category), "")
         return name if name in label_set(LABEL_SET) else "void"
 
     def is_shell(self, category: str) -> bool:
-        """Whether this is a part of the room rather than a thing in it."""
+        """Test whether this is a part of the room, such as a wall, rather than furniture."""
         return self.nyu40.get(_tidy(category), "") in SHELL
 
 
 def read_labels(path: Path) -> Labels:
-    """Read `scannetv2-labels.combined.tsv`. Where a category repeats, its last row wins.
+    """Read `scannetv2-labels.combined.tsv`; of a repeated category, the last row wins.
 
     Raises:
         InputError: the file is missing or is not that table.
@@ -47,7 +47,7 @@ def read_labels(path: Path) -> Labels:
     path = Path(path)
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            # Some categories hold a quotation mark (inches), which means nothing here.
+            # Some categories contain a literal quotation mark (inches).
             rows = list(csv.reader(file, delimiter="\t", quoting=csv.QUOTE_NONE))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Reads single instance masks out of a zip; nothing is unpacked to disk."""
+"""Reads single instance masks from a zip, without unpacking it to disk."""
 
 import contextlib
 import io
@@ -10,29 +10,30 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
+from sceneprior.core.instances.checked import plain, shown
 
 MASK_FILES = {"filt": "_2d-instance-filt.zip", "raw": "_2d-instance.zip"}
-"""What `--masks` may be, and how the archive's name goes on after the scan's."""
+"""Suffix of the archive's name, after the scan's, for each value of `--masks`."""
 _LARGEST_MEMBER_BYTES = 64 << 20
-"""A mask of 1296 x 968 has some 10 KB, and 1.2 MB if it were not compressed at all."""
+"""Size limit of a mask; one of 1296 x 968 has some 10 KB, or 1.2 MB uncompressed."""
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _HEADER_BYTES = 26
 
 
 class MaskArchive:
-    """One open archive of masks: 8-bit grey PNGs, value = objectId + 1, 0 = nothing.
+    """An open archive of masks: 8-bit grey PNGs, value = objectId + 1, 0 = no object.
 
-    A member's folder is free, its stem is the frame number (`instance-filt/123.png`). Close it,
-    or use it in a `with` block.
+    The stem of a member is its frame number (`instance-filt/123.png`), in any folder. Close the
+    archive, or use it in a `with` block.
 
     Attributes:
-        frames: The frame numbers that have a mask, ascending.
+        frames: Numbers of the frames with a mask, ascending.
         image_size: (height, width) of every mask.
 
     Raises:
-        InputError: the file is missing, damaged or truncated; a member's name leaves the archive;
-            two members are one frame; no member is a mask.
+        InputError: the file is missing, damaged or truncated; a member's path leads out of the
+            archive; two members have the same frame number; no member is a mask.
     """
 
     def __init__(self, path: Path):
@@ -48,7 +49,7 @@ class MaskArchive:
             self._members = self._list()
             self.frames = tuple(sorted(self._members))
             self.image_size = self._size(self.frames[0])
-            undo.pop_all()  # all went well: it stays open
+            undo.pop_all()  # success: keep the archive open
 
     def __enter__(self) -> "MaskArchive":
         return self
@@ -57,15 +58,15 @@ class MaskArchive:
         self.close()
 
     def close(self) -> None:
-        """Release the file."""
+        """Close the file."""
         self._zip.close()
 
     def read(self, frame: int) -> np.ndarray:
-        """The mask of one frame, (height, width) uint8: objectId + 1, 0 where no object is.
+        """Read the mask of one frame, (height, width) uint8: objectId + 1, or 0 for no object.
 
         Raises:
-            InputError: there is no such frame; the member is damaged, not 8-bit grey, or of
-                another size than the archive's first.
+            InputError: there is no such frame; the member is damaged, not 8-bit grey, or differs in
+                size from the archive's first.
         """
         if frame not in self._members:
             raise InputError(f"{self.path} has no mask of frame {frame}.")
@@ -76,7 +77,7 @@ class MaskArchive:
                 f"{self.image_size[1]} x {self.image_size[0]}; an archive has one size."
             )
         try:
-            # Pillow rather than cv2: it refuses a picture that is cut off, cv2 fills it up.
+            # Pillow rejects truncated pictures; cv2 would pad them.
             with Image.open(io.BytesIO(self._bytes(frame))) as picture:
                 return np.asarray(picture).copy()
         except (OSError, ValueError, SyntaxError, EOFError, zlib.error) as error:
@@ -88,17 +89,17 @@ class MaskArchive:
             parts = item.filename.replace("\\", "/").split("/")
             if parts[0] == "" or ".." in parts or re.match(r"[A-Za-z]:", parts[0]):
                 raise InputError(
-                    f"{self.path} holds '{item.filename}', a name that leads out of the archive; "
-                    "no file of ScanNet's does. Do not use it: download the archive again."
+                    f"{self.path} holds {shown(item.filename)}, a name that leads out of the "
+                    "archive; no file of ScanNet's does. Do not use it: download the archive again."
                 )
             found = re.fullmatch(r"([0-9]{1,9})\.png", parts[-1], re.IGNORECASE)
             if not found:
-                continue  # folders, and what a Mac adds
+                continue  # folders, and files that macOS adds
             frame = int(found[1])
             if frame in members:
                 raise InputError(
-                    f"{self.path} holds frame {frame} twice: '{members[frame].filename}' and "
-                    f"'{item.filename}'; keep one of them."
+                    f"{self.path} holds frame {frame} twice: {shown(members[frame].filename)} and "
+                    f"{shown(item.filename)}; keep one of them."
                 )
             members[frame] = item
         if not members:
@@ -108,7 +109,7 @@ class MaskArchive:
         return members
 
     def _size(self, frame: int) -> tuple[int, int]:
-        """Height and width of a mask, from the first bytes of its PNG."""
+        """Read the height and width of a mask from its PNG header."""
         head = self._bytes(frame, _HEADER_BYTES)
         if len(head) < _HEADER_BYTES or not head.startswith(_PNG_START):
             raise self._damaged(frame, "it is not a PNG")
@@ -135,13 +136,14 @@ class MaskArchive:
         except (
             OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error,
         ) as error:  # fmt: skip
-            # RuntimeError: it has a password; NotImplementedError is one, too.
+            # RuntimeError means a password; NotImplementedError is a subclass.
             raise self._damaged(frame, error) from None
 
     def _damaged(self, frame: int, why: object) -> InputError:
         return InputError(
-            f"{self._where(frame)} cannot be read ({why}); download the archive again."
+            f"{self._where(frame)} cannot be read ({plain(str(why), 200)}); download the archive "
+            "again."
         )
 
     def _where(self, frame: int) -> str:
-        return f"{self.path}, {self._members[frame].filename}"
+        return f"{self.path}, {plain(self._members[frame].filename)}"

@@ -1,11 +1,18 @@
-"""Reads one scan folder: its objects in the room frame, and its cameras."""
+"""Reads one scan folder: objects in the room frame, and cameras."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from data_prep.frames import FrameChoice, choose_frames, mask_intrinsics, room_cameras
+from data_prep.frames import (
+    FrameChoice,
+    choose_frames,
+    is_pose,
+    mask_intrinsics,
+    pose_fault,
+    room_cameras,
+)
 from data_prep.scannet.annotations import (
     axis_alignment,
     object_parts,
@@ -17,31 +24,32 @@ from data_prep.scannet.annotations import (
 )
 from data_prep.scannet.labels import Labels
 from data_prep.scannet.masks import MASK_FILES, MaskArchive
-from data_prep.scannet.sens import read_recording
-from sceneprior.errors import InputError
-from sceneprior.scene import Mesh
+from data_prep.scannet.sens import Recording, read_recording
+from sceneprior.core.errors import InputError
+from sceneprior.core.instances.checked import plain, shown
+from sceneprior.core.scene import Mesh
 
 FULL_SIZE = (968, 1296)
 QUARTER_SIZE = (242, 324)
-"""(height, width) of ScanNet's colour frames, and the quarter at which the paper renders."""
+"""(height, width) of ScanNet's colour frames, and a quarter of it, the paper's rendering size."""
 
 _Y_UP = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""(x, y, z) with z up -> (y, z, x) with y up; right-handed as before."""
+"""Maps (x, y, z) with z up to (y, z, x) with y up; stays right-handed."""
 
 
 @dataclass(frozen=True)
 class ScanSettings:
-    """How a recording becomes views."""
+    """Settings that turn a recording into views."""
 
     frame_step: int = 15
-    """Every so many frames is a candidate; ScanNet's common export takes every 15th."""
+    """Step between candidate frames; ScanNet's common export takes every 15th."""
     max_views: int = 100
-    """More candidates than this are thinned evenly (paper: 100)."""
+    """Maximum number of views; more candidates are thinned evenly (paper: 100)."""
     masks: str = "filt"
-    """`filt`, which ScanNet cleaned along depth and colour edges, or `raw`, the projected mesh."""
+    """`filt`: cleaned by ScanNet along depth and colour edges; `raw`: the projected mesh."""
     image_size: tuple[int, int] = QUARTER_SIZE
-    """(height, width) of every stored image. One size for all rooms, also for the few that were
-    recorded at 640 x 480: a batch holds many rooms. `FULL_SIZE` keeps every pixel."""
+    """(height, width) of stored images. It is the same for all rooms, even those recorded at
+    640 x 480, because batches mix rooms. `FULL_SIZE` keeps every pixel."""
 
     def __post_init__(self) -> None:
         if self.masks not in MASK_FILES:
@@ -59,60 +67,64 @@ class Instance:
     """One annotated object with the box of its vertices, in the room frame."""
 
     object_id: int
-    """Masks say this + 1."""
+    """Id of the object; its value in the masks is one more."""
     category: str
-    """The annotators' word."""
+    """Raw category chosen by the annotators."""
     label: str
-    """Class of the label set `scannet`; `void` outside the 19."""
+    """Class of the label set `scannet`; `void` outside its 19 classes."""
     is_shell: bool
-    """A part of the room (wall, floor, ...), not a thing in it."""
+    """True for a part of the room (wall, floor, ...), false for furniture."""
     lower_m: np.ndarray
     upper_m: np.ndarray
     """(3,) float64 corners of the axis-aligned box."""
+    vertices: np.ndarray
+    """Indices of the object's vertices in the scan's mesh."""
     surface: Mesh | None
-    """What the scan saw of it, in the room frame; None of what has no class."""
+    """Scanned surface of the object in the room frame; None for an object without a class."""
 
 
 @dataclass(frozen=True)
 class Scan:
-    """A scan: its objects and cameras in memory, its masks still in their zip."""
+    """A scan: objects and cameras in memory, masks still in their zip."""
 
     folder: Path
     scene_type: str
-    """Such as "Bedroom / Hotel"; empty where the scan does not say."""
+    """Type of room, such as "Bedroom / Hotel"; empty if the scan has none."""
     instances: tuple[Instance, ...]
-    """By object id; those without vertices are missing."""
+    """Objects in the order of their ids, without those that have no vertices."""
+    mesh: Mesh
+    """The whole scanned mesh in the room frame, with its unannotated parts."""
     room_from_scan: np.ndarray
-    """(4, 4) float64, rigid, from the scan's own frame (z up) to the room frame."""
+    """(4, 4) float64, rigid transform from the scan's frame (z up) to the room frame."""
     floor_m: np.ndarray
-    """(4, 2) x, z of the rectangle round the objects."""
+    """(4, 2) x, z of the bounding rectangle of the objects."""
     height_m: float
-    """From the floor to the highest vertex of the scan."""
+    """Height of the scan's highest vertex above the floor."""
     frames: tuple[int, ...]
     """Frame number of each view."""
     world_to_camera: np.ndarray
     """(views, 4, 4) float64, OpenCV axes, from the room frame."""
     intrinsics: np.ndarray
-    """(3, 3) float64, pixels of an image of the settings' size."""
+    """(3, 3) float64, in pixels of an image of `settings.image_size`."""
     masks: Path
     settings: ScanSettings
     notes: tuple[str, ...]
-    """What was left out, and why."""
+    """Parts of the scan that were left out, with reasons."""
 
     @property
     def scan_id(self) -> str:
-        """`scene0000_00`; a room that was scanned twice is two rooms."""
+        """Id of the scan, such as `scene0000_00`; each scan of a space is a room of its own."""
         return self.folder.name
 
 
 def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None) -> Scan:
-    """Read everything of a scan but its pictures.
+    """Read all of a scan except its pictures.
 
-    The room frame: axisAlignment, then (x, y, z) -> (y, z, x), so that y is up. The floor, y = 0,
-    is the lowest point of the boxes of objects that have a class, and its centre, the origin, the
-    middle of the rectangle around these boxes in x and z: ScanNet has no floor plan, and its
-    annotated floors are as ragged as what the camera happened to see. Where no object has a
-    class, the whole mesh takes their place.
+    The room frame is that of axisAlignment, with (x, y, z) mapped to (y, z, x) so that y is up. The
+    floor, y = 0, is at the lowest point of the boxes of objects with a class; the origin is the
+    centre of their bounding rectangle in x and z. ScanNet has no floor plans, and its annotated
+    floors cover only the parts that the camera saw. If no object has a class, the box of the whole
+    mesh is used instead.
 
     Raises:
         InputError: a file is missing or damaged, files do not belong together, or no frame has
@@ -161,15 +173,18 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
     for group, box, part in zip(groups, bounds, parts, strict=True):
         if not labels.knows(group.category):
             notes.append(
-                f"object {group.object_id}: '{group.category}' is not in {labels.source}, so void"
+                f"object {group.object_id}: {shown(group.category)} is not in {labels.source}, so "
+                "void"
             )
         if box is None:
-            notes.append(f"object {group.object_id} ({group.category}) has no vertices; left out")
+            notes.append(
+                f"object {group.object_id} ({plain(group.category)}) has no vertices; left out"
+            )
             continue
         kind, is_shell = labels.label(group.category), labels.is_shell(group.category)
         corners = box[0] - origin, box[1] - origin
         surface = None if kind == "void" else surface_of(mesh, part)
-        item = Instance(group.object_id, group.category, kind, is_shell, *corners, surface)
+        item = Instance(group.object_id, group.category, kind, is_shell, *corners, part, surface)
         instances.append(item)
     half = (upper - lower)[[0, 2]] / 2
     choice, world_to_camera, intrinsics, masks = _read_cameras(folder, room_from_scan, settings)
@@ -183,6 +198,7 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
         folder=folder,
         scene_type=properties.get("sceneType", ""),
         instances=tuple(instances),
+        mesh=mesh,
         room_from_scan=room_from_scan,
         floor_m=np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half,
         height_m=float(whole[1][1] - origin[1]),
@@ -198,7 +214,7 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
 def _read_cameras(
     folder: Path, room_from_scan: np.ndarray, settings: ScanSettings
 ) -> tuple[FrameChoice, np.ndarray, np.ndarray, Path]:
-    """Which frames, their world_to_camera, the intrinsics of all, and the archive of masks."""
+    """Choose the frames; returns them, world_to_camera, the intrinsics, and the mask archive."""
     mask_path = _mask_path(folder, settings.masks)
     sens_path = folder / f"{folder.name}.sens"
     sens = read_recording(sens_path)
@@ -209,8 +225,8 @@ def _read_cameras(
         raise InputError(
             f"{sens_path} gives no view: of {choice.candidates} frames (every "
             f"{settings.frame_step}), {choice.bad_poses} have no usable pose and "
-            f"{choice.without_mask} no mask in {mask_path.name}. Download the scan again, or "
-            "leave it out."
+            f"{choice.without_mask} no mask in {mask_path.name}{_first_fault(sens, settings)}. "
+            "Download the scan again, or leave it out."
         )
     try:
         intrinsics = mask_intrinsics(
@@ -220,6 +236,14 @@ def _read_cameras(
         raise InputError(f"{mask_path}: {error}") from None
     poses = sens.camera_to_world[list(choice.frames)]
     return choice, room_cameras(poses, room_from_scan), intrinsics, mask_path
+
+
+def _first_fault(sens: Recording, settings: ScanSettings) -> str:
+    for frame in range(0, len(sens.camera_to_world), settings.frame_step):
+        pose = sens.camera_to_world[frame]
+        if not is_pose(pose[None])[0]:
+            return f" (the pose of frame {frame}: {pose_fault(pose)})"
+    return ""
 
 
 def _mask_path(folder: Path, kind: str) -> Path:

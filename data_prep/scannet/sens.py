@@ -1,4 +1,4 @@
-"""Reads poses and intrinsics of a `.sens` recording; its pictures are skipped."""
+"""Reads the poses and intrinsics of a `.sens` recording and skips its pictures."""
 
 import struct
 from dataclasses import dataclass
@@ -7,41 +7,41 @@ from typing import BinaryIO
 
 import numpy as np
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 VERSION = 4
 _COLOR_KINDS, _DEPTH_KINDS = (-1, 0, 1, 2), (-1, 0, 1, 2)
 _LONGEST_SIDE_PX = 1 << 16
-"""No camera of this data set is larger; such numbers are damage."""
+"""Image sizes from here on are damage: the data set has none so large."""
 _FRAME = struct.Struct("<16f4Q")
-"""camera_to_world; times of colour and depth; bytes of colour and depth."""
+"""Header of a frame: camera_to_world; timestamps and byte counts of colour and depth."""
 _AFTER_CALIBRATION = struct.Struct("<2i4IfQ")
-"""Compressions; colour and depth width, height; depth shift; frames."""
+"""Rest of the header: compressions; widths and heights of colour and depth; depth shift; number of
+frames."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What a `.sens` says of its cameras.
+    """Cameras of a `.sens` recording.
 
-    Depth and colour of the release are aligned already; the extrinsics of the header are therefore
-    not used.
+    Depth and colour of the release are already aligned, so the header's extrinsics are not used.
     """
 
     intrinsic_color: np.ndarray
-    """(4, 4) float64, the colour camera's, pixels of a frame of `color_size`. ScanNet counts pixel
-    centres in whole numbers (its own tools lift pixel x, y with K^-1 (x, y, 1));
-    `data_prep.frames.mask_intrinsics` turns them into ours."""
+    """(4, 4) float64, intrinsics of the colour camera in pixels of a frame of `color_size`. ScanNet
+    puts pixel centres at integers (its tools unproject pixel x, y by K^-1 (x, y, 1));
+    `data_prep.frames.mask_intrinsics` converts them to our convention."""
     color_size: tuple[int, int]
     """(height, width) of the colour frames."""
     camera_to_world: np.ndarray
-    """(frames, 4, 4) float32, OpenCV axes, metres, as written: lost frames hold infinities."""
+    """(frames, 4, 4) float32, OpenCV axes, metres, as written: untracked frames hold infinities."""
 
 
 def read_recording(path: Path) -> Recording:
-    """Read the header and every frame's pose.
+    """Read the header and the pose of every frame.
 
-    The 96 bytes before each frame's pictures are read and the pictures passed over, so that a
-    recording of several GB costs about a hundred bytes of memory a frame.
+    Only the 96 bytes before each frame's pictures are read, so that a recording of several GB needs
+    about a hundred bytes of memory per frame.
 
     Raises:
         InputError: the file is missing, of another version, truncated, or has impossible sizes;
@@ -50,7 +50,7 @@ def read_recording(path: Path) -> Recording:
     Source: ScanNet's SensReader (sensorData.h), version 4.
     """
     try:
-        # Unbuffered: a buffer would read 100 KB around every header it seeks to.
+        # Unbuffered, because a buffer would read 100 KB around every header.
         file = path.open("rb", buffering=0)
     except OSError as error:
         raise InputError(
@@ -104,7 +104,7 @@ class _Reader:
         return Recording(intrinsics, (height, width), self._poses(at + len(rest), frames))
 
     def _poses(self, at: int, frames: int) -> np.ndarray:
-        poses = bytearray()  # grows with what is found: a damaged count must not ask for memory
+        poses = bytearray()  # grows as frames are read: a damaged count must not allocate memory
         for frame in range(frames):
             name = f"frame {frame}"
             head = self._read(at, _FRAME.size, name, "its pose and sizes")
@@ -114,8 +114,8 @@ class _Reader:
             self._check_end(name, at, color, "the colour picture")
             self._check_end(name, at + color, depth, "the depth picture")
             at += color + depth
-        # The count of IMU records comes next. A file that ends right here lacks nothing we use;
-        # half a number tells of a broken download.
+        # The count of IMU records comes next. A file may end here without loss to us, but a
+        # truncated number means a broken download.
         if at != self.size:
             self._check_end("IMU records", at, 8, "their count")
         return np.frombuffer(poses, "<f4").reshape(-1, 4, 4).astype(np.float32)
@@ -129,7 +129,7 @@ class _Reader:
             raise InputError(
                 f"{self._where(frame, start)}: {what} cannot be read ({error.strerror})."
             ) from None
-        self._check_end(frame, start, size, what, start + len(data))  # cut while it was open
+        self._check_end(frame, start, size, what, start + len(data))  # truncated while open
         return data
 
     def _check_end(
@@ -138,7 +138,7 @@ class _Reader:
         """Check that bytes `start` to `start + size` lie inside the file."""
         left = max((self.size if end is None else end) - start, 0)
         if size > left:
-            # A negative size, read as unsigned, is just a very large one.
+            # A negative size, read as unsigned, is a very large one and ends here, too.
             raise InputError(
                 f"{self._where(frame, start)}: {what} should take {size} bytes, but {left} are "
                 "left; the file is truncated or damaged. Download it again."

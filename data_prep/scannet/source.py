@@ -1,4 +1,4 @@
-"""ScanNet as a source of rooms: a scan is a room, and its recording has its views."""
+"""Source for ScanNet: a scan is a room, and the frames of its recording are its views."""
 
 import functools
 from dataclasses import asdict, dataclass, field
@@ -13,8 +13,8 @@ from data_prep.scannet.labels import LABEL_SET, Labels, read_labels
 from data_prep.scannet.scans import ScanSettings, read_scan
 from data_prep.scannet.splits import find_scans, space_of, split_scans
 from data_prep.scannet.views import prepare_scan
-from sceneprior.errors import InputError
-from sceneprior.offscreen import Renderer
+from sceneprior.core.errors import InputError
+from sceneprior.render.offscreen import Renderer
 
 _OFFICIAL = Expected(
     of="ScanNet v2 by its lists; views as the paper counts them (section 5)",
@@ -24,7 +24,7 @@ _OFFICIAL = Expected(
 
 @dataclass(frozen=True)
 class ScanNetSource:
-    """What `prep-scannet` reads: a `Source` (data_prep/engine/source.py)."""
+    """The `Source` (data_prep/engine/source.py) behind `prep-scannet`."""
 
     name: ClassVar = "scannet"
     label_set: ClassVar = LABEL_SET
@@ -38,10 +38,10 @@ class ScanNetSource:
     train: Path | None = None
     """scannetv2_train.txt."""
     val: Path | None = None
-    """scannetv2_val.txt, which becomes the split `test`. Without lists: a seeded 9:1 of spaces."""
+    """scannetv2_val.txt, the split `test`. Without lists, spaces are split 9:1, seeded."""
     seed: int = 0
     only: str | None = None
-    """A scan; the beginning of its name is enough."""
+    """Name of a scan; a prefix suffices."""
 
     @property
     def expected(self) -> Expected | None:
@@ -62,13 +62,13 @@ class ScanNetSource:
                 name: None if path is None else digest(Path(path).read_text(encoding="utf-8"))
                 for name, path in lists.items()
             },
-            # Names alone: a scan that failed may be downloaded again, and tried with the others
-            # kept (`--retry-failed`), which sizes of files would forbid.
+            # Only names, not file sizes, so that a failed scan can be downloaded again and retried
+            # (`--retry-failed`) in the same folder.
             "scans": digest("\n".join(path.name for path in folders)),
         }
 
     def survey(self, run: Run) -> Survey:
-        """Which scans are there and in a split; no scan is opened."""
+        """List the scans on disk and their splits, without opening any scan."""
         folders = find_scans(self.scans)
         names = [path.name for path in folders]
         left_out: list[LeftOut] = []
@@ -81,7 +81,7 @@ class ScanNetSource:
             ):
                 left_out += [LeftOut(name, name, "filtered", why, "split") for name in scan_ids]
         else:
-            # By space: the same room scanned again must not be in both halves.
+            # Split by space, because rescans of a room must not be in both splits.
             half = seeded_split(list(dict.fromkeys(map(space_of, names))), self.seed)
             split_of = {name: half[space_of(name)] for name in names}
         tasks = tuple(RoomTask(name, name, split) for name, split in split_of.items())
@@ -108,7 +108,8 @@ class ScanNetSource:
         return chosen
 
 
-# Kept from room to room within a process; the stamp makes a long-lived worker see a mended table.
+# Cached from room to room within a process; the stamp makes long-lived workers reread a changed
+# table.
 @functools.lru_cache(maxsize=1)
 def _labels(path: Path, stamp: int) -> Labels:
     return read_labels(path)

@@ -1,28 +1,30 @@
-"""Which scans of a folder are in which split, by the official lists."""
+"""Assigns the scans of a folder to splits by the official lists."""
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 
 @dataclass(frozen=True)
 class ScanSplits:
-    """Which scans are prepared, and under which split."""
+    """Scans to prepare, and their splits."""
 
     split_of: dict[str, str]
-    """Scan id -> train or test, in the order of the folders."""
+    """Split (train or test) by scan id, in the order of the folders."""
     skipped: tuple[str, ...]
-    """Scans on disk that no list names."""
+    """Scans on disk that are in no list."""
     missing: tuple[str, ...]
-    """Scans that a list names and the disk has not."""
+    """Scans in a list that are not on disk."""
 
 
 def find_scans(folder: Path) -> list[Path]:
-    """The scan folders in ScanNet's `scans`, sorted: `scene0000_00` and whatever holds a `.sens`
-    of its own name. A folder that lost its `.sens` is listed, too, for the report to name it.
+    """Find the scan folders in ScanNet's `scans`, sorted.
+
+    A scan folder is named like `scene0000_00` or holds a `.sens` of its own name. It is listed even
+    if its `.sens` is missing, so that the report mentions it.
 
     Raises:
         InputError: the folder is missing, or holds no scans.
@@ -50,18 +52,20 @@ def _is_scan(path: Path) -> bool:
 
 
 def space_of(scan_id: str) -> str:
-    """The place a scan was made in, `scene0000` of `scene0000_01`. A split that is drawn at
-    random should draw spaces, or a room is in both halves."""
+    """Space in which a scan was made: `scene0000` for `scene0000_01`.
+
+    Random splits should be drawn over spaces, or the same room may be in both splits.
+    """
     return re.sub(r"_\d{2}$", "", scan_id)
 
 
 def split_scans(
     folders: Sequence[Path], train: Path | None = None, val: Path | None = None
 ) -> ScanSplits:
-    """Sort scans by the official lists, one scan id a line; those of `val` are the split `test`.
+    """Split scans by the official lists, one scan id per line; `val` becomes the split `test`.
 
     Raises:
-        InputError: a list cannot be read, both name one scan, or no scan is in a list.
+        InputError: a list cannot be read, a scan is in both, or no scan is in any.
     """
     listed: dict[str, str] = {}
     for path, split in ((train, "train"), (val, "test")):

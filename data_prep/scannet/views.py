@@ -1,7 +1,7 @@
-"""Labels the views of one scan, in the arrays that shards store."""
+"""Labels the views of one scan and returns the arrays stored in shards."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,33 +9,34 @@ from data_prep.engine.source import PreparedRoom
 from data_prep.frames import sampled_lines
 from data_prep.scannet.labels import LABEL_SET
 from data_prep.scannet.masks import MaskArchive
+from data_prep.scannet.occlusion import unoccluded
 from data_prep.scannet.scans import Scan
-from sceneprior.classes import label_set
-from sceneprior.instances.observations import observe
-from sceneprior.scene import Mesh
-from sceneprior.shards import RoomGroundTruth
+from sceneprior.core.classes import label_set
+from sceneprior.core.instances.observations import observe
+from sceneprior.core.scene import Mesh
+from sceneprior.core.shards import RoomGroundTruth
 
 
 @dataclass(frozen=True)
 class LabelledView:
-    """What one frame shows."""
+    """Instance ids of one frame."""
 
     frame: int
-    """Number in the recording."""
+    """Number of the frame in the recording."""
     world_to_camera: np.ndarray
     """(4, 4) float64."""
     ids: np.ndarray
-    """(height, width): 0 = nothing or the room's shell, k + 1 = instance k of the scan, and
-    len(instances) + 1 = an id that the aggregation does not have."""
+    """(height, width): 0 = no object or the room's shell, k + 1 = instance k of the scan, and
+    len(instances) + 1 = an object id that is missing from the aggregation."""
     unlisted: tuple[int, ...]
-    """Such object ids."""
+    """Object ids in the mask that are missing from the aggregation."""
 
 
 def labelled_views(scan: Scan) -> Iterator[LabelledView]:
-    """The scan's views in the order of their frames, one mask in memory at a time.
+    """Read the scan's views in the order of their frames, one mask in memory at a time.
 
-    Masks are sampled, never averaged, at `sampled_lines`; `scan.intrinsics` knows where the
-    sampled pixels' centres are.
+    Masks are downsampled without averaging (`sampled_lines`); `scan.intrinsics` accounts for the
+    offset of the sampled pixels' centres.
 
     Raises:
         InputError: a mask is damaged, or of another size than the first.
@@ -56,11 +57,11 @@ def labelled_views(scan: Scan) -> Iterator[LabelledView]:
 def prepare_scan(scan: Scan) -> PreparedRoom | None:
     """Label all views of a scan; None if no view shows an object.
 
-    An image of ids alone says that two objects touch, not which of them is in front. So
-    `sides_clear` treats ScanNet as it does drawn rooms: a side is the object's own where no other
-    thing touches it, and a thing is furniture, also of no class (`void`). The room's shell (walls,
-    floor, doors, ...) surrounds everything and stands behind it, so it counts as nothing; a corner
-    of a wall or an open door that does hide an object's side goes unnoticed.
+    An image of ids shows that two objects touch, but not which one is in front. So `sides_clear` is
+    defined as for rendered rooms: a side is clear if no other furniture, void included, touches
+    it. The room's shell (walls, floor, doors, ...) is ignored because it is nearly always behind;
+    a wall corner or an open door that does occlude a side goes unnoticed. The ground truth's
+    `unoccluded` accounts for these, but only `inspect --verify` uses it.
 
     Raises:
         InputError: a mask is damaged, or of another size than the first.
@@ -71,10 +72,11 @@ def prepare_scan(scan: Scan) -> PreparedRoom | None:
     for view in labelled_views(scan):
         images.append(view.ids)
         unlisted.update(view.unlisted)
-    # The last entry stands for ids without an object: they hide what is behind them.
+    # The last entry stands for ids without an object, which may occlude others.
     labels = [*(item.label for item in scan.instances), "void"]
     classes = np.array([names.index(label) for label in labels], dtype=np.int16)
     seen = observe(np.stack(images), classes)
+    del images  # `seen` has its own
     if not len(seen.tracked):
         return None
     notes = scan.notes
@@ -84,11 +86,12 @@ def prepare_scan(scan: Scan) -> PreparedRoom | None:
     views = seen.room_views(scan.scan_id, scan.world_to_camera, scan.intrinsics)
     order = np.concatenate([seen.tracked, seen.unseen])
     truth, models = _ground_truth(scan, order, classes[order])
+    truth = replace(truth, unoccluded=unoccluded(scan, seen.tracked))
     return PreparedRoom(views, truth, models, notes=notes)
 
 
 def _ids_of_values(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """(256,) our id of each mask value, and the values that the aggregation explains."""
+    """Table of our ids by mask value, (256,), and the mask values known to the aggregation."""
     unknown = len(scan.instances) + 1
     table = np.full(256, unknown, dtype=np.uint8 if unknown <= 255 else np.uint16)
     table[0] = 0
@@ -103,7 +106,7 @@ def _ids_of_values(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 def _ground_truth(
     scan: Scan, order: np.ndarray, classes: np.ndarray
 ) -> tuple[RoomGroundTruth, dict[str, Mesh]]:
-    """The scan's instances of these rows, and their surfaces as models round the origin."""
+    """Ground truth of these instances, and their surfaces as models centred at the origin."""
     lower = np.array([scan.instances[k].lower_m for k in order])
     upper = np.array([scan.instances[k].upper_m for k in order])
     centers_m = (lower + upper) / 2
@@ -114,7 +117,7 @@ def _ground_truth(
     for row, k in enumerate(order):
         item = scan.instances[k]
         if item.surface is None:
-            # No model is known: the unit cube stands for it, and fills the box.
+            # Without a model, the transform maps the unit cube to the box.
             model_ids.append("")
             places[row, :3, :3] = np.diag(upper[row] - lower[row])
             continue

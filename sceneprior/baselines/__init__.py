@@ -1,1 +1,1 @@
-"""What the paper is compared with, in 2D and in 3D."""
+"""Baselines that the paper is compared with, learnt from 2D or 3D supervision."""

@@ -1,4 +1,4 @@
-"""The LSTM of ablation c2 and Table 1, which takes the transformer's place."""
+"""The LSTM of ablation c2 and Table 1, in place of the paper's transformer."""
 
 from typing import Literal
 
@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from sceneprior.models.layers import DecoderConfig
+from sceneprior.paper.layers import DecoderConfig
 
 
 class LstmConfig(DecoderConfig):
-    """An LSTM as wide as its features has nothing to choose."""
+    """The LSTM has no settings: its state is as wide as its features."""
 
     name: Literal["lstm"] = "lstm"
 
@@ -21,9 +21,8 @@ class LstmConfig(DecoderConfig):
 class SceneLstm(nn.Module):
     """x_k is the LSTM's output on x_(k-1), and x_0 is z.
 
-    One layer whose state begins at zero. Unlike the transformer's, its output depends on the order
-    of the objects before, and z is an input of the first step alone. `width` is D_z, and the
-    state's size.
+    It has one layer, whose state starts at zero. Unlike the transformer's, its output depends on
+    the order of the previous objects, and only the first step reads z. `width` is D_z.
     """
 
     def __init__(self, width: int):
@@ -36,7 +35,7 @@ class SceneLstm(nn.Module):
         objects: int,
         needed: Int[Tensor, " rooms"] | None = None,
     ) -> Float[Tensor, "rooms objects width"]:
-        """Unroll `objects` steps; z is scaled as it is for the transformer."""
+        """Features of `objects` objects; z is scaled as in the paper's transformer."""
         feature, state = z * z.shape[-1] ** 0.5, None
         features: list[Tensor] = []
         for _ in range(objects):

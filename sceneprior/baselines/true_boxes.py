@@ -1,7 +1,7 @@
-"""True 3D boxes of a shard folder, in batches: for the baselines with 3D supervision.
+"""Batches of the true 3D boxes of a shard folder, for the baselines with 3D supervision.
 
-The only door from training to the shards' ground truth. `atiss` and `sync2gen` open it; what
-learns from masks and 2D boxes never does (tests/baselines/test_true_boxes.py).
+Only ATISS and Sync2Gen train on them; methods that learn from masks and 2D boxes never open them
+(tests/baselines/test_true_boxes.py).
 """
 
 import math
@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sceneprior.data.dataset import BLANK, RoomDataset
-from sceneprior.errors import ShardError
-from sceneprior.geometry.turns import turn_boxes
-from sceneprior.shards import RoomGroundTruth, Shard
-from sceneprior.views import RoomBoxes
+from sceneprior.core.data.dataset import BLANK, RoomDataset
+from sceneprior.core.errors import ShardError
+from sceneprior.core.geometry.turns import turn_boxes
+from sceneprior.core.shards import RoomGroundTruth, Shard
+from sceneprior.core.views import RoomBoxes
 
 
 class TruthDataset(RoomDataset):
-    """Every furnished box of every room of a split, in memory; rows and turns are `ViewDataset`'s.
+    """The boxes of all furniture in the rooms of a split, in memory, visible to a camera or not.
 
-    All furniture that has a class counts, seen by a camera or not.
+    Rows and turns are those of `ViewDataset`.
 
     Raises:
-        ShardError: a shard is missing, damaged, without ground truth, or labelled otherwise than
+        ShardError: a shard is missing, damaged, without ground truth, or of another label set than
             the first.
     """
 
@@ -49,12 +49,12 @@ class TruthDataset(RoomDataset):
         return self
 
     def everything(self) -> RoomBoxes:
-        """All rows as one batch: what statistics are taken from."""
+        """All rows as one batch, for statistics."""
         return self.__getitems__([(row, 0) for row in range(len(self))])
 
     def __getitems__(self, draws: list[tuple[int, int]]) -> RoomBoxes:
-        """A batch of rows; each draw is (row, epoch). A draw of an epoch `BLANK` is a room in which
-        there is nothing, and which has no id: it teaches nothing."""
+        """A batch of rows; each draw is (row, epoch). The epoch `BLANK` gives an empty room without
+        an id, which has no loss."""
         device = self._counts.device
         rows = torch.tensor([row for row, _ in draws], device=device)
         shown = torch.tensor([epoch != BLANK for _, epoch in draws], device=device)
@@ -73,11 +73,20 @@ class TruthDataset(RoomDataset):
         )
 
 
-def _read_truth(shard: Shard, room_id: str) -> RoomGroundTruth:
+def check_ground_truth(shard: Shard, room_id: str) -> None:
+    """Refuse a room without 3D ground truth.
+
+    Raises:
+        ShardError: it has none.
+    """
     if not shard.has_ground_truth(room_id):
         raise ShardError(
-            f"{shard.path}, room {room_id} carries no 3D ground truth, which is what this "
-            "stage learns from. Take shards of a data set that has it, or a stage that "
-            "learns from masks (method: ours)."
+            f"{shard.path}, room {room_id} carries no 3D ground truth, which this method learns "
+            "from. Take shards of a data set that has it, or a method that learns from masks "
+            "(paper, lifted, gan, usl)."
         )
+
+
+def _read_truth(shard: Shard, room_id: str) -> RoomGroundTruth:
+    check_ground_truth(shard, room_id)
     return shard.read_ground_truth(room_id)

@@ -1,4 +1,4 @@
-"""AlexNet as the paper's classifier of pictures: generated, or real?"""
+"""The paper's classifier of generated and real pictures: a fine-tuned AlexNet."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Int, UInt8
 from torch import Tensor, nn
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 SIZE_PX = 224
 EPOCHS = 10
@@ -23,13 +23,13 @@ ALEXNET: dict[str, Any] = {
     "learning_rate": LEARNING_RATE,
     "batch": BATCH,
 }
-"""How SCA is measured with AlexNet, for the result file."""
+"""Training settings of SCA with AlexNet, for the result file."""
 
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def check_alexnet(path: Path) -> None:
-    """Raise InputError where the file is missing or holds something else."""
+    """Raise InputError if the file is missing or does not hold AlexNet's weights."""
     _weights(path)
 
 
@@ -40,19 +40,21 @@ def classify_pictures(
     others: UInt8[np.ndarray, "others 224 224 3"],
     seed: int,
 ) -> Int[np.ndarray, " others"]:
-    """Fine-tune AlexNet on labelled pictures and classify others, on a GPU where there is one.
+    """Fine-tune AlexNet on labelled pictures and classify others, on a GPU if there is one.
+
+    Weights differ between processors in their last digits, so a picture near the decision boundary
+    may be classified differently on another machine.
 
     Args:
         path: `alexnet-owt-*.pth`, the state dict of torchvision's AlexNet.
         labels: 1 generated, 0 real.
-        seed: Of the new layer and of the order of the pictures.
+        seed: Seed of the new layer and of the order of the pictures.
 
     Source:
-        The paper's classifier is ATISS's. Training changes with the processor in the last digits,
-        and so may a close call.
+        ATISS (Paschalidou et al., NeurIPS 2021), whose classifier the paper uses.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    # Random numbers drawn after this stay the same as before.
+    # Forked, so that the caller's random numbers do not depend on this call.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = _network(_weights(path)).to(device)
@@ -83,7 +85,7 @@ def _input(pictures: np.ndarray, device: torch.device) -> Tensor:
 
 
 def _convolutions() -> nn.Sequential:
-    """torchvision's `features`, by the numbers that its file has."""
+    """torchvision's `features`; the layers' indices are the names in its state dict."""
     return nn.Sequential(
         nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2),
         nn.Conv2d(64, 192, 5, 1, 2), nn.ReLU(), nn.MaxPool2d(3, 2),
@@ -111,13 +113,13 @@ def _weights(path: Path) -> dict[str, Tensor]:
         )
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-        with torch.device("meta"):  # no numbers are drawn
+        with torch.device("meta"):  # shapes alone, no random initialisation
             expected = _convolutions().state_dict()
         weights = {name: state[f"features.{name}"] for name in expected}
         for name, tensor in weights.items():
             if tensor.shape != expected[name].shape:
                 raise ValueError(f"features.{name} has shape {tuple(tensor.shape)}")
-    except Exception as error:  # what torch raises depends on which byte is odd
+    except Exception as error:  # a damaged file raises almost anything in torch.load
         reason = str(error).strip().splitlines()[0][:200] if str(error) else type(error).__name__
         raise InputError(
             f"{path} is not the state dict of torchvision's AlexNet ({reason}); give "

@@ -1,4 +1,4 @@
-"""Estimates with bootstrap intervals: how far a metric would move with other rooms."""
+"""Estimates with bootstrap intervals: the variation of a metric over the choice of rooms."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ METHOD = (
 def resample_counts(
     rooms: int, resamples: int, seed: int | tuple[int, ...]
 ) -> Int[np.ndarray, "resamples rooms"]:
-    """How often each room is drawn when `rooms` are drawn with replacement, a line a resample."""
+    """Count how often each room occurs in each resample of `rooms` drawn with replacement."""
     shares = np.full(rooms, 1 / rooms)
     return np.random.default_rng(seed).multinomial(rooms, shares, size=resamples)
 
@@ -27,19 +27,19 @@ class Estimate:
     """A metric's value, and its value on every resample."""
 
     value: float | None
-    """None where it does not exist."""
+    """None if the metric is undefined for this set."""
     resamples: Float[np.ndarray, " resamples"]
-    """Resamples in which it does not exist are left out."""
+    """Values on the resamples; those on which the metric is undefined are left out."""
     low: float = -np.inf
     high: float = np.inf
-    """The range in which it lies by definition."""
+    """Bounds of the metric by definition; the interval is clipped to [low, high]."""
 
     def interval(self) -> list[float] | None:
-        """[lower, upper] end; None without a value or without resamples.
+        """[lower, upper] end of the interval; None without a value or without resamples.
 
-        Drawing with replacement repeats rooms, and two sets of fewer different rooms lie farther
-        apart: the resamples of a Frechet distance all lie above the distance itself. Their spread
-        is what counts; so the quantiles are taken around the resamples' own mean.
+        Drawing with replacement repeats rooms, and sets with fewer distinct rooms lie farther
+        apart: the resamples of a Frechet distance all lie above the distance itself. This bias is
+        removed: the quantiles are shifted so that the resamples' mean meets the value.
         """
         if self.value is None or len(self.resamples) == 0:
             return None
@@ -49,7 +49,7 @@ class Estimate:
         return [float(end) for end in np.clip(ends, self.low, self.high)]
 
     def over(self, other: "Estimate") -> "Estimate":
-        """This metric in parts of another, from 0 on; no value where the other has none or is 0."""
+        """The ratio of this metric to another, both at least 0; undefined if the other is 0."""
         if self.value is None or not other.value:
             return Estimate(None, np.zeros(0))
         ours, theirs = _paired(self, other)
@@ -57,7 +57,7 @@ class Estimate:
         return Estimate(self.value / other.value, ours[known] / theirs[known], 0.0)
 
     def minus(self, other: "Estimate") -> "Estimate":
-        """By how much it is larger than another; no value where one has none."""
+        """The difference of this metric and another; undefined if either is."""
         if self.value is None or other.value is None:
             return Estimate(None, np.zeros(0))
         ours, theirs = _paired(self, other)
@@ -65,7 +65,7 @@ class Estimate:
 
 
 def _paired(a: Estimate, b: Estimate) -> tuple[np.ndarray, np.ndarray]:
-    """The resamples of both, as many as both have."""
+    """The resamples of both, cut to the shorter list."""
     both = min(len(a.resamples), len(b.resamples))
     return a.resamples[:both], b.resamples[:both]
 
@@ -76,12 +76,12 @@ def ratio(
     counts: Int[np.ndarray, "resamples rooms"],
     high: float = np.inf,
 ) -> Estimate:
-    """A sum over rooms divided by another: a mean over rooms, or over what they hold.
+    """The ratio of two sums over rooms, such as a mean over rooms or over their objects.
 
     Args:
-        denominators: What each room weighs; 0 leaves a room out. If all are 0 there is no value.
+        denominators: Weight of each room; 0 leaves a room out. If all are 0, the value is None.
         counts: From `resample_counts`.
-        high: The largest value it can have; the smallest is 0.
+        high: Upper bound of the ratio; the lower bound is 0.
     """
     total = denominators.sum()
     value = float(numerators.sum() / total) if total > 0 else None
@@ -94,6 +94,6 @@ def mean_of_rooms(
     counts: Int[np.ndarray, "resamples rooms"],
     high: float = np.inf,
 ) -> Estimate:
-    """The mean over rooms of numbers from 0 on; rooms with None are left out."""
+    """The mean over rooms of non-negative values; rooms with None are left out."""
     known = np.array([value is not None for value in values], dtype=float)
     return ratio(np.array([value or 0.0 for value in values], dtype=float), known, counts, high)

@@ -1,4 +1,4 @@
-"""Top-down pictures of a set of rooms, and what the feature networks read in them."""
+"""Top-down pictures of a set of rooms, and the networks' features of them."""
 
 import hashlib
 import os
@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from sceneprior.classes import class_colors, label_set
+from sceneprior.core.classes import class_colors, label_set
+from sceneprior.core.scene import Scene
 from sceneprior.evaluation.alexnet import SIZE_PX
 from sceneprior.evaluation.networks import (
     EFFNET_LITE0,
@@ -26,40 +27,40 @@ from sceneprior.evaluation.networks import (
     inception_features,
     single_threaded,
 )
-from sceneprior.offscreen import Renderer
-from sceneprior.scene import Scene
-from sceneprior.topdown import topdown, topdown_protocol
+from sceneprior.render.offscreen import Renderer
+from sceneprior.render.topdown import topdown, topdown_protocol
 
 _DRAWN_AT_ONCE = 8
 
 Features = dict[str, np.ndarray]
-"""What is kept of a set of rooms' pictures, a row a room; the pictures of 1,000 would be 0.8 GB.
+"""Features of a set of rooms' pictures, one row per room.
 
-`effnet_lite0`: (rooms, 1280) float32; `inception`: (rooms, 2048) float32, where the user gave the
-network; `small`: (rooms, 224, 224, 3) uint8 pictures, where a classifier wants them;
-`picture_sha256`: (rooms, 32) uint8, of the bytes of each (height, width, 3) uint8 picture.
+`effnet_lite0`: (rooms, 1280) float32; `inception`: (rooms, 2048) float32, if the user gave the
+network; `small`: (rooms, 224, 224, 3) uint8 pictures, if AlexNet needs them; `picture_sha256`:
+(rooms, 32) uint8, digest of the bytes of each (height, width, 3) uint8 picture. The full pictures
+are not kept: 1,000 rooms would take 0.8 GB.
 """
 
 
 def rows_of(features: Features, rows: Sequence[int]) -> Features:
-    """The same of some of the rooms."""
+    """The features of some of the rooms."""
     return {name: array[np.asarray(rows, dtype=np.int64)] for name, array in features.items()}
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """How pictures are made and read, the same for every set of rooms."""
+    """Settings for drawing and reading pictures, the same for every set of rooms."""
 
     label_set: str
     renderer: Renderer
     inception: Path | None = None
     """NVIDIA's TorchScript file."""
     small: bool = False
-    """Whether small pictures are kept, too."""
+    """Keep 224-pixel copies of the pictures too, for AlexNet."""
 
     @cached_property
     def protocol(self) -> dict[str, Any]:
-        """How pictures are drawn, as it stands in the result file."""
+        """The drawing settings, for the result file."""
         return {
             **topdown_protocol(self.label_set).as_dict(),
             "projection": "orthographic, straight down; one flat colour per class; no floor",
@@ -69,34 +70,35 @@ class Drawing:
 
     @cached_property
     def networks(self) -> dict[str, Any]:
-        """What reads the pictures, by the result's keys."""
+        """The feature networks, by the metric's key in the result."""
         fid = {} if self.inception is None else {"fid": INCEPTION | file_digest(self.inception)}
         return {"fd_effnet_lite0": EFFNET_LITE0, **fid}
 
     def features(
         self, scenes: Iterable[Scene], on_progress: Callable[[int], object] = lambda _: None
     ) -> Features:
-        """Draw scenes from above, a few at a time, and read each picture with the networks.
+        """Draw scenes from above, a few at a time, and compute the networks' features.
 
-        This thread draws, one thread for every processor reads; the bits do not depend on how many.
+        The calling thread draws, and one thread per processor runs the networks; the bits do not
+        depend on their number.
 
         Args:
-            scenes: At least one; a stream is never held as a whole.
+            scenes: At least one scene; a stream is consumed batch by batch.
             on_progress: Called with the number of scenes just done.
         """
         protocol, stream = topdown_protocol(self.label_set), iter(scenes)
         parts: list[Features] = []
         waiting: deque[Future[Features]] = deque()
-        # What this process may use, not what the machine has.
+        # The processors that this process may use, not all of the machine's.
         known = hasattr(os, "sched_getaffinity")
         processors = len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
-        efficientnet_lite0()  # loaded once, and not by every thread
+        efficientnet_lite0()  # loaded once, before the threads start
         with single_threaded(), ThreadPoolExecutor(processors) as pool:
             while (batch := list(islice(stream, _DRAWN_AT_ONCE))) or waiting:
                 if batch:
                     images = np.stack([topdown(scene, self.renderer, protocol) for scene in batch])
                     waiting.append(pool.submit(self._read, images))
-                # Few pictures in memory, however many rooms.
+                # The queue is bounded, so that few pictures are in memory at a time.
                 if not batch or len(waiting) > processors + 1:
                     parts.append(waiting.popleft().result())
                     on_progress(len(parts[-1]["picture_sha256"]))

@@ -1,8 +1,7 @@
-"""The networks that read pictures: EfficientNet-Lite0, and the user's Inception for FID."""
+"""The feature networks: EfficientNet-Lite0, and Inception (from the user's file) for FID."""
 
-import contextlib
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,18 +14,19 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
+from sceneprior.core.threads import single_threaded
 
 CHUNK = 2
-"""Images a network sees at once: what two cores' caches hold. The last chunk is filled up with a
-black image, so that every image passes through the same kernels and its features do not depend on
-the others."""
+"""Images per forward pass, as many as two cores' caches hold. The last chunk is padded with black
+images, so that every image passes through the same kernels and its features do not depend on the
+number of images."""
 
 _NORMALISED = {
     "_conv_stem": "_bn0", "_conv_head": "_bn1",
     "_expand_conv": "_bn0", "_depthwise_conv": "_bn1", "_project_conv": "_bn2",
 }  # fmt: skip
-"""EfficientNet's convolutions, and which layer normalises what each gives."""
+"""EfficientNet's convolutions, each with the batch normalisation after it."""
 
 EFFNET_LITE0: dict[str, Any] = {
     "name": "efficientnet-lite0 (ImageNet), pooled feature",
@@ -35,25 +35,25 @@ EFFNET_LITE0: dict[str, Any] = {
     "architecture": "PyPI efficientnet-lite-pytorch 0.1.0",
     "input": "224 x 224 RGB, bilinear with antialiasing in float32, (x - 127) / 128",
 }
-"""How `efficientnet_lite0_features` sees an image, for the result file."""
+"""Preprocessing and weights of `efficientnet_lite0_features`, for the result file."""
 
 INCEPTION: dict[str, Any] = {
     "name": "Inception-v3 of 2015-12-05 (TorchScript), features before the softmax layer",
     "dimensions": 2048,
     "input": "uint8 RGB as rendered; the file itself resizes to 299 x 299 (bilinear, no antialias)",
 }
-"""How `inception_features` sees an image, for the result file."""
+"""Preprocessing of `inception_features`, for the result file."""
 
 
 def efficientnet_lite0_features(
     images: UInt8[np.ndarray, "n height width 3"],
 ) -> Float32[np.ndarray, "n 1280"]:
-    """Features of EfficientNet-Lite0, whose weights come inside a wheel: no download.
+    """Pooled features of EfficientNet-Lite0, whose weights come in a wheel: no download.
 
-    The mean over the last feature map of RGB images of any size, shrunk and scaled as
-    `EFFNET_LITE0` says (which is the TensorFlow original's way); the same bits however many images
-    come together. A Frechet distance in these features is called `fd_effnet_lite0` and is not FID:
-    its size cannot be compared with that of any FID.
+    The features are the mean over the last feature map. Images of any size are resized and scaled
+    as `EFFNET_LITE0` states, like in the TensorFlow original. The bits do not depend on the number
+    of images. A Frechet distance in these features is called `fd_effnet_lite0`; it is not FID, and
+    its values cannot be compared with FID values.
     """
     network = efficientnet_lite0()
 
@@ -69,12 +69,12 @@ def efficientnet_lite0_features(
 
 @lru_cache(maxsize=1)
 def efficientnet_lite0() -> Any:
-    """The network itself; to be asked for once before several threads do."""
+    """Load the network, once per process; call it before starting threads that use it."""
     network = EfficientNet.from_name("efficientnet-lite0")
     path = EfficientnetLite0ModelFile.get_model_file_path()
     network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
     network.eval()  # this also switches off the package's drop connect
-    # Normalisation folded into the convolutions before it: a quarter less time for a picture.
+    # Batch normalisation is folded into the convolutions: a quarter less time per picture.
     for part in (network, *network._blocks):
         for name, normalisation in _NORMALISED.items():
             if hasattr(part, name):
@@ -87,7 +87,7 @@ def efficientnet_lite0() -> Any:
 def inception_features(
     images: UInt8[np.ndarray, "n height width 3"], torchscript_path: Path
 ) -> Float32[np.ndarray, "n dimensions"]:
-    """Features of the Inception network that FID is defined with, from the user's own file.
+    """Features of the Inception network that defines FID, from the user's file.
 
     Args:
         torchscript_path: NVIDIA's `inception-2015-12-05.pt`, a TorchScript of the 2015 network.
@@ -95,7 +95,7 @@ def inception_features(
             `return_features=True` with 2,048 numbers per image.
 
     Raises:
-        InputError: the file is missing, is not a TorchScript, or answers otherwise.
+        InputError: the file is missing, is not a TorchScript, or returns another shape.
     """
     network = _torchscript(Path(torchscript_path))
 
@@ -112,12 +112,12 @@ def inception_features(
 
 
 def check_inception(torchscript_path: Path) -> None:
-    """Ask the file for the features of one grey picture; raises like `inception_features`."""
+    """Compute the features of one grey picture; raises like `inception_features`."""
     inception_features(np.full((1, 32, 32, 3), 128, dtype=np.uint8), torchscript_path)
 
 
 def file_digest(path: Path) -> dict[str, str]:
-    """Which file of weights it was, for the result file."""
+    """Name and SHA-256 of a file of weights, for the result file."""
     return {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
@@ -140,21 +140,6 @@ def _torchscript(path: Path) -> Any:
         return torch.jit.load(str(path), map_location="cpu").eval()
     except (RuntimeError, ValueError) as error:
         raise _not_inception(path, str(error).strip().splitlines()[0]) from None
-
-
-@contextlib.contextmanager
-def single_threaded() -> Iterator[None]:
-    """Let torch use one thread in here: the same bits on any number of cores.
-
-    To use several cores, call the functions of this module from several threads, themselves in a
-    `with single_threaded()` of the caller.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _in_chunks(images: np.ndarray, features: Callable[[Tensor], Tensor], width: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Pages in one HTML file: templates, and rooms that turn under the mouse without a network."""
+"""Self-contained HTML pages: templates, and interactive 3D models that need no network."""
 
 import base64
 from collections.abc import Sequence
@@ -12,22 +12,22 @@ from markupsafe import Markup
 from PIL import Image
 
 from sceneprior import __version__
-from sceneprior.geometry.isosurface import decimate
-from sceneprior.pictures import png_bytes
-from sceneprior.scene import Mesh, Scene
-from sceneprior.scene_files import scene_to_glb
-from sceneprior.topdown import corner_view
+from sceneprior.core.geometry.isosurface import decimate
+from sceneprior.core.scene import Mesh, Scene
+from sceneprior.render.pictures import png_bytes
+from sceneprior.render.scene_files import scene_to_glb
+from sceneprior.render.topdown import corner_view
 
 FACES_PER_PAGE = 100_000
-"""Of all rooms of a page together. A face takes 24 bytes there, so a page stays at a few MB."""
+"""Limit on the faces of all models of a page. A face takes 24 bytes, so a page has a few MB."""
 FEWEST_FACES = 200
-"""Of an object, where there are so many that their share of the page would be smaller."""
+"""Least limit on the faces of one object, however many objects a page shows."""
 
 
 def render(template: str, **values: Any) -> bytes:
-    """A page made from a template of this folder; a name that the template lacks is an error.
+    """Render a page from a template of this folder; a variable without a value is an error.
 
-    The page may ask no network for anything: its own head forbids it.
+    The page loads nothing from a network: the policy in its head forbids it.
     """
     environment = Environment(
         loader=PackageLoader("sceneprior.evaluation", "."),
@@ -43,13 +43,13 @@ def render(template: str, **values: Any) -> bytes:
 
 
 def faces_per_object(scenes: Sequence[Scene]) -> int:
-    """How many faces an object may have on a page that shows these rooms."""
+    """Limit on the faces of each object on a page that shows these rooms."""
     objects = sum(len(scene.objects) for scene in scenes)
     return max(FACES_PER_PAGE // max(objects, 1), FEWEST_FACES)
 
 
 def glb_of(scene: Scene, most_faces: int) -> bytes:
-    """The room on its floor as a GLB, objects of about so many faces at most."""
+    """The room on its floor as a GLB, meshes decimated to about `most_faces` faces."""
     light = []
     for item in scene.objects:
         if item.mesh is not None:
@@ -66,5 +66,5 @@ def png_uri(image: Image.Image) -> str:
 
 
 def data_uri(kind: str, content: bytes) -> str:
-    """What a page may hold in place of a file, of this media type."""
+    """A data URI: a file's content inside a page, with its media type."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"

@@ -1,7 +1,8 @@
-"""Features of the real rooms' pictures, drawn once and kept in a file.
+"""A cache file for the features of the real rooms' pictures.
 
-Drawing the same test rooms over and over is what evaluation costs. A reference file keeps what was
-read from their pictures, with all that it depends on; a file that does not fit is refused.
+Drawing the same real rooms for every evaluation takes most of its time. A reference file keeps the
+features of their pictures and a key of all that these depend on; a file with another key is
+refused.
 """
 
 import io
@@ -13,17 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import write_whole
+from sceneprior.core.ground_truth import split_fingerprint, stream_scenes
 from sceneprior.evaluation.features import Drawing, Features, rows_of
-from sceneprior.evaluation.ground_truth import split_fingerprint, stream_scenes
-from sceneprior.files import write_whole
 
 FORMAT = "sceneprior-reference"
 VERSION = 1
 _SMALL = "small pictures"
 
 Progress = Callable[[str, int], Callable[[int], object]]
-"""(what is drawn, how many rooms) -> what is called with the number of rooms just done."""
+"""(name of the set, number of rooms) -> callback that takes the number of rooms just done."""
 
 
 def draw_reference(
@@ -34,16 +35,16 @@ def draw_reference(
     progress: Progress,
     path: Path | None = None,
 ) -> dict[str, Features]:
-    """Features of a split's rooms and of some training rooms, from a file where there is one.
+    """Features of a split's rooms and of some training rooms, from a reference file if it exists.
 
     Args:
-        rooms: How many rooms the two splits hold: `test` or `val`, and `train`.
-        train_rows: The training rooms wanted, in this order.
-        path: Reference file. One that lies there is read; otherwise every room of both splits is
-            drawn, so that any later choice of training rooms is in it, and the file is written.
+        rooms: Number of rooms in the two splits: `test` or `val`, and `train`.
+        train_rows: Indices of the requested training rooms, in this order.
+        path: Reference file. An existing file is read. Otherwise all rooms of both splits are
+            drawn, so that the file covers any later choice of training rooms, and it is written.
 
     Raises:
-        InputError: the file is none, or was made from other rooms or in another way.
+        InputError: the file is not a reference, or was made from other rooms or settings.
     """
     drawn: dict[str, Features] = {}
     if path is not None and path.is_file():
@@ -62,7 +63,7 @@ def draw_reference(
 
 
 def _key(shards: Path, drawing: Drawing, splits: Iterable[str]) -> dict[str, Any]:
-    """All that stored features depend on."""
+    """The key of a reference file: all that its features depend on."""
     key = {
         "format": FORMAT,
         "version": VERSION,
@@ -111,7 +112,7 @@ def _read_reference(
 
 
 def _check_key(path: Path, came: dict[str, Any], wanted: dict[str, Any]) -> None:
-    # A file that knows more than is asked fits, too.
+    # A file with more networks or pictures than requested is accepted.
     more = {**came.get("networks", {}), **wanted["networks"]}
     wanted = wanted | {"networks": more, _SMALL: came.get(_SMALL) or wanted[_SMALL]}
     for name in wanted:

@@ -1,4 +1,4 @@
-"""Every metric, in the order of tables; a new one is a file in metrics/ and its name here."""
+"""Every metric, in the order of tables. To add one, write a file in metrics/ and list it here."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,13 +17,14 @@ from sceneprior.evaluation.metrics import (
     novelty,
     overlaps,
     precision_recall,
+    relations,
 )
 from sceneprior.evaluation.metrics.contents import TYPE_CLASSES
 from sceneprior.evaluation.networks import file_digest
 
 _MODULES = (
-    frechet, kernel_distance, precision_recall, classifier, layout_classifier, contents, overlaps,
-    floor, novelty,
+    frechet, kernel_distance, precision_recall, classifier, layout_classifier, relations, contents,
+    overlaps, floor, novelty,
 )  # fmt: skip
 _NETWORKS = ("inception", "alexnet", "effnet_lite0", None)
 
@@ -33,15 +34,15 @@ METRICS: tuple[Metric, ...] = tuple(
         key=lambda metric: _NETWORKS.index(metric.network),
     )
 )
-"""Of sets of rooms; by network, those that read no pictures last."""
+"""Metrics of sets of rooms, sorted by network; metrics that read no pictures come last."""
 DECODED: tuple[Metric, ...] = decoded_rooms.METRICS
-"""Of decoded training rooms."""
+"""Metrics of decoded training rooms against their ground truth."""
 
 _BETTER = {"closer": "lower", "lower": "lower", "higher": "higher", "half": "0.5", "none": "–"}
 
 
 def definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
-    """What the metrics mean, whether or not there was what they need."""
+    """The protocol entries of all metrics, whether or not they could be computed."""
     stated: dict[str, Any] = {} if alexnet is None else {"sca": {**ALEXNET, **file_digest(alexnet)}}
     for metric in METRICS:
         stated |= metric.protocol
@@ -53,7 +54,7 @@ def definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
 
 
 def as_markdown() -> str:
-    """The lists of docs/evaluation.md, which a test compares with this."""
+    """The lists of metrics in docs/evaluation.md; a test compares the page with this text."""
     parts: dict[str, Sequence[Metric]] = {
         "Against test rooms": [metric for metric in METRICS if "test" not in metric.sets],
         "Of a set by itself": [metric for metric in METRICS if "test" in metric.sets],

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from sceneprior.classes import class_colors, label_set
+from sceneprior.core.classes import class_colors, label_set
+from sceneprior.core.scene import Scene
+from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.evaluation.page import data_uri, glb_of, png_uri
-from sceneprior.offscreen import Renderer
-from sceneprior.pictures import paint_ids
-from sceneprior.scene import Scene
-from sceneprior.shards import Shard, iterate_rooms
-from sceneprior.topdown import perspective, topdown
+from sceneprior.render.offscreen import Renderer
+from sceneprior.render.pictures import paint_ids
+from sceneprior.render.topdown import perspective, topdown
 
 _POINTS_PER_CURVE = 400
 _EMPTY = (244, 245, 247)
@@ -24,21 +24,24 @@ _EMPTY = (244, 245, 247)
 
 @dataclass(frozen=True)
 class RoomPictures:
-    """One scene as the page shows it."""
+    """The pictures and the 3D model of one scene on the page."""
 
     name: str
     contents: str
     """Its objects in words: "double bed, nightstand ×2"."""
     topdown: str
-    """Data URI of the flat picture that scores compare, with borders, at half size."""
+    """Data URI of the flat top-down picture that metrics compare, with borders, at half size."""
     perspective: str
     """Data URI of the shaded view from above a corner."""
     glb: str
-    """Data URI of the model that turns, in place of the shaded view; empty where none was asked."""
+    """Data URI of the 3D model that replaces the shaded view; empty if none was requested."""
 
 
 def room_pictures(scene: Scene, renderer: Renderer, most_faces: int = 0) -> RoomPictures:
-    """Draw one scene both ways, and make its model, of so many faces an object (0: no model)."""
+    """Draw a scene's top-down and corner view, and export its 3D model.
+
+    `most_faces` limits the faces of each object's mesh; 0 leaves the model out.
+    """
     counts = Counter(item.label.replace("_", " ") for item in scene.objects)
     words = [name if many == 1 else f"{name} ×{many}" for name, many in sorted(counts.items())]
     flat = Image.fromarray(topdown(scene, renderer, outlines=True))
@@ -53,7 +56,7 @@ def room_pictures(scene: Scene, renderer: Renderer, most_faces: int = 0) -> Room
 
 
 def legend(scenes: Sequence[Scene]) -> list[tuple[str, str]]:
-    """(class name, CSS colour) of every class that occurs, in the label set's order."""
+    """(class name, CSS colour) of every class in the scenes, in the label set's order."""
     if not scenes:
         return []
     names = label_set(scenes[0].label_set)
@@ -67,9 +70,9 @@ def legend(scenes: Sequence[Scene]) -> list[tuple[str, str]]:
 
 
 def input_views(shards: Path, rooms: int, views_per_room: int) -> list[tuple[str, str]]:
-    """What training sees: masks in class colours with their 2D boxes, as (caption, data URI).
+    """Input views of training: masks in class colours with 2D boxes, as (caption, data URI).
 
-    Of the first rooms of the `train` split, the views that see most objects.
+    The first rooms of the `train` split are shown, each in the views with most visible objects.
     """
     pictures: list[tuple[str, str]] = []
     for shard, room_id in islice(iterate_rooms(shards, "train"), rooms):
@@ -101,13 +104,13 @@ def _input_view(shard: Shard, room_id: str, view: int) -> tuple[str, str]:
 
 
 def curves_svg(curves: dict[str, list[tuple[int, float]]]) -> str:
-    """Learning curves as one SVG of small panels, a panel per name; a data URI.
+    """Learning curves as the data URI of one SVG, with one small panel per name.
 
     A panel whose values span more than a factor of 20 has a logarithmic axis.
     """
     import matplotlib
 
-    # A figure of its own, not pyplot: nothing of the caller's backend is touched.
+    # `Figure` rather than pyplot, so that the caller's backend stays as it is.
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator, NullFormatter

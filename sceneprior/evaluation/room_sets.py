@@ -1,4 +1,4 @@
-"""The sets of rooms that an evaluation compares: chosen, drawn, and with what metrics need."""
+"""The sets of rooms that an evaluation compares: choosing, drawing and describing them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,34 +9,39 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from sceneprior.classes import VOID
-from sceneprior.errors import InputError
-from sceneprior.evaluation.bootstrap import resample_counts
-from sceneprior.evaluation.features import Drawing, Features
-from sceneprior.evaluation.ground_truth import (
+from sceneprior.core.classes import VOID
+from sceneprior.core.errors import InputError
+from sceneprior.core.ground_truth import (
     independent_rooms,
+    known_in_3d,
     reference_scenes,
     shuffled_rooms,
 )
+from sceneprior.core.scene import Scene
+from sceneprior.evaluation.bootstrap import resample_counts
+from sceneprior.evaluation.features import Drawing, Features
 from sceneprior.evaluation.layout_distance import nearest_known
 from sceneprior.evaluation.metric import RoomSet
 from sceneprior.evaluation.metrics.contents import common_label_set
 from sceneprior.evaluation.reference_file import draw_reference
-from sceneprior.scene import Scene
 
 
 @dataclass(frozen=True)
 class ChosenRooms:
-    """The rooms to compare, without meshes but for those of generated and decoded ones."""
+    """The rooms to compare; only generated and decoded rooms keep their meshes."""
 
     groups: dict[str, Sequence[Scene]]
     """`test`, `generated`, `train`, `independent`, `shuffled` and, if any, `decoded_rooms`."""
     every_train: Sequence[Scene]
+    val: Sequence[Scene]
+    """The val rooms, which classifiers may train on; empty if `test` holds the val split."""
     train_rows: Sequence[int]
-    """Which of all training rooms `train` holds."""
+    """Indices into `every_train` of the rooms in `train`."""
+    pictured_rows: Sequence[int]
+    """Indices of the generated rooms that are drawn and compared by their pictures."""
     every_decoded: Sequence[Scene]
     split: str
-    """Whose rooms `test` holds."""
+    """The split that `test` holds, `test` or `val`."""
     seed: int
 
 
@@ -48,6 +53,8 @@ def choose_rooms(
     every_train = reference_scenes(shards, "train", meshes=False)
     generated = [without_void(scene) for scene in generated]
     common_label_set(generated, test)
+    no_val = split == "val" or not known_in_3d(shards, "val")
+    val = [] if no_val else reference_scenes(shards, "val", meshes=False)
     rows = seeded_rows(len(every_train), len(generated), seed)
     groups: dict[str, Sequence[Scene]] = {
         "test": test,
@@ -65,14 +72,20 @@ def choose_rooms(
     if len(decoded) > 1:
         chosen = seeded_rows(len(decoded), len(rows), seed)
         groups["decoded_rooms"] = [decoded[row] for row in chosen]
-    return ChosenRooms(groups, every_train, rows, decoded, split, seed)
+    pictured = seeded_rows(len(generated), len(rows), seed)
+    return ChosenRooms(groups, every_train, val, rows, pictured, decoded, split, seed)
 
 
 def draw_rooms(
     rooms: ChosenRooms, shards: Path, drawing: Drawing, boxes: bool, reference: Path | None
 ) -> tuple[dict[str, Features], dict[str, Features]]:
-    """Features of every group's pictures (and of `independent_meshes`), and drawn as boxes."""
-    groups, count = rooms.groups, len(rooms.train_rows)
+    """Features of every group's pictures (and of `independent_meshes`), with meshes and as boxes.
+
+    Frechet distances and recall depend on the number of pictures, so as many generated rooms are
+    drawn as there are real training rooms.
+    """
+    pictured = [rooms.groups["generated"][row] for row in rooms.pictured_rows]
+    groups, count = rooms.groups | {"generated": pictured}, len(rooms.train_rows)
     with Progress(console=Console(stderr=True)) as bars:
 
         def progress(group: str, total: int) -> Callable[[int], object]:
@@ -86,7 +99,7 @@ def draw_rooms(
         drawn["test"] = drawn.pop(rooms.split)
         for group in sorted(set(groups) - set(drawn)):
             drawn[group] = draw(group.replace("_", " "), groups[group])
-        # The same rooms once more: meshes of all training rooms live no longer than this line.
+        # Read again with meshes, so that all training meshes are in memory only for this line.
         furnished = independent_rooms(reference_scenes(shards, "train"), count, rooms.seed, True)
         drawn["independent_meshes"] = draw("independent, furnished", furnished)
         del furnished
@@ -105,7 +118,7 @@ def room_sets(
     as_boxes: dict[str, Features],
     resamples: int,
 ) -> dict[str, RoomSet]:
-    """The sets of rooms by their names in the result, and the `fair` share of generated ones."""
+    """The sets of rooms by name, with `pictured`, the subset of generated rooms that is drawn."""
     sets: dict[str, RoomSet] = {}
     for number, (group, scenes) in enumerate(rooms.groups.items()):
         sets[group] = RoomSet(
@@ -115,21 +128,27 @@ def room_sets(
             nearest_known(scenes, rooms.every_train, rooms.every_decoded, group == "train"),
             resample_counts(len(scenes), resamples, (rooms.seed, number)),
         )
-    rows = seeded_rows(len(sets["generated"].scenes), len(rooms.train_rows), rooms.seed)
-    sets["fair"] = sets["generated"].of(rows, (rooms.seed, len(sets)))
+    generated, rows = sets["generated"], rooms.pictured_rows
+    sets["pictured"] = replace(
+        generated,
+        scenes=[generated.scenes[row] for row in rows],
+        nearest=generated.nearest.of(rows),
+        counts=resample_counts(len(rows), resamples, (rooms.seed, len(sets))),
+    )
+    sets["generated"] = replace(generated, pictures={}, box_pictures=None)
     pictures = drawn["independent_meshes"]
     sets["independent_meshes"] = replace(sets["independent"], pictures=pictures)
     return sets | {"train_rooms": sets["train"]}
 
 
 def without_void(scene: Scene) -> Scene:
-    """The scene without furniture that no label names."""
+    """The scene without objects of class void."""
     known = zip(scene.objects, scene.class_indices, strict=True)
     return replace(scene, objects=tuple(item for item, index in known if index != VOID))
 
 
 def seeded_rows(available: int, count: int, seed: int) -> list[int]:
-    """At most `count` of `available` rows, drawn without replacement, in order."""
+    """At most `count` of `available` row indices, drawn without replacement, sorted."""
     if available <= count:
         return list(range(available))
     chosen = np.random.default_rng(seed).choice(available, size=count, replace=False)

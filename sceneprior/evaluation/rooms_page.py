@@ -1,13 +1,13 @@
-"""A page of rooms alone, to send: each turns under the mouse, beside its plan."""
+"""A page of rooms to send to others: a 3D model and a top-down picture of each room."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
+from sceneprior.core.files import write_whole
+from sceneprior.core.scene import Scene
 from sceneprior.evaluation.page import faces_per_object, render
 from sceneprior.evaluation.report_pictures import legend, room_pictures
-from sceneprior.files import write_whole
-from sceneprior.offscreen import Renderer
-from sceneprior.scene import Scene
+from sceneprior.render.offscreen import Renderer
 
 ROOMS_SHOWN = 24
 
@@ -21,12 +21,12 @@ def write_rooms_page(
     subtitle: str,
     pictures: Sequence[tuple[str, str]] = (),
 ) -> None:
-    """Write one HTML file of a few MB that needs nothing outside itself.
+    """Write one self-contained HTML file of a few MB.
 
     Args:
-        scenes: The first 24 are shown.
-        subtitle: Where they come from.
-        pictures: (caption, data URI) above the rooms.
+        scenes: Rooms; the first 24 are shown.
+        subtitle: Origin of the rooms.
+        pictures: (caption, data URI) of pictures shown above the rooms.
     """
     shown = scenes[:ROOMS_SHOWN]
     most_faces = faces_per_object(shown)

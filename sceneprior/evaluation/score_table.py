@@ -1,4 +1,4 @@
-"""The table of a result: rows of text for pages, and the table in the terminal."""
+"""The table of an evaluation result, as rows of text for pages and printed in the terminal."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from rich.text import Text
 from sceneprior.evaluation.registry import METRICS
 
 WIDTH = 150
-"""Characters of a table that goes to a file: what fits without folding an interval."""
+"""Width in characters of a table written to a file; narrower tables fold intervals."""
 
 COLUMNS = {
     "generated": "generated",
@@ -20,15 +20,15 @@ COLUMNS = {
     "independent": "independent",
     "test": "real test",
 }
-"""Headings by the names of sets of rooms; `n_` and such a name counts its rooms in a protocol, and
-a set that it does not count is no column."""
+"""Headings by set of rooms. The protocol counts the rooms of a set under `n_<set>`; a set without
+such a count has no column."""
 
 
 def score_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
-    """The table of a result: (title, unit, a cell per column of `headings`).
+    """The table of a result: (title, unit, one cell per column of `headings`).
 
-    A cell is the value and, on a line of its own, its interval. A metric that a column does not
-    have is a dash; a key that the result lacks is no row.
+    A cell holds the value and, on a second line, its interval; a missing value is a dash. A metric
+    that the result lacks has no row.
     """
     return [
         (
@@ -41,8 +41,26 @@ def score_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
     ]
 
 
+RELATION_HEADINGS = (
+    "an object", "and the nearest", "distance of gaps, m", "real training, m",
+    "within 0.3 m", "real test",
+)  # fmt: skip
+
+
+def relation_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Rows of text under `RELATION_HEADINGS`: the pairs of classes whose gaps differ most from
+    those in the test rooms."""
+    return [
+        (
+            row["of"], row["to"], f"{row['distance_m']:.2f}", f"{row['train_m']:.2f}",
+            *("–" if row[key] is None else f"{row[key]:.2f}" for key in ("near", "near_test")),
+        )
+        for row in scores.get("relations", [])
+    ]  # fmt: skip
+
+
 def headings(scores: dict[str, Any]) -> list[tuple[str, str]]:
-    """(what a column holds, how many rooms stand behind it) of each of `COLUMNS`."""
+    """(title, number of rooms) of each of `COLUMNS` that the result has."""
     protocol = scores.get("protocol", {})
     titles = COLUMNS | {"test": f"real {protocol.get('split', 'test')}"}
     return [(titles[name], f"{protocol[f'n_{name}']} rooms") for name in _sets(scores)]
@@ -66,7 +84,7 @@ def _cell(scores: dict[str, Any], column: str, key: str) -> str:
 
 
 def wide_console() -> Console:
-    """stdout; a file or a pipe has no width, for which rich would take 80."""
+    """A console on stdout, at least `WIDTH` wide for a file or a pipe, where rich assumes 80."""
     console = Console()
     if not console.is_terminal:
         console.width = max(console.width, WIDTH)
@@ -87,6 +105,14 @@ def print_scores(scores: dict[str, Any], console: Console | None = None) -> None
     for title, unit, *cells in score_rows(scores):
         table.add_row(*(_dim_below_first(text) for text in (f"{title}\n{unit}", *cells)))
     console.print(table)
+    if rows := relation_rows(scores):
+        pairs = Table(
+            *RELATION_HEADINGS, box=box.SIMPLE_HEAD,
+            title="Pairs of classes that add most to the distance of relations",
+        )  # fmt: skip
+        for row in rows:
+            pairs.add_row(*row)
+        console.print(pairs)
 
 
 def _dim_below_first(cell: str) -> Text:

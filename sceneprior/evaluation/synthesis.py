@@ -1,4 +1,4 @@
-"""Evaluate generated rooms against the test rooms of shards, beside real and independent ones."""
+"""Evaluate generated rooms against the test rooms of shards, with real and random baselines."""
 
 import hashlib
 from collections.abc import Container, Sequence
@@ -7,24 +7,28 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene
 from sceneprior.evaluation.alexnet import check_alexnet
 from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES, Estimate
 from sceneprior.evaluation.features import Drawing
 from sceneprior.evaluation.metric import PICTURED, Comparison, RoomSet
 from sceneprior.evaluation.metrics.contents import common_label_set, emptiness
+from sceneprior.evaluation.metrics.layout_classifier import FEW_TEST_ROOMS
 from sceneprior.evaluation.metrics.novelty import near_copy_threshold
 from sceneprior.evaluation.metrics.overlaps import plausible_pairs
+from sceneprior.evaluation.metrics.relations import furthest_pairs
 from sceneprior.evaluation.networks import check_inception
 from sceneprior.evaluation.registry import METRICS, definitions
 from sceneprior.evaluation.room_sets import choose_rooms, draw_rooms, room_sets
-from sceneprior.offscreen import Renderer, open_renderer
-from sceneprior.scene import Scene
+from sceneprior.render.offscreen import Renderer, open_renderer
 
 FORMAT = "sceneprior-scores"
-VERSION = 3
-"""2 called near copies what was nearer than 0.15 m, and did not split intersecting pairs; 1 hashed
-all pictures of a set as one, and knew neither intervals nor distances but Frechet's."""
+VERSION = 4
+"""Version of the result file. Version 3 had a weaker layout classifier, compared the pictures of
+all generated rooms, and required a near copy to have exactly the same objects. Version 2 set the
+threshold of near copies to 0.15 m, and did not split intersecting pairs. Version 1 hashed all
+pictures of a set as one, and had no intervals and only Frechet distances."""
 NOTE = (
     "Measured on the rooms of these shards. Where they come from `sceneprior make-homes`, they "
     "are made-up homes: no number here can be compared with the paper's, which are on 3D-FRONT."
@@ -38,25 +42,25 @@ _PACKAGES = (
 
 @dataclass(frozen=True)
 class EvalOptions:
-    """How rooms are evaluated, whichever method made them."""
+    """Settings of an evaluation, the same for every method."""
 
     seed: int = 0
-    """Chooses the training rooms, the classifiers' folds and the resamples."""
+    """Seed for choosing training rooms, the classifiers' folds and the resamples."""
     inception: Path | None = None
-    """NVIDIA's `inception-2015-12-05.pt`; None leaves `fid` and its kin out."""
+    """NVIDIA's `inception-2015-12-05.pt`; None leaves the metrics of Inception features out."""
     alexnet: Path | None = None
     """torchvision's AlexNet weights; None leaves `sca` out."""
     reference: Path | None = None
-    """File that keeps what was read from the real rooms' pictures; None draws them."""
+    """File with the features of the real rooms' pictures; None draws them each time."""
     split: str = "test"
-    """The rooms to compare with: `val` to choose settings by, `test` to report. A result calls
-    either "test", and names the split in its protocol."""
+    """The split to compare with: `val` to choose settings, `test` to report. The keys of a result
+    say "test" for either; its protocol names the split."""
     boxes: bool = False
-    """Also compare pictures of all rooms drawn as boxes: their layouts alone."""
+    """Also compare pictures in which all objects are boxes, which show layouts alone."""
     resamples: int = RESAMPLES
-    """Of the bootstrap intervals; 0 leaves them out."""
+    """Number of bootstrap resamples; 0 leaves the intervals out."""
     renderer: Renderer | str = "auto"
-    """A renderer, or the name of one."""
+    """A renderer, or its name."""
 
     def __post_init__(self) -> None:
         if self.split not in ("val", "test"):
@@ -72,32 +76,29 @@ def evaluate_synthesis(
     options: EvalOptions,
     decoded: Sequence[Scene] = (),
 ) -> dict[str, Any]:
-    """Compare generated rooms with the test rooms, and real and made-up rooms with them too.
+    """Compare generated rooms, and baseline sets of rooms, with the test rooms.
 
-    Void objects are left out everywhere, as the test rooms' are. The training rooms are as many
-    as the generated ones (all of them if there are fewer), drawn without replacement by the seed:
-    a Frechet distance depends on the number of images, so only equal numbers can be compared.
-    Rooms without meshes are drawn as boxes.
-    Independent and shuffled rooms, see ground_truth.py, are as many as real training rooms.
+    Void objects are left out of all sets. As many training rooms as generated ones (or all, if
+    there are fewer) are drawn without replacement by the seed, since a Frechet distance depends on
+    the number of images. There are as many independent and shuffled rooms (core/ground_truth.py)
+    as training rooms. Rooms without meshes are drawn as boxes.
 
     Args:
-        decoded: Training rooms as the prior decodes them, named by their ids. Copies are sought
-            among them, too, and as many as real training rooms are a set of their own; without
-            any, what needs them is left out.
+        decoded: Training rooms as the prior decodes them, named by their ids. The search for near
+            copies includes them, and a subset, as large as that of the real training rooms, is
+            compared as a set. If empty, the metrics that need them are left out.
 
     Returns:
-        The metrics of the generated rooms, `<key>_test` for those that the test rooms have by
-        themselves, under `train_rooms` those of real training rooms, under `independent` those of
-        rooms of independent objects (and what their pictures say with real meshes under
-        `independent_meshes`), under `shuffled` those of shuffled furniture, under `decoded_rooms`
-        those of decoded training rooms, `intervals` by set of rooms, and under `protocol` all they
-        depend on. docs/evaluation.md defines each.
+        The metrics of the generated rooms by key, and those of the test rooms as `<key>_test`. The
+        baselines' metrics are under `train_rooms`, `independent`, `independent_meshes` (pictures
+        with real meshes), `shuffled` and `decoded_rooms`. `intervals` is by set of rooms, and
+        `protocol` lists all that the values depend on. docs/evaluation.md defines each metric.
 
     Raises:
-        InputError: no rooms, fewer than two on a side, other label sets than the shards', or
-            a file of weights or a reference that cannot be used.
+        InputError: a set has fewer than two rooms, the label sets differ, or a file of weights or
+            a reference file cannot be used.
     """
-    # Weights first, before hours of drawing lean on them.
+    # The weights are checked first, before hours of drawing.
     if options.inception is not None:
         check_inception(options.inception)
     if options.alexnet is not None:
@@ -111,7 +112,7 @@ def evaluate_synthesis(
     sets = room_sets(rooms, drawn, as_boxes, options.resamples)
     comparison = Comparison(
         test=sets["test"],
-        fair=sets["fair"],
+        real=[*rooms.every_train, *rooms.val],
         seed=options.seed,
         alexnet=options.alexnet,
         plausible_pairs=plausible_pairs(rooms.every_train),
@@ -125,13 +126,14 @@ def evaluate_synthesis(
         **{f"n_{group}": len(scenes) for group, scenes in rooms.groups.items() if group != "train"},
         "n_train_rooms": len(rooms.train_rows),
         "n_train_rooms_available": len(rooms.every_train),
-        "n_gap": len(rooms.train_rows),
+        "n_real": len(comparison.real),
+        "n_pictured": len(rooms.pictured_rows),
         "near_copy_m": comparison.near_copy_m,
         "seed": options.seed,
         "resamples": options.resamples,
         "intervals": METHOD,
         "render": drawing.protocol,
-        # Of the pictures' own digests, one after the other in the order of the rooms.
+        # Digest of the concatenated digests of the pictures, in the order of the rooms.
         "renders_sha256": {
             group: hashlib.sha256(features["picture_sha256"].tobytes()).hexdigest()
             for group, features in drawn.items()
@@ -141,24 +143,40 @@ def evaluate_synthesis(
         "left_out": _left_out(columns["generated"], options),
         "packages": _package_versions(),
     }
-    note = " ".join(filter(None, (emptiness(rooms.groups["generated"]), NOTE)))
-    return _result(columns) | {"note": note, "protocol": protocol}
+    notes = (emptiness(rooms.groups["generated"]), _uncertainty(columns, len(sets["test"].scenes)))
+    return _result(columns) | {
+        "relations": furthest_pairs(sets["generated"], sets["train"], comparison),
+        "note": " ".join([*filter(None, notes), NOTE]),
+        "protocol": protocol,
+    }
+
+
+def _uncertainty(columns: dict[str, dict[str, Estimate]], test_rooms: int) -> str | None:
+    """A sentence on the layout classifier's interval, if there are few test rooms."""
+    interval = columns["generated"]["layout_classifier_accuracy"].interval()
+    if interval is None or test_rooms >= FEW_TEST_ROOMS:
+        return None
+    return (
+        f"With {test_rooms} test rooms, the accuracy of the layout classifier is uncertain: "
+        f"{interval[0]:.2f} to {interval[1]:.2f}."
+    )
 
 
 def _evaluate(
     sets: dict[str, RoomSet], comparison: Comparison, options: EvalOptions
 ) -> dict[str, dict[str, Estimate]]:
-    """Every metric that there is what it needs for, by set of rooms and key."""
+    """Compute every metric whose options are given, by set of rooms and key."""
     networks = _networks(options)
     metrics = [metric for metric in METRICS if metric.lacks(networks, options.boxes) is None]
     for name in ("test", *PICTURED):
         if name not in sets:
             continue
-        found = {
-            metric.key: metric.function(sets[name], comparison)
-            for metric in metrics
-            if name in metric.sets
-        }
+        found = {}
+        for metric in metrics:
+            if name in metric.sets:
+                pictured = name == "generated" and metric.network is not None
+                rooms = sets["pictured" if pictured else name]
+                found[metric.key] = metric.function(rooms, comparison)
         comparison.columns[name] = {key: value for key, value in found.items() if value is not None}
     return comparison.columns
 
@@ -169,7 +187,7 @@ def _networks(options: EvalOptions) -> list[str]:
 
 
 def _left_out(measured: Container[str], options: EvalOptions) -> dict[str, str]:
-    """Which metrics of generated rooms a result does not hold, and for want of what."""
+    """The metrics of generated rooms that a result lacks, each with the missing option."""
     return {
         metric.key: metric.lacks(_networks(options), options.boxes) or "decoded training rooms"
         for metric in METRICS

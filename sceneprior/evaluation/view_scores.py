@@ -1,4 +1,4 @@
-"""Scores of reconstructions from single images, from pairs of a true and a found object."""
+"""Scores of single-view reconstructions, computed from pairs of a true and a fitted object."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,38 +6,42 @@ from typing import Any
 
 import numpy as np
 
-from sceneprior.errors import InputError
-from sceneprior.evaluation.metrics.decoded_rooms import box_iou_3d
+from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.surfaces import chamfer_of, nearest_distances
+from sceneprior.core.overlaps import box_iou_3d
+from sceneprior.core.scene import SceneObject
+from sceneprior.evaluation.bootstrap import COVERAGE, ratio, resample_counts
 from sceneprior.evaluation.metrics.mesh_metrics import (
     F_THRESHOLD_M,
     POINTS,
-    f_score,
+    f_score_of,
     oriented_box,
     oriented_box_iou_3d,
     sample_surface,
 )
-from sceneprior.geometry.surfaces import chamfer_sum
-from sceneprior.scene import SceneObject
-from sceneprior.topdown import object_mesh
+from sceneprior.render.topdown import object_mesh
+
+RESAMPLES = 1000
+"""Bootstrap resamples of rooms behind an interval."""
 
 
 @dataclass(frozen=True)
 class ObjectPair:
-    """A true object that an image shows, and what was found for its mask."""
+    """A true object visible in an image, and the object fitted to its mask."""
 
     truth: SceneObject
     found: SceneObject | None
-    """None where nothing was: its IoUs and F-score are 0, and it has no distance."""
+    """None if no object was fitted: its IoUs and F-score are 0, and it has no distance."""
 
 
 @dataclass(frozen=True)
 class PairScore:
-    """How well one true object was found."""
+    """Scores of one true object."""
 
     label: str
     found: bool
     surface_known: bool
-    """Whether the true surface is; all but the boxes and the class is compared with it."""
+    """True if the true object has a mesh; without one, only its box and class are scored."""
     class_right: bool
     box_iou_3d: float
     oriented_box_iou_3d: float | None = None
@@ -47,9 +51,9 @@ class PairScore:
 
 
 def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairScore:
-    """Compare two objects where they stand; a found one without a mesh by its box.
+    """Compare two objects in the room frame; a fitted object without a mesh is its box.
 
-    `points` are drawn from each surface, uniformly by area, different ones by the same seed.
+    `points` are sampled from each surface, uniformly by area, with a different seed per surface.
     """
     truth, found = pair.truth, pair.found
     known = truth.mesh is not None
@@ -62,11 +66,12 @@ def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairSco
         for part in (item.center_m, item.size_m)
     )
     box_iou, class_right = float(box_iou_3d(*boxes)[0, 0]), found.label == truth.label
-    if truth.mesh is None:  # a right shape would be punished for not being a box
+    if truth.mesh is None:  # against a box, a correct shape would score worse than a box
         return PairScore(truth.label, True, False, class_right, box_iou)
     surfaces = [truth.mesh, object_mesh(found)]
     a, b = (sample_surface(mesh, points, 2 * seed + i) for i, mesh in enumerate(surfaces))
-    distance = chamfer_sum(a, b)
+    apart_m = nearest_distances(a, b)
+    distance = chamfer_of(*apart_m)
     return PairScore(
         label=truth.label,
         found=True,
@@ -76,17 +81,27 @@ def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairSco
         oriented_box_iou_3d=oriented_box_iou_3d(*map(oriented_box, surfaces)),
         chamfer_l2_m=distance.l2_m,
         chamfer_squared_m2=distance.squared_m2,
-        f_score=f_score(a, b, F_THRESHOLD_M),
+        f_score=f_score_of(*apart_m, F_THRESHOLD_M),
     )
 
 
 def score_views(
-    views: Sequence[Sequence[ObjectPair]], points: int = POINTS, seed: int = 0
+    views: Sequence[Sequence[ObjectPair]],
+    rooms: Sequence[str],
+    points: int = POINTS,
+    seed: int = 0,
 ) -> dict[str, Any]:
-    """Scores of single-view reconstructions, every true object with the same weight.
+    """Scores of single-view reconstructions; every true object has the same weight.
 
-    `summary` is of all objects of all images, `classes` the same of each true class. No object at
-    all is an InputError.
+    `summary` covers all objects of all images, `intervals` holds bootstrap intervals of its
+    metrics, and `classes` holds one summary per true class.
+
+    Args:
+        rooms: The room of each view. Views of one room are not independent, so intervals resample
+            rooms.
+
+    Raises:
+        InputError: no image shows an object.
     """
     scores = [
         score_pair(pair, points, seed + row)
@@ -97,13 +112,16 @@ def score_views(
     labels = sorted({score.label for score in scores})
     by_class = {name: [score for score in scores if score.label == name] for name in labels}
     return {
-        "summary": {"images": len(views), **summary(scores)},
+        "summary": {"rooms": len(set(rooms)), "images": len(views), **summary(scores)},
+        "intervals": intervals(
+            scores, [room for room, view in zip(rooms, views, strict=True) for _ in view], seed
+        ),
         "classes": {name: summary(some) for name, some in by_class.items()},
     }
 
 
 def summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
-    """Means over the objects that have a figure, and on how many those of surfaces stand."""
+    """Means over the objects that have a value, and the numbers of objects behind them."""
 
     def mean(name: str) -> float | None:
         known = [value for score in scores if (value := getattr(score, name)) is not None]
@@ -113,13 +131,35 @@ def summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
         "objects": len(scores),
         "unmatched": sum(not score.found for score in scores),
         "with_surface": sum(score.surface_known for score in scores),
-        **{name: mean(name) for name in METRICS},
-        "class_accuracy": mean("class_right"),
+        **{name: mean(attribute) for name, attribute in FIELDS.items()},
     }
 
 
+def intervals(
+    scores: Sequence[PairScore], rooms: Sequence[str], seed: int = 0
+) -> dict[str, list[float] | None]:
+    """[lower, upper] end for each metric of a summary; None for a metric without a value.
+
+    Rooms are resampled with all objects of all their views. The resamples depend only on the rooms
+    and the seed, so that several methods share them.
+
+    Args:
+        rooms: The room of each score.
+    """
+    names, number = np.unique(rooms, return_inverse=True)
+    counts = resample_counts(len(names), RESAMPLES, seed)
+    found = {}
+    for name, attribute in FIELDS.items():
+        values = [getattr(score, attribute) for score in scores]
+        known = np.bincount(number, [value is not None for value in values])
+        sums = np.bincount(number, [value or 0.0 for value in values])
+        high = np.inf if name.startswith("chamfer") else 1.0
+        found[name] = ratio(sums, known, counts, high).interval()
+    return found
+
+
 def surface_note(objects: int, with_surface: int, shards: str) -> str | None:
-    """Why metrics of surfaces stand on fewer objects than those of boxes; None if they do not."""
+    """A note that surface metrics cover fewer objects than box metrics; None if they do not."""
     if with_surface == objects:
         return None
     short = f"only of the {with_surface} that do" if with_surface else "not at all"
@@ -131,9 +171,7 @@ def surface_note(objects: int, with_surface: int, shards: str) -> str | None:
     )
 
 
-PROTOCOL = {
-    "objects": "those that the image shows, each matched to what was found for its mask by the "
-    "fit's own assignment (class and 2D box); every object weighs the same",
+METRICS = {
     "box_iou_3d": "axis-aligned boxes in the room frame",
     "oriented_box_iou_3d": "upright boxes around the meshes, over the footprint's rectangle of "
     "least area",
@@ -142,5 +180,13 @@ PROTOCOL = {
     "chamfer_squared_m2": "the same of squared distances, in square metres",
     "f_score": f"at {F_THRESHOLD_M} m",
 }
-"""What is compared and the metrics, as it stands in result files."""
-METRICS = tuple(name for name in PROTOCOL if name != "objects")
+PROTOCOL = {
+    "objects": "those that the image shows, each matched to what was found for its mask by the "
+    "fit's own assignment (class and 2D box); every object weighs the same",
+    **METRICS,
+    "intervals": f"{COVERAGE:.0%} bootstrap over rooms, {RESAMPLES:,} draws with replacement, all "
+    "views of a room together",
+}
+"""The compared objects and the metrics, as described in result files."""
+FIELDS = {**{name: name for name in METRICS}, "class_accuracy": "class_right"}
+"""Metrics of a summary, each the mean of this field of `PairScore`."""

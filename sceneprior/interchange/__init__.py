@@ -1,1 +1,1 @@
-"""Rooms in the formats of others, and back."""
+"""Conversion of rooms to and from other projects' formats."""

@@ -1,4 +1,4 @@
-"""Write rooms as ATISS keeps them: one box list a room, which `box_lists.py` reads back."""
+"""Write rooms in ATISS's format: one box list per room, which `box_lists.py` reads back."""
 
 import io
 from collections.abc import Sequence
@@ -8,47 +8,55 @@ from typing import Any
 import numpy as np
 import shapely
 
-from sceneprior.classes import label_set
-from sceneprior.files import write_whole
+from sceneprior.core.classes import label_set
+from sceneprior.core.files import write_whole
+from sceneprior.core.floor import floor_polygon
+from sceneprior.core.scene import Scene, Turned
 from sceneprior.interchange.box_lists import NOT_FURNITURE
-from sceneprior.scene import Scene
 
 ENDS = ("start", "end")
-"""Columns that ATISS keeps beside the classes, after them."""
+"""Columns that ATISS appends to those of the classes."""
 
 
 def write_atiss(scenes: Sequence[Scene], folder: Path) -> None:
-    """Write `<room>/boxes.npz` for each room, y up, in metres, about the floor's centre.
+    """Write `<room>/boxes.npz` for each room, y up, in metres, with the floor's centre as origin.
 
-    Boxes are axis-aligned, so every angle is 0 and sizes are half extents along x, y, z; meshes
-    are left behind. Columns of `class_labels` are the label set without void, then start and end.
+    Sizes are half extents in each box's own frame: of the turned box if the object has one, else of
+    the axis-aligned box, with angle 0. Meshes are not written. The columns of `class_labels` are
+    the label set without void, then start and end.
+
+    Raises:
+        InputError: a floor has no area.
     """
     for scene in scenes:
         columns = [name for name in label_set(scene.label_set) if name not in NOT_FURNITURE]
         one_hot = np.eye(len(columns) + len(ENDS), dtype=np.float32)
         rows = [columns.index(item.label) for item in scene.objects]
-        floor: dict[str, Any] = {} if scene.floor_m is None else floor_plan(scene.floor_m)
+        boxes = [item.turned or Turned(0.0, item.size_m) for item in scene.objects]
+        outline = floor_polygon(scene)
+        floor: dict[str, Any] = {} if outline is None else floor_plan(outline)
         buffer = io.BytesIO()
         np.savez(
             buffer,
             class_labels=one_hot[np.array(rows, dtype=int)],
             translations=scene.centers_m,
-            sizes=scene.sizes_m / 2,
-            angles=np.zeros((len(rows), 1)),
+            sizes=np.array([box.size_m for box in boxes]).reshape(-1, 3) / 2,
+            angles=np.array([box.yaw_rad for box in boxes]).reshape(-1, 1),
             **floor,
         )
         write_whole(Path(folder) / scene.name / "boxes.npz", buffer.getvalue())
 
 
-def floor_plan(outline_m: np.ndarray) -> dict[str, np.ndarray]:
-    """A floor as triangles (facing up) at y = 0, about the origin.
+def floor_plan(floor: shapely.Geometry) -> dict[str, np.ndarray]:
+    """ATISS's arrays of a floor plan: triangles at y = 0 that face up, and the origin as centroid.
 
-    >>> square = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
-    >>> floor_plan(square)["floor_plan_faces"].shape
+    >>> floor_plan(shapely.box(-1, -1, 1, 1))["floor_plan_faces"].shape
     (2, 3)
     """
-    parts = shapely.constrained_delaunay_triangles(shapely.Polygon(outline_m)).geoms
-    # Counter-clockwise in (x, z) faces down where y is up: turned about.
+    # A polygon with repeated corners cannot be triangulated.
+    floor = shapely.remove_repeated_points(floor)
+    parts = shapely.get_parts(shapely.constrained_delaunay_triangles(floor))
+    # Counter-clockwise in (x, z) faces down with y up, so the order is reversed.
     corners = [np.asarray(shapely.orient_polygons(part).exterior.coords)[2::-1] for part in parts]
     flat = np.concatenate(corners)
     return {

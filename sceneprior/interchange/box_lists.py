@@ -1,7 +1,5 @@
-"""Scenes from the box lists of other methods (docs/evaluation.md, "Scenes of other methods")."""
+"""Read scenes from other methods' box lists (docs/evaluation.md, "Scenes of other methods")."""
 
-import json
-import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,35 +9,45 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from sceneprior.classes import label_set
-from sceneprior.errors import InputError
-from sceneprior.geometry.turns import yaw_rotation
-from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.topdown import box_mesh
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json
+from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.scene import (
+    MOST_OBJECTS,
+    Mesh,
+    Scene,
+    SceneObject,
+    Turned,
+    bound_m,
+    check_box,
+    check_floor,
+)
+from sceneprior.render.topdown import box_mesh
 
 NEEDED = ("class_labels", "translations", "sizes", "angles")
 FLOOR = ("floor_plan_vertices", "floor_plan_faces", "floor_plan_centroid")
 NOT_FURNITURE = ("start", "empty", "void")
-"""Columns of class_labels that stand for no object; `end` also ends the list."""
+"""Columns of class_labels without an object; the column `end` ends the list."""
 SIZES = {"half": 2.0, "full": 1.0}
 _QUARTER_RAD = 1e-4
-"""Closer than this to a quarter turn, a box stays a box."""
+"""Tolerance within which an angle counts as a quarter turn; such boxes need no mesh."""
 
 
 def read_box_lists(
     boxes: Path, label_set_name: str, classes: str | None = None, sizes: str = "half"
 ) -> list[Scene]:
-    """The rooms of box lists.
+    """Read the rooms of box lists.
 
     Args:
-        boxes: A `.npz` or `.json`, or a folder searched for them.
-        label_set_name: Theirs; every class must be in it.
+        boxes: A `.npz` or `.json`, or a folder that is searched for them.
+        label_set_name: Label set of the rooms; it must contain every class.
         classes: Comma-separated names of the columns (or indices) of `class_labels`; None takes
-            the label set without void, and `start` and `end` after it where there are two more.
+            the label set without void, followed by `start` and `end` if there are two more columns.
         sizes: `half` or `full` extents.
 
     Raises:
-        InputError: a file is no box list, or names a class that the label set lacks.
+        InputError: a file is not a box list, or has a class that the label set lacks.
     """
     if sizes not in SIZES:
         raise InputError(f"No sizes '{sizes}'; they are half (extents, as ATISS has them) or full.")
@@ -52,7 +60,7 @@ def read_box_lists(
 
 
 def _files(boxes: Path) -> list[tuple[Path, str]]:
-    """Files with the names of their rooms: ATISS keeps one folder with a boxes.npz per room."""
+    """Files, each with a room name: ATISS stores one folder with a boxes.npz per room."""
     if boxes.is_file():
         return [(boxes, boxes.stem)]
     found = [path for path in sorted(boxes.rglob("*")) if path.suffix in (".npz", ".json")]
@@ -71,21 +79,25 @@ def read_boxes(
     columns: Sequence[str] | None = None,
     size_factor: float = 2.0,
 ) -> list[Scene]:
-    """The rooms of one file; see `read_box_lists`. Several get numbers after the name.
+    """Read the rooms of one file; see `read_box_lists`. Several rooms get a number in their name.
 
     Args:
         path: `.npz` with one room (arrays over objects) or several (one more axis in front), or
             `.json` with one such object, or a list of them.
-        columns: What the columns of `class_labels` mean.
-        size_factor: From `sizes` to full extents.
+        columns: Names of the columns of `class_labels`.
+        size_factor: Factor from `sizes` to full extents.
     """
     rooms = [room for record in _records(path) for room in _one_by_one(path, record)]
     scenes = []
     for row, room in enumerate(rooms):
         own = name if len(rooms) == 1 else f"{name}_{row:04d}"
-        objects = _objects(path, room, label_set_name, columns, size_factor)
+        objects = tuple(_objects(path, room, label_set_name, columns, size_factor))
+        if len(objects) > MOST_OBJECTS:
+            raise InputError(
+                f"{path}: a room has {len(objects)} objects; expected at most {MOST_OBJECTS}."
+            )
         come_from = {"converted_from": path.name}
-        scenes.append(Scene(own, label_set_name, tuple(objects), _floor(path, room), come_from))
+        scenes.append(Scene(own, label_set_name, objects, _floor(path, room), come_from))
     return scenes
 
 
@@ -95,28 +107,31 @@ def _records(path: Path) -> list[dict[str, Any]]:
             with np.load(path, allow_pickle=False) as file:
                 records = [{key: file[key] for key in (*NEEDED, *FLOOR) if key in file}]
         else:
-            loaded = json.loads(path.read_text())
+            loaded = read_json(path)
             records = loaded if isinstance(loaded, list) else [loaded]
-        missing = [key for key in NEEDED if any(key not in record for record in records)]
-    except (OSError, ValueError, TypeError, zipfile.BadZipFile) as error:
+    except Exception as error:  # a damaged file raises almost anything in numpy
         raise InputError(
             f"{path} is no box list ({type(error).__name__}); expected an .npz or .json with "
             f"{', '.join(NEEDED)}."
         ) from None
+    if not all(isinstance(record, dict) for record in records):
+        raise InputError(f"{path} is no box list; expected objects with {', '.join(NEEDED)}.")
+    missing = [key for key in NEEDED if any(key not in record for record in records)]
     if missing:
         raise InputError(f"{path} has no {' and no '.join(missing)}; a box list has all of them.")
     return records
 
 
 def _one_by_one(path: Path, record: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rooms of a record, with arrays over objects; several rooms lie along a first axis."""
+    """Split a record into rooms with arrays over objects; a first axis may hold several rooms."""
     try:
-        centers, sizes, angles = (np.asarray(record[key], dtype=np.float64) for key in NEEDED[1:])
-    except (ValueError, TypeError):
+        labels, *boxes = (np.asarray(record[key]) for key in NEEDED)
+        centers, sizes, angles = (part.astype(np.float64, casting="same_kind") for part in boxes)
+    except (ValueError, TypeError, OverflowError):
         raise InputError(
-            f"{path}: translations, sizes and angles must be arrays of numbers."
+            f"{path}: class_labels, translations, sizes and angles must be arrays, the last three "
+            "of numbers."
         ) from None
-    labels = np.asarray(record["class_labels"])
     if centers.size == 0:
         centers, sizes, angles = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
         labels = np.zeros(0, dtype=int)
@@ -164,8 +179,7 @@ def _objects(
                 f"{path}: class '{label}' is not in label set '{label_set_name}'; use one of "
                 f"{', '.join(known[1:])}, or another --label-set."
             )
-        if (size <= 0).any():
-            raise InputError(f"{path}: a {label} has size {size.tolist()}; sizes are above 0.")
+        check_box(path, label, center.tolist(), (size_factor * size).tolist())
         yield turned_box(label, center, size_factor * size, float(angle))
 
 
@@ -174,7 +188,7 @@ def _label_names(
 ) -> list[str]:
     if labels.dtype.kind in "US":
         return [str(label) for label in labels]
-    if labels.dtype.kind not in "fiub":
+    if labels.dtype.kind not in "fiub" or labels.shape[1:] == (0,):
         raise InputError(f"{path}: class_labels are neither names, indices nor one-hot rows.")
     rows = labels.argmax(-1) if labels.ndim == 2 else labels.astype(int)
     if columns is None:
@@ -193,39 +207,42 @@ def _label_names(
 def turned_box(
     label: str, center: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"], yaw_rad: float
 ) -> SceneObject:
-    """A box turned about +y, +z towards +x, as an object of ours.
+    """A `SceneObject` from a box turned about +y, +z towards +x.
 
-    Its box is the axis-aligned one around it; unless it stands in quarter turns, its mesh is the
-    turned box itself, which pictures show.
+    The object has the axis-aligned box around the turned one, which is kept as `turned`. Unless the
+    angle is a quarter turn, the object's mesh is the turned box, so that pictures show it.
 
-    Example: a square table, 1 m wide, stands on a corner.
+    Example: a square table, 1 m wide, turned by 45 degrees.
 
         >>> turned = turned_box("table", np.zeros(3), np.array([1.0, 0.7, 1.0]), np.pi / 4)
         >>> [round(float(side), 3) for side in turned.size_m]
         [1.414, 0.7, 1.414]
     """
-    turn = yaw_rotation(yaw_rad)
-    width, height, depth = np.abs(turn) @ size
+    width, height, depth = map(float, size)
+    turned = Turned(yaw_rad, (width, height, depth))
     x, y, z = map(float, center)
-    item = SceneObject(label, (x, y, z), (width, height, depth))
+    item = SceneObject(label, (x, y, z), bound_m(turned), turned=turned if yaw_rad else None)
     if abs(yaw_rad - np.round(yaw_rad / (np.pi / 2)) * (np.pi / 2)) < _QUARTER_RAD:
         return item
-    own = box_mesh((0.0, 0.0, 0.0), size.tolist())
-    return replace(item, mesh=Mesh(own.vertices_m @ turn.T + center, own.faces))
+    own = box_mesh((0.0, 0.0, 0.0), turned.size_m)
+    return replace(item, mesh=Mesh(own.vertices_m @ yaw_rotation(yaw_rad).T + center, own.faces))
 
 
 def _floor(path: Path, room: dict[str, Any]) -> np.ndarray | None:
-    """The outline of the floor's triangles around the floor's own centre, as ATISS places boxes."""
+    """Outline of the floor's triangles relative to its centroid, the origin of ATISS's boxes."""
     if any(key not in room for key in FLOOR):
         return None
     try:
         vertices, faces, centroid = (np.asarray(room[key]) for key in FLOOR)
         flat = (vertices.astype(np.float64) - centroid)[:, [0, 2]]
-        # Buffered by nothing: two triangles that share an edge become one outline.
+        check_floor(path, flat)
+        # buffer(0) makes the triangles valid, so that their union is one outline.
         floor = shapely.union_all([shapely.Polygon(flat[face]).buffer(0) for face in faces])
         largest = max(shapely.get_parts(floor), key=shapely.area)
         return np.asarray(largest.exterior.coords)[:-1]
-    except (ValueError, IndexError, TypeError) as error:
+    except InputError:
+        raise
+    except (ValueError, IndexError, TypeError, OverflowError, shapely.errors.ShapelyError) as error:
         raise InputError(
             f"{path}: its floor plan cannot be read ({error}); expected vertices (V, 3), "
             "triangles (F, 3) and a centroid (3,)."

@@ -1,14 +1,14 @@
-"""The formats that rooms are exported to, by name."""
+"""Export of rooms to other formats, by name."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from sceneprior.errors import InputError
-from sceneprior.files import is_name
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene
 from sceneprior.interchange.atiss import write_atiss
 from sceneprior.interchange.front import write_front
-from sceneprior.scene import Scene
-from sceneprior.scene_files import save_scene
+from sceneprior.render.scene_files import check_names, save_scene
 
 
 def _one_by_one(ending: str) -> Callable[[Sequence[Scene], Path], None]:
@@ -27,18 +27,30 @@ FORMATS: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
 }
 
 
-def export_scenes(scenes: Sequence[Scene], to: str, folder: Path) -> None:
-    """Write rooms to a folder in one of `FORMATS`; axes and unit are ours in all: y up, metres.
+OF_CLASSES = ("atiss", "threed-front")
+"""Formats in which every object needs a furniture class, so that void objects are left out."""
+
+
+def export_scenes(scenes: Sequence[Scene], to: str, folder: Path) -> list[str]:
+    """Write rooms to a folder in one of `FORMATS`; in all of them y is up, in metres.
+
+    Returns:
+        Notes for the user on objects that were left out.
 
     Raises:
-        InputError: an unknown format, or rooms that have no names of their own.
+        InputError: an unknown format, or room names that are not unique or no file names.
     """
     if to not in FORMATS:
         raise InputError(f"No format '{to}'; choose from {', '.join(FORMATS)}, or scenes.")
-    names = [scene.name for scene in scenes]
-    for name in names:
-        if not is_name(name) or names.count(name) > 1:
-            raise InputError(
-                f"Two rooms are called '{name}', or none can be; give each a name of its own."
-            )
-    FORMATS[to](scenes, Path(folder))
+    check_names(scenes)
+    named, notes = list(scenes), []
+    if to in OF_CLASSES:
+        named = [
+            replace(scene, objects=tuple(o for o in scene.objects if o.label != "void"))
+            for scene in scenes
+        ]
+        left_out = sum(len(a.objects) - len(b.objects) for a, b in zip(scenes, named, strict=True))
+        if left_out:
+            notes = [f"Objects of class void are left out ({left_out}): {to} has no such class."]
+    FORMATS[to](named, Path(folder))
+    return notes

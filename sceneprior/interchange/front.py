@@ -1,9 +1,9 @@
-"""Write rooms as 3D-FRONT and 3D-FUTURE keep them: a house a room, a model an object.
+"""Write rooms in the formats of 3D-FRONT and 3D-FUTURE: one house per room, one model per object.
 
     <folder>/3D-FRONT/<room>.json
     <folder>/3D-FUTURE-model/model_info.json, <model id>/raw_model.obj
 
-`prep-front` reads both. Units are metres, y is up, and rooms stand about the origin, as ours do.
+`prep-front` reads both. Units are metres, y is up, and rooms are centred at the origin.
 """
 
 import uuid
@@ -12,13 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 
-from sceneprior.errors import InputError
-from sceneprior.files import json_text, write_json, write_whole
-from sceneprior.furniture import MODEL_FILE, category_table, class_of_category
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import json_text, write_json, write_whole
+from sceneprior.core.floor import floor_polygon
+from sceneprior.core.furniture import MODEL_FILE, category_table, class_of_category
+from sceneprior.core.scene import Scene
 from sceneprior.interchange.atiss import floor_plan
-from sceneprior.scene import Scene
-from sceneprior.topdown import floor_rectangle, scene_meshes
+from sceneprior.render.topdown import floor_rectangle, scene_meshes
 
 ROOM_TYPES = {
     "front3d_bedroom": "Bedroom", "front3d_living": "LivingRoom", "front3d_dining": "DiningRoom",
@@ -29,14 +31,13 @@ _POSE = {"rot": [0, 0, 0, 1], "scale": [1, 1, 1]}
 
 
 def write_front(scenes: Sequence[Scene], folder: Path) -> None:
-    """Write a folder of houses and one of models.
+    """Write a folder of houses and a folder of models.
 
-    An object's mesh, or its box, becomes a model of its own, whose category is one of 3D-FUTURE's
-    that has the object's class. Where a room's floor is unknown, it is the rectangle around the
-    furniture.
+    Each object's mesh, or its box, becomes a separate model, with a 3D-FUTURE category that maps to
+    the object's class. An unknown floor is written as the rectangle around the furniture.
 
     Raises:
-        InputError: no category of 3D-FUTURE has a class.
+        InputError: no category of 3D-FUTURE maps to a class, or a floor has no area.
     """
     models: list[dict[str, Any]] = []
     for scene in scenes:
@@ -47,14 +48,14 @@ def write_front(scenes: Sequence[Scene], folder: Path) -> None:
 
 
 def _house(scene: Scene, models: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """A room's house, and the records of its models, whose files are written."""
+    """Write the model files of a room; return its house and the records of its models."""
     furniture: list[dict[str, Any]] = []
     children: list[dict[str, Any]] = []
     records: list[dict[str, Any]] = []
     for index, (item, mesh) in enumerate(zip(scene.objects, scene_meshes(scene), strict=True)):
         category = category_of_class(item.label, scene.label_set)
         jid = str(uuid.uuid5(uuid.NAMESPACE_OID, f"{scene.name}/{index}"))
-        # A model stands on its own origin, as 3D-FUTURE's do.
+        # As in 3D-FUTURE, a model's origin is the centre of its lower face.
         x, y, z = item.center_m
         origin = np.array([x, y - item.size_m[1] / 2, z])
         vertices = np.asarray(mesh.vertices_m, dtype=np.float64) - origin
@@ -73,7 +74,8 @@ def _house(scene: Scene, models: Path) -> tuple[dict[str, Any], list[dict[str, A
             | _POSE
         )
         records.append({"model_id": jid, "super-category": "", "category": category})
-    plan = floor_plan(_outline(scene))
+    (x0, z0), (x1, z1) = floor_rectangle(scene)
+    plan = floor_plan(floor_polygon(scene) or shapely.box(x0, z0, x1, z1))
     floor = {
         "uid": "floor", "type": "Floor", "jid": "", "material": "",
         "xyz": plan["floor_plan_vertices"].ravel().tolist(),
@@ -94,7 +96,7 @@ def _house(scene: Scene, models: Path) -> tuple[dict[str, Any], list[dict[str, A
 
 
 def category_of_class(label: str, label_set_name: str) -> str:
-    """A category that has a class, as `prep-front` reads it.
+    """A 3D-FRONT category that `prep-front` maps to a class.
 
     >>> category_of_class("double_bed", "front3d_bedroom")
     'double bed'
@@ -106,10 +108,3 @@ def category_of_class(label: str, label_set_name: str) -> str:
         f"No category of 3D-FRONT is a '{label}' in label set '{label_set_name}'; leave such "
         "objects out, or export to another format."
     )
-
-
-def _outline(scene: Scene) -> np.ndarray:
-    if scene.floor_m is not None:
-        return scene.floor_m
-    (x0, z0), (x1, z1) = floor_rectangle(scene)
-    return np.array([[x0, z0], [x1, z0], [x1, z1], [x0, z1]])

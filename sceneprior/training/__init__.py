@@ -1,1 +1,2 @@
-"""Training (sections 3.4 and 4): the two stages, their settings, checkpoints."""
+"""Training (sections 3.4 and 4): the stages of a run, their settings, checkpoints and
+monitoring."""

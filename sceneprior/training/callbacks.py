@@ -10,11 +10,11 @@ from rich import progress
 from rich.console import Console
 
 from sceneprior.training.checkpoints import write_checkpoint
-from sceneprior.training.objective import batch_seed
+from sceneprior.training.steps import batch_seed
 
 
 class RunProgress(Callback):
-    """One bar for the whole stage, with the newest loss; on the error stream."""
+    """A progress bar for the whole stage, with the latest loss, on standard error."""
 
     def __init__(self, title: str):
         self.title = title
@@ -36,7 +36,7 @@ class RunProgress(Callback):
         )
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
-        # Reading a metric reduces it over the processes: all must ask, though one shows it.
+        # Reading a metric reduces it over the processes, so all of them must read it.
         loss = trainer.callback_metrics.get("train/loss")
         if self._progress is not None:
             text = "" if loss is None else f"loss {float(loss):.4f}"
@@ -52,7 +52,7 @@ class RunProgress(Callback):
 
 
 class StepSeed(Callback):
-    """Seed each batch anew, so that a resumed run drops out what it would have dropped out."""
+    """Seed each batch separately, so that a resumed run draws the same dropout."""
 
     def __init__(self, seed: int):
         self.seed = seed
@@ -62,11 +62,11 @@ class StepSeed(Callback):
 
 
 class RollingCheckpoint(Callback):
-    """Keep `last.ckpt` fresh: after every epoch, since only there a run can be taken up exactly.
+    """Write `last.ckpt` after every epoch, the only point at which a run can be resumed exactly.
 
-    A stop by hand loses the epoch it falls into, and the resumed run draws that epoch's views
-    again: it ends at the same weights as one that was never stopped. `extra`, plain data under
-    keys of its own, goes into every checkpoint.
+    An interrupted run loses the epoch at hand; the resumed run draws that epoch's views again and
+    ends at the same weights as an uninterrupted one. `extra`, plain data under its own keys, is
+    added to every checkpoint.
     """
 
     def __init__(self, folder: Path, extra: dict):

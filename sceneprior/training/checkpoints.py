@@ -1,11 +1,9 @@
-"""A run's folder: which checkpoint to take, and how one is written and read.
+"""A run's folder: choosing, reading and writing its checkpoints.
 
-RUN/config.yaml            every setting, defaults included
-RUN/<stage>/last.ckpt      newest checkpoint of the stage: what `--resume` continues from
-RUN/<stage>/final.ckpt     the stage is done: what tasks take unless asked for `best`
-RUN/<stage>/best.ckpt      where `samples.every` is set: what generated best (training/monitor.py)
-RUN/<stage>/samples.json   the newest evaluation and the best so far; pictures in samples/
-RUN/<stage>/metrics.csv    one line an epoch; TensorBoard's files lie beside it
+RUN/config.yaml            all settings, defaults included
+RUN/<stage>/last.ckpt      the stage's newest checkpoint, from which `--resume` continues
+RUN/<stage>/final.ckpt     the finished stage, which commands load
+RUN/<stage>/metrics.csv    one line per epoch; TensorBoard's files lie beside it
 """
 
 from collections.abc import Callable, Sequence
@@ -15,38 +13,27 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from sceneprior.errors import InputError
-from sceneprior.files import write_whole
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import write_whole
 
 if TYPE_CHECKING:
     import lightning
 
-CHECKPOINTS = ("final", "best")
+_RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "pytorch-lightning_version")
+"""Keys that the trainer needs from a checkpoint to resume, beside the weights."""
 
 
-def find_checkpoint(
-    run: Path, stages: Sequence[str], checkpoint: str = "final"
-) -> tuple[str, Path]:
-    """The stage and path of the checkpoint that tasks use, of the `stages` in their order.
-
-    `final` is the furthest finished stage's, else the furthest begun one's; `best` the one that
-    generated best in the furthest stage that has one.
+def find_checkpoint(run: Path, stages: Sequence[str]) -> tuple[str, Path]:
+    """Stage and path of the checkpoint that commands load, given a run's `stages` in order: that
+    of the last finished stage, or else the newest of the last stage begun.
 
     Raises:
-        InputError: what was asked for was not saved in the run yet.
+        InputError: the run has not saved a checkpoint yet.
     """
-    if checkpoint not in CHECKPOINTS:
-        raise InputError(f"No checkpoint '{checkpoint}'; choose from {', '.join(CHECKPOINTS)}.")
-    names = ("best.ckpt",) if checkpoint == "best" else ("final.ckpt", "last.ckpt")
-    for name in names:
+    for name in ("final.ckpt", "last.ckpt"):
         for stage in reversed(stages):
             if (run / stage / name).is_file():
                 return stage, run / stage / name
-    if checkpoint == "best":
-        raise InputError(
-            f"{run} holds no best.ckpt: its config has samples.every at 0, or nothing was "
-            "evaluated yet. Use the final checkpoint, or train with `--set samples.every=25`."
-        )
     raise InputError(
         f"{run} holds no checkpoint yet; let `sceneprior fit --config {run / 'config.yaml'} "
         f"--run {run} --resume` get further."
@@ -54,31 +41,59 @@ def find_checkpoint(
 
 
 def write_checkpoint(trainer: "lightning.Trainer", folder: Path, name: str) -> None:
-    """Write a checkpoint whole or not at all; all processes call, the first writes."""
+    """Write a checkpoint atomically; every process calls this, and the first one writes."""
     if trainer.is_global_zero:
         write_whole(folder / name, trainer.save_checkpoint)
     else:
-        trainer.save_checkpoint(folder / name)  # which takes part in saving, and writes nothing
-    # Others may be about to read it.
+        trainer.save_checkpoint(folder / name)  # collective: takes part, but writes nothing
+    # Other processes may be about to read it.
     trainer.strategy.barrier()
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint's contents, tensors and plain data only; InputError if it is damaged."""
+    """The contents of a checkpoint: tensors and plain data only.
+
+    Raises:
+        InputError: the file is damaged, or not a checkpoint.
+    """
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        saved = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
         raise InputError(
             f"{path} cannot be read ({type(error).__name__}); it is damaged. Delete it and run "
             "`sceneprior fit` with `--resume`."
         ) from None
+    if not isinstance(saved, dict) or not isinstance(saved.get("state_dict"), dict):
+        raise InputError(
+            f"{path} is no checkpoint of `sceneprior fit` (no state_dict in it). Delete it and run "
+            "`sceneprior fit` with `--resume`."
+        )
+    return saved
+
+
+def check_resumable(path: Path, module: nn.Module) -> None:
+    """Check that a stage can be resumed from a checkpoint.
+
+    Raises:
+        InputError: it is damaged, lacks what the trainer needs, or belongs to another network.
+    """
+    saved = read_checkpoint(path)
+    missing = [name for name in _RESUMED if name not in saved]
+    shapes = {name: getattr(value, "shape", None) for name, value in saved["state_dict"].items()}
+    expected = {name: value.shape for name, value in module.state_dict().items()}
+    if missing or shapes != expected:
+        reason = f"it has no {missing[0]}" if missing else "its tensors are of another network"
+        raise InputError(
+            f"No training can go on from {path}: {reason}. Delete it, and the stage begins anew "
+            "with the same command."
+        )
 
 
 def read_networks(
     path: Path, build: Callable[[int], nn.ModuleDict]
 ) -> tuple[nn.ModuleDict, tuple[str, ...]]:
-    """The networks of a checkpoint, and the ids of the rooms that it was trained on; `build` makes
-    the networks, freshly initialised, for so many rooms.
+    """The networks of a checkpoint, and the ids of the rooms that it was trained on. `build` makes
+    the freshly initialised networks for a number of rooms.
 
     Raises:
         InputError: the checkpoint is damaged, of other networks, or not written by `fit`.
@@ -87,10 +102,12 @@ def read_networks(
     try:
         room_ids = tuple(saved["sceneprior"]["room_ids"])
         networks = build(len(room_ids))
-        # What helped in training alone, such as a discriminator, is not needed any more.
+        # Weights used only in training, such as a discriminator's, are left out.
         weights = {k: v for k, v in saved["state_dict"].items() if k.split(".")[0] in networks}
         networks.load_state_dict(weights)
-    except (KeyError, RuntimeError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # the error depends on where the wrong part is first used
         reason = " ".join(str(error).split())[:200]
         raise InputError(
             f"{path} does not fit the run's config.yaml ({reason}); use the config it was trained "

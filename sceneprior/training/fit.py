@@ -1,10 +1,13 @@
 """Train the stages of a run, one after the other, with Lightning."""
 
+import contextlib
 import csv
 import logging
 import os
 import signal
+import threading
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +15,18 @@ import lightning
 import torch
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
-from sceneprior.data.datamodule import make_loader
-from sceneprior.errors import ConfigError, InputError
-from sceneprior.files import remove_parts
-from sceneprior.settings import check_settings, dump_settings, read_settings
+from sceneprior.core.data.datamodule import make_loader
+from sceneprior.core.errors import ConfigError, InputError
+from sceneprior.core.files import only_writer, remove_parts
+from sceneprior.core.settings import check_settings, dump_settings, read_settings
 from sceneprior.training.callbacks import RollingCheckpoint, RunProgress, StepSeed
-from sceneprior.training.checkpoints import write_checkpoint
+from sceneprior.training.checkpoints import check_resumable, write_checkpoint
 from sceneprior.training.method import RunConfig, Stage
-from sceneprior.training.monitor import Evaluate, SampleMonitor
+from sceneprior.training.settings import without_samples
 from sceneprior.training.slurm import first_process, requeue_on_signal, slurm_plugins
 
 LOGGERS = ("csv", "tensorboard", "wandb")
+"""Names of the loggers that `fit` accepts."""
 
 
 def fit(
@@ -31,48 +35,62 @@ def fit(
     resume: bool = False,
     loggers: tuple[str, ...] = ("csv", "tensorboard"),
     trainer_options: dict[str, Any] | None = None,
-    evaluate: Evaluate | None = None,
 ) -> None:
-    """Train what `config.stages()` lists.
+    """Train the stages that `config.stages()` lists.
 
     Args:
         config: The run's settings.
-        run: Where config, checkpoints and logs go.
+        run: Folder for config, checkpoints and logs.
         resume: Continue an interrupted run: finished stages are not trained again.
-        loggers: Of `csv`, `tensorboard`, `wandb`.
+        loggers: Any of `csv`, `tensorboard`, `wandb`.
         trainer_options: Passed on to Lightning's Trainer (devices, accelerator, precision); its
-            `callbacks` come after those of `fit`.
-        evaluate: Scores what is generated every `samples.every` epochs;
-            `experiments.evaluate_samples.SampleEvaluator(config)`.
+            `callbacks` are called after those of `fit`.
 
     Raises:
-        InputError: the run exists and is not resumed, its settings differ from `config`, or the
-            shards do not fit it; a run refused at its start leaves nothing behind.
+        InputError: the run exists and is not resumed, its settings differ from `config`, another
+            process trains it, or the shards do not fit it. A run refused at its start leaves no
+            files behind.
+        OSError: the run's folder cannot be written; `filename` is set.
     """
     run, config = Path(run), config.with_label_set()
-    if config.samples.every and evaluate is None:
-        raise InputError(
-            f"samples.every is {config.samples.every}, but nothing was given to evaluate what is "
-            "generated; pass evaluate=sceneprior.experiments.evaluate_samples.SampleEvaluator("
-            "config), or set it to 0."
-        )
-    _check_run(config, run, resume)
     for name in loggers:
         if name not in LOGGERS:
             raise InputError(f"No logger '{name}'; choose from {', '.join(LOGGERS)}.")
     previous = None
-    with requeue_on_signal():
+    with _own_folder(run), requeue_on_signal():
+        if first_process():
+            _check_run(config, run, resume)
         for stage in config.stages():
             final = run / stage.name / "final.ckpt"
             if not final.is_file():
                 options = trainer_options or {}
-                _train(stage, config, final.parent, previous, resume, loggers, options, evaluate)
+                _train(stage, config, final.parent, previous, resume, loggers, options)
             previous = final
 
 
+@contextlib.contextmanager
+def _own_folder(run: Path) -> Iterator[None]:
+    """Lock a run's folder against other trainings; of this run's processes, the first holds the
+    lock."""
+
+    def report(ended: threading.ExceptHookArgs) -> None:
+        if ended.exc_type is None or not issubclass(ended.exc_type, OSError):
+            report_before(ended)
+
+    # TensorBoard writes in a thread; its errors are raised again in the main thread, so the
+    # thread's own report is left out.
+    report_before, threading.excepthook = threading.excepthook, report
+    try:
+        with only_writer(run) if first_process() else contextlib.nullcontext():
+            yield
+    except OSError as error:
+        error.filename = error.filename or str(run)  # a logger's error may not name its file
+        raise
+    finally:
+        threading.excepthook = report_before
+
+
 def _check_run(config: RunConfig, run: Path, resume: bool) -> None:
-    if not first_process():
-        return  # one of several processes: the first has checked, and the run is its own
     saved = run / "config.yaml"
     if not saved.is_file():
         return
@@ -81,7 +99,8 @@ def _check_run(config: RunConfig, run: Path, resume: bool) -> None:
             f"{run} already holds a run; add --resume to continue it, or name another folder."
         )
     try:
-        same = check_settings(type(config), read_settings(str(saved))[1], str(saved)) == config
+        data = without_samples(read_settings(str(saved))[1], str(saved))
+        same = check_settings(type(config), data, str(saved)) == config
     except ConfigError:
         raise InputError(
             f"{saved} is of another method or version than the settings given now, or damaged; "
@@ -102,21 +121,17 @@ def _train(
     resume: bool,
     loggers: tuple[str, ...],
     options: dict[str, Any],
-    evaluate: Evaluate | None,
 ) -> None:
-    """Train one stage in its folder to the end, or as far as Ctrl-C lets it."""
+    """Train one stage in its folder to the end, or until Ctrl-C."""
     settings = stage.settings
     rooms = stage.open_data()
     module = stage.build(rooms, previous)
     latents = getattr(module, "latents", None)
-    pairs_no_room = latents is not None and not len(latents.weight)  # with its latent space
+    pairs_no_room = latents is not None and not len(latents.weight)  # the table is empty
     room_ids = () if pairs_no_room else rooms.room_ids
     callbacks: list[lightning.Callback] = [
         RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed)
     ]  # fmt: skip
-    if evaluate is not None and config.samples.every:
-        # Before the rolling checkpoint, which holds the best so far.
-        callbacks.append(SampleMonitor(folder, config, stage.name, room_ids, evaluate))
     said = {"room_ids": list(room_ids), "label_set": config.label_set}
     callbacks.append(RollingCheckpoint(folder, {"sceneprior": said}))
     callbacks += options.get("callbacks", ())
@@ -130,12 +145,12 @@ def _train(
             f"method: {config.method} trains in one process, but {trainer.world_size} were "
             "asked for; use --devices 1."
         )
-    # Only now: a run that is refused leaves nothing behind.
+    # Written only now: a run that is refused leaves no files behind.
     if trainer.is_global_zero:
         folder.mkdir(parents=True, exist_ok=True)
-        remove_parts(folder)  # of a process that was killed while it saved
+        remove_parts(folder)  # left by a process killed while saving
         dump_settings(config, folder.parent / "config.yaml")
-    if rooms.masks is None:  # else worker processes may make the batches
+    if rooms.masks is None:  # with masks, worker processes may load the batches
         rooms.to(trainer.strategy.root_device)
     loader = make_loader(
         rooms, settings.batch_size, config.seed, config.data.workers,
@@ -143,6 +158,8 @@ def _train(
     )  # fmt: skip
     last = folder / "last.ckpt"
     start = last if resume and last.is_file() else None
+    if start is not None:
+        check_resumable(start, module)
     before = signal.getsignal(signal.SIGINT)
     try:
         trainer.fit(module, loader, ckpt_path=start, weights_only=True)
@@ -150,7 +167,7 @@ def _train(
         # Lightning answers Ctrl-C with sys.exit(1).
         if not trainer.interrupted:
             raise
-        signal.signal(signal.SIGINT, before)  # which Lightning left ignored
+        signal.signal(signal.SIGINT, before)  # Lightning leaves it ignored
         raise KeyboardInterrupt from None
     write_checkpoint(trainer, folder, "final.ckpt")
 
@@ -189,7 +206,8 @@ def _trainer(
 
 
 def make_logger(name: str, folder: Path) -> Logger:
-    """One of `LOGGERS`, for a stage's folder; CSV goes on where a stopped run's ended."""
+    """The logger of that name from `LOGGERS` for a stage's folder; CSV appends to an interrupted
+    run's file."""
     if name == "csv":
         return _csv_logger(folder)
     if name == "tensorboard":
@@ -201,7 +219,7 @@ def make_logger(name: str, folder: Path) -> Logger:
 
 
 def _csv_logger(folder: Path) -> CSVLogger:
-    # Lightning's deletes what it finds: hand it the rows of the epochs before the stop.
+    # Lightning's CSVLogger deletes an existing file, so it is given the rows of earlier epochs.
     path = folder / "metrics.csv"
     before = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
     logger = CSVLogger(folder, name="", version="")
@@ -212,7 +230,7 @@ def _csv_logger(folder: Path) -> CSVLogger:
 
 
 def _quiet_lightning() -> None:
-    """Leave out Lightning's hints, and let matrix products be fast where a GPU has such."""
+    """Silence Lightning's hints, and allow fast (TF32) matrix products on GPUs that have them."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="lightning")

@@ -1,4 +1,4 @@
-"""SLURM: leave a job in time and have it queued again (docs/cluster.md)."""
+"""SLURM: stop a job in time and requeue it (docs/cluster.md)."""
 
 import os
 import signal
@@ -13,26 +13,26 @@ from lightning.pytorch.utilities import rank_zero_only
 
 
 def first_process() -> bool:
-    """Whether this is the process that writes, of however many, on however many nodes."""
+    """True in the process that writes files: rank 0 over all nodes."""
     return getattr(rank_zero_only, "rank", 0) == 0
 
 
 def slurm_plugins() -> list[Any]:
-    """Lightning's view of SLURM, without its requeue.
+    """Lightning's SLURM environment, without its own requeueing.
 
-    That one saves in the middle of an epoch, where a run cannot be taken up exactly, and under
-    the current folder, where the next stage would take the file for its own.
+    Lightning's requeueing saves in the middle of an epoch, where a run cannot be resumed exactly,
+    and into the current folder, where the next stage would mistake the file for its own.
     """
     return [SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else []
 
 
 @contextmanager
 def requeue_on_signal() -> Iterator[None]:
-    """In a SLURM job, answer SIGUSR1 by queueing the job again and stopping as Ctrl-C does.
+    """In a SLURM job, handle SIGUSR1 by requeueing the job and stopping as Ctrl-C does.
 
-    Nothing needs saving then: `last.ckpt` is as old as the last whole epoch, and a resumed run
-    repeats the one that was cut short, view for view. SIGTERM, which SLURM sends before it
-    preempts a job that it queues again itself, stops after the batch at hand.
+    Nothing needs to be saved at that point: `last.ckpt` is that of the last complete epoch, and a
+    resumed run repeats the interrupted epoch view for view. SIGTERM, which SLURM sends before it
+    preempts and requeues a job itself, stops training after the current batch.
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
     if not (SLURMEnvironment.detect() and in_main_thread):
@@ -40,9 +40,9 @@ def requeue_on_signal() -> Iterator[None]:
         return
 
     def leave(number: int, frame: object) -> None:
-        signal.signal(number, signal.SIG_IGN)  # srun may pass it on a second time
+        signal.signal(number, signal.SIG_IGN)  # srun may send it a second time
         if first_process():
-            # First, while there is time: SLURM answers it with SIGTERM.
+            # Requeued first, while there is time: SLURM then sends SIGTERM.
             subprocess.run(["scontrol", "requeue", _job()], check=False)
         raise KeyboardInterrupt
 

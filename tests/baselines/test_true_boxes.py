@@ -2,20 +2,21 @@
 
 import ast
 import shutil
+from collections import defaultdict
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import torch
-from tiny_runs import tiny_baseline, tiny_config
 
 from sceneprior.baselines.true_boxes import TruthDataset
-from sceneprior.data.dataset import BLANK, ViewDataset
-from sceneprior.errors import ShardError
-from sceneprior.geometry.corners import box_corners
-from sceneprior.geometry.turns import turn_boxes
-from sceneprior.shards import Shard, iterate_rooms
+from sceneprior.core.data.dataset import BLANK, ViewDataset
+from sceneprior.core.errors import ShardError
+from sceneprior.core.geometry.corners import box_corners
+from sceneprior.core.geometry.turns import turn_boxes
+from sceneprior.core.shards import Shard, iterate_rooms
+from sceneprior.training.fit import fit
 
 PACKAGE = Path(__file__).parents[2] / "sceneprior"
 
@@ -96,72 +97,47 @@ def test_a_process_without_a_room_of_its_own_gets_nothing_in_no_room(toy_shards)
     assert batch.room_ids == () and not batch.is_object.any() and not batch.object_class.any()
 
 
-def test_shards_without_ground_truth_are_a_sentence(toy_shards, tmp_path):
+@pytest.mark.parametrize("method", ("atiss", "sync2gen", "total3d", "im3d"))
+def test_methods_under_3d_supervision_refuse_shards_without_it(
+    baseline_config, toy_shards, tmp_path, method
+):
     blind = shutil.copytree(toy_shards, tmp_path / "blind")
     with h5py.File(blind / "train" / "part_000.h5", "r+") as file:
         del next(iter(file["rooms"].values()))["ground_truth"]
-    with pytest.raises(
-        ShardError, match=r"part_000.h5, room toy/train_00 carries no 3D ground truth"
-    ):
-        TruthDataset(blind, "train")
-    with h5py.File(toy_shards / "train" / "part_001.h5") as file:
-        assert "ground_truth" in next(iter(file["rooms"].values()))
-    odd = shutil.copytree(toy_shards, tmp_path / "odd")
-    with h5py.File(odd / "train" / "part_001.h5", "r+") as file:
-        file.attrs["label_set"] = "scannet"
-    with pytest.raises(ShardError, match="is labelled 'scannet' but its neighbours 'front3d_bed"):
-        TruthDataset(odd, "train")
+    sentence = r"part_000.h5, room toy/train_00 carries no 3D ground truth.*\(paper, lifted, "
+    sentence += r"gan, usl\)"
+    with pytest.raises(ShardError, match=sentence):
+        fit(baseline_config(method, data__shards=str(blind)), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
-def test_only_baselines_with_3d_supervision_come_to_the_ground_truth():
-    """By name, over the whole package: evaluation reads it; retrieval asks it for the classes of
-    CAD models, not for rooms; and of training one module for methods that make rooms, and one for
-    those that answer images, which takes meshes by way of evaluation."""
-    readers, importers, of_meshes = set(), set(), set()
-    for path in sorted(PACKAGE.rglob("*.py")):
+@pytest.mark.parametrize("method", ("atiss2d", "atiss2d in one stage", "gan", "usl"))
+def test_methods_under_2d_supervision_never_read_it(baseline_config, tmp_path, monkeypatch, method):
+    monkeypatch.setattr(Shard, "read_ground_truth", None)
+    changes = {"layout": None} if "one stage" in method else {}
+    config = baseline_config(method.split()[0], **changes)
+    fit(config, tmp_path / "run", trainer_options={"accelerator": "cpu"})
+
+
+def test_only_baselines_with_3d_supervision_read_the_ground_truth():
+    """By the imports of the whole package: evaluation reads it; retrieval reads the classes of CAD
+    models; of what trains, one module reads boxes, and one reads views with true meshes."""
+    importers = defaultdict(set)
+    for path in PACKAGE.rglob("*.py"):
         name = path.relative_to(PACKAGE).as_posix()
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Attribute) and node.attr == "read_ground_truth":
-                readers.add(name)
-            if (
-                isinstance(node, ast.ImportFrom)
-                and node.module == "sceneprior.baselines.true_boxes"
-            ):
-                importers.add(name)
-            if (
-                isinstance(node, ast.ImportFrom)
-                and node.module == "sceneprior.evaluation.ground_truth"
-                and name.split("/")[0] in ("data", "models", "losses", "training", "baselines")
-            ):
-                of_meshes.add(name)
-            if isinstance(node, ast.ImportFrom) and str(node.module).endswith("single_view.truth"):
-                of_meshes.add(f"{name} (views)")
-    assert readers == {
-        "baselines/true_boxes.py", "evaluation/ground_truth.py", "generation/cad_models.py"
+                importers[node.attr].add(name)
+            if isinstance(node, ast.ImportFrom):
+                importers[node.module].add(name)
+                for alias in node.names:
+                    importers[alias.name].add(name)
+    assert importers["read_ground_truth"] == {
+        "baselines/true_boxes.py", "core/ground_truth.py", "apps/retrieval/cad_models.py"
     }  # fmt: skip
-    assert importers == {"baselines/box_training.py"}
-    assert of_meshes == {
-        "baselines/single_view/truth.py",
-        "baselines/single_view/total3d.py (views)",
-        "baselines/single_view/im3d.py (views)",
-    }
-
-
-@pytest.mark.parametrize("one_stage", [False, True])
-def test_stages_under_2d_supervision_never_ask_for_it(toy_shards, tmp_path, monkeypatch, one_stage):
-    from sceneprior.training.fit import fit
-
-    def refuse(self, room_id):
-        raise AssertionError(f"the ground truth of {room_id} was opened")
-
-    monkeypatch.setattr(Shard, "read_ground_truth", refuse)
-    config = tiny_config(toy_shards, layout__epochs=1, shape__epochs=1)
-    if one_stage:
-        config = config.model_copy(update={"layout": None})
-    fit(config, tmp_path / "run", trainer_options={"accelerator": "cpu"})
-    with pytest.raises(AssertionError, match="the ground truth of toy/train_00 was opened"):
-        fit(
-            tiny_baseline(toy_shards, "atiss"),
-            tmp_path / "other",
-            trainer_options={"accelerator": "cpu"},
-        )
+    trains = ("paper/", "lifted/", "training/", "baselines/")
+    readers = {n for n in importers["sceneprior.core.ground_truth"] if n.startswith(trains)}
+    views = "baselines/single_view"
+    assert readers == {f"{views}/truth.py", "lifted/reconstruction/known_rooms.py"}
+    assert importers["TruthDataset"] == {"baselines/box_training.py"}
+    assert importers["TrueViewDataset"] == {f"{views}/total3d.py"}

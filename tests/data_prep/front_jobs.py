@@ -12,7 +12,7 @@ from front_files import FrontFolder, bedroom
 from data_prep.engine.build import Job
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
-from sceneprior.shards import Shard, room_checksum
+from sceneprior.core.shards import Shard, room_checksum
 
 SMALL = ("views.image_size=[90, 120]", "views.per_m2=0.5", "views.min_object_pixels=20")
 
@@ -61,7 +61,7 @@ def change_room(
     with h5py.File(path, "a") as file:
         group = list(file["rooms"].values())[number]
         change(group)
-        room_id = str(group.attrs["room_id"])
+        room_id = group.attrs["room_id"].decode()
     if seal:
         with Shard(path) as shard:
             views = shard.read_room(room_id, images=True)

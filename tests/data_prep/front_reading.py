@@ -12,7 +12,7 @@ from data_prep.front.furnished import Furniture, Room
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import HouseRooms, read_house
-from sceneprior.scene import Mesh
+from sceneprior.core.scene import Mesh
 
 
 def read(

@@ -16,7 +16,7 @@ BEDS = {"double_bed", "single_bed", "kids_bed"}
 
 def class_of_category(room_type: str) -> dict[str, str]:
     column = {"bedroom": "bedroom_class", "living": "living_room_class"}[room_type]
-    table = files("sceneprior").joinpath("front3d_categories.csv").read_text()
+    table = files("sceneprior.core").joinpath("front3d_categories.csv").read_text()
     return {row["model_info_category"]: row[column] for row in csv.DictReader(table.splitlines())}
 
 

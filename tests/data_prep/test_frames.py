@@ -15,7 +15,7 @@ from data_prep.frames import (
     sampled_lines,
 )
 from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 
 def still(count):
@@ -144,4 +144,4 @@ def test_lines_are_sampled_as_shards_sample_them():
 
 
 def test_docstring_examples():
-    assert doctest.testmod(frames) == (0, 7)
+    assert doctest.testmod(frames) == (0, 8)

@@ -7,8 +7,8 @@ import numpy as np
 from toy_rooms import LABEL_SET, make_toy_room
 
 from data_prep.engine.source import Expected, LeftOut, PreparedRoom, RoomTask, Survey
-from sceneprior.errors import InputError
-from sceneprior.scene import Mesh
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Mesh
 
 TRIANGLE = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], dtype=np.int32))
 

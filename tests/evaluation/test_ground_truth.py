@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from toy_rooms import write_shard
 
-from sceneprior.errors import InputError, ShardError
-from sceneprior.evaluation.ground_truth import (
+from sceneprior.core.errors import InputError, ShardError
+from sceneprior.core.ground_truth import (
     independent_rooms,
     reference_scenes,
     shuffled_rooms,
 )
+from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.evaluation.metrics.contents import class_frequencies, object_counts
-from sceneprior.scene import Mesh, Scene, SceneObject
-from sceneprior.topdown import topdown
+from sceneprior.render.topdown import topdown
 
 MESH = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 

@@ -6,13 +6,13 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.evaluation.layout_distance import (
     layout_distance,
     nearest_distances,
     nearest_known,
     nearest_room,
 )
-from sceneprior.scene import Scene, SceneObject
 
 LABELS = ("desk", "chair", "sofa")
 
@@ -127,14 +127,53 @@ def test_turned_and_mirrored_copies_are_at_no_distance_and_a_room_passes_itself_
     assert nearest_distances(training[:1], [])[0] == np.inf
 
 
-def test_only_rooms_with_the_same_classes_compare_where_asked():
-    desk, chair = ("desk", (0, 0, 0), (1, 1, 1)), ("chair", (2, 0, 0), (1, 1, 1))
+DESK, CHAIR = ("desk", (0, 0, 0), (1, 1, 1)), ("chair", (2, 0, 0), (1, 1, 1))
+
+
+def test_copies_hold_the_same_furniture_and_one_odd_object_costs_nothing():
     moved = ("chair", (2.5, 0, 0), (1, 1, 1))
-    training = [room(desk), room(chair, chair), room(moved, desk)]
-    got = nearest_distances([room(desk, chair), room(desk, desk)], training, same_classes=True)
-    assert got[0] == pytest.approx(0.25) and got[1] == np.inf
-    # Without the condition, one missing object of two is as near as can be.
-    assert nearest_distances([room(desk, desk)], training)[0] == 0.5
+
+    def apart(scene, *training):
+        return nearest_distances([scene], training, as_copies=True)[0]
+
+    assert apart(room(DESK, CHAIR), room(moved, DESK)) == pytest.approx(0.25)
+    sofa = ("sofa", (5, 0, 5), (1, 1, 1))
+    # A sofa more, on either side: the pairs that are left count, and they alone.
+    assert apart(room(DESK, CHAIR, sofa), room(moved, DESK)) == pytest.approx(0.25)
+    assert apart(room(DESK, CHAIR), room(sofa, moved, DESK)) == pytest.approx(0.25)
+    # One object replaced is two that differ; an empty room is a copy of nothing.
+    assert apart(room(DESK, CHAIR), room(DESK, sofa)) == np.inf
+    assert apart(room(DESK), room()) == apart(room(), room(DESK)) == apart(room(), room()) == np.inf
+    # Otherwise, one missing object of two is as near as can be.
+    assert nearest_distances([room(DESK, DESK)], [room(DESK)])[0] == 0.5
+
+
+def test_the_nearest_copy_is_found_among_all(rng):
+    """Against every room by itself, all pairings tried: bounds must rule out no copy."""
+    labels = ("desk", "chair", "chair", "sofa")
+    training = [
+        room(*((labels[k], rng.uniform(-1, 1, 3), (1, 1, 1)) for k in range(1 + row % 4)))
+        for row in range(24)
+    ]
+    scenes = [
+        room(*((label, rng.uniform(-1, 1, 3), (1, 1, 1)) for label in labels[:count]))
+        for count in (1, 2, 3, 4)
+    ]
+    for scene in scenes:
+        alone = [nearest_distances([scene], [each], as_copies=True)[0] for each in training]
+        by_hand = [
+            min(
+                by_all_pairings(turn, other) * max(len(turn.objects), len(other.objects))
+                - abs(len(turn.objects) - len(other.objects))
+                for turn in eight(scene)
+            )
+            / min(len(scene.objects), len(other.objects))
+            if abs(len(scene.objects) - len(other.objects)) <= 1
+            else np.inf
+            for other in training
+        ]
+        np.testing.assert_allclose(alone, by_hand, atol=1e-9)
+        assert nearest_distances([scene], training, as_copies=True)[0] == min(alone)
 
 
 def test_what_a_prior_remembers_is_searched_beside_what_it_has_seen(rng):
@@ -143,7 +182,7 @@ def test_what_a_prior_remembers_is_searched_beside_what_it_has_seen(rng):
     decoded = [replace(room(*moved), name="room_0")]
     found = nearest_known(decoded, training, decoded)
     assert found.training_m[0] == pytest.approx(0.1 if moved else 0)
-    assert found.decoded_m[0] == found.same_classes_m[0] == 0
+    assert found.decoded_m[0] == found.as_copies_m[0] == 0
     assert nearest_known(decoded, training, []).decoded_m is None
     assert nearest_known(decoded, training, decoded, True).decoded_m[0] == np.inf
     assert found.of([0]).training_m.tolist() == found.training_m.tolist()

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from sceneprior.errors import InputError
-from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.core.errors import InputError
+from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.evaluation.metrics.frechet import frechet_distance
 from sceneprior.evaluation.networks import (
     efficientnet_lite0_features,
     inception_features,
     single_threaded,
 )
-from sceneprior.topdown import topdown
+from sceneprior.render.topdown import topdown
 
 
 @pytest.fixture(scope="module")

@@ -14,11 +14,11 @@ import pytest
 from PIL import Image
 
 import sceneprior.evaluation
+from sceneprior.core.geometry.corners import BOX_FACES
+from sceneprior.core.geometry.isosurface import surface_of
+from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.evaluation.page import FACES_PER_PAGE, faces_per_object, glb_of
 from sceneprior.evaluation.rooms_page import ROOMS_SHOWN, write_rooms_page
-from sceneprior.geometry.corners import BOX_FACES
-from sceneprior.geometry.isosurface import surface_of
-from sceneprior.scene import Mesh, Scene, SceneObject
 
 VIEWER = Path(sceneprior.evaluation.__file__).parent / "model_viewer"
 WITHOUT_WEBGL = """

@@ -8,15 +8,15 @@ import pytest
 from toy_metrics import without_classifiers
 from toy_rooms import write_shard
 
-from sceneprior.errors import InputError
-from sceneprior.evaluation import reference_file
-from sceneprior.evaluation.ground_truth import (
+from sceneprior.core.errors import InputError
+from sceneprior.core.ground_truth import (
     reference_scenes,
     split_fingerprint,
     stream_scenes,
 )
+from sceneprior.core.scene import Scene
+from sceneprior.evaluation import reference_file
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
-from sceneprior.scene import Scene
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprior.classes import class_colors
-from sceneprior.evaluation.ground_truth import reference_scenes
-from sceneprior.evaluation.report import UNFOLDING_SHOWN, _spread, write_report
+from sceneprior.core.classes import class_colors
+from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.evaluation.report import UNFOLDING_SHOWN, _spread, _tiles, write_report
 from sceneprior.evaluation.report_pictures import curves_svg, input_views, legend, room_pictures
+from sceneprior.evaluation.rooms_page import write_rooms_page
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
-from sceneprior.scene import Scene, SceneObject
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,9 @@ def page(shards, renderer, generated, tmp_path_factory) -> str:
         path,
         title="Bedrooms <new> & real",
         shards=shards,
-        run=path.parent / "my_run",
+        source="run my_run",
+        made_by="Paper's method; rooms drawn by: paper",
+        views=True,
         generated=generated,
         scores=scores,
         commands=["sceneprior synthesize --run RUN -n 16", "make demo && echo '<done>'"],
@@ -108,8 +111,9 @@ def test_text_is_escaped(page):
 
 def test_parts_without_material_are_left_out(shards, renderer, tmp_path):
     write_report(
-        tmp_path / "a.html", title="Bare", shards=shards, run="run", generated=[], scores={},
-        commands=[], curves={}, decoded=[], unfolding=[], renderer=renderer,
+        tmp_path / "a.html", title="Bare", shards=shards, source="run", made_by="none",
+        views=True, generated=[], scores={}, commands=[], curves={}, decoded=[], unfolding=[],
+        renderer=renderer,
     )  # fmt: skip
     page = (tmp_path / "a.html").read_text()
     assert re.findall("<h2>(.*)</h2>", page) == ["What training saw"]
@@ -156,3 +160,24 @@ def test_long_walks_are_thinned_with_both_ends_kept():
     assert _spread(list(range(17)), UNFOLDING_SHOWN) == [0, 2, 4, 6, 8, 10, 12, 14, 16]
     assert _spread([1, 2], UNFOLDING_SHOWN) == [1, 2]
     assert _spread([], UNFOLDING_SHOWN) == []
+
+
+def test_tiles_do_not_round_to_all_or_nothing():
+    scores = {
+        "type_share": 0.995, "type_share_test": 0.9996,
+        "near_copy_share": 0.004, "near_copy_share_test": 0.0,
+    }  # fmt: skip
+    assert _tiles(scores) == [
+        ("99.5%", "hold their type's furniture", "over 99.9% of real test rooms"),
+        ("0.4%", "near copies of a training room", "0% of real test rooms"),
+    ]
+
+
+def test_a_page_of_a_stranger_s_rooms_runs_nothing(renderer, tmp_path):
+    label = "<img src=x onerror='alert(1)'>"
+    item = SceneObject(label, (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
+    room = Scene("</figcaption><script>alert(2)</script>", f"void,{label}", (item,))
+    write_rooms_page(tmp_path / "a.html", [room], renderer, title=label, subtitle=label)
+    page = (tmp_path / "a.html").read_text("utf-8")
+    assert "<img src=x" not in page and "<script>alert" not in page
+    assert "&lt;script&gt;alert(2)" in page and 'alt="&lt;img src=x onerror=&#39;' in page

@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.scene import SceneObject
 from sceneprior.evaluation.room_sets import choose_rooms, seeded_rows, without_void
-from sceneprior.scene import SceneObject
 
 
 def test_void_is_left_out_and_subsets_are_seeded(shards):

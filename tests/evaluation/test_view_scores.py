@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import SceneObject
 from sceneprior.evaluation.view_scores import ObjectPair, score_pair, score_views, surface_note
-from sceneprior.scene import SceneObject
-from sceneprior.topdown import box_mesh
+from sceneprior.render.topdown import box_mesh
 
 POINTS = 4000
 
@@ -62,9 +62,10 @@ def test_a_mesh_counts_and_its_turn_shows_in_the_oriented_box():
 
 def test_every_object_weighs_the_same_and_nothing_found_is_no_number():
     views = [[ObjectPair(DESK, DESK), ObjectPair(BED, None)], [ObjectPair(DESK, None)]]
-    scores = score_views(views, POINTS)
+    scores = score_views(views, ["a", "a"], POINTS)
     summary = scores["summary"]
-    assert (summary["images"], summary["objects"], summary["unmatched"]) == (2, 3, 2)
+    assert (summary["rooms"], summary["images"], summary["objects"]) == (1, 2, 3)
+    assert summary["unmatched"] == 2
     assert summary["with_surface"] == 3
     assert summary["box_iou_3d"] == pytest.approx(1 / 3)
     assert summary["class_accuracy"] == pytest.approx(1 / 3)
@@ -84,10 +85,10 @@ def test_a_box_is_no_surface():
     assert all(getattr(score, name) is None for name in unknown)
     assert score_pair(ObjectPair(replace(DESK, mesh=None), None), POINTS).f_score is None
     mixed = [[ObjectPair(BED, moved(BED, 0.1)), ObjectPair(replace(DESK, mesh=None), DESK)]]
-    one, two = (score_views(v, POINTS)["summary"] for v in (mixed, [mixed[0][:1]]))
+    one, two = (score_views(v, ["a"], POINTS)["summary"] for v in (mixed, [mixed[0][:1]]))
     assert (one["objects"], one["with_surface"], two["with_surface"]) == (2, 1, 1)
     assert all(one[name] == two[name] for name in unknown)
-    bare = score_views([mixed[0][1:]], POINTS)["summary"]
+    bare = score_views([mixed[0][1:]], ["a"], POINTS)["summary"]
     assert bare["with_surface"] == 0 and all(bare[name] is None for name in unknown)
 
 
@@ -101,10 +102,33 @@ def test_why_metrics_of_surfaces_stand_on_fewer_objects():
 
 def test_the_same_seed_gives_the_same_scores():
     views = [[ObjectPair(DESK, moved(DESK, 0.2))]]
-    assert score_views(views, 200, 3) == score_views(views, 200, 3)
-    assert score_views(views, 200, 3) != score_views(views, 200, 4)
+    assert score_views(views, ["a"], 200, 3) == score_views(views, ["a"], 200, 3)
+    assert score_views(views, ["a"], 200, 3) != score_views(views, ["a"], 200, 4)
+
+
+def test_intervals_are_over_rooms_and_not_over_views():
+    """Ten views of one room say no more about other rooms than one does."""
+    rng, rooms = np.random.default_rng(0), [f"room {row}" for row in range(40)]
+    right = {room: rng.random() < 0.5 for room in rooms}
+
+    def width(count: int) -> float:
+        images = [room for room in rooms for _ in range(count)]
+        views = [[ObjectPair(DESK, DESK if right[room] else None)] for room in images]
+        scores = score_views(views, images, 50)
+        assert scores["summary"]["box_iou_3d"] == pytest.approx(np.mean(list(right.values())))
+        low, high = scores["intervals"]["box_iou_3d"]
+        assert scores["intervals"]["class_accuracy"] == [low, high]
+        return high - low
+
+    assert width(10) == pytest.approx(width(1))
+    assert width(1) == pytest.approx(2 * 1.96 * 0.5 / 40**0.5, rel=0.1)  # of a fair coin's mean
+
+
+def test_metrics_without_a_value_have_no_interval():
+    intervals = score_views([[ObjectPair(BED, None)]], ["a"], POINTS)["intervals"]
+    assert intervals["chamfer_l2_m"] is None and intervals["box_iou_3d"] == [0, 0]
 
 
 def test_no_object_is_a_sentence():
     with pytest.raises(InputError, match="nothing to score"):
-        score_views([[]])
+        score_views([[]], ["a"])

@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from sceneprior.errors import InputError
-from sceneprior.generation.export import write_scenes
+from sceneprior.apps.rooms import write_scenes
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene
 from sceneprior.interchange.box_lists import read_box_lists, read_boxes, turned_box
-from sceneprior.offscreen import SoftwareRenderer
-from sceneprior.scene import Scene
-from sceneprior.scene_files import load_scene_folder
-from sceneprior.topdown import topdown
+from sceneprior.render.offscreen import SoftwareRenderer
+from sceneprior.render.scene_files import load_scene_folder
+from sceneprior.render.topdown import topdown
 
 BEDROOM = "front3d_bedroom"
 DESK, BED = 7, 8
@@ -127,12 +127,19 @@ def test_a_folder_becomes_scenes_that_are_read_back(tmp_path):
         ({"sizes": np.ones((3, 3))}, "do not describe the same objects"),
         ({"translations": np.ones((2, 2))}, "do not describe the same objects"),
         ({"angles": np.full((2, 1), np.nan)}, "not finite"),
-        ({"sizes": np.zeros((2, 3))}, "sizes are above 0"),
+        ({"sizes": np.zeros((2, 3))}, "sizes above 0"),
+        ({"sizes": np.full((2, 3), 90)}, r"a desk .* Are these centimetres\? Give metres"),
+        ({"class_labels": np.zeros((2, 0))}, "neither names, indices nor one-hot rows"),
+        ({"angles": np.zeros((2, 1), complex)}, "must be arrays, the last three of numbers"),
+        ({key: np.ones((1001, 3)) for key in ("translations", "sizes")}
+         | {"angles": np.zeros(1001), "class_labels": np.ones(1001, int)}, "1001 objects"),
         ({"class_labels": np.eye(30)[:2]}, "know 30 classes, but 21 names stand for them"),
         ({"class_labels": np.array([0, -1])}, "names stand for them"),
         ({"class_labels": np.array(["desk", "lamp"])}, "'lamp' is not in label set"),
         ({"floor_plan_vertices": np.ones(3), "floor_plan_faces": np.ones(3),
           "floor_plan_centroid": np.ones(3)}, "its floor plan cannot be read"),
+        ({"floor_plan_vertices": np.eye(3) * 900, "floor_plan_faces": np.array([[0, 1, 2]]),
+          "floor_plan_centroid": np.zeros(3)}, "the floor reaches 900 m .* centimetres"),
     ],
 )  # fmt: skip
 def test_what_is_no_box_list_is_a_sentence(tmp_path, changes, sentence):
@@ -143,9 +150,13 @@ def test_what_is_no_box_list_is_a_sentence(tmp_path, changes, sentence):
 def test_files_that_are_none_are_named(tmp_path):
     for name, content in (("a.npz", "x"), ("a.json", "{"), ("b.json", "[1]")):
         (tmp_path / name).write_text(content)
-        with pytest.raises(InputError, match=f"{name} (is no box list|has no)"):
+        with pytest.raises(InputError, match=f"{name} is no box list"):
             read_boxes(tmp_path / name, "a", BEDROOM)
     (tmp_path / "c.json").write_text('{"sizes": []}')
+    (tmp_path / "d.json").write_text('{"class_labels": [[1], [1, 2]], "translations": [], "sizes": '
+                                     '[], "angles": []}')  # fmt: skip
+    with pytest.raises(InputError, match="class_labels, translations, sizes and angles must be"):
+        read_boxes(tmp_path / "d.json", "a", BEDROOM)
     with pytest.raises(InputError, match="has no class_labels and no translations and no angles"):
         read_boxes(tmp_path / "c.json", "a", BEDROOM)
     with pytest.raises(InputError, match=r"holds no \.npz and no \.json"):

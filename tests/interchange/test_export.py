@@ -1,5 +1,7 @@
 """Rooms go out in other formats and come back: axes, units, classes, floors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import shapely
@@ -7,10 +9,13 @@ import shapely
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import read_house
-from sceneprior.errors import InputError
+from sceneprior.apps.rooms import write_scenes
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.interchange.box_lists import read_box_lists
 from sceneprior.interchange.export import export_scenes
-from sceneprior.scene import Mesh, Scene, SceneObject
+from sceneprior.render.offscreen import SoftwareRenderer
+from sceneprior.render.scene_files import load_scene_folder
 
 BEDROOM = "front3d_bedroom"
 FLOOR = np.array([[-2.0, -1.5], [2.0, -1.5], [2.0, 1.5], [0.0, 1.5], [0.0, 0.5], [-2.0, 0.5]])
@@ -49,6 +54,49 @@ def test_box_lists_come_back(scenes, tmp_path):
         shapely.Polygon(FLOOR), 1e-9, normalize=True
     )
     assert back[1].floor_m is None
+
+
+def test_angles_of_box_lists_come_back(tmp_path):
+    """ATISS -> scenes -> ATISS, through files: quarter turns and others, and negative ones."""
+    angles = np.array([0.0, np.pi / 2, -np.pi / 2, np.pi, 0.4, -2.1, np.pi / 4])
+    rng = np.random.default_rng(0)
+    theirs = {
+        "class_labels": np.eye(23)[rng.integers(0, 21, len(angles))],
+        "translations": rng.uniform(-2, 2, (len(angles), 3)),
+        "sizes": rng.uniform(0.2, 1, (len(angles), 3)),
+        "angles": angles[:, None],
+    }
+    (tmp_path / "theirs" / "a").mkdir(parents=True)
+    np.savez(tmp_path / "theirs" / "a" / "boxes.npz", **theirs)
+    write_scenes(read_box_lists(tmp_path / "theirs", BEDROOM), tmp_path / "s", SoftwareRenderer())
+    for keep_meshes in (True, False):
+        if not keep_meshes:
+            (tmp_path / "s" / "a.glb").unlink()
+        out = tmp_path / str(keep_meshes)
+        assert export_scenes(load_scene_folder(tmp_path / "s"), "atiss", out) == []
+        with np.load(out / "a" / "boxes.npz") as back:
+            for key, values in theirs.items():
+                np.testing.assert_allclose(back[key], values, atol=1.1e-5, err_msg=key)
+
+
+@pytest.mark.parametrize("to", ["atiss", "threed-front"])
+def test_void_is_left_out_and_odd_floors_are_handled(scenes, tmp_path, to):
+    void = SceneObject("void", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
+    first = replace(scenes[0], objects=(void, *scenes[0].objects))
+    (note,) = export_scenes([first], to, tmp_path / "void")
+    assert note == f"Objects of class void are left out (1): {to} has no such class."
+    if to == "atiss":
+        (back,) = read_box_lists(tmp_path / "void", BEDROOM)
+        assert [item.label for item in back.objects] == ["double_bed", "pendant_lamp"]
+    for floor in (
+        [[-1, -1], [1, 1], [1, -1], [-1, 1]],  # crosses itself
+        [[-1, -1], [1, -1], [1, 1], [-1, -1], [-1, -1]],  # closed, and a corner twice
+    ):
+        odd = replace(first, floor_m=np.array(floor, dtype=float), name="odd")
+        export_scenes([odd], to, tmp_path / "odd")
+    flat = replace(first, floor_m=np.array([[0.0, 0], [1, 0], [2, 0]]))
+    with pytest.raises(InputError, match="The floor of scene 'first' has no area"):
+        export_scenes([flat], to, tmp_path / "flat")
 
 
 def test_3d_front_s_reader_finds_the_rooms_and_their_models(scenes, tmp_path):
@@ -106,7 +154,7 @@ def test_obj_is_one_file_a_room(scenes, tmp_path):
 def test_what_cannot_be_exported_is_a_sentence(scenes, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="No format 'max'; choose from atiss, threed-front, obj"):
         export_scenes(scenes, "max", tmp_path)
-    with pytest.raises(InputError, match="Two rooms are called 'first'"):
+    with pytest.raises(InputError, match="2 rooms are called 'first'"):
         export_scenes([scenes[0], scenes[0]], "obj", tmp_path)
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)
     with pytest.raises(InputError, match=r"USD needs a package more: pip install 'sceneprior\[usd"):

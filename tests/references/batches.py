@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sceneprior.shards import RoomViews, iterate_rooms
+from sceneprior.core.shards import RoomViews, iterate_rooms
 
 
 def rooms_with_images(folder: Path, split: str) -> list[RoomViews]:

@@ -1,4 +1,4 @@
-"""Rays through occupancy grids as torch has them: the slow twin of `lifting/thinning.py`."""
+"""Rays through occupancy grids as torch has them: the slow twin of `lifted/lifting/thinning.py`."""
 
 import math
 

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from toy_rooms import look_at
 
-from sceneprior.geometry.meshes import icosphere
-from sceneprior.silhouettes.render import render_scene
+from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.render.silhouettes.render import render_scene
 
 FILE = Path(__file__).resolve().parents[1] / "golden" / "silhouettes.npz"
 MODES = ("exact", "fast")

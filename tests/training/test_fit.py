@@ -6,23 +6,26 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch.utilities import rank_zero_only
 from tiny_runs import tiny_config, write_tiny_config
 from typer.testing import CliRunner
 
-from sceneprior.cli import app
-from sceneprior.config import load_config, load_run
-from sceneprior.errors import InputError
+from sceneprior.apps.cli.commands import app
+from sceneprior.apps.config import load_config, load_run
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import only_writer
+from sceneprior.paper.stages import LayoutStage
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import RollingCheckpoint
 from sceneprior.training.checkpoints import find_checkpoint, read_checkpoint
 from sceneprior.training.fit import fit
-from sceneprior.training.stages import LayoutStage
 
 CPU = {"accelerator": "cpu", "devices": 1}
 
@@ -102,7 +105,7 @@ def test_resuming_a_finished_run_trains_nothing(toy_run, toy_shards, tmp_path, m
     [
         {},
         {"model__decoder__dropout": 0.2},
-        {"layout__schedule": "cosine", "shape__schedule": "cosine"},
+        {"layout__schedule": {"name": "cosine"}, "shape__schedule": {"name": "cosine"}},
     ],
     ids=["plain", "dropout", "cosine"],
 )
@@ -180,7 +183,7 @@ def test_ctrl_c_before_training_does_not_speak_of_a_run(toy_shards, tmp_path, mo
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sceneprior.training.method.ViewDataset", stop)
+    monkeypatch.setattr("sceneprior.paper.trained.ViewDataset", stop)
     config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards)
     result = CliRunner().invoke(app, ["fit", "--config", str(config), "--run", str(tmp_path / "r")])
     assert result.exit_code == 130
@@ -308,6 +311,69 @@ def test_damaged_or_foreign_checkpoints_are_sentences(toy_run, tmp_path):
     ):
         load_run(run)
     with pytest.raises(
-        InputError, match=r"is not a run folder \(no config.yaml in it\); train one"
+        InputError, match=r"is not a run folder: there is no config.yaml in it, .* train one"
     ):
         load_run(tmp_path)
+
+
+def test_a_second_training_of_the_same_run_is_refused(toy_shards, tmp_path, monkeypatch):
+    config, run = tiny_config(toy_shards, layout__epochs=1, shape__epochs=1), tmp_path / "run"
+    with only_writer(run):
+        for resume in (False, True):
+            with pytest.raises(InputError, match=r"Another run is writing to .*run; wait for it"):
+                fit(config, run, resume=resume, trainer_options=CPU)
+        # The other processes of the training that holds the folder do not ask for it.
+        with monkeypatch.context() as patch:
+            patch.setattr(rank_zero_only, "rank", 1)
+            patch.setattr(
+                "sceneprior.training.fit._train", lambda *_: pytest.fail("as far as training")
+            )
+            with pytest.raises(pytest.fail.Exception, match="as far as training"):
+                fit(config, run, trainer_options=CPU)
+    assert not run.exists()
+
+
+def _zip_of_a_text(path):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("notes.txt", "no checkpoint")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda path: path.write_bytes(path.read_bytes()[:-3000]), "it is damaged. Delete it"),
+        (lambda path: path.write_bytes(b""), "it is damaged. Delete it"),
+        (lambda path: path.write_text("epoch: 3"), "it is damaged. Delete it"),
+        (_zip_of_a_text, "it is damaged. Delete it"),
+        (lambda path: torch.save([1, 2], path), "is no checkpoint of `sceneprior fit` (no state"),
+        (lambda path: torch.save({"state_dict": {}}, path), "it has no epoch. Delete it, and"),
+    ],
+    ids=["truncated", "empty", "text", "zip", "list", "weights"],
+)
+def test_a_spoilt_checkpoint_to_go_on_from_is_a_sentence(
+    toy_shards, tmp_path, begun_run, spoil, said
+):
+    run = shutil.copytree(begun_run, tmp_path / "run")
+    spoil(run / "layout" / "last.ckpt")
+    with pytest.raises(InputError) as error:
+        fit(tiny_config(toy_shards, layout__epochs=2), run, resume=True, trainer_options=CPU)
+    assert str(run / "layout" / "last.ckpt") in str(error.value) and said in str(error.value)
+
+
+def test_a_checkpoint_of_another_network_is_not_gone_on_from(toy_shards, tmp_path, begun_run):
+    run = shutil.copytree(begun_run, tmp_path / "run")
+    path = run / "layout" / "last.ckpt"
+    saved = read_checkpoint(path)
+    saved["state_dict"]["latents.weight"] = torch.zeros(3, 3)
+    torch.save(saved, path)
+    with pytest.raises(InputError, match="its tensors are of another network"):
+        fit(tiny_config(toy_shards, layout__epochs=2), run, resume=True, trainer_options=CPU)
+
+
+@pytest.fixture(scope="module")
+def begun_run(toy_shards, tmp_path_factory):
+    """Stopped in its first stage, after one epoch."""
+    run = tmp_path_factory.mktemp("begun") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        interrupted(patch, tiny_config(toy_shards, layout__epochs=2), run, "layout", 1)
+    return run

@@ -6,7 +6,7 @@ from recorded_fit import record
 from tiny_runs import tiny_config
 from torch.testing import assert_close
 
-from sceneprior.training import stages
+from sceneprior.paper import stages
 from sceneprior.training.fit import fit
 
 

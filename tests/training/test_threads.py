@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from sceneprior.config import load_config
+from sceneprior.apps.config import load_config
 
 
 @pytest.fixture
 def step_on() -> Callable[[int], tuple[Tensor, list[Tensor]]]:
     """Boxes and gradients of 64 rooms at the small configs' size, on so many threads."""
     before = torch.get_num_threads()
-    config = load_config("front_bedroom_small.yaml", ("label_set=front3d_bedroom",))
+    config = load_config("paper/bedroom_small.yaml", ("label_set=front3d_bedroom",))
     prior = config.build_prior()
     z = prior.latent_space(torch.randn(64, 100, generator=torch.Generator().manual_seed(0)))
 

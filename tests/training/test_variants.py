@@ -5,25 +5,27 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_runs import OCCUPANCY, tiny_config
+from tiny_runs import tiny_config, tiny_lifted
 from torch.testing import assert_close
 
-from sceneprior.baselines.lstm import SceneLstm
-from sceneprior.config import Model, load_run
-from sceneprior.evaluation.metrics.decoded_rooms import match_scenes
-from sceneprior.evaluation.synthesis import EvalOptions
-from sceneprior.experiments.evaluate import (
+from sceneprior.apps.config import load_run
+from sceneprior.apps.decoders import AnyPaperModel
+from sceneprior.apps.experiments.evaluate import (
     UNFOLDING_STEPS,
     decoded_and_true,
     evaluate_run,
     read_curves,
     unfold,
 )
-from sceneprior.generation.decode import decode_training_rooms, synthesize
-from sceneprior.generation.sample import DISTRIBUTIONS
-from sceneprior.lifting import dataset as lifted
-from sceneprior.models.latents import LatentCube
-from sceneprior.models.prototypes import Prototypes
+from sceneprior.apps.sample import sample_rooms
+from sceneprior.baselines.lstm import SceneLstm
+from sceneprior.core.overlaps import match_scenes
+from sceneprior.evaluation.synthesis import EvalOptions
+from sceneprior.lifted.lifting import dataset as lifted
+from sceneprior.lifted.prototypes import Prototypes
+from sceneprior.paper.decode import decode_training_rooms
+from sceneprior.paper.latents import LatentCube
+from sceneprior.paper.sampling import DISTRIBUTIONS
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import RollingCheckpoint
 from sceneprior.training.checkpoints import read_checkpoint
@@ -38,13 +40,11 @@ RELEASED = {
     "model__decoder__step_mlps": True,
     "model__layout_heads": "separate",
     "model__completeness_target": "stop",
-    "layout__proxy": "ellipsoid_points",
 }
 VARIANTS = {
     "c1_uniform": {
         "model__latent_space": {"name": "cube"},
         "layout__latent_noise": 0.1,
-        "loss__latents": 1.0,
     },
     "c2_lstm": {"model__decoder": {"name": "lstm"}},
     "c3_one_stage": {"layout": None, "shape__epochs": 5},
@@ -54,9 +54,12 @@ VARIANTS = {
         "shape__proxy": "beveled_box",
     },
     "released": RELEASED,
-    "lifted": {"layout__supervision": "lifted", "loss__latents": 1.0},
-    "occupancy": {"layout__supervision": "lifted", **OCCUPANCY},
-    "occupancy_one_stage": {"layout": None, **OCCUPANCY},
+    "lifted": {},
+    "lifted_spread": {
+        "loss__latents": 1.0,
+        "model__latent_space": {"name": "cube"},
+        "shape__epochs": 12,
+    },
 }
 
 
@@ -71,7 +74,11 @@ class Stop(RollingCheckpoint):
 @pytest.fixture(scope="module", params=VARIANTS)
 def variant(request, toy_shards, tmp_path_factory):
     """Name, config and a finished run."""
-    config = tiny_config(toy_shards, **(FAST | VARIANTS[request.param]))
+    changes = VARIANTS[request.param]
+    if request.param.startswith("lifted"):
+        config = tiny_lifted(toy_shards, **changes)
+    else:
+        config = tiny_config(toy_shards, **(FAST | changes))
     run = tmp_path_factory.mktemp(request.param) / "run"
     fit(config, run, trainer_options=CPU)
     return request.param, config, run
@@ -80,18 +87,19 @@ def variant(request, toy_shards, tmp_path_factory):
 def test_a_variant_learns(variant):
     _, config, run = variant
     curves = read_curves(run)
-    assert [k.split("/")[0] for k in curves if k.endswith("/loss")] == (
-        ["shape"] if config.layout is None else ["layout", "shape"]
-    )
-    losses = [value for _, value in curves["layout/loss" if config.layout else "shape/loss"]]
+    assert [k.split("/")[0] for k in curves if k.endswith("/loss")] == (list(config.stage_names))
+    losses = [value for _, value in curves[f"{config.stage_names[0]}/loss"]]
     assert losses[-1] < losses[0]
-    assert all(torch.isfinite(torch.tensor(value)) for _, value in curves["shape/mask"])
+    term = "shape/shape" if config.method == "lifted" else "shape/mask"
+    assert all(torch.isfinite(torch.tensor(value)) for _, value in curves[term])
 
 
 def test_bevels_are_learnt_by_the_beveled_box_alone(variant):
-    name, _, run = variant
+    _, config, run = variant
+    layout = getattr(config, "layout", None)
+    learnt = layout is not None and layout.proxy == "beveled_box"
     moved = (load_run(run).prior.bevels.logits != -2).any(dim=1)
-    assert moved.any() if name == "beveled_box" else not moved.any()
+    assert moved.any() if learnt else not moved.any()
 
 
 def test_a_variant_is_decoded_sampled_and_interpolated(variant):
@@ -103,9 +111,9 @@ def test_a_variant_is_decoded_sampled_and_interpolated(variant):
     assert [room.name for room in rooms] == list(trained.room_ids)
     assert len(decoded_and_true(trained, Path(config.data.shards))) == 12
     for distribution in DISTRIBUTIONS:
-        made = synthesize(trained, 4, 0, distribution)
+        made = sample_rooms(trained, 4, 0, distribution)
         assert len(made) == 4
-        again = synthesize(trained, 4, 0, distribution)
+        again = sample_rooms(trained, 4, 0, distribution)
         for scene, other in zip(made, again, strict=True):
             assert torch.equal(torch.tensor(scene.centers_m), torch.tensor(other.centers_m))
     steps = unfold(trained)
@@ -204,9 +212,9 @@ def test_the_ablations_change_their_module_and_no_other_module(toy_shards):
 )  # fmt: skip
 def test_docs_and_weights_count_alike(changes, millions):
     """The table of docs/paper_map.md: weights at the paper's size, bedrooms."""
-    from sceneprior.models.prior import ScenePrior
+    from sceneprior.paper.prior import ScenePrior
 
     plain = {"max_objects": 13, "decoder": {"name": "transformer"}, "shape": {"level": 0}}
-    prior = ScenePrior(Model.model_validate(plain | changes), classes=22)
+    prior = ScenePrior(AnyPaperModel.model_validate(plain | changes), classes=22)
     count = sum(p.numel() for p in prior.parameters())
     assert count / 1e6 == pytest.approx(millions, abs=0.0005)

@@ -1,4 +1,4 @@
-"""Mixtures of discretised logistics on [-1, 1]: log-probabilities and draws.
+"""Mixtures of discretised logistics on [-1, 1]: log-probabilities and sampling.
 
 Source: Salimans et al., "PixelCNN++", ICLR 2017, as ATISS uses it for coordinates and sizes.
 """
@@ -10,19 +10,19 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from sceneprior.sampler.mixtures import draw_index
+from sceneprior.core.mixtures import draw_index
 
 LEVELS = 256
-"""Steps that [-1, 1] is told apart in. On continuous coordinates a density could grow without end
-where many rooms share a number; the probability of a step is at most 1."""
+"""Steps of [-1, 1]. The probability of a step is at most 1, but a density of continuous numbers
+could grow without bound where many rooms share a number."""
 HALF_STEP = 1 / (LEVELS - 1)
 LEAST_LOG_SCALE = -7.0
-"""A logistic narrower than this is within one step anyway."""
+"""A logistic of this scale already lies within one step."""
 
 
 @dataclass(frozen=True)
 class LogisticMixture:
-    """K logistics a number: how likely each is, where it is, and how wide."""
+    """K weighted logistics per number."""
 
     weight_logits: Float[Tensor, "*batch mixtures"]
     means: Float[Tensor, "*batch mixtures"]
@@ -30,19 +30,19 @@ class LogisticMixture:
 
     @classmethod
     def of(cls, features: Float[Tensor, "*batch triples"]) -> "LogisticMixture":
-        """From a network's output, 3 K features a number."""
+        """The mixture of a network's output: 3 K features per number."""
         weight_logits, means, log_scales = features.chunk(3, dim=-1)
         return cls(weight_logits, means, log_scales.clamp(min=LEAST_LOG_SCALE))
 
     def log_prob(self, values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Log-probability of the step around each value; the outermost steps reach to infinity, so
-        that the steps of [-1, 1] have probability 1 together.
+        """Log-probability of the step around each value. The outermost steps extend to infinity, so
+        that all steps together have probability 1.
 
-        With a and b the scaled upper and lower ends of the step,
+        The probability of a step with scaled ends a > b is
 
             sigmoid(a) - sigmoid(b) = sigmoid(a) * sigmoid(-b) * (1 - exp(b - a)),
 
-        which has an accurate logarithm for every a > b.
+        and the logarithm of the right side is accurate for all a and b.
         """
         offset = values.unsqueeze(-1) - self.means
         inverse = torch.exp(-self.log_scales)
@@ -57,7 +57,8 @@ class LogisticMixture:
     def draw(
         self, choice: Float[Tensor, "*batch"], place: Float[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Values in [-1, 1] of uniform numbers: one chooses a logistic, one its quantile."""
+        """Samples in [-1, 1] from uniform numbers: `choice` selects the logistic, `place` is its
+        quantile."""
         chosen = draw_index(self.weight_logits, choice).unsqueeze(-1)
         mean = self.means.gather(-1, chosen)[..., 0]
         scale = self.log_scales.gather(-1, chosen)[..., 0].exp()

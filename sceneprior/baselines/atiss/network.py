@@ -1,7 +1,7 @@
-"""The network of ATISS: the distribution of the next box, given those that are placed.
+"""The network of ATISS: the distribution of the next box, given the boxes placed so far.
 
 Source: Paschalidou et al., "ATISS: Autoregressive Transformers for Indoor Scene Synthesis", NeurIPS
-2021. Where we differ: docs/baselines_3d.md.
+2021; docs/baselines_3d.md names the differences.
 """
 
 import math
@@ -11,41 +11,35 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from sceneprior.baselines.atiss.encoder import EncoderConfig
 from sceneprior.baselines.atiss.logistics import LogisticMixture
-from sceneprior.models.layers import mlp
-from sceneprior.sampler.mixtures import draw_index
-from sceneprior.settings import Section
-from sceneprior.views import RoomBoxes
+from sceneprior.core.mixtures import draw_index
+from sceneprior.core.views import RoomBoxes
+from sceneprior.paper.layers import mlp
 
 END = 0
-"""The class that ends a room: void, which is no furniture."""
+"""Class that ends a room: void, which no piece of furniture has."""
 PARTS = {"position": (0, 3), "angle": (3, 4), "size": (4, 7)}
-"""Which of an object's seven numbers are drawn together, in their order."""
+"""The parts of an object's seven numbers, in the order in which they are sampled."""
 CUT_RAD = -3 * math.pi / 4
-"""Where angles begin and end as numbers of [-1, 1]: at a diagonal, as the fewest pieces stand."""
+"""Angle at -1 and 1: a diagonal, because few pieces of furniture face one."""
 CLASS_WIDTH = 64
 OCTAVES = 8
-"""Sines and cosines a coordinate is shown to the network as; the finest has a period of two steps
-of the mixture. The published 32 octaves go far below what a float32 can tell apart."""
+"""Frequencies of `fourier_features`. The finest has a period of two steps of the mixture; the
+published 32 octaves exceed the precision of float32."""
 BATCH = 256
-"""Rooms sampled at a time."""
+"""Rooms per batch in sampling."""
 
 
-class AtissModel(Section):
+class AtissModel(EncoderConfig):
     """Size of the network; the defaults are the published settings."""
 
     max_objects: int = Field(ge=1, le=1000)
-    """Where sampling stops, if the end was not drawn before."""
+    """Most objects in a sampled room."""
     width: int = Field(512, ge=8)
-    """Of the encoder and the hidden layers."""
-    layers: int = Field(4, ge=1, le=100)
-    """Of the transformer encoder."""
-    heads: int = Field(8, ge=1)
-    hidden: int = Field(1024, ge=8)
-    """Inner width of its feed-forward layers."""
+    """Width of the encoder and of the hidden layers."""
     mixtures: int = Field(10, ge=1)
-    """K, logistics a coordinate."""
-    dropout: float = Field(0.1, ge=0, lt=1)
+    """K, logistics per number."""
 
     @model_validator(mode="after")
     def _heads_divide_width(self) -> "AtissModel":
@@ -55,13 +49,13 @@ class AtissModel(Section):
 
 
 class Atiss(nn.Module):
-    """Objects one after the other, each given the set of those before it.
+    """Generates objects one after the other, each given the set of objects before it.
 
-    A transformer encoder without positional encoding reads the objects there are and one learnt
-    query. What it makes of the query gives the class of the next object, or the room's end; then,
-    given the class, its position; then its angle, then its size, each given all before it. Every
-    number is a mixture of logistics of its own. An object is seven `numbers` in [-1, 1]; `classes`
-    is the size of the label set, void included.
+    A transformer encoder without positional encoding reads the placed objects and one learnt query.
+    Its output at the query predicts the class of the next object or the room's end, then its
+    position given the class, then its angle, then its size, each given all before it. Every number
+    has its own mixture of logistics. An object is seven numbers in [-1, 1]: centre, yaw and
+    extents. `classes` is the size of the label set with void.
     """
 
     low_m: Tensor
@@ -76,13 +70,7 @@ class Atiss(nn.Module):
         self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
         self.object = nn.Linear(CLASS_WIDTH + 7 * 2 * OCTAVES, width)
         self.query = nn.Parameter(torch.randn(width))
-        self.encoder = nn.ModuleList(
-            nn.TransformerEncoderLayer(
-                width, config.heads, config.hidden, config.dropout, "gelu", batch_first=True
-            )
-            # Each drawn by itself; nn.TransformerEncoder would start with copies of one.
-            for _ in range(config.layers)
-        )
+        self.encoder = config.build_layers(width)
         self.class_head = _head(width, classes)
         known = width + CLASS_WIDTH
         self.heads = nn.ModuleDict(
@@ -93,15 +81,15 @@ class Atiss(nn.Module):
         )
 
     def fit_statistics(self, rooms: RoomBoxes) -> None:
-        """Take the range of every coordinate and size from the training rooms."""
+        """Set the range of every coordinate and size from the training rooms."""
         boxes_m = rooms.boxes_m[rooms.is_object]
         self.low_m.copy_(boxes_m.amin(dim=0))
-        # Where all are alike (a toy), a range of nothing would divide by nothing.
+        # A number that is the same in all rooms would have a range of 0.
         self.high_m.copy_(torch.maximum(boxes_m.amax(dim=0), self.low_m + 1e-3))
 
     def to_unit(self, rooms: RoomBoxes) -> Float[Tensor, "rooms objects 7"]:
-        """Each object's `numbers`: centre, yaw and extents, from metres and radians to [-1, 1]."""
-        assert rooms.yaw_rad is not None, "true boxes have it"
+        """The seven numbers of each object, from metres and radians."""
+        assert rooms.yaw_rad is not None, "true boxes have yaws"
         unit = 2 * (rooms.boxes_m - self.low_m) / (self.high_m - self.low_m) - 1
         turn = torch.remainder(rooms.yaw_rad[..., None] - CUT_RAD, 2 * math.pi) / math.pi - 1
         return torch.cat([unit[..., :3], turn, unit[..., 3:]], dim=-1)
@@ -109,7 +97,7 @@ class Atiss(nn.Module):
     def to_metres(
         self, unit: Float[Tensor, "*batch 7"]
     ) -> tuple[Float[Tensor, "*batch 6"], Float[Tensor, "*batch"]]:
-        """Boxes and yaws of `numbers`."""
+        """Boxes in metres and yaws in radians, from the seven numbers of each object."""
         boxes = torch.cat([unit[..., :3], unit[..., 4:]], dim=-1)
         boxes_m = self.low_m + (boxes + 1) / 2 * (self.high_m - self.low_m)
         turn = (unit[..., 3] + 1) * math.pi + CUT_RAD
@@ -121,7 +109,7 @@ class Atiss(nn.Module):
         unit: Float[Tensor, "rooms objects 7"],
         is_object: Bool[Tensor, "rooms objects"],
     ) -> Float[Tensor, "rooms width"]:
-        """What a set of objects, in whatever order, means for the next one."""
+        """The encoder's output at the query; it does not depend on the order of the objects."""
         objects = torch.cat([self.class_embedding(object_class), fourier_features(unit)], dim=-1)
         query = self.query.expand(len(unit), 1, -1)
         tokens = torch.cat([query, self.object(objects)], dim=1)
@@ -136,8 +124,8 @@ class Atiss(nn.Module):
         next_class: Int[Tensor, " rooms"],
         next_unit: Float[Tensor, "rooms 7"],
     ) -> dict[str, Float[Tensor, " rooms"]]:
-        """Log-probability of the next object's class, position, angle and size; of all but the
-        class 0 where that is `END`."""
+        """Log-probabilities of the next object's class, position, angle and size; all but the first
+        are 0 at the class `END`."""
         class_log_prob = self.class_head(context).log_softmax(dim=-1)
         found = {"class": class_log_prob.gather(-1, next_class[:, None])[:, 0]}
         for name, (start, end) in PARTS.items():
@@ -147,7 +135,7 @@ class Atiss(nn.Module):
         return found
 
     def _mixture(self, name: str, context: Tensor, label: Tensor, unit: Tensor) -> LogisticMixture:
-        """Of one of `PARTS`, given the class and those of the numbers `unit` that come before."""
+        """The mixture of one of `PARTS`, given the class and the earlier parts of `unit`."""
         start, end = PARTS[name]
         known = [context, self.class_embedding(label), fourier_features(unit[:, :start])]
         features = self.heads[name](torch.cat(known, dim=-1))
@@ -155,7 +143,7 @@ class Atiss(nn.Module):
 
     @torch.no_grad()
     def sample(self, count: int, seed: int) -> RoomBoxes:
-        """New rooms. The same seed gives the same rooms, the first of them however many follow."""
+        """New rooms. The first rooms of a seed do not depend on `count`."""
         generator = torch.Generator().manual_seed(seed)
         uniform = torch.rand(count, self.max_objects, 15, generator=generator)
         parts = [self._sample(part) for part in uniform.to(self.query.device).split(BATCH)]
@@ -166,7 +154,7 @@ class Atiss(nn.Module):
     def _sample(
         self, uniform: Float[Tensor, "rooms objects 15"]
     ) -> tuple[Int[Tensor, "rooms objects"], Float[Tensor, "rooms objects 7"]]:
-        """Classes, `END` from a room's end on, and numbers."""
+        """Classes, which are `END` from a room's end on, and the seven numbers of each object."""
         labels = torch.full(uniform.shape[:2], END, device=uniform.device)
         unit = uniform.new_zeros(*labels.shape, 7)
         going = torch.ones_like(labels[:, 0], dtype=torch.bool)
@@ -184,7 +172,7 @@ class Atiss(nn.Module):
 
 
 def fourier_features(unit: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch features"]:
-    """Each number of [-1, 1] as sines and cosines of `OCTAVES` octaves."""
+    """Sines, then cosines, of each number in [-1, 1] at `OCTAVES` frequencies."""
     octaves = math.pi * 2.0 ** torch.arange(OCTAVES, device=unit.device, dtype=unit.dtype)
     phase = (unit.unsqueeze(-1) * octaves).flatten(-2)
     return torch.cat([phase.sin(), phase.cos()], dim=-1)

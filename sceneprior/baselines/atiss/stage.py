@@ -8,16 +8,17 @@ from pydantic import Field
 from torch import Tensor
 
 from sceneprior.baselines.atiss.network import END, Atiss, AtissModel
-from sceneprior.baselines.box_training import BoxConfig, BoxStage, BoxTraining
-from sceneprior.training.objective import batch_seed, full_precision
-from sceneprior.views import RoomBoxes
+from sceneprior.baselines.box_training import BoxConfig, room_means
+from sceneprior.baselines.one_stage import OneStage, OneStageTraining
+from sceneprior.core.views import RoomBoxes
+from sceneprior.training.steps import batch_seed, full_precision
 
 
-class AtissTraining(BoxTraining):
-    """Do not clip gradients (docs/baselines_3d.md). The defaults are the published settings."""
+class AtissTraining(OneStageTraining):
+    """The published settings. Do not clip gradients (docs/baselines_3d.md)."""
 
     epochs: int = Field(500, ge=1)
-    """With turned copies of 6,300 rooms these are the published 100,000 steps."""
+    """These are the published 100,000 steps on 6,300 rooms with turned copies."""
     batch_size: int = Field(128, ge=1)
     learning_rate: float = Field(1e-4, gt=0)
 
@@ -33,10 +34,14 @@ class AtissConfig(BoxConfig):
         return AtissStage(Atiss(self.model, self.classes), self.training, self.seed)
 
 
-class AtissStage(BoxStage):
-    """Maximum likelihood of one object of each room, given some of the others."""
+class AtissStage(OneStage):
+    """Maximises the likelihood of one object of each room, given some of the others."""
 
     prior: Atiss
+
+    def __init__(self, prior: Atiss, settings: AtissTraining, seed: int):
+        super().__init__(prior, settings)
+        self.seed = seed
 
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
         placed, coming = part_of_rooms(rooms, batch_seed(self.seed, self.trainer, batch_idx))
@@ -46,14 +51,14 @@ class AtissStage(BoxStage):
             next_class = coming.object_class[:, 0]
             log_probs = self.prior.log_prob(context.float(), next_class, next_unit[:, 0])
             losses = {name: -log_prob for name, log_prob in log_probs.items()}
-            return self.total(rooms, losses, weights={}, beside={})
+            return self.total(room_means(losses, rooms), {}, rooms)
 
 
 def part_of_rooms(rooms: RoomBoxes, seed: int) -> tuple[RoomBoxes, RoomBoxes]:
-    """Put each room's n objects in a random order, and keep the first 0 to n, each as likely.
+    """Shuffle each room's n objects and keep the first k, with k drawn evenly from 0 to n.
 
     Returns:
-        What is kept, and the next object of each room: of class `END` where all are kept.
+        The kept objects, and the next object of each room, whose class is `END` if all are kept.
     """
     generator = torch.Generator().manual_seed(seed)
     count = rooms.is_object.sum(dim=1)

@@ -1,4 +1,4 @@
-"""The GAN's discriminator: how real each patch of a map, and each room, looks."""
+"""The GAN's discriminator, which scores patches of semantic maps and whole rooms."""
 
 import torch
 from jaxtyping import Float
@@ -6,25 +6,25 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.parametrizations import spectral_norm
 
-from sceneprior.errors import InputError
-from sceneprior.models.layers import mlp
+from sceneprior.core.errors import InputError
+from sceneprior.paper.layers import mlp
 
 SLOPE = 0.2
-"""Of the leaky ReLUs."""
+"""Slope of the leaky ReLUs."""
 
 SMALLEST_PX = 4
-"""Side of a map that two halvings leave a pixel of."""
+"""Smallest side of a map, which two halvings reduce to one pixel."""
 
 GAIN = 10
-"""Of all scores: spectral norm makes them timid."""
+"""Factor on all scores, which spectral norm makes small."""
 
 
 class MapDiscriminator(nn.Module):
-    """Scores maps patch by patch, and a room by all of its views together.
+    """Scores each patch of 18 x 18 pixels of a map, and each room by all of its views.
 
     Every layer is spectrally normalised, so that the network is about 1-Lipschitz. There is no
     depth channel (supplement, Baselines). Two layers halve the sides; the first has `width`
-    channels, the second twice as many. A patch is then 18 x 18 pixels of a map.
+    channels, the second twice as many.
     """
 
     def __init__(self, classes: int, width: int = 32):
@@ -39,9 +39,9 @@ class MapDiscriminator(nn.Module):
     def forward(
         self, maps: Float[Tensor, "rooms views classes height width"]
     ) -> tuple[Float[Tensor, "rooms views rows columns"], Float[Tensor, " rooms"]]:
-        """Scores of patches and of rooms; a higher score looks more real.
+        """Scores of patches and of rooms; higher means more real.
 
-        A room is what its views show on average and at most, whatever their order and number.
+        A room's features are the mean and the maximum over its views, of any order and number.
 
         Raises:
             InputError: the maps are smaller than `SMALLEST_PX`.

@@ -1,7 +1,7 @@
-"""Losses of the GAN: the adversarial one, and penalties and aims of the generator.
+"""Losses of the GAN.
 
-`adversarial_loss` is what both players minimise. The others are what a discriminator of maps does
-not say, or says too late; docs/baselines_2d.md tells what happens without each.
+Generator and discriminator minimise `adversarial_loss`. The other losses keep the generator where
+the discriminator gives it no useful gradient; docs/baselines_2d.md describes training without each.
 """
 
 from collections.abc import Sequence
@@ -11,31 +11,30 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from sceneprior.classes import VOID
-from sceneprior.geometry.cameras import camera_centers
-from sceneprior.views import DecodedScenes, SceneViews
+from sceneprior.core.classes import VOID
+from sceneprior.core.geometry.cameras import camera_centers
+from sceneprior.core.views import DecodedScenes, SceneViews
 
 VARIED = (1.5, 1.5, 0.3, 0.3, 0.3)
-"""Spread over rooms, in metres, that the k-th object's x, z, width, height and depth are pushed
-towards."""
+"""Target standard deviation over rooms, in metres, of the k-th object's x, z, width, height and
+depth."""
 
 AREA = 10
-"""As how many objects of a class it counts if all pixels are of it: shares are a few hundredths."""
+"""Factor on pixel shares in `contents`, which are a few hundredths."""
 
 MARGIN_M, CEILING_M = 0.5, 3.0
-"""Generated boxes are to stay no further from the floor centre, along x and z, than some camera of
-the batch and a margin, and between floor and ceiling."""
+"""Bounds of generated boxes: along x and z the batch's furthest camera from the floor centre and a
+margin, along y the floor and the ceiling."""
 
 SIZES_M = (0.1, 2.5)
-"""What generated sizes are to stay between."""
+"""Bounds of generated sizes."""
 
 
 def adversarial_loss(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
-    """Cross entropy of scores, as logits of being real, with what is wanted of them.
+    """Cross entropy of scores as logits of being real, summed over patches and rooms.
 
-    Patches and rooms count alike. The generator minimises it for its own maps as if these were
-    real (Goodfellow et al., "Generative adversarial nets", NeurIPS 2014: the loss that does not
-    saturate).
+    The generator minimises it with `real` true for its own maps: the non-saturating loss of
+    Goodfellow et al., "Generative adversarial nets", NeurIPS 2014.
     """
     return torch.stack([F.softplus(-score if real else score).mean() for score in scores]).sum()
 
@@ -43,15 +42,15 @@ def adversarial_loss(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
 def contents(
     maps: Float[Tensor, "rooms views classes height width"], counts: Float[Tensor, "rooms classes"]
 ) -> Float[Tensor, "rooms both"]:
-    """What is in a room: how many objects of each class, and `AREA` times their share of views."""
+    """Per class, a room's number of objects and `AREA` times its share of the views' pixels."""
     return torch.cat([counts, AREA * maps.mean(dim=(1, 3, 4))], dim=-1)
 
 
 def bounds_penalty(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""]:
-    """How far boxes reach out of where cameras go, and sizes out of `SIZES_M`, in metres: a mean.
+    """Mean distance in metres by which boxes exceed the room's bounds and sizes exceed `SIZES_M`.
 
-    A discriminator of maps cannot tell a bed from a bed-coloured wall behind the room, and what no
-    view shows has no part in any map: unless it is told to come back, it goes for ever.
+    Maps do not distinguish a bed from a huge bed behind the room, and objects that no view shows
+    have no gradient. Without this penalty they would not return.
     """
     reach = camera_centers(views.world_to_camera).abs().amax(dim=(0, 1)) + MARGIN_M
     reach[1] = CEILING_M / 2
@@ -66,18 +65,18 @@ def bounds_penalty(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""
 
 
 def logit_penalty(scenes: DecodedScenes) -> Float[Tensor, ""]:
-    """Mean squares of the logits that decide: 0 is undecided. `void` is no choice."""
+    """Mean squared completeness logits and class logits, without those of `void`."""
     classes = scenes.class_logits[..., VOID + 1 :]
     return classes.square().mean() + scenes.completeness_logits.square().mean()
 
 
 def diversity_loss(scenes: DecodedScenes) -> Float[Tensor, ""]:
-    """How alike the k-th objects of all rooms are: minus the mean log spread of place and size, as
-    a share of `VARIED`.
+    """Minus the mean log of the standard deviation of the k-th object's position and size over
+    rooms, relative to `VARIED`.
 
-    It is minus the entropy of normal distributions of their spread (after Kumar et al., "Maximum
-    entropy generators for energy-based models", 2019). Below 1 mm a spread counts as 1 mm; above
-    `VARIED` there is nothing to gain, or objects would leave the room for the sake of it.
+    Up to a constant it is minus the entropy of normal distributions with these deviations (after
+    Kumar et al., "Maximum entropy generators for energy-based models", 2019). About 1 mm is added
+    to them, and there is no gain above `VARIED`, which would drive objects out of the room.
     """
     boxes = torch.cat([scenes.centers_m[..., [0, 2]], scenes.sizes_m], dim=-1)
     wanted = boxes.new_tensor(VARIED).square()

@@ -1,30 +1,32 @@
-"""Semantic maps: per pixel the share of each class, of decoded scenes or of what cameras saw."""
+"""Semantic maps: the share of each class per pixel, of observed views and of decoded scenes."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from sceneprior.classes import VOID
-from sceneprior.geometry.cameras import project
-from sceneprior.silhouettes.render import render_scene
-from sceneprior.views import DecodedScenes, SceneViews
+from sceneprior.core.classes import VOID
+from sceneprior.core.geometry.cameras import project
+from sceneprior.core.views import DecodedScenes, SceneViews
+from sceneprior.render.silhouettes.render import render_scene
 
 POOLING = 2
-"""Pixels of the instance ids on the side of one of a map. What is real has hard edges and what is
-rendered has soft ones, which would give it away; pooled, both are soft."""
+"""Pixels of the instance ids along the side of a map's pixel. Pooling softens the hard edges of
+real maps, which would otherwise distinguish them from rendered ones."""
 
 SIGMA_PX2 = 0.25
-"""Softness of rendered edges: about that of a hard edge after pooling, from 0.27 to 0.73 within
-half a pixel to either side."""
+"""Softness of rendered edges, about that of a pooled hard edge: coverage rises from 0.27 to 0.73
+between half a pixel outside and half a pixel inside."""
 
 
 def observed_maps(
     views: SceneViews, classes: int
 ) -> Float[Tensor, "rooms views classes height width"]:
-    """What the views show: the share of each class in a pixel, of `void` where no object is."""
+    """Maps of the observed views; pixels without an object are `void`."""
     ids = views.observed_ids.long()
-    of_id = F.pad(views.object_class, (1, 0), value=VOID)
+    of_id = F.pad(
+        views.object_class, (1, 1), value=VOID
+    )  # id 0 is nothing, the last id void furniture
     pixels = of_id.gather(1, ids.flatten(1)).view_as(ids)
     maps = F.one_hot(pixels, classes).movedim(-1, 2).to(views.intrinsics.dtype)
     return F.avg_pool2d(maps.flatten(0, 1), POOLING).unflatten(0, maps.shape[:2])
@@ -38,35 +40,35 @@ def rendered_maps(
     classes: Float[Tensor, "rooms objects classes"],
     mode: str = "fast",
 ) -> Float[Tensor, "rooms views classes height width"]:
-    """What the views would show of as many other scenes, drawn into the views' cameras.
+    """Maps of decoded scenes, one per room, in the cameras of the views.
 
-    Maps are pooled as those of `instance_ids` are; `kept` and `classes` are `choices`, `mode` is
-    that of `render_silhouettes`.
+    They have the size of observed maps. `kept` and `classes` come from `choices`; `mode` is that of
+    `render_silhouettes`.
     """
     assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
     height, width = (side / POOLING for side in views.observed_ids.shape[-2:])
     objects = scenes.vertices_m.shape[1]
-    # Each object is drawn as a room of its own: whole, with its own depth.
+    # Each object is rendered as a separate room, so that none hides another.
     alone = render_scene(
         scenes.vertices_m.flatten(0, 1).unsqueeze(1),
         faces,
         views.world_to_camera.repeat_interleave(objects, dim=0),
         views.intrinsics_at(height, width).repeat_interleave(objects, dim=0),
-        (int(height), int(width)),  # as pooling, which leaves out what does not fill a pixel
+        (int(height), int(width)),  # pooling drops incomplete pixels, too
         sigma_px2=SIGMA_PX2,
         mode=mode,
         compositing="alone",
     )
     coverage = alone.masks[:, :, 0].unflatten(0, (-1, objects)).transpose(1, 2)
     depth_m = alone.depth_m.unflatten(0, (-1, objects)).transpose(1, 2)
-    # Where only the soft edge reaches, the object is as far away as its centre.
+    # Pixels of the soft edge alone have no depth; they take that of the object's centre.
     centers = project(scenes.centers_m.unsqueeze(2), views.world_to_camera, views.intrinsics)
     depth_m = depth_m.where(depth_m.isfinite(), centers[..., 2:].detach())
     return compose_maps(coverage, depth_m, kept, classes)
 
 
 def observed_counts(views: SceneViews, classes: int) -> Float[Tensor, "rooms classes"]:
-    """How many objects of each class were tracked in each room."""
+    """Tracked objects of each class in each room."""
     of_objects = F.one_hot(views.object_class.long(), classes) * views.is_object[..., None]
     return of_objects.sum(dim=1).to(views.intrinsics.dtype)
 
@@ -74,10 +76,10 @@ def observed_counts(views: SceneViews, classes: int) -> Float[Tensor, "rooms cla
 def choices(
     scenes: DecodedScenes, completeness_target: str = "first_n"
 ) -> tuple[Float[Tensor, "rooms objects"], Float[Tensor, "rooms objects classes"]]:
-    """Which objects exist, and which class each has, as decoding reads them: 0 or 1.
+    """Existence and one-hot class of each object, as decoding reads them.
 
-    So what is drawn and counted is what will be generated. Gradients are those of sigmoid and
-    softmax (straight through): what does not exist still learns what it would change.
+    Values are 0 or 1; gradients are those of sigmoid and softmax (straight-through estimator), so
+    that objects which do not exist have gradients, too.
     """
     scores = scenes.completeness_logits.sigmoid()
     shares = scenes.class_logits.softmax(dim=-1)
@@ -89,12 +91,12 @@ def choices(
 def kept_share(
     scores: Float[Tensor, "rooms slots"], convention: str = "first_n"
 ) -> Float[Tensor, "rooms slots"]:
-    """How likely each prediction belongs to the scene, if each score is the chance of a yes.
+    """Probability that each prediction belongs to the scene, if each score is that of a yes.
 
-    Of scores that are 0 or 1 these are the `kept_objects`, and the gradient of each score is what
-    its change would bring about: the end of the scene there, or some objects more.
+    Scores of 0 or 1 give `kept_objects`; the gradient of a score is then the effect of ending the
+    scene there or of continuing it.
     """
-    if convention == "stop":  # none before it said so
+    if convention == "stop":  # the first object that says stop still counts
         scores = F.pad(1 - scores[:, :-1], (1, 0), value=1.0)
     return scores.cumprod(dim=1)
 
@@ -109,14 +111,17 @@ def compose_maps(
     kept: Float[Tensor, "rooms objects"],
     classes: Float[Tensor, "rooms objects classes"],
 ) -> Float[Tensor, "rooms views classes height width"]:
-    """Lay objects over each other, pixel by pixel, nearest first.
+    """Composite objects in each pixel, nearest first.
 
         visible_k = a_k * prod_{j nearer than k} (1 - a_j),    a_k = kept_k coverage_k
 
-    is what the pixel shows of object k, and what is left of it shows nothing: `void`.
+    The rest of the pixel is `void`, so that the classes of a map sum to 1.
 
-    a_k is in [0, 1], each object drawn alone; its depth carries no gradient. Of the classes, whose
-    shares sum to 1, none is `void`; those of the maps sum to 1, too.
+    Args:
+        coverage: Of each object rendered alone, in [0, 1].
+        depth_m: Of each object; it has no gradient.
+        kept: Existence of each object.
+        classes: Shares that sum to 1, with none of `void`.
     """
     alpha = coverage * kept[:, None, :, None, None]
     order = depth_m.argsort(dim=2)

@@ -1,4 +1,4 @@
-"""The GAN baseline: our network against a discriminator of semantic maps, without a view loss."""
+"""The GAN baseline: the paper's network, trained by a discriminator of semantic maps."""
 
 import copy
 from collections.abc import Iterable
@@ -28,82 +28,84 @@ from sceneprior.baselines.gan.semantic_maps import (
     observed_maps,
     rendered_maps,
 )
-from sceneprior.data.dataset import ViewDataset
-from sceneprior.models.layout_decoder import LayoutDecoder
-from sceneprior.models.prior import ModelConfig
-from sceneprior.models.shape_decoder import ShapeDecoderConfig
-from sceneprior.models.transformer import TransformerConfig
-from sceneprior.training.method import PriorConfig, Stage
-from sceneprior.training.objective import check_finite, full_precision
+from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.views import DecodedScenes, SceneViews
+from sceneprior.paper.layout_decoder import LayoutDecoder
+from sceneprior.paper.prior import ModelConfig
+from sceneprior.paper.shape_decoder import ShapeDecoderConfig
+from sceneprior.paper.trained import PriorConfig
+from sceneprior.paper.transformer import TransformerConfig
+from sceneprior.training.method import Stage
 from sceneprior.training.settings import TrainConfig
-from sceneprior.views import DecodedScenes, SceneViews
+from sceneprior.training.steps import check_finite, full_precision
 
 BETAS = (0.0, 0.99)
-"""Of both Adams: momentum would push on after the opponent has moved."""
+"""Betas of both Adam optimisers. Momentum would follow an opponent that has moved on."""
 
 STARTS = ((0.0, 1.2), (0.4, 0.4), (0.0, 1.2), (0.4, 0.5), (0.4, 0.5), (0.4, 0.5), (1.5, 1.0))
-"""Mean and spread, over rooms and objects, of what the layout decoder starts from: x, y, z, then
-width, height, depth before their SoftPlus, then completeness. Metres where they are metres."""
+"""Mean and standard deviation, over rooms and objects, of the untrained layout decoder's outputs:
+x, y, z in metres, width, height, depth before their SoftPlus, and completeness."""
 
 START_ROOMS = 64
+"""Random rooms that `STARTS` is set on."""
 
 SHAPE_RATE = 0.1
-"""Of the generator's learning rate, for the shape decoder: maps are content with sheared boxes."""
+"""Share of the generator's learning rate for the shape decoder, since maps accept sheared boxes."""
 
 LOGIT_PENALTY = 0.01
-"""Weight of the mean square of class and completeness logits. A choice that is all but certain has
-no gradient: a generator whose objects had all gone would never come back."""
+"""Weight of `logit_penalty`. Almost certain choices have no gradient, so a generator that has lost
+all objects could not recover."""
 
 BOUNDS_PENALTY = 10.0
-"""Weight of what leaves where rooms are and how large furniture is."""
+"""Weight of `bounds_penalty`."""
 
 MEMORY = 0.9
-"""Share of `excess` that is kept at each step: a batch alone says little of rare classes."""
+"""Share of `excess` kept at each step; one batch has too few objects of rare classes."""
 
 
 class GanTraining(TrainConfig):
-    """How the two opponents are trained; docs/baselines_2d.md says what each setting is for.
+    """Settings of the training; docs/baselines_2d.md explains each.
 
-    Maps are half as large as the instance ids that `data.mask_step` keeps.
+    Maps have half the size of the instance ids that `data.mask_step` keeps.
     """
 
     epochs: int = Field(400, ge=1)
     batch_size: int = Field(16, ge=1)
-    """Real rooms a step, and as many generated ones."""
+    """Real rooms per step, and as many generated ones."""
     accumulate: Literal[1] = 1
-    """The two opponents take turns at every batch."""
+    """Every batch updates both networks."""
     views_per_room: int = Field(4, ge=1)
     learning_rate: float = Field(1e-3, gt=0)
-    """Of the generator's Adam; its shape decoder has a tenth."""
+    """Rate of the generator; its shape decoder has a tenth of it."""
     discriminator_learning_rate: float = Field(4e-3, gt=0)
-    """Of the discriminator's. Too large: it is soon always right, and teaches nothing; too small:
-    the generator runs ahead to whatever it finds unusual."""
+    """Rate of the discriminator. Too large: it is always right and its gradient vanishes; too
+    small: the generator exploits its errors."""
     counts: float = Field(1.0, ge=0)
-    """Weight of the generator's second aim: as much of each class a room, on average, as real rooms
-    have, in objects and in pixels. 0 leaves that to the discriminator, and classes drift."""
+    """Weight of the loss that matches each class's mean number of objects and pixels to real rooms.
+    At 0, class frequencies drift."""
     variety: float = Field(4.0, ge=0)
-    """Weight of the generator's third aim: that the k-th object of different rooms has different
-    places and sizes. Too small: all rooms end up as one; too large: objects are anywhere."""
+    """Weight of `diversity_loss`. Too small: all rooms become the same; too large: positions become
+    random."""
     averaging: float = Field(0.97, ge=0, lt=1)
-    """Share of the averaged generator that is kept at each step; 0 keeps the newest alone."""
+    """Decay of the generator's running average per step; 0 takes the newest weights."""
     noise: float = Field(0.1, ge=0)
-    """Spread of the noise on all maps at the start; it falls to 0 over the epochs. Without it,
-    classes can be lost for good."""
+    """Standard deviation of the noise on all maps at the start; it falls to 0 over the epochs.
+    Without it, classes can be lost permanently."""
     clip_gradient: float = Field(1.0, ge=0)
-    """Largest gradient norm of each of the two; 0 does not clip."""
+    """Largest gradient norm of each network; 0 does not clip."""
     silhouettes: Literal["exact", "fast"] = "fast"
-    """As in the shape stage of `ours`."""
+    """As in `ShapeConfig`."""
 
 
 class GanModel(ModelConfig):
-    """The paper's network. Its maps are drawn from meshes, so no shape is an occupancy grid."""
+    """The paper's network with meshes as shapes, which the maps are rendered from."""
 
     decoder: TransformerConfig = TransformerConfig()
     shape: ShapeDecoderConfig = ShapeDecoderConfig()
 
 
 class GanConfig(PriorConfig):
-    """A run of the GAN. Its objects are never void (docs/baselines_2d.md)."""
+    """A run of the GAN, whose objects are never void (docs/baselines_2d.md)."""
 
     method: Literal["gan"] = "gan"
     model: GanModel
@@ -120,15 +122,15 @@ class GanConfig(PriorConfig):
 
 
 class GanStage(lightning.LightningModule):
-    """Generator and discriminator in turn, once each a batch (supplement, Baselines).
+    """Updates the discriminator and the generator once per batch (supplement, Baselines).
 
-    A room is generated for each of the batch, from logits drawn from N(0, 1), and drawn as semantic
-    maps into that room's own cameras. There are no latents of rooms: nothing pairs a generated
-    room with a real one. What keeps it stable is listed in docs/baselines_2d.md.
+    For each room of the batch a new one is generated, from logits drawn from N(0, 1), and rendered
+    as semantic maps in that room's cameras. Generated and real rooms are not paired, so training
+    rooms have no latents. docs/baselines_2d.md lists what keeps the training stable.
 
-    `generator` is what plays; `prior`, which tasks take out of checkpoints, is a running average of
-    its weights, in which the two opponents' circling cancels. `excess` is how much more
-    of each class a generated room has than a real one, of late: objects, and pixels (`contents`).
+    `generator` is trained; `prior`, which tasks load from checkpoints, is a running average of its
+    weights, in which the oscillation of the two networks cancels. `excess` is the running mean of
+    `contents` of generated rooms minus that of real rooms.
     """
 
     def __init__(self, config: GanConfig):
@@ -140,7 +142,7 @@ class GanStage(lightning.LightningModule):
         spread_out(prior.layout, prior.decoder(self._latents(START_ROOMS), prior.max_objects))
         self.prior = copy.deepcopy(prior).requires_grad_(False)
         self.average = get_ema_multi_avg_fn(config.training.averaging)
-        # A GAN pairs no point of the latent space with a room; checkpoints of all priors are alike.
+        # No room has a latent; the empty table keeps the checkpoint format of all priors.
         self.latents = config.build_latents(0)
         self.discriminator = MapDiscriminator(self.classes)
         self.excess: Tensor
@@ -150,7 +152,7 @@ class GanStage(lightning.LightningModule):
         generator_optimizer, discriminator_optimizer = self.optimizers()  # type: ignore[attr-defined]
         scenes = self.generator.decode(self._latents(len(views.room_index)))
         with full_precision(self.device):
-            # Before rendering, too, which refuses vertices that are not finite.
+            # Checked before rendering, which refuses vertices that are not finite.
             undecided = logit_penalty(scenes)
             check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views)
             real = observed_maps(views, self.classes)
@@ -161,15 +163,15 @@ class GanStage(lightning.LightningModule):
             loss = loss + self.settings.variety * diversity_loss(scenes)
             loss = loss + self.settings.counts * (more @ self.excess).mean()
 
-        # Real maps come in steps that rendered ones lack.
+        # Pooled real maps have few distinct values, rendered ones many; noise hides this.
         noise = self.settings.noise * self._left()
         real, fake = (maps + noise * torch.randn_like(maps) for maps in (real, fake))
         real_scores = self.discriminator(real)
         fake_scores = self.discriminator(fake.detach())
-        told_apart = adversarial_loss(real_scores, real=True) + adversarial_loss(
+        discriminator_loss = adversarial_loss(real_scores, real=True) + adversarial_loss(
             fake_scores, real=False
         )
-        self._update(discriminator_optimizer, told_apart)
+        self._update(discriminator_optimizer, discriminator_loss)
 
         self.discriminator.requires_grad_(False)
         loss = loss + adversarial_loss(self.discriminator(fake), real=True)
@@ -177,24 +179,24 @@ class GanStage(lightning.LightningModule):
         self._update(generator_optimizer, loss)
         self.discriminator.requires_grad_(True)
         self.average(list(self.prior.parameters()), list(self.generator.parameters()), 0)
-        said = {
+        logged = {
             "loss": loss,
-            "discriminator": told_apart,
+            "discriminator": discriminator_loss,
             "real_score": torch.stack([score.mean() for score in real_scores]).mean(),
             "fake_score": torch.stack([score.mean() for score in fake_scores]).mean(),
             "objects": counts.sum(dim=1).mean(),
         }
-        said = {f"train/{name}": value.detach() for name, value in said.items()}
-        self.log_dict(said, on_step=False, on_epoch=True, batch_size=len(counts))
+        logged = {f"train/{name}": value.detach() for name, value in logged.items()}
+        self.log_dict(logged, on_step=False, on_epoch=True, batch_size=len(counts))
 
     def on_train_epoch_start(self) -> None:
-        """Rates fall evenly to 0, so that the opponents' circling ends, too."""
+        """Reduce the rates linearly to 0, which ends the oscillation of the two networks."""
         for optimizer in self.optimizers():  # type: ignore[union-attr]
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * self._left()
 
     def _left(self) -> float:
-        """Share of the training that is still to come."""
+        """Share of the epochs that is left."""
         return 1 - self.current_epoch / self.settings.epochs
 
     def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:
@@ -203,7 +205,7 @@ class GanStage(lightning.LightningModule):
             return self.generator.latent_space(torch.randn(shape, device=self.device))
 
     def _draw(self, scenes: DecodedScenes, views: SceneViews) -> tuple[Tensor, Tensor]:
-        """Maps, and how many objects of each class are in each room."""
+        """Maps of the scenes, and the number of objects of each class in each room."""
         kept, classes = choices(scenes, self.model.completeness_target)
         faces, mode = self.generator.faces, self.settings.silhouettes
         assert faces is not None, "GanModel has meshes"
@@ -233,13 +235,14 @@ def _adam(*parts: tuple[Iterable[nn.Parameter], float]) -> torch.optim.Optimizer
 
 @torch.no_grad()
 def spread_out(layout: LayoutDecoder, features: Float[Tensor, "rooms objects width"]) -> None:
-    """Start with objects all over the floor, of all sizes and classes.
+    """Initialise the layout decoder so that objects differ in position, size and class.
 
-    A fresh layout decoder puts every object at the floor centre, all of one class, and the
-    discriminator would pull all of them the same way: they would never part. So its last layer is
-    scaled and shifted until each output has the mean and the spread over these rooms and objects
-    that `STARTS` names, and class logits 0 and 1 (after Salimans and Kingma, "Weight
-    normalization", NeurIPS 2016, section 3). `features` are those of random rooms.
+    An untrained layout decoder puts all objects at the floor centre with the same class, and the
+    discriminator would move them all alike. This scales and shifts its last layer until each output
+    has the mean and standard deviation of `STARTS` over the objects of random rooms, with the given
+    `features`; class logits get 0 and 1.
+
+    Source: Salimans and Kingma, "Weight normalization", NeurIPS 2016, section 3.
     """
     outputs = layout.mlp2(layout.mlp1(features)).flatten(0, 1)
     starts = [(0.0, 1.0)] * layout.classes + list(STARTS)

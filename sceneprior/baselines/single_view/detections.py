@@ -1,8 +1,8 @@
-"""What networks are told of each mask of an image, in a frame without what they cannot know.
+"""Network inputs for each mask of an image, in the image's frame.
 
-The frame of an image is the room's, moved to the camera and turned by quarters until the camera
-looks along +z, to within 45 degrees. An answer therefore moves and turns with the room; boxes stay
-axis-aligned, since quarters keep them so.
+That frame is the room's, moved to the camera and turned by quarters until the camera looks along +z
+to within 45 degrees. Inputs and predictions therefore move and turn with the room, and quarter
+turns keep boxes axis-aligned.
 """
 
 import math
@@ -12,45 +12,46 @@ import torch
 from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor
 
-from sceneprior.geometry.cameras import camera_centers
-from sceneprior.geometry.turns import QUARTERS, turn_vectors
-from sceneprior.views import SceneViews
+from sceneprior.core.geometry.cameras import camera_centers
+from sceneprior.core.geometry.turns import QUARTERS, turn_vectors
+from sceneprior.core.views import SceneViews
 
 CROP = 32
 """Pixels along each side of a crop."""
 MARGIN = 0.25
-"""Of a box's width and height, that a crop shows around it on each side."""
+"""Border of a crop on each side of its 2D box, as a share of the box's width or height."""
 CHANNELS = 6
-"""Of a crop: the mask, all other masks, what is inside the image, and the pixels' rays (3)."""
+"""Channels of a crop: the mask, all other masks with void, the inside of the image, and the pixels'
+rays (3)."""
 NUMBERS = 26
-"""What is told of a mask beside its crop and class, see `_numbers`."""
+"""Numbers beside a mask's crop and class, see `_numbers`."""
 NEAR_M = 0.1
-"""Nearer to the camera's plane, or behind it, a centre has no place in the image."""
+"""Least depth of a centre that is projected into the image."""
 
 
 @dataclass(frozen=True)
 class Detections:
-    """The visible masks of a batch of images, one a row; those of an image follow each other.
+    """The visible masks of a batch of images, one per row, image after image.
 
-    An image is a view of a room; `SceneViews` of several views are as many images.
+    Every view of every room is an image.
     """
 
     image: Int[Tensor, " masks"]
     slot: Int[Tensor, " masks"]
-    """Place among the masks of its image."""
+    """Index among the masks of its image."""
     room: Int[Tensor, " masks"]
     item: Int[Tensor, " masks"]
-    """Which object of the room it is of."""
+    """Index of its object in the room."""
     object_class: Int[Tensor, " masks"]
     boxes: Float[Tensor, "masks 4"]
     """As in `SceneViews`, relative to the image."""
     quarter: Int[Tensor, " masks"]
-    """By which the room was turned into the image's frame."""
+    """Quarters that turn the room into the image's frame."""
     eye_m: Float[Tensor, "masks 3"]
-    """Where the camera stands in the room."""
+    """Camera position in the room."""
     frame_to_camera: Float[Tensor, "masks 3 3"]
     intrinsics: Float[Tensor, "masks 3 3"]
-    """Relative to the image's size."""
+    """Intrinsics in units of the image's width and height."""
     crops: Float[Tensor, "masks channels rows columns"]
     numbers: Float[Tensor, "masks numbers"]
 
@@ -58,7 +59,7 @@ class Detections:
         return len(self.image)
 
     def rays(self, places: Float[Tensor, "masks points 2"]) -> Float[Tensor, "masks points 3"]:
-        """Unit vectors from the camera through places u, v, in the image's frame."""
+        """Unit vectors from the camera through places (u, v), in the image's frame."""
         focal = self.intrinsics[:, None, (0, 1), (0, 1)]
         middle = self.intrinsics[:, None, :2, 2]
         on_plane = (places - middle) / focal
@@ -68,8 +69,13 @@ class Detections:
     def centers_at(
         self, offsets: Float[Tensor, "masks 2"], distances_m: Float[Tensor, " masks"]
     ) -> Float[Tensor, "masks 3"]:
-        """Centres in the room that are seen at some offset from the middles of 2D boxes, in units
-        of their width and height, at a distance from the camera."""
+        """Centres in the room.
+
+        Args:
+            offsets: From the middle of the 2D box to the projected centre, in units of the 2D box's
+                width and height.
+            distances_m: From the camera to the centre.
+        """
         low, high = self.boxes.split(2, dim=-1)
         place = (low + high) / 2 + offsets * (high - low)
         away = self.rays(place.unsqueeze(1))[:, 0] * distances_m.unsqueeze(-1)
@@ -78,8 +84,8 @@ class Detections:
     def offsets_and_distances(
         self, centers_m: Float[Tensor, "masks 3"]
     ) -> tuple[Float[Tensor, "masks 2"], Float[Tensor, " masks"], Bool[Tensor, " masks"]]:
-        """The other way round; and which centres are in front of the camera, others have no
-        offset."""
+        """The inverse of `centers_at`, and True for centres in front of the camera. The offsets of
+        other centres are 0."""
         away = self.to_frame(centers_m - self.eye_m)
         seen = (self.frame_to_camera @ away.unsqueeze(-1))[..., 0]
         ahead = seen[:, 2] > NEAR_M
@@ -90,29 +96,28 @@ class Detections:
         return offsets * ahead.unsqueeze(-1), away.norm(dim=-1), ahead
 
     def to_frame(self, vectors: Float[Tensor, "masks *many 3"]) -> Float[Tensor, "masks *many 3"]:
-        """Directions of the room in the images' frames."""
+        """Directions turned from the room into the images' frames."""
         return turn_vectors(vectors, self.quarter)
 
     def to_room(self, vectors: Float[Tensor, "masks *many 3"]) -> Float[Tensor, "masks *many 3"]:
-        """Back."""
+        """Directions turned from the images' frames into the room."""
         return turn_vectors(vectors, (QUARTERS - self.quarter) % QUARTERS)
 
     def padded(self, values: Float[Tensor, "masks width"]) -> Float[Tensor, "images most width"]:
-        """Values of each image's masks beside each other; 0 where there are fewer."""
+        """One row of values per mask of each image, padded with zeros to the most masks."""
         images = int(self.image.max()) + 1 if len(self) else 0
         most = int(self.slot.max()) + 1 if len(self) else 0
         empty = values.new_zeros(images, most, values.shape[-1])
         return empty.index_put((self.image, self.slot), values)
 
     def of_objects(self, values: Tensor, rooms: int, objects: int) -> Tensor:
-        """Values of masks at their room's objects, (rooms, objects, ...): of one view a room."""
+        """Values at the masks' objects, (rooms, objects, ...); one view per room."""
         empty = values.new_zeros(rooms, objects, *values.shape[1:])
         return empty.index_put((self.room, self.item), values)
 
 
-def one_view(views: SceneViews, first: int, last: int | None = None) -> SceneViews:
-    """A batch with some of its views alone: `first`, or `first` to `last` (not included)."""
-    part = slice(first, first + 1 if last is None else last)
+def some_views(views: SceneViews, part: slice) -> SceneViews:
+    """The batch with some of each room's views."""
     return replace(
         views,
         world_to_camera=views.world_to_camera[:, part],
@@ -125,7 +130,7 @@ def one_view(views: SceneViews, first: int, last: int | None = None) -> SceneVie
 
 
 def detections_of(views: SceneViews) -> Detections:
-    """Every visible mask of every view.
+    """The visible masks of all views.
 
     Raises:
         ValueError: the views were loaded without their instance ids.
@@ -163,8 +168,8 @@ def detections_of(views: SceneViews) -> Detections:
 
 
 def _numbers(found: Detections, clear: Bool[Tensor, "masks 4"]) -> Float[Tensor, "masks numbers"]:
-    """The 2D box, the log of its sides, whether these are the object's own (4 each, 2 logs), rays
-    through its middle and corners, and the camera's height."""
+    """The 2D box (4), the logs of its width and height (2), its clear sides (4), the rays through
+    its middle and corners (15), and the camera's height (1)."""
     x1, y1, x2, y2 = found.boxes.unbind(dim=-1)
     corners = [((x1 + x2) / 2, (y1 + y2) / 2), (x1, y1), (x2, y1), (x1, y2), (x2, y2)]
     rays = found.rays(torch.stack([torch.stack(place, dim=-1) for place in corners], dim=1))
@@ -177,7 +182,7 @@ def _numbers(found: Detections, clear: Bool[Tensor, "masks 4"]) -> Float[Tensor,
 def _crops(
     found: Detections, ids: Integer[Tensor, "masks height width"]
 ) -> Float[Tensor, "masks channels rows columns"]:
-    """The surroundings of each 2D box, stretched to a square, see `CHANNELS`."""
+    """Each 2D box with its border, stretched to a square, see `CHANNELS`."""
     steps = (torch.arange(CROP, device=ids.device) + 0.5) / CROP
     steps = steps * (1 + 2 * MARGIN) - MARGIN
     low, high = found.boxes[:, None, :2], found.boxes[:, None, 2:]

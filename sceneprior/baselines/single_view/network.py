@@ -1,31 +1,75 @@
-"""The network that the baselines share: what it sees of masks, and what it says of objects."""
+"""Parts that the networks of all three single-view baselines share."""
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sceneprior.baselines.single_view.detections import CHANNELS, CROP, NUMBERS, Detections
-from sceneprior.geometry.meshes import place
-from sceneprior.models.layers import mlp
-from sceneprior.scene import Mesh
+from sceneprior.baselines.single_view.detections import (
+    CHANNELS,
+    CROP,
+    NUMBERS,
+    Detections,
+    detections_of,
+)
+from sceneprior.core.scene import Mesh
+from sceneprior.core.views import SceneViews
+from sceneprior.paper.layers import mlp
 from sceneprior.training.method import FoundObject
 
 
 class Placed(NamedTuple):
-    """What is said of masks: boxes in the room."""
+    """One predicted or true box per mask, in the room frame."""
 
     centers_m: Float[Tensor, "masks 3"]
     sizes_m: Float[Tensor, "masks 3"]
 
+    @classmethod
+    def of(
+        cls,
+        found: Detections,
+        offsets: Float[Tensor, "masks 2"],
+        distances_m: Float[Tensor, " masks"],
+        sizes_m: Float[Tensor, "masks 3"],
+    ) -> "Placed":
+        """Boxes from a network's numbers: `Detections.centers_at` explains offsets and distances;
+        sizes are along the axes of the image's frame."""
+        return cls(found.centers_at(offsets, distances_m), found.to_room(sizes_m).abs())
+
+    def points_m(
+        self, found: Detections, points: Float[Tensor, "masks points 3"]
+    ) -> Float[Tensor, "masks points 3"]:
+        """Points in metres in the room, from points in the image's frame where each box is
+        [-1, 1]^3."""
+        return found.to_room(points) * (self.sizes_m / 2).unsqueeze(1) + self.centers_m.unsqueeze(1)
+
+
+class ViewNetwork(nn.Module, ABC):
+    """A network that reconstructs the objects behind the masks of single views."""
+
+    @abstractmethod
+    def reconstruct(self, found: Detections) -> tuple[Placed, Iterable[Mesh]]:
+        """One box and one mesh per mask, in the room frame."""
+
+    @torch.no_grad()
+    def find(self, views: SceneViews) -> list[list[FoundObject]]:
+        found = detections_of(views)
+        placed, meshes = self.reconstruct(found)
+        answers: list[list[FoundObject]] = [[] for _ in views.room_index]
+        numbers = (part.tolist() for part in (found.room, placed.centers_m, placed.sizes_m))
+        for room, (x, y, z), (width, height, depth), mesh in zip(*numbers, meshes, strict=True):
+            answers[room].append(FoundObject((x, y, z), (width, height, depth), mesh))
+        return answers
+
 
 class DetectionEncoder(nn.Module):
-    """Features of masks, each by itself: a small convolutional network on its crop, joined with its
-    box, rays and class. Published networks read colours by a ResNet instead."""
+    """Features of each mask alone: a small convolutional network reads its crop, a linear layer its
+    2D box, rays and class. The published networks read colours with a ResNet instead."""
 
     def __init__(self, classes: int, width: int):
         super().__init__()
@@ -43,38 +87,22 @@ class DetectionEncoder(nn.Module):
         self.join = mlp(nn.Linear(2 * width, width), nn.Linear(width, width))
 
     def forward(self, found: Detections) -> Float[Tensor, "masks width"]:
-        """One feature a mask."""
+        """One feature vector per mask."""
         known = F.one_hot(found.object_class, self.classes).to(found.numbers)
         numbers = self.numbers(torch.cat([found.numbers, known], dim=-1))
         return F.relu(self.join(torch.cat([self.crop(found.crops), numbers], dim=-1).relu()))
 
 
-def sizes_in_room(found: Detections, sizes_m: Float[Tensor, "masks 3"]) -> Float[Tensor, "masks 3"]:
-    """Extents along the axes of the images' frames, along the room's."""
-    return found.to_room(sizes_m).abs()
-
-
-def placed_meshes(
-    found: Detections, placed: Placed, canonical: Float[Tensor, "masks vertices 3"]
-) -> Float[Tensor, "masks vertices 3"]:
-    """Meshes of the images' frames, whose boxes span [-1, 1]^3, in the room."""
-    turned = found.to_room(canonical).unsqueeze(0)
-    return place(turned, placed.centers_m[None], placed.sizes_m[None])[0]
-
-
-def by_image(
-    found: Detections, placed: Placed, meshes: Sequence[Mesh], images: int
-) -> list[list[FoundObject]]:
-    """What was found, of one view a room, in the order of its masks."""
-    answers: list[list[FoundObject]] = [[] for _ in range(images)]
-    numbers = (part.tolist() for part in (found.room, placed.centers_m, placed.sizes_m))
-    for room, (x, y, z), (width, height, depth), mesh in zip(*numbers, meshes, strict=True):
-        answers[room].append(FoundObject((x, y, z), (width, height, depth), mesh))
-    return answers
+def meshes_of(
+    vertices_m: Float[Tensor, "masks vertices 3"], faces: Int[Tensor, "faces 3"]
+) -> list[Mesh]:
+    """One mesh per mask; all have the same faces."""
+    triangles = faces.cpu().numpy()
+    return [Mesh(as_numpy(vertices), triangles) for vertices in vertices_m]
 
 
 def last_layer(width: int, outputs: int) -> nn.Linear:
-    """A layer that says nearly nothing at first: what stands for 0 is where training begins."""
+    """A linear layer whose outputs start close to 0: small weights, zero bias."""
     layer = nn.Linear(width, outputs)
     with torch.no_grad():
         layer.weight *= 0.1
@@ -83,5 +111,5 @@ def last_layer(width: int, outputs: int) -> nn.Linear:
 
 
 def as_numpy(values: Tensor) -> np.ndarray:
-    """Plain numbers of a tensor, in float64."""
+    """A tensor as a float64 array."""
     return values.detach().cpu().double().numpy()

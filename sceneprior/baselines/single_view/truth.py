@@ -1,6 +1,6 @@
-"""Single views with true boxes and shapes beside them: for the baselines with 3D supervision.
+"""Batches of views with true boxes and shapes, for the baselines with 3D supervision.
 
-Models come through `evaluation.ground_truth`; USL and the paper's method never do
+Only Total3D and Im3D train on them; USL and the paper's method never open them
 (tests/baselines/test_true_boxes.py).
 """
 
@@ -12,36 +12,36 @@ import torch
 from jaxtyping import Bool, Float, Int16
 from torch import Tensor
 
-from sceneprior.data.dataset import ViewDataset
-from sceneprior.errors import ShardError
-from sceneprior.evaluation.ground_truth import known_in_3d, reference_scene
-from sceneprior.geometry.surfaces import surface_points
-from sceneprior.shards import iterate_rooms
-from sceneprior.topdown import object_mesh
-from sceneprior.views import SceneViews
+from sceneprior.baselines.true_boxes import check_ground_truth
+from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.geometry.surfaces import surface_points
+from sceneprior.core.ground_truth import reference_scene
+from sceneprior.core.shards import iterate_rooms
+from sceneprior.core.views import SceneViews
+from sceneprior.render.topdown import object_mesh
 
 POINTS = 256
-"""On the surface of each object."""
+"""Points on the surface of each object."""
 CELLS = 16
-"""Along each axis of an object's grid."""
+"""Cells along each axis of an object's grid."""
 DENSE = 12288
-"""Points that tell which cells a surface passes: about eight a cell of a cube's surface."""
+"""Surface points that mark cells: about eight per cell of a cube's surface."""
 
 
 class TrueViews(NamedTuple):
-    """Views of rooms, and what their tracked objects are in 3D; void and padding are zeros."""
+    """Views of rooms with the boxes and shapes of tracked objects; zeros for void and padding."""
 
     views: SceneViews
     boxes_m: Float[Tensor, "rooms objects 6"]
     """Centre, then full extents, in the room frame."""
     points: Float[Tensor, "rooms objects points 3"]
-    """Of the surface; the box spans [-1, 1]^3."""
+    """Surface points; the box is [-1, 1]^3."""
     occupied: Bool[Tensor, "rooms objects x y z"]
-    """Cells of the box that the object fills."""
+    """Cells of the box inside the object."""
 
 
 class TrueViewDataset(ViewDataset):
-    """`ViewDataset` with boxes and shapes of the ground truth, of unturned rooms.
+    """A `ViewDataset` of unturned rooms with the boxes and shapes of their ground truth.
 
     Raises:
         ShardError: a room has no ground truth, or a model is missing.
@@ -49,12 +49,6 @@ class TrueViewDataset(ViewDataset):
 
     def __init__(self, folder: Path, split: str, **options: Any):
         super().__init__(folder, split, **options)
-        if not known_in_3d(folder, split):
-            raise ShardError(
-                f"A '{split}' room of {folder} carries no 3D ground truth, which is what this "
-                "stage learns from. Take shards of a data set that has it, or a method that learns "
-                "from masks (usl, ours)."
-            )
         true = [_read(folder, shard, room_id) for shard, room_id in iterate_rooms(folder, split)]
         padded = [
             torch.nn.utils.rnn.pad_sequence([torch.from_numpy(part) for part in parts], True)
@@ -63,14 +57,14 @@ class TrueViewDataset(ViewDataset):
         self._boxes_m, self._points, self._occupied = padded
 
     def to(self, device: torch.device | str) -> "TrueViewDataset":
-        """Move what is known in 3D to `device`, too."""
+        """Move views, boxes and shapes to `device`."""
         super().to(device)
         self._boxes_m, self._points = self._boxes_m.to(device), self._points.to(device)
         self._occupied = self._occupied.to(device)
         return self
 
     def log_sizes(self) -> tuple[Float[Tensor, "objects 3"], Int16[Tensor, " objects"]]:
-        """Logs of the sizes of all objects in metres, and their classes."""
+        """Logs of all objects' sizes in metres, and their classes."""
         classes = self.flat.object_class[:-1]  # the last is padding
         there = torch.arange(self._boxes_m.shape[1]) < self.flat.object_count[:, None]
         return self._boxes_m[there][:, 3:].clamp(min=1e-3).log(), classes
@@ -86,13 +80,14 @@ class TrueViewDataset(ViewDataset):
 
 
 def _read(folder: Path, shard: Any, room_id: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    check_ground_truth(shard, room_id)
     scene = reference_scene(shard, room_id, folder, tracked_only=True)
     boxes_m = np.hstack([scene.centers_m, scene.sizes_m]).astype(np.float32)
     points = np.empty((len(boxes_m), POINTS, 3), np.float32)
     occupied = np.empty((len(boxes_m), CELLS, CELLS, CELLS), bool)
     for row, item in enumerate(scene.objects):
         mesh, half_m = object_mesh(item), np.maximum(item.size_m, 1e-6) / 2
-        # Scaled first, lest the small sides of a flat piece get few points.
+        # Scaled to the cube first, or the small sides of a flat piece would get few points.
         unit = (mesh.vertices_m - np.asarray(item.center_m)) / half_m
         occupied[row] = filled(surface_points(unit, mesh.faces, DENSE), CELLS)
         surface = surface_points(mesh.vertices_m, mesh.faces, POINTS)
@@ -101,8 +96,9 @@ def _read(folder: Path, shard: Any, room_id: str) -> tuple[np.ndarray, np.ndarra
 
 
 def filled(points: Float[np.ndarray, "points 3"], cells: int) -> Bool[np.ndarray, "x y z"]:
-    """Cells of [-1, 1]^3 that a surface passes, by points on it, or that have it on both sides
-    along each of the three axes. A cell that points miss costs a line, where a flood would leak.
+    """Cells of [-1, 1]^3 that hold a point of the surface, or that have such cells on both sides
+    along all three axes. A surface cell without a point then spoils at most the lines through it,
+    where a flood fill would leak.
 
     Example: a sphere's inside is filled.
 

@@ -1,70 +1,65 @@
 """The baseline USL: boxes and meshes of single images, learnt from the masks of other views alone.
 
-After Gkioxari et al., "Learning 3D Object Shape and Layout without 3D Supervision", CVPR 2022. What
-is published, and what is ours: docs/baselines_single_view.md.
+After Gkioxari et al., "Learning 3D Object Shape and Layout without 3D Supervision", CVPR 2022;
+docs/baselines_single_view.md names the differences.
 """
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 
-from sceneprior.baselines.single_view.detections import Detections, detections_of, one_view
+from sceneprior.baselines.one_stage import OneStage
+from sceneprior.baselines.single_view.detections import Detections, detections_of, some_views
 from sceneprior.baselines.single_view.network import (
     DetectionEncoder,
     Placed,
-    as_numpy,
-    by_image,
+    ViewNetwork,
     last_layer,
-    placed_meshes,
-    sizes_in_room,
+    meshes_of,
 )
 from sceneprior.baselines.single_view.training import (
     SingleViewConfig,
     SingleViewModel,
-    SingleViewStage,
     SingleViewTraining,
 )
-from sceneprior.data.dataset import ViewDataset
-from sceneprior.geometry.cameras import boxes_of_points
-from sceneprior.losses.averages import mean_of_objects
-from sceneprior.losses.layout import box_loss, frustum_loss
-from sceneprior.losses.shape import soft_iou
-from sceneprior.models.shape_decoder import ShapeDecoder, ShapeDecoderConfig
-from sceneprior.scene import Mesh
-from sceneprior.silhouettes.render import render_silhouettes
-from sceneprior.training.method import FoundObject
-from sceneprior.training.objective import full_precision
-from sceneprior.views import SceneViews
+from sceneprior.core.geometry.cameras import boxes_of_points
+from sceneprior.core.scene import Mesh
+from sceneprior.core.views import SceneViews
+from sceneprior.paper.losses.averages import mean_of_objects
+from sceneprior.paper.losses.layout import box_loss, frustum_loss
+from sceneprior.paper.losses.shape import soft_iou
+from sceneprior.paper.shape_decoder import ShapeDecoder, ShapeDecoderConfig
+from sceneprior.render.silhouettes.render import render_silhouettes
+from sceneprior.training.steps import full_precision
 
 START_M = 3.0
-"""Distance at which every object is believed to stand before training; its size follows from that
-of its mask."""
+"""Distance of every object before training; its size then follows from its mask."""
 
 
 class UslModel(SingleViewModel):
-    """The network."""
+    """Size of the network."""
 
     shape: ShapeDecoderConfig = ShapeDecoderConfig(width=64, level=2, template="box", fit_box=True)
 
 
 class UslTraining(SingleViewTraining):
-    """How the network is trained. Of the views drawn from a room, one is the image."""
+    """Settings of the training. The first of the views drawn from a room is the image, and the
+    others supervise it."""
 
     epochs: int = Field(200, ge=1)
     box: float = Field(5.0, ge=0)
-    """Weight of 2D boxes in the other views: silhouettes that do not meet their masks have no
-    gradient."""
+    """Weight of 2D boxes in the other views. Silhouettes that miss their masks have no gradient."""
     frustum: float = Field(1.0, ge=0)
-    """Weight of the rays to objects that other views see, but not where they are predicted."""
+    """Weight of the rays to objects that another view sees but whose prediction lies outside it."""
     mask: float = Field(1.0, ge=0)
     """Weight of silhouettes in the other views."""
     occlusion_slack: float = Field(0.15, ge=0, le=1)
-    """As of `LossConfig`."""
+    """As in `LossConfig`."""
     silhouettes: Literal["exact", "fast"] = "fast"
-    """As of `ShapeConfig`."""
+    """As in `ShapeConfig`."""
 
 
 class UslConfig(SingleViewConfig):
@@ -77,20 +72,10 @@ class UslConfig(SingleViewConfig):
     def make(self) -> "UslStage":
         return UslStage(Usl(self.model, self.classes), self.training)
 
-    def open_rooms(self) -> ViewDataset:
-        return self.views_of()
 
-
-class Predicted(NamedTuple):
-    """Of masks: boxes and meshes in the room."""
-
-    placed: Placed
-    vertices_m: Float[Tensor, "masks vertices 3"]
-
-
-class Usl(nn.Module):
-    """Each mask by itself: how far its object is, where its centre lies behind the mask, how large
-    it is, and by how much its mesh departs from a template."""
+class Usl(ViewNetwork):
+    """Predicts each object from its mask alone: the offset of its centre, its distance, its size,
+    and the deformation of a template mesh."""
 
     def __init__(self, config: UslModel, classes: int):
         super().__init__()
@@ -98,69 +83,67 @@ class Usl(nn.Module):
         self.box = last_layer(config.width, 6)
         self.shape: ShapeDecoder = config.shape.build(config.width)
 
-    def forward(self, found: Detections) -> Predicted:
-        """Where training begins, objects stand `START_M` away and are as large as their masks."""
+    def forward(self, found: Detections) -> tuple[Placed, Float[Tensor, "masks vertices 3"]]:
+        """Boxes, and vertices in metres. An output of 0 means `START_M` away and as large as the 2D
+        box."""
         features = self.encoder(found)
         offsets, log_distance, log_sizes = self.box(features).split([2, 1, 3], dim=-1)
         distances_m = START_M * log_distance[:, 0].exp()
         sides = (found.boxes[:, 2:] - found.boxes[:, :2]).clamp(min=1e-3)
         seen_m = sides / found.intrinsics[:, (0, 1), (0, 1)] * distances_m.unsqueeze(-1)
-        wide_m, high_m = seen_m.unbind(dim=-1)
-        sizes_m = torch.stack([wide_m, high_m, wide_m], dim=-1) * log_sizes.exp()
-        placed = Placed(found.centers_at(offsets, distances_m), sizes_in_room(found, sizes_m))
-        canonical = self.shape(features.unsqueeze(0))[0]
-        return Predicted(placed, placed_meshes(found, placed, canonical))
+        width_m, height_m = seen_m.unbind(dim=-1)
+        sizes_m = torch.stack([width_m, height_m, width_m], dim=-1) * log_sizes.exp()
+        placed = Placed.of(found, offsets, distances_m, sizes_m)
+        vertices = self.shape(features.unsqueeze(0))[0]
+        return placed, placed.points_m(found, vertices)
 
-    @torch.no_grad()
-    def find(self, views: SceneViews) -> list[list[FoundObject]]:
-        found = detections_of(views)
+    def reconstruct(self, found: Detections) -> tuple[Placed, list[Mesh]]:
         placed, vertices_m = self(found)
-        faces = self.shape.faces.cpu().numpy()
-        meshes = [Mesh(as_numpy(vertices), faces) for vertices in vertices_m]
-        return by_image(found, placed, meshes, len(views.room_index))
+        return placed, meshes_of(vertices_m, self.shape.faces)
 
 
-class UslStage(SingleViewStage):
-    """What one view shows, held against the masks of the other views."""
+class UslStage(OneStage):
+    """Compares predictions from one view with the masks of the other views."""
 
     prior: Usl
     settings: UslTraining
 
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
-        found = detections_of(one_view(views, 0))
-        others = one_view(views, 1, views.visible.shape[1])
-        predicted = self.prior(found)
+        found = detections_of(some_views(views, slice(1)))
+        others = some_views(views, slice(1, None))
+        placed, vertices_m = self.prior(found)
         with full_precision(self.device):
             losses = other_view_losses(
-                found, predicted, self.prior.shape.faces, others, self.settings
+                found, placed, vertices_m, self.prior.shape.faces, others, self.settings
             )
-            weights = self.settings.model_dump(include={"box", "frustum", "mask"})
+            weights = self.settings.model_dump(include=set(losses))
             return self.total(losses, weights, views)
 
 
 def other_view_losses(
     found: Detections,
-    predicted: Predicted,
-    faces: Tensor,
+    placed: Placed,
+    vertices_m: Float[Tensor, "masks vertices 3"],
+    faces: Int[Tensor, "faces 3"],
     others: SceneViews,
     settings: UslTraining,
 ) -> dict[str, Float[Tensor, ""]]:
-    """Terms of the 2D boxes, of what leaves the view, and of the silhouettes; means over objects.
+    """Losses in the other views, as means over objects: 2D boxes, rays to objects predicted outside
+    a view, and silhouettes.
 
-    The silhouette of each object is drawn alone. Where another object is seen, nobody knows
-    whether it goes on behind, so those pixels do not count:
+    Each silhouette is drawn alone. The object may continue behind other objects, so pixels that
+    show one do not count:
 
         L_mask = 1 - IoU(silhouette, mask) over the other pixels
     """
     rooms, objects = others.is_object.shape
-    answered = found.of_objects(torch.ones_like(found.image, dtype=torch.bool), rooms, objects)
-    vertices_m = found.of_objects(predicted.vertices_m.float(), rooms, objects)
-    centers_m = found.of_objects(predicted.placed.centers_m.float(), rooms, objects)
+    predicted = found.of_objects(torch.ones_like(found.image, dtype=torch.bool), rooms, objects)
+    vertices_m = found.of_objects(vertices_m.float(), rooms, objects)
+    centers_m = found.of_objects(placed.centers_m.float(), rooms, objects)
     cameras = (others.world_to_camera, others.intrinsics)
     boxes, inside = boxes_of_points(vertices_m, *cameras, others.image_size)
-    seen = others.visible & answered.unsqueeze(1)
+    seen = others.visible & predicted.unsqueeze(1)
     counted = seen & inside
-    box = box_loss(boxes, others.boxes, others.sides_clear, counted, settings.occlusion_slack)
     height, width = others.observed_ids.shape[-2:]
     silhouettes = render_silhouettes(
         vertices_m,
@@ -170,10 +153,11 @@ def other_view_losses(
         (height, width),
         mode=settings.silhouettes,
         compositing="alone",
-        drawn=answered,
+        drawn=predicted,
     )
+    slack = settings.occlusion_slack
     return {
-        "box": box,
+        "box": box_loss(boxes, others.boxes, others.sides_clear, counted, slack),
         "frustum": frustum_loss(centers_m, others, seen & ~inside),
         "mask": silhouette_loss(silhouettes, others, counted),
     }
@@ -184,7 +168,8 @@ def silhouette_loss(
     others: SceneViews,
     counted: Bool[Tensor, "rooms views objects"],
 ) -> Float[Tensor, ""]:
-    """1 - IoU over the pixels that show the object or nothing: mean over views, then objects."""
+    """1 - IoU over the pixels that show the object or nothing: the mean over views, then over
+    objects."""
     room, view, item = counted.nonzero(as_tuple=True)
     ids = others.observed_ids[room, view]
     own = (ids == (item + 1)[:, None, None]).to(silhouettes)

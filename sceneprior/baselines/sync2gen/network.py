@@ -1,7 +1,7 @@
-"""The network of the Sync2Gen-style baseline: a VAE of a room's furniture as one matrix.
+"""The network of the Sync2Gen-style baseline: a VAE of rooms as matrices.
 
-Source: Yang et al., "Scene Synthesis via Uncertainty-Driven Attribute Synchronization", ICCV 2021.
-What was ambiguous, and what we chose: docs/baselines_3d.md.
+Source: Yang et al., "Scene Synthesis via Uncertainty-Driven Attribute Synchronization", ICCV 2021;
+docs/baselines_3d.md lists our choices where it is ambiguous.
 """
 
 import torch
@@ -11,32 +11,32 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.baselines.sync2gen.pairs import PairPrior
-from sceneprior.models.layers import mlp
-from sceneprior.settings import Section
-from sceneprior.views import RoomBoxes
+from sceneprior.core.settings import Section
+from sceneprior.core.views import RoomBoxes
+from sceneprior.paper.layers import mlp
 
 ATTRIBUTES = 7
-"""Of a slot: whether it exists, centre x, y, z, full extents along x, y, z."""
+"""Numbers of a slot: existence, centre x, y, z, full extents along x, y, z."""
 READS = 4
-"""Groups of inputs that an output of a sparse layer is connected with."""
+"""Groups of inputs connected to each output of a sparse layer."""
 HIDDEN_GROUP = 8
 LEAST_SPREAD_M = 0.05
 LEAST_SIZE_M = 0.02
 
 
 class Sync2genModel(Section):
-    """Size of the network; the latent is as released."""
+    """Size of the network; `latent` is the released setting."""
 
     width: int = Field(512, ge=8)
-    """Of the hidden layers; a multiple of 8."""
+    """Width of the hidden layers; a multiple of 8."""
     latent: int = Field(20, ge=1)
-    """Numbers that a room is encoded as."""
+    """Size of a room's latent."""
     slots: int = Field(8, ge=1, le=1000)
-    """Objects of one class that a room can hold (released: 4); further ones are left out, and
-    their share is logged as `train/left_out`."""
+    """Most objects of one class in a room (released: 4). Others are left out; `train/left_out` logs
+    their share."""
     refine_steps: int = Field(100, ge=0)
-    """Gradient steps on each new room's positions, towards offsets between classes as training
-    rooms have them; 0 takes rooms as decoded (the paper's Sync2Gen*). Acts on sampling alone."""
+    """Gradient steps that move each new room's objects towards the offsets of training rooms; 0
+    keeps rooms as decoded (the paper's Sync2Gen*). Training does not use it."""
 
     @model_validator(mode="after")
     def _width_in_groups(self) -> "Sync2genModel":
@@ -46,13 +46,12 @@ class Sync2genModel(Section):
 
 
 class Sync2Gen(nn.Module):
-    """A variational auto-encoder of arrangements: `slots` objects a class, each there or not.
+    """A variational auto-encoder of rooms, with `slots` slots per class that are filled or empty.
 
-    Attributes are standardised per class. Objects of a class take its slots from left to right (by
-    x, then z); of more than `slots`, the rightmost are left out. Layers are sparsely and fully
-    connected in turn: a sparse one lets each output see few groups of inputs, chosen once by
-    `seed`, which holds overfitting down. It chooses which offsets of frequent pairs are kept, too.
-    `classes` is the size of the label set, void included.
+    Attributes are standardised per class. Objects of a class fill its slots from left to right (by
+    x, then z); beyond `slots`, the rightmost are left out. Sparse and full layers alternate, which
+    reduces overfitting. `seed` chooses the connections of sparse layers and the offsets that
+    `PairPrior` keeps. `classes` is the size of the label set with void.
     """
 
     mean_m: Tensor
@@ -81,7 +80,7 @@ class Sync2Gen(nn.Module):
         )
 
     def fit_statistics(self, rooms: RoomBoxes) -> None:
-        """Take means and spreads per class, and how pairs of classes lie, from training rooms."""
+        """Set means and spreads of each class and offsets of class pairs from training rooms."""
         for label in range(1, self.classes):
             mine = rooms.boxes_m[rooms.is_object & (rooms.object_class == label)]
             if len(mine):
@@ -91,10 +90,10 @@ class Sync2Gen(nn.Module):
         self.pairs.fit(rooms, self.seed)
 
     def to_matrix(self, rooms: RoomBoxes) -> Float[Tensor, "rooms classes slots 7"]:
-        """Rooms as matrices, bit for bit the same for every order of their objects."""
+        """Rooms as matrices, bit for bit independent of the order of objects."""
         label = rooms.object_class.where(rooms.is_object, self.classes)
         order = torch.arange(label.shape[1], device=label.device).expand_as(label)
-        # Sorting is stable, so the last key counts most.
+        # The sort is stable, so the last key is the primary one.
         for key in (rooms.boxes_m[..., 2], rooms.boxes_m[..., 0], label):
             order = order.gather(1, key.gather(1, order).argsort(dim=1, stable=True))
         rooms, label = rooms.take(order), label.gather(1, order).contiguous()
@@ -103,7 +102,7 @@ class Sync2Gen(nn.Module):
         row = (label - 1).clamp(max=self.classes - 2)
         unit = (rooms.boxes_m - self.mean_m[row, 0]) / self.spread_m[row, 0]
         cell = torch.cat([torch.ones_like(unit[..., :1]), unit], dim=-1)
-        # What finds no slot goes to one behind the last, which is cut off again.
+        # Objects without a slot go to one behind the last, which is cut off below.
         last = (self.classes - 1) * self.slots
         slot = (row * self.slots + rank).where(fits, last)
         matrix = cell.new_zeros(len(label), last + 1, ATTRIBUTES)
@@ -128,7 +127,7 @@ class Sync2Gen(nn.Module):
         mean: Float[Tensor, "rooms latent"],
         log_variance: Float[Tensor, "rooms latent"],
     ) -> dict[str, Float[Tensor, " rooms"]]:
-        """Each room's terms: existence over all slots, the rest over slots that are filled."""
+        """Losses of each room: existence over all slots, attributes over the filled ones."""
         exists = matrix[..., 0]
         off = F.smooth_l1_loss(decoded[..., 1:], matrix[..., 1:], reduction="none")
         off = off * exists.unsqueeze(-1)
@@ -146,22 +145,21 @@ class Sync2Gen(nn.Module):
         matrix: Float[Tensor, "rooms classes slots 7"],
         decoded: Float[Tensor, "rooms classes slots 7"],
     ) -> None:
-        """Remember how far decoded centres are off, per class: what refinement may move them by."""
+        """Update the running errors of decoded centres, which refinement uses."""
         off_m = (decoded - matrix)[..., [1, 3]] * self.spread_m[..., [0, 2]]
         squared = (off_m**2).mean(dim=-1) * matrix[..., 0]
         self.pairs.note_errors(squared.sum(dim=(0, 2)), matrix[..., 0].sum(dim=(0, 2)))
 
     @torch.no_grad()
     def sample(self, count: int, seed: int) -> RoomBoxes:
-        """New rooms of latents from N(0, 1). The same seed gives the same rooms, the first of them
-        however many follow."""
+        """New rooms of latents from N(0, 1). The first rooms of a seed do not depend on `count`."""
         generator = torch.Generator().manual_seed(seed)
         z = torch.stack([torch.randn(self.latent, generator=generator) for _ in range(count)])
         rooms = self.to_rooms(self.decode(z.to(self.mean_m)))
         return self.pairs.refine(rooms, self.refine_steps)
 
     def to_rooms(self, decoded: Float[Tensor, "rooms classes slots 7"]) -> RoomBoxes:
-        """The slots that rather exist than not, in metres."""
+        """Boxes in metres of the slots whose existence is likelier than not."""
         boxes_m = (self.mean_m + self.spread_m * decoded[..., 1:]).flatten(1, 2)
         boxes_m = torch.cat([boxes_m[..., :3], boxes_m[..., 3:].clamp(min=LEAST_SIZE_M)], dim=-1)
         exists = (decoded[..., 0] > 0).flatten(1, 2)
@@ -172,7 +170,7 @@ class Sync2Gen(nn.Module):
 
 
 class SparseLinear(nn.Linear):
-    """A linear layer in which every output sees `READS` groups of neighbouring inputs."""
+    """A linear layer with `READS` groups of neighbouring inputs per output."""
 
     mask: Tensor
 
@@ -183,9 +181,9 @@ class SparseLinear(nn.Linear):
         generator = torch.Generator().manual_seed(seed)
         seen = torch.rand(outputs, groups, generator=generator).argsort(dim=1) < reads
         self.register_buffer("mask", seen.repeat_interleave(group, dim=1).float())
-        with torch.no_grad():  # as large as a layer of so many inputs starts
+        with torch.no_grad():  # the initial scale of a layer with as many inputs
             self.weight.mul_((groups / reads) ** 0.5)
 
     def forward(self, x: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:
-        """Only the connections that there are."""
+        """The layer's output, with the weights of missing connections at 0."""
         return F.linear(x, self.weight * self.mask, self.bias)

@@ -1,7 +1,7 @@
-"""Offsets between pairs of furniture in training rooms, and rooms moved towards such offsets.
+"""Offsets between pairs of furniture in training rooms, and their use to refine new rooms.
 
-Sync2Gen's synchronisation, in a small form: absolute positions, as uncertain as the decoder is,
-meet relative ones, as uncertain as training rooms are. What is left out: docs/baselines_3d.md.
+This is a small form of Sync2Gen's synchronisation: absolute positions have the decoder's
+uncertainty, relative ones that of training rooms. docs/baselines_3d.md names what is left out.
 """
 
 from dataclasses import replace
@@ -10,23 +10,23 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from sceneprior.views import RoomBoxes
+from sceneprior.core.views import RoomBoxes
 
 COMPONENTS = 64
-"""Offsets kept a pair of classes: each is the centre of one Gaussian of its mixture."""
+"""Offsets kept per pair of classes, each the mean of one Gaussian of the pair's mixture."""
 BANDWIDTH_M = 0.15
 ANYWHERE = 0.05
-"""Share of pairs that lie in no learnt way, evenly over `AREA_M2`: no pair pulls for ever."""
+"""Weight of a uniform density over `AREA_M2` in each mixture, which bounds the pull of a pair."""
 AREA_M2 = 64.0
 STEP_M = 0.02
 MOMENTUM = 0.05
-"""Of the running error per class."""
+"""Share of the newest batch in the running error of each class."""
 BATCH = 64
-"""Rooms refined at a time."""
+"""Rooms per batch in refinement."""
 
 
 class PairPrior(nn.Module):
-    """For every pair of classes, a mixture over the offset between centres, in x and z."""
+    """Per pair of classes, a mixture of Gaussians over the offset between centres in x and z."""
 
     offsets_m: Tensor
     known: Tensor
@@ -39,7 +39,8 @@ class PairPrior(nn.Module):
         self.register_buffer("error_m2", torch.full((classes,), 0.04))
 
     def fit(self, rooms: RoomBoxes, seed: int) -> None:
-        """Keep offsets of training rooms: all of a rare pair, over and over; some of a frequent."""
+        """Keep `COMPONENTS` offsets per pair from training rooms: a random choice of a frequent
+        pair's, repetitions of a rare pair's."""
         generator = torch.Generator().manual_seed(seed)
         offsets_m, together = _offsets(rooms)
         room, one, other = together.nonzero(as_tuple=True)
@@ -57,8 +58,12 @@ class PairPrior(nn.Module):
     def note_errors(
         self, squared: Float[Tensor, " labels"], count: Float[Tensor, " labels"]
     ) -> None:
-        """Let the running mean of squared errors of centres follow a batch's: sums in square metres
-        over so many objects, per class without void."""
+        """Update the running mean squared error of centres per class.
+
+        Args:
+            squared: Sum of a batch's squared errors per class without void, in square metres.
+            count: Objects in that sum.
+        """
         newest = squared / count.clamp(min=1)
         weight = MOMENTUM * (count > 0)
         self.error_m2[1:] += weight * (newest - self.error_m2[1:])
@@ -70,7 +75,7 @@ class PairPrior(nn.Module):
 
             sum_i |p_i - start_i|^2 / (2 error_i) - mean_(j != i) log p(p_j - p_i | classes)
 
-        A pair that training never saw together says nothing.
+        Pairs that no training room holds do not count.
         """
         error_m2 = self.error_m2[rooms.object_class]
         stray = ((rooms.boxes_m[..., [0, 2]] - start_m) ** 2).sum(dim=-1) / (2 * error_m2)
@@ -86,7 +91,7 @@ class PairPrior(nn.Module):
         return ((stray - of_pairs) * rooms.is_object).sum(dim=-1)
 
     def refine(self, rooms: RoomBoxes, steps: int) -> RoomBoxes:
-        """Move every object over the floor by `steps` steps of Adam down the energy."""
+        """Reduce the energy by `steps` steps of Adam on the floor positions."""
         if steps == 0:
             return rooms
         moved = [self._refine(part, steps) for part in rooms.split(BATCH)]
@@ -96,8 +101,8 @@ class PairPrior(nn.Module):
     def _refine(self, rooms: RoomBoxes, steps: int) -> Float[Tensor, "rooms objects 6"]:
         start_m = rooms.boxes_m[..., [0, 2]]
         rooms = replace(rooms, boxes_m=rooms.boxes_m.clone().requires_grad_())
-        # Adam treats each number by itself: no room depends on its neighbours in the batch, and
-        # what the energy does not ask for, heights and sizes, stays.
+        # Adam updates each number by its own gradient: a room does not depend on the others in its
+        # batch, and heights and sizes, which have no gradient, stay.
         optimizer = torch.optim.Adam([rooms.boxes_m], lr=STEP_M)
         for _ in range(steps):
             optimizer.zero_grad()
@@ -109,7 +114,7 @@ class PairPrior(nn.Module):
 def _offsets(
     rooms: RoomBoxes,
 ) -> tuple[Float[Tensor, "rooms objects objects 2"], Bool[Tensor, "rooms objects objects"]]:
-    """From each object i to each object j in x and z; and which are two objects of a room."""
+    """Offsets from object i to object j in x and z, and True for two objects of a room."""
     floor_m = rooms.boxes_m[..., [0, 2]]
     objects = floor_m.shape[1]
     other = ~torch.eye(objects, dtype=torch.bool, device=floor_m.device)

@@ -6,21 +6,22 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from sceneprior.baselines.box_training import BoxConfig, BoxStage, BoxTraining
+from sceneprior.baselines.box_training import BoxConfig, room_means
+from sceneprior.baselines.one_stage import OneStage, OneStageTraining
 from sceneprior.baselines.sync2gen.network import Sync2Gen, Sync2genModel
-from sceneprior.training.objective import full_precision
-from sceneprior.views import RoomBoxes
+from sceneprior.core.views import RoomBoxes
+from sceneprior.training.steps import full_precision
 
 
-class Sync2genTraining(BoxTraining):
-    """Epochs, batch and rate as released."""
+class Sync2genTraining(OneStageTraining):
+    """The released epochs, batch size and learning rate."""
 
     epochs: int = Field(800, ge=1)
     batch_size: int = Field(64, ge=1)
     learning_rate: float = Field(1e-3, gt=0)
     kl_weight: float = Field(0.1, ge=0)
-    """Of the KL divergence from N(0, 1). Larger: new rooms are more like each other and better
-    formed; smaller: training rooms are remembered better, and what lies between is worse."""
+    """Weight of the KL divergence from N(0, 1). Larger: new rooms are better and less varied;
+    smaller: training rooms are reconstructed better, and rooms between them are worse."""
 
 
 class Sync2genConfig(BoxConfig):
@@ -32,11 +33,11 @@ class Sync2genConfig(BoxConfig):
 
     def make(self) -> "Sync2genStage":
         network = Sync2Gen(self.model, self.classes, self.seed)
-        return Sync2genStage(network, self.training, self.seed)
+        return Sync2genStage(network, self.training)
 
 
-class Sync2genStage(BoxStage):
-    """What a VAE minimises: reconstruction errors of rooms, and their latents' KL from N(0, 1)."""
+class Sync2genStage(OneStage):
+    """Minimises reconstruction errors and the KL divergence of latents from N(0, 1)."""
 
     prior: Sync2Gen
     settings: Sync2genTraining
@@ -44,7 +45,7 @@ class Sync2genStage(BoxStage):
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
         matrix = self.prior.to_matrix(rooms)
         mean, log_variance = self.prior.encode(matrix)
-        # `StepSeed` makes this step's noise its own, the same when a run is resumed.
+        # `StepSeed` seeds this noise by the step, so that a resumed run draws the same.
         z = mean + torch.exp(0.5 * log_variance) * torch.randn_like(mean)
         decoded = self.prior.decode(z)
         with full_precision(self.device):
@@ -54,4 +55,4 @@ class Sync2genStage(BoxStage):
             objects = rooms.is_object.sum()
             left_out = (objects - matrix[..., 0].sum()) / objects.clamp(min=1)
             weights = {"kl": self.settings.kl_weight}
-            return self.total(rooms, losses, weights, beside={"left_out": left_out})
+            return self.total(room_means(losses, rooms), weights, rooms, {"left_out": left_out})

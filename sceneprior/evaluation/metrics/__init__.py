@@ -1,1 +1,1 @@
-"""The metrics, one file a metric or a family of them."""
+"""The metrics, one file per metric or family of metrics."""

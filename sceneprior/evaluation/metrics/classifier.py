@@ -1,6 +1,6 @@
-"""Scene classification accuracy (SCA): can a classifier tell generated rooms from real ones?
+"""Scene classification accuracy (SCA) of a classifier that separates generated from real rooms.
 
-0.5 where the two sets cannot be told apart, 1 where they always can.
+It is 0.5 if the two sets are indistinguishable, and 1 if they are always told apart.
 """
 
 from collections.abc import Callable
@@ -20,10 +20,10 @@ from sceneprior.evaluation.metric import PICTURED, Comparison, Metric, RoomSet, 
 
 FOLDS = 5
 REPEATS = 5
-"""Times that folds are drawn, and as many rooms of the larger set as the smaller one has."""
+"""Repetitions with new folds, and a new subset of the larger set of the smaller one's size."""
 INVERSE_PENALTY = 0.01
-"""scikit-learn's C of the linear classifier, on standardized features: strong, because there are
-often fewer rooms than features."""
+"""scikit-learn's C of the linear classifier, on standardized features. It is small, a strong
+regularisation, because there are often fewer rooms than features."""
 
 Classify = Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray]
 """(training inputs, their 0/1 labels, inputs to classify, seed) -> 0/1 answers."""
@@ -31,7 +31,7 @@ Classify = Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray]
 
 @dataclass(frozen=True)
 class CrossValidated:
-    """How often each room was classified, and rightly, by classifiers that never saw it."""
+    """Counts of all and of correct predictions for each room, as a held-out room."""
 
     right_generated: Int[np.ndarray, " n"]
     asked_generated: Int[np.ndarray, " n"]
@@ -39,7 +39,7 @@ class CrossValidated:
     asked_real: Int[np.ndarray, " m"]
 
     def accuracy(self, counts_generated: np.ndarray, counts_real: np.ndarray) -> Estimate:
-        """The share of right answers, both sets with the same weight."""
+        """Share of correct predictions; both sets have the same weight."""
         generated = ratio(self.right_generated, self.asked_generated, counts_generated)
         real = ratio(self.right_real, self.asked_real, counts_real)
         if generated.value is None or real.value is None:
@@ -55,7 +55,7 @@ def linear(
     others: Float[np.ndarray, "others dimensions"],
     seed: int,
 ) -> Int[np.ndarray, " others"]:
-    """Logistic regression on standardized features; `seed` changes nothing."""
+    """Logistic regression on standardized features; `seed` is unused."""
     model = make_pipeline(StandardScaler(), LogisticRegression(C=INVERSE_PENALTY, max_iter=300))
     model.fit(features.astype(np.float64), labels)
     return np.asarray(model.predict(others.astype(np.float64)), dtype=int)
@@ -68,15 +68,15 @@ def cross_validated_predictions(
     classify: Classify = linear,
     repeats: int = REPEATS,
 ) -> CrossValidated:
-    """Classify rooms by classifiers trained on the other folds.
+    """Classify each room by a classifier trained on the other folds.
 
-    Both sets enter every training with the same number of rooms, so that always giving one answer
-    is right half of the time.
+    Both sets contribute the same number of rooms to every training, so that a constant prediction
+    has accuracy 0.5.
 
     Args:
-        generated: What is known of each generated room, features or small pictures; at least two
-            rows, as in `real`.
-        seed: Of the choice of rooms and of the folds.
+        generated: Features or small pictures of the generated rooms; at least two rows, as in
+            `real`.
+        seed: Seed of the choice of rooms and of the folds.
     """
     n, smaller = len(generated), min(len(generated), len(real))
     inputs = np.concatenate([generated, real])
@@ -113,25 +113,25 @@ def _linear(rooms: RoomSet, comparison: Comparison) -> Estimate:
 
 
 def _alexnet(rooms: RoomSet, comparison: Comparison) -> Estimate:
-    assert comparison.alexnet is not None  # the metric applies only where it is given
+    assert comparison.alexnet is not None  # the metric is computed only with `--alexnet`
     classify = partial(classify_pictures, comparison.alexnet)
-    # Folds are drawn once: ten epochs of AlexNet, five times, are minutes.
+    # One draw of folds, since each trains AlexNet five times for ten epochs, which takes minutes.
     return _accuracy("small", rooms, comparison, classify, repeats=1)
 
 
 METRICS = (
     Metric(
         "sca", "SCA (AlexNet)", "", "half",
-        "The paper's: AlexNet from the user's `alexnet-owt-7be5be79.pth` (`--alexnet`), one new "
-        "linear layer, all fine-tuned for 10 epochs at 1e-4 in batches of 256, on 224 x 224 "
-        "pictures; 5 folds, drawn once.",
+        "The paper's scene classification accuracy: AlexNet from the user's "
+        "`alexnet-owt-7be5be79.pth` (`--alexnet`) with one new linear layer, all fine-tuned for 10 "
+        "epochs at 1e-4 in batches of 256, on 224 x 224 pictures; 5 folds, drawn once.",
         _alexnet, PICTURED, "Paschalidou et al., NeurIPS 2021", "alexnet",
     ),
     Metric(
         "sca_effnet_lite0", "Classifier accuracy, EfficientNet-Lite0", "", "half",
         "Accuracy of a linear classifier (scikit-learn's logistic regression, C = 0.01, on "
-        "standardized features) that tells the set from test rooms: 5 folds, drawn 5 times, with "
-        "as many rooms of the larger set as the smaller one has.",
+        "standardized features) that separates the set from the test rooms: 5 folds, drawn 5 "
+        "times; the larger set is subsampled to the size of the smaller one.",
         _linear, PICTURED, network="effnet_lite0",
         protocol={
             "sca_effnet_lite0": f"logistic regression (L2, C = {INVERSE_PENALTY}) on standardized "

@@ -1,12 +1,13 @@
-"""What rooms hold: class frequencies, numbers of objects, the furniture of a room type."""
+"""Metrics of room contents: class frequencies, numbers of objects, furniture of a room type."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from sceneprior.classes import LABEL_SETS, VOID, label_set
-from sceneprior.errors import InputError
+from sceneprior.core.classes import LABEL_SETS, VOID, label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene
 from sceneprior.evaluation.bootstrap import Estimate
 from sceneprior.evaluation.metric import (
     AGAINST_TEST,
@@ -16,20 +17,19 @@ from sceneprior.evaluation.metric import (
     TableColumn,
     mean_over_rooms,
 )
-from sceneprior.scene import Scene
 
 KL_EPSILON = 1e-6
-"""Added to both frequencies inside the logarithm, as ATISS does: a class never generated costs
-at most p * log(p / 1e-6) instead of infinity."""
+"""Added to both frequencies inside the logarithm, as in ATISS: a class that is never generated
+costs about p * log(p / 1e-6) instead of infinity."""
 TYPE_CLASSES: dict[str, tuple[str, ...]] = {
     "front3d_bedroom": ("double_bed", "single_bed", "kids_bed"),
     "front3d_living": ("sofa", "armchair"),
 }
-"""What makes a room one of its type. ScanNet mixes room types and has no entry."""
+"""Classes of which a room of a type holds at least one. ScanNet mixes room types: no entry."""
 
 
 def common_label_set(*groups: Sequence[Scene]) -> str:
-    """The one label set that all these scenes use.
+    """The label set that all these scenes share.
 
     Raises:
         InputError: there are no scenes, or more than one label set.
@@ -69,16 +69,15 @@ def category_kl(generated: Sequence[Scene], test: Sequence[Scene]) -> float:
 
         KL = sum_c p_c * (log(p_c + 1e-6) - log(q_c + 1e-6))
 
-    p are the test rooms' frequencies, q the generated rooms', both without void.
-
-    Test rooms, not training rooms: the training split flatters. Raises like `common_label_set`.
+    p are the test rooms' frequencies, q the generated rooms', both without void. Training rooms
+    in place of test rooms would give values that are too good. Raises like `common_label_set`.
     """
     common_label_set(generated, test)
     return frequency_kl(class_frequencies(test), class_frequencies(generated))
 
 
 def frequency_kl(p: Float[np.ndarray, " classes"], q: Float[np.ndarray, " classes"]) -> float:
-    """`category_kl` of class frequencies: of q, the generated rooms', from p."""
+    """`category_kl` of known class frequencies: p of test rooms, q of generated rooms."""
     return float((p * (np.log(p + KL_EPSILON) - np.log(q + KL_EPSILON))).sum())
 
 
@@ -92,10 +91,10 @@ def _count(scene: Scene) -> int:
 
 
 def emptiness(scenes: Sequence[Scene]) -> str | None:
-    """A sentence for generated rooms more than half of which are empty; None for others.
+    """A warning if more than half of the generated rooms are empty; else None.
 
-    What is measured of such rooms misleads: nothing intersects in them, and the ball round a real
-    room's picture easily holds a blank one.
+    Metrics of empty rooms mislead: no objects intersect, and a blank picture easily lies in the
+    ball around a real room's picture, which raises precision.
     """
     empty = int((object_counts(scenes) == 0).sum())
     if 2 * empty <= len(scenes):
@@ -107,9 +106,9 @@ def emptiness(scenes: Sequence[Scene]) -> str | None:
 
 
 def type_share(scenes: Sequence[Scene]) -> float | None:
-    """Share of the scenes that hold what their room type stands for (`TYPE_CLASSES`).
+    """Share of the scenes that hold the furniture of their room type (`TYPE_CLASSES`).
 
-    None for a label set without a room type, and without scenes.
+    None for a label set without a room type, and if there are no scenes.
     """
     known = [holds for scene in scenes if (holds := _holds_its_type(scene)) is not None]
     return float(np.mean(known)) if known else None
@@ -131,8 +130,8 @@ def _category_kl(rooms: RoomSet, comparison: Comparison) -> Estimate:
 METRICS = (
     Metric(
         "category_kl", "Category KL to test rooms", "nats", "closer",
-        "`sum_c p_c (log(p_c + 1e-6) - log(q_c + 1e-6))`, p the class frequencies of the test "
-        "rooms, q of the set.",
+        "KL divergence `sum_c p_c (log(p_c + 1e-6) - log(q_c + 1e-6))`, p the class frequencies of "
+        "the test rooms, q those of the set.",
         _category_kl, AGAINST_TEST, "Paschalidou et al., NeurIPS 2021",
         protocol={
             "category_kl": f"KL(test || generated) in nats, epsilon {KL_EPSILON}, without void"
@@ -145,8 +144,8 @@ METRICS = (
     ),
     Metric(
         "type_share", "Rooms that hold their type's furniture", "share", "higher",
-        "Share of bedrooms with a double, single or kids' bed, of living rooms with a sofa or an "
-        "armchair; null for every other label set.",
+        "Share of bedrooms with a double, single or kids' bed, or of living rooms with a sofa or "
+        "an armchair; null for every other label set.",
         mean_over_rooms(_holds_its_type, 1.0),
         column=TableColumn("type", 2, "type: rooms that hold the furniture their type needs"),
     ),

@@ -1,7 +1,7 @@
-"""The floor between furniture: pieces that stand outside it, and what can be walked.
+"""Metrics of the floor: objects outside its outline, and the walkable area between objects.
 
-Furniture is its axis-aligned box on the floor (x, z). All areas are exact (shapely), but for round
-corners, which are polygons of `ARC_SEGMENTS` sides a quarter turn.
+An object's footprint is its axis-aligned box on the floor (x, z). Areas are exact (shapely), except
+that round corners are polygons of `ARC_SEGMENTS` sides per quarter turn.
 """
 
 from functools import partial
@@ -9,50 +9,35 @@ from functools import partial
 import numpy as np
 import shapely
 
-from sceneprior.classes import VOID
-from sceneprior.errors import InputError
+from sceneprior.core.classes import VOID
+from sceneprior.core.floor import floor_polygon
+from sceneprior.core.scene import Scene
 from sceneprior.evaluation.bootstrap import Estimate, ratio
 from sceneprior.evaluation.metric import Comparison, Metric, RoomSet, mean_over_rooms
-from sceneprior.scene import Scene
 
 AGENT_RADIUS_M = 0.2
 AGENT_HEIGHT_M = 1.5
-"""Who walks: a cylinder. What hangs higher, such as a lamp, is not in the way."""
+"""Height of the cylindrical agent; objects that hang higher, such as lamps, do not block it."""
 OUTSIDE_SHARE = 0.05
-"""A piece is out of bounds with more than this part of its box beyond the floor's outline."""
+"""Share of an object's footprint outside the floor above which it is out of bounds."""
 ARC_SEGMENTS = 8
 
 
 def footprints(scene: Scene, below_m: float = np.inf) -> np.ndarray:
-    """The boxes of named furniture whose lower face is lower than `below_m`, as polygons."""
+    """Footprints, as polygons, of non-void objects whose lower face is lower than `below_m`."""
     low, high = scene.centers_m - scene.sizes_m / 2, scene.centers_m + scene.sizes_m / 2
     kept = (scene.class_indices != VOID) & (low[:, 1] < below_m)
     return np.asarray(shapely.box(*low[kept][:, [0, 2]].T, *high[kept][:, [0, 2]].T))
 
 
-def floor_polygon(scene: Scene) -> shapely.Geometry | None:
-    """The floor inside the scene's outline, None where it has none; no area is an InputError."""
-    if scene.floor_m is None:
-        return None
-    outline = np.asarray(scene.floor_m, dtype=np.float64)
-    if outline.ndim == 2 and len(outline) >= 3 and outline.shape[1] == 2:
-        floor = shapely.make_valid(shapely.Polygon(outline))
-        if floor.area > 0:
-            return floor
-    raise InputError(
-        f"The floor of scene '{scene.name}' has no area; `floor_m` lists at least 3 corners "
-        "[x, z] in metres, or is left out."
-    )
-
-
 def outside_count(scene: Scene) -> tuple[int, int]:
-    """(pieces out of bounds, pieces with a floor to stand on); (0, 0) without a known floor.
+    """(objects out of bounds, all objects); (0, 0) for a scene without a floor outline.
 
-    A piece is out of bounds with more than 5% of its box beyond the outline.
+    An object is out of bounds if more than 5% of its footprint lies outside the outline.
 
-    Example: a floor of 4 x 4 m, and a desk that pokes out by half its width.
+    Example: a floor of 4 x 4 m, and a desk with half its width outside.
 
-        >>> from sceneprior.scene import SceneObject
+        >>> from sceneprior.core.scene import SceneObject
         >>> desk = SceneObject("desk", (2.0, 0.4, 0.0), (1.0, 0.8, 0.5))
         >>> floor = np.array([[-2, -2], [2, -2], [2, 2], [-2, 2]])
         >>> outside_count(Scene("a", "front3d_bedroom", (desk,), floor))
@@ -67,18 +52,19 @@ def outside_count(scene: Scene) -> tuple[int, int]:
 
 
 def walkable_share(scene: Scene, within: str = "furniture") -> float | None:
-    """The largest area that can be walked in one piece, as a share of all that can be stood on.
+    """Area of the largest connected free region, as a share of the whole free area.
 
-    The agent, a disc of 0.2 m, stands where it meets neither a wall nor furniture lower than its
-    1.5 m. 1 means that all free floor hangs together, 0 that the agent fits nowhere.
+    Free are the positions in which the agent, a cylinder of radius 0.2 m and height 1.5 m,
+    intersects neither a wall nor an object. 1 means that the free area is connected, 0 that the
+    agent fits nowhere.
 
     Args:
-        within: Where the walls are. `furniture`: the rectangle around all furniture, which every
-            scene has, so that rooms with and without a floor compare. `floor`: the outline.
+        within: The walls. `furniture`: the rectangle around all furniture, which every scene has,
+            so that rooms with and without a floor can be compared. `floor`: the floor's outline.
 
     Returns:
-        In [0, 1]; None for a room without a floor (`floor`), or with fewer than two pieces, which
-        leave no room in a rectangle around themselves (`furniture`).
+        A share in [0, 1]; None for a room without an outline (`floor`), or with fewer than two
+        objects, whose rectangle has no space between them (`furniture`).
     """
     if within == "floor":
         walls = floor_polygon(scene)
@@ -104,9 +90,9 @@ METRICS = (
     Metric(
         "out_of_bounds_share", "Pieces out of the floor's bounds", "share; known floors alone",
         "lower",
-        "Share of pieces with more than 5% of their box, seen from above, outside the floor's "
-        "outline; only rooms with `floor_m` count, null where none has one, as rooms of this "
-        "package's prior, which knows no floor.",
+        "Share of objects with more than 5% of their footprint outside the floor's outline. Only "
+        "rooms with `floor_m` count; null if no room has one, as for this package's priors, which "
+        "generate no floor.",
         _out_of_bounds,
         protocol={
             "out_of_bounds_share": f"pieces with more than {OUTSIDE_SHARE:.0%} of their box "
@@ -116,10 +102,11 @@ METRICS = (
     Metric(
         "walkable_share", "Walkable in one piece, between furniture", "share of free floor",
         "higher",
-        "The largest area that a disc of 0.2 m can walk in one piece, over all area it can stand "
-        "on, mean over rooms; walls are the **rectangle around all furniture**, so that rooms "
-        "with and without a floor compare; pieces whose lower face is at 1.5 m or higher are "
-        "walked under; 0 where the disc fits nowhere, rooms with fewer than two pieces left out.",
+        "Mean over rooms of the largest connected area in which a disc of radius 0.2 m can stand, "
+        "divided by all such area. The walls are the **rectangle around all furniture**, so that "
+        "rooms with and without a floor can be compared; objects whose lower face is at 1.5 m or "
+        "higher do not block. 0 if the disc fits nowhere; rooms with fewer than two objects are "
+        "left out.",
         mean_over_rooms(walkable_share, 1.0), source="Yang et al., CVPR 2024, in exact areas",
         protocol={
             "walkable_share": f"disc of {AGENT_RADIUS_M} m, {AGENT_HEIGHT_M} m high; exact areas; "
@@ -129,7 +116,7 @@ METRICS = (
     Metric(
         "walkable_share_floor", "Walkable in one piece, within the floor",
         "share; known floors alone", "higher",
-        "`walkable_share` within `floor_m`; rooms without one are left out, null where none has "
+        "`walkable_share` within `floor_m`; rooms without one are left out; null if no room has "
         "one.",
         mean_over_rooms(partial(walkable_share, within="floor"), 1.0),
     ),

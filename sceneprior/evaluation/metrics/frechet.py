@@ -1,11 +1,11 @@
-"""Frechet distance of two sets of pictures in a network's features, and the gap it has closed."""
+"""Frechet distance of two sets of pictures in a network's features, and the share of gap closed."""
 
 from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 from sceneprior.evaluation.bootstrap import Estimate
 from sceneprior.evaluation.metric import (
     AGAINST_TEST,
@@ -18,7 +18,7 @@ from sceneprior.evaluation.metric import (
 )
 
 FRECHET = {"inception": "fid", "effnet_lite0": "fd_effnet_lite0"}
-"""What the Frechet distance is called, by the network that reads the pictures."""
+"""Key of the Frechet distance for each feature network."""
 
 
 def frechet_distance(
@@ -31,19 +31,19 @@ def frechet_distance(
 
         d = |mean_a - mean_b|^2 + tr(S_a) + tr(S_b) - 2 tr((S_a S_b)^(1/2))
 
-    with covariances over n - 1. The last trace needs no matrix square root: with the centred
-    features A and B divided by sqrt(n - 1), S_a = A^T A, S_b = B^T B, and the eigenvalues of
-    S_a S_b are the squared singular values of A B^T. That is exact also where there are fewer
-    images than dimensions and both covariances are singular, which the usual square root
-    answers with rounding noise or complex numbers. It costs an SVD of min(n, d) x min(m, d).
+    with unbiased covariances. The last trace needs no matrix square root: with the centred features
+    A and B divided by sqrt(n - 1), S_a = A^T A, S_b = B^T B, and the eigenvalues of S_a S_b are the
+    squared singular values of A B^T. This stays exact with fewer images than dimensions, when both
+    covariances are singular and the usual matrix square root returns rounding noise or complex
+    numbers. It costs an SVD of a min(n, d) x min(m, d) matrix.
 
     Args:
         a, b: One feature vector per image; the sizes of the sets may differ.
         counts_a, counts_b: How often each row is in its set (see bootstrap.py); None: once.
 
     Returns:
-        The squared distance (what "FID" reports), never below 0. It falls with n even for one
-        and the same distribution: compare only values made with equal n.
+        The squared distance, as FID reports it, never below 0. It falls with n even for samples of
+        one distribution: compare only values computed with equal n.
 
     Raises:
         InputError: a set holds fewer than two rows, or numbers that are not finite.
@@ -66,7 +66,7 @@ def frechet_distance(
 
 
 def check_features(*sets: np.ndarray) -> None:
-    """Raise InputError where a set of features, (rows, dimensions), has no distance."""
+    """Raise InputError if a set of features (rows, dimensions) is too small or not finite."""
     for features in sets:
         if len(features) < 2:
             raise InputError(
@@ -83,7 +83,7 @@ def check_features(*sets: np.ndarray) -> None:
 def _mean_and_root(
     features: np.ndarray, counts: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mean, and R with R^T R = covariance and at most `dimensions` rows."""
+    """The mean, and a matrix R with R^T R = covariance and at most `dimensions` rows."""
     weights = np.ones(len(features)) if counts is None else counts.astype(np.float64)
     features, weights = features[weights > 0].astype(np.float64), weights[weights > 0]
     mean = weights @ features / weights.sum()
@@ -94,14 +94,14 @@ def _mean_and_root(
 
 
 def gap_closed(ours: float, independent: float, real: float) -> float:
-    """How much of the way from independent rooms to real ones a Frechet distance has gone.
+    """Share of the gap between independent and real rooms that a Frechet distance closes.
 
         (independent - ours) / (independent - real)
 
-    All are distances to the test rooms, with equal numbers of rooms. 0: no nearer to the test
-    rooms than rooms whose objects know nothing of each other (`independent_rooms`); 1: as near
-    as real training rooms. Below 0 and above 1 exist. Where independent rooms are as near as real
-    ones, there is no way to go, and it is 1 for `ours` no farther than real rooms, else 0.
+    All three are distances to the test rooms, with equal numbers of rooms. 0: as far from the test
+    rooms as rooms of independently drawn objects (`independent_rooms`); 1: as near as real training
+    rooms. Values below 0 and above 1 occur. If independent rooms are as near as real ones, there is
+    no gap, and the value is 1 if `ours <= real`, else 0.
 
     Example: a third of the way is left.
 
@@ -123,10 +123,10 @@ def _distance(network: str, boxes: bool, rooms: RoomSet, comparison: Comparison)
 def _gap(network: str, boxes: bool, rooms: RoomSet, comparison: Comparison) -> Estimate:
     key, known = FRECHET[network] + ("_boxes" if boxes else ""), comparison.columns
     furthest = "independent" if boxes else "independent_meshes"
-    ours = _distance(network, boxes, comparison.fair, comparison)
+    ours = _distance(network, boxes, rooms, comparison)
     distances = (ours, known[furthest][key], known["train_rooms"][key])
     value = gap_closed(*(distance.value or 0.0 for distance in distances))
-    # A resample repeats rooms, which moves all distances up: each back to its own mean.
+    # Resamples repeat rooms, which raises all distances: each is shifted back to its value.
     moved = [
         (d.value or 0.0) + d.resamples - d.resamples.mean() for d in distances if len(d.resamples)
     ]
@@ -139,11 +139,12 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
     key, gap = FRECHET[network], "gap_closed" if lite else f"gap_closed_{network}"
     where = "EfficientNet-Lite0" if lite else "Inception"
     ends = "0: theirs, 1: as near as real"
-    equal = "all three with `n_gap` rooms (as many as real training rooms)"
     return [
         Metric(
             key, title, "", "closer",
-            f"Frechet distance in {where} features (below), in squared feature units.",
+            f"Frechet distance in {where} features (below), in squared feature units; like all "
+            "metrics of pictures, computed on as many generated rooms as there are real training "
+            "rooms (`n_pictured`).",
             partial(_distance, network, False), PICTURED, network=network,
             source="Heusel et al., NeurIPS 2017",
             column=TableColumn(
@@ -152,16 +153,15 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
         ),
         Metric(
             f"{gap}_furnished", f"Gap closed, from independent furniture, {short}", ends, "higher",
-            "How much of the way from independent objects, drawn with their real meshes, to real "
-            "rooms the generated ones have gone: `(D_independent_meshes - D_generated) / "
-            f"(D_independent_meshes - D_real)`, D the Frechet distance `{key}` to the test rooms, "
-            f"{equal}; where `D_independent_meshes <= D_real` it is 1 if `D_generated <= D_real`, "
-            "else 0.",
+            "Share of the gap between independent objects, drawn with their real meshes, and real "
+            "rooms that the generated rooms close: `(D_independent_meshes - D_generated) / "
+            f"(D_independent_meshes - D_real)`, D the Frechet distance `{key}` to the test rooms; "
+            "if `D_independent_meshes <= D_real`, it is 1 for `D_generated <= D_real`, else 0.",
             partial(_gap, network, False), GENERATED, network=network,
             protocol={
                 "gap_closed": "(independent - generated) / (independent - real training), Frechet "
-                "distances to the test rooms, n_gap rooms each; 1 or 0 where independent <= real; "
-                "_furnished: independent objects with their real meshes",
+                "distances to the test rooms, n_pictured rooms each; 1 or 0 where independent <= "
+                "real; _furnished: independent objects with their real meshes",
             },
             column=TableColumn(
                 "gap closed", 2,
@@ -171,8 +171,8 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
         ),
         Metric(
             f"{key}_boxes", boxes_title, "", "closer",
-            f"`{key}` with all rooms drawn as boxes (`--boxes`), the test rooms too: what layouts "
-            "alone say, for methods that decode meshes beside methods that have none.",
+            f"`{key}` with all rooms, the test rooms too, drawn as boxes (`--boxes`): compares "
+            "layouts alone, for methods with and without meshes.",
             partial(_distance, network, True), AGAINST_TEST, network=network, boxes=True,
             protocol={
                 "_boxes": "the same metric, all rooms drawn as boxes, real ones too (--boxes)"

@@ -12,7 +12,7 @@ from sceneprior.evaluation.metrics.frechet import check_features
 
 
 class Kernels(NamedTuple):
-    """Kernel values within and between two sets, made once for any number of resamples."""
+    """Kernel matrices within and between two sets, computed once for all resamples."""
 
     aa: np.ndarray
     bb: np.ndarray
@@ -20,7 +20,7 @@ class Kernels(NamedTuple):
 
 
 def kernels(a: Float[np.ndarray, "n dimensions"], b: Float[np.ndarray, "m dimensions"]) -> Kernels:
-    """k(x, y) = (x . y / dimensions + 1)^3 of all pairs: the kernel that KID is defined with."""
+    """Values of KID's kernel, k(x, y) = (x . y / dimensions + 1)^3, for all pairs of rows."""
     check_features(a, b)
     a, b = a.astype(np.float64), b.astype(np.float64)
 
@@ -37,11 +37,11 @@ def kernel_distance(
 ) -> Float[np.ndarray, " resamples"]:
     """Squared maximum mean discrepancy, unbiased, in float64.
 
-    It is around 0, and may be below, for two samples of one distribution, whatever their sizes.
-    KID is often stated as the mean over random subsets; the mean over ALL subsets, of any size,
-    is the estimate on the whole sets, which is computed here: it needs no seed.
+    For two samples of one distribution its expectation is 0, whatever their sizes, and it may be
+    negative. KID is often reported as the mean over random subsets. The mean over all subsets of a
+    size equals the estimate on the whole sets, which is computed here and needs no seed.
 
-    `counts_*` say how often each row is in its set, a line per resample; None: once, one line.
+    `counts_*` hold the multiplicity of each row, one line per resample; None: each row once.
     """
     counts_a = np.ones((1, len(of.aa)), int) if counts_a is None else counts_a
     counts_b = np.ones((1, len(of.bb)), int) if counts_b is None else counts_b
@@ -69,9 +69,10 @@ METRICS = tuple(
         ("inception", "kid", "KID (Inception)", "`kid_effnet_lite0` in Inception features."),
         (
             "effnet_lite0", "kid_effnet_lite0", "Kernel distance, EfficientNet-Lite0 (not KID)",
-            "Squared maximum mean discrepancy, unbiased, kernel `(x . y / dimensions + 1)^3`: "
-            "around 0, perhaps below, for two samples of one distribution of any sizes; computed "
-            "on the whole sets, which is the mean over all subsets, and not times 1,000.",
+            "Unbiased squared maximum mean discrepancy with the kernel `(x . y / dimensions + "
+            "1)^3`: around 0, possibly negative, for two samples of one distribution of any sizes; "
+            "computed on the whole sets, which equals the mean over all subsets, and not "
+            "multiplied by 1,000.",
         ),
     )
 )  # fmt: skip

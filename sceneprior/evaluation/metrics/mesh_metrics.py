@@ -7,22 +7,22 @@ import shapely
 import trimesh
 from jaxtyping import Float
 
-from sceneprior.errors import InputError
-from sceneprior.geometry.surfaces import nearest_distances
-from sceneprior.geometry.turns import yaw_rotation
-from sceneprior.scene import Mesh
+from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.surfaces import nearest_distances
+from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.scene import Mesh
 
 POINTS = 10_000
-"""Points an object's surface is compared by. Two samples of one sphere of radius 1 m are still
-35 mm apart by `chamfer_sum(...).l2_m`; with 1,000 points, 112 mm."""
+"""Points sampled per surface. Two samples of one sphere of radius 1 m still have a Chamfer distance
+(`chamfer_sum(...).l2_m`) of 35 mm; with 1,000 points, 112 mm."""
 F_THRESHOLD_M = 0.05
-"""How near a point must have a neighbour on the other surface to count for the F-score."""
+"""Distance to the other surface up to which a point counts as correct for the F-score."""
 
 
 def sample_surface(mesh: Mesh, count: int, seed: int) -> Float[np.ndarray, "count 3"]:
     """Draw points uniformly by area from a mesh's surface, inner faces included.
 
-    Where all faces are without area, points lie on the first.
+    If no face has an area, all points lie on the first face.
 
     Raises:
         InputError: the mesh has no faces.
@@ -42,36 +42,41 @@ def f_score(
     b_points_m: Float[np.ndarray, "m 3"],
     threshold_m: float = F_THRESHOLD_M,
 ) -> float:
-    """Harmonic mean of the shares of a near b and of b near a, in [0, 1]; 0 where no point is near.
+    """Harmonic mean of precision (share of a near b) and recall (share of b near a), in [0, 1].
 
     Raises:
         InputError: a set is empty.
     """
-    precision, recall = (
-        float((way <= threshold_m).mean()) for way in nearest_distances(a_points_m, b_points_m)
-    )
+    return f_score_of(*nearest_distances(a_points_m, b_points_m), threshold_m)
+
+
+def f_score_of(
+    there_m: Float[np.ndarray, " n"], back_m: Float[np.ndarray, " m"], threshold_m: float
+) -> float:
+    """`f_score` from the results of `nearest_distances`."""
+    precision, recall = (float((way <= threshold_m).mean()) for way in (there_m, back_m))
     return 2 * precision * recall / max(precision + recall, 1e-12)
 
 
 class OrientedBox(NamedTuple):
-    """An upright box that may be turned about the vertical axis."""
+    """An upright box, rotated about the vertical axis."""
 
     center_m: Float[np.ndarray, "3"]
     size_m: Float[np.ndarray, "3"]
     """Full extents along the box's own x, y and z."""
     yaw_rad: float
-    """Turns +z towards +x (docs/conventions.md)."""
+    """Rotation that turns +z towards +x (docs/conventions.md)."""
 
 
 def oriented_box(mesh: Mesh) -> OrientedBox:
-    """The tightest upright box around a mesh: over the footprint's rectangle of least area.
+    """The tightest upright box around a mesh, over the footprint's rectangle of least area.
 
-    A mesh alone does not say which side is its front, and no IoU asks: yaw is in [0, pi / 2).
-    A mesh that is an upright box has that box.
+    The yaw is in [0, pi / 2): a mesh does not tell its front, and the IoU does not depend on it.
+    The box of a mesh that is an upright box is that box.
     """
     points = np.asarray(mesh.vertices_m, dtype=np.float64)
     rectangle = shapely.MultiPoint(points[:, [0, 2]]).minimum_rotated_rectangle
-    yaw = 0.0  # a footprint without area is any rectangle's side
+    yaw = 0.0  # any yaw fits a footprint without area
     if isinstance(rectangle, shapely.Polygon):
         x, z = np.diff(np.asarray(rectangle.exterior.coords)[:2], axis=0)[0]
         yaw = float(np.arctan2(x, z) % (np.pi / 2))
@@ -82,9 +87,9 @@ def oriented_box(mesh: Mesh) -> OrientedBox:
 
 
 def oriented_box_iou_3d(a: OrientedBox, b: OrientedBox) -> float:
-    """Intersection over union of two boxes: shared footprint x shared height.
+    """Intersection over union of two upright boxes: shared footprint x shared height.
 
-    Two boxes without volume have IoU 0. At yaw 0 this is `box_iou_3d` of decoded_rooms.
+    Two boxes without volume have IoU 0. At yaw 0 it equals `box_iou_3d` of decoded_rooms.
 
     Example: a cube and the same cube turned by 45 degrees share a regular octagon.
 

@@ -1,89 +1,81 @@
-"""How much furniture stands in furniture: intersections of the boxes of a room's objects."""
+"""Intersections of the boxes of a room's objects."""
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sceneprior.classes import VOID
+from sceneprior.core.classes import VOID
+from sceneprior.core.scene import Scene
 from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms
 from sceneprior.evaluation.metric import Comparison, Metric, RoomSet, TableColumn, mean_over_rooms
 from sceneprior.evaluation.metrics.contents import class_counts
-from sceneprior.scene import Scene
 
 OVERLAP_SHARE = 0.01
-"""Two boxes intersect when they share more than this part of the smaller one's volume: pieces
-that touch, or graze each other by a few millimetres, do not count."""
+"""Two boxes intersect if they share more than this part of the smaller one's volume, so that
+objects that touch, or overlap by a few millimetres, do not count."""
+DEEP_M = 0.01
+"""Penetration depth, in metres, above which two boxes count as deep pairs."""
 PLAUSIBLE_SHARE = 0.05
-"""Two classes may intersect that do so in at least this part of the real training rooms that hold
-both."""
-
-
-def intersection_volumes(
-    centers_a: Float[np.ndarray, "n 3"],
-    sizes_a: Float[np.ndarray, "n 3"],
-    centers_b: Float[np.ndarray, "m 3"],
-    sizes_b: Float[np.ndarray, "m 3"],
-) -> Float[np.ndarray, "n m"]:
-    """What every axis-aligned box a shares with every box b, in cubic metres."""
-    low = np.maximum((centers_a - sizes_a / 2)[:, None], (centers_b - sizes_b / 2)[None])
-    high = np.minimum((centers_a + sizes_a / 2)[:, None], (centers_b + sizes_b / 2)[None])
-    return np.asarray(np.clip(high - low, 0, None).prod(2))
-
-
-def shared_of_smaller(a: Scene, b: Scene) -> Float[np.ndarray, "n m"]:
-    """The part of the smaller box's volume that each box of a shares with each of b, in [0, 1].
-
-    0 where a box has no volume.
-    """
-    shared = intersection_volumes(a.centers_m, a.sizes_m, b.centers_m, b.sizes_m)
-    smaller = np.minimum(a.sizes_m.prod(1)[:, None], b.sizes_m.prod(1)[None])
-    return np.divide(shared, smaller, out=np.zeros_like(shared), where=smaller > 0)
+"""A pair of classes is plausible if it intersects in at least this share of the real training rooms
+that hold both."""
 
 
 class RoomOverlaps(NamedTuple):
-    """The furniture that stands in furniture of one room."""
+    """All pairs of objects of one room, and the intersections of their boxes."""
 
-    hits: Int[np.ndarray, "hits 2"]
-    """Class indices of the intersecting pairs, the smaller first."""
-    volume_m3: float
-    """What all pairs share, intersecting or grazing, summed."""
+    classes: Int[np.ndarray, "pairs 2"]
+    """Class indices of each pair, the smaller first."""
+    volumes_m3: Float[np.ndarray, " pairs"]
+    """Volume shared by the two boxes."""
+    shares: Float[np.ndarray, " pairs"]
+    """Shared volume as a part of the smaller box's volume."""
+    depths_m: Float[np.ndarray, " pairs"]
+    """Penetration depth: the smallest shift along one axis that separates the boxes."""
+
+    @property
+    def intersect(self) -> Bool[np.ndarray, " pairs"]:
+        """True for pairs that share more than `OVERLAP_SHARE` of the smaller box."""
+        return np.asarray(self.shares > OVERLAP_SHARE)
 
 
 def room_overlaps(scene: Scene) -> RoomOverlaps:
     """Compare every pair of objects of a room by their axis-aligned boxes.
 
-    A pair intersects when its boxes share more than 1% of the smaller box's volume. Lamps take
-    part, void does not.
+    Lamps are included, void objects are not.
     """
     known = scene.class_indices != VOID
     classes = scene.class_indices[known]
-    centers, sizes = scene.centers_m[known], scene.sizes_m[known]
-    first, second = np.triu_indices(len(centers), k=1)
-    shared = intersection_volumes(centers, sizes, centers, sizes)[first, second]
-    volumes = sizes.prod(1)
-    smaller = np.minimum(volumes[first], volumes[second])
-    hit = shared > OVERLAP_SHARE * smaller
-    pairs = np.sort(np.stack([classes[first[hit]], classes[second[hit]]], axis=1), axis=1)
-    return RoomOverlaps(pairs, float(shared.sum()))
+    low = (scene.centers_m - scene.sizes_m / 2)[known]
+    high = (scene.centers_m + scene.sizes_m / 2)[known]
+    a, b = np.triu_indices(len(classes), k=1)
+    shared = np.clip(np.minimum(high[a], high[b]) - np.maximum(low[a], low[b]), 0, None)
+    apart = np.minimum(high[a] - low[b], high[b] - low[a])
+    volumes, each = shared.prod(1), scene.sizes_m[known].prod(1)
+    smaller = np.minimum(each[a], each[b])
+    return RoomOverlaps(
+        np.sort(np.stack([classes[a], classes[b]], axis=1), axis=1),
+        volumes,
+        np.divide(volumes, smaller, out=np.zeros_like(volumes), where=smaller > 0),
+        np.where(volumes > 0, apart.min(axis=1, initial=np.inf), 0.0),
+    )
 
 
 def overlap_pairs(scenes: Sequence[Scene]) -> float:
-    """Mean number of intersecting pairs in a room, plausible ones among them: see `room_overlaps`.
+    """Mean number of intersecting pairs in a room, plausible ones included.
 
-    A box is larger than the piece in it (a chair pushed under a table, a piece at an angle), so
-    real rooms score above 0 too: read the number beside theirs.
+    A box is larger than its object (a chair pushed under a table, an object at an angle), so real
+    rooms score above 0 too: compare with their value.
     """
-    return sum(len(room_overlaps(scene).hits) for scene in scenes) / max(len(scenes), 1)
+    return sum(int(room_overlaps(scene).intersect.sum()) for scene in scenes) / max(len(scenes), 1)
 
 
 def plausible_pairs(training: Sequence[Scene]) -> Bool[np.ndarray, "classes classes"]:
-    """Pairs of classes that real rooms let intersect, such as a chair and its table.
+    """Pairs of classes that intersect in real rooms, such as a chair and its table.
 
-    True where objects of the two classes intersect in at least 5% of the real training rooms that
-    hold both (of one class: that hold two of it); symmetric.
+    True if objects of the two classes intersect in at least 5% of the real training rooms that hold
+    both (for a class with itself: that hold two of it); symmetric.
 
     Raises InputError like `class_counts`.
     """
@@ -93,27 +85,36 @@ def plausible_pairs(training: Sequence[Scene]) -> Bool[np.ndarray, "classes clas
     np.fill_diagonal(together, several.sum(0))
     intersecting = np.zeros_like(together)
     for scene in training:
-        for first, second in {(int(a), int(b)) for a, b in room_overlaps(scene).hits}:
+        overlaps = room_overlaps(scene)
+        for first, second in {(int(a), int(b)) for a, b in overlaps.classes[overlaps.intersect]}:
             intersecting[first, second] += 1
     intersecting = np.maximum(intersecting, intersecting.T)
     return np.asarray((intersecting > 0) & (intersecting >= PLAUSIBLE_SHARE * together))
 
 
-def _pairs(plausible: bool, rooms: RoomSet, comparison: Comparison) -> Estimate:
-    def count(scene: Scene) -> int:
-        first, second = room_overlaps(scene).hits.T
-        return int((comparison.plausible_pairs[first, second] == plausible).sum())
+def _mean_of_pairs(
+    of_pairs: Callable[[RoomOverlaps], np.ndarray], plausible: bool
+) -> Callable[[RoomSet, Comparison], Estimate]:
+    """Build a metric's function: the mean over rooms of a sum over (im)plausible pairs."""
 
-    return mean_of_rooms([count(scene) for scene in rooms.scenes], rooms.counts)
+    def function(rooms: RoomSet, comparison: Comparison) -> Estimate:
+        def total(scene: Scene) -> float:
+            overlaps = room_overlaps(scene)
+            chosen = comparison.plausible_pairs[tuple(overlaps.classes.T)] == plausible
+            return float(of_pairs(overlaps)[chosen].sum())
+
+        return mean_of_rooms([total(scene) for scene in rooms.scenes], rooms.counts)
+
+    return function
 
 
 METRICS = (
     Metric(
         "implausible_pairs", "Implausible intersecting pairs in a room", "mean", "lower",
-        "Mean number of intersecting pairs in a room (boxes that share more than 1% of the smaller "
-        "one's volume; lamps take part) of two classes that intersect in fewer than 5% of the real "
+        "Mean number per room of intersecting pairs (boxes that share more than 1% of the smaller "
+        "one's volume; lamps included) whose classes intersect in fewer than 5% of the real "
         "training rooms that hold both.",
-        partial(_pairs, False),
+        _mean_of_pairs(lambda overlaps: overlaps.intersect, plausible=False),
         protocol={"implausible_pairs": f"boxes sharing more than {OVERLAP_SHARE:.0%} of the "
                   f"smaller one, classes that do so in under {PLAUSIBLE_SHARE:.0%} of the real "
                   "training rooms that hold both"},
@@ -124,13 +125,33 @@ METRICS = (
         ),
     ),
     Metric(
-        "plausible_pairs", "Plausible intersecting pairs in a room", "mean", "none",
-        "All other intersecting pairs, such as a chair pushed under a table.",
-        partial(_pairs, True),
+        "deep_pairs", "Implausible pairs deeper than 1 cm", "mean", "lower",
+        "Mean number per room of implausible pairs whose boxes penetrate each other by more than "
+        "1 cm, whatever volume they share. The `sampler` rejects the pairs of `implausible_pairs`, "
+        "not these.",
+        _mean_of_pairs(lambda overlaps: overlaps.depths_m > DEEP_M, plausible=False),
+        protocol={"deep_pairs": f"penetration over {DEEP_M} m, classes as in implausible_pairs"},
+        column=TableColumn("deeper than 1 cm", 2, "deeper than 1 cm: such pairs by depth"),
     ),
     Metric(
-        "overlap_volume_m3", "Volume shared by pairs in a room", "mean, cubic metres", "lower",
-        "Mean over rooms of the volumes that all pairs share, summed; grazing pairs take part.",
-        mean_over_rooms(lambda scene: room_overlaps(scene).volume_m3),
+        "implausible_litres", "Volume shared by implausible pairs", "mean, litres", "lower",
+        "Mean over rooms of the volume shared by all implausible pairs, however small.",
+        _mean_of_pairs(lambda overlaps: 1000 * overlaps.volumes_m3, plausible=False),
+    ),
+    Metric(
+        "plausible_pairs", "Plausible intersecting pairs in a room", "mean", "none",
+        "Mean number per room of all other intersecting pairs, such as a chair pushed under a "
+        "table; a value near that of real rooms is good.",
+        _mean_of_pairs(lambda overlaps: overlaps.intersect, plausible=True),
+        column=TableColumn(
+            "plausible pairs", 2,
+            "plausible pairs: all other intersecting pairs, such as chairs under tables; near the "
+            "real rooms' number is good",
+        ),
+    ),
+    Metric(
+        "overlap_volume_m3", "Volume shared by all pairs in a room", "mean, cubic metres", "none",
+        "Mean over rooms of the volume shared by all pairs, plausible ones too.",
+        mean_over_rooms(lambda scene: float(room_overlaps(scene).volumes_m3.sum())),
     ),
 )  # fmt: skip

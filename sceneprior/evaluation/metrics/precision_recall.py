@@ -1,4 +1,4 @@
-"""Improved precision and recall: which pictures lie among those of the other set."""
+"""Improved precision and recall: the shares of pictures inside the other set's manifold."""
 
 from functools import partial
 
@@ -19,8 +19,8 @@ from sceneprior.evaluation.metrics.contents import emptiness
 from sceneprior.evaluation.metrics.frechet import check_features
 
 NEIGHBOUR = 3
-"""A row's neighbourhood reaches to this nearest other row, as in the authors' settings; in a set
-of 3 or fewer to the farthest one."""
+"""k of the k-th nearest neighbour that sets a ball's radius, as in the authors' settings; in a set
+of 3 rows or fewer, the farthest row."""
 
 
 def in_manifold(
@@ -28,12 +28,12 @@ def in_manifold(
     others: Float[np.ndarray, "m dimensions"],
     neighbour: int = NEIGHBOUR,
 ) -> Bool[np.ndarray, " n"]:
-    """Which rows of `features` lie in the manifold of `others`, in float64.
+    """True for rows of `features` that lie in the manifold of `others`, computed in float64.
 
-    A set's manifold is the union of balls around its rows, each reaching to the row's
-    `neighbour`-th nearest other row of the same set. The border belongs to it, so equal pictures,
-    whose balls have no radius, lie in each other's. The mean over generated rows, with real
-    `others`, is precision; over real rows, with generated `others`, recall.
+    A set's manifold is the union of balls around its rows, each with the distance to the row's
+    `neighbour`-th nearest other row as its radius. The balls are closed, so that equal pictures lie
+    in each other's balls of radius 0. The mean over generated rows, with real `others`, is
+    precision; the mean over real rows, with generated `others`, is recall.
     """
     check_features(features, others)
     features, others = features.astype(np.float64), others.astype(np.float64)
@@ -58,7 +58,7 @@ def _recall(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
 
 def _recall_ratio(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
     real = comparison.columns["train_rooms"][f"recall_{network}"]
-    return _recall(network, comparison.fair, comparison).over(real)
+    return _recall(network, rooms, comparison).over(real)
 
 
 def _metrics_of(network: str, title: str, column: TableColumn | None) -> tuple[Metric, Metric]:
@@ -67,16 +67,16 @@ def _metrics_of(network: str, title: str, column: TableColumn | None) -> tuple[M
         Metric(
             f"precision_{network}", f"Precision, {title}", "share of rooms", "higher",
             f"Improved precision in {title} features: the share of rooms inside the test rooms' "
-            "manifold, the union of balls around its pictures that each reach to the 3rd nearest "
-            "other (in a set of 3 or fewer the farthest), border included; null where more than "
-            "half of the rooms are empty, since blank pictures lie there, too.",
+            "manifold, the union of closed balls around its pictures that each reach to the 3rd "
+            "nearest other (in a set of 3 or fewer the farthest); null if more than half of the "
+            "rooms are empty, since blank pictures lie inside too.",
             partial(_precision, network), PICTURED, source, network,
             protocol={"precision_recall_k": NEIGHBOUR},
         ),
         Metric(
             f"recall_{network}", f"Recall, {title}", "share of test rooms", "higher",
-            f"Improved recall in {title} features: the share of test rooms inside the other set's "
-            "manifold, which grows with the size of that set.",
+            f"Improved recall in {title} features: the share of test rooms inside the set's "
+            "manifold; it grows with the size of the set.",
             partial(_recall, network), PICTURED, source, network, column=column,
         ),
     )  # fmt: skip
@@ -92,8 +92,8 @@ METRICS = (
     ),
     Metric(
         "recall_ratio", "Recall over that of real training rooms", "1: as varied as real", "higher",
-        "`recall_effnet_lite0` of generated rooms over that of real training rooms, `n_gap` rooms "
-        "each, since recall grows with their number; null where that is 0.",
+        "`recall_effnet_lite0` of generated rooms divided by that of real training rooms, "
+        "`n_pictured` rooms each, since recall grows with their number; null if the latter is 0.",
         partial(_recall_ratio, "effnet_lite0"), GENERATED, network="effnet_lite0",
     ),
 )  # fmt: skip

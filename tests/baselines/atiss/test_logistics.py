@@ -7,7 +7,6 @@ from scipy import stats
 from torch.testing import assert_close
 
 from sceneprior.baselines.atiss.logistics import HALF_STEP, LEVELS, LogisticMixture
-from sceneprior.sampler.mixtures import draw_index
 
 
 @pytest.fixture
@@ -88,11 +87,3 @@ def test_draws_follow_the_distribution(torch_rng):
     assert abs(draws).max() <= 1
     assert stats.kstest(draws, cdf).pvalue > 0.01
     assert stats.kstest(draws + 0.03, cdf).pvalue < 1e-6
-
-
-def test_an_index_is_drawn_as_often_as_it_is_likely():
-    logits = torch.log(torch.tensor([0.5, 0.0, 0.2, 0.3]))
-    grid = (torch.arange(1000) + 0.5) / 1000
-    drawn = draw_index(logits.expand(1000, -1), grid)
-    assert torch.bincount(drawn, minlength=4).tolist() == [500, 0, 200, 300]
-    assert draw_index(logits.expand(1, -1), torch.tensor([1.0])).tolist() == [3]

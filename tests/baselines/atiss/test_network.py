@@ -15,7 +15,7 @@ from sceneprior.baselines.atiss.network import (
     AtissModel,
     fourier_features,
 )
-from sceneprior.views import RoomBoxes
+from sceneprior.core.views import RoomBoxes
 
 
 @pytest.fixture

@@ -17,9 +17,9 @@ from sceneprior.baselines.gan.losses import (
     contents,
     diversity_loss,
 )
-from sceneprior.data.dataset import ViewDataset
-from sceneprior.geometry.cameras import camera_centers
-from sceneprior.views import DecodedScenes
+from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.geometry.cameras import camera_centers
+from sceneprior.core.views import DecodedScenes
 
 
 def scenes_of(boxes: torch.Tensor) -> DecodedScenes:

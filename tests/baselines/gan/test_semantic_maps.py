@@ -16,13 +16,13 @@ from sceneprior.baselines.gan.semantic_maps import (
     observed_maps,
     rendered_maps,
 )
-from sceneprior.classes import VOID
-from sceneprior.data.dataset import ViewDataset
-from sceneprior.geometry.meshes import place
-from sceneprior.losses.completeness import kept_objects
-from sceneprior.shards import iterate_rooms
-from sceneprior.silhouettes.render import render_silhouettes
-from sceneprior.views import DecodedScenes
+from sceneprior.core.classes import VOID
+from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.geometry.meshes import place
+from sceneprior.core.shards import iterate_rooms
+from sceneprior.core.views import DecodedScenes
+from sceneprior.paper.losses.completeness import kept_objects
+from sceneprior.render.silhouettes.render import render_silhouettes
 
 CLASSES = 22
 BOX = trimesh.creation.box()
@@ -68,6 +68,14 @@ def test_observed_maps_are_the_shares_of_classes_in_each_pixel(views):
                     wanted[room, view, label, row // POOLING, column // POOLING] += 1 / POOLING**2
     assert torch.equal(maps, wanted)
     assert 0 < maps[:, :, VOID].mean() < 1
+
+
+def test_void_furniture_is_void_in_maps(views):
+    objects = views.is_object.sum(dim=1)[:, None, None, None]
+    hidden = replace(
+        views, instance_ids=torch.where(views.instance_ids == 0, objects + 1, views.instance_ids)
+    )
+    assert torch.equal(observed_maps(hidden, CLASSES), observed_maps(views, CLASSES))
 
 
 def test_the_true_room_looks_as_it_was_seen(views, toy_shards):

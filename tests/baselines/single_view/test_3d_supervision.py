@@ -1,5 +1,6 @@
 """Total3D and Im3D: their numbers make boxes, what they hear of each other, their shapes."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,27 +9,21 @@ import torch
 from tiny_runs import tiny_baseline
 from torch.testing import assert_close
 
-from sceneprior.baselines.single_view.detections import detections_of, one_view
-from sceneprior.baselines.single_view.im3d import (
-    LEVEL,
-    STEEP,
-    occupancy_logits,
-    overlap_loss,
-    refined_boxes,
-)
+from sceneprior.baselines.single_view.blobs import LEVEL, STEEP, occupancy_logits, overlap_loss
+from sceneprior.baselines.single_view.detections import detections_of, some_views
 from sceneprior.baselines.single_view.network import Placed
 from sceneprior.baselines.single_view.total3d import (
     BIN,
     BINS,
     NEAREST_M,
     Estimate,
-    boxes_of,
+    TrueObjects,
     estimate_losses,
     mesh_losses,
     true_objects,
 )
 from sceneprior.baselines.single_view.truth import TrueViewDataset, filled
-from sceneprior.geometry.meshes import icosphere
+from sceneprior.core.geometry.meshes import icosphere
 
 METHODS = ("total3d", "im3d")
 
@@ -45,25 +40,27 @@ def stage(toy_shards, request):
     return config.build(config.open_rooms(), None)
 
 
-def perfect_estimate(found, true: Placed) -> Estimate:
-    offsets, distances_m, _ = found.offsets_and_distances(true.centers_m)
-    place = torch.log(distances_m / NEAREST_M) / BIN
+def perfect_estimate(true: TrueObjects) -> Estimate:
+    offsets, log_distances, log_sizes = true.boxes
+    place = (log_distances - math.log(NEAREST_M)) / BIN
     bins = place.long().clamp(0, BINS - 1)
     logits = 20 * torch.nn.functional.one_hot(bins, BINS).float()
     residuals = (place - bins - 0.5).unsqueeze(-1).expand(-1, BINS)
-    return Estimate(offsets, found.to_frame(true.sizes_m).abs().log(), logits, residuals)
+    return Estimate(offsets, log_sizes, logits, residuals)
 
 
-def test_true_numbers_make_the_true_boxes_and_cost_nothing(batch):
+def test_true_numbers_give_the_true_boxes_and_no_loss(batch):
     found = detections_of(batch.views)
-    true = true_objects(found, batch).placed
-    *_, ahead = found.offsets_and_distances(true.centers_m)
-    estimate = perfect_estimate(found, true)
-    made = boxes_of(found, estimate)
-    assert ahead.sum() > 10
-    assert_close(made.centers_m[ahead], true.centers_m[ahead], rtol=0, atol=1e-3)
-    assert_close(made.sizes_m, true.sizes_m, rtol=0, atol=1e-4)
-    if ahead.all():
+    true = true_objects(found, batch)
+    estimate = perfect_estimate(true)
+    assert true.ahead.sum() > 10
+    for boxes in (true.boxes, estimate.boxes()):
+        made = boxes.in_room(found)
+        assert_close(
+            made.centers_m[true.ahead], true.placed.centers_m[true.ahead], rtol=0, atol=1e-3
+        )
+        assert_close(made.sizes_m, true.placed.sizes_m, rtol=0, atol=1e-4)
+    if true.ahead.all():
         losses = estimate_losses(found, estimate, true)
         assert max(float(loss) for loss in losses.values()) < 1e-3
     wrong = estimate_losses(found, estimate._replace(log_sizes=estimate.log_sizes + 0.3), true)
@@ -85,7 +82,7 @@ def test_the_truth_of_a_mask_is_that_of_its_object(batch, toy_shards):
 @pytest.mark.parametrize("stage", METHODS, indirect=True)
 def test_masks_hear_of_their_own_image_alone(batch, stage):
     prior = stage.prior.eval()
-    views = one_view(batch.views, 0)
+    views = some_views(batch.views, slice(1))
     together = prior.find(views)
     alone = prior.find(views.changed(lambda tensor: tensor[1:2]))[0]
     assert len(alone) == len(together[1]) > 1
@@ -153,7 +150,7 @@ def test_occupancy_is_the_definition(torch_rng):
 
 
 def test_objects_inside_one_another_move_apart(batch):
-    found = detections_of(one_view(batch.views.changed(lambda tensor: tensor[:1]), 0))
+    found = detections_of(some_views(batch.views.changed(lambda tensor: tensor[:1]), slice(1)))
     count = len(found)
     assert count > 1
     centers_m = torch.zeros(count, 3)
@@ -169,11 +166,3 @@ def test_objects_inside_one_another_move_apart(batch):
     alone = detections_of(replace(batch.views, visible=torch.zeros_like(batch.views.visible)))
     nothing = Placed(centers_m[:0], centers_m[:0])
     assert float(overlap_loss(alone, nothing, blobs[:0]).detach()) == 0
-
-
-def test_a_refined_box_is_where_its_numbers_say(batch):
-    found = detections_of(batch.views)
-    true = true_objects(found, batch).placed
-    _, distances_m, ahead = found.offsets_and_distances(true.centers_m)
-    made = refined_boxes(found, perfect_estimate(found, true), distances_m.log())
-    assert_close(made.centers_m[ahead], true.centers_m[ahead], rtol=0, atol=1e-3)

@@ -11,11 +11,11 @@ from sceneprior.baselines.single_view.detections import (
     CROP,
     NUMBERS,
     detections_of,
-    one_view,
+    some_views,
 )
-from sceneprior.data.dataset import ViewDataset
-from sceneprior.geometry.turns import turn_vectors
-from sceneprior.views import SceneViews
+from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.geometry.turns import turn_vectors
+from sceneprior.core.views import SceneViews
 
 
 @pytest.fixture(scope="module")
@@ -95,13 +95,13 @@ def test_offsets_and_distances_are_where_centers_are(views):
 
 
 def test_a_view_without_a_mask_is_no_detection(views):
-    blank = replace(one_view(views, 0), visible=torch.zeros_like(views.visible[:, :1]))
+    blank = replace(some_views(views, slice(1)), visible=torch.zeros_like(views.visible[:, :1]))
     found = detections_of(blank)
     assert len(found) == 0 and found.padded(found.boxes).shape == (0, 0, 4)
 
 
 def test_values_go_to_their_objects_and_to_their_images(views):
-    found = detections_of(one_view(views, 2))
+    found = detections_of(some_views(views, slice(2, 3)))
     values = torch.arange(1.0, 1 + len(found)).unsqueeze(-1)
     rooms, objects = views.is_object.shape
     spread = found.of_objects(values, rooms, objects)

@@ -7,11 +7,11 @@ import torch
 from tiny_runs import tiny_baseline
 from torch.testing import assert_close
 
-from sceneprior.baselines.single_view.detections import detections_of, one_view
+from sceneprior.baselines.single_view.detections import detections_of, some_views
 from sceneprior.baselines.single_view.usl import other_view_losses, silhouette_loss
-from sceneprior.data.dataset import ViewDataset
-from sceneprior.evaluation.ground_truth import reference_scenes
-from sceneprior.evaluation.metrics.decoded_rooms import box_iou_3d
+from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.overlaps import box_iou_3d
 
 
 @pytest.fixture(scope="module")
@@ -50,21 +50,21 @@ def test_silhouettes_have_gradients_where_masks_are_missed(views):
 
 
 def test_an_object_that_no_other_view_shows_teaches_nothing(views, stage):
-    found, others = detections_of(one_view(views, 0)), one_view(views, 1, 5)
-    predicted, faces = stage.prior(found), stage.prior.shape.faces
+    found, others = detections_of(some_views(views, slice(1))), some_views(views, slice(1, None))
+    faces = stage.prior.shape.faces
     hidden = replace(others, visible=others.visible & (torch.arange(others.visible.shape[2]) != 0))
-    losses = other_view_losses(found, predicted, faces, hidden, stage.settings)
+    losses = other_view_losses(found, *stage.prior(found), faces, hidden, stage.settings)
     sum(losses.values()).backward()
     before = [p.grad.clone() for p in stage.prior.parameters()]
     assert all(torch.isfinite(slope).all() for slope in before)
     nobody = replace(others, visible=torch.zeros_like(others.visible))
     stage.zero_grad()
-    losses = other_view_losses(found, stage.prior(found), faces, nobody, stage.settings)
+    losses = other_view_losses(found, *stage.prior(found), faces, nobody, stage.settings)
     assert {name: loss.item() for name, loss in losses.items()} == dict.fromkeys(losses, 0.0)
 
 
 def test_before_training_boxes_are_seen_as_large_as_their_masks(views, stage):
-    found = detections_of(one_view(views, 0))
+    found = detections_of(some_views(views, slice(1)))
     with torch.no_grad():
         for layer in (stage.prior.box,):
             layer.weight.zero_()
@@ -81,7 +81,7 @@ def test_a_few_rooms_can_be_learnt_from_their_masks_alone(views, stage, toy_shar
     true = {room.name: room for room in reference_scenes(toy_shards, "train", tracked_only=True)}
 
     def overlap() -> float:
-        first = one_view(views, 0)
+        first = some_views(views, slice(1))
         found = []
         for row, objects in enumerate(stage.prior.find(first)):
             room = true[views.room_ids[row]]
@@ -93,10 +93,10 @@ def test_a_few_rooms_can_be_learnt_from_their_masks_alone(views, stage, toy_shar
 
     before = overlap()
     optimizer = torch.optim.Adam(stage.prior.parameters(), lr=1e-2)
-    found, others = detections_of(one_view(views, 0)), one_view(views, 1, 5)
+    found, others = detections_of(some_views(views, slice(1))), some_views(views, slice(1, None))
     faces = stage.prior.shape.faces
     for _ in range(50):
-        losses = other_view_losses(found, stage.prior(found), faces, others, stage.settings)
+        losses = other_view_losses(found, *stage.prior(found), faces, others, stage.settings)
         loss = 5 * losses["box"] + losses["frustum"] + losses["mask"]
         optimizer.zero_grad()
         loss.backward()

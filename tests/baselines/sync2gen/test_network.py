@@ -6,7 +6,7 @@ from torch.nn import functional as F
 from torch.testing import assert_close
 
 from sceneprior.baselines.sync2gen.network import READS, SparseLinear, Sync2Gen, Sync2genModel
-from sceneprior.views import RoomBoxes
+from sceneprior.core.views import RoomBoxes
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from sceneprior.baselines.sync2gen.pairs import (
     COMPONENTS,
     PairPrior,
 )
-from sceneprior.views import RoomBoxes
+from sceneprior.core.views import RoomBoxes
 
 BED, STAND, LAMP = 1, 2, 3
 

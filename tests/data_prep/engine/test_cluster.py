@@ -15,7 +15,7 @@ from front_jobs import digests, front_job
 from data_prep.engine import cluster as module
 from data_prep.engine.build import build_shards
 from data_prep.engine.cluster import cluster
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from toy_source import ToySource
 
 from data_prep.engine.build import Job, build_shards
 from data_prep.engine.output import claimed
-from sceneprior import files
-from sceneprior.errors import InputError
+from sceneprior.core import files
+from sceneprior.core.errors import InputError
 
 
 def test_a_folder_that_cannot_be_written(front, tmp_path):

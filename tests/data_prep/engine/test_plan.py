@@ -7,7 +7,7 @@ from front_files import bedroom
 from front_jobs import digests, front_job, rooms_of, three_houses
 
 from data_prep.engine.build import build_shards
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 
 def test_other_settings_want_another_folder(front, tmp_path):

@@ -14,8 +14,8 @@ from data_prep.engine.report import Line, compare, make_report
 from data_prep.engine.report_tables import report_tables
 from data_prep.engine.source import Expected
 from data_prep.front.recipe import load_recipe
-from sceneprior.errors import InputError
-from sceneprior.shards import read_index
+from sceneprior.core.errors import InputError
+from sceneprior.core.shards import read_index
 
 
 def test_every_room_left_out_is_named_with_the_reason(front, tmp_path):

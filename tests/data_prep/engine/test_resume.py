@@ -14,7 +14,7 @@ from front_files import bedroom
 from front_jobs import digests, front_job
 
 from data_prep.engine.build import build_shards
-from sceneprior import files
+from sceneprior.core import files
 
 KILLS = 10
 

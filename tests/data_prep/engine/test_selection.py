@@ -8,8 +8,8 @@ from front_jobs import front_job, three_houses
 
 from data_prep.engine.build import build_shards
 from data_prep.engine.selection import house_may_match, is_asked_for, seeded_split
-from sceneprior.errors import InputError
-from sceneprior.shards import list_shards
+from sceneprior.core.errors import InputError
+from sceneprior.core.shards import list_shards
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.engine.plan import ShardPlan
 from data_prep.engine.shard_job import RoomFailedError, make_shard, read_finished
 from data_prep.engine.source import RoomTask
-from sceneprior.errors import InputError
-from sceneprior.shards import read_index
+from sceneprior.core.errors import InputError
+from sceneprior.core.shards import read_index
 
 FAILURES = {
     1: ("sentence", "its file is truncated"),

@@ -7,7 +7,7 @@ from front_reading import only_room
 
 from data_prep.front.drawing import prepare_room
 from data_prep.front.recipe import load_recipe
-from sceneprior.offscreen import SoftwareRenderer
+from sceneprior.render.offscreen import SoftwareRenderer
 
 SMALL = ("views.image_size=[60, 80]", "views.min_object_pixels=20")
 

@@ -6,7 +6,7 @@ from front_jobs import front_job
 
 from data_prep.engine.build import build_shards
 from data_prep.engine.report_tables import report_tables
-from sceneprior.shards import read_index
+from sceneprior.core.shards import read_index
 
 BED = {"jid": "bed", "pos": (0.0, 0.0, -1.0)}
 STAND = {"jid": "stand", "pos": (-1.4, 0.0, -1.8)}
@@ -76,6 +76,33 @@ def test_rules(front, tmp_path, pieces, rule, said):
     assert report["filtered"][name]["room_ids"] == ["house_Bedroom-1"]
     line, _ = prepared(front, tmp_path, pieces, *off, f"{name}=null", out="without")
     assert line.status == "prepared"
+
+
+@pytest.mark.parametrize(
+    ("piece", "rule", "said"),
+    [
+        ({"jid": "piano"}, "allowed", "'grand piano' is none of allowed_categories"),
+        (
+            {"jid": "far", "entry": {"category": "Grand / Piano"}},
+            "allowed",
+            "'grand/piano' is none",
+        ),
+        ({"jid": "far"}, "allowed", "'others' is none of allowed_categories"),
+        ({"jid": "known"}, "invalid_models", "'known' is among the invalid_models"),
+        ({"jid": "known"}, "", ""),
+    ],
+)
+def test_a_piece_without_a_model_is_judged_as_the_others_are(front, tmp_path, piece, rule, said):
+    """Of `far` not even the release's list says anything."""
+    front.list_model("piano", "Grand Piano")
+    front.list_model("known", "Nightstand")
+    rules = ["min_models_share=null", "allowed_categories=[king-size bed, nightstand, floor lamp]"]
+    if rule == "invalid_models":
+        rules.append("invalid_models=[known]")
+    pieces = [BED, STAND, piece | {"pos": (0.0, 0.0, 1.0)}]
+    line, _ = prepared(front, tmp_path, pieces, *rules)
+    assert line.status == ("filtered" if said else "prepared")
+    assert said in line.reason and line.rule.startswith(rule)
 
 
 def test_what_is_outside_or_missing_is_noted_and_counted(front, tmp_path):

@@ -17,7 +17,7 @@ from data_prep.engine.build import build_shards
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import read_house
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 CASES = 400
 DEEP: Any = 0

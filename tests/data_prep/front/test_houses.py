@@ -7,7 +7,7 @@ import pytest
 from front_files import bedroom, room
 from front_reading import extent, only_room, read
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 
 def test_both_flavours_of_entries_and_keys(front):

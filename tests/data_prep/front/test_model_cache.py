@@ -6,7 +6,7 @@ import pytest
 
 from data_prep.front import models
 from data_prep.front.models import ModelBank
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 BOX_BYTES = 240  # 8 vertices and 12 faces
 

@@ -8,8 +8,8 @@ from PIL import Image
 
 from data_prep.front.files import house_files
 from data_prep.front.models import ModelBank
-from sceneprior.errors import InputError
-from sceneprior.furniture import read_obj
+from sceneprior.core.errors import InputError
+from sceneprior.core.furniture import read_obj
 
 
 def test_models_a_hundred_times_too_large(front):

@@ -18,10 +18,10 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.engine.report_tables import report_tables
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
-from sceneprior.classes import label_set
-from sceneprior.errors import InputError
-from sceneprior.generation.cad_models import open_models
-from sceneprior.shards import read_index
+from sceneprior.apps.retrieval.cad_models import open_models
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.shards import read_index
 
 PAGE = Path(__file__).parents[3] / "docs" / "own_room_types.md"
 LABEL_SET = "void,cabinet,fridge,sink,stool,stove,table"

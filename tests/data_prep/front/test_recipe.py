@@ -3,9 +3,9 @@
 import pytest
 
 from data_prep.front.recipe import load_recipe, recipe_text
-from sceneprior.classes import label_set
-from sceneprior.errors import InputError
-from sceneprior.furniture import category_table
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.furniture import category_table
 
 
 def test_recipes_load_and_say_what_is_wrong():

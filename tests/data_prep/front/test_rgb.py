@@ -14,9 +14,9 @@ from PIL import Image
 from data_prep.engine.build import build_shards
 from data_prep.front.furnished import Room
 from data_prep.front.rgb import shell_of
-from sceneprior.errors import InputError
-from sceneprior.offscreen import Pinhole, open_renderer
-from sceneprior.scene import Mesh
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Mesh
+from sceneprior.render.offscreen import Pinhole, open_renderer
 
 
 def areas(mesh: Mesh) -> np.ndarray:

@@ -17,8 +17,8 @@ from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import read_house
 from data_prep.front.source import FrontSource
-from sceneprior.errors import InputError
-from sceneprior.shards import read_index
+from sceneprior.core.errors import InputError
+from sceneprior.core.shards import read_index
 
 RULES_OFF = ("min_objects=null", "max_objects=null", "max_floor_m=null", "max_height_m=null",
              "required_classes=[]", "scale_range=null")  # fmt: skip

@@ -6,7 +6,7 @@ import pytest
 from homes_on_disk import TYPES
 
 from data_prep.homes.catalog import at_score, make_catalog, real_sizes
-from sceneprior.classes import LABEL_SETS
+from sceneprior.core.classes import LABEL_SETS
 
 
 @pytest.mark.parametrize(("room_type", "label_set"), TYPES.items())

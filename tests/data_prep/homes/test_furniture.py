@@ -5,7 +5,7 @@ import pytest
 
 from data_prep.homes.catalog import make_catalog
 from data_prep.homes.furniture import Table, build, furniture_tables
-from sceneprior.classes import LABEL_SETS
+from sceneprior.core.classes import LABEL_SETS
 
 
 def build_from(tables: dict, size_m=(1.0, 2.0, 0.5), style: int = 0):

@@ -1,6 +1,7 @@
 """Whole data sets: reproducible, split nine to one, there whole or not at all."""
 
 import csv
+import errno
 import hashlib
 from collections import Counter
 
@@ -9,7 +10,8 @@ from homes_on_disk import TYPES
 
 from data_prep.homes.catalog import make_catalog
 from data_prep.homes.make import make_homes
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import only_writer
 
 
 @pytest.mark.parametrize("room_type", TYPES)
@@ -68,7 +70,7 @@ def test_bad_input_is_one_sentence_and_leaves_nothing(tmp_path):
         make_homes(tmp_path / "new", 4, "kitchen", 0)
     with pytest.raises(InputError, match="A seed is 0 or more"):
         make_homes(tmp_path / "new", 4, "bedroom", -1)
-    with pytest.raises(InputError, match="Cannot write beside"):
+    with pytest.raises(NotADirectoryError, match="new"):
         make_homes(full / "notes.txt" / "new", 4, "bedroom", 0)
     assert [path.name for path in tmp_path.iterdir()] == ["full"]
 
@@ -81,3 +83,22 @@ def test_an_interrupted_run_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         make_homes(tmp_path / "new", 2, "living", 0)
     assert not list(tmp_path.iterdir())
+
+
+def test_two_processes_do_not_make_the_same_folder(tmp_path):
+    with (
+        only_writer(tmp_path / "new"),
+        pytest.raises(InputError, match=r"Another run is writing to .*new; wait for it \(process"),
+    ):
+        make_homes(tmp_path / "new", 2, "living", 0)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_an_error_that_names_the_folder_and_leaves_nothing(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")  # as `write` raises it: no name
+
+    monkeypatch.setattr("data_prep.homes.make._write_split", full)
+    with pytest.raises(OSError, match="No space left") as error:
+        make_homes(tmp_path / "new", 2, "living", 0)
+    assert error.value.filename == str(tmp_path / "new") and not list(tmp_path.iterdir())

@@ -10,7 +10,7 @@ from front_jobs import front_job, rooms_of
 from data_prep.engine.build import build_shards
 from data_prep.inspection.agreement import MARGIN, Agreement, Tally, compare, compare_boxes
 from data_prep.inspection.bodies import ModelHulls, found_bodies, true_bodies
-from sceneprior.errors import ShardError
+from sceneprior.core.errors import ShardError
 
 LARGER = ("views.image_size=[180, 240]", "views.per_m2=2")
 

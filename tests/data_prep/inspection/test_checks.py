@@ -111,3 +111,12 @@ def test_a_ground_truth_that_cannot_be(made, name, change, said):
 def test_a_ground_truth_that_lacks_rows(made):
     views, truth = made
     assert list(truth_problems(views, replace(truth, object_class=truth.object_class[:2])))
+
+
+def test_occlusion_of_another_number_of_views(made):
+    views, truth = made
+    flags = np.ones((1, *views.visible.shape[1:]), dtype=bool)
+    (said,) = truth_problems(views, replace(truth, unoccluded=flags))
+    assert said == (
+        f"ground truth: unoccluded has shape {flags.shape}, expected {views.visible.shape}"
+    )

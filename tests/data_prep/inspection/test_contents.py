@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from data_prep.cli import add_commands
 from data_prep.engine.build import build_shards
 from data_prep.inspection.contents import count_shards, describe_room, draw_sheet
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ from front_jobs import front_job
 from data_prep.engine.build import build_shards
 from data_prep.inspection.pictures import AXES, BACKGROUND, draw_plan, draw_view
 from data_prep.inspection.projection import wire_pixels
-from sceneprior.geometry.corners import BOX_EDGES, box_corners
-from sceneprior.shards import Shard, list_shards
+from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
+from sceneprior.core.shards import Shard, list_shards
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from data_prep.inspection.projection import (
     hull_of,
     wire_pixels,
 )
-from sceneprior.geometry.corners import BOX_EDGES, box_corners
+from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 
 K = np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]])
 

@@ -14,7 +14,7 @@ from data_prep.engine.build import build_shards
 from data_prep.inspection.agreement import Agreement, Tally
 from data_prep.inspection.command import _check_tables
 from data_prep.inspection.verify import FolderCheck, RoomCheck, verify
-from sceneprior.errors import InputError, ShardError
+from sceneprior.core.errors import InputError, ShardError
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from sceneprior.offscreen.zbuffer import rasterize
+from sceneprior.render.offscreen.zbuffer import rasterize
 
 FACES = np.array(
     [(0, 1, 3), (0, 3, 2), (4, 7, 5), (4, 6, 7), (0, 5, 1), (0, 4, 5),

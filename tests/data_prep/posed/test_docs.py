@@ -51,7 +51,7 @@ def test_the_example_runs_as_printed(tmp_path, monkeypatch):
 def test_every_key_that_is_read_is_in_the_document():
     from data_prep.posed import transforms
     from data_prep.posed.recording import Camera
-    from sceneprior.instances import tables
+    from sceneprior.core.instances import tables
 
     text = DOCUMENT.read_text()
     keys = {word for key in re.findall(r"`([^`]+)`", transforms.__doc__) for word in key.split()}

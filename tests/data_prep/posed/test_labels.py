@@ -3,9 +3,9 @@
 import pytest
 
 from data_prep.posed.labels import find_table, read_label_set
-from sceneprior.classes import label_set
-from sceneprior.errors import InputError
-from sceneprior.instances.tables import read_class_table
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.instances.tables import read_class_table
 
 
 def table(folder, text, name="classes.json"):

@@ -19,9 +19,9 @@ from data_prep.engine.source import RoomTask
 from data_prep.engine.workers import pool
 from data_prep.posed.source import PosedSource, find_rooms
 from data_prep.posed.views import PosedSettings
-from sceneprior.data.dataset import ViewDataset
-from sceneprior.errors import InputError
-from sceneprior.evaluation.ground_truth import reference_scenes
+from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.errors import InputError
+from sceneprior.core.ground_truth import reference_scenes
 
 SET = "void,bed,chair"
 

@@ -13,8 +13,8 @@ from data_prep.posed.cameras import cameras_in_room, seems_up, upright_cameras
 from data_prep.posed.transforms import read_recording
 from data_prep.posed.views import PosedSettings, prepare_posed
 from data_prep.upright import own_sides
-from sceneprior.classes import label_set
-from sceneprior.errors import InputError
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
 
 SET = "void,bed,chair"
 
@@ -165,11 +165,12 @@ def test_what_hides_and_what_does_not(room):
     unlisted = prepared(room)
     assert unlisted.views.sides_clear[0, 0].tolist() == [False, True, True, True]
     assert "the table of classes does not have (9): void" in " ".join(unlisted.notes)
-    assert unlisted.views.instance_ids.max() == 1
+    np.testing.assert_array_equal(unlisted.views.instance_ids[0] == 2, beside == 9)
     (room.folder / "classes.json").write_text('{"3": "bed", "9": "backpack"}')
     assert not prepared(room).views.sides_clear[0, 0].all()
     (room.folder / "classes.json").write_text('{"3": "bed", "9": "Wall"}')
     assert prepared(room).views.sides_clear[0, 0].all()
+    assert prepared(room).views.instance_ids.max() == 1
     Image.fromarray(base).save(room.png(0))
     known = np.full(room.size, 255, dtype=np.uint8)
     known[left] = 0
@@ -177,7 +178,10 @@ def test_what_hides_and_what_does_not(room):
     data = room.data
     data["frames"][0]["mask_path"] = "known/0.png"
     room.write_transforms(data)
-    assert prepared(room).views.sides_clear[0, 0].tolist() == [False, True, True, True]
+    masked = prepared(room).views
+    assert masked.sides_clear[0, 0].tolist() == [False, True, True, True]
+    np.testing.assert_array_equal(masked.instance_ids[0] == 2, known == 0)
+    check(masked)
     Image.fromarray(known[:-1]).save(folder / "0.png")
     with pytest.raises(InputError, match=r"known/0.png is 128 x 95 pixels, but the ids 128 x 96\."):
         prepared(room)
@@ -219,6 +223,25 @@ def test_no_usable_frame(room):
         room.png(view).unlink()
     with pytest.raises(InputError, match=r"none of its 2 frames has a PNG of instance ids; expect"):
         prepared(room)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda pose: pose @ np.diag([1.0, 1, -1, 1]), "it is left-handed, a mirror."),
+        (lambda pose: pose * np.nan, "it holds NaN or infinity."),
+        (lambda pose: pose.T, "it is transposed: its translation is in the last row."),
+        (lambda pose: pose @ np.diag([3.0, 3, 3, 1]), "its axes have the length 3, expected 1."),
+        (lambda pose: pose + np.eye(4)[::-1], "its last row is not 0, 0, 0, 1."),
+        (lambda pose: pose @ np.diag([1.0, 2, 0.5, 1]), "its axes are no rotation."),
+    ],
+)
+def test_poses_that_are_none_are_named_with_their_fault(room, wrong, said):
+    room.poses = [wrong(pose) for pose in room.poses]
+    room.write()
+    with pytest.raises(InputError) as error:
+        prepared(room)
+    assert str(error.value).endswith(f"; frame 'images/frame_00000.jpg': {said}")
 
 
 def test_all_frames_of_a_room_have_one_size(room):

@@ -175,7 +175,7 @@ class ScanFolder:
 
     def mask(self, frame: int, size: tuple[int, int] | None = None) -> np.ndarray:
         """(H, W) uint8, objectId + 1 of what is nearest in each pixel."""
-        from sceneprior.offscreen.zbuffer import rasterize
+        from sceneprior.render.offscreen.zbuffer import rasterize
 
         height, width = size or self.size
         down, across = height / self.size[0], width / self.size[1]

@@ -4,8 +4,8 @@ import pytest
 from scan_files import TABLE, write_table
 
 from data_prep.scannet.labels import SHELL, read_labels
-from sceneprior.classes import label_set
-from sceneprior.errors import InputError
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
 
 
 def test_raw_categories_become_the_nineteen_classes(labels):

@@ -10,7 +10,7 @@ from PIL import Image
 from scan_files import png, write_zip
 
 from data_prep.scannet.masks import MaskArchive
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 
 def mask(seed=0, height=12, width=16):

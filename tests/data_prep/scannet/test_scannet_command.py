@@ -6,8 +6,8 @@ from scan_files import ScanFolder, write_table
 from typer.testing import CliRunner
 
 from data_prep.cli import add_commands
-from sceneprior.errors import InputError
-from sceneprior.shards import Shard
+from sceneprior.core.errors import InputError
+from sceneprior.core.shards import Shard
 
 
 @pytest.fixture

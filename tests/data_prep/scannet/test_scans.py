@@ -7,7 +7,7 @@ import pytest
 from scan_files import sens_bytes, write_zip
 
 from data_prep.scannet.scans import FULL_SIZE, ScanSettings, read_scan
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 EVERY = ScanSettings(frame_step=1)
 

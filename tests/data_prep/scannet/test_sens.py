@@ -9,7 +9,7 @@ import pytest
 from scan_files import SCANNET_K, frame_header, png, sens_bytes, sens_header
 
 from data_prep.scannet.sens import _Reader, read_recording
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 SIZE = (24, 32)
 

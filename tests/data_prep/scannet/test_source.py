@@ -11,8 +11,8 @@ from data_prep.engine.source import LeftOut, RoomTask
 from data_prep.engine.workers import pool
 from data_prep.scannet.scans import ScanSettings
 from data_prep.scannet.source import ScanNetSource
-from sceneprior.errors import InputError
-from sceneprior.shards import iterate_rooms
+from sceneprior.core.errors import InputError
+from sceneprior.core.shards import iterate_rooms
 
 IDS = ["scene0000_00", "scene0000_01", "scene0001_00", "scene0002_00"]
 

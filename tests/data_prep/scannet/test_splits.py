@@ -3,7 +3,7 @@
 import pytest
 
 from data_prep.scannet.splits import find_scans, space_of, split_scans
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 
 
 @pytest.fixture

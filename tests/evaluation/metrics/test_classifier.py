@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 from sceneprior.evaluation.alexnet import _network, _weights, check_alexnet, classify_pictures
 from sceneprior.evaluation.bootstrap import resample_counts
 from sceneprior.evaluation.metrics.classifier import (

@@ -5,14 +5,14 @@ import math
 import pytest
 from toy_metrics import of_classes
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metrics.contents import (
     category_kl,
     class_frequencies,
     object_counts,
     type_share,
 )
-from sceneprior.scene import Scene
 
 
 def test_category_kl_by_hand():

@@ -7,11 +7,8 @@ import pytest
 import trimesh
 from toy_metrics import of_classes, room
 
-from sceneprior.evaluation.metrics.decoded_rooms import (
-    box_iou_3d,
-    match_scenes,
-    reconstruction_scores,
-)
+from sceneprior.core.overlaps import box_iou_3d, match_scenes
+from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 
 
 def test_iou_by_hand():

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.evaluation.metrics.floor import AGENT_RADIUS_M, outside_count, walkable_share
-from sceneprior.scene import Scene, SceneObject
 
 FLOOR = np.array([[-2.0, -1], [2, -1], [2, 1], [-2, 1]])
 

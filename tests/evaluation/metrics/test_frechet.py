@@ -9,7 +9,7 @@ import torch
 from torchmetrics.image.fid import FrechetInceptionDistance
 from toy_metrics import Plain, fed
 
-from sceneprior.errors import InputError
+from sceneprior.core.errors import InputError
 from sceneprior.evaluation.metrics.frechet import frechet_distance, gap_closed
 
 

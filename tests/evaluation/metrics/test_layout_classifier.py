@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from toy_metrics import compared_with, room, room_set
 
-from sceneprior.classes import label_set
+from sceneprior.core.classes import label_set
+from sceneprior.core.scene import Scene
+from sceneprior.evaluation.metrics import layout_classifier
 from sceneprior.evaluation.metrics.layout_classifier import (
     ABSENT,
     METRICS,
@@ -12,7 +14,6 @@ from sceneprior.evaluation.metrics.layout_classifier import (
     jittered_features,
     layout_features,
 )
-from sceneprior.scene import Scene
 
 CLASSES = label_set("front3d_bedroom")
 DESK, CHAIR = CLASSES.index("desk"), CLASSES.index("chair")
@@ -92,22 +93,62 @@ def test_turns_mirror_images_moves_and_the_order_of_objects_change_nothing(rng):
 @pytest.fixture
 def accuracy(rng):
     test = room_set(random_rooms(rng, 60), [])
+    real = random_rooms(rng, 120)
 
     def of(scenes) -> float:
-        return METRICS[0].function(room_set(scenes, []), compared_with(test)).value
+        return METRICS[0].function(room_set(scenes, []), compared_with(test, real=real)).value
 
+    of.real = real
     return of
 
 
-def test_other_real_rooms_are_not_told_and_rooms_without_relations_are(accuracy, rng):
-    # 120 rooms a draw: a coin's share of heads is within 0.15 in all but 1 of 1,000 draws.
-    assert accuracy(random_rooms(rng, 60)) == pytest.approx(0.5, abs=0.15)
-    real = random_rooms(rng, 60)
-    apart = [
+def incoherent(real, rng) -> list[Scene]:
+    """The same furniture, each piece anywhere."""
+    return [
         room(*((o.label, (*rng.uniform(-2, 2, 1), 0.5, *rng.uniform(-2, 2, 1))) for o in s.objects))
         for s in real
     ]
-    assert accuracy(apart) > 0.8
+
+
+def test_other_real_rooms_are_not_told_and_rooms_without_relations_are(accuracy, rng):
+    # 120 rooms judged: a coin's share of heads is within 0.15 in all but 1 of 1,000 draws.
+    assert accuracy(random_rooms(rng, 60)) == pytest.approx(0.5, abs=0.15)
+    assert accuracy(incoherent(random_rooms(rng, 60), rng)) > 0.8
+
+
+def test_real_training_rooms_are_told_from_the_other_half(accuracy):
+    """Were they told from themselves, all would be called real: 0.5 by one side alone."""
+    assert accuracy(accuracy.real[:60]) == pytest.approx(0.5, abs=0.15)
+    assert accuracy(accuracy.real) == accuracy(accuracy.real[:60]), "which half, the seed says"
+
+
+def test_both_sides_weigh_alike_and_no_judged_room_is_learnt_from(accuracy, rng, monkeypatch):
+    asked: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def remember(features, labels, others, seed):
+        asked.append((features, labels, others))
+        return np.ones(len(others), dtype=int)
+
+    monkeypatch.setattr(layout_classifier, "boosted_trees", remember)
+    # Always the same answer is right half of the time, however many rooms there are.
+    assert accuracy(random_rooms(rng, 200)) == 0.5
+    assert len(asked) == 5
+    for features, labels, others in asked:
+        assert np.bincount(labels).tolist() == [120, 120], "at most as many as real rooms"
+        assert len(others) == 60 + 40
+        assert not (others[:, None] == features).all(axis=2).any()
+    fresh = np.concatenate([others[60:] for *_, others in asked])
+    assert len(np.unique(fresh, axis=0)) == 200, "each judged once"
+
+
+def test_an_unbalanced_set_does_not_tip_the_classifier(rng):
+    """Without weights, 10 rooms among 120 that look the same would all be given to the 120."""
+    features = rng.normal(size=(130, 6))
+    labels = np.repeat([0, 1], [120, 10])
+    others = rng.normal(size=(400, 6))
+    share = boosted_trees(features, labels, others, 0).mean()
+    same = boosted_trees(features, labels, features, 0)
+    assert (same == labels).all() and share > 0.02
 
 
 def test_millimetres_do_not_show(accuracy, rng):

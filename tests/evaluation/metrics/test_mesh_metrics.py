@@ -7,8 +7,10 @@ import pytest
 import trimesh
 from scipy.spatial.distance import cdist
 
-from sceneprior.errors import InputError
-from sceneprior.evaluation.metrics.decoded_rooms import box_iou_3d
+from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.surfaces import chamfer_sum
+from sceneprior.core.overlaps import box_iou_3d
+from sceneprior.core.scene import Mesh
 from sceneprior.evaluation.metrics.mesh_metrics import (
     OrientedBox,
     f_score,
@@ -16,9 +18,7 @@ from sceneprior.evaluation.metrics.mesh_metrics import (
     oriented_box_iou_3d,
     sample_surface,
 )
-from sceneprior.geometry.surfaces import chamfer_sum
-from sceneprior.scene import Mesh
-from sceneprior.topdown import box_mesh
+from sceneprior.render.topdown import box_mesh
 
 
 def sphere(radius_m: float) -> Mesh:

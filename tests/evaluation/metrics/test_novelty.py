@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toy_metrics import compared_with, room, room_set
+from toy_metrics import compared_with, of_classes, room, room_set
 
+from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metric import Comparison
 from sceneprior.evaluation.metrics.novelty import METRICS, near_copy_threshold
-from sceneprior.scene import Scene
 
 FUNCTIONS = {metric.key: metric.function for metric in METRICS}
 LABELS = ("desk", "chair", "sofa")
@@ -58,24 +58,32 @@ def test_a_copy_of_what_the_prior_remembers_is_one_though_the_true_room_is_far(t
     drawn = room_set(nudged(decoded, 0.01), training, decoded)
     assert values(drawn, comparison)["near_copy_share"] == 1
     assert values(drawn, comparison)["nearest_decoded_m"] == pytest.approx(0.01)
-    # Another piece of furniture makes it another room.
-    more = [replace(s, objects=(*s.objects, s.objects[0])) for s in nudged(decoded, 0.01)]
-    assert values(room_set(more, training, decoded), comparison)["near_copy_share"] == 0
+    # One object added or left out does not make another room; two do.
+    copies = nudged(decoded, 0.01)
+    for objects, share in (
+        (lambda s: (*s.objects, s.objects[0]), 1),
+        (lambda s: s.objects[1:], 1),
+        (lambda s: (*s.objects, *s.objects[:2]), 0),
+    ):
+        changed = [replace(s, objects=objects(s)) for s in copies]
+        found = values(room_set(changed, training, decoded), comparison)
+        assert found["near_copy_share"] == share
 
 
 def test_the_threshold_is_what_one_real_room_in_a_hundred_falls_below(training):
     threshold = near_copy_threshold(training)
-    nearest = room_set(training, training, own=True).nearest.training_m
-    assert threshold == np.quantile(nearest, 0.01)
+    copies = room_set(training, training, own=True).nearest.as_copies_m
+    assert threshold == np.quantile(copies, 0.01, method="higher")
     assert near_copy_threshold(training[:1]) == 0  # nothing is nearer than that
+    # Where no two rooms hold the same furniture, nothing can be a copy of another.
+    assert near_copy_threshold([training[0], of_classes("sofa", "stool", "wardrobe")]) == 0
 
 
-def test_the_ratio_is_one_for_real_rooms_and_left_out_where_nothing_is_decoded(training, rng):
-    test = nudged(training[:6], 0.7)
-    comparison = compared(training, test)
-    assert "nearest_decoded_training_ratio" not in values(room_set(test, training), comparison)
-    comparison = replace(comparison, test=room_set(test, training, training))
-    same = values(room_set(test, training, training), comparison)
-    assert same["nearest_decoded_training_ratio"] == 1
-    nearer = values(room_set(nudged(training[:6], 0.35), training, training), comparison)
-    assert nearer["nearest_decoded_training_ratio"] < 0.8
+def test_distances_of_incoherent_rooms_are_not_called_better(training):
+    """Furniture at random is as far from training rooms as new rooms are: no direction."""
+    directions = {metric.key: metric.direction for metric in METRICS}
+    assert directions["nearest_training_m"] == directions["nearest_decoded_m"] == "none"
+    comparison = compared(training, training[:2])
+    assert values(room_set(training, training), comparison).keys() == {
+        "nearest_training_m", "near_copy_share", "near_copy_excess"
+    }  # fmt: skip

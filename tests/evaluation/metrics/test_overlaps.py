@@ -1,9 +1,10 @@
 """Intersections of boxes, by hand."""
 
 import numpy as np
+import pytest
 from toy_metrics import compared_with, of_classes, room, room_set
 
-from sceneprior.classes import label_set
+from sceneprior.core.classes import label_set
 from sceneprior.evaluation.metrics.overlaps import (
     METRICS,
     overlap_pairs,
@@ -25,7 +26,38 @@ def test_overlaps_by_hand():
     )  # fmt: skip
     assert overlap_pairs([scene, of_classes("desk")]) == 0.5
     pair = sorted((CLASSES.index("desk"), CLASSES.index("chair")))
-    assert room_overlaps(scene).hits.tolist() == [pair]
+    overlaps = room_overlaps(scene)
+    assert overlaps.classes[overlaps.intersect].tolist() == [pair]
+    assert overlaps.volumes_m3[overlaps.intersect].tolist() == [0.5]
+    assert overlaps.depths_m[overlaps.intersect].tolist() == [0.5]
+    # The stool shares half a percent of the sofa, so only its depth tells: 5 mm.
+    grazing = ~overlaps.intersect & (overlaps.volumes_m3 > 0)
+    np.testing.assert_allclose(overlaps.depths_m[grazing], [0.005], atol=1e-12)
+
+
+def test_depth_is_the_shortest_way_out():
+    # A small box 0.2 m inside the left side of a large one leaves it by 0.3 m, not through it.
+    inside = room(("desk", (0, 0, 0)), ("stool", (-1.75, 0, 0)), sizes=[(4, 4, 4), (0.1, 0.1, 0.1)])
+    np.testing.assert_allclose(room_overlaps(inside).depths_m, [0.3], atol=1e-12)
+    assert room_overlaps(BESIDE).depths_m.tolist() == [0.0]
+
+
+def test_pairs_that_share_a_sliver_are_deep_where_they_reach_in_by_a_centimetre():
+    """A rule of 1% of the volume lets beds stand 1 cm in wardrobes; these two do not."""
+    sizes = [(2.0, 0.5, 2.0), (1.0, 2.0, 0.6)]
+    apart = room(("double_bed", (0, 0.25, 0)), ("wardrobe", (1.51, 1.0, 0)), sizes=sizes)
+    nudged = room(("double_bed", (0, 0.25, 0)), ("wardrobe", (1.488, 1.0, 0)), sizes=sizes)
+    comparison = compared_with(room_set([apart], []))
+    found = [
+        {
+            key: function(room_set([scene], []), comparison).value
+            for key, function in FUNCTIONS.items()
+        }
+        for scene in (apart, nudged)
+    ]
+    assert [each["implausible_pairs"] for each in found] == [0, 0]
+    assert [each["deep_pairs"] for each in found] == [0, 1]
+    assert found[1]["implausible_litres"] == pytest.approx(0.012 * 0.5 * 0.6 * 1000)
 
 
 def test_a_small_box_inside_a_large_one_intersects_and_touching_ones_do_not():

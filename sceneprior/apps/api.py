@@ -1,0 +1,191 @@
+"""The Python API, on which the commands are built: load a trained prior and make rooms with it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneprior.apps.config import load_any_run, with_latents
+from sceneprior.apps.sample import sample_rooms
+from sceneprior.core.classes import label_set
+from sceneprior.core.observed_image import ObservedImage
+from sceneprior.core.scene import Scene
+from sceneprior.core.views import DecodedScenes
+from sceneprior.paper.sampling import Point, latent_of
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.training.method import Trained
+
+if TYPE_CHECKING:
+    from sceneprior.apps.reconstruction.reconstruct import Reconstruction
+
+
+def load(where: str | Path) -> "Prior":
+    """Load a trained prior, on the CPU.
+
+    Args:
+        where: The folder of a run that `sceneprior fit` made; a file that `sceneprior pack` made;
+            the name of a prior of the package (`sceneprior priors` lists them); or
+            `hf://OWNER/NAME`, on the Hugging Face Hub.
+
+    Raises:
+        InputError: there is no prior, or it is damaged.
+
+    Examples:
+        >>> load("procthor-bedroom")
+        Prior('procthor-bedroom', front3d_bedroom, rooms from: sampler)
+    """
+    return Prior(load_any_run(where), str(where))
+
+
+@dataclass(frozen=True, repr=False)
+class Prior:
+    """A trained prior of rooms. Rooms are `Scene`s: classes, boxes and meshes in metres, y up.
+
+    Runs of methods without a latent space (`atiss`, `sync2gen`) can only `sample`.
+    """
+
+    trained: Trained
+    """The trained networks, with their configuration."""
+    where: str
+    """The path or name that it was loaded from."""
+
+    def __repr__(self) -> str:
+        return f"Prior({self.where!r}, {self.label_set}, rooms from: {self.distribution})"
+
+    @property
+    def label_set(self) -> str:
+        """The name of its classes' label set."""
+        return self.trained.config.label_set
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of its classes; the first, `void`, stands for unlabelled objects."""
+        return tuple(label_set(self.label_set))
+
+    @property
+    def distribution(self) -> str:
+        """The default distribution of `sample`."""
+        return self.trained.distribution
+
+    def sample(self, count: int = 1, seed: int = 0, distribution: str | None = None) -> list[Scene]:
+        """Sample new rooms; the same seed gives the same rooms.
+
+        Args:
+            distribution: `sampler`, or a distribution of latents: `paper` or `kernel`.
+
+        Raises:
+            InputError: the prior has no such distribution.
+
+        Examples:
+            >>> rooms = load("procthor-bedroom").sample(2, seed=1)
+            >>> [room.name for room in rooms]
+            ['seed1_0000', 'seed1_0001']
+        """
+        return sample_rooms(self.trained, count, seed, distribution)
+
+    def interpolate(self, start: Point, end: Point, steps: int = 9) -> list[Scene]:
+        """Rooms on the geodesic between two latents, both ends included.
+
+        Args:
+            start, end: A room with a latent, `"seed:7"`, a training room's id, a file of latents,
+                or a vector.
+
+        Raises:
+            InputError: an end is no latent of this prior, or the two ends are antipodal.
+
+        Examples:
+            >>> way = load("procthor-bedroom").interpolate("seed:1", "seed:2", steps=3)
+            >>> [room.extra["along"] for room in way]
+            [0.0, 0.5, 1.0]
+        """
+        from sceneprior.paper.interpolate import interpolate
+
+        return interpolate(self.with_latents, start, end, steps)
+
+    def complete(
+        self,
+        scene: Scene,
+        count: int = 4,
+        seed: int = 0,
+        distribution: str | None = None,
+        classes: Sequence[str] | None = None,
+    ) -> list[Scene]:
+        """Complete a partly furnished room; the given objects stay unchanged.
+
+        Args:
+            scene: The given objects and, optionally, the floor.
+            count: Number of completions.
+            classes: Classes of the objects to add, and no others; only for priors with a sampler.
+
+        Raises:
+            InputError: an object cannot be used, or there are more objects than the prior
+                generates.
+
+        Examples:
+            >>> from sceneprior.core.scene import SceneObject
+            >>> bed = SceneObject("double_bed", (0.0, 0.3, -1.0), (1.8, 0.6, 2.0))
+            >>> given = Scene("mine", "front3d_bedroom", (bed,))
+            >>> (room,) = load("procthor-bedroom").complete(given, count=1, classes=["nightstand"])
+            >>> [item.label for item in room.objects]
+            ['double_bed', 'nightstand']
+        """
+        from sceneprior.lifted.complete import complete
+
+        return complete(self.with_latents, [scene], count, seed, distribution, classes=classes)[0]
+
+    def reconstruct(
+        self, images: Sequence[ObservedImage], fit: str = "objects", restarts: int = 1
+    ) -> "list[Reconstruction]":
+        """Reconstruct rooms (`.scene`) from the instance masks of single images.
+
+        The prior needs the latents of its training rooms: it must be a run, or packed with
+        `--latents`.
+
+        Args:
+            images: Images from shards (`image_from_shards`) or files (`read_own_image`).
+            fit: `objects` fits object by object; `paper` fits a latent to each image.
+            restarts: Latents fitted to each image.
+
+        Raises:
+            InputError: the images have another label set, or the prior lacks the latents.
+        """
+        from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
+
+        return reconstruct(self.trained, images, FitOptions(fit, restarts))
+
+    def latent(self, point: Point) -> Float[Tensor, " dimension"]:
+        """The latent of an end of `interpolate`.
+
+        Raises:
+            InputError: the point is no latent of this prior.
+
+        Examples:
+            >>> load("procthor-bedroom").latent("seed:1").shape
+            torch.Size([128])
+        """
+        return latent_of(self.with_latents, point)
+
+    def decode(self, z: Float[Tensor, "rooms dimension"]) -> DecodedScenes:
+        """Decode latents to tensors (N predictions per room), differentiable in `z`.
+
+        Raises:
+            InputError: the prior has no latent space.
+
+        Examples:
+            >>> prior = load("procthor-bedroom")
+            >>> z = prior.latent("seed:1").unsqueeze(0).requires_grad_()
+            >>> prior.decode(z).sizes_m.sum().backward()
+            >>> bool(z.grad.abs().max() > 0)
+            True
+        """
+        trained = self.with_latents
+        z = z.to(trained.logits.dtype)
+        return trained.prior.decode(z, with_shape=trained.stage != "layout")
+
+    @property
+    def with_latents(self) -> TrainedPrior:
+        """`trained`, with an InputError if it has no latent space."""
+        return with_latents(self.trained, self.where)

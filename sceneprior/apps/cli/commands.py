@@ -1,0 +1,56 @@
+"""The Typer app: all commands of `sceneprior`, and its global options.
+
+Each command imports its dependencies when it is called, so that `--help` is fast.
+"""
+
+from typing import Annotated
+
+import typer
+
+from data_prep.cli import add_commands
+from sceneprior import __version__
+from sceneprior.apps.cli import (
+    evaluating,
+    experiments,
+    generating,
+    reconstruction,
+    sharing,
+    training,
+    viewing,
+)
+
+app = typer.Typer(
+    name="sceneprior",
+    help="Learn priors of furnished rooms from posed instance masks, and use them.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+add_commands(app)
+for command in (
+    training.fit, training.report,
+    generating.synthesize, generating.interpolate, generating.complete, generating.retrieve,
+    reconstruction.reconstruct, reconstruction.eval_svr,
+    sharing.pack, sharing.priors, sharing.export,
+    evaluating.eval_fid,
+    experiments.compare, experiments.demo, viewing.view,
+):  # fmt: skip
+    app.command()(command)
+
+
+def _show_version(wanted: bool | None) -> None:
+    if wanted:
+        typer.echo(f"sceneprior {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool | None,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = None,
+) -> None:
+    pass

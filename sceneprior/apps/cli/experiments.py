@@ -1,0 +1,77 @@
+"""Commands that run many others: compare and demo."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sceneprior.apps.cli.options import AcceleratorOption, InceptionOption, RendererOption
+from sceneprior.core.errors import InputError
+
+
+@contextmanager
+def _stopped_by_ctrl_c() -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo("Stopped. The same command goes on from here.", err=True)
+        raise typer.Exit(130) from None
+
+
+def compare(
+    config: Annotated[
+        str,
+        typer.Option(help="compare/new_rooms_small.yaml, compare/single_view.yaml or your own."),
+    ] = "compare/new_rooms_small.yaml",
+    out: Annotated[Path, typer.Option(help="Folder for runs, tables and pictures.")] = Path(
+        "out/compare"
+    ),
+    methods: Annotated[str | None, typer.Option(help="Only these methods: lifted,lstm.")] = None,
+    rooms: Annotated[str | None, typer.Option(help="Only these kinds of rooms: bedroom.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Only these seeds: 0,1.")] = None,
+    inception: InceptionOption = None,
+    accelerator: AcceleratorOption = "auto",
+    renderer: RendererOption = "auto",
+) -> None:
+    """Train and evaluate methods on the same rooms, and tabulate them; run again to continue."""
+    from sceneprior.apps.experiments.compare import CompareOptions
+    from sceneprior.apps.experiments.compare import compare as run_comparison
+    from sceneprior.apps.experiments.comparison import load_comparison, part_of
+
+    comparison = load_comparison(config)
+    part = part_of(comparison, methods, rooms, seeds)
+    with _stopped_by_ctrl_c():
+        options = CompareOptions(renderer, inception, accelerator)
+        done = run_comparison(comparison, part, out, options)
+    if done.table is not None:
+        typer.echo(f"Wrote {done.table}")
+    if done.left_out:
+        typer.echo(
+            "Not in the table, since trained or evaluated otherwise (settings, rooms, seed, "
+            f"renderer or weights): {'; '.join(done.left_out)}. Ask for them as well, and they are "
+            "evaluated again.",
+            err=True,
+        )
+    if done.failures:
+        raise InputError(
+            f"{len(done.failures)} runs failed and are not in the table: {'; '.join(done.failures)}"
+        )
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for everything the demo makes.")] = Path(
+        "out/demo"
+    ),
+    config: Annotated[str, typer.Option(help="What to train.")] = "demo.yaml",
+    rooms: Annotated[int, typer.Option(min=20, help="Homes to make.")] = 240,
+    count: Annotated[int, typer.Option(min=2, help="Rooms to generate and evaluate.")] = 200,
+    renderer: RendererOption = "auto",
+) -> None:
+    """Run the whole pipeline on procedural homes: shards, fit, new rooms, scores, report page."""
+    from sceneprior.apps.experiments.demo import run_demo
+
+    with _stopped_by_ctrl_c():
+        run_demo(out, config, rooms, count, renderer)
+    typer.echo(f"Open {out / 'report.html'}; scores are in {out / 'scores.json'}.")

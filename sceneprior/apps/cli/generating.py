@@ -1,0 +1,156 @@
+"""Commands that generate or complete rooms, or retrieve models; dependencies load when called.
+
+Pictures are drawn by the z-buffer: without a GPU, GL takes a second to start and is slower.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sceneprior.apps.cli.options import (
+    DistributionOption,
+    OverwriteOption,
+    RendererOption,
+    RunOption,
+)
+from sceneprior.core.seeds import LARGEST_SEED
+
+
+def synthesize(
+    run: RunOption,
+    out: Annotated[Path, typer.Option(help="Folder for the scenes.")],
+    count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many rooms.")] = 16,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same rooms.")] = 0,
+    distribution: DistributionOption = None,
+    html: Annotated[
+        bool, typer.Option("--html", help="Also rooms.html, one file whose rooms turn.")
+    ] = False,
+    overwrite: OverwriteOption = False,
+    renderer: RendererOption = "software",
+) -> None:
+    """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them."""
+    from sceneprior.apps.api import load
+    from sceneprior.apps.rooms import PAGE_FILE, check_free, write_scenes
+    from sceneprior.evaluation.metrics.contents import emptiness
+    from sceneprior.evaluation.rooms_page import write_rooms_page
+    from sceneprior.render.offscreen import open_renderer
+
+    check_free(out, overwrite)
+    prior = load(run)
+    artist = open_renderer(renderer)
+    scenes = prior.sample(count, seed, distribution)
+    write_scenes(scenes, out, artist, overwrite)
+    origin = distribution or prior.distribution
+    if html:
+        told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
+        write_rooms_page(out / PAGE_FILE, scenes, artist, title="New rooms", subtitle=told)
+    typer.echo(f"Wrote {count} rooms to {out} (from: {origin})")
+    if (warning := emptiness(scenes)) is not None:
+        typer.echo(f"Warning: {warning}", err=True)
+
+
+_END_HELP = "a training room's id, seed:7, or a file of latents: scenes/latents.npz:seed0_0003."
+
+
+def interpolate(
+    run: RunOption,
+    start: Annotated[str, typer.Option("--from", help=f"Where to begin: {_END_HELP}")],
+    end: Annotated[str, typer.Option("--to", help="Where to end: named like the beginning.")],
+    out: Annotated[Path, typer.Option(help="Folder for the rooms and pictures.")],
+    steps: Annotated[int, typer.Option(min=2, max=1000, help="Rooms, both ends included.")] = 9,
+    overwrite: OverwriteOption = False,
+    renderer: RendererOption = "software",
+) -> None:
+    """Interpolate between two rooms on the sphere: rooms, a strip and an animation."""
+    from sceneprior.apps.api import load
+    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.paper.interpolate import write_pictures
+    from sceneprior.render.offscreen import open_renderer
+
+    check_free(out, overwrite)
+    prior = load(run)
+    scenes = prior.interpolate(start, end, steps)
+    artist = open_renderer(renderer)
+    write_scenes(scenes, out, artist, overwrite)
+    write_pictures(prior.with_latents, scenes, out, artist)
+    typer.echo(f"Wrote {steps} rooms, strip.png and animation.gif to {out}")
+
+
+def complete(
+    run: RunOption,
+    given: Annotated[Path, typer.Option(help="Scene JSON of the objects that are there.")],
+    out: Annotated[Path, typer.Option(help="Folder for the completed rooms.")],
+    count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many answers.")] = 4,
+    seed: Annotated[
+        int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same answers.")
+    ] = 0,
+    classes: Annotated[
+        str | None,
+        typer.Option(help="What to add, and nothing else: double_bed,nightstand (samplers only)."),
+    ] = None,
+    distribution: DistributionOption = None,
+    overwrite: OverwriteOption = False,
+    renderer: RendererOption = "software",
+) -> None:
+    """Complete a room of which some objects, or the floor, are given."""
+    from sceneprior.apps.api import load
+    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.render.offscreen import open_renderer
+    from sceneprior.render.scene_files import load_scene
+
+    check_free(out, overwrite)
+    scene = load_scene(given)
+    wanted = None if classes is None else [label.strip() for label in classes.split(",")]
+    prior = load(run)
+    scenes = prior.complete(scene, count, seed, distribution, wanted)
+    write_scenes(scenes, out, open_renderer(renderer), overwrite)
+    how = "drawn by the sampler" if scenes[0].latent is None else "of fitted latents"
+    typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects, {how}, to {out}")
+    for room in scenes:
+        if lacking := room.extra.get("no_place"):
+            typer.echo(f"Note: {room.name} has no place for {', '.join(lacking)}.", err=True)
+
+
+def retrieve(
+    scenes: Annotated[Path, typer.Option(help="Folder of scene JSONs, with their GLBs.")],
+    models: Annotated[Path, typer.Option(help="3D-FUTURE-model, a folder like it, or shards.")],
+    out: Annotated[Path, typer.Option(help="Folder for the scenes with CAD models.")],
+    cache: Annotated[
+        Path | None,
+        typer.Option(help="Folder for the models' points (default: ~/.cache/sceneprior)."),
+    ] = None,
+    overwrite: OverwriteOption = False,
+    renderer: RendererOption = "software",
+) -> None:
+    """Replace every object by the most similar CAD model of its class."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from sceneprior.apps.retrieval.cad_models import default_cache, open_models
+    from sceneprior.apps.retrieval.retrieve import retrieval_report, retrieve_all
+    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.core.files import write_json
+    from sceneprior.evaluation.metrics.contents import common_label_set
+    from sceneprior.render.offscreen import open_renderer
+    from sceneprior.render.scene_files import load_scene_folder
+
+    check_free(out, overwrite)
+    console = Console(stderr=True)
+    rooms = load_scene_folder(scenes)
+    cad_models = open_models(
+        models, common_label_set(rooms), cache or default_cache(),
+        track=lambda ids: track(ids, "Reading models", console=console, transient=True),
+    )  # fmt: skip
+    chosen = retrieve_all(rooms, cad_models)
+    made = list(track(chosen, "Choosing models", total=len(rooms), console=console))
+    report = retrieval_report(made, cad_models)
+    write_scenes(made, out, open_renderer(renderer), overwrite)
+    write_json(out / "retrieval.json", report)
+    typer.echo(f"Gave {report['objects_with_a_model']} of {report['objects']} objects a model")
+    if report["classes_without_models"]:
+        kept = ", ".join(report["classes_without_models"])
+        typer.echo(f"No model of these classes, so objects keep their own meshes: {kept}")
+    if report["broken_models"]:
+        typer.echo(f"{len(report['broken_models'])} models are broken; see retrieval.json")
+    typer.echo(f"Wrote {len(made)} rooms to {out}")

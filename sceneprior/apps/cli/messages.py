@@ -1,0 +1,32 @@
+"""Warnings of the command line, printed on stderr without source lines."""
+
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+from sceneprior.core.errors import InputWarning
+
+
+@contextmanager
+def warnings_as_sentences() -> Iterator[None]:
+    """Print each `InputWarning` without the source line that Python adds."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def say(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, InputWarning):
+                print(f"Warning: {message}", file=sys.stderr)
+            else:
+                show(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = say
+        yield

@@ -1,0 +1,169 @@
+"""Commands that reconstruct rooms from single images; dependencies load when called."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sceneprior.apps.cli.options import (
+    OverwriteOption,
+    RendererOption,
+    RunOption,
+    checked_target,
+    result_file,
+)
+from sceneprior.core.seeds import LARGEST_SEED
+
+FitOption = Annotated[
+    str, typer.Option(help="objects (one by one), or paper: one latent an image, in 1,000 steps.")
+]
+RestartsOption = Annotated[int, typer.Option(min=1, help="Latents fitted; the best is kept.")]
+
+
+def reconstruct(
+    run: RunOption,
+    out: Annotated[Path, typer.Option(help="Folder for the rooms.")],
+    shards: Annotated[Path | None, typer.Option(help="Folder of shards with the images.")] = None,
+    room: Annotated[str | None, typer.Option(help="A room of the shards.")] = None,
+    view: Annotated[int, typer.Option(min=0, help="Which of its views.")] = 0,
+    split: Annotated[
+        str | None, typer.Option(help="One view of each room of train or test.")
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Only the first rooms.")] = None,
+    mask: Annotated[
+        Path | None, typer.Option(help="Your own image: a PNG of ids, or COCO's JSON.")
+    ] = None,
+    classes: Annotated[
+        Path | None, typer.Option(help="Of a PNG: CSV or JSON, id and class.")
+    ] = None,
+    intrinsics: Annotated[
+        str | None, typer.Option(help="Its camera's: fov=73, 35mm=26, fx,fy,cx,cy or a JSON file.")
+    ] = None,
+    pose: Annotated[Path | None, typer.Option(help="Its camera in the room frame, JSON.")] = None,
+    camera_height: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="Metres above the floor, without --pose (several are tried)."),
+    ] = None,
+    gravity: Annotated[
+        str | None,
+        typer.Option(help="Where things fall in its camera's axes, without --pose: x,y,z."),
+    ] = None,
+    fit: FitOption = "objects",
+    restarts: RestartsOption = 1,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of drawn views.")] = 0,
+    overwrite: OverwriteOption = False,
+    renderer: RendererOption = "auto",
+) -> None:
+    """Reconstruct rooms from the instance masks of single images: JSON, GLB and pictures."""
+    from sceneprior.apps.api import load
+    from sceneprior.apps.reconstruction.export import write_reconstructions, write_turning
+    from sceneprior.apps.reconstruction.own_image import read_own_image
+    from sceneprior.apps.reconstruction.reconstruct import OBJECTS
+    from sceneprior.apps.rooms import check_free
+    from sceneprior.core.errors import InputError
+    from sceneprior.core.geometry.turns import QUARTERS
+    from sceneprior.core.observed_image import image_from_shards, images_of_split
+    from sceneprior.render.offscreen import open_renderer
+
+    ways = [mask is not None, room is not None, split is not None]
+    if sum(ways) != 1 or (shards is None) != (mask is not None):
+        raise InputError(
+            "Say what to reconstruct from, in one way: --shards with --room (and --view) or with "
+            "--split; or --mask with --intrinsics (and --classes)."
+        )
+    if mask is None and any(given is not None for given in (classes, intrinsics, pose, gravity)):
+        raise InputError("--classes, --intrinsics, --pose and --gravity belong to --mask.")
+    if pose is not None and gravity is not None:
+        raise InputError("--pose says where things fall, too; leave out --gravity.")
+    if (limit is not None and split is None) or (view and room is None):
+        raise InputError("--limit belongs to --split, and --view to --room.")
+    check_free(out, overwrite)
+    prior = load(run)
+    notes = []
+    if shards is None:
+        if mask is None or intrinsics is None:
+            raise InputError("--mask needs --intrinsics beside it, and a PNG --classes, too.")
+        # A fit object by object does not depend on the side of the room.
+        sides = 1 if fit == OBJECTS else QUARTERS
+        own = read_own_image(
+            mask, classes, intrinsics, prior.label_set, pose, camera_height, sides, gravity
+        )
+        images, notes = list(own.images), [f"{note}." for note in own.notes]
+    elif room is not None:
+        images = [image_from_shards(shards, room, view)]
+    else:
+        images, blank = images_of_split(shards, split or "test", seed, limit)
+        notes = [f"no view of room {name} shows an object; it is left out." for name in blank]
+    for note in notes:
+        typer.echo(f"Note: {note}", err=True)
+    found = prior.reconstruct(images, fit, restarts)
+    if mask is not None:  # one image with several candidate cameras: the best fit is kept
+        found = [min(found, key=lambda one: one.score)]
+        if len(images) > 1:
+            height_m = found[0].image.eye_m[1]
+            typer.echo(f"Note: a camera {height_m:g} m above the floor fits best.", err=True)
+    taken_for = {pair for one in found for pair in one.taken_for.items()}
+    for name, other in sorted(taken_for):
+        typer.echo(
+            f"Note: the run never generates the class {name}; a {other} stands for it.", err=True
+        )
+    artist = open_renderer(renderer)
+    write_reconstructions(found, out, artist)
+    if mask is not None:
+        write_turning(found[0], out, artist)
+    typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
+
+
+def eval_svr(
+    shards: Annotated[Path, typer.Option(help="Shards with 3D ground truth.")],
+    run: Annotated[str | None, typer.Option(help="A run: its fits are evaluated.")] = None,
+    scenes: Annotated[
+        Path | None, typer.Option(help="Instead: what reconstruct, or retrieve after it, wrote.")
+    ] = None,
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    views: Annotated[int, typer.Option(min=1, help="Drawn from each room, if it has them.")] = 1,
+    limit: Annotated[int | None, typer.Option(min=1, help="Only the first rooms.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="JSON file (default: svr.json in RUN or SCENES).")
+    ] = None,
+    fit: FitOption = "objects",
+    restarts: RestartsOption = 1,
+    models: Annotated[
+        Path | None,
+        typer.Option(help="Also with CAD models: 3D-FUTURE-model, a folder like it, or shards."),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the views and random rooms.")
+    ] = 0,
+    renderer: RendererOption = "auto",
+) -> None:
+    """Evaluate single-view reconstruction, with training rooms as baselines."""
+    from sceneprior.apps.reconstruction.reconstruct import FitOptions
+    from sceneprior.apps.reconstruction.score import (
+        SvrProtocol,
+        evaluate_run,
+        evaluate_scenes,
+        print_view_scores,
+    )
+    from sceneprior.core.errors import InputError
+    from sceneprior.core.files import write_json
+
+    protocol = SvrProtocol(shards, split, seed, views, renderer)
+    if run is not None and scenes is None:
+        options = FitOptions(fit, restarts)
+        target = checked_target(result_file(run, out, "svr.json"))
+        found = evaluate_run(run, protocol, options, limit, models)
+    elif scenes is not None and run is None:
+        given = (views, limit, fit, restarts, models)
+        if given != (1, None, "objects", 1, None):
+            raise InputError(
+                "--views, --limit, --fit, --restarts and --models belong to --run; scenes are "
+                "evaluated as they are."
+            )
+        target = checked_target(out or scenes / "svr.json")
+        found = evaluate_scenes(scenes, protocol)
+    else:
+        raise InputError("Say what to evaluate: either --run, or --scenes with reconstructions.")
+    write_json(target, found)
+    print_view_scores(found)
+    typer.echo(f"Wrote {target}")

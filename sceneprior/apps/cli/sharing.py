@@ -1,0 +1,137 @@
+"""Commands to share priors and rooms: pack, priors and export."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sceneprior.apps.cli.options import OverwriteOption
+from sceneprior.core.errors import InputError
+
+
+def pack(
+    run: Annotated[Path, typer.Argument(help="Folder of a run that `fit` made.")],
+    out: Annotated[Path, typer.Option(help="The file to write, such as bedroom.prior.")],
+    about: Annotated[
+        Path | None,
+        typer.Option(help="Markdown for the card: the data, their authors and licence."),
+    ] = None,
+    scores: Annotated[
+        Path | None, typer.Option(help="From eval-fid, for the card (RUN/scores.json).")
+    ] = None,
+    latents: Annotated[
+        bool, typer.Option("--latents", help="Keep the latents and ids of the training rooms.")
+    ] = False,
+    half: Annotated[
+        bool, typer.Option("--half", help="Large tensors in half precision: a smaller file.")
+    ] = False,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Write a trained run to one file for sharing: weights, settings, a card; no pickle."""
+    from sceneprior.apps.config import load_any_run, run_config
+    from sceneprior.apps.priors.card import model_card
+    from sceneprior.apps.priors.packed import pack as packed_of
+    from sceneprior.apps.priors.packed import write_packed
+    from sceneprior.core.files import read_json
+    from sceneprior.lifted.trained import SAMPLER
+    from sceneprior.paper.trained import TrainedPrior
+
+    if out.exists() and (out.is_dir() or not overwrite):
+        raise InputError(f"{out} is there; name another file, or replace a file by --overwrite.")
+    found = scores or run / "scores.json"
+    measured = read_json(found) if scores is not None or found.is_file() else None
+    stated = None if about is None else _text_of(about)
+    run_config(run)
+    trained = load_any_run(run)
+    card = model_card(trained, out.stem, stated, measured, latents, half)
+    write_packed(packed_of(trained, card, latents, half), out)
+    typer.echo(f"Wrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
+    if stated is None:
+        typer.echo(
+            "Note: the card says nothing of the data's authors and licence; --about adds it.",
+            err=True,
+        )
+    alone = isinstance(trained, TrainedPrior) and trained.distribution not in (SAMPLER, "paper")
+    if alone and not latents:
+        typer.echo(
+            f"Note: the run draws rooms by '{trained.distribution}', which needs --latents; of "
+            "this file they come from `paper`.",
+            err=True,
+        )
+
+
+def _text_of(path: Path) -> str:
+    """Text of a regular file; devices and pipes, which may be endless, are refused."""
+    from sceneprior.apps.priors.packed import CARD, LARGEST
+
+    if not path.is_file():
+        raise InputError(f"{path} cannot be read: it is missing, or no regular file.")
+    try:
+        with path.open() as file:
+            return file.read(LARGEST[CARD])  # a card with a longer text is refused later
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error}).") from None
+
+
+def priors(
+    name: Annotated[
+        str | None, typer.Argument(help="Print the card of one: a name, a file, hf://OWNER/NAME.")
+    ] = None,
+) -> None:
+    """List the priors that the package ships, or print the card of one."""
+    from sceneprior.apps.priors.packed import is_packed, read_packed
+    from sceneprior.apps.priors.where import find_prior, shipped_priors
+
+    if name is not None:
+        path = find_prior(name)
+        if not is_packed(path):
+            raise InputError(f"{name} is a run, which has no card; `sceneprior pack` writes one.")
+        typer.echo(read_packed(path).card, nl=False)
+        return
+    for known, path in shipped_priors().items():
+        packed = read_packed(path)
+        typer.echo(
+            f"{known:<20} {path.stat().st_size / 1e6:.1f} MB, {packed.said.settings['label_set']}, "
+            f"{packed.said.training_rooms} training rooms"
+        )
+
+
+def export(
+    source: Annotated[
+        Path, typer.Argument(help="A folder of scenes; for `--to scenes`, box lists as ATISS has.")
+    ],
+    to: Annotated[str, typer.Option(help="atiss, threed-front, obj or usd; or scenes, back.")],
+    out: Annotated[Path, typer.Option(help="Folder to write to.")],
+    label_set: Annotated[
+        str | None, typer.Option(help="Of box lists, such as front3d_bedroom.")
+    ] = None,
+    classes: Annotated[
+        str | None,
+        typer.Option(help="Of box lists: names of the columns (default: the label set's)."),
+    ] = None,
+    sizes: Annotated[
+        str | None,
+        typer.Option(help="Of box lists: half (extents, as ATISS writes them; default) or full."),
+    ] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Export scenes to another format, or convert box lists (such as ATISS's) to scenes."""
+    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.interchange.box_lists import read_box_lists
+    from sceneprior.interchange.export import export_scenes
+    from sceneprior.render.offscreen import SoftwareRenderer
+    from sceneprior.render.scene_files import load_scene_folder
+
+    check_free(out, overwrite)
+    if to == "scenes":
+        if label_set is None:
+            raise InputError("--to scenes needs --label-set: that of the box lists' classes.")
+        rooms = read_box_lists(source, label_set, classes, sizes or "half")
+        write_scenes(rooms, out, SoftwareRenderer(), overwrite)
+    else:
+        if (label_set, classes, sizes) != (None, None, None):
+            raise InputError("--label-set, --classes and --sizes are of box lists: --to scenes.")
+        rooms = load_scene_folder(source)
+        for note in export_scenes(rooms, to, out):
+            typer.echo(f"Note: {note}", err=True)
+    typer.echo(f"Wrote {len(rooms)} rooms to {out}")

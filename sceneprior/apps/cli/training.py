@@ -1,0 +1,96 @@
+"""Commands to train a run and to report on it: fit and report."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sceneprior.apps.cli.options import (
+    AcceleratorOption,
+    RendererOption,
+    checked_target,
+)
+from sceneprior.core.errors import InputError
+from sceneprior.core.seeds import LARGEST_SEED
+
+
+def fit(
+    config: Annotated[str, typer.Option(help="A YAML file, or a shipped one such as demo.yaml.")],
+    run: Annotated[
+        Path | None, typer.Option(help="Folder for checkpoints and logs (default: runs/<config>).")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Override: model.width=256. Repeatable.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")] = False,
+    logger: Annotated[
+        list[str] | None, typer.Option(help="csv, tensorboard, wandb. Repeatable.")
+    ] = None,
+    devices: Annotated[str, typer.Option(help="How many, or which; Lightning's option.")] = "auto",
+    accelerator: AcceleratorOption = "auto",
+    precision: Annotated[str, typer.Option(help="32-true, bf16-mixed; Lightning's option.")] = (
+        "32-true"
+    ),
+) -> None:
+    """Train the stages of a run, one after the other."""
+    from sceneprior.apps.config import load_config
+
+    settings = load_config(config, tuple(set_ or ()))  # before imports that take seconds
+    folder = run or Path("runs") / Path(config).stem
+    from sceneprior.training.fit import fit as run_fit
+
+    options = {"devices": devices, "accelerator": accelerator, "precision": precision}
+    try:
+        run_fit(settings, folder, resume, tuple(logger or ("csv", "tensorboard")), options)
+    except KeyboardInterrupt:
+        saved = folder / "config.yaml"
+        said = "Stopped before training began; run the same command again."
+        if saved.is_file():
+            go_on = f"sceneprior fit --config {saved} --run {folder} --resume"
+            said = f"Stopped and saved. Go on with: {go_on}"
+        typer.echo(said, err=True)
+        raise typer.Exit(130) from None
+    typer.echo(f"Trained: {folder}")
+
+
+def report(
+    run: Annotated[Path | None, typer.Option(help="Folder of a run that `fit` made.")] = None,
+    scenes: Annotated[
+        Path | None, typer.Option(help="Instead of a run: a folder of scene JSONs, of any method.")
+    ] = None,
+    shards: Annotated[
+        Path | None, typer.Option(help="Of --scenes: the shards they were evaluated on.")
+    ] = None,
+    scores: Annotated[
+        Path | None, typer.Option(help="From eval-fid (default: scores.json in RUN or SCENES).")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="HTML file (default: report.html in RUN or SCENES).")
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the generated rooms shown.")
+    ] = 0,
+    command: Annotated[
+        list[str] | None, typer.Option(help="A command to list on the page. Repeatable.")
+    ] = None,
+    renderer: RendererOption = "auto",
+) -> None:
+    """Write one self-contained page: inputs, curves, rooms, scores."""
+    from sceneprior.apps.experiments.evaluate import report_folder, report_run
+
+    commands = tuple(command or ())
+    if run is not None and (scenes, shards) == (None, None):
+        target = out or run / "report.html"
+        if run.is_dir():
+            checked_target(target)
+        report_run(run, scores, target, seed, commands, renderer)
+    elif scenes is not None and shards is not None and run is None:
+        if seed != 0:
+            raise InputError("--seed belongs to --run; scenes are shown as they are.")
+        target = checked_target(out or scenes / "report.html")
+        report_folder(scenes, shards, scores, target, commands, renderer)
+    else:
+        raise InputError(
+            "Say what to report on: either --run RUN, or --scenes DIR --shards SHARDS."
+        )
+    typer.echo(f"Wrote {target}")

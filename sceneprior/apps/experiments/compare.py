@@ -1,0 +1,218 @@
+"""Trains and evaluates the runs of a comparison, and writes its tables and pictures.
+
+A run is a `fit` and the commands that score it, or these alone where scenes are there; what is done
+is kept.
+"""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+
+from sceneprior.apps.config import load_config
+from sceneprior.apps.experiments.comparison import (
+    Comparison,
+    RoomComparison,
+    Run,
+    ViewComparison,
+    runs_of,
+    shards_of,
+    variants_of,
+)
+from sceneprior.apps.experiments.figure import write_figure
+from sceneprior.apps.experiments.rows import result_of, rows_of
+from sceneprior.apps.experiments.steps import Step, StepRunner, is_done, open_runner
+from sceneprior.apps.experiments.table import NEW_ROOMS, VIEWS, write_tables
+from sceneprior.core.errors import InputError
+from sceneprior.core.ground_truth import known_in_3d
+from sceneprior.core.shards import iterate_rooms
+from sceneprior.evaluation.networks import check_inception
+from sceneprior.render.offscreen import open_renderer
+
+OF_SHARDS = "shards"
+"""In place of a folder of CAD models: those of the training rooms."""
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """Options by which all runs of a comparison are trained and evaluated."""
+
+    renderer: str = "auto"
+    inception: Path | None = None
+    """NVIDIA's `inception-2015-12-05.pt`; None leaves FID out."""
+    accelerator: str = "auto"
+    """That trains the runs, one device each: Lightning's word."""
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Outcome of a call of `compare`."""
+
+    table: Path | None
+    """None where no run is done."""
+    failures: list[str]
+    """A sentence for each run that failed; the table is written without it."""
+    left_out: list[str]
+    """Runs that were trained or evaluated otherwise than the table's."""
+
+
+def compare(
+    comparison: Comparison, part: Comparison, out: Path, options: CompareOptions
+) -> Compared:
+    """Train and evaluate every run that is not done yet, then write `table.*` and the pictures.
+
+    Args:
+        comparison: The tables show all of it that is done.
+        part: What to do now: from `part_of`, or the same.
+        out: `<rooms>/<method>/seed<k>/` in it holds a run; the tables lie beside them.
+
+    Raises:
+        InputError: of shards, renderer or weights, or another `compare` is writing to `out`.
+        KeyboardInterrupt: stopped by Ctrl-C, SIGTERM or SIGHUP; the same call goes on.
+    """
+    if options.inception is not None:
+        check_inception(options.inception)
+    renderer = open_renderer(options.renderer)
+    count = cache(partial(count_of, comparison))
+    for rooms in part.rooms:
+        count(rooms)  # refuses shards before anything is trained
+    failures: dict[Run, str] = {}
+    done, left_out = [], []
+    with open_runner(out) as runner:
+        for run in runs_of(part, out):
+            steps = steps_of(comparison, run, count(run.rooms), options)
+            if failure := _do(runner, run, steps):
+                failures[run] = f"{run.title}: {failure}"
+        for run in runs_of(comparison, out):
+            if run in failures or not (run.folder / "scores.json").is_file():
+                continue
+            steps = steps_of(comparison, run, count(run.rooms), options)
+            if keeps_settings(run) and all(is_done(step, run.folder) for step in steps):
+                done.append(run)
+            else:
+                left_out.append(run.title)
+        if done:
+            form = VIEWS if isinstance(comparison, ViewComparison) else NEW_ROOMS
+            write_tables([row for run in done for row in rows_of(comparison, run)], out, form)
+        for rooms in comparison.rooms:
+            first = {run.method: run for run in reversed(done) if run.rooms == rooms}
+            if shown := [first[method] for method in comparison.methods if method in first]:
+                write_figure(comparison, shown, count(rooms), out / f"{rooms}.png", renderer)
+    return Compared(out / "table.md" if done else None, [*failures.values()], left_out)
+
+
+def _do(runner: StepRunner, run: Run, steps: list[Step]) -> str | None:
+    """Do the steps of a run that are not done; a sentence where one fails."""
+    try:
+        if not keeps_settings(run):
+            raise InputError(
+                f"{run.folder} holds a run of other settings than the comparison now asks for; "
+                "delete it to train anew, or name another --out."
+            )
+        for step in steps:
+            if not is_done(step, run.folder):
+                runner.do(step, run.folder, run.folder / f"{step.name}.log")
+    except InputError as error:
+        return str(error)
+    except OSError as error:
+        return f"{error.filename or run.folder} cannot be written ({error.strerror})"
+    return None
+
+
+def count_of(comparison: Comparison, rooms: str) -> int | None:
+    """Number of rooms that each run generates, or of test rooms whose views it answers; None: all.
+
+    Raises:
+        InputError: the shards are missing, or runs cannot be scored on them.
+    """
+    shards = shards_of(comparison, rooms)
+    if isinstance(comparison, ViewComparison):
+        if not known_in_3d(shards, "test"):
+            raise InputError(
+                f"Single views are compared with true rooms, and the 'test' rooms of {shards} are "
+                "missing or not known in 3D; give shards of prep-front or prep-scannet."
+            )
+        return comparison.count
+    assert isinstance(comparison, RoomComparison), "one of TASKS"
+    return comparison.count or sum(1 for _ in iterate_rooms(shards, "train"))
+
+
+def steps_of(
+    comparison: Comparison, run: Run, count: int | None, options: CompareOptions
+) -> list[Step]:
+    """The commands of a run: `fit`, if it is not of scenes, and those that score it."""
+    scoring = scoring_steps(comparison, run, count, options)
+    if run.scenes is not None:
+        return scoring
+    folder = run.folder / "run"
+    settings = [word for setting in run.settings for word in ("--set", setting)]
+    last = run.run_config.stage_names[-1]
+    # One device: several would share each batch, or train on larger ones.
+    device = ["--accelerator", options.accelerator, "--devices", "1"]
+    words = ["fit", "--config", run.config, "--run", str(folder), *settings, "--logger", "csv"]
+    fit = Step(
+        "fit",
+        [*words, *device, "--resume"],
+        result=folder / last / "final.ckpt",
+        depends_on=[],  # never redone for other settings, but refused (`keeps_settings`)
+        continues=folder / "config.yaml",
+    )
+    return [fit, *scoring]
+
+
+def keeps_settings(run: Run) -> bool:
+    """Test whether a run's folder is free, or holds a run trained with the settings wanted now.
+
+    The distribution that rooms are drawn from by default has no part in training, and rows name it.
+    """
+    saved = run.folder / "run" / "config.yaml"
+    if not saved.is_file():
+        return True
+    wanted = run.run_config.with_label_set()
+    try:
+        kept = load_config(str(saved))
+    except InputError:
+        return False  # of another version, or damaged
+    return kept.model_dump(exclude={"sampling"}) == wanted.model_dump(exclude={"sampling"})
+
+
+def scoring_steps(
+    comparison: Comparison, run: Run, count: int | None, options: CompareOptions
+) -> list[Step]:
+    """`eval-fid` or `eval-svr` of a run, once for each of its variants.
+
+    They depend on what the rows of one table have in common.
+    """
+    shards, state = str(shards_of(comparison, run.rooms)), []
+    source = ["--run", str(run.folder / "run")]
+    seed, renderer = ["--seed", str(comparison.sampling_seed)], ["--renderer", options.renderer]
+    if isinstance(comparison, ViewComparison):
+        command, option = "eval-svr", "--fit"
+        source += ["--shards", shards]
+        alike = ["--split", "test", "--views", str(comparison.views), *seed, *renderer]
+        if count is not None:
+            alike += ["--limit", str(count)]
+        if (models := comparison.cad_models) is not None:
+            alike += ["--models", shards if models == OF_SHARDS else models]
+    else:
+        command, option = "eval-fid", "--distribution"
+        if run.scenes is not None:
+            source, state = ["--scenes", str(run.scenes), "--shards", shards], [_state(run.scenes)]
+        # Some methods decode meshes and some have boxes alone: --boxes compares what all have.
+        alike = ["-n", str(count), *seed, "--boxes", *renderer]
+        if options.inception is not None:
+            alike += ["--inception", str(options.inception)]
+    steps = []
+    for variant in variants_of(comparison, run):
+        result = result_of(comparison, run, variant)
+        asked = alike if variant is None else [*alike, option, variant]
+        words = [command, *source, "--out", str(result), *asked]
+        steps.append(Step(result.stem, words, result=result, depends_on=asked + state))
+    return steps
+
+
+def _state(scenes: Path) -> str:
+    """A word that changes with the files of a folder of scenes; they are not read."""
+    files = sorted(path for path in scenes.glob("*") if path.suffix in (".json", ".glb"))
+    found = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    return hashlib.sha256(repr((str(scenes), found)).encode()).hexdigest()

@@ -1,0 +1,311 @@
+"""Settings of `sceneprior compare`, and the runs that they ask for."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from sceneprior.apps.config import load_config
+from sceneprior.apps.experiments.makers import GIVEN, Maker, maker_of_answers, maker_of_rooms
+from sceneprior.apps.reconstruction.reconstruct import OBJECTS
+from sceneprior.core.errors import ConfigError, InputError
+from sceneprior.core.seeds import LARGEST_SEED
+from sceneprior.core.settings import Section, check_settings, read_settings
+from sceneprior.lifted.trained import SAMPLER
+from sceneprior.training.method import RunConfig
+
+EVERY = "every"
+"""In `Method.set`: settings for every kind of room."""
+
+
+class Rooms(Section):
+    """A kind of room to compare on."""
+
+    config: str
+    """Run config of the paper's or the lifted method; its rooms are those of all methods."""
+    title: str
+    """Heading of its table."""
+
+
+class Method(Section):
+    """One side of a comparison: a method to train, or scenes that exist."""
+
+    title: str | None = None
+    """Title of its rows. None: named by its config (`makers.py`), which only the paper's and the
+    lifted method are; their variations need a title, to which the table adds what they learn from
+    and how they draw rooms."""
+    config: str | None = None
+    """The method's own run config; None: that of the rooms. Label set, shards, seed and, where it
+    has the key, `model.max_objects` are the rooms' in either case."""
+    set: dict[str, list[str]] = Field(default_factory=dict)
+    """Changes to the config as `section.key=value`, by kind of room; those for `every` first."""
+    scenes: dict[str, str] = Field(default_factory=dict)
+    """Folders of scenes, by kind of room, instead of `config` and `set`: nothing is trained, and
+    the scenes are evaluated as they are."""
+
+    @model_validator(mode="after")
+    def _trained_or_given(self) -> "Method":
+        if self.scenes and (self.config is not None or self.set):
+            raise ValueError(
+                "scenes are evaluated as they are, so `config` and `set` have no effect on them; "
+                "leave out either"
+            )
+        if self.scenes and self.title is None:
+            raise ValueError("scenes need a title: no config says what made them")
+        return self
+
+
+class Comparison(Section):
+    """Methods by kinds of rooms by seeds."""
+
+    seeds: tuple[int, ...] = Field(min_length=1, strict=False)
+    """A run each; the seed of training."""
+    sampling_seed: int = Field(0, ge=0, le=LARGEST_SEED)
+    """Seed of the generated rooms, or of the views to answer, the same for every run."""
+    rooms: dict[str, Rooms] = Field(min_length=1)
+    methods: dict[str, Method] = Field(min_length=1)
+
+    @field_validator("seeds")
+    @classmethod
+    def _each_once(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        if len(set(seeds)) < len(seeds) or min(seeds) < 0:
+            raise ValueError("seeds are numbers from 0 on, each once")
+        return seeds
+
+    @model_validator(mode="after")
+    def _names_are_clear(self) -> "Comparison":
+        titles = [rooms.title for rooms in self.rooms.values()]
+        if twice := [title for title in titles if titles.count(title) > 1]:
+            raise ValueError(f"the title '{twice[0]}' is given twice; a title names a table")
+        known = ", ".join(self.rooms)
+        for key, method in self.methods.items():
+            if unlisted := sorted(set(method.set) - {EVERY, *self.rooms}):
+                raise ValueError(
+                    f"methods.{key}.set has '{unlisted[0]}'; expected {EVERY} or one of {known}"
+                )
+            if unlisted := sorted(set(method.scenes) - set(self.rooms)):
+                raise ValueError(
+                    f"methods.{key}.scenes has '{unlisted[0]}'; expected one of {known}"
+                )
+        return self
+
+
+class RoomComparison(Comparison):
+    """Comparison of new rooms (the paper's Tables 1, 3 and 4)."""
+
+    task: Literal["new_rooms"] = "new_rooms"
+    count: int | None = Field(None, ge=2)
+    """Rooms that each run generates and is evaluated by. None: as many as there are training rooms,
+    the numbers at which Frechet distances compare with those of the reference rows."""
+    distributions: tuple[Literal["paper", "kernel"], ...] = Field(
+        ("paper", "kernel"), min_length=1, strict=False
+    )
+    """Distributions of latents by which priors that remember training rooms are evaluated, a row
+    each. Pictures show the first. Methods without such latents have their own."""
+
+
+class ViewComparison(Comparison):
+    """Comparison of reconstructions from single views (the paper's Table 2)."""
+
+    task: Literal["single_views"] = "single_views"
+    count: int | None = Field(None, ge=1)
+    """Test rooms whose views are answered; None: all."""
+    views: int = Field(1, ge=1)
+    """Views answered of each test room; all where a room has fewer."""
+    fits: tuple[Literal["objects", "paper"], ...] = Field(("objects",), min_length=1, strict=False)
+    """Fits by which runs that remember rooms answer, as `eval-svr --fit`, a row each. Other methods
+    have their own."""
+    cad_models: str | None = None
+    """Value of `eval-svr --models`: a folder of CAD models, or `shards` for those of the training
+    rooms. Null: no rows with CAD models."""
+
+    @model_validator(mode="after")
+    def _answers_the_same_views(self) -> "ViewComparison":
+        for key, method in self.methods.items():
+            if method.scenes:
+                raise ValueError(
+                    f"methods.{key}.scenes: each method answers views that the comparison draws; "
+                    "score scenes that are there with `sceneprior eval-svr --scenes`"
+                )
+        return self
+
+
+TASKS: dict[str, type[Comparison]] = {"new_rooms": RoomComparison, "single_views": ViewComparison}
+"""Comparisons by the value of their key `task`."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training with one seed, or a folder of scenes, which needs none; and where it goes."""
+
+    rooms: str
+    method: str
+    seed: int | None
+    """None of scenes."""
+    config: str
+    settings: tuple[str, ...]
+    """Changes to the config, for `fit --set`."""
+    folder: Path
+    scenes: Path | None = None
+    """Scenes that are there, of any method; None of what is trained."""
+
+    @property
+    def run_config(self) -> RunConfig:
+        """The settings that the run is trained with; of scenes, those of their kind of rooms."""
+        return load_config(self.config, self.settings)
+
+    @property
+    def title(self) -> str:
+        seed = () if self.seed is None else (f"seed {self.seed}",)
+        return ", ".join((self.rooms, self.method, *seed))
+
+
+def load_comparison(name: str) -> Comparison:
+    """Read a comparison and check the settings of each of its runs.
+
+    Raises:
+        ConfigError: not found, not YAML, an unknown key or a wrong value, in it or in a run.
+    """
+    path, data = read_settings(name)
+    task = data.get("task", "new_rooms")
+    if not isinstance(task, str) or task not in TASKS:
+        raise ConfigError(f"{path}: no task is called '{task}'; choose from {', '.join(TASKS)}.")
+    comparison = check_settings(TASKS[task], data, str(path))
+    rows: dict[tuple[str, str], str] = {}
+    for run in runs_of(comparison, Path()):
+        for variant in variants_of(comparison, run):
+            title = title_of(comparison, run, variant)
+            if not title:
+                raise ConfigError(
+                    f"{path}: methods.{run.method} has no title; only the paper's and the "
+                    "lifted method are named by their configs."
+                )
+            if (other := rows.setdefault((run.rooms, title), run.method)) != run.method:
+                raise ConfigError(
+                    f"{path}: the title '{title}' is given twice; a title names a row, so give "
+                    f"methods.{other} or methods.{run.method} another `title`."
+                )
+    return comparison
+
+
+def part_of(
+    comparison: Comparison, methods: str | None, rooms: str | None, seeds: str | None
+) -> Comparison:
+    """Some methods, kinds of rooms and seeds of a comparison, each given as `a,b`; None is all.
+
+    Raises:
+        InputError: the comparison has no such entry.
+    """
+    kept_methods = _chosen("method", methods, tuple(comparison.methods))
+    kept_rooms = _chosen("kind of rooms", rooms, tuple(comparison.rooms))
+    kept_seeds = _chosen("seed", seeds, tuple(str(seed) for seed in comparison.seeds))
+    return comparison.model_copy(
+        update={
+            "methods": {key: comparison.methods[key] for key in kept_methods},
+            "rooms": {key: comparison.rooms[key] for key in kept_rooms},
+            "seeds": tuple(int(seed) for seed in kept_seeds),
+        }
+    )
+
+
+def _chosen(what: str, given: str | None, known: tuple[str, ...]) -> tuple[str, ...]:
+    if given is None:
+        return known
+    names = tuple(name.strip() for name in given.split(",") if name.strip())
+    for name in names:
+        if name not in known:
+            raise InputError(f"No {what} '{name}' in this comparison; it has {', '.join(known)}.")
+    if not names:
+        raise InputError(f"No {what} was named; the comparison has {', '.join(known)}.")
+    return tuple(name for name in known if name in names)
+
+
+def runs_of(comparison: Comparison, out: Path) -> list[Run]:
+    """Every run, scenes first, then seed by seed, so that a comparison that is stopped early is a
+    whole one of fewer seeds.
+
+    Raises:
+        ConfigError: the config of rooms or of a method is not found, or not YAML.
+    """
+    given = [
+        Run(key, name, None, rooms.config, (), out / key / name, Path(method.scenes[key]))
+        for key, rooms in comparison.rooms.items()
+        for name, method in comparison.methods.items()
+        if key in method.scenes
+    ]
+    trained = [
+        Run(
+            rooms=key,
+            method=name,
+            seed=seed,
+            config=method.config or rooms.config,
+            settings=(
+                *_taken_over(rooms, method),
+                *method.set.get(EVERY, ()),
+                *method.set.get(key, ()),
+                f"seed={seed}",
+            ),
+            folder=out / key / name / f"seed{seed}",
+        )
+        for seed in comparison.seeds
+        for key, rooms in comparison.rooms.items()
+        for name, method in comparison.methods.items()
+        if not method.scenes
+    ]
+    return given + trained
+
+
+def _taken_over(rooms: Rooms, method: Method) -> list[str]:
+    """Settings that a method with its own config shares with the others on the same rooms."""
+    if method.config is None:
+        return []
+    shared, own = read_settings(rooms.config)[1], read_settings(method.config)[1]
+    keys = ["label_set", "data.shards"]
+    if _value(own, "model.max_objects") is not None:
+        keys.append("model.max_objects")
+    values = {key: _value(shared, key) for key in keys}
+    # As JSON, which YAML reads as it is: a folder may be called 2024.
+    return [f"{key}={json.dumps(v)}" for key, v in values.items() if v is not None]
+
+
+def _value(data: Any, key: str) -> Any:
+    for part in key.split("."):
+        data = data.get(part) if isinstance(data, dict) else None
+    return data
+
+
+def variants_of(comparison: Comparison, run: Run) -> tuple[str | None, ...]:
+    """Distributions that a run's rooms are drawn from, or fits of its answers; a row each.
+
+    None is the run's own way, which comes first where that is a sampler, and is all that scenes and
+    methods without latents of rooms have.
+    """
+    config = run.run_config
+    if run.scenes is not None or not config.remembers_rooms:
+        return (None,)
+    if isinstance(comparison, ViewComparison):
+        return comparison.fits
+    assert isinstance(comparison, RoomComparison), "one of TASKS"
+    own = (None,) if getattr(config, "distribution", None) == SAMPLER else ()
+    return (*own, *comparison.distributions)
+
+
+def maker_of(comparison: Comparison, run: Run, variant: str | None) -> Maker:
+    """Maker of the rooms, or the answers, of one of a run's variants."""
+    if run.scenes is not None:
+        return GIVEN
+    if isinstance(comparison, ViewComparison):
+        return maker_of_answers(run.run_config, variant or OBJECTS)
+    return maker_of_rooms(run.run_config, variant)
+
+
+def title_of(comparison: Comparison, run: Run, variant: str | None) -> str:
+    """The title of a row of a run; empty where neither the comparison nor a config gives one."""
+    return maker_of(comparison, run, variant).named(comparison.methods[run.method].title)
+
+
+def shards_of(comparison: Comparison, rooms: str) -> Path:
+    """The shards that a kind of rooms is in."""
+    return Path(load_config(comparison.rooms[rooms].config).data.shards)

@@ -1,0 +1,260 @@
+"""Evaluate a run, or a folder of the user's scenes, and write their report page."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from sceneprior.apps.config import load_any_run, run_config
+from sceneprior.apps.experiments.evaluate_views import (
+    evaluate_from_views,
+    known_from_views_alone,
+    mask_scores,
+)
+from sceneprior.apps.experiments.makers import maker_of_rooms
+from sceneprior.apps.sample import sample_rooms
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import write_json
+from sceneprior.core.ground_truth import known_in_3d, reference_scenes
+from sceneprior.core.scene import Scene
+from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
+from sceneprior.evaluation.report import ROOMS_SHOWN, write_report
+from sceneprior.evaluation.room_sets import seeded_rows
+from sceneprior.evaluation.synthesis import FORMAT, EvalOptions, evaluate_synthesis
+from sceneprior.paper.decode import decode_latents, decode_training_rooms
+from sceneprior.paper.sampling import marked
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.render.offscreen import open_renderer
+from sceneprior.render.scene_files import load_scene_folder
+from sceneprior.training.method import Trained, TrainedSampler
+
+UNFOLDING_STEPS = 7
+CURVES = (
+    "loss", "class", "box", "completeness", "frustum", "mask", "mask_iou", "shape", "latents",
+    "discriminator", "objects", "existence", "position", "size", "kl",
+)  # fmt: skip
+
+
+def evaluate_run(
+    run: Path | str,
+    count: int,
+    options: EvalOptions,
+    out: Path,
+    shards: Path | None = None,
+    distribution: str | None = None,
+) -> dict[str, Any]:
+    """Score generated rooms against test rooms, and write the scores.
+
+    In runs that remember their training rooms, those are decoded and scored against the truth, too;
+    against masks, where rooms are known from views alone.
+
+    The options' seed draws the latents, too; `shards` and `distribution` are by default the run's.
+
+    Raises:
+        InputError: the run, the shards or a file of weights cannot be used.
+    """
+    trained = load_any_run(run)
+    folder = shards or Path(trained.config.data.shards)
+    if shards is None and not folder.is_dir():
+        raise InputError(
+            f"{run} was trained on shards '{folder}', which are not here; name the shards to "
+            "compare with: --shards."
+        )
+    if known_from_views_alone(folder, options.split):
+        masks: dict[str, float] = {}
+        if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
+            masks = mask_scores(trained, folder)
+        generated = sample_rooms(trained, count, options.seed, distribution)
+        scores = evaluate_from_views(generated, folder, options) | masks
+    else:
+        # First, because other shards than the run's are refused here.
+        pairs = decoded_and_true(trained, folder) if trained.remembers_rooms else []
+        generated = sample_rooms(trained, count, options.seed, distribution)
+        scores = evaluate_synthesis(generated, folder, options, [decoded for decoded, _ in pairs])
+        if pairs:
+            scores |= reconstruction_scores(pairs)
+    scores["protocol"] |= {"run": Path(run).name, "stage": trained.stage}
+    with_latents = isinstance(trained, TrainedPrior)
+    latents = marked(distribution or trained.distribution) if with_latents else "its own"
+    scores["protocol"]["latents"] = latents
+    write_json(out, scores)
+    return scores
+
+
+def evaluate_folder(
+    folder: Path, count: int | None, options: EvalOptions, out: Path, shards: Path
+) -> dict[str, Any]:
+    """Score the user's scenes, of any method, against test rooms, and write the scores.
+
+    Args:
+        folder: Scene JSONs (docs/conventions.md), perhaps with the GLBs of their meshes.
+        count: So many of them, drawn by the options' seed; None takes all.
+
+    Raises:
+        InputError: there are fewer scenes, or they, the shards or a file of weights cannot be used.
+    """
+    scenes = load_scene_folder(folder)
+    if count is not None and count > len(scenes):
+        raise InputError(
+            f"{count} scenes are to be evaluated, but {folder} holds {len(scenes)}; leave out -n "
+            "to take all of them, or make more."
+        )
+    rows = seeded_rows(len(scenes), count or len(scenes), options.seed)
+    chosen = [scenes[row] for row in rows]
+    alone = known_from_views_alone(shards, options.split)
+    scores = (evaluate_from_views if alone else evaluate_synthesis)(chosen, shards, options)
+    scores["protocol"] |= {"scenes": folder.resolve().name, "n_scenes_available": len(scenes)}
+    write_json(out, scores)
+    return scores
+
+
+def decoded_and_true(
+    trained: Trained, shards: Path, meshes: bool = False
+) -> list[tuple[Scene, Scene]]:
+    """Training rooms as decoded, each with what training never saw: the room in 3D.
+
+    Only tracked objects count: what no camera saw cannot be known. Turned copies of a room
+    are left out. `meshes` are for pictures; scores of boxes need none of the true ones.
+    """
+    real = reference_scenes(shards, "train", tracked_only=True, meshes=meshes)
+    truth = {scene.name: scene for scene in real}
+    decoded = {scene.name: scene for scene in decode_training_rooms(trained)}
+    missing = sorted(set(decoded) - set(truth) - {name for name in decoded if "@" in name})
+    if missing:
+        raise InputError(
+            f"{shards} does not hold training room {missing[0]} of this run "
+            f"({len(missing)} are missing); give the shards it was trained on with --shards."
+        )
+    return [(decoded[name], truth[name]) for name in truth if name in decoded]
+
+
+def report_run(
+    run: Path,
+    scores: Path | None,
+    out: Path,
+    seed: int,
+    commands: tuple[str, ...],
+    renderer: str,
+) -> None:
+    """Write the page of a run; of rooms not known in 3D, without what compares with true rooms.
+
+    Args:
+        scores: None takes the run's `scores.json`.
+
+    Raises:
+        InputError: the run or its scores cannot be read.
+    """
+    trained = load_any_run(run)
+    config, shards = trained.config, Path(trained.config.data.shards)
+    found = read_scores(scores, run, shards, f"--run {run}")
+    decoded: list[tuple[Scene, Scene]] = []
+    unfolding: list[Scene] = []
+    if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
+        if known_in_3d(shards, "train"):
+            decoded = decoded_and_true(trained, shards, meshes=True)
+        unfolding = unfold(trained)
+    maker = maker_of_rooms(config, trained.distribution).title or f"the method {config.method}"
+    made_by = f"{maker}, which learns from {config.learns_from}"
+    if isinstance(trained, TrainedPrior):
+        made_by += f"; rooms drawn by: {marked(trained.distribution)}"
+    write_report(
+        out,
+        title=f"New rooms from a prior learnt from {config.learns_from}",
+        source=f"run {run.resolve().name}",
+        made_by=made_by,
+        shards=shards,
+        views=not isinstance(trained, TrainedSampler),
+        generated=sample_rooms(trained, ROOMS_SHOWN, seed),
+        scores=found,
+        commands=commands,
+        curves=read_curves(run),
+        decoded=decoded,
+        unfolding=unfolding,
+        renderer=open_renderer(renderer),
+    )
+
+
+def report_folder(
+    folder: Path,
+    shards: Path,
+    scores: Path | None,
+    out: Path,
+    commands: tuple[str, ...],
+    renderer: str,
+) -> None:
+    """Write the page of the user's scenes, of any method: that of a run without the parts that a
+    run alone has.
+
+    Args:
+        scores: None takes the folder's `scores.json`.
+
+    Raises:
+        InputError: the scenes, the shards or the scores cannot be read.
+    """
+    scenes = load_scene_folder(folder)
+    write_report(
+        out,
+        title="Rooms beside real ones",
+        source=f"scenes {folder.resolve().name}",
+        made_by="scenes as given, which were made elsewhere",
+        shards=shards,
+        views=False,
+        generated=scenes[:ROOMS_SHOWN],
+        scores=read_scores(scores, folder, shards, f"--scenes {folder} --shards {shards}"),
+        commands=commands,
+        curves={},
+        decoded=[],
+        unfolding=[],
+        renderer=open_renderer(renderer),
+    )
+
+
+def read_scores(path: Path | None, folder: Path, shards: Path, evaluated: str) -> dict[str, Any]:
+    """Read the scores that `eval-fid` wrote to a file. None reads the folder's `scores.json`, which
+    may be missing where rooms have no 3D ground truth; `evaluated` is the command that writes it.
+
+    Raises:
+        InputError: the file is missing, or holds no scores.
+    """
+    if path is None:
+        path = folder / "scores.json"
+        if not path.exists() and not known_in_3d(shards, "test"):
+            return {}
+    try:
+        found = json.loads(path.read_text())
+        if not isinstance(found, dict) or found.get("format") != FORMAT:
+            raise ValueError("another file")
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path} holds no scores ({error}); write them with `sceneprior eval-fid {evaluated}`."
+        ) from None
+    return found
+
+
+def unfold(trained: TrainedPrior) -> list[Scene]:
+    """Rooms between two training rooms that lie far apart: on the sphere, along the geodesic."""
+    space = trained.prior.latent_space
+    z = space(trained.logits)
+    end = int(space.nearness(z[:1], z).argmin())
+    start, far = z[:1].expand(UNFOLDING_STEPS, -1), z[end].expand(UNFOLDING_STEPS, -1)
+    names = [f"step_{step}" for step in range(UNFOLDING_STEPS)]
+    along = torch.linspace(0, 1, UNFOLDING_STEPS)
+    return decode_latents(trained, space.between(start, far, along), names)
+
+
+def read_curves(run: Path) -> dict[str, list[tuple[int, float]]]:
+    """Loss curves of every stage from its metrics.csv, as `stage/term` -> (epoch, value)."""
+    curves: dict[str, list[tuple[int, float]]] = {}
+    for stage in run_config(run).stage_names:
+        path = run / stage / "metrics.csv"
+        if not path.is_file():
+            continue
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                for term in CURVES:
+                    if row.get(f"train/{term}"):
+                        point = (int(row["epoch"]), float(row[f"train/{term}"]))
+                        curves.setdefault(f"{stage}/{term}", []).append(point)
+    return curves

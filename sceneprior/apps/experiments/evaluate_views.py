@@ -1,0 +1,200 @@
+"""Evaluate generated rooms where real ones are known from views alone, as posed captures are."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Int
+
+from sceneprior.core.classes import VOID, label_set
+from sceneprior.core.data.dataset import ViewDataset, allowed_views
+from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.cameras import boxes_of_points
+from sceneprior.core.geometry.meshes import place
+from sceneprior.core.scene import Scene
+from sceneprior.core.shards import iterate_rooms, list_shards
+from sceneprior.core.views import SceneViews
+from sceneprior.evaluation.bootstrap import METHOD, Estimate, mean_of_rooms, resample_counts
+from sceneprior.evaluation.metrics.contents import (
+    TYPE_CLASSES,
+    class_counts,
+    common_label_set,
+    emptiness,
+    frequency_kl,
+)
+from sceneprior.evaluation.metrics.overlaps import room_overlaps
+from sceneprior.evaluation.registry import METRICS
+from sceneprior.evaluation.synthesis import FORMAT, VERSION, EvalOptions
+from sceneprior.paper.config import PaperConfig
+from sceneprior.paper.losses.matching import match_objects
+from sceneprior.paper.shape_decoder import ShapeDecoder
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.render.silhouettes.render import render_scene
+
+VIEWS = 4
+"""Views of each training room in which its decoded masks are compared."""
+_BATCH = 8
+_NOTE = (
+    "The rooms of these shards are known from views alone: their objects are counted as cameras "
+    "saw them, and what compares with true rooms in 3D is left out."
+)
+
+
+def known_from_views_alone(shards: Path, split: str) -> bool:
+    """Test whether a room of a split lacks ground truth; a ShardError where there is no room."""
+    list_shards(shards, split)
+    return any(not shard.has_ground_truth(room) for shard, room in iterate_rooms(shards, split))
+
+
+def evaluate_from_views(
+    generated: Sequence[Scene], shards: Path, options: EvalOptions
+) -> dict[str, Any]:
+    """Scores by key of `METRICS`, of those that need no room in 3D, as `evaluate_synthesis` has
+    them: of generated rooms, of real training rooms, and of the rooms compared with (`_test`).
+
+    Raises:
+        InputError: no rooms, or other classes than the shards'.
+    """
+    names = common_label_set(generated)
+    rooms = {split: _counted(shards, split, names) for split in ("train", options.split)}
+    counts = {
+        "generated": class_counts(generated), "train_rooms": rooms["train"],
+        "test": rooms[options.split],
+    }  # fmt: skip
+    draws = {
+        name: resample_counts(len(table), options.resamples, (options.seed, number))
+        for number, (name, table) in enumerate(counts.items())
+    }
+    columns: dict[str, dict[str, Estimate]] = {}
+    for name, table in counts.items():
+        found = {"mean_objects": mean_of_rooms(table.sum(axis=1), draws[name])}
+        if wanted := TYPE_CLASSES.get(names):
+            held = table[:, [label_set(names).index(label) for label in wanted]].any(axis=1)
+            found["type_share"] = mean_of_rooms(held.astype(float), draws[name], 1.0)
+        if name != "test":
+            pairs = (table, counts["test"], draws[name], draws["test"])
+            found["category_kl"] = _category_kl(*pairs)
+        columns[name] = found
+    volumes = [room_overlaps(scene).volumes_m3.sum() for scene in generated]
+    columns["generated"]["overlap_volume_m3"] = mean_of_rooms(volumes, draws["generated"])
+    values = {name: {k: v.value for k, v in found.items()} for name, found in columns.items()}
+    measured = columns["generated"]
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        **values["generated"],
+        **{f"{key}_test": value for key, value in values["test"].items()},
+        "train_rooms": values["train_rooms"],
+        "intervals": {
+            name: {key: estimate.interval() for key, estimate in found.items()}
+            for name, found in columns.items()
+        },
+        "note": " ".join(filter(None, (emptiness(generated), _NOTE))),
+        "protocol": {
+            "label_set": names,
+            "shards": Path(shards).resolve().name,
+            "split": options.split,
+            **{f"n_{name}": len(table) for name, table in counts.items()},
+            "seed": options.seed,
+            "resamples": options.resamples,
+            "intervals": METHOD,
+            "left_out": {m.key: "rooms in 3D" for m in METRICS if m.key not in measured},
+        },
+    }
+
+
+def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
+    """Mean IoU of decoded training rooms' masks with observed ones, in views that training never
+    saw (`mask_iou_held_out`, where `data.view_fraction` left some out of every room), or else in
+    some that it did (`mask_iou_training_views`). Nothing where shapes are no meshes.
+
+    Raises:
+        InputError: the shards are not those of the run.
+    """
+    config = trained.config
+    if not isinstance(config, PaperConfig):
+        return {}
+    data = config.data
+    fewest = min(len(shard.read_room(r).visible) for shard, r in iterate_rooms(shards, "train"))
+    held_out = len(allowed_views(0, 0, fewest, data.view_fraction)) < fewest
+    rooms = ViewDataset(
+        shards, "train", views_per_room=VIEWS, rotations=data.rotations, seed=config.seed,
+        mask_step=data.mask_step, view_fraction=data.view_fraction, held_out=held_out,
+    )  # fmt: skip
+    if set(rooms.room_ids) != set(trained.room_ids):
+        raise InputError(
+            f"{shards} does not hold the training rooms of this run; give the shards it was "
+            "trained on with --shards."
+        )
+    total, pairs = 0.0, 0
+    rows = range(0, len(rooms), rooms.rotations)
+    for start in range(0, len(rows), _BATCH):
+        views = rooms.__getitems__([(row, 0) for row in rows[start : start + _BATCH]])
+        seen = int(views.visible.sum())
+        if seen:
+            total, pairs = total + seen * mask_iou_of_rooms(trained, views), pairs + seen
+    key = "mask_iou_held_out" if held_out else "mask_iou_training_views"
+    return {key: total / pairs} if pairs else {}
+
+
+@torch.no_grad()
+def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
+    """Mean IoU of hard masks of decoded training rooms with the observed ones; void is left out.
+
+    Args:
+        trained: A prior of meshes; before the shape stage each box has the plain template in it.
+        views: Of training rooms, with instance ids.
+    """
+    config, prior = trained.config, trained.prior
+    assert isinstance(config, PaperConfig), "a run that remembers rooms has a view loss"
+    weights = config.loss
+    scenes = prior(trained.logits[views.room_index], with_shape=trained.stage != "layout")
+    shape, vertices = prior.shape, scenes.vertices_m
+    assert isinstance(shape, ShapeDecoder), "masks are drawn of meshes"
+    if vertices is None:
+        template = shape.template.expand(*scenes.centers_m.shape[:2], -1, -1)
+        vertices = place(template, scenes.centers_m, scenes.sizes_m)
+    boxes = boxes_of_points(vertices, views.world_to_camera, views.intrinsics, views.image_size)
+    matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
+    ids = views.observed_ids
+    height, width = ids.shape[-2:]
+    counts = views.is_object.sum(dim=-1, keepdim=True)
+    front = render_scene(
+        vertices, shape.faces, views.world_to_camera, views.intrinsics_at(height, width),
+        (height, width), mode="fast", drawn=torch.arange(vertices.shape[1]) < counts,
+    ).front  # fmt: skip
+    room, view, item = (views.visible & matches.valid.unsqueeze(1)).nonzero(as_tuple=True)
+    mine = front[room, view] == matches.prediction[room, item][:, None, None]
+    mine &= views.known_pixels[room, view]
+    seen = ids[room, view] == (item + 1)[:, None, None]
+    both = (mine & seen).sum(dim=(1, 2))
+    return float((both / (mine | seen).sum(dim=(1, 2)).clamp(min=1)).mean())
+
+
+def _counted(shards: Path, split: str, names: str) -> Int[np.ndarray, "rooms classes"]:
+    """Tracked objects of each class in each room, void left out."""
+    tables = []
+    for shard, room_id in iterate_rooms(shards, split):
+        if shard.label_set != names:
+            raise InputError(
+                f"Scores compare scenes of one label set, but the scenes have '{names}' and "
+                f"{shards} '{shard.label_set}'."
+            )
+        labels = shard.read_room(room_id).object_class
+        tables.append(np.bincount(labels, minlength=len(label_set(names))))
+    table = np.stack(tables).astype(np.int64)
+    table[:, VOID] = 0
+    return table
+
+
+def _category_kl(
+    table: np.ndarray, test: np.ndarray, draws: np.ndarray, test_draws: np.ndarray
+) -> Estimate:
+    def shares(counts: np.ndarray) -> np.ndarray:
+        return np.asarray(counts / np.maximum(counts.sum(axis=-1, keepdims=True), 1))
+
+    resamples = zip(shares(test_draws @ test), shares(draws @ table), strict=True)
+    value = frequency_kl(shares(test.sum(axis=0)), shares(table.sum(axis=0)))
+    return Estimate(value, np.array([frequency_kl(p, q) for p, q in resamples]), 0.0)

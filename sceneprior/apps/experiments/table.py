@@ -1,0 +1,241 @@
+"""The tables of a comparison, as Markdown and CSV, from the scores of its runs."""
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+from sceneprior.apps.experiments.makers import LIFTED, PAPER
+from sceneprior.core.files import write_whole
+from sceneprior.evaluation.metric import ARROWS, Direction, TableColumn
+from sceneprior.evaluation.registry import DECODED, METRICS
+
+GAP = "–"
+COSTS = {
+    "steps": TableColumn("steps", 0),
+    "cpu_s": TableColumn("CPU min", 1),
+    "parameters": TableColumn("parameters (M)", 2),
+}
+"""Columns of what training took."""
+FACTORS = {"cpu_s": 1 / 60, "parameters": 1e-6}
+"""From the units of costs to the table's."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Result of one run: rooms, method, scores and costs of training."""
+
+    rooms: str
+    group: str
+    title: str
+    variant: str
+    """Value that sets the row apart from others of its run (`Form.variant`)."""
+    seed: int | None
+    """None of scenes as given."""
+    scores: dict[str, Any]
+    costs: dict[str, int | float | None]
+    made_by: str
+    """Who its method is of, as a caption says it (`Maker.said`)."""
+    rank: int = 0
+    """Groups stand in the order of their ranks."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """Columns and captions of the tables of one kind of comparison."""
+
+    columns: dict[str, TableColumn]
+    """By key of the scores; `COSTS` follow."""
+    references: dict[str, str]
+    """Rows that need no training: (title, where a result keeps their values)."""
+    variant: str
+    """Heading of the second column."""
+    say: Callable[[Sequence[Row]], str]
+    """Makes what stands above a table from its rows."""
+
+
+def write_tables(rows: Sequence[Row], out: Path, form: Form) -> None:
+    """Write `table.md` and `table.csv` (a line a run) into a folder."""
+    write_whole(out / "table.md", markdown(rows, form).encode())
+    write_whole(out / "table.csv", as_csv(rows, form).encode())
+
+
+def markdown(rows: Sequence[Row], form: Form) -> str:
+    """A table for each kind of rooms, methods under the headings of their groups."""
+    parts = []
+    for rooms, own in _by(rows, lambda row: row.rooms).items():
+        columns = {
+            key: column
+            for key, column in (form.columns | COSTS).items()
+            if any(_value(row, key) is not None for row in own)
+        }
+        titles = [column.title for column in columns.values()]
+        lines = [f"### {rooms}", "", form.say(own), ""]
+        lines.append(_line(["method", form.variant, *titles]))
+        lines.append("| --- | --- |" + " ---: |" * len(columns))
+        lines += [_line(cells) for cells in _body(own, columns, form)]
+        parts.append("\n".join(lines))
+    notes = [column.note for column in form.columns.values() if column.note]
+    seeds = "A value of several seeds is their mean ± half their range."
+    return "\n\n".join([*parts, f"{'; '.join(notes)}. {seeds}"]) + "\n"
+
+
+def as_csv(rows: Sequence[Row], form: Form) -> str:
+    """A line a run and variant, numbers in full."""
+    keys = [*form.columns, *COSTS]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["rooms", "group", "method", "made by", form.variant, "seed", *keys])
+    for row in rows:
+        values = [_value(row, key) for key in keys]
+        told = ["" if value is None else repr(value) for value in values]
+        seed = "" if row.seed is None else row.seed
+        named = [row.rooms, row.group, row.title, row.made_by, row.variant, seed]
+        writer.writerow([*named, *told])
+    return text.getvalue()
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _body(rows: Sequence[Row], columns: dict[str, TableColumn], form: Form) -> list[list[str]]:
+    """The cells of each line, the headings of groups among them."""
+
+    def heading(group: str) -> list[str]:
+        return [f"*{group}*", *[""] * (len(columns) + 1)]
+
+    lines = [heading("reference")]
+    for title, name in form.references.items():
+        values = rows[0].scores.get(name, {})
+        cells = [_cell([values.get(key)], key, of, values) for key, of in columns.items()]
+        lines.append([title, GAP, *cells])
+    ranked = sorted(rows, key=lambda row: row.rank)
+    for group, members in _by(ranked, lambda row: row.group).items():
+        lines.append(heading(group))
+        for runs in _by(members, lambda row: f"{row.title}: {row.variant}").values():
+            values = runs[0].scores if len(runs) == 1 else {}
+            cells = [
+                _cell([_value(row, key) for row in runs], key, of, values)
+                for key, of in columns.items()
+            ]
+            lines.append([runs[0].title, runs[0].variant, *cells])
+    return lines
+
+
+def _value(row: Row, key: str) -> int | float | None:
+    return (row.costs if key in COSTS else row.scores).get(key)
+
+
+def _cell(
+    found: Sequence[int | float | None], key: str, column: TableColumn, scores: dict[str, Any]
+) -> str:
+    """The mean of a value over seeds, with half its range, or with the interval of `scores`."""
+    values = [float(value) * FACTORS.get(key, 1.0) for value in found if value is not None]
+    if not values:
+        return GAP
+    middle = f"{mean(values):,.{column.digits}f}"
+    if interval := scores.get("intervals", {}).get(key):
+        low, high = (f"{end:,.{column.digits}f}" for end in interval)
+        return f"{middle} [{low}, {high}]"
+    if len(values) == 1 or key in COSTS:
+        return middle
+    return f"{middle} ± {(max(values) - min(values)) / 2:.{column.digits}f}"
+
+
+def _by(rows: Sequence[Row], key: Callable[[Row], str]) -> dict[str, list[Row]]:
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups
+
+
+def _arrowed(column: TableColumn, direction: Direction) -> TableColumn:
+    """A column whose title tells which values are good."""
+    return replace(column, title=column.title + ARROWS[direction])
+
+
+def _seeds_of(rows: Sequence[Row]) -> str:
+    """The seeds of rows, in words; scenes as given have none."""
+    seeds = sorted({row.seed for row in rows if row.seed is not None})
+    return ", ".join(map(str, seeds)) or "none"
+
+
+def _makers_of(rows: Sequence[Row]) -> str:
+    """The sentence that says which rows are the paper's method and which the lifted one."""
+    titles: dict[str, list[str]] = {PAPER.said: [], LIFTED: []}
+    for row in rows:
+        named = titles.setdefault(row.made_by, [])
+        if row.title not in named:
+            named.append(row.title)
+    parts = (
+        f"of {said}: " + (", ".join(f"'{title}'" for title in named) or "none")
+        for said, named in titles.items()
+    )
+    return f"Rows {'; '.join(parts)}."
+
+
+def _of_new_rooms(rows: Sequence[Row]) -> str:
+    protocol = rows[0].scores["protocol"]
+    return (
+        f"{_makers_of(rows)} "
+        f"{protocol['n_generated']} generated rooms a run against {protocol['n_test']} test rooms "
+        f"of {protocol['shards']}; {protocol['n_train_rooms']} real training rooms; "
+        f"seeds {_seeds_of(rows)}."
+    )
+
+
+def _of_views(rows: Sequence[Row]) -> str:
+    scores = rows[0].scores
+    protocol = scores["protocol"]
+    surfaces, known = scores["with_surface"], protocol["known_model_share"]
+    objects = f"{scores['objects']} objects"
+    if surfaces < scores["objects"]:
+        objects += f" ({surfaces} of them with a known surface)"
+    told = [
+        f"{scores['images']} views of {scores['rooms']} test rooms of "
+        f"{Path(protocol['shards']).name}, {objects}",
+        "masks, classes, 2D boxes and cameras are given to every method",
+        "boxes are upright and along the room's axes, in the truth and in every answer",
+        f"seeds {_seeds_of(rows)}",
+    ]
+    if known is not None:
+        told.insert(1, f"{known:.0%} of the objects are models that training rooms hold, too")
+    return f"{_makers_of(rows)} {'; '.join(told)}."
+
+
+NEW_ROOMS = Form(
+    columns={m.key: _arrowed(m.column, m.direction) for m in (*METRICS, *DECODED) if m.column},
+    references={
+        "Independent objects, as boxes": "independent",
+        "Independent objects, with meshes": "independent_meshes",
+        "Shuffled furniture, as boxes": "shuffled",
+        "Real training rooms": "train_rooms",
+    },
+    variant="latents",
+    say=_of_new_rooms,
+)
+CD = TableColumn("CD (m)", 3, "CD: mean distance to the other surface, both ways added")
+SECONDS = TableColumn(
+    "s an image",
+    3,
+    "s an image: CPU seconds, all images together; [from, to]: 95% interval over rooms, all views "
+    "of a room together",
+)
+VIEWS = Form(
+    columns={
+        "box_iou_3d": _arrowed(TableColumn("3D box IoU", 3), "higher"),
+        "chamfer_l2_m": _arrowed(CD, "lower"),
+        "f_score": _arrowed(TableColumn("F at 5 cm", 3), "higher"),
+        "seconds": _arrowed(SECONDS, "lower"),
+    },
+    references={
+        "Nearest training room by masks": "nearest_room",
+        "Random training room": "random_room",
+    },
+    variant="shapes",
+    say=_of_views,
+)

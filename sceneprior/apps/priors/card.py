@@ -1,0 +1,146 @@
+"""The card of a packed prior: training data, scores and limitations."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from sceneprior import __version__
+from sceneprior.core.classes import VOID, label_set
+from sceneprior.core.files import read_json
+from sceneprior.core.settings import Section
+from sceneprior.core.shards import INDEX_NAME
+from sceneprior.evaluation.score_table import headings, score_rows
+from sceneprior.lifted.trained import TrainedLifted
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.training.method import Trained
+
+UNSTATED = (
+    "Not stated when this was packed. Ask where the data come from, and what their licence allows, "
+    "before you pass this on."
+)
+SHOWN = ("generated", "real training", "independent")
+"""Columns of the table of scores, in addition to that of the test rooms."""
+
+
+def model_card(
+    trained: Trained,
+    name: str,
+    about: str | None = None,
+    scores: dict[str, Any] | None = None,
+    latents: bool = False,
+    half: bool = False,
+) -> str:
+    """The card as Markdown.
+
+    Args:
+        name: Name of the prior, the card's heading.
+        about: Markdown on the data, their authors and licence, and the making of the run.
+        scores: Result of `eval-fid`, on rooms that were held out of training.
+        latents, half: The options of `pack`.
+    """
+    config = trained.config
+    packed = trained
+    if isinstance(trained, TrainedPrior) and not latents:
+        packed = replace(trained, logits=trained.logits[:0])
+    shards = Path(config.data.shards)
+    parts = [
+        # Metadata for the Hugging Face Hub.
+        "---\nlibrary_name: sceneprior\ntags: [3d, scene-synthesis, indoor-scenes]\n---",
+        f"# {name}",
+        f"A prior of rooms that `sceneprior` {__version__} learnt from {len(trained.room_ids)} "
+        f"training rooms. New rooms come from: {packed.distribution}.",
+        f'```python\nimport sceneprior\n\nprior = sceneprior.load("{name}.prior")\n'
+        'prior.sample(4, seed=0)[0].save("room.glb")\n```',
+        _classes(trained),
+        "Boxes and meshes in metres, y up, the floor at y = 0.",
+        "## Data, authors and licence",
+        (about or UNSTATED).strip(),
+        *_splits(shards),
+        "## Scores",
+        *_scores(scores),
+        "## Limits",
+        *_limits(trained, latents, half),
+        "## Settings",
+        f"```json\n{json.dumps(_settings(config), indent=1)}\n```",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _classes(trained: Trained) -> str:
+    """A sentence on the classes that the prior generates, and on those that it never does."""
+    name = trained.config.label_set
+    names = label_set(name)
+    sampler = trained.sampler if isinstance(trained, TrainedLifted) else None
+    made = names[VOID + 1 :] if sampler is None else [names[row] for row in sampler.drawn_classes]
+    lacking = [label for label in names[VOID + 1 :] if label not in made]
+    said = f"Classes that it makes (label set {name}): {', '.join(made)}."
+    if lacking:
+        said += f" It makes none of the label set's other classes: {', '.join(lacking)}."
+    return said
+
+
+def _settings(config: Section) -> dict[str, Any]:
+    data = config.model_dump(mode="json", by_alias=True)
+    data["data"]["shards"] = Path(data["data"]["shards"]).name
+    return data
+
+
+def _splits(shards: Path) -> list[str]:
+    """Table of the shards' splits, if the shards are available."""
+    if not (shards / INDEX_NAME).is_file():
+        return []
+    index = read_json(shards / INDEX_NAME)
+    rows = [
+        f"| {split} | {counts['rooms']} | {counts['views']} | {counts['objects']} |"
+        for split, counts in index.get("counts", {}).items()
+    ]
+    return ["\n".join(["| split | rooms | views | objects |", "| --- | --- | --- | --- |", *rows])]
+
+
+def _scores(scores: dict[str, Any] | None) -> list[str]:
+    if scores is None:
+        return ["Not measured when this was packed (`sceneprior pack --scores` adds them)."]
+    protocol = scores.get("protocol", {})
+    found = headings(scores)
+    chosen = [k for k, (title, _) in enumerate(found) if title in SHOWN or k == len(found) - 1]
+    columns = [" (".join(found[k]) + ")" for k in chosen]
+    table = [
+        "| " + " | ".join(["", *columns]) + " |",
+        "|" + " --- |" * (len(columns) + 1),
+        *(
+            f"| {title} ({unit}) | "
+            + " | ".join(cells[k].replace("\n", ", ") for k in chosen)
+            + " |"
+            for title, unit, *cells in score_rows(scores)
+        ),
+    ]
+    return [
+        f"`sceneprior eval-fid`, seed {protocol.get('seed')}, against {protocol.get('split')} "
+        "rooms, which training did not see; after a value its 95% interval, of "
+        f"{protocol.get('resamples')} resamples. Definitions: docs/evaluation.md of the package.",
+        "\n".join(table),
+    ]
+
+
+def _limits(trained: Trained, latents: bool, half: bool) -> list[str]:
+    limits = ["It makes rooms like its training rooms, of these classes, and no others."]
+    if isinstance(trained, TrainedPrior):
+        limits.append(
+            "Latents of the training rooms and their ids are in it: training rooms can be decoded "
+            "from it."
+            if latents
+            else "Latents of the training rooms are not in it: it draws no rooms near them "
+            "(`kernel`), and single images cannot be reconstructed."
+        )
+        if isinstance(trained, TrainedLifted) and trained.sampler is not None:
+            limits.append(
+                "Shapes were lifted from training masks, and are part of the weights: an object is "
+                "drawn as one of a few hundred of them. Objects stand in quarter turns."
+            )
+    if half:
+        limits.append(
+            "Large tensors are in half precision: rooms differ from those of the run, of which the "
+            "scores are."
+        )
+    return ["\n".join(f"- {limit}" for limit in limits)]

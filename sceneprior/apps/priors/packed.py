@@ -1,0 +1,235 @@
+"""The file of a packed prior: weights, settings and a card, without executable code.
+
+It is a zip, which any tool opens and which compresses zeros well, of three files:
+
+README.md            the card (apps/priors/card.py)
+config.json          the run's settings, the stage, the classes; `PackedPrior`
+model.safetensors    the weights
+
+A folder with these three files is the same prior, and so is a repository of the Hugging Face Hub.
+"""
+
+import io
+import json
+import zipfile
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load as read_tensors
+from safetensors.torch import save as tensors_to_bytes
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
+
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import json_text, write_whole
+from sceneprior.core.settings import Section, check_settings
+from sceneprior.lifted.trained import TrainedLifted
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.training.method import RunConfig, Trained
+
+FORMAT = "sceneprior-prior"
+VERSION = 1
+CARD, CONFIG, WEIGHTS = FILES = ("README.md", "config.json", "model.safetensors")
+LARGEST = {CARD: 2**20, CONFIG: 2**24, WEIGHTS: 2**31}
+"""Limits on the unpacked sizes in bytes; larger files are refused before they are read."""
+FEW = 4096
+"""Number of elements below which tensors are kept in full precision, since little is saved."""
+
+
+class Description(Section):
+    """The contents of config.json."""
+
+    format: str = FORMAT
+    version: int = VERSION
+    stage: str
+    classes: list[str]
+    """Names of the label set's classes."""
+    training_rooms: int
+    room_ids: list[str]
+    """Ids of the training rooms whose latents are packed; empty without latents."""
+    settings: dict[str, Any]
+    """The run's config, defaults included."""
+
+
+@dataclass(frozen=True)
+class PackedPrior:
+    """The contents of a packed prior."""
+
+    said: Description
+    tensors: dict[str, Tensor]
+    card: str
+
+
+def pack(trained: Trained, card: str, latents: bool = False, half: bool = False) -> PackedPrior:
+    """Pack a trained method for writing to a file.
+
+    Args:
+        latents: Keep the latents and ids of the training rooms. Without them, no `kernel` rooms can
+            be drawn, and no images reconstructed.
+        half: Store large tensors in half precision: a smaller file, with slightly other rooms.
+    """
+    networks: dict[str, Any] = {"prior": trained.prior}
+    rooms: list[str] = []
+    if isinstance(trained, TrainedPrior):
+        logits = trained.logits if latents else trained.logits[:0]
+        networks["latents"] = nn.Embedding.from_pretrained(logits)
+        networks["sampler"] = trained.sampler if isinstance(trained, TrainedLifted) else None
+        rooms = list(trained.room_ids) if latents and trained.remembers_rooms else []
+    tensors = {
+        f"{name}.{key}": value.half() if half and _is_large(value) else value
+        for name, network in networks.items()
+        if network is not None
+        for key, value in network.state_dict().items()
+    }
+    settings = trained.config.model_dump(mode="json", by_alias=True)
+    # Only the name of the data is kept, not the path on the user's machine.
+    settings["data"]["shards"] = Path(settings["data"]["shards"]).name
+    classes = list(label_set(trained.config.label_set))
+    count = len(trained.room_ids)
+    said = Description(
+        stage=trained.stage,
+        classes=classes,
+        training_rooms=count,
+        room_ids=rooms,
+        settings=settings,
+    )
+    return PackedPrior(said, tensors, card)
+
+
+def _is_large(tensor: Tensor) -> bool:
+    return tensor.dtype == torch.float32 and tensor.numel() >= FEW
+
+
+def unpack(packed: PackedPrior, config: RunConfig, source: str) -> Trained:
+    """Restore the trained method of a file; `config` is the validated `packed.said.settings`.
+
+    Raises:
+        InputError: the weights do not fit these settings.
+    """
+    try:
+        if packed.said.stage not in config.stage_names:
+            raise ValueError(f"no stage of its method is called '{packed.said.stage}'")
+        build = partial(config.networks, packed.said.stage, len(packed.said.room_ids))
+        # First on the meta device: settings may describe networks too large for any memory.
+        with torch.device("meta"), _ShapesAlone():
+            shapes = {name: tensor.shape for name, tensor in build().state_dict().items()}
+        found = {name: tensor.shape for name, tensor in packed.tensors.items()}
+        different = sorted(name for name in shapes | found if shapes.get(name) != found.get(name))
+        if different:
+            raise ValueError(f"{different[0]} and {len(different) - 1} others do not fit")
+        classes = label_set(config.label_set)
+        if packed.said.classes != list(classes):
+            raise ValueError(f"its classes are not those of {config.label_set}")
+        for name, tensor in packed.tensors.items():
+            _check(name, tensor, len(classes))
+        networks = build()
+        networks.load_state_dict(packed.tensors)
+        return config.trained(networks, packed.said.stage, tuple(packed.said.room_ids))
+    except (ValueError, RuntimeError, KeyError, TypeError, InputError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"{source}: its weights are not those of its settings ({reason}); have it packed again "
+            "with `sceneprior pack`."
+        ) from None
+
+
+class _ShapesAlone(TorchFunctionMode):
+    """Skips functions on the device `meta` that only set values.
+
+    Torch would import its compiler for them, which takes as long as the rest of loading a prior.
+    """
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if func is nn.init.normal_:
+            return kwargs["tensor"]
+        if func in (nn.functional.normalize, Tensor.div):
+            return args[0]
+        return torch.empty(*args) if func is torch.randn else func(*args, **kwargs)
+
+
+def _check(name: str, tensor: Tensor, classes: int) -> None:
+    """Raise ValueError for numbers that are not finite, or class indices out of range."""
+    if tensor.is_floating_point():
+        if not tensor.isfinite().all():
+            raise ValueError(f"{name} holds numbers that are not finite")
+    elif name.endswith("_class") and not ((tensor >= -1) & (tensor < classes)).all():
+        raise ValueError(f"{name} names classes that are not there")
+
+
+def write_packed(packed: PackedPrior, path: Path) -> None:
+    """Write a prior to one file, atomically; the same prior gives the same bytes.
+
+    Raises:
+        InputError: a part of it is larger than `read_packed` accepts.
+    """
+    described = packed.said.model_dump(mode="json")
+    tensors = {name: tensor.contiguous() for name, tensor in packed.tensors.items()}
+    contents = (packed.card.encode(), json_text(described).encode(), tensors_to_bytes(tensors))
+    for name, content in zip(FILES, contents, strict=True):
+        if len(content) > LARGEST[name]:
+            raise InputError(
+                f"{name} of {path} would have {len(content)} bytes, and a packed prior may have "
+                f"{LARGEST[name]} there; nothing was written. Shorten what --about names, if it is "
+                f"{CARD}."
+            )
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        for name, content in zip(FILES, contents, strict=True):
+            archive.writestr(_entry(name), content)
+    write_whole(Path(path), buffer.getvalue())
+
+
+def _entry(name: str) -> zipfile.ZipInfo:
+    entry = zipfile.ZipInfo(name)  # with its default date, 1980, for reproducible bytes
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    return entry
+
+
+def is_packed(path: Path) -> bool:
+    """True if a path is a packed prior: a file, or a folder of its files."""
+    return path.is_file() or (path / WEIGHTS).is_file()
+
+
+def read_packed(path: Path) -> PackedPrior:
+    """Read a packed prior. Nothing in it is executed, and nothing is written.
+
+    Raises:
+        InputError: the path is not a packed prior, or is damaged.
+    """
+    try:
+        card, described, weights = (_contents(path, name) for name in FILES)
+        data = json.loads(described)
+        if (data["format"], data["version"]) != (FORMAT, VERSION):
+            raise ValueError(
+                f"it says format '{data['format']}' version {data['version']}, not '{FORMAT}' "
+                f"version {VERSION}"
+            )
+        said = check_settings(Description, data, CONFIG)
+        return PackedPrior(said, read_tensors(weights), card.decode())
+    except Exception as error:  # a damaged file raises almost anything in zipfile and safetensors
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"{path} is no packed prior, or is damaged ({type(error).__name__}: {reason}); fetch "
+            "it again, or have it packed again with `sceneprior pack RUN --out FILE`."
+        ) from None
+
+
+def _contents(path: Path, name: str) -> bytes:
+    """Read one file of a packed prior, of at most `LARGEST` bytes."""
+    most = LARGEST[name]
+    if path.is_dir():
+        with (path / name).open("rb") as file:
+            content = file.read(most + 1)
+    else:
+        with zipfile.ZipFile(path) as archive, archive.open(name) as member:
+            content = member.read(most + 1)
+    if len(content) > most:
+        raise ValueError(f"{name} has more than {most} bytes")
+    return content

@@ -1,0 +1,62 @@
+"""Find a prior by path, by the name of a shipped prior, or by a repository of the Hub."""
+
+from pathlib import Path
+
+from sceneprior.apps.priors.packed import FILES
+from sceneprior.core.errors import InputError
+
+ENDING = ".prior"
+HUB = "hf://"
+
+
+def shipped_priors() -> dict[str, Path]:
+    """The priors that the package ships, by name.
+
+    >>> "procthor-bedroom" in shipped_priors()
+    True
+    """
+    return {path.stem: path for path in sorted(Path(__file__).parent.glob(f"*{ENDING}"))}
+
+
+def find_prior(where: str | Path) -> Path:
+    """The file or folder of a prior.
+
+    Args:
+        where: A path, which takes precedence; a name of `shipped_priors`; or `hf://OWNER/NAME`,
+            which is downloaded once and kept in the Hub's cache.
+
+    Raises:
+        InputError: no such prior exists, or the download fails.
+    """
+    text = str(where)
+    if text.startswith(HUB):
+        return _fetch(text)
+    path, shipped = Path(where), shipped_priors()
+    if path.exists():
+        return path
+    if text in shipped:
+        return shipped[text]
+    raise InputError(
+        f"No prior at {text}; give a run's folder (`sceneprior fit`), a file of `sceneprior pack`, "
+        f"{HUB}OWNER/NAME, or a name: {', '.join(shipped)}."
+    )
+
+
+def _fetch(where: str) -> Path:
+    """The folder of a repository of the Hub, downloaded unless it is in the cache."""
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError:
+        raise InputError(
+            f"{where} is on the Hugging Face Hub, which needs a package more: pip install "
+            "'sceneprior[hub]'."
+        ) from None
+    try:
+        return Path(snapshot_download(where.removeprefix(HUB), allow_patterns=list(FILES)))
+    except Exception as error:  # errors of the network, of the Hub, or an invalid name
+        reason = " ".join(str(error).split())[:160]
+        raise InputError(
+            f"{where} cannot be fetched ({type(error).__name__}: {reason}). Look at the name, be "
+            "online the first time, and for a private repository set HF_TOKEN or run `hf auth "
+            "login`."
+        ) from None

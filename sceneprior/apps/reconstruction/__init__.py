@@ -1,0 +1,1 @@
+"""Reconstruction of rooms from the instance masks of single images (section 5.2)."""

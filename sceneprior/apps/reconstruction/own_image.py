@@ -1,0 +1,358 @@
+"""Read an image of the user: its masks, their classes, and the camera."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json
+from sceneprior.core.geometry.intrinsics import odd_field_of_view
+from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
+from sceneprior.core.instances.checked import number_array
+from sceneprior.core.instances.coco import read_coco
+from sceneprior.core.instances.observations import observe
+from sceneprior.core.instances.pngs import read_mask
+from sceneprior.core.instances.tables import IdTable, read_class_table, tidy
+from sceneprior.core.observed_image import ObservedImage
+from sceneprior.core.shards import thinned
+
+SAME_CLASS = {
+    "bed": "double bed",
+    "bookcase": "bookshelf",
+    "closet": "wardrobe",
+    "couch": "sofa",
+    "dining chair": "chair",
+    "dining table": "table",
+    "double bed": "bed",
+    "night stand": "nightstand",
+    "nightstand": "night stand",
+    "office chair": "chair",
+    "refrigerator": "refridgerator",
+    "shelf": "shelves",
+    "shelves": "shelf",
+    "single bed": "bed",
+    "tv": "television",
+}
+"""Maps class names of other data sets (COCO, ADE20K) to names that a label set may have instead."""
+CAMERA_HEIGHTS_M = (1.0, 1.2, 1.4, 1.6, 1.8)
+"""Heights that are tried without a pose, from a sitting to a standing photographer."""
+LARGEST_PX = 640
+"""Longest side, about that of training images; larger images are subsampled."""
+FILM_DIAGONAL_MM = math.hypot(36, 24)
+UPSIDE_DOWN = 0.1
+"""Largest upward component of a camera's y axis (a sine); cameras above it are refused as upside
+down. Cameras that look straight down or up are accepted."""
+CAMERA_DISTANCE_M = 1.5
+"""Horizontal distance of the assumed camera from the middle of the room, which it faces."""
+
+
+class OwnImage(NamedTuple):
+    """The user's image, with its camera in the room frame."""
+
+    images: list[ObservedImage]
+    """The image; without a pose, one copy per assumed height and side of the room."""
+    notes: list[str]
+    """Sentences to print on assumptions and omissions."""
+
+
+def read_own_image(
+    mask: Path,
+    classes: Path | None,
+    intrinsics: str,
+    label_set_name: str,
+    pose: Path | None = None,
+    camera_height_m: float | None = None,
+    sides: int = QUARTERS,
+    gravity: str | None = None,
+) -> OwnImage:
+    """Read an image's masks and camera.
+
+    Classes outside the run's label set become those of `SAME_CLASS`, or void.
+
+    Args:
+        mask: A PNG of ids (`read_mask`), or COCO's JSON (`read_coco`), which has the classes too.
+        classes: Table of a PNG's classes (`read_class_table`).
+        intrinsics: See `read_intrinsics`.
+        label_set_name: The run's label set.
+        pose: File for `read_pose`. None assumes a `level_camera`.
+        camera_height_m: Height of an assumed camera; None tries all `CAMERA_HEIGHTS_M`.
+        sides: Number of sides of the room from which an assumed camera may look.
+        gravity: Direction of gravity for an assumed camera (`read_gravity`); None is level.
+
+    Raises:
+        InputError: a file is missing or cannot be used, the sizes differ, or no object is visible.
+    """
+    if mask.suffix.lower() == ".json":
+        if classes is not None:
+            raise InputError(f"{mask} has its classes in itself; leave out --classes {classes}.")
+        values, of_id = read_coco(mask)
+        classes = mask
+    elif classes is None:
+        raise InputError(f"{mask} needs --classes: a table of the class of each of its values.")
+    else:
+        values, of_id = read_mask(mask), read_class_table(classes)
+    of_id, notes = _known_by_another_name(of_id, label_set_name)
+    table = IdTable(of_id, label_set_name, str(classes))
+    camera = read_intrinsics(intrinsics, values.shape)
+    step = -(-max(values.shape) // LARGEST_PX)
+    seen = observe(table.ids(values[thinned(step)])[None], table.classes)
+    # Intrinsics are scaled to the subsampled image.
+    small = seen.instance_ids.shape[1:]
+    camera = np.diag([small[1] / values.shape[1], small[0] / values.shape[0], 1]) @ camera
+    if not len(seen.tracked):
+        raise InputError(
+            f"{mask} shows no object: none of its masks is of a class of the run and wider than "
+            f"4 pixels. Its values are {_some(np.unique(values))}; {classes} says what they are."
+        )
+    notes += table.notes
+    if table.unlisted:
+        notes.append(
+            f"{mask} has values that {classes} does not list, taken for void: "
+            f"{_some(sorted(table.unlisted))}"
+        )
+    if pose is None:
+        heights_m = CAMERA_HEIGHTS_M if camera_height_m is None else (camera_height_m,)
+        told = " or ".join(f"{height_m:g}" for height_m in heights_m)
+        notes.append(
+            f"without --pose the camera is {'level' if gravity is None else 'tilted as given'}, "
+            f"{told} m above the floor (what fits best is kept) and {CAMERA_DISTANCE_M:g} m from "
+            "the middle of the room, which it faces"
+        )
+        if gravity is None:
+            notes.append(
+                "level is a guess: of cameras that look down by 13 degrees in the median it put "
+                "objects 34 cm off (1.1 m with a given --camera-height), where --gravity put them "
+                "7 cm off; give --gravity x,y,z from the phone's accelerometer, or --pose"
+            )
+        tilt = np.eye(4) if gravity is None else tilted(read_gravity(gravity))
+        poses = [tilt @ level_camera(height, side) for height in heights_m for side in range(sides)]
+    else:
+        poses = [read_pose(pose)]
+    images = [
+        ObservedImage(
+            name=mask.stem,
+            label_set=label_set_name,
+            object_class=seen.object_class.astype(np.int64),
+            instance_ids=seen.instance_ids[0],
+            boxes=seen.boxes[0],
+            sides_clear=seen.sides_clear[0],
+            world_to_camera=world_to_camera,
+            intrinsics=camera,
+        )
+        for world_to_camera in poses
+    ]
+    return OwnImage(images, notes)
+
+
+def _known_by_another_name(
+    of_id: dict[int, str], label_set_name: str
+) -> tuple[dict[int, str], list[str]]:
+    """Rename classes by `SAME_CLASS` to those of the label set; notes list the renamed classes."""
+    known = {tidy(name) for name in label_set(label_set_name)}
+    taken: Counter[tuple[str, str]] = Counter()
+    for key, name in of_id.items():
+        other = SAME_CLASS.get(tidy(name))
+        if tidy(name) not in known and other in known:
+            taken[name, other] += 1
+            of_id = of_id | {key: other}
+    return of_id, [
+        f"the label set has no class {name}: taken for {other} ({count})"
+        for (name, other), count in sorted(taken.items())
+    ]
+
+
+def _some(values: Sequence[int] | np.ndarray) -> str:
+    return ", ".join(str(value) for value in values[:8]) + (", ..." if len(values) > 8 else "")
+
+
+def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
+    """`world_to_camera` of a level camera `height_m` above the floor that faces the room's middle.
+
+    The horizontal distance to the middle is `CAMERA_DISTANCE_M`. With `quarter` 0 the camera is on
+    the +z side and looks along -z; each quarter turns it about +y.
+    """
+    turn = quarter_rotation(quarter)
+    eye = turn @ np.array([0, height_m, CAMERA_DISTANCE_M])
+    pose = np.eye(4)
+    pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turn.T  # OpenCV: y down, z into the room
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return pose
+
+
+def read_gravity(text: str) -> np.ndarray:
+    """Unit vector of gravity in camera axes (x right, y down, z forward).
+
+    Args:
+        text: `x,y,z`, of any length, from a phone's accelerometer or a horizon detector.
+
+    Raises:
+        InputError: the text is not three finite numbers, or the camera is upside down.
+    """
+    try:
+        down = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        down = np.zeros(0)
+    if down.shape != (3,) or not np.isfinite(down).all() or not down.any():
+        raise InputError(
+            f"--gravity {text} is no direction; expected x,y,z in camera axes (x right, y down, z "
+            "forward): 0,1,0 of a level camera, 0,0.9,0.4 of one that looks down a little."
+        )
+    down = down / np.linalg.norm(down)
+    if down[1] < -UPSIDE_DOWN:
+        raise InputError(
+            f"--gravity {text} points up in the image: the camera is upside down. Expected camera "
+            "axes x right, y down, z forward."
+        )
+    return down
+
+
+def tilted(down: np.ndarray) -> np.ndarray:
+    """(4, 4) transform that tilts a level camera: the smallest rotation of +y to `down`.
+
+    `down` is the unit vector of gravity in camera axes. The transform is applied after the level
+    camera's `world_to_camera`.
+
+    >>> (tilted(np.array([0.0, 0.6, 0.8]))[:3, :3] @ [0, 1, 0]).round(6).tolist()
+    [0.0, 0.6, 0.8]
+    """
+    x, y, z = down
+    # Rodrigues' formula for rotating (0, 1, 0) to `down` about their common normal, (z, 0, -x).
+    cross = np.array([[0, x, 0], [-x, 0, -z], [0, z, 0]])
+    pose = np.eye(4)
+    pose[:3, :3] += cross + cross @ cross / (1 + y)
+    return pose
+
+
+def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
+    """Read intrinsics: `fov=73`, `35mm=26`, `fx,fy,cx,cy`, or a JSON file with `K` (3 x 3), or
+    with `fx`, `fy`, `cx` and `cy`.
+
+    `fov` is the horizontal field of view in degrees, `35mm` the 35 mm equivalent focal length in
+    millimetres, by the diagonal; for both the principal point is the image centre. A file may state
+    the size of its image (`width`, `height`), which is checked.
+
+    Raises:
+        InputError: the text is none of these, is not finite, or is for an image of another size.
+    """
+    expected = (
+        "fx,fy,cx,cy in pixels, fov=DEGREES, 35mm=MILLIMETRES, or a JSON file: "
+        '{"fx": 240, "fy": 240, "cx": 240, "cy": 180}'
+    )
+    path = Path(text)
+    in_file = path.suffix.lower() == ".json"
+    try:
+        if text.startswith(("fov=", "35mm=")):
+            focal = _focal_px(text, image_size)
+            data: Any = {"fx": focal, "fy": focal, "cx": image_size[1] / 2, "cy": image_size[0] / 2}
+        elif not in_file:
+            values = (float(part) for part in text.split(","))
+            data = dict(zip(("fx", "fy", "cx", "cy"), values, strict=True))
+        else:
+            data = read_json(path)
+            data = data if isinstance(data, dict) else {"K": data}
+            said = (data.get("height", image_size[0]), data.get("width", image_size[1]))
+            if said != image_size:
+                raise InputError(
+                    f"{path} is of an image of {said[1]} x {said[0]} pixels, but the mask has "
+                    f"{image_size[1]} x {image_size[0]}; scale fx, fy, cx and cy, or the mask."
+                )
+        if "K" not in data:
+            fx, fy, cx, cy = (data[key] for key in ("fx", "fy", "cx", "cy"))
+            data = {"K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]}
+        matrix = number_array(data["K"])
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError):
+        source = f"{path} holds" if in_file else f"--intrinsics {text} is"
+        raise InputError(f"{source} no intrinsics; expected {expected}.") from None
+    pinhole = (
+        matrix.shape == (3, 3)
+        and np.isfinite(matrix).all()
+        and min(matrix[0, 0], matrix[1, 1]) > 0
+        and matrix[0, 1] == 0
+        and np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1])
+    )
+    if not pinhole:
+        raise InputError(
+            f"--intrinsics {text} is no pinhole camera (fx and fy above 0, no skew); "
+            f"expected {expected}."
+        )
+    for focal in (matrix[0, 0], matrix[1, 1]):
+        if odd := odd_field_of_view(focal, image_size):
+            raise InputError(f"--intrinsics {text}: {odd}.")
+    width, height = image_size[::-1]
+    if not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
+        raise InputError(
+            f"The middle of the camera's image, cx = {matrix[0, 2]:g} and cy = {matrix[1, 2]:g}, "
+            f"is outside the mask of {width} x {height} pixels; --intrinsics {text} is of an image "
+            "of another size. Scale it, or the mask."
+        )
+    return matrix
+
+
+def _focal_px(text: str, image_size: tuple[int, int]) -> float:
+    kind, _, number = text.partition("=")
+    if kind == "35mm":
+        return float(number) * math.hypot(*image_size) / FILM_DIAGONAL_MM
+    angle = float(number)
+    if 0 < angle < math.pi:
+        raise InputError(
+            f"--intrinsics {text}: no camera sees so few degrees. {number}: radians? Give degrees: "
+            f"fov={math.degrees(angle):.3g}."
+        )
+    if not 0 < angle < 180:
+        raise ValueError("no field of view")
+    return image_size[1] / 2 / math.tan(math.radians(angle) / 2)
+
+
+def read_pose(path: Path) -> np.ndarray:
+    """Read a 4 x 4 pose from the JSON key `world_to_camera` or `camera_to_world`, OpenCV axes.
+
+    The world is the room frame: metres, y up, the origin in the middle of the floor (y = 0).
+
+    Returns:
+        `world_to_camera`.
+
+    Raises:
+        InputError: there is no such matrix, it is not a rigid transform, or the camera is upside
+            down or below the floor.
+    """
+    data = read_json(path)
+    try:
+        key = "world_to_camera" if "world_to_camera" in data else "camera_to_world"
+        matrix = number_array(data[key])
+        turn = matrix[:3, :3]
+        rigid = (
+            matrix.shape == (4, 4)
+            and np.isfinite(matrix).all()
+            and np.allclose(turn @ turn.T, np.eye(3), atol=1e-3)
+            and np.linalg.det(turn) > 0
+            and np.allclose(matrix[3], [0, 0, 0, 1])
+        )
+    except (IndexError, KeyError, TypeError, ValueError):
+        rigid = False
+    if not rigid:
+        raise InputError(
+            f'{path} holds no pose; expected {{"world_to_camera": 4 x 4}} or '
+            '{"camera_to_world": 4 x 4}, a rotation and a translation in metres, camera axes x '
+            "right, y down, z forward, in a room with y up and the floor at 0."
+        )
+    pose = matrix if key == "world_to_camera" else np.linalg.inv(matrix)
+    if pose[1, 1] > UPSIDE_DOWN:
+        raise InputError(
+            f"The camera of {path} is upside down: the room's y axis points down in its image. "
+            "Expected camera axes x right, y down, z forward (OpenCV; Blender's and OpenGL's have "
+            "y up and look along -z), and a room with y up."
+        )
+    eye_m = -pose[:3, :3].T @ pose[:3, 3]
+    if eye_m[1] <= 0:
+        raise InputError(
+            f"The camera of {path} is {-eye_m[1]:g} m below the floor, which is y = 0; move it, or "
+            "turn the room so that y is up."
+        )
+    return pose

@@ -1,0 +1,1 @@
+"""Retrieval of CAD models for the objects of a scene."""

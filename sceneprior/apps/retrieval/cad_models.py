@@ -1,0 +1,209 @@
+"""CAD models by class, from a 3D-FUTURE folder or from shards, with points on their surfaces.
+
+Points are sampled once per model and cached in one file; they are sampled again when the model's
+file changes.
+"""
+
+import hashlib
+import io
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import file_stamp, is_name, write_whole
+from sceneprior.core.furniture import MODEL_FILE, class_of_category, model_categories, read_obj
+from sceneprior.core.geometry.surfaces import surface_points
+from sceneprior.core.ground_truth import model_path, read_model
+from sceneprior.core.scene import Mesh
+from sceneprior.core.shards import INDEX_NAME, iterate_rooms
+
+POINTS = 1024
+"""Points per surface; on a surface of 2 m2, one every 4 to 5 cm."""
+SEED = 0
+FORMAT = 1
+"""Version of the cache file; increase it when the sampling of points changes."""
+_FLAT = 1e-9
+"""Ratio to the longest side up to which a side counts as flat, and is not scaled."""
+_MESHES_KEPT = 256
+
+Track = Callable[[list[str]], Iterable[str]]
+"""Wraps an iteration over model ids, for a progress bar."""
+
+
+@dataclass(frozen=True)
+class ClassModels:
+    """The models of one class."""
+
+    model_ids: tuple[str, ...]
+    points: Float[np.ndarray, "models points 3"]
+    """Points on the surface of each model, which is scaled to fill [-0.5, 0.5]^3."""
+
+
+@dataclass(frozen=True)
+class CadModels:
+    """Models by class, and a function that loads their meshes."""
+
+    by_class: Mapping[str, ClassModels]
+    load: Callable[[str], Mesh]
+    """Loads the mesh of a model id, scaled to fill [-0.5, 0.5]^3."""
+    broken: Mapping[str, str] = field(default_factory=dict)
+    """Ids of unusable models, each with the reason."""
+
+
+def default_cache() -> Path:
+    """The default cache folder: $XDG_CACHE_HOME/sceneprior, or ~/.cache/sceneprior."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sceneprior"
+
+
+def open_models(
+    folder: Path, label_set_name: str, cache: Path, points: int = POINTS, track: Track = iter
+) -> CadModels:
+    """Open the models of a label set's classes, with points on their surfaces.
+
+    Args:
+        folder: The models of 3D-FUTURE, or shards of `prep-front` with this label set.
+        cache: Folder for the cache file of points, which may be deleted at any time.
+
+    Raises:
+        InputError: the folder is neither, has shards of another label set, or has no model of
+            these classes.
+    """
+    folder = Path(folder)
+    names = label_set(label_set_name)
+    of_shards = (folder / INDEX_NAME).is_file()
+    labels_of = _labels_of_shards if of_shards else _labels_of_3d_future
+    labels = labels_of(folder, label_set_name)
+    read: Callable[[Path], Mesh] = read_model if of_shards else read_obj
+    files = {
+        model_id: model_path(folder, model_id) if of_shards else folder / model_id / MODEL_FILE
+        for model_id, label in sorted(labels.items())
+        if label != "void"
+    }
+    wanted = list(files)
+    drawn, broken = _points_of_models(folder, files, read, Path(cache), points, track)
+    by_class = {}
+    for label in names:
+        if of_class := [m for m in wanted if labels[m] == label and m not in broken]:
+            stack = np.stack([drawn[m] for m in of_class])
+            by_class[label] = ClassModels(tuple(of_class), stack)
+    if not by_class:
+        raise InputError(
+            f"{folder} holds no usable model of a class of {label_set_name} ({len(labels)} models "
+            f"listed, {len(broken)} of them broken); --models names a folder with their files."
+        )
+
+    def load(model_id: str) -> Mesh:
+        return unit_mesh(read(files[model_id]))
+
+    return CadModels(by_class, lru_cache(_MESHES_KEPT)(load), broken)
+
+
+def _labels_of_3d_future(folder: Path, label_set_name: str) -> dict[str, str]:
+    categories = model_categories(folder, "--models")
+    return {
+        model_id: class_of_category(category, label_set_name)
+        for model_id, category in categories.items()
+    }
+
+
+def _labels_of_shards(folder: Path, label_set_name: str) -> dict[str, str]:
+    """Classes of the models in training rooms, as assigned by the recipe of the shards."""
+    labels: dict[str, str] = {}
+    for shard, room_id in iterate_rooms(folder, "train"):
+        if shard.label_set != label_set_name:
+            raise InputError(
+                f"The rooms of {folder} are labelled '{shard.label_set}', but the scenes "
+                f"'{label_set_name}'; --models names shards with the scenes' classes."
+            )
+        truth = shard.read_ground_truth(room_id)
+        names = label_set(label_set_name)
+        labels |= {
+            model_id: names[label]
+            for model_id, label in zip(truth.model_ids, truth.object_class, strict=True)
+            if model_id  # ScanNet's objects have none
+        }
+    return labels
+
+
+def unit_mesh(mesh: Mesh) -> Mesh:
+    """Move and scale a mesh to fill [-0.5, 0.5]^3; a flat side becomes 0."""
+    vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
+    return Mesh(_into_unit_box(vertices, vertices), mesh.faces)
+
+
+def _into_unit_box(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    sides = high - low
+    scale = np.where(sides > _FLAT * sides.max(), 1 / np.maximum(sides, 1e-300), 0.0)
+    return (points - (low + high) / 2) * scale
+
+
+def _points_of_models(
+    folder: Path,
+    files: Mapping[str, Path],
+    read: Callable[[Path], Mesh],
+    cache: Path,
+    count: int,
+    track: Track,
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Sample `count` points of each model; returns them, and the reasons for broken models.
+
+    The points are cached in an npz in the folder `cache`, also when interrupted.
+    """
+    settings = f"{folder.resolve()}|{count}|{SEED}|{FORMAT}"
+    kept = cache / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
+    points, stamps = _read_points(kept, count)
+    todo: dict[str, tuple[int, int]] = {}
+    broken: dict[str, str] = {}
+    for model_id, path in files.items():
+        try:
+            if not is_name(model_id):
+                raise InputError(f"{ascii(model_id)[:60]} cannot be a folder's name")
+            stamp = file_stamp(path)
+            if stamps.get(model_id) != stamp:
+                todo[model_id] = stamp
+        except InputError as error:
+            broken[model_id] = str(error)
+    before = dict(stamps)
+    try:
+        for model_id in track(list(todo)):
+            try:
+                mesh = read(files[model_id])
+                vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
+                # Sampled before scaling to the unit box, which would enlarge thin sides.
+                drawn = surface_points(vertices, mesh.faces, count, SEED)
+                points[model_id] = _into_unit_box(drawn, vertices).astype(np.float32)
+                stamps[model_id] = todo[model_id]
+            except (InputError, ValueError) as error:
+                broken[model_id] = str(error)
+    finally:
+        if stamps != before:
+            ids, buffer = sorted(stamps), io.BytesIO()
+            np.savez(
+                buffer,
+                ids=np.array(ids),
+                stamps=np.array([stamps[m] for m in ids], np.int64),
+                points=np.stack([points[m] for m in ids]),
+            )
+            write_whole(kept, buffer.getvalue())
+    return points, broken
+
+
+def _read_points(
+    path: Path, count: int
+) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, int]]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            ids, stamps, points = file["ids"].tolist(), file["stamps"].tolist(), file["points"]
+    except Exception:  # absent or damaged: points are sampled again
+        return {}, {}
+    if points.shape != (len(ids), count, 3):
+        return {}, {}
+    return dict(zip(ids, points, strict=True)), dict(zip(ids, map(tuple, stamps), strict=True))

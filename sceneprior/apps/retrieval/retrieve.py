@@ -1,0 +1,209 @@
+"""Replace every object of a scene by the most similar CAD model (supplement, shape retrieval).
+
+A box whose centre is at most 1 m high is extruded to the floor. Every CAD model of the object's
+class is scaled into the box, turned by 0, 90, 180 and 270 degrees, and compared with the object's
+mesh; the model with the smallest Chamfer distance is taken. An object without a mesh is compared by
+its box.
+
+All models and turns are compared by few points, and the best of them by all points.
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels
+from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.surfaces import chamfer_mean, surface_points
+from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
+from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.render.topdown import box_mesh
+
+STANDS_M = 1.0
+"""Largest height of a box's centre for which the box is extruded to the floor."""
+ROUNDS = ((16, 1 / 3), (4, None))
+"""(step, share) of each preselection: compare every `step`-th point, and keep this share of the
+candidates; None keeps `KEEP`."""
+KEEP = 16
+"""Candidates (model and turn) compared by all points; None compares all: exact, and slow."""
+_BLOCK = 2**16
+"""Squared distances computed at a time, as many as fit in a core's cache."""
+
+
+class Retrieved(NamedTuple):
+    """The model retrieved for a box."""
+
+    model_id: str
+    turn_deg: int
+    """The yaw of the model in the room: 0, 90, 180 or 270; docs/conventions.md."""
+    distance_m: float
+    """Chamfer distance of `chamfer_mean`."""
+
+
+def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
+    """The scene with the mesh of the most similar CAD model in every box.
+
+    `extra["retrieval"]` holds {"model_id", "turn_deg", "distance_m"} for each object, in their
+    order. It is None for a class without models; such an object keeps its mesh, extruded with its
+    box.
+
+    Raises:
+        InputError: a box is not finite or has a negative side.
+    """
+    _check(scene)
+    objects: list[SceneObject] = []
+    found: list[dict[str, object] | None] = []
+    for item in scene.objects:
+        box, told = extruded(item), None
+        if of_class := models.by_class.get(item.label):
+            best = most_similar(box, of_class, keep)
+            mesh = placed(models.load(best.model_id), box, best.turn_deg)
+            objects.append(replace(box, mesh=mesh, turned=None))
+            told = best._asdict() | {"distance_m": round(best.distance_m, 5)}
+        else:
+            objects.append(item if box is item else item.in_box(box.center_m, box.size_m))
+        found.append(told)
+    return replace(scene, objects=tuple(objects), extra={**scene.extra, "retrieval": found})
+
+
+def retrieve_all(scenes: Sequence[Scene], models: CadModels) -> Iterator[Scene]:
+    """`retrieve` for many scenes, on all cores, in their order."""
+    # One thread per core, each with one torch thread, since the matrix products are small.
+    with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as p:
+        yield from p.map(lambda scene: retrieve(scene, models), scenes)
+
+
+def retrieval_report(scenes: Sequence[Scene], models: CadModels) -> dict[str, Any]:
+    """Report on retrieved scenes: models and objects by class, distances, broken models."""
+    pairs = [
+        (item.label, found)
+        for scene in scenes
+        for item, found in zip(scene.objects, scene.extra["retrieval"], strict=True)
+    ]
+    classes = {}
+    for label in sorted({label for label, _ in pairs}):
+        given = [found for name, found in pairs if name == label and found]
+        distances = [found["distance_m"] for found in given]
+        there = models.by_class.get(label)
+        classes[label] = {
+            "objects": sum(name == label for name, _ in pairs),
+            "models": len(there.model_ids) if there else 0,
+            "models_used": len({found["model_id"] for found in given}),
+            "mean_distance_m": round(float(np.mean(distances)), 5) if given else None,
+        }
+    return {
+        "format": "sceneprior-retrieval",
+        "version": 1,
+        "scenes": len(scenes),
+        "objects": len(pairs),
+        "objects_with_a_model": sum(found is not None for _, found in pairs),
+        "classes": classes,
+        "classes_without_models": [label for label in classes if not classes[label]["models"]],
+        "broken_models": dict(models.broken),
+    }
+
+
+def extruded(item: SceneObject) -> SceneObject:
+    """The object with its box's lower face on the floor if its centre is at most 1 m high."""
+    (x, y, z), (width, height, depth) = item.center_m, item.size_m
+    top = y + height / 2
+    if y > STANDS_M or top <= 0:
+        return item
+    return replace(item, center_m=(x, top / 2, z), size_m=(width, top, depth), turned=None)
+
+
+def placed(unit: Mesh, item: SceneObject, turn_deg: int) -> Mesh:
+    """A mesh that fills [-0.5, 0.5]^3, turned and scaled into an object's box."""
+    turned = unit.vertices_m @ quarter_rotation(turn_deg // 90).T
+    return Mesh(turned * np.asarray(item.size_m) + np.asarray(item.center_m), unit.faces)
+
+
+def most_similar(item: SceneObject, models: ClassModels, keep: int | None = KEEP) -> Retrieved:
+    """The model and turn of a class that are nearest to an object by Chamfer distance."""
+    count = models.points.shape[1]
+    views = _turned_views(_points_of(item, count) - np.asarray(item.center_m), item.size_m)
+    choices = np.arange(len(models.model_ids) * QUARTERS)
+    for step, share in ROUNDS if keep is not None else ():
+        going_on = max(keep or 0, int(len(choices) * share) if share else 0)
+        if going_on < len(choices):
+            rough = _rough_distances(views, models.points, choices, step)
+            # A stable sort keeps the first of equal models on every machine.
+            choices = choices[np.argsort(rough, kind="stable")[:going_on]]
+    trees = [cKDTree(points) for points, _ in views]
+    distances = []
+    for choice in choices:
+        model, turn = divmod(int(choice), QUARTERS)
+        points, size = views[turn]
+        distances.append(chamfer_mean(points, models.points[model] * size, trees[turn]))
+    best = int(np.argmin(distances))
+    model, turn = divmod(int(choices[best]), QUARTERS)
+    return Retrieved(models.model_ids[model], 90 * turn, distances[best])
+
+
+def _points_of(item: SceneObject, count: int) -> np.ndarray:
+    for mesh in (item.mesh, box_mesh(item.center_m, item.size_m)):
+        try:
+            if mesh is not None:
+                return surface_points(mesh.vertices_m, mesh.faces, count)
+        except ValueError:  # no area: a collapsed mesh, or a box of size 0
+            continue
+    return np.tile(np.asarray(item.center_m, dtype=np.float64), (count, 1))
+
+
+def _turned_views(
+    points: Float[np.ndarray, "points 3"], size_m: Sequence[float]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The object's points and box sizes, turned back by each quarter turn.
+
+    Turning the object back instead of turning the models gives the same distances, and the models'
+    points are used as stored.
+    """
+    back = [quarter_rotation(quarters).T for quarters in range(QUARTERS)]
+    return [(points @ turn.T, np.abs(turn @ np.asarray(size_m, dtype=np.float64))) for turn in back]
+
+
+def _rough_distances(
+    views: list[tuple[np.ndarray, np.ndarray]],
+    models: Float[np.ndarray, "models points 3"],
+    choices: Int[np.ndarray, " choices"],
+    step: int,
+) -> Float[np.ndarray, " choices"]:
+    """`chamfer_mean` by every `step`-th point, for preselection."""
+    rough = np.empty(len(choices), dtype=np.float32)
+    few = models[:, ::step]
+    for turn, (points, size) in enumerate(views):
+        ours = torch.from_numpy(points[::step].astype(np.float32))
+        # |a - b|^2 as one product: [b, 1, |b|^2] . [-2a, |a|^2, 1].
+        right = torch.cat([-2 * ours, _squares(ours), torch.ones(len(ours), 1)], dim=1).T
+        rows = np.flatnonzero(choices % QUARTERS == turn)
+        at_once = max(1, _BLOCK // right.shape[1] ** 2)
+        for start in range(0, len(rows), at_once):
+            part = rows[start : start + at_once]
+            theirs = torch.from_numpy(few[choices[part] // QUARTERS] * size.astype(np.float32))
+            left = torch.cat([theirs, torch.ones(*theirs.shape[:2], 1), _squares(theirs)], dim=2)
+            squared = left @ right
+            there, back = (squared.amin(dim=dim).clamp(min=0).sqrt().mean(dim=1) for dim in (1, 2))
+            rough[part] = ((there + back) / 2).numpy()
+    return rough
+
+
+def _squares(points: Tensor) -> Tensor:
+    return points.square().sum(dim=-1, keepdim=True)
+
+
+def _check(scene: Scene) -> None:
+    for row, item in enumerate(scene.objects):
+        numbers = np.asarray([*item.center_m, *item.size_m], dtype=np.float64)
+        if not np.isfinite(numbers).all() or (numbers[3:] < 0).any():
+            raise InputError(
+                f"{scene.name}: the box of object {row} ({item.label}) is {numbers.tolist()}; "
+                "expected a finite centre and sides that are not negative."
+            )

@@ -1,0 +1,105 @@
+"""Write rooms to a folder: scene files, an overview picture and latents."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from rich.console import Console
+from rich.progress import Progress
+
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import PARTS, check_writable, write_whole
+from sceneprior.core.scene import FORMAT, Scene
+from sceneprior.paper.sampling import LATENTS_FILE, write_latents
+from sceneprior.render.offscreen import Renderer
+from sceneprior.render.pictures import contact_sheet, png_bytes
+from sceneprior.render.scene_files import check_names, format_of, save_scene
+from sceneprior.render.topdown import perspective
+
+PAGE_FILE = "rooms.html"
+OVERVIEW_ROOMS = 12
+OVERVIEW_TILE = (240, 320)
+"""Height and width of one room of the overview, in pixels."""
+
+
+def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> None:
+    """Write `<name>.glb`, `<name>.png` and `<name>.json`; see `save_scene`.
+
+    The JSON is written last, so that a JSON implies that the other two files exist.
+
+    Raises:
+        InputError: `name` is empty or holds a path separator.
+    """
+    if not name or Path(name).name != name:
+        raise InputError(f"'{name}' cannot name a scene's files; use a plain name such as room_0.")
+    for ending in (".glb", ".png", ".json"):
+        save_scene(scene, Path(folder) / f"{name}{ending}", renderer)
+
+
+def check_free(folder: Path, overwrite: bool = False) -> None:
+    """Check that a folder can be written, and is empty unless `overwrite` is true.
+
+    Raises:
+        InputError: the path is a file, or the folder is not empty and `overwrite` is false.
+        OSError: the folder cannot be written; `filename` is set.
+    """
+    folder = Path(folder)
+    if folder.is_file():
+        raise InputError(f"{folder} is a file; name a folder.")
+    if not overwrite and folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder} is not empty; add --overwrite or name another folder.")
+    check_writable(folder)
+
+
+def clear_scenes(folder: Path) -> None:
+    """Delete the old scenes of a folder, so that they are not taken for new ones.
+
+    Deleted are scene JSONs with their GLBs and PNGs, latents, the page, and the partial files of
+    interrupted writers; all other files stay.
+    """
+    for path in Path(folder).glob("*.json"):
+        if format_of(path) == FORMAT:
+            for ending in (".glb", ".png", ".json"):
+                path.with_suffix(ending).unlink(missing_ok=True)
+    for name in (LATENTS_FILE, PAGE_FILE):
+        (Path(folder) / name).unlink(missing_ok=True)
+    for path in Path(folder).glob(PARTS):
+        path.unlink(missing_ok=True)
+
+
+def write_scenes(
+    scenes: Sequence[Scene],
+    folder: Path,
+    renderer: Renderer,
+    overwrite: bool = False,
+) -> None:
+    """Write scenes to a folder (see `check_free`).
+
+    Each scene is written under its own name. `overview.png` shows the first few, and `latents.npz`
+    is written if all scenes are decoded from latents.
+
+    Raises:
+        InputError: the folder is not empty and `overwrite` is false, or scene names are not unique
+            or no file names.
+    """
+    check_free(folder, overwrite)
+    check_names(scenes)
+    clear_scenes(folder)
+    with ThreadPoolExecutor(os.cpu_count()) as pool, Progress(console=Console(stderr=True)) as bar:
+        # Drawing, compression and disk access run in parallel, except that GL has one thread.
+        each = pool.map if renderer.kind == "software" else map
+        done = each(lambda scene: write_scene(scene, folder, scene.name, renderer), scenes)
+        for _ in bar.track(done, total=len(scenes), description="Writing scenes"):
+            pass
+    sheet = overview(scenes[:OVERVIEW_ROOMS], renderer)
+    write_whole(Path(folder) / "overview.png", png_bytes(sheet))
+    write_latents(folder, scenes)
+
+
+def overview(scenes: Sequence[Scene], renderer: Renderer) -> UInt8[np.ndarray, "height width 3"]:
+    """Contact sheet of one or more rooms from above a corner, four per row, coloured by class."""
+    tiles = [perspective(scene, renderer, OVERVIEW_TILE) for scene in scenes]
+    return contact_sheet(tiles, min(4, len(tiles)))

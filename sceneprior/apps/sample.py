@@ -1,0 +1,66 @@
+"""Sampling of new rooms from a run of any method."""
+
+from collections.abc import Sequence
+
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.core.seeds import check_seed
+from sceneprior.core.threads import single_threaded
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.sampled import drawn_by_sampler, sample_scenes
+from sceneprior.paper.decode import decode_latents
+from sceneprior.paper.sampling import draw_latents, scene_names
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.training.method import Trained, TrainedReconstructor
+
+
+@single_threaded()
+def sample_rooms(
+    trained: Trained, count: int, seed: int, distribution: str | None = None
+) -> list[Scene]:
+    """Sample new rooms from a run of any method; the same seed gives the same rooms.
+
+    Args:
+        distribution: `sampler`, or a distribution of latents; None takes the run's default.
+
+    Raises:
+        InputError: the method generates no rooms, or has neither a sampler nor latents but a
+            distribution is given.
+    """
+    if isinstance(trained, TrainedReconstructor):
+        raise InputError(
+            f"`method: {trained.config.method}` answers images and makes no new rooms; use "
+            "`sceneprior reconstruct` or `eval-svr`, or a run of another method."
+        )
+    check_seed(seed)
+    names = scene_names(count, seed)
+    if isinstance(trained, TrainedPrior):
+        if (with_sampler := drawn_by_sampler(trained, distribution)) is not None:
+            return sample_scenes(with_sampler, names, seed)
+        z, _ = draw_latents(trained, count, seed, distribution)
+        return decode_latents(trained, z, names)
+    if distribution is not None:
+        raise InputError(
+            f"A distribution says where latents of rooms come from, but `method: "
+            f"{trained.config.method}` has none; leave out --distribution {distribution}."
+        )
+    rooms = trained.prior.sample(count, seed)
+    return boxes_to_scenes(rooms, trained.config.label_set, names)
+
+
+def boxes_to_scenes(rooms: RoomBoxes, label_set_name: str, names: Sequence[str]) -> list[Scene]:
+    """Scenes of boxes without meshes; `extra` holds the objects' yaws, if they are known."""
+    classes = label_set(label_set_name)
+    scenes = []
+    for row, name in enumerate(names):
+        real = rooms.is_object[row]
+        labels, boxes = rooms.object_class[row, real].tolist(), rooms.boxes_m[row, real].tolist()
+        objects = tuple(
+            SceneObject(classes[label], tuple(box[:3]), tuple(box[3:]))
+            for label, box in zip(labels, boxes, strict=True)
+        )
+        yaw_rad = rooms.yaw_rad
+        extra = {} if yaw_rad is None else {"yaw_rad": yaw_rad[row, real].tolist()}
+        scenes.append(Scene(name, label_set_name, objects, extra=extra))
+    return scenes

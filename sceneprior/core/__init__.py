@@ -1,0 +1,1 @@
+"""Code shared by all other folders: scenes, views, shards, classes, settings, geometry."""

@@ -1,0 +1,140 @@
+"""Reads furniture models in 3D-FUTURE's layout: their categories, classes and meshes.
+
+    <folder>/model_info.json        or model_info_revised.json: the category of each model
+    <folder>/<model id>/raw_model.obj
+
+It is used to prepare rooms and to retrieve CAD models for generated rooms.
+"""
+
+import csv
+import functools
+from pathlib import Path
+
+import numpy as np
+
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json
+from sceneprior.core.scene import Mesh
+
+MODEL_FILE = "raw_model.obj"
+CATEGORY_TABLE = Path(__file__).with_name("front3d_categories.csv")
+
+
+def model_info_path(folder: Path, option: str = "--future") -> Path:
+    """Path of 3D-FUTURE's list of models; `option` is the command-line option named in errors.
+
+    Raises:
+        InputError: the folder is missing, or has no list.
+    """
+    if not folder.is_dir():
+        raise InputError(f"No folder at {folder}; {option} names the folder of 3D-FUTURE models.")
+    for name in ("model_info.json", "model_info_revised.json"):
+        if (folder / name).is_file():
+            return folder / name
+    raise InputError(
+        f"{folder} has no model_info.json (nor model_info_revised.json), so it is not a folder "
+        f"of 3D-FUTURE models; {option} usually ends in 3D-FUTURE-model."
+    )
+
+
+def model_categories(folder: Path, option: str = "--future") -> dict[str, str]:
+    """Category by model id: lower case, "a / b" as "a/b"; "others" if the release has null.
+
+    Raises:
+        InputError: the folder is missing, or is not 3D-FUTURE's.
+    """
+    path = model_info_path(folder, option)
+    data = read_json(path)
+    try:
+        categories = {str(row["model_id"]): row.get("category") for row in data}
+    except (TypeError, KeyError, AttributeError) as error:
+        raise InputError(
+            f"{path} is not 3D-FUTURE's list of models ({type(error).__name__}: {error})."
+        ) from None
+    return {
+        model_id: "others" if text is None else tidy_category(str(text))
+        for model_id, text in categories.items()
+    }
+
+
+def tidy_category(text: str) -> str:
+    """Normalise a category as in the table: lower case, "a / b" as "a/b".
+
+    >>> tidy_category("King-size Bed")
+    'king-size bed'
+    """
+    return text.strip().lower().replace(" / ", "/")
+
+
+_COLUMNS = {
+    "front3d_bedroom": ("bedroom_class",),
+    "front3d_living": ("living_room_class",),
+    "front3d_dining": ("living_room_class",),
+    "front3d_library": ("living_room_class",),
+}
+
+
+@functools.cache
+def category_table() -> dict[str, dict[str, str]]:
+    """Rows of front3d_categories.csv by 3D-FUTURE's category.
+
+    A row has the class in bedrooms (`bedroom_class`) and in living rooms (`living_room_class`).
+    """
+    with CATEGORY_TABLE.open(newline="") as file:
+        return {row["model_info_category"]: row for row in csv.DictReader(file)}
+
+
+def class_of_category(category: str, label_set_name: str) -> str:
+    """Class of a category in a label set; `void` if it has none.
+
+    The label sets of 3D-FRONT follow the paper's table. In any other label set, the first of these
+    that it contains is the class: the category itself, its bedroom class, its living-room class.
+
+        >>> class_of_category("king-size bed", "front3d_bedroom")
+        'double_bed'
+        >>> class_of_category("dining table", "void,sink,table")
+        'table'
+    """
+    names = label_set(label_set_name)
+    if label_set_name not in _COLUMNS and category in names:
+        return category
+    row = category_table().get(category, {})
+    for column in _COLUMNS.get(label_set_name, ("bedroom_class", "living_room_class")):
+        found = row.get(column, "void")
+        if found != "void" and found in names:
+            return found
+    return "void"
+
+
+def read_obj(path: Path) -> Mesh:
+    """Read the triangles of a Wavefront OBJ, without materials, normals and unused vertices.
+
+    Raises:
+        InputError: the file cannot be read, or holds no triangle.
+    """
+    vertices: list[list[str]] = []
+    polygons: list[list[str]] = []
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            for line in file:
+                if line.startswith("v "):
+                    vertices.append(line.split()[1:4])
+                elif line.startswith("f "):
+                    polygons.append([corner.split("/", 1)[0] for corner in line.split()[1:]])
+        points = np.array(vertices, dtype=np.float32).reshape(-1, 3)
+        corners = [
+            (polygon[0], polygon[i - 1], polygon[i])
+            for polygon in polygons
+            for i in range(2, len(polygon))
+        ]
+        faces = np.array(corners, dtype=np.int64).reshape(-1, 3)
+        # OBJ indices start at 1; negative ones count from the end (correct for a single group).
+        faces = np.where(faces < 0, faces + len(points), faces - 1)
+        used, faces = np.unique(faces, return_inverse=True)
+        points = points[used]
+    except (OSError, ValueError, IndexError, OverflowError) as error:
+        raise InputError(f"{path.parent.name}/{path.name} cannot be read ({error})") from None
+    if not len(used) or used[0] < 0 or not np.isfinite(points).all():
+        raise InputError(f"{path.parent.name}/{path.name} holds no usable triangles")
+    return Mesh(points, faces.reshape(-1, 3).astype(np.int32))

@@ -1,0 +1,1 @@
+"""Pure functions on cameras, boxes and meshes, without weights."""

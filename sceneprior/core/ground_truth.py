@@ -1,0 +1,199 @@
+"""Reference scenes: the ground-truth rooms of shards, and random baselines drawn from them."""
+
+import hashlib
+import json
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from sceneprior.core.classes import VOID, label_set
+from sceneprior.core.errors import InputError, ShardError
+from sceneprior.core.scene import Mesh, Scene, SceneObject, mesh_of_file
+from sceneprior.core.shards import MODELS_FOLDER, Shard, iterate_rooms
+
+
+def reference_scenes(
+    shards: Path,
+    split: str,
+    limit: int | None = None,
+    tracked_only: bool = False,
+    meshes: bool = True,
+) -> list[Scene]:
+    """Ground-truth rooms of a split, in the order of the shards.
+
+    Args:
+        shards: Folder of view shards with ground truth; meshes lie in its `models/`.
+        tracked_only: Leave out furniture that no camera saw, for comparison with decoded training
+            rooms.
+        meshes: Also read the meshes; boxes alone take much less memory.
+
+    Raises:
+        ShardError: a shard, the ground truth or a model file is missing or damaged.
+    """
+    return [
+        reference_scene(*room, shards, tracked_only, meshes)
+        for room in islice(iterate_rooms(shards, split), limit)
+    ]
+
+
+def known_in_3d(shards: Path, split: str) -> bool:
+    """Test whether a split has rooms and all have ground truth; rooms of posed pictures do not."""
+    return any((Path(shards) / split).glob("*.h5")) and all(
+        shard.has_ground_truth(room_id) for shard, room_id in iterate_rooms(shards, split)
+    )
+
+
+def models_of(shards: Path, split: str) -> dict[str, tuple[str, ...]]:
+    """Model ids of the furniture in each room; "" for a piece without a model."""
+    return {
+        room_id: shard.read_ground_truth(room_id).model_ids
+        for shard, room_id in iterate_rooms(shards, split)
+    }
+
+
+def stream_scenes(shards: Path, split: str, rows: Collection[int]) -> Iterator[Scene]:
+    """Yield the rooms with these indices in `reference_scenes`, with meshes, one at a time."""
+    for row, room in enumerate(iterate_rooms(shards, split)):
+        if row in rows:
+            yield reference_scene(*room, shards)
+
+
+def independent_rooms(
+    real: Sequence[Scene], count: int, seed: int, with_meshes: bool = False
+) -> list[Scene]:
+    """Sample rooms from the marginals of real rooms: a baseline without object relations.
+
+    The number of objects is that of a random real room. Each object is drawn at random from all
+    objects of all rooms, with its class and position. Single objects are therefore real, but
+    independent of each other.
+
+    `with_meshes` keeps the real meshes, a stronger baseline; otherwise objects are boxes.
+
+    Raises:
+        InputError: no real room holds an object.
+    """
+    pool = [item for scene in real for item in scene.objects]
+    if not pool:
+        raise InputError(
+            "Independent rooms are drawn from the objects of real rooms, but none of the "
+            f"{len(real)} rooms given holds any; give the training rooms of prepared shards."
+        )
+    generator = np.random.default_rng(seed)
+    sizes = generator.choice([len(scene.objects) for scene in real], size=count)
+    rooms = [
+        Scene(
+            f"independent_{index:04d}",
+            real[0].label_set,
+            tuple(pool[pick] for pick in generator.integers(len(pool), size=size)),
+        )
+        for index, size in enumerate(sizes)
+    ]
+    return rooms if with_meshes else [room.without_meshes() for room in rooms]
+
+
+def shuffled_rooms(real: Sequence[Scene], count: int, seed: int) -> list[Scene]:
+    """Real rooms with shuffled positions: a baseline with real contents but random layouts.
+
+    Each object, as a box, takes the x and z of an object drawn at random from all rooms, and keeps
+    its own height.
+
+    Args:
+        real: Rooms with at least one object in total.
+        count: Number of rooms, drawn without replacement; at most as many as there are real ones.
+    """
+    generator = np.random.default_rng(seed)
+    places = [item.center_m for scene in real for item in scene.objects]
+    rooms: list[Scene] = []
+    for row in generator.permutation(len(real))[:count]:
+        chosen = generator.integers(len(places), size=len(real[row].objects))
+        objects = tuple(
+            replace(item, center_m=(places[pick][0], item.center_m[1], places[pick][2]), mesh=None)
+            for item, pick in zip(real[row].objects, chosen, strict=True)
+        )
+        rooms.append(Scene(f"shuffled_{len(rooms):04d}", real[row].label_set, objects))
+    return rooms
+
+
+def split_fingerprint(shards: Path, split: str) -> str:
+    """SHA-256 of everything that renderings of a split depend on: ids, objects, model files."""
+    digest = hashlib.sha256()
+    models: set[str] = set()
+    for shard, room_id in iterate_rooms(shards, split):
+        truth = shard.read_ground_truth(room_id)
+        digest.update(json.dumps([shard.label_set, room_id, truth.model_ids]).encode())
+        for array in (truth.object_class, truth.centers_m, truth.sizes_m, truth.model_to_room):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        models.update(model_id for model_id in truth.model_ids if model_id)
+    for model_id in sorted(models):
+        path = Path(shards) / MODELS_FOLDER / f"{model_id}.ply"
+        digest.update(hashlib.sha256(path.read_bytes() if path.is_file() else b"").digest())
+    return digest.hexdigest()
+
+
+def reference_scene(
+    shard: Shard, room_id: str, shards: Path, tracked_only: bool = False, meshes: bool = True
+) -> Scene:
+    """Ground truth of one room of an open shard, without void furniture; see `reference_scenes`."""
+    truth = shard.read_ground_truth(room_id)
+    names = label_set(shard.label_set)
+    count = len((shard.read_room(room_id) if tracked_only else truth).object_class)
+    objects = []
+    for row in np.flatnonzero(truth.object_class[:count] != VOID):
+        mesh = None
+        if meshes:
+            mesh = _placed(Path(shards), truth.model_ids[row], truth.model_to_room[row])
+        label = names[int(truth.object_class[row])]
+        box = _triple(truth.centers_m[row]), _triple(truth.sizes_m[row])
+        objects.append(SceneObject(label, *box, mesh))
+    floor = np.asarray(truth.floor_m, dtype=np.float64)
+    extra = {"room_id": room_id, "height_m": truth.height_m}
+    return Scene(room_id, shard.label_set, tuple(objects), floor, extra)
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return (x, y, z)
+
+
+def _placed(shards: Path, model_id: str, model_to_room: np.ndarray) -> Mesh | None:
+    if not model_id:
+        return None
+    model = read_model(model_path(shards, model_id))
+    matrix = np.asarray(model_to_room, dtype=np.float64)
+    vertices = model.vertices_m @ matrix[:3, :3].T + matrix[:3, 3]
+    # A mirrored placement reverses the orientation of all triangles.
+    mirrored = np.linalg.det(matrix[:3, :3]) < 0
+    return Mesh(vertices, model.faces[:, ::-1] if mirrored else model.faces)
+
+
+def model_path(shards: Path, model_id: str) -> Path:
+    """Path of a model in a folder of shards."""
+    return shards / MODELS_FOLDER / f"{model_id}.ply"
+
+
+@lru_cache(maxsize=4096)
+def read_model(path: Path) -> Mesh:
+    """Read a model of a folder of shards (`model_path`) in its own frame.
+
+    Raises:
+        ShardError: the file is missing or damaged.
+    """
+    if not path.is_file():
+        raise ShardError(
+            f"{path} is missing, but a room's ground truth stands on it. Keep `models/` beside "
+            "the shards, or run `sceneprior prep-front` again."
+        )
+    import trimesh
+
+    try:
+        model = trimesh.load_mesh(path, process=False)
+        return mesh_of_file(np.asarray(model.vertices, dtype=np.float64), model.faces)
+    except Exception as error:  # the type that trimesh raises depends on the damage
+        raise ShardError(
+            f"{path} is not a triangle mesh ({type(error).__name__}: {error}). Delete it and run "
+            "`sceneprior prep-front` again."
+        ) from None

@@ -1,0 +1,67 @@
+"""Validates plain data from files against models."""
+
+import reprlib
+from typing import Any, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ValidationError
+
+from sceneprior.core.errors import InputError
+
+_M = TypeVar("_M", bound=BaseModel)
+_LONGEST = 60
+_REPR = reprlib.Repr()
+_REPR.maxstring = _LONGEST
+
+
+def checked(model: type[_M], data: dict[str, Any], where: str) -> _M:
+    """Validate plain data as a model.
+
+    Raises:
+        InputError: the data is invalid; the message names the key.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        if first["type"] == "value_error":
+            raise InputError(f"{where}: {first['ctx']['error']}") from None
+        key, reason = ".".join(map(str, first["loc"])), first["msg"]
+        raise InputError(
+            f"{where}: {key} is {shown(first['input'])}; {reason[:1].lower()}{reason[1:]}."
+        ) from None
+
+
+def number_array(value: Any) -> np.ndarray:
+    """Convert nested lists of numbers to float64.
+
+    Raises:
+        TypeError: an entry is a text, null or too large a number.
+        ValueError: rows have different lengths.
+    """
+    array = np.array(value)
+    if array.dtype.kind not in "iuf":
+        raise TypeError("not all are numbers")
+    return array.astype(np.float64)
+
+
+def shown(value: Any) -> str:
+    """Format a value from a file for a message: short and printable, whatever its depth or length.
+
+    >>> shown({"a": [1, 2]}), len(shown("x" * 10_000)), shown(10**5000)
+    ("{'a': [1, 2]}", 62, 'a number of many digits')
+    """
+    if isinstance(value, int) and abs(value) >= 10**_LONGEST:
+        return "a number of many digits"
+    return f"'{plain(value)}'" if isinstance(value, str) else plain(_REPR.repr(value))
+
+
+def plain(text: str, longest: int = _LONGEST) -> str:
+    """Escape a text from a file if it is not printable, and shorten it if it is long.
+
+    >>> plain("Büro"), plain("a" + chr(10)), plain("x" * 99, longest=5)
+    ('Büro', 'a\\\\n', 'xx...')
+    """
+    text = text[: 2 * longest]
+    text = text if text.isprintable() else ascii(text)[1:-1]
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."

@@ -1,0 +1,152 @@
+"""Reads tables of instance ids and classes, and renumbers ids for `observe`."""
+
+import csv
+import io
+import json
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sceneprior.core.classes import VOID, label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.instances.checked import plain
+
+SHELL = frozenset(
+    ["background", "wall", "floor", "ceiling", "door", "window", "blinds", "mirror", "picture"]
+)
+"""Classes of the room itself, background unless the label set has them: they surround the
+furniture and are taken not to occlude it."""
+LARGEST_ID = 65_535
+
+
+def read_class_table(path: Path) -> dict[int, str]:
+    """Read the class name of each instance id from a JSON or CSV file.
+
+    A JSON is an object `{"1": "bed", "2": "chair"}` or a list as written by segmenters, alone or
+    under `segments_info` or `labels`: `[{"id": 1, "label": "bed", "score": 0.9}, ...]`. In a list,
+    the id may also be called `value` or `instance_id`, and the class `class`, `class_name` or
+    `name`; a row with id 0 is skipped. A CSV has rows `id,class`, with or without a header.
+
+    Raises:
+        InputError: the file cannot be read; an id is not a number from 1 to 65,535 or is repeated.
+    """
+    try:
+        content = path.read_text(encoding="utf-8-sig")
+        pairs = _json_rows(path, content) if path.suffix.lower() == ".json" else _csv_rows(content)
+    except (OSError, ValueError, RecursionError, csv.Error) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} cannot be read ({str(error)[:120]}).") from None
+    classes: dict[int, str] = {}
+    for key, name in pairs:
+        if not (key.isascii() and key.isdigit()) or not 0 < int(key[:9]) <= LARGEST_ID:
+            raise InputError(
+                f"{path}: '{plain(key)}' is no instance id; expected a number from 1 to "
+                f"{LARGEST_ID} (0 is nothing)."
+            )
+        if int(key) in classes:
+            raise InputError(f"{path}: instance id {int(key)} is there twice.")
+        classes[int(key)] = name
+    if not classes:
+        raise InputError(f"{path} is empty; expected a class for each instance id.")
+    return classes
+
+
+_IDS = ("id", "value", "instance_id")
+_NAMES = ("label", "class", "class_name", "name")
+_ROWS = ("segments_info", "labels")
+
+
+def _json_rows(path: Path, content: str) -> Iterable[tuple[str, str]]:
+    # Parsed as pairs, to detect repeated keys.
+    data = json.loads(content, object_pairs_hook=_Pairs)
+    if isinstance(data, _Pairs) and (listed := [rows for key, rows in data if key in _ROWS]):
+        data = listed[0]
+    if isinstance(data, list) and not isinstance(data, _Pairs):
+        rows = [_listed_row(row) for row in data]
+    elif isinstance(data, _Pairs):
+        rows = [(key.strip(), name) for key, name in data]
+    else:
+        rows = [("", None)]
+    if not all(isinstance(name, str) for _, name in rows):
+        raise InputError(
+            f'{path} is not an object of ids and class names, as {{"1": "bed", "2": "chair"}} is, '
+            f'nor a list as [{{"id": 1, "label": "bed"}}] is.'
+        )
+    return [(key, str(name)) for key, name in rows if isinstance(data, _Pairs) or key != "0"]
+
+
+class _Pairs(list[tuple[str, Any]]):
+    """A JSON object as pairs, in contrast to a JSON list."""
+
+
+def _listed_row(row: Any) -> tuple[str, Any]:
+    """Id and class of a segmenter's row; the class is None if either is missing."""
+    values = dict(row) if isinstance(row, _Pairs) else {}
+    ids = [values[key] for key in _IDS if key in values]
+    names = [values[key] for key in _NAMES if key in values]
+    return (str(ids[0]), names[0]) if ids and names else ("", None)
+
+
+def _csv_rows(content: str) -> Iterable[tuple[str, str]]:
+    rows = [row for row in csv.reader(io.StringIO(content)) if any(cell.strip() for cell in row)]
+    if rows and not rows[0][0].strip().isdigit():
+        rows = rows[1:]
+    if short := [row for row in rows if len(row) < 2]:
+        raise ValueError(f"a row '{plain(short[0][0])}' has no class")
+    return [(row[0].strip(), row[1]) for row in rows]
+
+
+def tidy(name: str) -> str:
+    """Normalise a name for comparison: `Night_Stand` and `night stand` are equal.
+
+    >>> tidy(" Night_Stand ")
+    'night stand'
+    """
+    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+
+
+class IdTable:
+    """Maps values of masks to consecutive ids for `observe`.
+
+    The k-th instance of the table gets k + 1, and unlisted values get the next id, which is void
+    and may occlude objects.
+
+    Args:
+        of_id: Class name of each value, from `read_class_table`.
+        label_set_name: Label set; other classes become void, and parts of the room background.
+        where: Beginning of error messages.
+
+    Raises:
+        InputError: none of the classes is in the label set.
+    """
+
+    def __init__(self, of_id: dict[int, str], label_set_name: str, where: str):
+        names = {tidy(name): i for i, name in enumerate(label_set(label_set_name))}
+        shell = [key for key, name in of_id.items() if tidy(name) in SHELL - set(names)]
+        objects = sorted(set(of_id) - set(shell))
+        indices = [names.get(tidy(of_id[key]), VOID) for key in objects]
+        self.classes = np.array([*indices, VOID], dtype=np.int16)
+        if not self.classes.any():
+            came = ", ".join(map(plain, sorted(set(of_id.values()))[:10]))
+            raise InputError(
+                f"{where}: none of its classes ({came}) is in the label set "
+                f"({', '.join(list(names)[1:11])}{', ...' if len(names) > 11 else ''})."
+            )
+        others = Counter(of_id[key] for key in objects if tidy(of_id[key]) not in names)
+        told = ", ".join(f"{plain(name)} ({count})" for name, count in sorted(others.items()))
+        self.notes = [f"classes outside the label set are void: {told}"] if others else []
+        self.unlisted: set[int] = set()
+        # The last entry is for the value -1.
+        self._table = np.full(LARGEST_ID + 2, len(objects) + 1, dtype=np.uint32)
+        self._table[[0, *shell]] = 0
+        self._table[objects] = np.arange(1, len(objects) + 1)
+        self._listed = np.array([-1, 0, *of_id])
+
+    def ids(self, values: np.ndarray) -> np.ndarray:
+        """Convert values to ids, (H, W) uint32, and collect unlisted values in `unlisted`."""
+        self.unlisted |= set(np.setdiff1d(values, self._listed).tolist())
+        return self._table[values]

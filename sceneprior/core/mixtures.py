@@ -1,0 +1,78 @@
+"""Mixtures of logistic distributions, parametrised by a network's output."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+LEAST_SCALE = 0.01
+"""Minimum scale of a logistic; its standard deviation is 1.8 times the scale. Lifted boxes are not
+accurate to the centimetre, and without a minimum the density is unbounded where many rooms share a
+value."""
+MOST_SCALE = 3.0
+"""Maximum scale of a logistic."""
+FIRST_SCALE = 0.3
+"""Scale for a network output of 0."""
+
+
+class LogisticMixture(NamedTuple):
+    """Mixture of K products of D logistic distributions.
+
+    Unlike those of Gaussians, the log-densities of logistics have linear tails, so that outliers
+    have bounded gradients.
+    """
+
+    weight_logits: Float[Tensor, "*batch mixtures"]
+    means: Float[Tensor, "*batch mixtures numbers"]
+    log_scales: Float[Tensor, "*batch mixtures numbers"]
+
+    @classmethod
+    def of(cls, features: Float[Tensor, "*batch features"], numbers: int) -> "LogisticMixture":
+        """Build a mixture from a network's output, 1 + 2 D features per component."""
+        weight_logits, means, scales = features.unflatten(-1, (-1, 1 + 2 * numbers)).split(
+            [1, numbers, numbers], dim=-1
+        )
+        return cls.bounded(weight_logits[..., 0], means, scales)
+
+    @classmethod
+    def bounded(cls, weight_logits: Tensor, means: Tensor, scales: Tensor) -> "LogisticMixture":
+        """Build a mixture with scales clamped to [`LEAST_SCALE`, `MOST_SCALE`]."""
+        least, most = math.log(LEAST_SCALE), math.log(MOST_SCALE)
+        return cls(weight_logits, means, (scales + math.log(FIRST_SCALE)).clamp(least, most))
+
+    def log_prob(self, values: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch"]:
+        """Log-densities of values."""
+        away = (values.unsqueeze(-2) - self.means) * torch.exp(-self.log_scales)
+        each = (F.logsigmoid(away) + F.logsigmoid(-away) - self.log_scales).sum(dim=-1)
+        return torch.logsumexp(self.weight_logits.log_softmax(dim=-1) + each, dim=-1)
+
+    def drawn(
+        self, choice: Float[Tensor, "*batch draws"], place: Float[Tensor, "*batch draws numbers"]
+    ) -> Float[Tensor, "*batch draws numbers"]:
+        """Sample several values per mixture by inverse transform of uniform numbers.
+
+        Args:
+            choice: Uniform numbers that choose the components.
+            place: Uniform numbers, the quantiles within the chosen components.
+        """
+        logits = self.weight_logits.unsqueeze(-2).expand(*choice.shape, -1)
+        chosen = draw_index(logits, choice).unsqueeze(-1)
+        mean, log_scale = (
+            torch.take_along_dim(part, chosen, dim=-2) for part in (self.means, self.log_scales)
+        )
+        return mean + log_scale.exp() * torch.logit(place, eps=1e-6)
+
+    def draw(
+        self, choice: Float[Tensor, "*batch"], place: Float[Tensor, "*batch numbers"]
+    ) -> Float[Tensor, "*batch numbers"]:
+        """Sample one value per mixture; see `drawn`."""
+        return self.drawn(choice.unsqueeze(-1), place.unsqueeze(-2))[..., 0, :]
+
+
+def draw_index(logits: Float[Tensor, "*batch choices"], uniform: Float[Tensor, "*batch"]) -> Tensor:
+    """Sample a categorical index by inverse transform of a uniform number in [0, 1)."""
+    reached = logits.softmax(dim=-1).cumsum(dim=-1) <= uniform.unsqueeze(-1)
+    return reached.sum(dim=-1).clamp(max=logits.shape[-1] - 1)

@@ -1,1 +1,0 @@
-"""New rooms from a trained prior: sampled, interpolated, completed, with CAD models."""

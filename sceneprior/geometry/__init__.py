@@ -1,1 +1,0 @@
-"""Pure tensor functions on cameras, boxes and meshes; nothing here has weights."""

@@ -1,0 +1,267 @@
+"""Room completion: furnish the rest of a room of which some objects are given.
+
+A run's sampler draws the missing objects, given the others. Without a sampler, latents are fitted:
+
+1. Latents are sampled from the run's distribution and decoded. Those whose rooms come nearest to
+   the given objects are the starts; each answer has its own.
+2. The network is frozen, and each latent is optimised until its room holds the given classes and
+   boxes, with a penalty on its distance from the start. Predictions are matched to the given
+   objects anew in each step, as in training, but in 3D.
+3. The best of an answer's starts is kept, and the given objects are inserted into its room
+   (`sceneprior/lifted/insert.py`).
+"""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from sceneprior.core.classes import VOID, label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene
+from sceneprior.core.seeds import check_seed
+from sceneprior.core.views import DecodedScenes, RoomBoxes
+from sceneprior.lifted.insert import insert
+from sceneprior.lifted.sampled import class_rows, drawn_by_sampler, floor_rectangle, sample_scenes
+from sceneprior.lifted.sampler.plan import Given
+from sceneprior.lifted.trained import TrainedLifted
+from sceneprior.paper.decode import decode_latents
+from sceneprior.paper.losses.layout import take
+from sceneprior.paper.losses.matching import assign
+from sceneprior.paper.sampling import draw_latents
+from sceneprior.paper.trained import TrainedPrior
+
+DRAWN = 256
+"""Latents sampled, from which the starts are chosen."""
+RESTARTS = 3
+"""Starts per answer."""
+STEPS = 150
+"""Steps of the fit."""
+RATE = 0.05
+"""Length of an early step of Adam on the sphere of radius 1; it falls to 0 along a cosine."""
+BOX_WEIGHT = 5.0
+"""Weight of the mean distance of centres and sides in metres, beside the class's cross entropy."""
+START_WEIGHT = 2.0
+"""Weight of half the squared distance from the start, which on a sphere is 1 - cosine. A larger one
+keeps rooms as they were sampled; a smaller one fits the given objects better."""
+
+
+def complete(
+    trained: TrainedPrior,
+    scenes: Sequence[Scene],
+    count: int = 4,
+    seed: int = 0,
+    distribution: str | None = None,
+    steps: int = STEPS,
+    classes: Sequence[str] | None = None,
+) -> list[list[Scene]]:
+    """Furnish the rest of rooms; all rooms and all answers are computed in one batch.
+
+    Args:
+        scenes: The given objects of each room: classes, boxes, optionally meshes. If there are
+            none, the answers are rooms that the run generates. A sampler stays within the
+            bounding rectangle of a scene's floor.
+        count: Answers per room.
+        seed, distribution: `sampler`, or the distribution of the latents that answers start from;
+            see `draw_latents`.
+        steps: Steps of the fit; 0 leaves the sampled latents as they are.
+        classes: Classes to add, and no others; None leaves the choice to the sampler.
+
+    Returns:
+        The answers of each room: see `insert`. If `classes` were given, `extra["no_place"]` lists
+        those for which the sampler found no free place.
+
+    Raises:
+        InputError: a given object cannot be used, or there are more than the run's rooms hold.
+    """
+    check_seed(seed)
+    given = gather_given(trained, scenes)
+    if (with_sampler := drawn_by_sampler(trained, distribution)) is not None:
+        return _drawn(with_sampler, scenes, given, count, seed, classes)
+    if classes is not None:
+        raise InputError(
+            "Which classes to add can be asked of a sampler alone, and these rooms come from "
+            "latents; leave the classes out, or train with a section `sampler`."
+        )
+    starts = _starts(trained, given, count * RESTARTS, seed, distribution)
+    z, loss = fit_latents(trained, starts, repeated(given, count * RESTARTS), steps)
+    # Starts are sorted, best first; dealing them out in turn gives every answer good ones.
+    best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
+    z = z.view(len(scenes), RESTARTS, count, -1).take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
+    names = [f"complete_{k:02d}" for k in range(count)]
+    return [
+        [insert(room, scene, seed=seed) for room in decode_latents(trained, own, names)]
+        for scene, own in zip(scenes, z, strict=True)
+    ]
+
+
+def _drawn(
+    trained: TrainedLifted,
+    scenes: Sequence[Scene],
+    given: RoomBoxes,
+    count: int,
+    seed: int,
+    classes: Sequence[str] | None,
+) -> list[list[Scene]]:
+    """Answers drawn by a run's sampler, by room."""
+    names = [f"complete_{k:02d}" for k in range(count)]
+    coming = None if classes is None else class_rows(trained, classes)
+    most = trained.config.model.max_objects
+    fullest = int(given.is_object.sum(dim=1).max()) + len(classes or ())
+    if fullest > most:
+        raise InputError(
+            f"Given and asked-for objects are {fullest} together, but rooms of this run hold at "
+            f"most {most} (model.max_objects); ask for fewer."
+        )
+    answers = []
+    for scene, one in zip(scenes, given.split(1), strict=True):
+        frame = None if scene.floor_m is None else floor_rectangle(scene).expand(count, -1)
+        whole = Given(
+            repeated(one, count), frame, None if coming is None else coming.expand(count, -1)
+        )
+        rooms = sample_scenes(trained, names, seed, whole)
+        assert trained.sampler is not None, "drawn_by_sampler has asked"
+        may_meet = trained.sampler.may_meet.cpu().numpy()
+        made = [insert(room, scene, may_meet, seed=seed) for room in rooms]
+        answers.append([_with_no_place(room, classes) for room in made])
+    return answers
+
+
+def _with_no_place(room: Scene, classes: Sequence[str] | None) -> Scene:
+    """An answer with `extra["no_place"]`: the requested objects that it lacks, by class."""
+    if classes is None:
+        return room
+    added = Counter(item.label for item in room.objects[len(room.extra["given"]) :])
+    lacking = sorted((Counter(classes) - added).elements())
+    return replace(room, extra={**room.extra, "no_place": lacking})
+
+
+def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> RoomBoxes:
+    """Given objects as tensors.
+
+    Raises:
+        InputError: a class is not in the run's label set, a box is invalid, or there are too many.
+    """
+    config = trained.config
+    names, most = label_set(config.label_set), config.model.max_objects
+    counts = torch.tensor([len(scene.objects) for scene in scenes])
+    is_object = torch.arange(max(1, int(counts.max()))) < counts[:, None]
+    labels = torch.zeros(is_object.shape, dtype=torch.int64)
+    boxes_m = torch.ones(*is_object.shape, 6, dtype=trained.logits.dtype)
+    for row, scene in enumerate(scenes):
+        if len(scene.objects) > most:
+            raise InputError(
+                f"{scene.name} gives {len(scene.objects)} objects, but rooms of this run hold at "
+                f"most {most} (model.max_objects); give fewer, or train with more."
+            )
+        for column, item in enumerate(scene.objects):
+            if item.label not in names or names.index(item.label) == VOID:
+                raise InputError(
+                    f"{scene.name}: object {column} is a '{item.label}', which this run does not "
+                    f"know; its classes are {', '.join(names[1:])}."
+                )
+            box = np.array([*item.center_m, *item.size_m], dtype=np.float64)
+            if not np.isfinite(box).all() or (box[3:] <= 0).any():
+                raise InputError(
+                    f"{scene.name}: the box of object {column} ({item.label}) is {box.tolist()}; "
+                    "expected a finite centre and three sides above 0 (metres)."
+                )
+            labels[row, column] = names.index(item.label)
+            boxes_m[row, column] = torch.from_numpy(box)
+    return RoomBoxes(labels, is_object, boxes_m)
+
+
+def repeated(rooms: RoomBoxes, times: int) -> RoomBoxes:
+    """Each room repeated `times` times in a row."""
+    return rooms.changed(lambda tensor: tensor.repeat_interleave(times, dim=0))
+
+
+@torch.no_grad()
+def _starts(
+    trained: TrainedPrior, given: RoomBoxes, each: int, seed: int, distribution: str | None
+) -> Float[Tensor, "starts dimension"]:
+    """For every room, the `each` sampled latents whose rooms come nearest to the given objects,
+    best first."""
+    z, _ = draw_latents(trained, max(DRAWN, each), seed, distribution)
+    decoded = trained.prior.decode(z, with_shape=False)
+    target = trained.config.model.completeness_target
+    losses = [given_loss(decoded, repeated(one, len(z)), target) for one in given.split(1)]
+    return torch.cat([z[some.argsort(stable=True)[:each]] for some in losses])
+
+
+def fit_latents(
+    trained: TrainedPrior,
+    starts: Float[Tensor, "rooms dimension"],
+    given: RoomBoxes,
+    steps: int = STEPS,
+) -> tuple[Float[Tensor, "rooms dimension"], Float[Tensor, " rooms"]]:
+    """Optimise latents until their rooms hold the given objects; return them and their final
+    losses."""
+    space, target = trained.prior.latent_space, trained.config.model.completeness_target
+    free = starts.clone().requires_grad_()
+    # Adam moves every coordinate by about its rate, hence the division.
+    optimizer = torch.optim.Adam([free], lr=RATE / math.sqrt(starts.shape[1]))
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+
+    def loss_of(points: Tensor) -> Float[Tensor, " rooms"]:
+        decoded = trained.prior.decode(space.onto(points), with_shape=False)
+        # Measured before the projection onto the sphere: projecting a start again may change its
+        # last bits, and Adam would follow that difference.
+        moved = (points - starts).square().sum(dim=-1)
+        return given_loss(decoded, given, target) + START_WEIGHT / 2 * moved
+
+    for _ in range(steps):
+        optimizer.zero_grad()
+        # Summed, not averaged, so that a room's steps do not depend on the rest of the batch.
+        loss_of(free).sum().backward()
+        optimizer.step()
+        schedule.step()
+    with torch.no_grad():
+        return space.onto(free), loss_of(free)
+
+
+def given_loss(
+    decoded: DecodedScenes, given: RoomBoxes, completeness_target: str = "first_n"
+) -> Float[Tensor, " rooms"]:
+    """Loss of decoded rooms against the given objects, averaged over these; 0 if there are none.
+
+        L = cross entropy of the class + `BOX_WEIGHT` * mean |b - b_given| - log p(part of the room)
+
+    with b centre and size in metres, for the prediction matched to each given object. The matching
+    cost has minus the class's probability in place of its cross entropy, as in DETR.
+    """
+    boxes = torch.cat([decoded.centers_m, decoded.sizes_m], dim=-1)
+    kept = -log_kept(decoded.completeness_logits, completeness_target)
+    with torch.no_grad():
+        predictions, objects = boxes.shape[1], given.object_class.shape[1]
+        wanted = given.object_class.unsqueeze(1).expand(-1, predictions, -1)
+        cost = -decoded.class_logits.softmax(dim=-1).gather(-1, wanted)
+        for side in range(6):
+            apart = boxes[..., side].unsqueeze(2) - given.boxes_m[..., side].unsqueeze(1)
+            cost += BOX_WEIGHT / 6 * apart.abs()
+        cost += kept.unsqueeze(-1)
+        rows = assign(cost, [predictions] * len(cost), given.is_object.sum(dim=1).tolist())
+    logits = take(decoded.class_logits, rows, dim=1)
+    each = F.cross_entropy(logits.flatten(0, 1), given.object_class.flatten(), reduction="none")
+    each = each.view(-1, objects) + take(kept, rows, dim=1)
+    each = each + BOX_WEIGHT * (take(boxes, rows, dim=1) - given.boxes_m).abs().mean(dim=-1)
+    # Padding has class void; where void is ruled out, its cross entropy is infinite.
+    each = each.where(given.is_object, 0.0)
+    return each.sum(dim=1) / given.is_object.sum(dim=1).clamp(min=1)
+
+
+def log_kept(
+    completeness_logits: Float[Tensor, "rooms predictions"], completeness_target: str
+) -> Float[Tensor, "rooms predictions"]:
+    """Log-probability that each prediction belongs to the room: that no prediction up to and
+    including it (`first_n`), or none before it (`stop`), ended the room."""
+    if completeness_target == "stop":
+        goes_on = F.logsigmoid(-completeness_logits)
+        return goes_on.cumsum(dim=1) - goes_on
+    return F.logsigmoid(completeness_logits).cumsum(dim=1)

@@ -1,0 +1,138 @@
+"""Settings of a run of the lifted method, and its stages, from opened data to a module."""
+
+import contextlib
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import torch
+from pydantic import model_validator
+from torch import nn
+
+from sceneprior.core.errors import ShardError
+from sceneprior.core.shards import list_shards
+from sceneprior.lifted.lifting.dataset import LiftedDataset
+from sceneprior.lifted.lifting.lifted import ShapeGrid
+from sceneprior.lifted.occupancy import OccupancyConfig, OccupancyDecoder
+from sceneprior.lifted.sampler.network import RoomSampler
+from sceneprior.lifted.sampler.rooms import SamplerRooms
+from sceneprior.lifted.sampler.settings import SamplerConfig
+from sceneprior.lifted.settings import LiftedLossConfig, LiftedSamplingConfig, LiftedStageConfig
+from sceneprior.lifted.trained import SAMPLER, TrainedLifted
+from sceneprior.paper.prior import ModelConfig
+from sceneprior.paper.trained import PriorConfig
+from sceneprior.paper.transformer import TransformerConfig
+from sceneprior.training.method import Stage, ready_copy
+
+if TYPE_CHECKING:
+    from sceneprior.lifted.sampler.stage import SamplerStage
+    from sceneprior.lifted.stages import LiftedStage
+
+
+class LiftedModel(ModelConfig):
+    """The paper's network, with looks in place of deformed templates."""
+
+    decoder: TransformerConfig
+    shape: OccupancyConfig = OccupancyConfig()
+
+
+class LiftedConfig(PriorConfig):
+    """A run of the lifted method: 3D boxes and shapes are found from the masks before training."""
+
+    method: Literal["lifted"] = "lifted"
+    model: LiftedModel
+    loss: LiftedLossConfig = LiftedLossConfig()
+    shape: LiftedStageConfig
+    """The sphere: the paper's network and latents, supervised by lifted boxes and shapes."""
+    sampler: SamplerConfig | None = None
+    """A model of a room's objects one by one, which draws new rooms; null for none."""
+    sampling: LiftedSamplingConfig = LiftedSamplingConfig()
+
+    remembers_rooms: ClassVar[bool] = True
+
+    @property
+    def distribution(self) -> str:
+        return self.sampling.distribution
+
+    @property
+    def learns_from(self) -> str:
+        return "boxes lifted from masks in 2D"
+
+    @model_validator(mode="after")
+    def _sampler_is_there(self) -> "LiftedConfig":
+        if self.sampler is None and self.sampling.distribution == SAMPLER:
+            raise ValueError(
+                "sampling.distribution is 'sampler', but there is no section `sampler`; add one "
+                "(`sampler: {epochs: 200}`), or choose another distribution"
+            )
+        return self
+
+    def stages(self) -> tuple[Stage, ...]:
+        sphere = Stage("shape", self.shape, self.open_lifted, self._build)
+        if self.sampler is None:
+            return (sphere,)
+        build = partial(self._build_sampler_stage, self.sampler)
+        return sphere, Stage("sampler", self.sampler, self._sampler_rooms, build)
+
+    def networks(self, stage: str, rooms: int) -> nn.ModuleDict:
+        networks = super().networks(stage, rooms)
+        if stage == "sampler" and self.sampler is not None:
+            networks["sampler"] = self.build_sampler(self.sampler)
+        return networks
+
+    def trained(self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]) -> TrainedLifted:
+        plain = super().trained(networks, stage, room_ids)
+        sampler = ready_copy(networks.sampler) if hasattr(networks, "sampler") else None
+        return TrainedLifted(plain.prior, plain.logits, room_ids, self, stage, sampler)
+
+    def build_sampler(self, settings: SamplerConfig) -> RoomSampler:
+        """The sampler's network, freshly initialised from the seed; it knows no rooms yet."""
+        torch.manual_seed(self.seed)
+        most = self.model.shape.prototypes
+        return RoomSampler(settings, self.classes, most, self.model.max_objects)
+
+    def open_lifted(self, split: str = "train") -> LiftedDataset:
+        """Rooms with the 3D boxes and shapes found from their masks; InputError if they do not fit
+        the config."""
+        data, shape = self.data, self.model.shape
+        rooms = LiftedDataset(
+            Path(data.shards),
+            split,
+            rotations=data.rotations,
+            view_fraction=data.view_fraction,
+            shape=ShapeGrid(shape.cells, shape.margin),
+            seed=self.seed,
+        )
+        self.check_rooms(rooms, self.model.max_objects)
+        return rooms
+
+    def _sampler_rooms(self, split: str = "train") -> SamplerRooms:
+        return SamplerRooms(self.open_lifted(split))
+
+    def _build(self, rooms: LiftedDataset, previous: Path | None) -> "LiftedStage":
+        # Imported where something is trained, here and below: Lightning takes seconds.
+        from sceneprior.lifted.stages import LiftedStage
+
+        prior, latents = self.build_prior(), self.build_latents(len(rooms))
+        assert isinstance(prior.shape, OccupancyDecoder)
+        prior.shape.learn_prototypes(rooms.find_prototypes(self.model.shape.prototypes))
+        target = self.model.completeness_target
+        return LiftedStage(prior, latents, rooms, self.shape, self.loss, target, self.seed)
+
+    def _build_sampler_stage(
+        self, stage: SamplerConfig, rooms: SamplerRooms, previous: Path | None
+    ) -> "SamplerStage":
+        from sceneprior.lifted.sampler.stage import SamplerStage, teach
+
+        assert previous is not None, "the shape stage comes before"
+        before = self.before(previous, rooms.room_ids)
+        assert isinstance(before.prior.shape, OccupancyDecoder)
+        prototypes = before.prior.shape.prototypes
+        sampler = self.build_sampler(stage)
+        teach(sampler, rooms.see_looks(prototypes))
+        val = None
+        with contextlib.suppress(ShardError):  # no val rooms: the newest network is kept
+            list_shards(Path(self.data.shards), "val")
+            val = self._sampler_rooms("val").see_looks(prototypes)
+        latents = nn.Embedding.from_pretrained(before.logits)
+        return SamplerStage(before.prior, latents, sampler, stage, val, self.seed)

@@ -1,0 +1,198 @@
+"""The smallest 3D box of each tracked object that explains its masks in all views."""
+
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Real
+from numba import njit
+
+from sceneprior.core.shards import RoomViews
+from sceneprior.lifted.lifting.hulls import MOST_EMPTY, Sightings, carve, cells_along, sightings_of
+from sceneprior.lifted.lifting.lifted import LiftedBoxes
+
+GRIDS = ((16, 0.6), (24, 0.6), (40, 0.4))
+"""Cells along an edge and their `reach` (see `carve`), coarse to fine: each grid spans the hull
+found on the previous one."""
+EXPLAINED = 0.985
+"""Share of an object's rays that its hull must meet; the others may be wrong pixels."""
+RAYS = 400
+"""Rays per object, about; see `own_rays`."""
+TRIM = 0.3
+"""Distance in cells by which a box's sides are moved inwards from its outermost cells, which are
+only partly filled."""
+UNKNOWN_DISTANCE_M = 2.5
+"""Assumed distance of an object from its cameras where the views do not determine it, as with a
+single view."""
+
+
+def lift_boxes(
+    views: RoomViews, chosen: Int[np.ndarray, " views"] | None = None, seed: int = 0
+) -> LiftedBoxes:
+    """3D boxes of a room's objects, from instance ids and cameras; no 3D ground truth is used.
+
+    An object's visual hull is carved coarse to fine. Its box is then shrunk, side after side, as
+    long as every ray through one of its pixels meets a cell of the hull inside.
+
+    Args:
+        views: A room, read with its images.
+        chosen: The views to use; None uses all.
+        seed: Seed of the choice of pixels whose rays are used.
+    """
+    rng = np.random.default_rng(seed)
+    rows = np.arange(len(views.visible)) if chosen is None else chosen
+    found = [
+        _lift(views, rows[views.visible[rows, item]], item, rng)
+        for item in range(len(views.object_class))
+    ]
+    sides_m = np.array([sides for *sides, _ in found]).reshape(-1, 2, 3)
+    explained = np.array([share for *_, share in found])
+    return LiftedBoxes(sides_m.mean(axis=1), sides_m[:, 1] - sides_m[:, 0], explained)
+
+
+def _lift(
+    views: RoomViews, rows: Int[np.ndarray, " views"], item: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, float]:
+    if not len(rows):
+        return np.full(3, -0.5), np.full(3, 0.5), 0.0
+    poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]
+    seen = sightings_of(views, rows, item)
+    origins_m, directions = own_rays(seen, poses, intrinsics, views.sides_clear[rows, item], rng)
+    low_m, high_m = _where_to_look(views, rows, item)
+    for cells, reach in GRIDS:
+        hull = carve(seen, low_m, high_m, cells, reach)
+        where, emptiness = cells_along(hull, origins_m, directions, 3 * cells)
+        limit = _limit(emptiness.min(axis=1))
+        inside = np.argwhere(hull.emptiness <= limit)
+        if not len(inside):
+            break
+        low_m, high_m = (
+            hull.low_m + (inside.min(axis=0) - 1) * hull.cell_m,
+            hull.low_m + (inside.max(axis=0) + 2) * hull.cell_m,
+        )
+    in_hull = emptiness <= limit
+    first, last = smallest_box(where, in_hull, hull.emptiness.shape[0])
+    trim = np.where(last - first > 1, TRIM, 0.0)
+    explained = float(in_hull.any(axis=1).mean())
+    return (
+        hull.low_m + (first + trim) * hull.cell_m,
+        hull.low_m + (last - trim) * hull.cell_m,
+        explained,
+    )
+
+
+def _limit(least: Float[np.ndarray, " rays"]) -> float:
+    """The emptiness threshold at which a hull meets the share `EXPLAINED` of the rays; `least` is
+    each ray's lowest emptiness."""
+    met = least[least <= 1]
+    return min(float(np.quantile(met, EXPLAINED)), MOST_EMPTY) if len(met) else MOST_EMPTY
+
+
+def smallest_box(
+    where: Int[np.ndarray, "rays samples 3"],
+    in_hull: Bool[np.ndarray, "rays samples"],
+    cells: int,
+) -> tuple[Int[np.ndarray, "3"], Int[np.ndarray, "3"]]:
+    """Move each side inwards as far as every ray that meets the hull still meets it inside the box.
+
+    Sides are moved in the order x, y, z; returns the first and one past the last cell per axis.
+    """
+    met = in_hull.any(axis=1)
+    where, inside = where[met], in_hull[met]
+    first, last = np.zeros(3, dtype=np.int64), np.full(3, cells)
+    if not len(inside):
+        return first, last
+    for axis in range(3):
+        at = where[..., axis]
+        # Each ray must meet a cell at or beyond the side, which bounds how far the side can move.
+        first[axis] = np.where(inside, at, -1).max(axis=1).min()
+        inside = inside & (at >= first[axis])
+        last[axis] = np.where(inside, at, cells).min(axis=1).max() + 1
+        inside = inside & (at < last[axis])
+    return first, last
+
+
+def own_rays(
+    seen: Sightings,
+    poses: Float[np.ndarray, "views 4 4"],
+    intrinsics: Float[np.ndarray, "views 3 3"],
+    sides_clear: Bool[np.ndarray, "views 4"],
+    rng: np.random.Generator,
+) -> tuple[Float[np.ndarray, "rays 3"], Float[np.ndarray, "rays 3"]]:
+    """Origins and unit directions of rays through an object's pixels.
+
+    About `RAYS` of them go through random pixels of its masks. In every view, further rays go
+    through the outermost pixel at each side that is the object's own rather than an occluder's:
+    they determine its extent.
+    """
+    each = max(4, RAYS // len(poses))
+    origins, directions = [], []
+    for ids, pose, camera, clear in zip(seen.ids, poses, intrinsics, sides_clear, strict=True):
+        u, v = _pixels(ids, seen.own_id)
+        outermost = np.array([u.argmin(), v.argmin(), u.argmax(), v.argmax()])[clear]
+        picked = np.concatenate([rng.integers(len(u), size=each), outermost])
+        rays = pixel_directions(u[picked], v[picked], pose, camera)
+        directions.append(rays)
+        origins.append(np.broadcast_to(-pose[:3, :3].T @ pose[:3, 3], rays.shape))
+    return np.concatenate(origins).astype(np.float64), np.concatenate(directions)
+
+
+# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
+@njit(cache=True, nogil=True)
+@no_type_check
+def _pixels(ids, own_id):
+    """Columns and rows of an image's pixels with an id, row by row."""
+    height, width = ids.shape
+    count = 0
+    for row in range(height):
+        for column in range(width):
+            count += ids[row, column] == own_id
+    u, v = np.empty(count, np.int64), np.empty(count, np.int64)
+    at = 0
+    for row in range(height):
+        for column in range(width):
+            if ids[row, column] == own_id:
+                u[at], v[at] = column, row
+                at += 1
+    return u, v
+
+
+def pixel_directions(
+    u: Real[np.ndarray, " rays"],
+    v: Real[np.ndarray, " rays"],
+    world_to_camera: Float[np.ndarray, "4 4"],
+    intrinsics: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, "rays 3"]:
+    """Unit directions, in the room frame, of rays through the centres of pixels."""
+    x = (u + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (v + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ world_to_camera[:3, :3].astype(np.float64)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def _where_to_look(
+    views: RoomViews, rows: Int[np.ndarray, " views"], item: int
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """A cube that contains the object, around the point nearest to the rays through its 2D boxes'
+    centres."""
+    height, width = views.image_size
+    boxes_px = views.boxes[rows, item] * np.array([width, height, width, height])
+    poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]
+    middle_px = (boxes_px[:, :2] + boxes_px[:, 2:]) / 2 - 0.5
+    cameras_m = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+    rays = np.concatenate(
+        [
+            pixel_directions(pixel[:1], pixel[1:], pose, camera)
+            for pixel, pose, camera in zip(middle_px, poses, intrinsics, strict=True)
+        ]
+    )
+    across = np.eye(3) - rays[:, :, None] * rays[:, None]
+    weak = 1e-3
+    guess_m = (cameras_m + UNKNOWN_DISTANCE_M * rays).mean(axis=0)
+    middle_m = np.linalg.solve(
+        across.sum(axis=0) + weak * np.eye(3),
+        (across @ cameras_m[..., None]).sum(axis=0)[:, 0] + weak * guess_m,
+    )
+    spans = (boxes_px[:, 2:] - boxes_px[:, :2]) / intrinsics[:, [0, 1], [0, 1]]
+    distances_m = np.linalg.norm(middle_m - cameras_m, axis=-1)
+    radius_m = 1.3 * float((np.linalg.norm(spans, axis=-1) / 2 * distances_m).max()) + 0.15
+    return middle_m - radius_m, middle_m + radius_m

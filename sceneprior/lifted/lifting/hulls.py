@@ -1,0 +1,236 @@
+"""Visual hulls: the grid cells that no view shows to be outside an object.
+
+Laurentini, "The visual hull concept for silhouette-based image understanding", TPAMI 1994. The hull
+is an outer bound: it extends behind an object wherever no camera sees that space. `boxes.py` finds
+the smallest box in it that still explains every mask.
+"""
+
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int, Integer
+from numba import njit
+
+from sceneprior.core.shards import RoomViews
+from sceneprior.render.silhouettes.cpu.threads import in_threads
+
+MOST_EMPTY = 0.35
+"""Largest emptiness of a cell in any hull, even if rays then stay unexplained; see
+`Hull.emptiness`."""
+NEVER = 2.0
+"""Emptiness of a cell that is in no hull: too many views see past it, or fewer than two see the
+object there."""
+MIN_DEPTH_M = 0.1
+"""Depth below which a cell is not projected into a view."""
+
+
+class Sightings(NamedTuple):
+    """The views of one room that show one object."""
+
+    ids: Integer[np.ndarray, "views height width"]
+    own_id: int
+    boxes_px: Int[np.ndarray, "views 4"]
+    """First column and row of the object's pixels, and one past the last of each."""
+    own_before: Int[np.ndarray, " corners"]
+    """Summed-area tables of the object's pixels in its 2D box: for each pixel corner, the number of
+    its pixels above and to the left. (height + 1) x (width + 1) of the box, view after view."""
+    table_starts: Int[np.ndarray, " views"]
+    """Start of each view's table in `own_before`."""
+    world_to_image: Float[np.ndarray, "views 3 4"]
+    """Intrinsics times `world_to_camera`."""
+    focal_px: Float[np.ndarray, " views"]
+
+
+class Hull(NamedTuple):
+    """A grid of cells between two corners, indexed x, y, z."""
+
+    low_m: Float[np.ndarray, "3"]
+    high_m: Float[np.ndarray, "3"]
+    emptiness: Float[np.ndarray, "x y z"]
+    """Share of the views with evidence on a cell that see past it; `NEVER` if it exceeds the
+    carver's limit. The hull is the cells below a threshold, which `boxes.py` chooses, since masks
+    have errors."""
+
+    @property
+    def cell_m(self) -> Float[np.ndarray, "3"]:
+        """Edge lengths of a cell."""
+        return (self.high_m - self.low_m) / self.emptiness.shape[0]
+
+
+def sightings_of(views: RoomViews, rows: Int[np.ndarray, " views"], item: int) -> Sightings:
+    """The data that `carve` needs about an object, from the `rows` of a room's views that show
+    it."""
+    assert views.instance_ids is not None, "lifting reads images"
+    ids = views.instance_ids[rows]
+    count, height, width = ids.shape
+    size = np.array([width, height, width, height])
+    # Clipped as a safeguard: compiled code checks no index.
+    boxes_px = np.rint(np.nan_to_num(views.boxes[rows, item]) * size).clip(0, size).astype(np.int64)
+    boxes_px[:, 2:] = np.maximum(boxes_px[:, 2:], boxes_px[:, :2])
+    columns, lines = (boxes_px[:, 2:] - boxes_px[:, :2] + 1).T
+    ends = np.cumsum(columns * lines)
+    table = np.empty(int(ends[-1]) if count else 0, dtype=np.int32)
+    starts = ends - columns * lines
+    in_threads(_sum_areas, count, ids, item + 1, boxes_px, starts, table)
+    intrinsics = views.intrinsics[rows].astype(np.float64)
+    matrices = intrinsics @ views.world_to_camera[rows, :3].astype(np.float64)
+    return Sightings(ids, item + 1, boxes_px, table, starts, matrices, intrinsics[:, 0, 0].copy())
+
+
+def carve(
+    seen: Sightings,
+    low_m: Float[np.ndarray, "3"],
+    high_m: Float[np.ndarray, "3"],
+    cells: int,
+    reach: float,
+    most_empty: float = MOST_EMPTY,
+) -> Hull:
+    """Count, for every cell of a grid, the views that see past it; stop at more than `most_empty`
+    of them.
+
+    A view sees past a cell if the pixel there is background and no pixel of the object lies within
+    `reach` cells of it, so that parts thinner than a cell survive. A pixel of another object is no
+    evidence: that object may be an occluder.
+    """
+    emptiness = np.empty((cells, cells, cells), dtype=np.float32)
+    in_threads(
+        _carve, cells, seen.ids, seen.boxes_px, seen.own_before, seen.table_starts,
+        seen.world_to_image, seen.focal_px, low_m, high_m, reach, most_empty, emptiness,
+    )  # fmt: skip
+    return Hull(low_m, high_m, emptiness)
+
+
+def cells_along(
+    hull: Hull,
+    origins_m: Float[np.ndarray, "rays 3"],
+    directions: Float[np.ndarray, "rays 3"],
+    samples: int,
+) -> tuple[Int[np.ndarray, "rays samples 3"], Float[np.ndarray, "rays samples"]]:
+    """Cells at evenly spaced samples of rays, from entry to exit, and their emptiness."""
+    near, far = pass_through(origins_m, directions, hull.low_m, hull.high_m)
+    where = np.empty((len(near), samples, 3), dtype=np.int32)
+    emptiness = np.empty((len(near), samples), dtype=np.float32)
+    in_threads(
+        _cells_along, len(near), origins_m, directions, near, far, hull.low_m, hull.cell_m,
+        hull.emptiness, where, emptiness,
+    )  # fmt: skip
+    return where, emptiness
+
+
+def pass_through(
+    origins_m: Float[np.ndarray, "rays 3"],
+    directions: Float[np.ndarray, "rays 3"],
+    low_m: Float[np.ndarray, "*rays 3"],
+    high_m: Float[np.ndarray, "*rays 3"],
+) -> tuple[Float[np.ndarray, " rays"], Float[np.ndarray, " rays"]]:
+    """Distances at which rays enter and leave axis-aligned boxes. A ray that misses leaves no later
+    than it enters, or behind the origin. A ray that starts inside enters at 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.stack([low_m - origins_m, high_m - origins_m]) / directions
+    # A ray in the plane of a side divides 0 by 0; it counts as inside.
+    near = np.where(np.isnan(ends[0]), -np.inf, ends.min(axis=0)).max(axis=-1)
+    far = np.where(np.isnan(ends[0]), np.inf, ends.max(axis=0)).min(axis=-1)
+    return near.clip(min=0), far
+
+
+# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
+@njit(cache=True, nogil=True)
+@no_type_check
+def _sum_areas(first, last, ids, own_id, boxes_px, starts, table):
+    for view in range(first, last):
+        x1, y1, x2, y2 = boxes_px[view]
+        columns, at = x2 - x1 + 1, starts[view]
+        table[at : at + columns] = 0
+        for row in range(y1, y2):
+            at += columns
+            table[at] = so_far = 0
+            for column in range(x1, x2):
+                so_far += ids[view, row, column] == own_id
+                here = at + column - x1 + 1
+                table[here] = table[here - columns] + so_far
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def own_in(box_px, table, start, x1, y1, x2, y2):
+    """Number of the object's pixels in columns x1 to x2 and rows y1 to y2 (one past the last) of a
+    view; `start` is the start of the view's table."""
+    x1, x2 = max(x1, box_px[0]) - box_px[0], min(x2, box_px[2]) - box_px[0]
+    y1, y2 = max(y1, box_px[1]) - box_px[1], min(y2, box_px[3]) - box_px[1]
+    if x1 >= x2 or y1 >= y2:
+        return 0
+    columns = box_px[2] - box_px[0] + 1
+    top, bottom = start + y1 * columns, start + y2 * columns
+    return table[bottom + x2] - table[top + x2] - table[bottom + x1] + table[top + x1]
+
+
+# "numpy": division by zero raises no error, so that a row of cells can be projected at once.
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _carve(
+    first, last, ids, boxes_px, table, starts, matrices, focal_px, low_m, high_m, reach, most_empty,
+    emptiness,
+):  # fmt: skip
+    views, height, width = ids.shape
+    cells = emptiness.shape[0]
+    size_m = (high_m - low_m) / cells
+    radius_m = reach * size_m.max()
+    enough = most_empty * views + 0.5  # over the limit, whatever the other views see
+    own, past = np.empty((cells, cells), np.int32), np.empty((cells, cells), np.int32)
+    u, v, depth = np.empty(cells), np.empty(cells), np.empty(cells)
+    z = low_m[2] + (np.arange(cells) + 0.5) * size_m[2]
+    for i in range(first, last):
+        own[:] = 0
+        past[:] = 0
+        x = low_m[0] + (i + 0.5) * size_m[0]
+        for view in range(views):  # outer loop: keeps the view's image in the cache
+            m = matrices[view]
+            box, start = boxes_px[view], starts[view]
+            for j in range(cells):
+                y = low_m[1] + (j + 0.5) * size_m[1]
+                a, b, c = (
+                    m[0, 0] * x + m[0, 1] * y,
+                    m[1, 0] * x + m[1, 1] * y,
+                    m[2, 0] * x + m[2, 1] * y,
+                )
+                for k in range(cells):
+                    depth[k] = c + m[2, 2] * z[k] + m[2, 3]
+                    u[k] = (a + m[0, 2] * z[k] + m[0, 3]) / depth[k]
+                    v[k] = (b + m[1, 2] * z[k] + m[1, 3]) / depth[k]
+                for k in range(cells):
+                    if past[j, k] > enough or depth[k] < MIN_DEPTH_M:
+                        continue
+                    if not (0 <= u[k] < width and 0 <= v[k] < height):
+                        continue
+                    column, row = int(u[k]), int(v[k])
+                    radius = int(radius_m * focal_px[view] / depth[k] + 0.5)
+                    if own_in(
+                        box, table, start,
+                        column - radius, row - radius, column + radius + 1, row + radius + 1,
+                    ):  # fmt: skip
+                        own[j, k] += 1
+                    elif ids[view, row, column] == 0:
+                        past[j, k] += 1
+        for j in range(cells):
+            for k in range(cells):
+                # Half a view is subtracted: an object's outline runs through pixels.
+                share = max(past[j, k] - 0.5, 0.0) / (own[j, k] + past[j, k])
+                never = own[j, k] < 2 or past[j, k] > enough
+                emptiness[i, j, k] = NEVER if never else share
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _cells_along(first, last, origins, directions, near, far, low_m, cell_m, grid, where, found):
+    cells, samples = grid.shape[0], found.shape[1]
+    for ray in range(first, last):
+        met = far[ray] > near[ray]
+        start, span = (near[ray], far[ray] - near[ray]) if met else (0.0, 0.0)
+        for i in range(samples):
+            depth_m = start + span * ((i + 0.5) / samples)
+            for axis in range(3):
+                point_m = origins[ray, axis] + depth_m * directions[ray, axis]
+                cell = (point_m - low_m[axis]) / cell_m[axis]
+                where[ray, i, axis] = int(min(max(cell, 0.0), cells - 1.0))
+            x, y, z = where[ray, i]
+            found[ray, i] = grid[x, y, z] if met else NEVER

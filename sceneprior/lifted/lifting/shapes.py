@@ -1,0 +1,46 @@
+"""Visual hulls of tracked objects, on a grid in the frame of each object's box."""
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from sceneprior.core.shards import RoomViews
+from sceneprior.lifted.lifting.hulls import carve, sightings_of
+from sceneprior.lifted.lifting.lifted import LiftedBoxes, ShapeGrid
+
+REACH = 0.4
+"""`reach` of `hulls.carve`: parts this thin, in cells, are kept."""
+EMPTY = 0.05
+"""Share of views seeing past a cell above which it is empty. It is lower than the limit in
+`boxes.py`, where one wrong cell can move a whole side of a box; here it is only one cell."""
+
+
+def lift_shapes(
+    views: RoomViews,
+    boxes: LiftedBoxes,
+    shape: ShapeGrid,
+    chosen: Int[np.ndarray, " views"] | None = None,
+) -> Bool[np.ndarray, "objects x y z"]:
+    """The visual hull of each of a room's objects, on a grid in the frame of its box.
+
+    Args:
+        views: A room, read with its images.
+        boxes: The room's boxes from `lift_boxes`.
+        shape: The grid.
+        chosen: The views to use; None uses all.
+
+    Returns:
+        True in cells that the object may fill, indexed x, y, z; all False for an object without a
+        box. Cells outside the box are False.
+    """
+    rows = np.arange(len(views.visible)) if chosen is None else chosen
+    cells, margin = shape.cells, shape.margin
+    grids = np.zeros((len(views.object_class), cells, cells, cells), dtype=bool)
+    # Cells whose centres lie in the box.
+    inside = np.abs((np.arange(cells) + 0.5) / cells - 0.5) * margin < 0.5
+    for item in np.flatnonzero(boxes.explained > 0):
+        seen = sightings_of(views, rows[views.visible[rows, item]], int(item))
+        half_m = margin * boxes.sizes_m[item] / 2
+        low_m, high_m = boxes.centers_m[item] - half_m, boxes.centers_m[item] + half_m
+        hull = carve(seen, low_m, high_m, cells, REACH, EMPTY)
+        grids[item] = (hull.emptiness <= EMPTY) & inside & inside[:, None] & inside[:, None, None]
+    return grids

@@ -1,0 +1,97 @@
+"""The layout loss (Eq. 7) against lifted 3D boxes instead of 2D boxes in views.
+
+Not in the paper, which compares 2D boxes in every view at every step. `lifting` estimates each
+object's 3D box from its masks beforehand, so boxes are compared in 3D, and no frustum loss is
+needed.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from sceneprior.core.views import DecodedScenes, LiftedRooms
+from sceneprior.paper.losses.averages import mean_of_objects
+from sceneprior.paper.losses.completeness import completeness_targets
+from sceneprior.paper.losses.layout import class_loss, take
+from sceneprior.paper.losses.matching import Matches, assign, class_cost
+
+PER_METRE = 1 / 6
+"""Weight of a metre: the share of the image's width that 1 m spans at a distance of 3 m and a field
+of view of 90 degrees. So lambda_box and lambda_B have about the same effect as for 2D boxes."""
+
+
+@torch.no_grad()
+def match_lifted(scenes: DecodedScenes, rooms: LiftedRooms, box_weight: float = 5.0) -> Matches:
+    """The cheapest one-to-one assignment of the first n predictions to a room's n objects.
+
+        sigma = argmin sum_k -p_k(l_j) + lambda_B |b_k - b_j|_1
+
+    as Eq. S2, but b is a 3D box, centre and extents, with weight `PER_METRE` per metre. An object
+    without a lifted box costs nothing.
+    """
+    distance = torch.cdist(predicted_boxes(scenes), rooms.boxes_m, p=1)
+    cost = class_cost(scenes, rooms.object_class) + box_weight * PER_METRE * distance
+    cost = cost * rooms.is_lifted.unsqueeze(1)
+    counts = rooms.is_object.sum(dim=-1).tolist()
+    return Matches(assign(cost, counts, counts), rooms.is_lifted)
+
+
+def needed_predictions(rooms: LiftedRooms, slots: int) -> Bool[Tensor, "rooms slots"]:
+    """Mask of the first n + 1 predictions in a room of n objects: the last of them marks the end,
+    and no scene is decoded further. A room without objects is padding of the batch and needs
+    none."""
+    counts = rooms.is_object.sum(dim=-1, keepdim=True)
+    return (torch.arange(slots, device=counts.device) <= counts) & (counts > 0)
+
+
+def lifted_losses(
+    scenes: DecodedScenes, rooms: LiftedRooms, matches: Matches, completeness_target: str
+) -> dict[str, Float[Tensor, ""]]:
+    """The losses `class`, `box` and `completeness`, unweighted, as in `layout_losses`; completeness
+    covers only the predictions that are needed (`needed_predictions`).
+
+        L_box = mean over objects of `PER_METRE` * (|c_k - c_j|_1 + |s_k - s_j|_1)
+    """
+    logits = scenes.completeness_logits
+    goes_on = completeness_targets(
+        rooms.is_object.sum(dim=-1), logits.shape[1], completeness_target
+    )
+    every = F.binary_cross_entropy_with_logits(logits, goes_on.to(logits.dtype), reduction="none")
+    predicted = take(predicted_boxes(scenes), matches.prediction, dim=1)
+    apart = (predicted - rooms.boxes_m).abs().sum(dim=-1)
+    return {
+        "class": class_loss(scenes, rooms, matches),
+        "box": mean_of_objects(PER_METRE * apart, matches.valid),
+        "completeness": mean_of_objects(every, needed_predictions(rooms, logits.shape[1])),
+    }
+
+
+def predicted_boxes(scenes: DecodedScenes) -> Float[Tensor, "rooms objects 6"]:
+    """Centre and full extents of every prediction."""
+    return torch.cat([scenes.centers_m, scenes.sizes_m], dim=-1)
+
+
+def shape_code_loss(
+    scenes: DecodedScenes,
+    matches: Matches,
+    codes: Float[Tensor, "rooms objects codes"],
+    cells: Float[Tensor, "rooms objects"],
+) -> Float[Tensor, ""]:
+    """Squared distance between decoded and lifted shape codes, relative to the size of the lifted
+    shape.
+
+        L_S = mean over objects of |a_k - a_j|_2^2 / cells_j
+
+    Squared distances of the codes a count differing grid cells, and cells_j is the number of cells
+    that the lifted shape fills. Without the division, a lamp on a cord, which fills a hundredth of
+    its box, would hardly be learnt.
+
+    Args:
+        scenes: With `shape_codes`.
+        matches: As `match_lifted` gives them.
+        codes, cells: Codes and filled cells of the objects' looks (`OccupancyDecoder.targets`).
+    """
+    assert scenes.shape_codes is not None, "the prior decodes looks"
+    apart = take(scenes.shape_codes, matches.prediction, dim=1) - codes
+    return mean_of_objects(apart.square().sum(dim=-1) / cells, matches.valid)

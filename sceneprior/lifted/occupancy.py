@@ -1,0 +1,175 @@
+"""The occupancy decoder: from an object's feature to a prototype shape in one of its poses.
+
+It replaces the paper's deformed template; such shapes may have legs, holes and thin tops.
+"""
+
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from pydantic import Field
+from torch import Tensor, nn
+
+from sceneprior.core.geometry.isosurface import surface_of
+from sceneprior.core.geometry.turns import quarter_rotation
+from sceneprior.core.scene import Mesh
+from sceneprior.core.views import DecodedScenes
+from sceneprior.lifted.prototypes import POSES, Prototypes, looks_apart, turn_of
+from sceneprior.paper.layers import ShapeModule, ShapeModuleConfig
+
+
+class OccupancyConfig(ShapeModuleConfig):
+    """Shapes as occupancy grids, chosen among prototypes lifted from the training rooms' masks."""
+
+    prototypes: int = Field(1024, ge=1)
+    """Maximum number of prototype shapes, which represent the shapes of all objects."""
+    codes: int = Field(128, ge=1)
+    """Dimension of the shape code; similar looks (`lifted/prototypes.py`) have nearby codes."""
+    width: int = Field(128, ge=8)
+    """Hidden width of the MLP that predicts the code."""
+    cells: int = Field(32, ge=8, le=64)
+    """Cells along each axis of the grid."""
+    margin: float = Field(1.1, ge=1, le=2)
+    """Extent of the grid, relative to the object's box."""
+
+    def build(self, features: int) -> "OccupancyDecoder":
+        """The module for object features of this width, freshly initialised."""
+        return OccupancyDecoder(features, self)
+
+
+class OccupancyDecoder(ShapeModule):
+    """An MLP on MLP1's output predicts a code; the object gets the look whose code is nearest.
+
+    Looks are defined in `lifted/prototypes.py`: a prototype shape in one of its poses. Squared
+    distances between the codes of looks approximate the number of cells in which their grids
+    differ. So the code is trained with a squared error, near misses cost little, and the decoded
+    shape is still a sharp one rather than the mean of several.
+
+    Prototypes and the codes of their looks are buffers, not parameters: they are computed from the
+    training data before the first step (`learn_prototypes`) and saved in checkpoints.
+    """
+
+    faces = None
+    unknown: ClassVar[int] = -1
+    """Class of unused prototype slots."""
+
+    def __init__(self, features: int, config: OccupancyConfig):
+        super().__init__()
+        width, cells, most = config.width, config.cells, config.prototypes
+        self.cells, self.margin = cells, config.margin
+        self.mlp = nn.Sequential(
+            nn.ReLU(),
+            nn.Linear(features, width), nn.SiLU(),
+            nn.Linear(width, width), nn.SiLU(),
+            nn.Linear(width, config.codes),
+        )  # fmt: skip
+        self.grid_bits: Tensor
+        self.filled: Tensor
+        self.sizes_m: Tensor
+        self.object_class: Tensor
+        self.common: Tensor
+        self.look_codes: Tensor
+        self.spread: Tensor
+        self.register_buffer("grid_bits", torch.zeros(most, -(-(cells**3) // 8), dtype=torch.uint8))
+        self.register_buffer("filled", torch.ones(most))
+        self.register_buffer("sizes_m", torch.ones(most, 3))
+        self.register_buffer("object_class", torch.full((most,), self.unknown))
+        self.register_buffer("common", torch.zeros(most, dtype=torch.bool))
+        self.register_buffer("look_codes", torch.zeros(most * POSES, config.codes))
+        self.register_buffer("spread", torch.ones(()))
+        self._meshes: dict[int, Mesh] = {}
+
+    def learn_prototypes(self, prototypes: Prototypes) -> None:
+        """Set the prototypes whose looks are decoded."""
+        count = len(prototypes.grids)
+        flat = prototypes.grids.reshape(count, -1)
+        self.grid_bits[:count] = torch.from_numpy(np.packbits(flat, axis=1))
+        self.filled[:count] = torch.from_numpy(flat.sum(axis=1).clip(min=1).astype(np.float32))
+        self.sizes_m[:count] = torch.from_numpy(prototypes.sizes_m)
+        self.object_class[:count] = torch.from_numpy(prototypes.object_class)
+        self.common[:count] = torch.from_numpy(prototypes.common)
+        codes = looks_apart(prototypes.grids, self.look_codes.shape[1])
+        self.look_codes[: count * POSES] = torch.from_numpy(codes)
+        self.spread.fill_(float(np.sqrt((codes**2).mean())) or 1.0)
+
+    @property
+    def prototypes(self) -> Prototypes:
+        """The prototypes set by `learn_prototypes`."""
+        known = self.object_class != self.unknown
+        bits, sizes_m, labels, common = (
+            part[known].cpu().numpy()
+            for part in (self.grid_bits, self.sizes_m, self.object_class, self.common)
+        )
+        flat = np.unpackbits(bits, axis=1, count=self.cells**3).view(bool)
+        grids = flat.reshape(-1, *(self.cells,) * 3)
+        return Prototypes(grids, sizes_m.astype(np.float64), labels, common)
+
+    def forward(
+        self, features: Float[Tensor, "*objects features"]
+    ) -> Float[Tensor, "*objects codes"]:
+        """Predicted shape codes of objects."""
+        codes: Tensor = self.mlp(features) * self.spread
+        return codes
+
+    def add_shapes(
+        self,
+        scenes: DecodedScenes,
+        features: Float[Tensor, "rooms objects features"],
+        with_shape: bool | Bool[Tensor, "rooms shaped"],
+        wanted: Bool[Tensor, "rooms wanted"] | None,
+    ) -> DecodedScenes:
+        """The scenes with shape codes of all objects and, with `with_shape`, the looks nearest to
+        them."""
+        codes = self(features).to(scenes.centers_m.dtype)
+        looks = None if with_shape is False else self.looks(codes)
+        return replace(scenes, shape_codes=codes, looks=looks)
+
+    def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:
+        if decoded.looks is None:
+            return None
+        box_m = torch.cat((decoded.centers_m[room, item], decoded.sizes_m[room, item]))
+        return self.mesh(int(decoded.looks[room, item]), box_m.double().cpu().numpy())
+
+    def looks(self, codes: Float[Tensor, "*objects codes"]) -> Int[Tensor, "*objects"]:
+        """The look whose code is nearest, the first of equal ones; 0 if there are no prototypes
+        yet."""
+        known = (self.object_class != self.unknown).repeat_interleave(POSES).nonzero()[:, 0]
+        if not len(known):
+            return torch.zeros(codes.shape[:-1], dtype=torch.int64, device=codes.device)
+        # Only looks in use are compared: most slots are unused, and comparing with all takes as
+        # long as decoding.
+        apart = torch.cdist(codes.flatten(0, -2), self.look_codes[known].to(codes))
+        return known[apart.argmin(dim=-1)].unflatten(0, codes.shape[:-1])
+
+    def targets(
+        self, looks: Int[Tensor, "*objects"]
+    ) -> tuple[Float[Tensor, "*objects codes"], Float[Tensor, "*objects"]]:
+        """Codes of looks, and the number of cells that each fills."""
+        return self.look_codes[looks], self.filled[looks // POSES]
+
+    def mesh(self, look: int, box_m: Float[np.ndarray, "6"]) -> Mesh:
+        """The mesh of a look, stretched into a box (centre, full extents)."""
+        prototype, pose = divmod(look, POSES)
+        surface = self.surface(prototype)
+        vertices, faces = surface.vertices_m, surface.faces
+        quarters, mirrored = turn_of(pose)
+        if mirrored:  # inverts the faces: reverse their corners
+            vertices, faces = vertices * [-1, 1, 1], faces[:, ::-1].copy()
+        vertices = vertices @ quarter_rotation(quarters).T
+        return Mesh(vertices * box_m[3:] + box_m[:3], faces)
+
+    @property
+    def known(self) -> list[int]:
+        """Indices of the prototypes in use."""
+        return (self.object_class != self.unknown).nonzero()[:, 0].tolist()
+
+    def surface(self, prototype: int) -> Mesh:
+        """The surface of a prototype in [-0.5, 0.5]^3; computed once."""
+        if prototype not in self._meshes:
+            bits = self.grid_bits[prototype].cpu().numpy()
+            filled = np.unpackbits(bits, count=self.cells**3).reshape((self.cells,) * 3)
+            surface = surface_of(filled - 0.5, np.zeros(3), np.ones(3), self.margin)
+            self._meshes[prototype] = Mesh(*surface)
+        return self._meshes[prototype]

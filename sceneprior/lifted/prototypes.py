@@ -1,0 +1,219 @@
+"""Prototype shapes: a few of a data set's objects, mirrored and turned, represent all of them.
+
+A look is a prototype shape in one of its `POSES`. It is stored as one number, prototype * POSES +
+pose, where pose p mirrors the prototype (x reversed) if p >= 4 and then turns it about +y by p % 4
+quarter turns.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sceneprior.core.geometry.turns import QUARTERS, turn_grids
+
+POSES = 2 * QUARTERS
+"""Poses of a prototype: mirrored or not, times the quarter turns; numbered as in the module's
+docstring."""
+ALIKE = 0.25
+"""Largest distance (`distances`) at which two objects look alike. It is the squared difference of
+their coarse grids over the geometric mean of the cells that the two fill (without which a chair's
+legs would hardly count), plus `SIZE_WEIGHT` times the L1 distance of their log extents."""
+SIZE_WEIGHT = 0.3
+"""Weight of the difference in log extents; see `ALIKE`."""
+COMMON = 3
+"""Number of objects, itself among them, that a common prototype looks like. The most frequent
+prototype of each class is common in any case. An odd shape is more often badly lifted than truly
+rare."""
+COARSE, PARTS = 8, 4
+"""Cells along each axis of the coarse grids that are compared (`COARSE`), and of those that the
+sampler's network reads (`PARTS`)."""
+
+
+class Prototypes(NamedTuple):
+    """Objects whose shapes represent those of all objects of their classes."""
+
+    grids: Bool[np.ndarray, "prototypes x y z"]
+    sizes_m: Float[np.ndarray, "prototypes 3"]
+    object_class: Int[np.ndarray, " prototypes"]
+    """Class of each prototype; -1 if it is not used."""
+    common: Bool[np.ndarray, " prototypes"]
+    """True if the prototype represents several objects (`COMMON`)."""
+
+    def common_alone(self) -> "Prototypes":
+        """The same prototypes in the same order, with those that are not common marked as
+        unused."""
+        return self._replace(object_class=np.where(self.common, self.object_class, -1))
+
+    def shown(self) -> Float[np.ndarray, "looks shown"]:
+        """The network's input for each look: its coarse grid and the logarithms of its extents."""
+        rows = [
+            np.hstack([
+                turn_grids(pooled(self.grids, PARTS), *turn_of(pose)).reshape(len(self.grids), -1),
+                turned_extents(np.log(self.sizes_m), pose),
+            ])
+            for pose in range(POSES)
+        ]  # fmt: skip
+        return np.stack(rows, axis=1).reshape(len(self.grids) * POSES, -1).astype(np.float32)
+
+    def looks_of(
+        self,
+        grids: Bool[np.ndarray, "objects x y z"],
+        sizes_m: Float[np.ndarray, "objects 3"],
+        object_class: Int[np.ndarray, " objects"],
+    ) -> Int[np.ndarray, " objects"]:
+        """The nearest look of each object; -1 if its class has no prototype."""
+        looks = np.full(len(grids), -1, dtype=np.int64)
+        for label in np.unique(object_class):
+            rows, own = (
+                np.flatnonzero(all_ == label) for all_ in (object_class, self.object_class)
+            )
+            if len(own):
+                ours = described(grids[rows], sizes_m[rows])
+                apart, pose = distances(ours, described(self.grids[own], self.sizes_m[own]))
+                nearest = apart.argmin(axis=1)
+                looks[rows] = own[nearest] * POSES + pose[np.arange(len(rows)), nearest]
+        return looks
+
+
+def choose_prototypes(
+    grids: Bool[np.ndarray, "objects x y z"],
+    sizes_m: Float[np.ndarray, "objects 3"],
+    object_class: Int[np.ndarray, " objects"],
+    usable: Bool[np.ndarray, " objects"],
+    most: int,
+) -> Prototypes:
+    """Prototypes of each class: greedily, the object that looks like most of those left, until
+    every usable object looks like a prototype.
+
+    The threshold `ALIKE` is raised by half until there are at most `most` prototypes, or one per
+    class.
+    """
+    apart = []
+    for label in np.unique(object_class[usable]):
+        rows = np.flatnonzero((object_class == label) & usable)
+        own = described(grids[rows], sizes_m[rows])
+        apart.append((rows, distances(own, own)[0]))
+    alike = ALIKE
+    items, common = _covering(apart, alike)
+    while len(items) > max(most, len(apart)):
+        alike *= 1.5
+        items, common = _covering(apart, alike)
+    return Prototypes(grids[items], sizes_m[items], object_class[items], common)
+
+
+def _covering(
+    apart: list[tuple[np.ndarray, np.ndarray]], alike: float
+) -> tuple[Int[np.ndarray, " prototypes"], Bool[np.ndarray, " prototypes"]]:
+    """Rows of the prototypes that `choose_prototypes` finds at the threshold `alike`, and whether
+    they are common; `apart` holds each class's rows and their distances."""
+    items, common = [], []
+    for rows, distance in apart:
+        near = (distance <= alike) | np.eye(len(rows), dtype=bool)
+        first = True
+        while near.any():
+            likes = near.sum(axis=0)
+            best = int(likes.argmax())
+            items.append(rows[best])
+            common.append(first or likes[best] >= COMMON)
+            near[near[:, best]] = False  # these are represented
+            first = False
+    return np.array(items, dtype=np.int64), np.array(common, dtype=bool)
+
+
+def looks_apart(
+    grids: Bool[np.ndarray, "prototypes x y z"], codes: int
+) -> Float[np.ndarray, "looks codes"]:
+    """Codes of all looks whose squared distances approximate the number of cells in which the looks
+    differ: their leading principal components, padded with zeros if there are fewer looks than
+    `codes`.
+
+    Source:
+        Torgerson, "Multidimensional scaling: I. Theory and method", Psychometrika 1952.
+    """
+    from scipy import linalg  # imported here: training only
+
+    looks = np.stack([turn_grids(grids, *turn_of(pose)) for pose in range(POSES)], axis=1)
+    flat = looks.reshape(len(grids) * POSES, -1).astype(np.float32)
+    flat -= flat.mean(axis=0)
+    # The eigenvalues of the Gram matrix are the squared singular values of the looks, and there are
+    # far fewer looks than cells.
+    products = (flat @ flat.T).astype(np.float64)
+    found = min(codes, len(flat))
+    squares, turns = linalg.eigh(products, subset_by_index=(len(flat) - found, len(flat) - 1))
+    placed = np.zeros((len(flat), codes), np.float32)
+    placed[:, :found] = turns[:, ::-1] * np.sqrt(squares[::-1].clip(min=0))
+    return placed
+
+
+class Described(NamedTuple):
+    """Features by which objects are compared."""
+
+    coarse: Float[np.ndarray, "objects u v w"]
+    log_sizes: Float[np.ndarray, "objects 3"]
+
+
+def described(
+    grids: Bool[np.ndarray, "objects x y z"], sizes_m: Float[np.ndarray, "objects 3"]
+) -> Described:
+    """Coarse grids and logarithms of extents."""
+    return Described(pooled(grids, COARSE), np.log(sizes_m))
+
+
+def distances(
+    objects: Described, offered: Described
+) -> tuple[Float[np.ndarray, "objects offered"], Int[np.ndarray, "objects offered"]]:
+    """Distance of each object from each offered one in the latter's best pose, and that pose; the
+    first of equal ones."""
+    own, theirs = (each.coarse.reshape(len(each.coarse), -1) for each in (objects, offered))
+    own = own.astype(np.float64)
+    filled = np.sqrt(np.outer(own.sum(axis=1), theirs.sum(axis=1))).clip(min=1e-9)
+    apart = np.full((len(own), len(offered.coarse)), np.inf)
+    best = np.zeros(apart.shape, dtype=np.int64)
+    for pose in range(POSES):
+        turned = turn_grids(offered.coarse, *turn_of(pose)).reshape(len(offered.coarse), -1)
+        squared = (own**2).sum(1)[:, None] + (turned**2).sum(1) - 2 * own @ turned.T
+        sizes = turned_extents(offered.log_sizes, pose)
+        differ = np.abs(objects.log_sizes[:, None] - sizes).sum(2)
+        found = squared / filled + SIZE_WEIGHT * differ
+        better = found < apart - 1e-9
+        best[better], apart[better] = pose, found[better]
+    return apart, best
+
+
+def turn_of(pose: int) -> tuple[int, bool]:
+    """Quarter turns and mirroring of a pose, as `turn_grids` takes them."""
+    return pose % QUARTERS, pose >= QUARTERS
+
+
+def turned_extents(extents: Float[np.ndarray, "n 3"], pose: int) -> Float[np.ndarray, "n 3"]:
+    """Extents along x, y, z of objects that are put into a pose."""
+    return extents[:, ::-1] if pose % 2 else extents
+
+
+def turned_looks(
+    looks: Int[Tensor, "rooms objects"],
+    quarters: Int[Tensor, " rooms"],
+    mirrored: Bool[Tensor, " rooms"],
+) -> Int[Tensor, "rooms objects"]:
+    """The looks of objects whose rooms are optionally mirrored, then turned by `quarters`."""
+    pose = looks % POSES
+    own, flipped = pose % QUARTERS, pose >= QUARTERS
+    # Mirroring reverses the direction of a turn.
+    turn = torch.where(mirrored[:, None], -own, own) + quarters[:, None]
+    return looks - pose + turn % QUARTERS + QUARTERS * (flipped ^ mirrored[:, None])
+
+
+def pooled(
+    grids: Bool[np.ndarray, "objects x y z"], parts: int
+) -> Float[np.ndarray, "objects u v w"]:
+    """Mean occupancy of each of `parts`^3 blocks of a grid; cells left over at the end of an axis
+    are dropped."""
+    n, cells = len(grids), grids.shape[1] // parts
+    even = grids[:, : parts * cells, : parts * cells, : parts * cells]
+    means: np.ndarray = even.reshape(n, parts, cells, parts, cells, parts, cells).mean(
+        axis=(2, 4, 6), dtype=np.float32
+    )
+    return means

@@ -1,0 +1,208 @@
+"""Baselines of reconstruction: the training room with the best masks, and a random training room.
+
+Rooms are matched to images by one fixed cost, whatever method they are compared with; a run's own
+weights have no influence.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+from torch.nn.utils.rnn import pad_sequence
+
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.cameras import boxes_of_points
+from sceneprior.core.geometry.corners import box_corners
+from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
+from sceneprior.core.ground_truth import reference_scene
+from sceneprior.core.observed_image import ObservedImage, as_views, rows_of
+from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.shards import Shard, iterate_rooms
+from sceneprior.core.views import DecodedScenes
+from sceneprior.paper.losses.matching import match_objects, matching_cost
+from sceneprior.render.offscreen import Pinhole, Renderer
+from sceneprior.render.topdown import scene_meshes
+
+BOX_WEIGHT, OCCLUSION_SLACK = 5.0, 0.15
+"""Weights of the cost by which a room's objects are matched to masks (`match_objects`). The
+occlusion slack is below 1 since boxes of whole objects extend behind their occluders."""
+SHORTLIST = 16
+"""Rooms, best by 2D boxes, whose masks are compared."""
+MASK_COLUMNS = 80
+"""Approximate width of the compared masks in pixels, whatever a run trains with."""
+CERTAIN_LOGIT = 30.0
+"""Logit of a known class: its probability rounds to 1."""
+ABSENT_M = 1e4
+"""Coordinate of padding, far from every camera."""
+
+
+@dataclass(frozen=True)
+class KnownRooms:
+    """Rooms in 3D, each in four turns, with their objects in the form of decoded predictions.
+
+    Scenes hold boxes only, since a data set's meshes in four turns take many gigabytes; `furnished`
+    reads the meshes of one room.
+    """
+
+    folder: Path
+    paths: tuple[Path, ...]
+    """The shard of each room, before turning."""
+    scenes: tuple[Scene, ...]
+    class_logits: Float[Tensor, "rooms objects classes"]
+    centers_m: Float[Tensor, "rooms objects 3"]
+    sizes_m: Float[Tensor, "rooms objects 3"]
+
+    def furnished(self, row: int) -> Scene:
+        """`scenes[row]` with its meshes.
+
+        Raises:
+            ShardError: a model's file is missing or damaged.
+        """
+        scene = self.scenes[row]
+        with Shard(self.paths[row // QUARTERS]) as shard:
+            home = reference_scene(shard, scene.name, self.folder)
+        return turn_scene(home, row % QUARTERS)
+
+
+class KnownAnswer(NamedTuple):
+    """A known room as the answer to an image."""
+
+    scene: Scene
+    objects: tuple[SceneObject | None, ...]
+    """The object for each mask; None if the room has none left for it."""
+
+
+def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
+    """The rooms of a split, turned by 0, 90, 180 and 270 degrees.
+
+    Raises:
+        ShardError: the shards or their ground truth cannot be read.
+    """
+    rooms = [
+        (shard.path, reference_scene(shard, room_id, shards, meshes=False))
+        for shard, room_id in iterate_rooms(shards, split)
+    ]
+    turned = tuple(turn_scene(scene, quarter) for _, scene in rooms for quarter in range(QUARTERS))
+    certain = CERTAIN_LOGIT * torch.eye(len(label_set(turned[0].label_set)))
+    centers_m = [torch.from_numpy(scene.centers_m).float() for scene in turned]
+    sizes_m = [torch.from_numpy(scene.sizes_m).float() for scene in turned]
+    return KnownRooms(
+        Path(shards),
+        tuple(path for path, _ in rooms),
+        turned,
+        pad_sequence([certain[scene.class_indices] for scene in turned], True),
+        pad_sequence(centers_m, True, ABSENT_M),
+        pad_sequence(sizes_m, True),
+    )
+
+
+def turn_scene(scene: Scene, quarter: int) -> Scene:
+    """The room turned by `quarter` quarter turns about the vertical axis, +z towards +x."""
+    turn = quarter_rotation(quarter)
+    floor = None if scene.floor_m is None else scene.floor_m @ turn[::2, ::2].T
+    extra = {**scene.extra, "turned_degrees": 90 * (quarter % QUARTERS)}
+    objects = tuple(turn_object(item, quarter) for item in scene.objects)
+    return replace(scene, objects=objects, floor_m=floor, extra=extra)
+
+
+def turn_object(item: SceneObject, quarter: int) -> SceneObject:
+    """An object of a room that is turned by `quarter` quarter turns."""
+    turn = quarter_rotation(quarter)
+    center_m, size_m = turn @ np.array(item.center_m), np.abs(turn) @ np.array(item.size_m)
+    mesh = item.mesh and Mesh(item.mesh.vertices_m @ turn.T, item.mesh.faces)
+    return SceneObject(item.label, tuple(center_m.tolist()), tuple(size_m.tolist()), mesh)
+
+
+def random_answers(
+    rooms: KnownRooms, images: Sequence[ObservedImage], seed: int
+) -> list[KnownAnswer]:
+    """For each image, a random room other than its own, matched to its masks."""
+    rng = np.random.default_rng(seed)
+    rows = [int(rng.choice(_others(rooms, image))) for image in images]
+    return [
+        _answer(rooms, row, _matched(rooms, torch.tensor([row]), image)[0][0])
+        for row, image in zip(rows, images, strict=True)
+    ]
+
+
+def nearest_answers(
+    rooms: KnownRooms, images: Sequence[ObservedImage], renderer: Renderer
+) -> list[KnownAnswer]:
+    """For each image, the room other than its own with the highest mean IoU over the image's masks.
+
+    Masks are rendered only for the `SHORTLIST` rooms that are best by classes and 2D boxes.
+    """
+    answers = []
+    for image in images:
+        others = _others(rooms, image)
+        matched, costs = _matched(rooms, others, image)
+        best = costs.argsort()[:SHORTLIST].tolist()
+        offered = [_answer(rooms, int(others[at]), matched[at]) for at in best]
+        answers.append(max(offered, key=lambda one: mask_overlap(one, image, renderer)))
+    return answers
+
+
+def _answer(rooms: KnownRooms, row: int, matched: Sequence[int]) -> KnownAnswer:
+    scene = rooms.furnished(row)
+    count = len(scene.objects)
+    return KnownAnswer(scene, tuple(scene.objects[k] if k < count else None for k in matched))
+
+
+def _others(rooms: KnownRooms, image: ObservedImage) -> Tensor:
+    rows = [row for row, scene in enumerate(rooms.scenes) if scene.name != image.room_id]
+    if not rows:
+        raise InputError(
+            f"The shards' only training room is {image.room_id} itself, so there is no other to "
+            "compare its reconstruction with; take shards with more training rooms."
+        )
+    return torch.tensor(rows)
+
+
+def _matched(
+    known: KnownRooms, rows: Int[Tensor, " rooms"], image: ObservedImage
+) -> tuple[list[list[int]], Float[Tensor, " rooms"]]:
+    """Index of the object that each room assigns to each mask, beyond its last object for none, and
+    the mean cost of each room."""
+    view = rows_of(as_views([image], 1), torch.zeros(len(rows), dtype=torch.int64))
+    # As much padding as there are masks, so that every mask can be assigned.
+    masks = view.is_object.shape[1]
+
+    def padded(values: Tensor, value: float = 0.0) -> Tensor:
+        return F.pad(values[rows], (0, 0, 0, masks), value=value)
+
+    logits, sizes_m = padded(known.class_logits), padded(known.sizes_m)
+    centers_m = padded(known.centers_m, ABSENT_M)
+    decoded = DecodedScenes(logits, centers_m, sizes_m, torch.zeros(centers_m.shape[:2]))
+    corners = box_corners(centers_m, sizes_m)
+    boxes = boxes_of_points(corners, view.world_to_camera, view.intrinsics, view.image_size)
+    settings = (BOX_WEIGHT, OCCLUSION_SLACK)
+    chosen = match_objects(decoded, boxes, view, *settings, first_n=False).prediction
+    costs = matching_cost(decoded, boxes, view, *settings).gather(1, chosen.unsqueeze(1))
+    return chosen.tolist(), costs[:, 0].mean(dim=1)
+
+
+def mask_overlap(answer: KnownAnswer, image: ObservedImage, renderer: Renderer) -> float:
+    """Mean IoU of an image's masks with those of the objects assigned to them, without void
+    pixels."""
+    scene = answer.scene
+    observed = image.sampled_ids(max(1, round(image.instance_ids.shape[1] / MASK_COLUMNS)))
+    height, width = observed.shape
+    full = image.instance_ids.shape
+    intrinsics = np.diag([width / full[1], height / full[0], 1]) @ image.intrinsics
+    camera = Pinhole(np.asarray(image.world_to_camera, dtype=np.float64), intrinsics)
+    drawn = renderer.instance_ids(scene_meshes(scene), camera, (height, width))
+    number = {id(item): row + 1 for row, item in enumerate(scene.objects)}
+    known = observed <= len(image.object_class)
+    overlaps = []
+    for mask, item in enumerate(answer.objects):
+        # No pixel is -1, so a mask without an object has IoU 0.
+        mine, seen = known & (drawn == number.get(id(item), -1)), observed == mask + 1
+        overlaps.append((mine & seen).sum() / max((mine | seen).sum(), 1))
+    return float(np.mean(overlaps))

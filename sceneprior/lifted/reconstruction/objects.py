@@ -1,0 +1,193 @@
+"""Reconstruct an image object by object: the prior's objects, placed so that they match the masks.
+
+For each mask, candidates are the objects of its class in all training rooms, as the prior decodes
+them, in all quarter turns. Each is moved until its outline fits the mask's. The remaining misfit
+gives its likelihood; the answer is the candidate whose box has the highest expected IoU.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sceneprior.core.classes import label_set
+from sceneprior.core.geometry.turns import QUARTERS, turn_vectors
+from sceneprior.core.observed_image import ObservedImage
+from sceneprior.core.overlaps import box_iou_3d
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.lifted.reconstruction.candidates import (
+    Candidates,
+    candidates_of,
+    decode_some,
+    with_shapes,
+)
+from sceneprior.lifted.reconstruction.known_rooms import turn_object
+from sceneprior.lifted.reconstruction.outlines import Outlines, joined, outlines_of
+from sceneprior.lifted.reconstruction.placing import Placed, place_objects
+from sceneprior.paper.decode import scene_of
+from sceneprior.paper.trained import TrainedPrior
+
+OF_CLASS = 200
+"""Candidates per class, chosen with a fixed seed."""
+PROMISING = 64
+"""Best guesses per mask, placed in two turns as beveled boxes, whose decoded shapes are then placed
+in all four turns."""
+AT_ONCE = 16384
+"""Objects placed at a time."""
+
+
+class Guesses(NamedTuple):
+    """Guesses of the object behind each mask: a candidate in a turn, one per row."""
+
+    mask: Int[Tensor, " guesses"]
+    """Index of the mask, counted over all images."""
+    candidate: Int[Tensor, " guesses"]
+    quarter: Int[Tensor, " guesses"]
+
+    def take(self, rows: Tensor) -> "Guesses":
+        return Guesses(*(part[rows] for part in self))
+
+
+class ObjectAnswer(NamedTuple):
+    """The reconstruction of an image."""
+
+    scene: Scene
+    """One object per mask, in the order of the masks, with the image's classes."""
+    energy: float
+    """Mean of `Placed.energy` over the masks' best guesses: ranks camera hypotheses of one
+    image."""
+    taken_for: dict[str, str]
+    """Maps each class of the image that the run never generates to the class of the object used for
+    it."""
+
+
+@torch.no_grad()
+def answer_images(trained: TrainedPrior, images: Sequence[ObservedImage]) -> list[ObjectAnswer]:
+    """Reconstruct images of the run's label set in one batch; answers do not depend on each other.
+
+    For a class that the run never generates, objects of all classes are tried.
+    """
+    masks = joined([outlines_of(image) for image in images])
+    classes = torch.from_numpy(np.concatenate([image.object_class for image in images]))
+    rough = candidates_of(trained)
+    first = _of_classes(rough, classes)
+    energy = _placed(rough, first, masks).energy
+    second = _promising(first, energy, len(classes))
+    used, numbered = second.candidate.unique(return_inverse=True)
+    shaped = with_shapes(trained, rough.take(used))
+    second = second._replace(candidate=numbered)
+    placed = _placed(shaped, second, masks)
+    chosen = torch.tensor(
+        [
+            int(rows[likeliest_box(placed, _turned_sizes(shaped, second.take(rows)), rows)])
+            for rows in (second.mask == torch.arange(len(classes))[:, None])
+            .nonzero()[:, 1]
+            .split(second.mask.bincount(minlength=len(classes)).tolist())
+        ]
+    )
+    best = torch.full((len(classes),), torch.inf)
+    best = best.scatter_reduce(0, second.mask, placed.energy, "amin")
+    objects = _objects(trained, shaped, second.take(chosen), placed.centers_m[chosen])
+    names = label_set(trained.config.label_set)
+    known = {names[index] for index in rough.object_class.unique().tolist()}
+    answers, at = [], 0
+    for image in images:
+        rows = slice(at, at + len(image.object_class))
+        labels = [names[index] for index in image.object_class]
+        pairs = list(zip(labels, objects[rows], strict=True))
+        scene = Scene(
+            image.name,
+            image.label_set,
+            tuple(SceneObject(label, o.center_m, o.size_m, o.mesh) for label, o in pairs),
+        )
+        taken_for = {label: o.label for label, o in pairs if label not in known}
+        answers.append(ObjectAnswer(scene, float(best[rows].mean()), taken_for))
+        at = rows.stop
+    return answers
+
+
+def _of_classes(candidates: Candidates, classes: Int[Tensor, " masks"]) -> Guesses:
+    """For each mask, `OF_CLASS` candidates of its class, in quarter turns 0 and 1."""
+    generator = torch.Generator().manual_seed(0)
+    shuffled = torch.randperm(len(candidates.room), generator=generator)
+    of_class = {
+        index: shuffled[candidates.object_class[shuffled] == index][:OF_CLASS]
+        for index in classes.unique().tolist()
+    }
+    chosen = [
+        rows if len(rows := of_class[index]) else shuffled[:OF_CLASS] for index in classes.tolist()
+    ]
+    counts = torch.tensor([len(rows) for rows in chosen])
+    mask = torch.arange(len(classes)).repeat_interleave(counts)
+    candidate = torch.cat(chosen)
+    quarter = torch.zeros_like(mask)
+    return Guesses(mask.repeat(2), candidate.repeat(2), torch.cat([quarter, quarter + 1]))
+
+
+def _promising(guesses: Guesses, energy: Float[Tensor, " guesses"], masks: int) -> Guesses:
+    """The guesses of least energy for each mask, and the same turned by 180 degrees."""
+    order = energy.argsort(stable=True)
+    order = order[guesses.mask[order].argsort(stable=True)]
+    counts = guesses.mask.bincount(minlength=masks)
+    first = counts.cumsum(0) - counts
+    rank = torch.arange(len(order)) - first[guesses.mask[order]]
+    best = guesses.take(order[rank < PROMISING])
+    turned = best._replace(quarter=best.quarter + QUARTERS // 2)
+    return Guesses(*(torch.cat(parts) for parts in zip(best, turned, strict=True)))
+
+
+def _turned_sizes(candidates: Candidates, guesses: Guesses) -> Float[Tensor, "guesses 3"]:
+    return turn_vectors(candidates.sizes_m[guesses.candidate], guesses.quarter).abs()
+
+
+def _placed(candidates: Candidates, guesses: Guesses, masks: Outlines) -> Placed:
+    parts = []
+    for rows in torch.arange(len(guesses.mask)).split(AT_ONCE):
+        part = guesses.take(rows)
+        points = turn_vectors(candidates.points[part.candidate], part.quarter)
+        parts.append(
+            place_objects(
+                points,
+                _turned_sizes(candidates, part),
+                candidates.bottom_m[part.candidate],
+                Outlines(*(values[part.mask] for values in masks)),
+            )
+        )
+    return Placed(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def likeliest_box(
+    placed: Placed, sizes_m: Float[Tensor, "guesses 3"], rows: Int[Tensor, " guesses"]
+) -> int:
+    """Index into `rows` of the guess whose box has the highest expected IoU with the true one."""
+    likely = (-placed.energy[rows]).double().softmax(dim=0).numpy()
+    centers_m, sizes = (part.double().numpy() for part in (placed.centers_m[rows], sizes_m))
+    return int((box_iou_3d(centers_m, sizes, centers_m, sizes) @ likely).argmax())
+
+
+def _objects(
+    trained: TrainedPrior,
+    candidates: Candidates,
+    chosen: Guesses,
+    centers_m: Float[Tensor, "masks 3"],
+) -> list[SceneObject]:
+    """The chosen candidates, decoded, turned and moved to their centres."""
+    objects: dict[tuple[int, int], SceneObject] = {}
+    rooms, slots = candidates.room[chosen.candidate], candidates.slot[chosen.candidate]
+    for room in rooms.unique():
+        mine = slots[rooms == room].unique()
+        decoded = decode_some(trained, room[None], torch.zeros_like(mine), mine)
+        labels = trained.config.label_set
+        scene = scene_of(decoded, 0, mine.tolist(), trained.prior, labels, "")
+        pairs = zip(mine.tolist(), scene.objects, strict=True)
+        objects |= {(int(room), slot): item for slot, item in pairs}
+    found = []
+    for room, slot, quarter, center_m in zip(
+        rooms.tolist(), slots.tolist(), chosen.quarter.tolist(), centers_m.tolist(), strict=True
+    ):
+        item = turn_object(objects[room, slot], quarter)
+        found.append(item.in_box(center_m, item.size_m))
+    return found

@@ -1,0 +1,89 @@
+"""Scenes from a run's sampler: each object's look becomes a mesh in its box."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.core.threads import single_threaded
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.occupancy import OccupancyDecoder
+from sceneprior.lifted.sampler.draw import draw_rooms
+from sceneprior.lifted.sampler.plan import Given
+from sceneprior.lifted.trained import SAMPLER, TrainedLifted
+from sceneprior.paper.trained import TrainedPrior
+
+
+def drawn_by_sampler(trained: TrainedPrior, distribution: str | None) -> TrainedLifted | None:
+    """`trained` if its sampler is to draw new rooms, by `distribution` or else by the run's own
+    settings; None if new rooms come from latents.
+
+    Raises:
+        InputError: the sampler is asked for, but the run has none, or has not trained it yet.
+    """
+    if (distribution or trained.distribution) != SAMPLER:
+        return None
+    if not isinstance(trained, TrainedLifted) or trained.sampler is None:
+        raise InputError(
+            "This run has no sampler, or its stage has not begun; leave out --distribution "
+            f"{SAMPLER}, or train with a section `sampler` (`--config lifted/bedroom.yaml`)."
+        )
+    return trained
+
+
+@single_threaded()
+def sample_scenes(
+    trained: TrainedLifted, names: Sequence[str], seed: int, given: Given | None = None
+) -> list[Scene]:
+    """A new room with meshes for each name; see `draw_rooms`."""
+    assert trained.sampler is not None, "callers ask trained.sampler first"
+    rooms = draw_rooms(trained.sampler, len(names), seed, given)
+    return looks_to_scenes(trained, rooms, names)
+
+
+def looks_to_scenes(trained: TrainedLifted, rooms: RoomBoxes, names: Sequence[str]) -> list[Scene]:
+    """Scenes of rooms whose objects have looks, with meshes from the run's shape decoder."""
+    assert rooms.looks is not None and trained.sampler is not None
+    shapes = trained.prior.shape
+    assert isinstance(shapes, OccupancyDecoder), "whose looks the sampler draws"
+    classes = label_set(trained.config.label_set)
+    scenes = []
+    for row, name in enumerate(names):
+        objects = []
+        for item in rooms.is_object[row].nonzero()[:, 0].tolist():
+            box = rooms.boxes_m[row, item].double().numpy()
+            look, index = int(rooms.looks[row, item]), int(rooms.object_class[row, item])
+            # A given object whose class has no prototype gets no mesh.
+            known = int(trained.sampler.look_class[look]) == index
+            mesh = shapes.mesh(look, box) if known else None
+            label = classes[index]
+            objects.append(SceneObject(label, tuple(box[:3]), tuple(box[3:]), mesh))
+        scenes.append(Scene(name, trained.config.label_set, tuple(objects)))
+    return scenes
+
+
+def class_rows(trained: TrainedLifted, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:
+    """Indices of named classes, as `Given.coming` takes them; an `InputError` for a class that is
+    not in the training rooms."""
+    assert trained.sampler is not None
+    classes = label_set(trained.config.label_set)
+    known = [classes[row] for row in trained.sampler.drawn_classes]
+    for label in labels:
+        if label not in known:
+            raise InputError(
+                f"'{label}' is no class of this run's training rooms; choose from "
+                f"{', '.join(known)}."
+            )
+    return torch.tensor([[classes.index(label) for label in labels]], dtype=torch.int64)
+
+
+def floor_rectangle(scene: Scene) -> Float[Tensor, "1 4"]:
+    """The bounding rectangle of a scene's floor: centre x, z and extents x, z."""
+    assert scene.floor_m is not None
+    low, high = scene.floor_m.min(axis=0), scene.floor_m.max(axis=0)
+    return torch.from_numpy(np.concatenate([(low + high) / 2, high - low])[None]).float()

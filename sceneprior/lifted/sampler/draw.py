@@ -1,0 +1,222 @@
+"""Draw rooms from a trained sampler: whole rooms, or the rest of rooms with given objects."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from sceneprior.core.mixtures import draw_index
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.sampler.contents import END
+from sceneprior.lifted.sampler.network import Frame, Reading, RoomSampler
+from sceneprior.lifted.sampler.plan import (
+    BEYOND_M,
+    Given,
+    Plan,
+    nothing_given,
+    plan_rooms,
+    uniform_numbers,
+)
+from sceneprior.lifted.sampler.rooms import FRAME_M, gaps_m, shared_extents
+
+PLACES = 32
+"""Places sampled for an object, which takes the first without a violation."""
+LOOKS = 16
+"""Looks sampled for a given object, one of which is chosen by the likelihood of its place."""
+INTERSECTING = 0.01
+"""Share of the smaller volume from which two boxes count as intersecting, as in the evaluation."""
+OPEN_M = 3 * FRAME_M
+"""Distance in metres beyond which a side counts as empty: 1 of 370 sides in the training rooms
+exceeds it."""
+SIZE_RANGE = 0.5
+"""Largest difference between the log extents of an object and of its look."""
+SIZE_DOUBT = 0.1
+"""Standard deviation of that difference for given objects."""
+ROUNDS = 8
+"""Maximum number of attempts to furnish a room before it is planned anew."""
+PLANS = 3
+"""Maximum number of plans of a room."""
+BATCH = 256
+"""Rooms drawn at a time."""
+
+
+@torch.no_grad()
+def draw_rooms(
+    sampler: RoomSampler, count: int, seed: int, given: Given | None = None
+) -> RoomBoxes:
+    """New rooms with looks; given objects come first, with their own boxes.
+
+    A room's contents are sampled first (`plan_rooms`), then its objects one by one, each at the
+    first of `PLACES` sampled places where it neither intersects an object that it should not
+    (`RoomSampler.may_meet`) nor extends beyond the rectangle. A room is furnished again if some
+    object has no such place, or if a side of its sampled rectangle stays empty (`OPEN_M`), as
+    hardly any training room's does. After `ROUNDS` attempts it is planned again.
+
+    In the last round of `PLANS`, objects without a place are left out; if their classes were
+    requested, they take the place with the least violation instead.
+
+    The same seed draws the same rooms, and the first ones do not depend on `count`.
+    """
+    given = given or nothing_given(count)
+    keep = given.coming is not None
+    slots, waiting = sampler.max_objects, torch.arange(count)
+    drawn = _nothing_drawn(count, slots)
+    for number in range(PLANS * ROUNDS):
+        last = number + 1 == PLANS * ROUNDS
+        if number % ROUNDS == 0:
+            plan = plan_rooms(sampler, given, count, (seed, number // ROUNDS))
+        numbers = uniform_numbers(count, slots * (7 + 3 * PLACES), (seed, PLANS + number))
+        numbers = numbers.unflatten(1, (slots, -1))
+        stuck = []
+        for rows in waiting.split(BATCH):
+            found, found_stuck = _draw(sampler, numbers[rows], plan.rows(rows), last, keep)
+            for whole, part in zip(_parts(drawn), _parts(found), strict=True):
+                whole[rows] = part
+            stuck.append(rows[found_stuck])
+        waiting = torch.cat(stuck)
+        if last or not len(waiting):
+            break
+    return drawn
+
+
+def _nothing_drawn(count: int, slots: int) -> RoomBoxes:
+    none = torch.zeros(count, slots, dtype=torch.int64)
+    return RoomBoxes(none, none > 0, torch.zeros(count, slots, 6), looks=none.clone())
+
+
+def _parts(rooms: RoomBoxes) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    assert rooms.looks is not None
+    return rooms.object_class, rooms.is_object, rooms.boxes_m, rooms.looks
+
+
+def _draw(
+    sampler: RoomSampler,
+    uniform: Float[Tensor, "rooms slots numbers"],
+    plan: Plan,
+    last: bool,
+    keep: bool,
+) -> tuple[RoomBoxes, Bool[Tensor, " rooms"]]:
+    """The rooms, and a mask of those to furnish again: some object found no place, or a side of a
+    sampled rectangle stays empty. With `keep`, the last round places objects in any case."""
+    number = plan.objects.is_object.sum(dim=1)
+    rooms = _recognised(sampler, uniform, plan)
+    looks = rooms.looks
+    assert looks is not None
+    stuck = torch.zeros_like(number, dtype=torch.bool)
+    added = (plan.coming != END).any(dim=1)
+    for step, chance in enumerate(uniform.unbind(dim=1)):
+        label = plan.coming[:, step]
+        # Rooms to be furnished again are not completed.
+        going = (label != END) & (last | ~stuck)
+        if not going.any():
+            break
+        reading = _read(sampler, rooms, number, plan, plan.coming[:, step:])
+        some = label.where(going, label[going][0])  # finished rooms get a dummy class
+        look, tried_m = _tried(sampler, reading, some, chance)
+        wrong = _wrong(tried_m, some, reading, sampler.may_meet)
+        best = wrong.argmin(dim=1, keepdim=True)  # first minimum
+        fits = wrong.gather(1, best)[:, 0] == 0
+        stuck = stuck | (going & ~fits)
+        placed = going & (fits | (last & keep))
+        box_m = torch.take_along_dim(tried_m, best.unsqueeze(-1), dim=1)[:, 0]
+        at = (placed.nonzero()[:, 0], number[placed])
+        rooms.object_class[at], rooms.is_object[at] = some[placed], True
+        rooms.boxes_m[at], looks[at] = box_m[placed], look[placed]
+        number = number + placed
+    side_open = gaps_m(rooms, plan.rectangle_m).amax(dim=-1) > OPEN_M
+    return rooms, stuck | (added & plan.drawn & side_open)
+
+
+def _read(
+    sampler: RoomSampler,
+    rooms: RoomBoxes,
+    number: Int[Tensor, " rooms"],
+    plan: Plan,
+    coming: Int[Tensor, "rooms wanted"],
+) -> Reading:
+    """Encode the first `number` objects of each room, and the classes still to come."""
+    most = int(number.max())
+    first = torch.arange(most, device=number.device) < number[:, None]
+    before = rooms.changed(lambda part: part[:, :most]).only(first)
+    still = sampler.contents.before(coming, coming != END)[:, -1]
+    tokens = sampler.tokens(before, plan.rectangle_m)
+    return sampler.read(before, still, Frame.plain(plan.rectangle_m), tokens)
+
+
+def _tried(
+    sampler: RoomSampler,
+    reading: Reading,
+    label: Int[Tensor, " rooms"],
+    chance: Float[Tensor, "rooms numbers"],
+) -> tuple[Int[Tensor, " rooms"], Float[Tensor, "rooms places 6"]]:
+    """A look and a size for an object of a class, and boxes at all sampled places."""
+    look = draw_index(sampler.look_logits(reading, label), chance[:, 1])
+    details = sampler.details(reading, label, look).draw(chance[:, 2], chance[:, 3:7])
+    off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)
+    size_m = (sampler.look_shown[look, -3:] + off).exp()
+    bottom_m = details[:, 3].clamp(min=0)  # the floor
+    places = sampler.place(reading, label, look, size_m, bottom_m)
+    numbers = chance[:, 7:].unflatten(1, (PLACES, 3))
+    x, z = places.drawn(numbers[..., 0], numbers[..., 1:]).unbind(dim=-1)
+    y = (bottom_m + size_m[:, 1] / 2).unsqueeze(1).expand_as(x)
+    size_m = size_m.unsqueeze(1).expand(-1, PLACES, -1)
+    return look, torch.cat([torch.stack([x, y, z], dim=-1), size_m], dim=-1)
+
+
+def _recognised(
+    sampler: RoomSampler,
+    uniform: Float[Tensor, "rooms slots numbers"],
+    plan: Plan,
+) -> RoomBoxes:
+    """The given objects, in as many slots as rooms have, each with a look: `LOOKS` looks are
+    sampled by their likelihood and that of the size, then one of them by the likelihood of the
+    place."""
+    objects = plan.objects
+    count, known = objects.is_object.shape
+    still = torch.cat([objects.object_class * objects.is_object, plan.coming], dim=1)
+    empty = (0, sampler.max_objects - known)
+    looks = torch.zeros(count, sampler.max_objects, dtype=torch.int64)
+    rooms = RoomBoxes(
+        F.pad(objects.object_class, empty), F.pad(objects.is_object, empty),
+        F.pad(objects.boxes_m, (0, 0, *empty)), looks=looks,
+    )  # fmt: skip
+    for step in range(known):
+        here = rooms.is_object[:, step]
+        reading = _read(sampler, rooms, torch.full((count,), step), plan, still[:, step:])
+        label = rooms.object_class[:, step].clamp(min=1)
+        centre_m, size_m = rooms.boxes_m[:, step].split(3, dim=-1)
+        size_m = size_m.where(here[:, None], 1.0)
+        off = size_m.log().unsqueeze(1) - sampler.look_shown[:, -3:]
+        logits = sampler.look_logits(reading, label)
+        logits = logits - off.square().sum(dim=-1) / (2 * SIZE_DOUBT**2)
+        chance = uniform[:, step]
+        some = draw_index(logits.unsqueeze(1).expand(-1, LOOKS, -1), chance[:, 1 : 1 + LOOKS])
+        bottom_m = centre_m[:, 1] - size_m[:, 1] / 2
+        fits = [
+            sampler.place(reading, label, look, size_m, bottom_m).log_prob(centre_m[:, ::2])
+            for look in some.unbind(dim=1)
+        ]
+        chosen = draw_index(torch.stack(fits, dim=1), chance[:, 0])
+        looks[:, step] = some.gather(1, chosen[:, None])[:, 0] * here
+    return rooms
+
+
+def _wrong(
+    boxes_m: Float[Tensor, "rooms places 6"],
+    label: Int[Tensor, " rooms"],
+    reading: Reading,
+    may_meet: Bool[Tensor, "classes classes"],
+) -> Float[Tensor, "rooms places"]:
+    """Violation of a box at a place, 0 if there is none: the intersected shares of the smaller
+    boxes, summed over objects that it should not meet, plus the metres by which it extends beyond
+    the rectangle."""
+    others = reading.before
+    here, theirs = boxes_m.unsqueeze(2), others.boxes_m.unsqueeze(1)
+    shared = shared_extents(here, theirs).prod(dim=-1)
+    least = torch.minimum(here[..., 3:].prod(dim=-1), theirs[..., 3:].prod(dim=-1))
+    share = shared / least.clamp(min=1e-9)
+    counts = others.is_object & ~may_meet[label[:, None], others.object_class]
+    share = share.where((share > INTERSECTING) & counts.unsqueeze(1), 0.0)
+    middle, extents = reading.frame.rectangle_m.unsqueeze(1).split(2, dim=-1)
+    beyond = (boxes_m[..., [0, 2]] - middle).abs() + (boxes_m[..., [3, 5]] - extents) / 2
+    return share.sum(dim=-1) + (beyond.amax(dim=-1) - BEYOND_M).clamp(min=0)

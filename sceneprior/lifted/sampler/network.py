@@ -1,0 +1,278 @@
+"""The sampler's network: a room's contents, and the next object given the set of the previous
+ones."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from sceneprior.core.geometry.turns import QUARTERS
+from sceneprior.core.mixtures import LogisticMixture, draw_index
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.prototypes import PARTS, POSES, turned_looks
+from sceneprior.lifted.sampler.contents import Contents
+from sceneprior.lifted.sampler.placement import Placement
+from sceneprior.lifted.sampler.rooms import SYMMETRIES, gaps_m, rectangle_sides
+from sceneprior.lifted.sampler.settings import SamplerConfig
+from sceneprior.paper.layers import mlp
+
+CLASS_WIDTH = 32
+"""Dimension of the class embedding."""
+OCTAVES = 6
+"""Frequencies in the encoding of a length."""
+LONGEST_M = 16.0
+"""Longest period of that encoding: sines and cosines of `OCTAVES` periods, this one, its half and
+so on."""
+LENGTHS = 1 + 2 * OCTAVES
+"""Numbers that encode a length."""
+SHOWN = PARTS**3 + 3
+"""Numbers that encode a look: its coarse grid and the logarithms of its extents."""
+RECTANGLES = 6
+"""Components of the Gaussian mixture of the rectangle around a room's furniture."""
+DETAILS = 4
+"""Components of the logistic mixture of an object's size and height."""
+MATCH_WIDTH = 64
+"""Dimension of the query and the keys by which looks are compared."""
+
+
+def _own_pose() -> Int[Tensor, "symmetries poses"]:
+    symmetry, own = torch.arange(SYMMETRIES), torch.arange(POSES).expand(SYMMETRIES, -1)
+    return turned_looks(own, symmetry % QUARTERS, symmetry >= QUARTERS).argsort(dim=1)
+
+
+OWN_POSE = _own_pose()
+"""Maps (room symmetry, observed pose) to the pose in the untransformed room."""
+
+
+class RoomSampler(nn.Module):
+    """Autoregressive model of rooms: the contents (`Contents`), then one object after the other,
+    each given the unordered set of the previous ones and the classes still to come.
+
+    A transformer encoder without positional encoding reads the rectangle around the room's
+    furniture, the objects placed so far, and a learnt query. The query's output predicts the next
+    object, whose class is already known: first its look, then its size relative to that look and
+    the height of its bottom, then its place (`Placement`), relative to the rectangle, to the
+    floor's middle or to another object.
+
+    Training rooms are presented in all their `SYMMETRIES`. The frequency of each look in each pose
+    depends on the orientation of the data; it is learnt for untransformed rooms and transformed
+    with them.
+
+    Args:
+        settings: Size of the network.
+        classes: Size of the label set, void included.
+        prototypes: Maximum number of prototypes, as in the prior's shape decoder.
+        max_objects: Maximum number of objects in a room.
+    """
+
+    look_class: Tensor
+    look_shown: Tensor
+    rectangle_logits: Tensor
+    rectangle_means: Tensor
+    rectangle_factors: Tensor
+    may_meet: Tensor
+    footprints_m2: Tensor
+
+    def __init__(self, settings: SamplerConfig, classes: int, prototypes: int, max_objects: int):
+        super().__init__()
+        width, dropout = settings.width, settings.dropout
+        self.max_objects = max_objects
+        # Computed from the training rooms before the first step, and saved in checkpoints.
+        looks = prototypes * POSES
+        self.register_buffer("look_class", torch.full((looks,), -1))
+        self.register_buffer("look_shown", torch.zeros(looks, SHOWN))
+        self.register_buffer("rectangle_logits", torch.zeros(RECTANGLES))
+        self.register_buffer("rectangle_means", torch.zeros(RECTANGLES, 4))
+        self.register_buffer("rectangle_factors", torch.zeros(RECTANGLES, 4, 4))
+        self.register_buffer("may_meet", torch.zeros(classes, classes, dtype=torch.bool))
+        self.register_buffer("footprints_m2", torch.ones(classes))
+        # Small, with exact inputs, so that it overfits first: it gets twice the dropout, at most
+        # 0.5.
+        self.contents = Contents(classes, width // 2, min(2 * dropout, 0.5))
+        self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
+        self.look_embedding = nn.Linear(SHOWN, width)
+        self.object_embedding = nn.Linear(CLASS_WIDTH + 10 * LENGTHS, width)
+        self.rectangle_embedding = nn.Linear(4 * LENGTHS, width)
+        self.query = nn.Parameter(torch.randn(width))
+        self.summary_embedding = nn.Linear(2 * classes + 4 * LENGTHS, width)
+        self.dropout = nn.Dropout(dropout)
+        self.encoder = nn.ModuleList(
+            nn.TransformerEncoderLayer(
+                width, settings.heads, 2 * width, dropout, "gelu", batch_first=True, norm_first=True
+            )
+            for _ in range(settings.layers)
+        )
+        self.norm = nn.LayerNorm(width)
+        known = width + CLASS_WIDTH
+        self.wanted_look = _head(known, width, MATCH_WIDTH)
+        self.offered_look = _head(SHOWN, width, MATCH_WIDTH)
+        self.frequency = nn.Parameter(torch.zeros(prototypes, POSES))
+        self.details_head = _head(known + width, width, DETAILS * 9)
+        self.place_query = _head(known + width + 4 * LENGTHS, width, width)
+        self.placement = Placement(width)
+
+    @property
+    def drawn_classes(self) -> list[int]:
+        """Indices of the classes that can be sampled: those with looks, not the whole label set."""
+        return [int(row) for row in self.look_class[self.look_class >= 0].unique()]
+
+    def rectangles(
+        self, choice: Float[Tensor, "*batch"], noise: Float[Tensor, "*batch 4"]
+    ) -> Float[Tensor, "*batch 4"]:
+        """Rectangles (centre x, z, extents x, z) from a uniform number and standard normal ones."""
+        which = draw_index(self.rectangle_logits.expand(*choice.shape, -1), choice)
+        moved = (self.rectangle_factors[which] @ noise.unsqueeze(-1))[..., 0]
+        found = self.rectangle_means[which] + moved
+        return torch.cat([found[..., :2], found[..., 2:].exp()], dim=-1)
+
+    def tokens(
+        self, rooms: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]
+    ) -> Float[Tensor, "rooms objects width"]:
+        """Encoder inputs, one per object: class, look, size, height, and its place in the rectangle
+        (centre x, z, extents x, z)."""
+        assert rooms.looks is not None
+        centre, size = rooms.boxes_m.split(3, dim=-1)
+        middle, extents = rectangle_m.unsqueeze(1).split(2, dim=-1)
+        place, footprint = centre[..., ::2] - middle, size[..., ::2]
+        bottom = centre[..., 1:2] - size[..., 1:2] / 2
+        low, high = (extents - footprint) / 2 + place, (extents - footprint) / 2 - place
+        shown = lengths_shown(torch.cat([place, bottom, size, low, high], dim=-1))
+        known = torch.cat([self.class_embedding(rooms.object_class), shown], dim=-1)
+        return self.object_embedding(known) + self.look_embedding(self.look_shown)[rooms.looks]
+
+    def read(
+        self,
+        before: RoomBoxes,
+        coming: Float[Tensor, "rooms classes"],
+        frame: "Frame",
+        tokens: Float[Tensor, "rooms objects width"],
+    ) -> "Reading":
+        """Encode the objects placed so far, in any order, from their `tokens`, and the counts of
+        each class still to come."""
+        query = self.query + self.summary_embedding(self.summary(before, coming, frame))
+        shown = self.rectangle_embedding(lengths_shown(frame.rectangle_m))
+        features = torch.cat([query.unsqueeze(1), shown.unsqueeze(1), tokens], dim=1)
+        features = self.dropout(features)
+        nothing = torch.cat([before.is_object.new_zeros(len(tokens), 2), ~before.is_object], dim=1)
+        for layer in self.encoder:
+            features = layer(features, src_key_padding_mask=nothing)
+        features = self.norm(features)
+        return Reading(before, frame, features[:, 0], features[:, 2:])
+
+    def summary(
+        self, before: RoomBoxes, coming: Float[Tensor, "rooms classes"], frame: "Frame"
+    ) -> Float[Tensor, "rooms summary"]:
+        """Features that attention would have to count: objects of each class, those to come, and
+        the gaps between the furniture and each side of the rectangle, which are small in a finished
+        room."""
+        counts = self.contents.before(before.object_class, before.is_object)[:, -1]
+        furnished = before.is_object.any(dim=1, keepdim=True)
+        low, high = rectangle_sides(frame.rectangle_m)
+        whole = torch.cat([high - low] * 2, dim=-1)
+        gaps = gaps_m(before, frame.rectangle_m).where(furnished, whole)
+        return torch.cat([counts, coming, lengths_shown(gaps)], dim=-1)
+
+    def look_logits(
+        self, reading: "Reading", label: Int[Tensor, " rooms"]
+    ) -> Float[Tensor, "rooms looks"]:
+        """Logits of the next object's look, given its class; looks of other classes are ruled
+        out."""
+        known = torch.cat([reading.context, self.class_embedding(label)], dim=-1)
+        offered = self.offered_look(self.look_shown)
+        logits = self.wanted_look(known) @ offered.T / math.sqrt(MATCH_WIDTH)
+        own_pose = OWN_POSE.to(self.frequency.device)
+        frequency = self.frequency[:, own_pose].transpose(0, 1).flatten(1)
+        logits = logits + frequency[reading.frame.symmetry]
+        return logits.masked_fill(self.look_class != label.unsqueeze(-1), -torch.inf)
+
+    def details(
+        self, reading: "Reading", label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
+    ) -> LogisticMixture:
+        """Distribution of the log extents relative to those of the look, and of the height of the
+        bottom."""
+        return LogisticMixture.of(self.details_head(self._known(reading, label, look)), 4)
+
+    def place(
+        self,
+        reading: "Reading",
+        label: Int[Tensor, " rooms"],
+        look: Int[Tensor, " rooms"],
+        size_m: Float[Tensor, "rooms 3"],
+        bottom_m: Float[Tensor, " rooms"],
+    ) -> LogisticMixture:
+        """Distribution of x and z of the centre."""
+        lengths = lengths_shown(torch.cat([size_m, bottom_m.unsqueeze(-1)], dim=-1))
+        known = torch.cat([self._known(reading, label, look), lengths], dim=-1)
+        footprints = reading.before.boxes_m[..., [0, 2, 3, 5]]
+        return self.placement(
+            self.place_query(known), size_m[:, ::2], reading.frame.rectangle_m,
+            reading.objects, footprints, reading.before.is_object,
+        )  # fmt: skip
+
+    def log_prob(self, reading: "Reading", coming: RoomBoxes) -> dict[str, Float[Tensor, " rooms"]]:
+        """Log-probability of each room's next object given its class, by part. Every room of
+        `coming` has one object."""
+        assert coming.looks is not None
+        label, look = coming.object_class[:, 0], coming.looks[:, 0]
+        centre_m, size_m = coming.boxes_m[:, 0].split(3, dim=-1)
+        bottom_m = centre_m[:, 1] - size_m[:, 1] / 2
+        looks = self.look_logits(reading, label).log_softmax(dim=-1)
+        details = torch.cat(
+            [size_m.log() - self.look_shown[look, -3:], bottom_m.unsqueeze(-1)], dim=-1
+        )
+        place = self.place(reading, label, look, size_m, bottom_m)
+        return {
+            "look": looks.gather(-1, look.unsqueeze(-1))[:, 0],
+            "size": self.details(reading, label, look).log_prob(details),
+            "place": place.log_prob(centre_m[:, ::2]),
+        }
+
+    def _known(
+        self, reading: "Reading", label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
+    ) -> Float[Tensor, "rooms known"]:
+        look_seen = self.look_embedding(self.look_shown[look])
+        return torch.cat([reading.context, self.class_embedding(label), look_seen], dim=-1)
+
+
+class Frame(NamedTuple):
+    """Conditions of rooms that are known before they have any furniture."""
+
+    rectangle_m: Float[Tensor, "rooms 4"]
+    """Rectangle that the furniture may fill: centre x, z and extents x, z."""
+    symmetry: Int[Tensor, " rooms"]
+    """Index of the symmetry, out of `SYMMETRIES`, in which each room is presented; 0 is
+    untransformed."""
+
+    @classmethod
+    def plain(cls, rectangle_m: Float[Tensor, "rooms 4"]) -> "Frame":
+        """The frame of untransformed rooms."""
+        return cls(rectangle_m, rectangle_m.new_zeros(len(rectangle_m), dtype=torch.int64))
+
+    def rows(self, chosen: Tensor) -> "Frame":
+        """The frame of the chosen rooms."""
+        return Frame(self.rectangle_m[chosen], self.symmetry[chosen])
+
+
+class Reading(NamedTuple):
+    """Encoder outputs for partly furnished rooms."""
+
+    before: RoomBoxes
+    frame: Frame
+    context: Float[Tensor, "rooms width"]
+    """Output of the query: the context for the next object."""
+    objects: Float[Tensor, "rooms objects width"]
+    """Output of each object; arbitrary for padding."""
+
+
+def lengths_shown(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch shown"]:
+    """Fourier features of lengths: the lengths themselves (in units of 4 m), their sines and
+    cosines."""
+    octaves = torch.arange(OCTAVES, device=lengths_m.device, dtype=lengths_m.dtype)
+    phase = (lengths_m.unsqueeze(-1) * (2 * math.pi / LONGEST_M * 2**octaves)).flatten(-2)
+    return torch.cat([lengths_m / 4, phase.sin(), phase.cos()], dim=-1)
+
+
+def _head(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    return mlp(nn.Linear(inputs, width), nn.Linear(width, outputs))

@@ -1,0 +1,191 @@
+"""Training rooms of the sampler: the lifted objects of each room, with their looks."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.lifting.dataset import LiftedDataset
+from sceneprior.lifted.prototypes import Prototypes, turned_looks
+
+GRAZE_M = 0.05
+"""Overlap along an axis up to which lifted boxes may overlap only because they are inaccurate."""
+SYMMETRIES = 2 * QUARTERS
+"""Symmetries of a room: mirrored or not, times the quarter turns; 0 is the untransformed room."""
+LOOSELY = 2.0
+"""Range of the random offset of log footprints in `large_first`."""
+FRAME_M = 0.15
+"""Standard deviation of the normal distribution in `frames_of`."""
+PLAUSIBLE_SHARE = 0.2
+"""Share of the training rooms with both classes from which an intersection of the two is considered
+intended: lifted boxes of chairs intersect each other in a seventh of them, true ones in none."""
+
+
+class SamplerRooms:
+    """Rooms as unordered sets of objects: class, box and look. Rows are rooms without turned
+    copies.
+
+    Objects without a label, and those that no view shows, are left out.
+
+    Args:
+        lifted: A split, with its shapes.
+    """
+
+    room_ids: tuple[str, ...]
+    """Ids of the rows of the prior's latents, turned copies included."""
+    masks = None
+    """None: batches are made in the training process, as `ViewDataset` says."""
+
+    def __init__(self, lifted: LiftedDataset):
+        self.room_ids, self.label_set = lifted.room_ids, lifted.label_set
+        self.plain_ids = tuple(lifted.plain_ids)
+        self._lifted = lifted
+        self.prototypes: Prototypes
+        self.rooms: RoomBoxes
+
+    def see_looks(self, prototypes: Prototypes) -> "SamplerRooms":
+        """Set `rooms`, in which every object has a look, and return this data set. Only common
+        prototypes are used, since odd ones are often badly lifted."""
+        lifted, prototypes = self._lifted, prototypes.common_alone()
+        counts = [len(room.explained) for room in lifted.boxes]
+        boxes_m = np.concatenate([np.hstack([b.centers_m, b.sizes_m]) for b in lifted.boxes])
+        looks = lifted.looks_of(prototypes)
+        rows = np.split(np.arange(len(looks)), np.cumsum(counts)[:-1])
+        kept = [torch.from_numpy(row[looks[row] >= 0]) for row in rows]
+
+        def padded(values: np.ndarray) -> Tensor:
+            return pad_sequence([torch.from_numpy(values)[row] for row in kept], batch_first=True)
+
+        self.prototypes = prototypes
+        self.rooms = RoomBoxes(
+            object_class=padded(lifted.object_classes),
+            is_object=padded(np.ones(len(looks), dtype=bool)),
+            boxes_m=padded(boxes_m.astype(np.float32)),
+            room_ids=self.plain_ids,
+            looks=padded(looks),
+        )
+        return self
+
+    def __len__(self) -> int:
+        return len(self.plain_ids)
+
+    def to(self, device: torch.device | str) -> "SamplerRooms":
+        """Move all rooms to `device`, on which batches are then assembled."""
+        self.rooms = self.rooms.to(device)
+        return self
+
+    def __getitems__(self, draws: list[tuple[int, int]]) -> RoomBoxes:
+        """A batch of rows; each draw is (row, epoch). A draw of epoch `BLANK` is an empty room;
+        empty rooms add nothing to the loss."""
+        shown = torch.tensor([epoch >= 0 for _, epoch in draws])
+        rows = [row for row, _ in draws]
+        rooms = self.rooms.changed(lambda part: part[rows])
+        rooms = rooms.only(shown.to(rooms.is_object.device)[:, None])
+        return replace(rooms, room_ids=tuple(self.plain_ids[row] for row in rows))
+
+    def may_meet(self, classes: int) -> Bool[Tensor, "classes classes"]:
+        """Pairs of classes that intersect in at least `PLAUSIBLE_SHARE` of the rooms with both,
+        such as a chair and its table; symmetric."""
+        together = torch.zeros(2, classes, classes, dtype=torch.int64)
+        for row in range(len(self)):
+            here = self.rooms.is_object[row]
+            label, boxes_m = self.rooms.object_class[row, here], self.rooms.boxes_m[row, here]
+            first, second = torch.triu_indices(len(label), len(label), 1)
+            shared = shared_extents(boxes_m[first], boxes_m[second]).amin(dim=-1) > GRAZE_M
+            for number, pairs in enumerate((torch.ones_like(shared), shared)):
+                found = torch.zeros(classes, classes, dtype=torch.bool)
+                found[label[first[pairs]], label[second[pairs]]] = True
+                together[number] += found | found.T
+        both, meeting = together
+        return (both > 0) & (meeting >= PLAUSIBLE_SHARE * both)
+
+
+def shared_extents(
+    boxes_m: Float[Tensor, "*#batch 6"], others_m: Float[Tensor, "*#batch 6"]
+) -> Float[Tensor, "*#batch 3"]:
+    """Overlap of two boxes (centre, full extents) along each axis; 0 where they are disjoint."""
+    apart = (boxes_m[..., :3] - others_m[..., :3]).abs()
+    total = (boxes_m[..., 3:] + others_m[..., 3:]) / 2
+    least = torch.minimum(boxes_m[..., 3:], others_m[..., 3:])
+    return torch.minimum(total - apart, least).clamp(min=0)
+
+
+def rectangles_of(rooms: RoomBoxes) -> Float[Tensor, "rooms 4"]:
+    """The bounding rectangle of each room's footprints: centre x, z, extents x, z; zeros for an
+    empty room."""
+    if not rooms.boxes_m.shape[1]:
+        return rooms.boxes_m.new_zeros(len(rooms.boxes_m), 4)
+    centers, sizes = (part[..., ::2] for part in rooms.boxes_m.split(3, dim=-1))
+    nowhere = ~rooms.is_object.unsqueeze(-1)
+    low = (centers - sizes / 2).masked_fill(nowhere, torch.inf).amin(dim=1)
+    high = (centers + sizes / 2).masked_fill(nowhere, -torch.inf).amax(dim=1)
+    found = torch.cat([(low + high) / 2, high - low], dim=-1)
+    return found.where(rooms.is_object.any(dim=1, keepdim=True), 0.0)
+
+
+def frames_of(rooms: RoomBoxes, generator: torch.Generator) -> Float[Tensor, "rooms 4"]:
+    """`rectangles_of` with each side moved outwards by the absolute value of a normal number.
+
+    The exact extents would reveal when a room is complete, since the last object touches them, and
+    sampled furniture never fits a rectangle exactly. So noise of standard deviation `FRAME_M` is
+    added.
+    """
+    rectangle_m = rectangles_of(rooms)
+    out = FRAME_M * torch.randn(len(rectangle_m), 4, generator=generator).abs().to(rectangle_m)
+    low, high = rectangle_sides(rectangle_m)
+    low, high = low - out[:, :2], high + out[:, 2:]
+    return torch.cat([(low + high) / 2, high - low], dim=-1)
+
+
+def rectangle_sides(
+    rectangle_m: Float[Tensor, "*batch 4"],
+) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2"]]:
+    """Lower and upper sides of rectangles (centre x, z, extents x, z)."""
+    middle, extents = rectangle_m.split(2, dim=-1)
+    return middle - extents / 2, middle + extents / 2
+
+
+def gaps_m(rooms: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]) -> Float[Tensor, "rooms 4"]:
+    """Gaps in metres between the furniture and the sides of a rectangle: the lower sides along x
+    and z, then the upper ones. Meaningless in rooms without furniture."""
+    low, high = rectangle_sides(rectangle_m)
+    own_low, own_high = rectangle_sides(rectangles_of(rooms))
+    return torch.cat([own_low - low, high - own_high], dim=-1)
+
+
+def turned_rooms(rooms: RoomBoxes, symmetry: Int[Tensor, " rooms"]) -> RoomBoxes:
+    """Every room in one of its `SYMMETRIES`: from 4 on mirrored, then turned by `symmetry` % 4
+    quarters."""
+    assert rooms.looks is not None
+    quarters, mirrored = symmetry % QUARTERS, symmetry >= QUARTERS
+    return replace(
+        rooms,
+        boxes_m=turn_boxes(rooms.boxes_m, quarters, mirrored),
+        looks=turned_looks(rooms.looks, quarters, mirrored),
+    )
+
+
+def shuffled(rooms: RoomBoxes, generator: torch.Generator) -> RoomBoxes:
+    """Every room's objects in a random order, followed by its padding."""
+    tickets = torch.rand(rooms.is_object.shape, generator=generator).to(rooms.boxes_m.device)
+    return rooms.take(tickets.masked_fill(~rooms.is_object, 2.0).argsort(dim=1))
+
+
+def large_first(
+    object_class: Int[Tensor, "rooms objects"],
+    footprints_m2: Float[Tensor, " classes"],
+    uniform: Float[Tensor, "rooms objects"],
+) -> Int[Tensor, "rooms objects"]:
+    """A random order in which classes with large footprints tend to come first; padding comes last.
+
+    A class precedes one with up to exp(`LOOSELY`) times its footprint now and then, so that the
+    network also learns from rooms in which only small objects are given. `uniform` are random
+    numbers in [0, 1).
+    """
+    tickets = LOOSELY * uniform - footprints_m2.log()[object_class]
+    return tickets.masked_fill(object_class == 0, torch.inf).argsort(dim=1)

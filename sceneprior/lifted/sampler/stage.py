@@ -1,0 +1,160 @@
+"""The stage that trains the sampler, by maximum likelihood of the training rooms' objects."""
+
+import copy
+import math
+from typing import Any
+
+import lightning
+import numpy as np
+import torch
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
+from sklearn.mixture import GaussianMixture
+from torch import Tensor, nn
+
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.prototypes import POSES
+from sceneprior.lifted.sampler.contents import END
+from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
+from sceneprior.lifted.sampler.network import RECTANGLES, RoomSampler
+from sceneprior.lifted.sampler.rooms import SYMMETRIES, SamplerRooms, frames_of, turned_rooms
+from sceneprior.lifted.sampler.settings import SamplerConfig
+from sceneprior.paper.losses.averages import share_of_batch
+from sceneprior.paper.prior import ScenePrior
+from sceneprior.training.steps import (
+    batch_seed,
+    check_finite,
+    full_precision,
+    log_losses,
+    with_cosine,
+)
+
+ORDERS = 4
+"""Random orders of every val room over which its likelihood is averaged."""
+CONTENTS_RATE = 5.0
+"""Learning rate of `Contents` relative to that of the rest. It is small and independent of the
+rest, and its evidence is rare: one in thirty rooms shows whether a bedroom may lack a bed."""
+FRAMES = 8
+"""Noisy rectangles per training room to which the mixture is fitted."""
+LEAST_VARIANCE = 0.01
+"""Added to the variances of the mixture of rectangles: 10 cm squared, or a tenth of an extent
+squared."""
+
+
+class SamplerStage(lightning.LightningModule):
+    """Maximum likelihood of rooms, each in a random order of its objects and one of eight
+    symmetries."""
+
+    def __init__(
+        self,
+        prior: ScenePrior,
+        latents: nn.Embedding,
+        sampler: RoomSampler,
+        stage: SamplerConfig,
+        val: SamplerRooms | None,
+        seed: int,
+    ):
+        super().__init__()
+        self.prior, self.latents = prior.requires_grad_(False), latents.requires_grad_(False)
+        self.learner = sampler
+        # The best learner so far, which is what is loaded from checkpoints.
+        self.sampler = copy.deepcopy(sampler).requires_grad_(False)
+        self.stage, self.seed = stage, seed
+        self.val = val
+        self.least: Tensor
+        self.register_buffer("least", torch.tensor(math.inf))
+
+    def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
+        """Negative log-likelihood of a room, averaged over the batch."""
+        generator = torch.Generator().manual_seed(batch_seed(self.seed, self.trainer, batch_idx))
+        with full_precision(self.device):
+            symmetry = torch.randint(SYMMETRIES, (len(rooms.boxes_m),), generator=generator)
+            symmetry = symmetry.to(self.device)
+            turned = turned_rooms(rooms, symmetry)
+            parts = negative_log_likelihood(self.learner, turned, symmetry, generator)
+            taught = rooms.is_object.any(dim=1)
+            share = share_of_batch(taught.sum()) / max(int(taught.sum()), 1)
+            means = {name: (part * taught).sum() * share for name, part in parts.items()}
+            total = torch.stack(list(means.values())).sum()
+        check_finite(total, rooms)
+        log_losses(self, means, total, len(rooms.boxes_m))
+        return total
+
+    def on_train_batch_end(self, outputs: Any, batch: RoomBoxes, batch_idx: int) -> None:
+        """Every few epochs, keep the learner if the val rooms' likelihood is the highest so far.
+
+        Runs after the epoch's last batch rather than after the epoch, when its checkpoint is
+        already written.
+        """
+        done = self.current_epoch + 1
+        looks = done % self.stage.val_every == 0 or done == self.stage.epochs
+        if batch_idx + 1 < self.trainer.num_training_batches or not looks:
+            return
+        if self.val is not None:
+            found = self.val_loss()
+            self.log("val/loss", found, on_step=False, on_epoch=True, batch_size=1)
+            if found >= self.least:
+                return
+            self.least.copy_(found)
+        self.sampler.load_state_dict(self.learner.state_dict())
+
+    @torch.no_grad()
+    def val_loss(self) -> Tensor:
+        """Negative log-likelihood of a val room, averaged over rooms and `ORDERS` orders, the same
+        each time."""
+        assert self.val is not None
+        rooms = self.val.to(self.device).rooms
+        generator = torch.Generator().manual_seed(self.seed)
+        self.learner.eval()
+        plain = torch.zeros_like(rooms.object_class[:, 0])
+        found = [
+            negative_log_likelihood(self.learner, rooms, plain, generator) for _ in range(ORDERS)
+        ]
+        self.learner.train()
+        return (
+            torch.stack([part.mean() for parts in found for part in parts.values()]).sum() / ORDERS
+        )
+
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
+        rate = self.stage.learning_rate
+        named = list(self.learner.named_parameters())
+        contents = [value for name, value in named if name.startswith("contents.")]
+        rest = [value for name, value in named if not name.startswith("contents.")]
+        optimizer = torch.optim.AdamW(
+            [
+                {"params": rest, "lr": rate},
+                {"params": contents, "lr": CONTENTS_RATE * rate},
+            ],
+            weight_decay=self.stage.weight_decay,
+        )
+        return with_cosine(optimizer, int(self.trainer.estimated_stepping_batches))
+
+
+def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
+    """Set the buffers that a fresh sampler takes from the training rooms: the encodings of looks,
+    the mixture of rectangles, the classes that may be sampled and may intersect, and mean
+    footprints."""
+    prototypes = rooms.prototypes
+    looks = torch.from_numpy(prototypes.shown())
+    sampler.look_shown[: len(looks)] = looks
+    labels = torch.from_numpy(prototypes.object_class)
+    sampler.look_class[: len(looks)] = labels.repeat_interleave(POSES)
+    sampler.contents.known[labels[labels >= 0]] = True
+    sampler.contents.known[END] = True
+    sampler.may_meet.copy_(rooms.may_meet(len(sampler.may_meet)))
+    here = rooms.rooms.is_object
+    areas_m2 = rooms.rooms.boxes_m[here][:, [3, 5]].prod(dim=-1)
+    labels = rooms.rooms.object_class[here]
+    sampler.footprints_m2.scatter_reduce_(0, labels, areas_m2, "mean", include_self=False)
+    generator = torch.Generator().manual_seed(0)
+    furnished = here.any(dim=1)
+    frames = torch.cat([frames_of(rooms.rooms, generator) for _ in range(FRAMES)])
+    centre, extents = frames[furnished.repeat(FRAMES)].split(2, dim=-1)
+    found = GaussianMixture(RECTANGLES, reg_covar=LEAST_VARIANCE, random_state=0).fit(
+        torch.cat([centre, extents.log()], dim=-1).numpy()
+    )
+    for buffer, values in (
+        (sampler.rectangle_logits, np.log(found.weights_)),
+        (sampler.rectangle_means, found.means_),
+        (sampler.rectangle_factors, np.linalg.cholesky(found.covariances_)),
+    ):
+        buffer.copy_(torch.from_numpy(values))

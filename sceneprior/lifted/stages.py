@@ -1,0 +1,57 @@
+"""The stage that trains the paper's network and latents on lifted boxes and shapes."""
+
+import torch
+from torch import Tensor
+
+from sceneprior.core.views import LiftedRooms
+from sceneprior.lifted.latent_loss import latent_loss
+from sceneprior.lifted.lifting.dataset import LiftedDataset
+from sceneprior.lifted.losses import (
+    lifted_losses,
+    match_lifted,
+    needed_predictions,
+    shape_code_loss,
+)
+from sceneprior.lifted.occupancy import OccupancyDecoder
+from sceneprior.lifted.settings import LiftedLossConfig, LiftedStageConfig
+from sceneprior.paper.stages import LatentStage
+from sceneprior.training.steps import batch_seed, full_precision
+
+
+class LiftedStage(LatentStage):
+    """The layout loss against lifted 3D boxes, and the distance to the lifted shapes."""
+
+    stage: LiftedStageConfig
+    loss: LiftedLossConfig
+    rooms: LiftedDataset
+
+    @property
+    def looks(self) -> OccupancyDecoder:
+        """The shape decoder."""
+        assert isinstance(self.prior.shape, OccupancyDecoder)
+        return self.prior.shape
+
+    def on_fit_start(self) -> None:
+        # Done only now, since a resumed run has just loaded its checkpoint's prototypes.
+        self.rooms.see_looks(self.looks.prototypes)
+
+    def training_step(self, rooms: LiftedRooms, batch_idx: int) -> Tensor:
+        slots = min(rooms.is_object.shape[1] + 1, self.prior.max_objects)
+        wanted = needed_predictions(rooms, slots)
+        scenes = self.prior.decode(self.room_latents(rooms, batch_idx), False, wanted)
+        with full_precision(self.device):
+            matches = match_lifted(scenes, rooms, self.loss.match_box)
+            losses = lifted_losses(scenes, rooms, matches, self.completeness_target)
+            assert rooms.looks is not None, "on_fit_start has found them"
+            known = matches._replace(valid=matches.valid & (rooms.looks >= 0))
+            targets = self.looks.targets(rooms.looks.clamp(min=0))
+            losses["shape"] = shape_code_loss(scenes, known, *targets)
+            if self.loss.latents:
+                losses["latents"] = self._latent_loss(batch_idx)
+            return self.total(losses, rooms)
+
+    def _latent_loss(self, batch_idx: int) -> Tensor:
+        generator = torch.Generator().manual_seed(
+            batch_seed(self.seed, self.trainer, batch_idx) + 1  # a seed other than the noise's
+        )
+        return latent_loss(self.latents.weight, self.prior.latent_space.shift_free, generator)

@@ -1,0 +1,80 @@
+"""Settings of a run of the paper's method, and its two stages, from opened data to a module."""
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from torch import nn
+
+from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.paper.prior import ModelConfig
+from sceneprior.paper.settings import (
+    LayoutConfig,
+    LossConfig,
+    SamplingConfig,
+    ShapeConfig,
+    StageConfig,
+)
+from sceneprior.paper.shape_decoder import ShapeDecoderConfig
+from sceneprior.paper.trained import PriorConfig
+from sceneprior.paper.transformer import TransformerConfig
+from sceneprior.training.method import Stage
+from sceneprior.training.settings import ViewDataConfig
+
+if TYPE_CHECKING:
+    from sceneprior.paper.stages import LatentStage
+
+
+class PaperModel(ModelConfig):
+    """The paper's network."""
+
+    decoder: TransformerConfig
+    shape: ShapeDecoderConfig = ShapeDecoderConfig()
+
+
+class PaperConfig(PriorConfig):
+    """A run of the paper's method."""
+
+    method: Literal["paper"] = "paper"
+    model: PaperModel
+    data: ViewDataConfig
+    loss: LossConfig = LossConfig()
+    layout: LayoutConfig | None
+    """Null trains layout and shape together from the start (ablation c3)."""
+    shape: ShapeConfig
+    sampling: SamplingConfig = SamplingConfig()
+
+    remembers_rooms: ClassVar[bool] = True
+
+    @property
+    def distribution(self) -> str:
+        return self.sampling.distribution
+
+    @property
+    def view_terms(self) -> tuple[LossConfig, ShapeConfig | None]:
+        return self.loss, self.shape
+
+    def stages(self) -> tuple[Stage, ...]:
+        views = self.data.views_per_room
+        boxes = partial(self.open_views, views, None)
+        masks = partial(self.open_views, self.shape.views_per_room or views, self.data.mask_step)
+        shape = Stage("shape", self.shape, masks, partial(self._build, self.shape))
+        if self.layout is None:
+            return (shape,)
+        return Stage("layout", self.layout, boxes, partial(self._build, self.layout)), shape
+
+    def _build(
+        self, stage: StageConfig, rooms: ViewDataset, previous: Path | None
+    ) -> "LatentStage":
+        # Imported where something is trained: Lightning takes seconds.
+        from sceneprior.paper.stages import LayoutStage, ShapeStage
+
+        if previous is None:
+            prior, latents = self.build_prior(), self.build_latents(len(rooms))
+        else:
+            before = self.before(previous, rooms.room_ids)
+            prior = before.prior.train()
+            latents = nn.Embedding.from_pretrained(before.logits, freeze=False)
+        module = LayoutStage if isinstance(stage, LayoutConfig) else ShapeStage
+        target = self.model.completeness_target
+        return module(prior, latents, rooms, stage, self.loss, target, self.seed)

@@ -1,0 +1,192 @@
+"""Fit latents to the masks of single images, with the network frozen (section 5.2)."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sceneprior.core.errors import InputError
+from sceneprior.core.observed_image import rows_of
+from sceneprior.core.views import DecodedScenes, SceneViews
+from sceneprior.paper.losses.matching import Matches
+from sceneprior.paper.losses.shape import mask_loss
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.view_loss import match_and_score, seen_boxes, seen_masks
+from sceneprior.training.steps import check_finite, weighted_sum
+
+CHECK_EVERY = 20
+"""Steps between two checks of which images have converged."""
+SMOOTHING, EPSILON = 0.99, 1e-8
+"""RMSProp's smoothing constant and epsilon: the defaults of PyTorch."""
+
+
+@dataclass(frozen=True)
+class FitSchedule:
+    """Schedule by which the latents of images are fitted."""
+
+    steps: int = 1000
+    drop_at: int = 500
+    """Step at which the learning rate is multiplied by `decay`."""
+    learning_rate: float = 0.01
+    decay: float = 0.1
+    patience: int = 100
+    """An image stalls when its score has not fallen by the fraction `least_gain` for this many
+    steps. It then goes on at the decayed rate, and is done when it stalls at that rate. 0 always
+    takes all steps."""
+    least_gain: float = 2e-3
+    """Smallest relative fall of the score that counts as progress; see `patience`."""
+
+
+SCHEDULES = {"paper": FitSchedule()}
+"""By the name of a fit; `paper` is that of supplement D."""
+
+
+class ViewLoss(NamedTuple):
+    """View loss of scenes on their images, one number per image."""
+
+    total: Float[Tensor, " images"]
+    """The loss that is minimised: class, box, frustum and mask terms with the run's weights."""
+    score: Float[Tensor, " images"]
+    """The score that ranks fits: the layout terms plus lambda_S * (1 - mean IoU of the masks). The
+    mask term itself counts badly aligned masks as zero, so a worse fit may have the lower
+    `total`."""
+    mask_iou: Float[Tensor, " images"]
+    """Mean soft IoU over an image's masks; 0 where masks are not compared."""
+    matches: Matches
+
+
+class Fit(NamedTuple):
+    """The best latent and scene found for each image."""
+
+    z: Float[Tensor, "images width"]
+    scenes: DecodedScenes
+    """The decoded scenes, with as many predictions as the fullest image has objects. In an image of
+    n objects, the first n predictions are the answer."""
+    loss: ViewLoss
+    steps: Int[Tensor, " images"]
+    """Steps taken until the image had converged."""
+
+
+def decode_images(
+    trained: TrainedPrior,
+    points: Float[Tensor, "images width"],
+    views: SceneViews,
+    with_grids: bool = True,
+) -> DecodedScenes:
+    """Decode as many objects of each latent as the fullest image shows, with shapes after the shape
+    stage.
+
+    Without `with_grids`, shapes are decoded only where they are meshes: occupancy grids are not
+    compared with masks, so the fit does not need them.
+    """
+    z = trained.prior.latent_space.onto(points)
+    with_shape = trained.stage != "layout" and (with_grids or trained.prior.faces is not None)
+    return trained.prior.decode(z, with_shape, wanted=views.is_object)
+
+
+def view_loss(
+    trained: TrainedPrior,
+    scenes: DecodedScenes,
+    views: SceneViews,
+    masks: bool = True,
+) -> ViewLoss:
+    """The losses of training, per image (a room of `views`) and without completeness.
+
+    Args:
+        scenes: At least as many objects per room as the fullest image shows. Objects without
+            meshes (before the shape stage, or with occupancy grids) have no masks.
+        masks: Compare masks, too; `views` then needs instance ids.
+    """
+    weights, drawing = trained.config.view_terms
+    boxes = seen_boxes(scenes, views, drawing)
+    target = trained.config.model.completeness_target
+    losses, matches = match_and_score(scenes, boxes, views, weights, target, True)
+    # A single image does not show how many objects the room holds in all (supplement D).
+    del losses["completeness"]
+    total = weighted_sum(losses, weights)
+    faces = trained.prior.faces
+    if not masks or scenes.vertices_m is None or faces is None or drawing is None:
+        return ViewLoss(total, total.detach(), torch.zeros_like(total), matches)
+    layout = total.detach()
+    # Checked before rendering, whose own error for vertices that are not finite names no image.
+    check_finite(layout.sum(), views)
+    seen = seen_masks(scenes.vertices_m, faces, views, drawing)
+    mask, overlap = mask_loss(seen, views, matches, weights.iou_gate, per_room=True)
+    score = layout + weights.mask * (1 - overlap["mask_iou"])
+    return ViewLoss(total + weights.mask * mask, score, overlap["mask_iou"], matches)
+
+
+def fit_latents(
+    trained: TrainedPrior,
+    views: SceneViews,
+    start: Float[Tensor, "images width"],
+    schedule: FitSchedule = SCHEDULES["paper"],
+    masks: bool = True,
+) -> Fit:
+    """Fit one latent per image by RMSProp on its view loss; return the best latent on the way.
+
+    For shapes that are occupancy grids, only classes and 2D boxes are fitted: their masks are not
+    rendered.
+
+    The fit moves z itself and projects it onto the sphere before each decoding. Training moves the
+    logits instead, but those only reach points between the anchors, and reach them slowly.
+    RMSProp's first steps are ten times the later ones and leave the start behind; smaller first
+    steps, and fitting the logits, end worse (docs/experiments/2026-11-22-one-image.md).
+
+    Images are independent: an image takes the same steps alone and in a batch, apart from rounding,
+    which grows over a thousand steps.
+
+    Raises:
+        InputError: an image shows more objects than the prior can generate.
+        FloatingPointError: a loss is not a number.
+    """
+    refuse_crowds(trained, views)
+    points, square = start.detach().clone(), torch.zeros_like(start)
+    best, found = torch.full((len(start),), torch.inf), start.detach().clone()
+    rate = torch.full((len(start), 1), schedule.learning_rate)
+    stalled = torch.zeros(len(start), dtype=torch.int64)
+    taken = torch.full((len(start),), schedule.steps)
+    active, seen = torch.arange(len(start)), views
+    for step in range(schedule.steps):
+        if step == schedule.drop_at:
+            rate = rate.clamp(max=schedule.learning_rate * schedule.decay)
+        x = points[active].requires_grad_()
+        scenes = decode_images(trained, x, seen, with_grids=False)
+        loss = view_loss(trained, scenes, seen, masks)
+        check_finite(loss.total.sum(), seen)
+        gains = loss.score < best[active] * (1 - schedule.least_gain)
+        stalled[active] = torch.where(gains, 0, stalled[active] + 1)
+        better = active[loss.score < best[active]]
+        found[better] = points[better]
+        best[active] = torch.minimum(best[active], loss.score)
+        (slope,) = torch.autograd.grad(loss.total.sum(), x)
+        square[active] = SMOOTHING * square[active] + (1 - SMOOTHING) * slope**2
+        points[active] -= rate[active] * slope / (square[active].sqrt() + EPSILON)
+        if schedule.patience and (step + 1) % CHECK_EVERY == 0:
+            still = (stalled >= schedule.patience)[active]
+            slow = rate[active, 0] < schedule.learning_rate
+            rate[active[still]] = schedule.learning_rate * schedule.decay
+            stalled[active[still]] = 0
+            taken[active[still & slow]] = step + 1
+            going = ~(still & slow)
+            if not going.any():
+                break
+            if not going.all():
+                active, seen = active[going], rows_of(seen, going)
+    with torch.no_grad():
+        scenes = decode_images(trained, found, views)
+        loss = view_loss(trained, scenes, views, masks)
+        return Fit(trained.prior.latent_space.onto(found), scenes, loss, taken)
+
+
+def refuse_crowds(trained: TrainedPrior, views: SceneViews) -> None:
+    """Raise an `InputError` where an image shows more objects than the prior can generate."""
+    count, row = (int(value) for value in views.is_object.sum(dim=-1).max(dim=0))
+    if count > trained.prior.max_objects:
+        raise InputError(
+            f"{views.room_ids[row]} shows {count} objects, but the run generates at most "
+            f"{trained.prior.max_objects} (model.max_objects); leave out the smallest masks, or "
+            "train with more."
+        )

@@ -1,0 +1,124 @@
+"""Interpolation between two latents (section 5.3): as scenes, a strip of pictures and an
+animation."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from sceneprior.core.classes import VOID, class_colors
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import write_whole
+from sceneprior.core.scene import Scene
+from sceneprior.paper.decode import DecodedRoom, decode_rooms
+from sceneprior.paper.sampling import Point, latent_of
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.render.offscreen import Renderer
+from sceneprior.render.pictures import contact_sheet, gif_bytes, png_bytes
+from sceneprior.render.topdown import corner_view, perspective
+
+TILE = (240, 320)
+"""Height and width in pixels of a step in the strip, and of the animation."""
+STRIP_COLUMNS = 9
+"""Pictures in a row of the strip."""
+BETWEEN = 4
+"""Pictures of the animation from one step to the next."""
+FRAME_MS = 70
+"""Milliseconds that a picture of the animation is shown."""
+PAUSE_MS = 700
+"""Milliseconds at either end, where the animation turns round."""
+
+
+def interpolate(trained: TrainedPrior, start: Point, end: Point, steps: int) -> list[Scene]:
+    """Rooms `step_00`, `step_01`, ... on the way from one latent to another.
+
+    A room's `extra` holds `along`, its position from 0 to 1, and `slots`, the prediction that each
+    object comes from: objects with the same slot in two rooms are the same object, moved.
+
+    Args:
+        start, end: See `latent_of`.
+        steps: Number of rooms, both ends included; at least 2.
+
+    Raises:
+        InputError: an end is unknown, or the two are opposite.
+    """
+    z = path_latents(trained, latent_of(trained, start), latent_of(trained, end), steps)
+    names = [f"step_{k:02d}" for k in range(steps)]
+    ends = {"from": _name_of(start), "to": _name_of(end)}
+    scenes = []
+    for step, room in enumerate(decode_rooms(trained, z, names)):
+        along = round(step / (steps - 1), 6)
+        extra = {**ends, "along": along, "slots": room.predictions}
+        scenes.append(replace(room.scene, extra=extra))
+    return scenes
+
+
+def _name_of(point: Point) -> str:
+    return point if isinstance(point, str) else getattr(point, "name", None) or "a latent"
+
+
+def path_latents(
+    trained: TrainedPrior,
+    start: Float[Tensor, " dimension"],
+    end: Float[Tensor, " dimension"],
+    steps: int,
+) -> Float[Tensor, "steps dimension"]:
+    """Evenly spaced points of the geodesic (in a cube: the straight line), both ends included.
+
+    Raises:
+        InputError: the ends are opposite points of the sphere.
+    """
+    along = torch.linspace(0, 1, steps, dtype=start.dtype)
+    try:
+        space = trained.prior.latent_space
+        return space.between(start.expand(steps, -1), end.expand(steps, -1), along)
+    except ValueError:
+        raise InputError(
+            "The two ends are opposite points of the sphere, and every great circle leads from "
+            "one to the other; choose another end, or go by way of a third room."
+        ) from None
+
+
+def mixed_colors(room: DecodedRoom) -> UInt8[np.ndarray, "objects 3"]:
+    """Each object's class colours, averaged by its class probabilities, so that they change as
+    gradually as the room does."""
+    share = room.class_logits.softmax(dim=-1).double().numpy()
+    share[:, VOID] = 0
+    # A decoded object's likeliest class is not void, so the sum is not 0.
+    mixed = share @ class_colors(share.shape[1]).astype(np.float64)
+    return np.rint(mixed / share.sum(axis=-1, keepdims=True)).astype(np.uint8)
+
+
+def strip(
+    pictures: Sequence[UInt8[np.ndarray, "height width 3"]],
+) -> UInt8[np.ndarray, "strip_height strip_width 3"]:
+    """Pictures side by side, in rows of nine."""
+    return contact_sheet(pictures, min(STRIP_COLUMNS, len(pictures)))
+
+
+def animation(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bytes:
+    """A GIF that plays the pictures forwards and backwards in an endless loop."""
+    times = [FRAME_MS] * len(pictures)
+    times[0] = times[-1] = PAUSE_MS
+    there_and_back = [*pictures, *pictures[-2:0:-1]]
+    return gif_bytes(there_and_back, times + times[-2:0:-1])
+
+
+def write_pictures(
+    trained: TrainedPrior, scenes: Sequence[Scene], folder: Path, renderer: Renderer
+) -> None:
+    """Write `strip.png`, the steps of `interpolate`, and `animation.gif`, which has `BETWEEN`
+    pictures per step."""
+    start, end = (latent_of(trained, scene) for scene in (scenes[0], scenes[-1]))
+    z = path_latents(trained, start, end, (len(scenes) - 1) * BETWEEN + 1)
+    rooms = decode_rooms(trained, z, [""] * len(z))
+    view = corner_view([room.scene for room in rooms], TILE)
+    pictures = [
+        perspective(room.scene, renderer, view=view, colors=mixed_colors(room)) for room in rooms
+    ]
+    write_whole(folder / "strip.png", png_bytes(strip(pictures[::BETWEEN])))
+    write_whole(folder / "animation.gif", animation(pictures))

@@ -1,0 +1,89 @@
+"""Building blocks that several modules share: MLPs, dropout, and base classes of the decoders."""
+
+import math
+from abc import ABC, abstractmethod
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sceneprior.core.scene import Mesh
+from sceneprior.core.settings import Section
+from sceneprior.core.views import DecodedScenes
+
+
+def mlp(*layers: nn.Module, slope: float = 0.0) -> nn.Sequential:
+    """The layers in sequence with a ReLU between each two, or a leaky ReLU of the given `slope`.
+
+    Example:
+
+        >>> mlp(nn.Linear(3, 8), nn.Linear(8, 2))
+        Sequential(
+          (0): Linear(in_features=3, out_features=8, bias=True)
+          (1): ReLU()
+          (2): Linear(in_features=8, out_features=2, bias=True)
+        )
+    """
+    between = nn.LeakyReLU(slope) if slope else nn.ReLU()
+    return nn.Sequential(*[part for layer in layers for part in (layer, between)][:-1])
+
+
+def dropout(x: Float[Tensor, "*shape"], p: float) -> Float[Tensor, "*shape"]:
+    """Set each number to 0 with probability `p` and divide the others by 1 - p, as `F.dropout` in
+    training.
+
+    On a CPU this samples the positions of the zeros instead of deciding for every number, which
+    takes a quarter of the time. For n numbers, Poisson(-n ln(1 - p)) positions are drawn uniformly
+    with replacement. Each number is then hit Poisson(-ln(1 - p)) times, independently of the
+    others, so it is never hit with probability 1 - p.
+    """
+    if p == 0 or x.device.type != "cpu":
+        return F.dropout(x, p)
+    hits = torch.poisson(torch.tensor(-x.numel() * math.log1p(-p), dtype=torch.float64))
+    scale = x.new_full((x.numel(),), 1 / (1 - p))
+    scale.scatter_(0, torch.randint(max(x.numel(), 1), (int(hits),)), 0)
+    return x * scale.view(x.shape)
+
+
+class ShapeModule(nn.Module, ABC):
+    """A shape decoder: from an object's feature to its shape, and from that to a mesh."""
+
+    faces: Tensor | None
+    """(faces, 3) triangles, if all of its meshes share one topology; else None."""
+
+    @abstractmethod
+    def add_shapes(
+        self,
+        scenes: DecodedScenes,
+        features: Float[Tensor, "rooms objects features"],
+        with_shape: bool | Bool[Tensor, "rooms shaped"],
+        wanted: Bool[Tensor, "rooms wanted"] | None,
+    ) -> DecodedScenes:
+        """The decoded layouts with shapes added; the arguments are those of `ScenePrior.decode`."""
+
+    @abstractmethod
+    def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:
+        """The mesh of prediction `item`; None if shapes were not decoded."""
+
+
+class ShapeModuleConfig(Section, ABC):
+    """A config section that builds a shape decoder."""
+
+    @abstractmethod
+    def build(self, features: int) -> ShapeModule:
+        """The module for object features of this width, freshly initialised."""
+
+
+class DecoderConfig(Section, ABC):
+    """A config section that builds the decoder from a latent z to object features x_k.
+
+    The module maps (z of shape (rooms, D_z), N) to features of shape (rooms, N, D_z). It also
+    accepts the number of features that each room needs; those beyond it are meaningless.
+    """
+
+    name: str
+
+    @abstractmethod
+    def build(self, width: int, max_objects: int) -> nn.Module:
+        """The module, for features of D_z = `width`, freshly initialised."""

@@ -1,0 +1,134 @@
+"""Hungarian matching of predictions to tracked objects (supplement B, Eq. S2 and S3)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sceneprior.core.geometry.cameras import Boxes2D
+from sceneprior.core.views import DecodedScenes, SceneViews
+
+
+class Matches(NamedTuple):
+    """The matched prediction of each tracked object."""
+
+    prediction: Int[Tensor, "rooms objects"]
+    """Index of the matched prediction; 0 for padding, arbitrary for objects that no drawn view
+    sees."""
+    valid: Bool[Tensor, "rooms objects"]
+    """False for padding and for objects that no drawn view sees."""
+
+
+@torch.no_grad()
+def match_objects(
+    scenes: DecodedScenes,
+    boxes_2d: Boxes2D,
+    views: SceneViews,
+    box_weight: float = 5.0,
+    occlusion_slack: float = 1.0,
+    first_n: bool = True,
+) -> Matches:
+    """Find the cheapest one-to-one assignment of predictions to tracked objects.
+
+        sigma = argmin sum_k L^l + lambda_B L^B                       (Eq. S2)
+        L^l = -p_k(l_j),    L^B = 1/|T_j| sum_p |b_k^p - b_j^p|_1     (Eq. S3)
+
+    with 2D boxes b relative to the image size. In a room with n tracked objects, only the first n
+    predictions take part. An object that no drawn view sees has zero cost: its match is arbitrary
+    and enters no loss.
+
+    Args:
+        scenes, boxes_2d: Predictions, and their 2D boxes in the views.
+        views: The observations: tracked objects and their 2D boxes.
+        box_weight: lambda_B.
+        occlusion_slack: See `side_distance`.
+        first_n: False matches among all predictions, for predictions without an order.
+
+    Raises:
+        ValueError: a room holds more objects than the prior can generate.
+    """
+    cost = matching_cost(scenes, boxes_2d, views, box_weight, occlusion_slack)
+    counts = views.is_object.sum(dim=-1)
+    slots = cost.shape[1]
+    if int(counts.max()) > slots:
+        raise ValueError(
+            f"A room holds {int(counts.max())} tracked objects but the prior generates "
+            f"{slots}; set model.max_objects to at least {int(counts.max())}."
+        )
+    objects = counts.tolist()
+    predictions = objects if first_n else [slots] * len(objects)
+    prediction = assign(cost, predictions, objects)
+    return Matches(prediction, views.is_object & views.visible.any(dim=1))
+
+
+def assign(
+    cost: Float[Tensor, "rooms predictions objects"], predictions: list[int], objects: list[int]
+) -> Int[Tensor, "rooms objects"]:
+    """The prediction of each object in the one-to-one assignment of least total cost, room by room.
+
+    In each room, the first `predictions[room]` rows and `objects[room]` columns of the cost take
+    part; there are no more objects than predictions. Remaining objects get 0.
+    """
+    from scipy.optimize import linear_sum_assignment  # takes half a second; training only
+
+    prediction = torch.zeros(len(cost), cost.shape[2], dtype=torch.int64)
+    # SciPy rejects NaN. The loss will be NaN, too, and its check names the rooms.
+    matrices = cost.detach().nan_to_num().cpu().numpy()
+    for room, (count, many) in enumerate(zip(predictions, objects, strict=True)):
+        rows, columns = linear_sum_assignment(matrices[room, :count, :many])
+        prediction[room, torch.from_numpy(columns)] = torch.from_numpy(rows)
+    return prediction.to(cost.device)
+
+
+def side_distance(
+    predicted: Tensor, observed: Tensor, clear: Tensor, side: int, occlusion_slack: float
+) -> Tensor:
+    """Distance between one side of predicted 2D boxes and the same side of observed ones.
+
+    Args:
+        predicted, observed, clear: Sides relative to the image size, and whether the observed side
+            is the object's own rather than an occluder's; their shapes broadcast.
+        side: 0 to 3: left, upper, right, lower.
+        occlusion_slack: Weight of the distance where the prediction extends beyond a side that is
+            not clear. 1 takes the absolute difference everywhere (paper). Below 1, an object may
+            extend behind an occluder, and the views that see its own edge determine its size. At
+            0 nothing would bound an object that touches another in every view.
+    """
+    apart = predicted - observed
+    distance = apart.abs()
+    if occlusion_slack == 1:
+        return distance
+    beyond = apart < 0 if side < 2 else apart > 0
+    return torch.where(beyond & ~clear, occlusion_slack * distance, distance)
+
+
+def matching_cost(
+    scenes: DecodedScenes,
+    boxes_2d: Boxes2D,
+    views: SceneViews,
+    box_weight: float,
+    occlusion_slack: float = 1.0,
+) -> Float[Tensor, "rooms predictions objects"]:
+    """Cost of each pair of prediction and tracked object: L^l + lambda_B L^B (Eq. S2)."""
+    cost = class_cost(scenes, views.object_class)
+    seen = views.visible.to(cost.dtype)
+    distance = torch.zeros_like(cost)
+    # One coordinate at a time takes a quarter of the memory of the full pairwise difference.
+    for side in range(4):
+        predicted = boxes_2d.boxes[..., side].unsqueeze(-1)
+        target = views.boxes[..., side].unsqueeze(-2)
+        clear = views.sides_clear[..., side].unsqueeze(-2)
+        apart = side_distance(predicted, target, clear, side, occlusion_slack)
+        distance += (apart * seen.unsqueeze(-2)).sum(dim=1)
+    distance = distance / seen.sum(dim=1).clamp(min=1).unsqueeze(-2)
+    cost = cost + box_weight * distance
+    return cost * seen.any(dim=1).unsqueeze(-2)
+
+
+def class_cost(
+    scenes: DecodedScenes, object_class: Int[Tensor, "rooms objects"]
+) -> Float[Tensor, "rooms predictions objects"]:
+    """L^l of Eq. S3: minus the probability that each prediction has each object's class."""
+    probability = scenes.class_logits.softmax(dim=-1)
+    return -probability.gather(-1, object_class.unsqueeze(1).expand(-1, probability.shape[1], -1))

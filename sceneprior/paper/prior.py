@@ -1,0 +1,107 @@
+"""The whole prior, s = f(z) (Eq. 1): from logits or latents to decoded scenes."""
+
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from sceneprior.core.settings import Section
+from sceneprior.core.views import DecodedScenes
+from sceneprior.paper.latents import CubeConfig, LatentSpace, SphereConfig
+from sceneprior.paper.layers import DecoderConfig, ShapeModule, ShapeModuleConfig
+from sceneprior.paper.layout_decoder import ClassBevels, LayoutDecoder
+
+
+class ModelConfig(Section):
+    """The network (section 3 and supplement A). `apps/config.py` lists the choices of `decoder`."""
+
+    max_objects: int = Field(ge=1, le=1000)
+    """N, the number of predictions: 13 for bedrooms, 28 for living rooms, 53 for ScanNet."""
+    width: int = Field(512, ge=8)
+    """D_z, the dimension of latents and object features."""
+    latent_space: Annotated[SphereConfig | CubeConfig, Field(discriminator="name")] = SphereConfig()
+    decoder: DecoderConfig
+    layout_heads: Literal["joint", "separate"] = "joint"
+    """MLP2 is one MLP for all outputs (`joint`), or a linear layer for the classes and separate
+    MLPs for x, y, z, width, height and depth (`separate`, released code)."""
+    floor_gradient: bool = False
+    """Let an object that ReLU holds at the floor (Eq. S1) learn to leave it. With the paper's ReLU
+    (false) it cannot, and lamps may stay on the floor for good."""
+    completeness_target: Literal["first_n", "stop"] = "first_n"
+    """Targets of the completeness scores of n objects. `first_n`: 1 for the first n predictions, 0
+    after (supplement B). `stop`: 1 from the n-th prediction on; a generated scene then ends with
+    its first prediction above 0.5 (main text, released code). Decoding follows the same
+    convention."""
+    shape: ShapeModuleConfig
+
+    @model_validator(mode="after")
+    def _heads_divide_width(self) -> "ModelConfig":
+        heads = getattr(self.decoder, "heads", 1)
+        if self.width % heads:
+            raise ValueError(f"width {self.width} is not a multiple of heads {heads}")
+        return self
+
+    @property
+    def logits_per_room(self) -> int:
+        """Number of learnt logits per room."""
+        space = self.latent_space
+        return space.anchors if isinstance(space, SphereConfig) else self.width
+
+
+class ScenePrior(nn.Module):
+    """The mapping s = f(z) from the latent space to scenes (Eq. 1).
+
+    `seed` draws the fixed anchors of the latent sphere; `void` is that of `LayoutDecoder`.
+    """
+
+    def __init__(self, config: ModelConfig, classes: int, seed: int = 0, void: bool = True):
+        super().__init__()
+        width = config.width
+        self.max_objects = config.max_objects
+        self.latent_space: LatentSpace = config.latent_space.build(width, seed)
+        self.decoder = config.decoder.build(width, config.max_objects)
+        self.layout = LayoutDecoder(
+            width, classes, config.layout_heads, void, config.floor_gradient
+        )
+        self.bevels = ClassBevels(classes)
+        self.shape: ShapeModule = config.shape.build(2 * width)
+
+    @property
+    def faces(self) -> Int[Tensor, "faces 3"] | None:
+        """Triangles that all decoded meshes share; None if shapes are looks
+        (`lifted/prototypes.py`)."""
+        return self.shape.faces
+
+    def forward(
+        self, logits: Float[Tensor, "rooms logits"], with_shape: bool = True
+    ) -> DecodedScenes:
+        """Decode rooms from the logits of their latent weights."""
+        return self.decode(self.latent_space(logits), with_shape)
+
+    def decode(
+        self,
+        z: Float[Tensor, "rooms width"],
+        with_shape: bool | Bool[Tensor, "rooms shaped"] = True,
+        wanted: Bool[Tensor, "rooms wanted"] | None = None,
+    ) -> DecodedScenes:
+        """Decode rooms from points of the latent space; `with_shape` adds meshes or looks.
+
+        A tensor `with_shape` selects the objects that get a mesh; the vertices of the others lie at
+        their box's centre. `wanted` limits decoding to as many predictions as it has columns, and
+        to meshes where it is true; predictions after a room's last wanted one are meaningless. None
+        decodes all N.
+
+        Layouts stay float32 under autocast: bfloat16 would round 3 m to steps of 2 cm.
+        """
+        count = self.max_objects if wanted is None else wanted.shape[1]
+        needed = None
+        if wanted is not None:
+            numbers = torch.arange(1, wanted.shape[1] + 1, device=wanted.device)
+            needed = (wanted * numbers).amax(dim=1)
+        features = self.decoder(z, count, needed)
+        with torch.autocast(z.device.type, enabled=False):
+            layout, shared = self.layout(features.to(z.dtype))
+        scenes = DecodedScenes(**layout._asdict(), bevels=self.bevels(layout.class_logits))
+        return self.shape.add_shapes(scenes, shared, with_shape, wanted)

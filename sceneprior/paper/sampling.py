@@ -1,0 +1,241 @@
+"""Latents of rooms: sampled around the training rooms, read by name, and written to files."""
+
+import io
+import json
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sceneprior.core.errors import InputError, InputWarning
+from sceneprior.core.files import write_whole
+from sceneprior.core.scene import Scene
+from sceneprior.core.seeds import check_seed
+from sceneprior.paper.latents import LatentSpace
+from sceneprior.paper.trained import TrainedPrior
+
+BANDWIDTH = 0.15
+"""Bandwidth of the kernel distribution, in standard deviations of the training rooms' logits: 0
+copies training rooms, 1 is one Gaussian fitted to all. A larger one gives more novel rooms, and
+more often rooms with no bed or two."""
+DISTRIBUTIONS = ("kernel", "paper")
+"""Distributions that latents of new rooms can be sampled from; see `sample_logits`."""
+MARKS = {"kernel": "copies: near training rooms"}
+"""The note that tables add to a distribution that draws near training rooms."""
+COPIES = (
+    "The distribution `kernel` draws close to single training rooms: nine in ten of its rooms are "
+    "near copies of one. The distribution `paper` takes nothing from single training rooms."
+)
+"""Warning given with the `kernel` distribution."""
+LATENTS_FILE = "latents.npz"
+Point = str | Scene | Float[Tensor, " dimension"] | Float[np.ndarray, " dimension"]
+"""Anything that determines a point of a latent space; see `latent_of`."""
+_ENDINGS = (".npz", ".npy", ".json")
+
+
+def marked(distribution: str) -> str:
+    """A distribution's name in tables, with its note from `MARKS`."""
+    mark = MARKS.get(distribution)
+    return distribution if mark is None else f"{distribution}, {mark}"
+
+
+def sample_latents(
+    space: LatentSpace,
+    trained: Float[Tensor, "rooms anchors"],
+    count: int,
+    seed: int,
+    distribution: str = "paper",
+) -> Float[Tensor, "count dimension"]:
+    """Sample `count` points of the latent space, given the logits `trained` of the training rooms;
+    the same seed gives the same points. `sample_logits` describes the distributions.
+
+    Raises:
+        InputError: an unknown distribution, or fewer than two training rooms to sample around.
+    """
+    if distribution not in DISTRIBUTIONS:
+        raise InputError(
+            f"No sampling distribution '{distribution}'; choose from {', '.join(DISTRIBUTIONS)}."
+        )
+    if distribution != "paper" and len(trained) < 2:
+        raise InputError(
+            f"The {distribution} distribution needs the latents of at least 2 training rooms, and "
+            f"this prior keeps {len(trained)} (a packed one keeps them if packed with --latents); "
+            "use --distribution paper, or leave it out."
+        )
+    return space(sample_logits(trained, count, seed, distribution, space.shift_free))
+
+
+def sample_logits(
+    trained: Float[Tensor, "rooms anchors"],
+    count: int,
+    seed: int,
+    distribution: str,
+    shift_free: bool = True,
+) -> Float[Tensor, "count anchors"]:
+    """Sample logits of latent weights for `sample_latents`.
+
+    Args:
+        distribution: `paper`: N(0, 1), from which the training rooms' logits were initialised;
+            training has moved them since. `kernel`: a mixture of Gaussians around the training
+            rooms' logits, with their mean and covariance (a smoothed bootstrap of width
+            `BANDWIDTH`).
+        shift_free: Adding a constant to all logits of a room changes nothing, as in a softmax;
+            that degree of freedom is then removed first.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(count, trained.shape[1], generator=generator, dtype=torch.float64)
+    if distribution == "paper":
+        return noise.to(trained.dtype)
+    logits = trained.double()
+    if shift_free:
+        logits = logits - logits.mean(dim=1, keepdim=True)
+    mean = logits.mean(dim=0)
+    centred = logits - mean
+    # centred^T centred is the covariance; the SVD gives its square root even where it is singular.
+    _, scale, axes = torch.linalg.svd(centred / (len(logits) - 1) ** 0.5, full_matrices=False)
+    drawn = (noise[:, : len(scale)] * scale) @ axes
+    start = centred[_rooms_in_turn(len(logits), count, generator)]
+    # Shrunk towards the mean by as much as the noise adds, so that the covariance is preserved.
+    drawn = (1 - BANDWIDTH**2) ** 0.5 * start + BANDWIDTH * drawn
+    return (mean + drawn).to(trained.dtype)
+
+
+def _rooms_in_turn(rooms: int, count: int, generator: torch.Generator) -> Int[Tensor, " count"]:
+    """Room indices in random order; none repeats before all have occurred."""
+    rounds = [torch.randperm(rooms, generator=generator) for _ in range(-(-count // rooms))]
+    return torch.cat(rounds)[:count]
+
+
+def draw_latents(
+    trained: TrainedPrior, count: int, seed: int, distribution: str | None = None
+) -> tuple[Float[Tensor, "count dimension"], list[str]]:
+    """Latents sampled from a distribution (None: the run's own), and the names of their rooms.
+
+    `kernel` raises a warning that its rooms are near copies (`COPIES`).
+    """
+    space = trained.prior.latent_space
+    distribution = distribution or trained.latent_distribution
+    z = sample_latents(space, trained.logits, count, seed, distribution)
+    if distribution == "kernel":
+        warnings.warn(COPIES, InputWarning, stacklevel=1)
+    return z, scene_names(count, seed)
+
+
+def scene_names(count: int, seed: int) -> list[str]:
+    """Names of generated rooms."""
+    return [f"seed{seed}_{index:04d}" for index in range(count)]
+
+
+def write_latents(folder: Path, scenes: Sequence[Scene]) -> None:
+    """Write `latents.npz` with `latents`, one row per room, and `names`, the names of the rooms'
+    files. Writes nothing if any room has no latent."""
+    latents = [scene.latent for scene in scenes if scene.latent is not None]
+    if not latents or len(latents) < len(scenes):
+        return
+    buffer = io.BytesIO()
+    np.savez(buffer, latents=np.stack(latents), names=np.array([scene.name for scene in scenes]))
+    write_whole(Path(folder) / LATENTS_FILE, buffer.getvalue())
+
+
+def latent_of(trained: TrainedPrior, point: Point) -> Float[Tensor, " dimension"]:
+    """The point of a run's latent space for a name (`read_latent`), for a scene (the latent it was
+    decoded from), or for a vector (the nearest point).
+
+    Raises:
+        InputError: the name is unknown, the scene has no latent, or the vector has another size.
+    """
+    if isinstance(point, str):
+        return read_latent(trained, point)
+    if isinstance(point, Scene):
+        if point.latent is None:
+            raise InputError(
+                f"Room {point.name} comes from no latent (a sampler drew it, or it was read from a "
+                "file); take a room of another distribution (`kernel`, `paper`), or name one, such "
+                "as 'seed:7'."
+            )
+        return _onto(trained, point.latent, f"Room {point.name}")
+    return _onto(trained, np.asarray(point), "The vector")
+
+
+def _onto(trained: TrainedPrior, point: np.ndarray, source: str) -> Float[Tensor, " dimension"]:
+    """The nearest point of the latent space; `source` names the latent's origin in errors."""
+    width = trained.config.model.width
+    if point.shape != (width,):
+        raise InputError(
+            f"{source} has a latent of shape {point.shape}, but this prior's have {width} numbers; "
+            "take latents of the same run."
+        )
+    if not np.isfinite(point).all() or not point.any():
+        raise InputError(f"{source}: a latent is all zeros or holds no numbers; write it again.")
+    space = trained.prior.latent_space
+    return space.onto(torch.from_numpy(point).to(trained.logits.dtype).unsqueeze(0))[0]
+
+
+def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]:
+    """The point of a run's latent space that a text names.
+
+    A name is the id of a training room; `seed:7`, the room that `synthesize -n 1 --seed 7` makes;
+    or a file of latents: `FILE` (its first), `FILE:3` (counted from 0), `FILE:NAME`. Files are
+    `latents.npz`, an .npy of (D,) or (n, D) numbers, or a .json of such lists.
+
+    Raises:
+        InputError: the name is unknown, or the file does not hold a latent of this run's size.
+    """
+    file, _, item = text.rpartition(":")
+    path, item = (Path(file), item) if file.endswith(_ENDINGS) else (Path(text), "0")
+    if text in trained.room_ids or not path.is_file():
+        return named_latent(trained, text, f"a file of latents ({', '.join(_ENDINGS)})")
+    latents, names = _read_latents(path)
+    if item in names:
+        row = names.index(item)
+    elif item.isdecimal() and int(item) < len(latents):
+        row = int(item)
+    else:
+        known = f"names such as {names[0]}" if names else "no names"
+        raise InputError(f"{path} has no latent '{item}': it holds {len(latents)} and {known}.")
+    return _onto(trained, latents[row], f"{path}, row {row},")
+
+
+def named_latent(trained: TrainedPrior, name: str, or_else: str) -> Float[Tensor, " dimension"]:
+    """The latent of a training room, named by its id, or of the room that `seed:7` names.
+
+    Raises:
+        InputError: the name is unknown; the message lists valid names, `or_else` last.
+    """
+    if name in trained.room_ids:
+        row = trained.room_ids.index(name)
+        return trained.prior.latent_space(trained.logits[row : row + 1])[0]
+    if re.fullmatch(r"seed:\d+", name):
+        check_seed(int(name[5:]))
+        return draw_latents(trained, 1, int(name[5:]))[0][0]
+    known = f"such as {trained.room_ids[0]}" if trained.room_ids else "which keeps none"
+    raise InputError(
+        f"'{name}' is neither a training room of this run ({known}), nor seed:NUMBER, nor "
+        f"{or_else}."
+    )
+
+
+def _read_latents(path: Path) -> tuple[np.ndarray, list[str]]:
+    try:
+        raw = path.read_bytes()
+        data: Any = json.loads(raw) if path.suffix == ".json" else np.load(io.BytesIO(raw))
+        names: list[str] = []
+        if isinstance(data, Mapping):
+            if "latents" not in data:
+                raise ValueError("it has no 'latents'")
+            data, names = data["latents"], [str(name) for name in data.get("names", [])]
+        latents = np.atleast_2d(np.asarray(data, dtype=np.float64))
+        if latents.ndim != 2 or not latents.size:
+            raise ValueError(f"an array of shape {latents.shape}")
+    except Exception as error:  # NumPy's error depends on which byte is damaged
+        raise InputError(
+            f"{path} holds no latents ({type(error).__name__}: {error}); expected (n, D) numbers, "
+            "as in the latents.npz that `sceneprior synthesize` writes."
+        ) from None
+    return latents, names

@@ -1,0 +1,171 @@
+"""The paper's two stages: layouts from 2D boxes (Eq. 7), then shapes from masks as well (Eq. 8)."""
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import lightning
+import torch
+from jaxtyping import Float
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
+from torch import Tensor, nn
+from torch.utils.data import Dataset
+
+from sceneprior.core.settings import Section
+from sceneprior.core.views import LiftedRooms, SceneViews
+from sceneprior.paper.losses.shape import mask_loss
+from sceneprior.paper.prior import ScenePrior
+from sceneprior.paper.settings import (
+    LatentStageConfig,
+    LayoutConfig,
+    LossConfig,
+    ShapeConfig,
+    StageConfig,
+    Steps,
+)
+from sceneprior.paper.view_loss import match_and_score, proxy_boxes, seen_boxes, seen_masks
+from sceneprior.training.steps import (
+    batch_seed,
+    check_finite,
+    full_precision,
+    log_losses,
+    weighted_sum,
+    with_cosine,
+)
+
+
+class LatentStage(lightning.LightningModule, ABC):
+    """A stage that trains the network and the latents of the training rooms.
+
+    Args:
+        prior: The network of the previous stage; a fresh one in the first.
+        latents: One row of logits per training room.
+        rooms: The data set that the stage is trained on.
+        stage: The stage's settings.
+        loss: Weights of the losses, by their names.
+        completeness_target: The model's setting.
+        seed: The run's seed.
+    """
+
+    trains_shape: ClassVar[bool] = True
+    """True if the loss reaches the shape decoder."""
+
+    def __init__(
+        self,
+        prior: ScenePrior,
+        latents: nn.Embedding,
+        rooms: Dataset[Any],
+        stage: LatentStageConfig,
+        loss: Section,
+        completeness_target: str,
+        seed: int,
+    ):
+        super().__init__()
+        # DDP expects a gradient of every parameter that requires one.
+        prior.requires_grad_(True)
+        prior.shape.requires_grad_(self.trains_shape)
+        prior.bevels.requires_grad_(self.trains_bevels(stage))
+        self.prior, self.latents, self.rooms = prior, latents, rooms
+        self.stage, self.loss, self.seed = stage, loss, seed
+        self.completeness_target = completeness_target
+
+    @staticmethod
+    def trains_bevels(stage: Any) -> bool:
+        """True if the loss uses 2D boxes of beveled boxes."""
+        return False
+
+    @abstractmethod
+    def training_step(self, views: Any, batch_idx: int) -> Tensor:
+        """The loss of a batch."""
+
+    def room_latents(
+        self, views: SceneViews | LiftedRooms, batch_idx: int
+    ) -> Float[Tensor, "rooms width"]:
+        """The rooms' latents z, each moved by a random step of the length that the stage's settings
+        give."""
+        stage, space = self.stage, self.prior.latent_space
+        end = stage.latent_noise if stage.latent_noise_end is None else stage.latent_noise_end
+        done = self.current_epoch / stage.epochs
+        noise = stage.latent_noise + done * (end - stage.latent_noise)
+        with full_precision(self.device):
+            z = space(self.latents(views.room_index))
+            if not noise:
+                return z
+            return space.step(z, noise, batch_seed(self.seed, self.trainer, batch_idx))
+
+    def total(
+        self,
+        losses: dict[str, Tensor],
+        views: SceneViews | LiftedRooms,
+        beside: dict[str, Tensor] | None = None,
+    ) -> Tensor:
+        """The weighted sum of the losses, checked and logged; `beside` is only logged."""
+        total = weighted_sum(losses, self.loss)
+        check_finite(total, views)
+        log_losses(self, losses | (beside or {}), total, len(views.room_index))
+        return total
+
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
+        """Adam with the stage's schedule, and separate rates for the network, the shape decoder,
+        and the latents and bevels."""
+        stage, others = self.stage, ("shape.", "bevels.")
+        trained = [p for name, p in self.prior.named_parameters() if not name.startswith(others)]
+        tables = [*self.latents.parameters(), *self.prior.bevels.parameters()]
+        groups = [
+            {"params": trained, "lr": stage.learning_rate},
+            {"params": self.prior.shape.parameters(), "lr": stage.shape_rate},
+            {"params": tables, "lr": stage.latent_learning_rate},
+        ]
+        optimizer = torch.optim.Adam(groups, fused=True)
+        if isinstance(stage, StageConfig) and isinstance(stage.schedule, Steps):
+            drops = torch.optim.lr_scheduler.MultiStepLR(
+                optimizer, list(stage.schedule.milestones), gamma=stage.schedule.decay
+            )
+            return {"optimizer": optimizer, "lr_scheduler": drops}
+        return with_cosine(optimizer, int(self.trainer.estimated_stepping_batches))
+
+
+class LayoutStage(LatentStage):
+    """The layout loss L_L without shape decoding (section 3.4, Eq. 7)."""
+
+    stage: LayoutConfig
+    loss: LossConfig
+    trains_shape = False
+
+    @staticmethod
+    def trains_bevels(stage: Any) -> bool:
+        return bool(stage.proxy == "beveled_box")
+
+    def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+        scenes = self.prior.decode(self.room_latents(views, batch_idx), with_shape=False)
+        with full_precision(self.device):
+            boxes = proxy_boxes(scenes, views, self.stage.proxy)
+            losses, _ = match_and_score(scenes, boxes, views, self.loss, self.completeness_target)
+            return self.total(losses, views)
+
+
+class ShapeStage(LatentStage):
+    """The layout loss, now of deformed meshes, plus the mask loss: L = L_L + lambda_S L_S."""
+
+    stage: ShapeConfig
+    loss: LossConfig
+
+    @staticmethod
+    def trains_bevels(stage: Any) -> bool:
+        return stage.box_from == "proxy" and stage.proxy == "beveled_box"
+
+    def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+        # In a room of n objects, only the first n predictions are matched and rendered.
+        scenes = self.prior.decode(self.room_latents(views, batch_idx), views.is_object)
+        with full_precision(self.device):
+            boxes = seen_boxes(scenes, views, self.stage)
+            losses, matches = match_and_score(
+                scenes, boxes, views, self.loss, self.completeness_target
+            )
+            # Checked before rendering, too, whose own error for vertices that are not finite names
+            # no room.
+            check_finite(weighted_sum(losses, self.loss), views)
+            faces = self.prior.faces
+            assert scenes.vertices_m is not None and faces is not None, "masks are of meshes"
+            masks = seen_masks(scenes.vertices_m, faces, views, self.stage)
+            losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
+            return self.total(losses, views, beside=overlap)

@@ -1,1 +1,0 @@
-"""Rooms from the instance masks of single images (section 5.2)."""

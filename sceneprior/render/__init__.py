@@ -1,0 +1,1 @@
+"""Rendering of rooms: silhouettes with gradients, instance ids, pictures, and scene files."""

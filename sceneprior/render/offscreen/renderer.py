@@ -1,0 +1,161 @@
+"""Renderers and their cameras: the interface, the software renderer, and shaded pictures.
+
+The z-buffer is imported when it draws: Numba takes 60 MB and half a second, which commands that
+draw nothing (prep-scannet) should not spend.
+"""
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sceneprior.core.scene import Mesh
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A perspective camera: `point_camera = world_to_camera @ point_world`, OpenCV axes."""
+
+    world_to_camera: np.ndarray
+    """(4, 4), metres."""
+    intrinsics: np.ndarray
+    """(3, 3), pixels; without skew."""
+
+
+@dataclass(frozen=True)
+class Orthographic:
+    """A parallel camera; the centre of the image lies on its optical axis."""
+
+    world_to_camera: np.ndarray
+    """(4, 4), metres. Only geometry in front of the camera is drawn."""
+    metres_per_pixel: float
+
+
+Camera = Pinhole | Orthographic
+
+
+class Renderer(abc.ABC):
+    """A renderer of meshes; `open_renderer` returns one."""
+
+    name: str
+    """Name for reports: "software" or "pyrender (EGL, <name of the GL renderer>)"."""
+    kind: str
+    """Argument of `open_renderer` for the same renderer: "pyrender" or "software"."""
+
+    @abc.abstractmethod
+    def instance_ids_of_views(
+        self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
+    ) -> np.ndarray:
+        """The mesh that is visible at each pixel centre, in many views of one room.
+
+        Returns:
+            (views, height, width) uint16: 0 for none, k + 1 for `meshes[k]`. Both sides of a face
+            are drawn.
+        """
+
+    def instance_ids(
+        self, meshes: Sequence[Mesh], camera: Camera, image_size: tuple[int, int]
+    ) -> np.ndarray:
+        """Instance ids of one view: (height, width) uint16."""
+        return self.instance_ids_of_views(meshes, [camera], image_size)[0]
+
+    def shaded(
+        self,
+        meshes: Sequence[Mesh],
+        colors: np.ndarray,
+        camera: Camera,
+        image_size: tuple[int, int],
+        background: tuple[int, int, int] | np.ndarray = (255, 255, 255),
+    ) -> np.ndarray:
+        """A shaded picture (H, W, 3), with mesh k in `colors[k]` (uint8), lit from the camera.
+
+        The background is a colour, or a picture of this size. Both renderers use the software
+        z-buffer for it, so that pictures look the same everywhere.
+        """
+        height, width = image_size
+        soup = _join(meshes)
+        face_index = _draw(soup, camera, (2 * height, 2 * width), supersampling=2)
+        light = _face_light(soup, camera)
+        palette = np.asarray(colors, dtype=np.float64).reshape(-1, 3)[soup.mesh_of_face]
+        palette = np.concatenate([palette * light[:, None], [(0, 0, 0)]])  # -1 is the last row
+        fine = palette[face_index].reshape(height, 2, width, 2, 3)
+        behind = np.broadcast_to(np.asarray(background), (height, width, 3))[:, None, :, None]
+        fine = np.where((face_index < 0).reshape(height, 2, width, 2, 1), behind, fine)
+        return np.rint(fine.mean(axis=(1, 3))).astype(np.uint8)
+
+
+class SoftwareRenderer(Renderer):
+    """The package's Numba z-buffer: no system libraries, the same pixels on every machine."""
+
+    name = "software"
+    kind = "software"
+
+    def instance_ids_of_views(
+        self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
+    ) -> np.ndarray:
+        soup = _join(meshes)
+        images = np.empty((len(cameras), *image_size), dtype=np.uint16)
+        for image, camera in zip(images, cameras, strict=True):
+            image[...] = _draw(soup, camera, image_size, labels=soup.mesh_of_face) + 1
+        return images
+
+
+class _Soup(NamedTuple):
+    """All meshes of a room joined into one."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    mesh_of_face: np.ndarray
+
+
+def _join(meshes: Sequence[Mesh]) -> _Soup:
+    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+    faces = [
+        np.asarray(mesh.faces, np.int32).reshape(-1, 3) + np.int32(start)
+        for mesh, start in zip(meshes, starts, strict=False)
+    ]
+    return _Soup(
+        np.concatenate([np.zeros((0, 3)), *(mesh.vertices_m for mesh in meshes)]),
+        np.concatenate([np.zeros((0, 3), np.int32), *faces]),
+        np.repeat(np.arange(len(meshes)), [len(part) for part in faces]),
+    )
+
+
+def _draw(
+    soup: _Soup,
+    camera: Camera,
+    image_size: tuple[int, int],
+    supersampling: int = 1,
+    labels: np.ndarray | None = None,
+) -> np.ndarray:
+    """Draw with `zbuffer.rasterize`; `image_size` is the supersampled size."""
+    from sceneprior.render.offscreen.zbuffer import rasterize
+
+    if isinstance(camera, Pinhole):
+        K = np.asarray(camera.intrinsics, dtype=np.float64) * supersampling
+        projection = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    else:
+        scale = supersampling / camera.metres_per_pixel
+        projection = (scale, scale, image_size[1] / 2, image_size[0] / 2)
+    return rasterize(
+        soup.vertices, soup.faces, camera.world_to_camera, projection, image_size,
+        isinstance(camera, Pinhole), labels,
+    )[0]  # fmt: skip
+
+
+def _face_light(soup: _Soup, camera: Camera) -> np.ndarray:
+    """Brightness of each face in [0.4, 1]: ambient light, and a lamp slightly above the camera."""
+    to_camera = np.asarray(camera.world_to_camera, dtype=np.float64)
+    corners = (soup.vertices @ to_camera[:3, :3].T + to_camera[:3, 3])[soup.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    if isinstance(camera, Pinhole):
+        towards_eye = -corners.mean(axis=1)
+    else:
+        towards_eye = np.broadcast_to([0.0, 0.0, -1.0], normals.shape)
+    normals *= np.where((normals * towards_eye).sum(axis=1, keepdims=True) < 0, -1, 1)
+    lamp = np.array([-0.25, -0.55, -0.8])
+    lamp /= np.linalg.norm(lamp)
+    return 0.4 + 0.6 * np.clip(normals @ lamp, 0, 1)

@@ -1,0 +1,341 @@
+"""Scene files: write JSON, GLB, OBJ, USD and PNG; read a scene, or a folder of scenes."""
+
+import json
+import re
+import warnings
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sceneprior.core.errors import InputError, InputWarning
+from sceneprior.core.files import is_name, read_json, write_json, write_whole
+from sceneprior.core.scene import FORMAT, Mesh, Scene, mesh_of_file, read_scene, scene_to_json
+from sceneprior.render.offscreen import Renderer, open_renderer
+from sceneprior.render.pictures import png_bytes
+from sceneprior.render.topdown import FLOOR_COLOR, object_colors, scene_meshes, topdown
+
+PACKAGE_FORMATS = "sceneprior-"
+"""Prefix of the names of the package's formats."""
+
+
+def save_scene(scene: Scene, path: Path, renderer: Renderer | None = None) -> None:
+    """Write a scene to one file, atomically, in the format of its suffix.
+
+    `.json`: classes and boxes. `.glb`: one node per object, called `<index>_<class>`, in the class
+    colour; an object without a mesh is written as its box. `.obj`: the same objects, with an `.mtl`
+    file. `.usda`: one mesh per object, its class in `userProperties:class`. `.png`: the top-down
+    picture of the metrics, with borders between objects. Axes and unit are the room frame's: y up,
+    metres.
+
+    Args:
+        renderer: Renderer of the picture; None opens one.
+
+    Raises:
+        InputError: the path has another suffix.
+    """
+    path = Path(path)
+    if path.suffix not in WRITERS:
+        raise InputError(
+            f"{path} ends with '{path.suffix}', which is no format of scenes; end it with one of "
+            f"{', '.join(WRITERS)}."
+        )
+    WRITERS[path.suffix](scene, path, renderer)
+
+
+def _write_json(scene: Scene, path: Path, _: Renderer | None) -> None:
+    write_json(path, scene_to_json(scene))
+
+
+def _write_glb(scene: Scene, path: Path, _: Renderer | None) -> None:
+    write_whole(path, scene_to_glb(scene))
+
+
+def _write_obj(scene: Scene, path: Path, _: Renderer | None) -> None:
+    materials = path.with_suffix(".mtl")
+    text, described = scene_to_obj(scene, materials.name)
+    write_whole(materials, described)
+    write_whole(path, text)
+
+
+def _write_png(scene: Scene, path: Path, renderer: Renderer | None) -> None:
+    picture = topdown(scene, renderer or open_renderer(), outlines=True)
+    write_whole(path, png_bytes(picture))
+
+
+def _write_usd(scene: Scene, path: Path, _: Renderer | None) -> None:
+    write_whole(path, scene_to_usd(scene))
+
+
+WRITERS: Mapping[str, Callable[[Scene, Path, Renderer | None], None]] = {
+    ".json": _write_json, ".glb": _write_glb, ".obj": _write_obj, ".usda": _write_usd,
+    ".png": _write_png,
+}  # fmt: skip
+
+
+def scene_to_glb(scene: Scene, floor: Mesh | None = None) -> bytes:
+    """The scene as binary glTF 2.0: a named node, mesh and material per object; no cameras.
+
+    Args:
+        floor: Mesh of an additional node `floor`, for pages; `load_scene` rejects such a node.
+    """
+    if not scene.objects and floor is None:
+        return _empty_glb()
+    room = _trimesh_of(scene)
+    if floor is not None:
+        _add(room, "floor", "floor", floor, np.array(FLOOR_COLOR))
+    # Without normals, viewers use flat shading, and boxes keep sharp edges.
+    return bytes(room.export(file_type="glb", include_normals=False))
+
+
+def scene_to_obj(scene: Scene, materials: str) -> tuple[str, bytes]:
+    """The scene as Wavefront OBJ with one named object each, and its materials (MTL).
+
+    The OBJ refers to the MTL file by the name `materials`. y is up, in metres, as in the GLB.
+    """
+    from trimesh.exchange.obj import export_obj
+
+    if not scene.objects:
+        return "", b""
+    text, files = export_obj(
+        _trimesh_of(scene), include_normals=False, return_texture=True, mtl_name=materials,
+        header=None,
+    )  # fmt: skip
+    return text + "\n", files[materials]
+
+
+def scene_to_usd(scene: Scene) -> str:
+    """The scene as the text of a USD stage: y up, metres, one mesh per object under `/room`.
+
+    Raises:
+        InputError: the package `usd-core` is missing.
+    """
+    try:
+        from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
+    except ImportError:
+        raise InputError("USD needs a package more: pip install 'sceneprior[usd]'.") from None
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/room").GetPrim())
+    meshes, colors = scene_meshes(scene), object_colors(scene)
+    for node, item, mesh, color in zip(_nodes(scene), scene.objects, meshes, colors, strict=True):
+        # USD names must begin with a letter.
+        prim = UsdGeom.Mesh.Define(
+            stage, Sdf.Path("/room").AppendChild(Tf.MakeValidIdentifier(f"object_{node}"))
+        )
+        vertices = np.ascontiguousarray(mesh.vertices_m, dtype=np.float32)
+        faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
+        prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(vertices))
+        prim.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), 3))
+        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.ravel()))
+        prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([vertices.min(0), vertices.max(0)])))
+        prim.CreateDisplayColorAttr([Gf.Vec3f(*_linear_rgba(color)[:3])])
+        label = prim.GetPrim().CreateAttribute("userProperties:class", Sdf.ValueTypeNames.String)
+        label.Set(item.label)
+    return str(stage.GetRootLayer().ExportToString())
+
+
+def _trimesh_of(scene: Scene) -> Any:
+    import trimesh
+
+    room = trimesh.Scene(base_frame="room")
+    meshes, colors = scene_meshes(scene), object_colors(scene)
+    for node, item, mesh, color in zip(_nodes(scene), scene.objects, meshes, colors, strict=True):
+        _add(room, node, item.label, mesh, color)
+    return room
+
+
+def _add(room: Any, node: str, material: str, mesh: Mesh, color: np.ndarray) -> None:
+    import trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    surface = PBRMaterial(
+        name=material,
+        baseColorFactor=_linear_rgba(color),
+        metallicFactor=0.0,
+        roughnessFactor=0.9,
+        # A learned mesh may fold over itself, and its back faces should be visible.
+        doubleSided=True,
+    )
+    geometry = trimesh.Trimesh(
+        np.asarray(mesh.vertices_m, dtype=np.float64),
+        np.asarray(mesh.faces, dtype=np.int64),
+        process=False,
+        visual=TextureVisuals(material=surface),
+    )
+    room.add_geometry(geometry, node_name=node, geom_name=node)
+
+
+def _nodes(scene: Scene) -> list[str]:
+    return [f"{index}_{item.label}" for index, item in enumerate(scene.objects)]
+
+
+def _linear_rgba(color: np.ndarray) -> list[float]:
+    # glTF's base colours are linear; class colours are sRGB.
+    srgb = color / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return [*(float(value) for value in linear), 1.0]
+
+
+def _empty_glb() -> bytes:
+    # trimesh does not export a scene without geometry, but an empty room is valid.
+    text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{}]}).encode()
+    text += b" " * (-len(text) % 4)
+    header = np.array([0x46546C67, 2, 20 + len(text), len(text), 0x4E4F534A], dtype="<u4")
+    return header.tobytes() + text
+
+
+def read_glb_meshes(path: Path) -> dict[str, Mesh]:
+    """Meshes of a GLB by node name, with vertices in the room frame in metres.
+
+    Raises:
+        InputError: the file is missing or not a GLB.
+    """
+    import trimesh
+
+    try:
+        # process=False keeps vertices and faces as written; materials follow from the classes.
+        loaded = trimesh.load_scene(Path(path), file_type="glb", process=False, skip_materials=True)
+        meshes = {}
+        for node in loaded.graph.nodes_geometry:
+            transform, name = loaded.graph[node]
+            mesh = loaded.geometry[name]
+            vertices = np.asarray(mesh.vertices, dtype=np.float64)
+            placed = vertices @ transform[:3, :3].T + transform[:3, 3]
+            meshes[node] = mesh_of_file(placed, mesh.faces)
+        return meshes
+    except Exception as error:  # a damaged file raises almost anything in trimesh
+        reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        raise InputError(
+            f"{path} cannot be read as a GLB ({reason.rstrip('.')}); write the scene again with "
+            "`sceneprior synthesize`, or delete the file to use the boxes alone."
+        ) from None
+
+
+def load_scene(path: Path) -> Scene:
+    """Read a scene's JSON, and its meshes from the GLB of the same name if there is one.
+
+    Raises:
+        InputError: the JSON is not a scene, or the GLB has other objects.
+    """
+    path = Path(path)
+    scene = read_scene(path)
+    glb = path.with_suffix(".glb")
+    if not glb.is_file() or not scene.objects:
+        return scene
+    meshes = read_glb_meshes(glb)
+    wanted = _nodes(scene)
+    if set(meshes) != set(wanted):
+        unlisted = sorted(set(meshes) ^ set(wanted))
+        raise InputError(
+            f"{glb.name} and {path.name} describe different objects (only in one of them: "
+            f"{', '.join(unlisted[:4])}); write both again with `sceneprior synthesize`."
+        )
+    with_mesh = [
+        replace(item, mesh=meshes[node]) for node, item in zip(wanted, scene.objects, strict=True)
+    ]
+    return replace(scene, objects=tuple(with_mesh))
+
+
+def load_scene_folder(folder: Path) -> list[Scene]:
+    """Read all scenes of a folder, sorted by name in natural order (room_2 before room_10).
+
+    JSON files of the package's other formats, such as scores, are skipped; JSON files of unknown
+    formats are skipped with a warning.
+
+    Raises:
+        InputError: the folder is missing, holds no scene, or a file in it is damaged.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        _refuse_box_lists(folder, [folder])
+        raise InputError(f"No folder of scenes at {folder}; `sceneprior synthesize` writes one.")
+    paths = sorted(folder.glob("*.json"), key=_counting_order)
+    # Unreadable files (format None) are not skipped, so that load_scene reports their error.
+    formats = {path: format_of(path) for path in paths}
+    scenes = [load_scene(path) for path, form in formats.items() if form in (FORMAT, None)]
+    if not scenes:
+        _refuse_box_lists(folder, [*folder.rglob("*.npz"), *paths])
+        raise InputError(
+            f"{folder} holds no scene JSON; `sceneprior synthesize` writes them, and "
+            "docs/conventions.md describes the format."
+        )
+    if other := [
+        path.name
+        for path, form in formats.items()
+        if form is not None and not form.startswith(PACKAGE_FORMATS)
+    ]:
+        warnings.warn(
+            f"{len(scenes)} scenes are read from {folder}; {len(other)} other JSON files there are "
+            f"no scenes ('format' is not {FORMAT}) and are passed over: {', '.join(other[:3])}"
+            f"{', ...' if len(other) > 3 else ''}.",
+            InputWarning,
+            stacklevel=2,
+        )
+    return scenes
+
+
+def _refuse_box_lists(given: Path, paths: Iterable[Path]) -> None:
+    """Raise an InputError with the command for conversion if box lists like ATISS's were given."""
+    for path in paths:
+        if _is_box_list(path):
+            raise InputError(
+                f"{given} holds box lists ({path.name}) and no scenes; `sceneprior export {given} "
+                "--to scenes --label-set front3d_bedroom --out DIR` makes scenes of them, with "
+                "the label set of their classes."
+            )
+
+
+def _is_box_list(path: Path) -> bool:
+    key = "class_labels"
+    try:
+        if path.suffix == ".npz":
+            with zipfile.ZipFile(path) as file:
+                return f"{key}.npy" in file.namelist()
+        data = read_json(path)
+    except (OSError, zipfile.BadZipFile, InputError):
+        return False
+    record = data[0] if isinstance(data, list) and data else data
+    return isinstance(record, dict) and key in record
+
+
+def check_names(scenes: Sequence[Scene]) -> None:
+    """Check that the scenes' names are unique and can be file names.
+
+    Raises:
+        InputError: a name occurs twice or cannot be a file name.
+    """
+    counts = Counter(scene.name for scene in scenes)
+    for name, count in counts.items():
+        if count > 1:
+            raise InputError(
+                f"{count} rooms are called '{name}', and files are named by rooms; give each "
+                "another `name` in its JSON."
+            )
+        if not is_name(name):
+            raise InputError(
+                f"A room is called {ascii(name)[:60]}, which cannot be the name of a file; give it "
+                "a short one without slashes (`name` in its JSON)."
+            )
+
+
+def _counting_order(path: Path) -> list[str]:
+    # Zero-padded numbers sort like numbers.
+    parts = re.split(r"(\d+)", path.stem)
+    return [part.zfill(20) if part.isdigit() else part for part in parts]
+
+
+def format_of(path: Path) -> str | None:
+    """The `format` entry of a JSON file ("" without one); None if the file cannot be read."""
+    try:
+        data = read_json(path)
+    except InputError:
+        return None
+    return str(data.get("format", "")) if isinstance(data, dict) else ""

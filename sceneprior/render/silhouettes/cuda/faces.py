@@ -1,0 +1,196 @@
+"""The exact mode on CUDA: the launches of its kernels, and its backward kernels.
+
+In the backward pass, each face sums over its pixels, then each vertex over the corners that use
+it, always in the same order.
+"""
+
+from typing import no_type_check
+
+import torch
+from torch import Tensor
+
+from sceneprior.render.silhouettes.cuda.kernels import (
+    BLOCK,
+    TILE,
+    corners_of,
+    cover_tiles,
+    tl,
+    to_edge,
+    triton,
+    window,
+)
+from sceneprior.render.silhouettes.cuda.windows import Windows, launch
+from sceneprior.render.silhouettes.reference import Settings
+
+FACES, PIXELS = 8, 8
+"""Faces per backward program, and pixels processed at once for each. More faces need more registers
+(about 100 for 8, 190 for 16); with more pixels, lanes idle on small faces."""
+
+VERTICES = 128
+"""Vertices per program of `gather_vertices`."""
+
+
+@triton.jit
+@no_type_check
+def corner_gradients(
+    pixels, faces, face_bounds, windows, first_tiles, upstream, by_corner,
+    vertex_count, face_count, block_count, sigma, blur, FACES: tl.constexpr, PIXELS: tl.constexpr,
+):  # pragma: no cover - compiled  # fmt: skip
+    """Gradients of each face's corners, summed over its pixels.
+
+    The pixels of a face are split between lanes, whose sums are added at the end.
+    """
+    programs = tl.cdiv(face_count, FACES)
+    mesh = tl.program_id(0).to(tl.int64) // programs
+    face = (tl.program_id(0) % programs) * FACES + tl.arange(0, FACES)[:, None]
+    exists = face < face_count
+    row_size = block_count * BLOCK
+    bounds = face_bounds + mesh * 4 * row_size + face
+    first_row = tl.load(bounds, mask=exists, other=0).to(tl.int32)
+    last_row = tl.load(bounds + row_size, mask=exists, other=-1).to(tl.int32)
+    first_column = tl.load(bounds + 2 * row_size, mask=exists, other=0).to(tl.int32)
+    last_column = tl.load(bounds + 3 * row_size, mask=exists, other=-1).to(tl.int32)
+    columns = tl.maximum(last_column - first_column + 1, 1)
+    count = tl.where(last_row >= 0, (last_row - first_row + 1) * columns, 0)
+    most = tl.max(tl.max(count, axis=1), axis=0)
+    base, stride = window(windows, first_tiles, mesh)
+
+    real = by_corner.dtype.element_ty
+    _, _, _, ax, ay, bx, by, cx, cy = corners_of(
+        pixels, faces, face, mesh * vertex_count, exists, real
+    )
+    turn = tl.where((bx - ax) * (cy - ay) - (by - ay) * (cx - ax) > 0, 1.0, -1.0)
+    gax, gay = tl.zeros((FACES, PIXELS), real), tl.zeros((FACES, PIXELS), real)
+    gbx, gby = tl.zeros((FACES, PIXELS), real), tl.zeros((FACES, PIXELS), real)
+    gcx, gcy = tl.zeros((FACES, PIXELS), real), tl.zeros((FACES, PIXELS), real)
+    # Lane i takes the face's pixels i, i + PIXELS, ... in reading order, stepped incrementally.
+    lane = tl.arange(0, PIXELS)[None, :]
+    row, column = lane // columns, lane % columns
+    down, along = PIXELS // columns, PIXELS % columns
+    inverse_sigma = 1.0 / sigma
+    for start in range(0, most, PIXELS):
+        at = base + (first_row + row) * stride + first_column + column
+        grad = tl.load(upstream + at, mask=start + lane < count, other=0)
+        # Pixels that are certainly covered, hidden or without a loss have no gradient.
+        if tl.max(tl.max(tl.abs(grad), axis=1), axis=0) > 0:
+            px, py = (first_column + column).to(real) + 0.5, (first_row + row).to(real) + 0.5
+            rx, ry, t, wc = to_edge(px, py, ax, ay, bx, by)
+            distance = rx * rx + ry * ry
+            share_a, share_b = 1.0 - t, t
+            sx, sy, t, wa = to_edge(px, py, bx, by, cx, cy)
+            here = sx * sx + sy * sy
+            nearer = here < distance
+            distance = tl.where(nearer, here, distance)
+            rx, ry = tl.where(nearer, sx, rx), tl.where(nearer, sy, ry)
+            share_a, share_b = tl.where(nearer, 0.0, share_a), tl.where(nearer, 1.0 - t, share_b)
+            sx, sy, t, wb = to_edge(px, py, cx, cy, ax, ay)
+            here = sx * sx + sy * sy
+            nearer = here < distance
+            distance = tl.where(nearer, here, distance)
+            rx, ry = tl.where(nearer, sx, rx), tl.where(nearer, sy, ry)
+            share_a, share_b = tl.where(nearer, t, share_a), tl.where(nearer, 0.0, share_b)
+
+            inside = tl.minimum(tl.minimum(wa * turn, wb * turn), wc * turn) > 0
+            sign = tl.where(inside, 1.0, -1.0)
+            # dmask/dx_f is `upstream` times the chance that this face covers; dd_f/dcorner is
+            # -2 (p - nearest) times the corner's share of the nearest point.
+            covers = 1.0 / (1.0 + tl.exp(-sign * distance * inverse_sigma))
+            weight = -2.0 * grad * sign * covers * inverse_sigma
+            weight = tl.where(inside | (distance < blur), weight, 0.0)
+            gx, gy = weight * rx, weight * ry
+            gax += share_a * gx
+            gay += share_a * gy
+            gbx += share_b * gx
+            gby += share_b * gy
+            gcx += (1.0 - share_a - share_b) * gx
+            gcy += (1.0 - share_a - share_b) * gy
+        wraps = column + along >= columns
+        row += down + wraps.to(tl.int32)
+        column += along - tl.where(wraps, columns, 0)
+    face = (tl.program_id(0) % programs) * FACES + tl.arange(0, FACES)
+    to = by_corner + (mesh * face_count + face) * 6
+    exists = face < face_count
+    tl.store(to, tl.sum(gax, axis=1), mask=exists)
+    tl.store(to + 1, tl.sum(gay, axis=1), mask=exists)
+    tl.store(to + 2, tl.sum(gbx, axis=1), mask=exists)
+    tl.store(to + 3, tl.sum(gby, axis=1), mask=exists)
+    tl.store(to + 4, tl.sum(gcx, axis=1), mask=exists)
+    tl.store(to + 5, tl.sum(gcy, axis=1), mask=exists)
+
+
+@triton.jit
+@no_type_check
+def gather_vertices(
+    by_corner, corners, first_corners, windows, gradient, vertex_count, corner_count,
+    VERTICES: tl.constexpr,
+):  # pragma: no cover - compiled  # fmt: skip
+    """Sum gradients by vertex v over its corners[first_corners[v] : first_corners[v + 1]]."""
+    programs = tl.cdiv(vertex_count, VERTICES)
+    mesh = tl.program_id(0).to(tl.int64) // programs
+    vertex = (tl.program_id(0) % programs) * VERTICES + tl.arange(0, VERTICES)
+    exists = vertex < vertex_count
+    first = tl.load(first_corners + vertex, mask=exists, other=0)
+    count = tl.load(first_corners + vertex + 1, mask=exists, other=0) - first
+    seen = tl.load(windows + mesh * 4 + 2) > 0
+    most = tl.where(seen, tl.max(count, axis=0), 0)
+    real = gradient.dtype.element_ty
+    gx, gy = tl.zeros((VERTICES,), real), tl.zeros((VERTICES,), real)
+    for step in range(0, most):
+        here = step < count
+        corner = mesh * corner_count + tl.load(corners + first + step, mask=here, other=0)
+        gx += tl.load(by_corner + corner * 2, mask=here, other=0)
+        gy += tl.load(by_corner + corner * 2 + 1, mask=here, other=0)
+    to = gradient + (mesh * vertex_count + vertex) * 2
+    tl.store(to, gx, mask=exists)
+    tl.store(to + 1, gy, mask=exists)
+
+
+def cover(
+    pixels: Tensor, depths: Tensor, faces: Tensor, windows: Windows, settings: Settings
+) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    """1 - coverage and the order value at all pixels of the windows, and the inputs saved for
+    `cover_backward`."""
+    tiles = len(windows.tile_meshes)
+    missed = pixels.new_empty(tiles * TILE.value**2)
+    order = torch.empty_like(missed)
+    launch(
+        cover_tiles, tiles, pixels, depths.reciprocal(), faces, *windows, missed, order,
+        pixels.shape[2], windows.block_bounds.shape[-1], settings.sigma_px2, settings.blur_px2,
+        num_warps=1,
+    )  # fmt: skip
+    return missed, order, (windows.face_bounds,)
+
+
+def cover_backward(
+    pixels: Tensor,
+    faces: Tensor,
+    seen: tuple[Tensor, Tensor],
+    settings: Settings,
+    traced: list[Tensor],
+    upstream: Tensor,
+) -> Tensor:
+    """dL/dpixels from -dL/dlog(missed)."""
+    (face_bounds,), (places, first_tiles) = traced, seen
+    images, objects, vertices, _ = pixels.shape
+    by_corner = pixels.new_empty(images * objects, len(faces), 3, 2)
+    launch(
+        corner_gradients, images * objects * -(-len(faces) // FACES), pixels, faces,
+        face_bounds, places, first_tiles, upstream, by_corner, vertices, len(faces),
+        face_bounds.shape[-1] // BLOCK.value, settings.sigma_px2, settings.blur_px2, FACES=FACES,
+        PIXELS=PIXELS, num_warps=1,
+    )  # fmt: skip
+    return sum_by_vertex(by_corner, faces.flatten(), places, pixels)
+
+
+def sum_by_vertex(by_corner: Tensor, owners: Tensor, places: Tensor, pixels: Tensor) -> Tensor:
+    """Sum each mesh's corner gradients by vertex (`owners`); `places` has one row per mesh."""
+    gradient = torch.empty_like(pixels)
+    vertices = pixels.numel() // 2 // max(len(places), 1)
+    owners, corners = owners.sort(stable=True)
+    every = torch.arange(vertices + 1, dtype=owners.dtype, device=owners.device)
+    launch(
+        gather_vertices, len(places) * -(-vertices // VERTICES), by_corner, corners,
+        torch.searchsorted(owners, every), places, gradient, vertices, len(corners),
+        VERTICES=VERTICES, num_warps=4,
+    )  # fmt: skip
+    return gradient

@@ -1,0 +1,223 @@
+"""Pictures of scenes: top-down, as metrics compare them, from above a corner, and turntables."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from sceneprior.core.classes import class_colors, label_set
+from sceneprior.core.geometry.corners import BOX_FACES, box_corners
+from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.render.offscreen import Orthographic, Pinhole, Renderer
+from sceneprior.render.pictures import paint_ids
+
+BACKGROUND = (255, 255, 255)
+"""White, which differs clearly from all class colours and prints as paper."""
+
+FLOOR_COLOR = (232, 228, 220)
+DIRECTION = np.array([0.42, 0.62, 0.66])
+"""Unit vector from a room towards the camera of `perspective`; 3D models start in this view."""
+
+
+@dataclass(frozen=True)
+class TopDownProtocol:
+    """The settings of a top-down picture."""
+
+    image_size: tuple[int, int] = (512, 512)
+    """(height, width) in pixels, as in the paper."""
+    window_m: float = 6.4
+    """Side of the square of floor in the picture; objects outside are cut off."""
+    camera_height_m: float = 10.0
+    """The camera's height above the floor; nothing above it is drawn."""
+    background: tuple[int, int, int] = BACKGROUND
+    """RGB of pixels without an object. The floor is not drawn: a generated room has none."""
+
+    @property
+    def metres_per_pixel(self) -> float:
+        """Side of the square that a pixel covers."""
+        return self.window_m / self.image_size[1]
+
+    def as_dict(self) -> dict[str, object]:
+        """The protocol, for a result file."""
+        return {**asdict(self), "metres_per_pixel": self.metres_per_pixel}
+
+
+def topdown_protocol(label_set_name: str) -> TopDownProtocol:
+    """The protocol of a label set: 12.5 mm per pixel for bedrooms, 25 mm for all other sets.
+
+    The windows hold the largest rooms that ATISS's filter accepts (6 x 6 m bedrooms, 12 x 12 m
+    living rooms).
+
+    Raises:
+        InputError: no label set has this name.
+    """
+    label_set(label_set_name)
+    return TopDownProtocol(window_m=6.4 if label_set_name == "front3d_bedroom" else 12.8)
+
+
+def box_mesh(center_m: Sequence[float], size_m: Sequence[float]) -> Mesh:
+    """A box as a mesh of 12 triangles that face outwards."""
+    return Mesh(box_corners(np.asarray(center_m), np.asarray(size_m)), BOX_FACES)
+
+
+def object_mesh(item: SceneObject) -> Mesh:
+    """The object's mesh, or its box if it has none."""
+    return item.mesh if item.mesh is not None else box_mesh(item.center_m, item.size_m)
+
+
+def scene_meshes(scene: Scene) -> list[Mesh]:
+    """One mesh per object, see `object_mesh`."""
+    return [object_mesh(item) for item in scene.objects]
+
+
+def object_colors(scene: Scene) -> UInt8[np.ndarray, "objects 3"]:
+    """The flat RGB class colour of each object."""
+    return class_colors(len(label_set(scene.label_set)))[scene.class_indices]
+
+
+def topdown(
+    scene: Scene,
+    renderer: Renderer,
+    protocol: TopDownProtocol | None = None,
+    outlines: bool = False,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Orthographic picture of a room from above: one flat colour per class, without shading.
+
+    Image right is +x, image down is +z, and the room's origin is the centre of the image. Of
+    objects above each other, the highest surface is drawn.
+
+    Args:
+        protocol: None takes the protocol of the scene's label set.
+        outlines: Darken the borders between objects: for readers, never for metrics.
+
+    Source:
+        The paper, section 4.2: 512 x 512, orthographic, a colour per category.
+    """
+    protocol = protocol or topdown_protocol(scene.label_set)
+    ids = np.zeros(protocol.image_size, dtype=np.uint16)
+    if scene.objects:
+        height = protocol.camera_height_m
+        world_to_camera = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, height], [0, 0, 0, 1]])
+        camera = Orthographic(world_to_camera, protocol.metres_per_pixel)
+        ids = renderer.instance_ids(scene_meshes(scene), camera, protocol.image_size)
+    colors = object_colors(scene)
+    if outlines:
+        return paint_ids(ids, colors, protocol.background)
+    return np.concatenate([[protocol.background], colors]).astype(np.uint8)[ids]
+
+
+def look_at(
+    eye_m: Float[np.ndarray, "3"], target_m: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    """`world_to_camera` of a camera at `eye_m` that looks at `target_m`, y up, not vertically."""
+    forward = target_m - eye_m
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye_m
+    return matrix
+
+
+@dataclass(frozen=True)
+class CornerView:
+    """The camera of `perspective`, and the floor that it draws."""
+
+    camera: Pinhole
+    image_size: tuple[int, int]
+    floor: Mesh
+
+
+def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480)) -> CornerView:
+    """A view from above a corner, outside the room, into which all these rooms just fit.
+
+    The camera is two diagonals away. The floor is the rectangle around the rooms' outlines or, for
+    rooms without an outline, their objects.
+    """
+    floors = np.array([floor_rectangle(scene) for scene in scenes])
+    low, high = floors[:, 0].min(axis=0), floors[:, 1].max(axis=0)
+    # Top face 2 cm below y = 0, so that objects on the floor do not z-fight with it.
+    center = ((low[0] + high[0]) / 2, -0.03, (low[1] + high[1]) / 2)
+    floor = box_mesh(center, (high[0] - low[0], 0.02, high[1] - low[1]))
+    meshes = [floor, *(mesh for scene in scenes for mesh in scene_meshes(scene))]
+    points = np.concatenate([mesh.vertices_m for mesh in meshes])
+    target, diagonal = (points.min(0) + points.max(0)) / 2, np.linalg.norm(np.ptp(points, axis=0))
+    world_to_camera = look_at(target + 2 * diagonal * DIRECTION, target)
+    x, y, z = world_to_camera[:3, :3] @ points.T + world_to_camera[:3, 3:]
+    across, down = x / z, y / z
+    height, width = image_size
+    focal = 0.96 * min(width / np.ptp(across), height / np.ptp(down))  # a margin of 4%
+    x_px, y_px = (
+        side / 2 - focal * (seen.min() + seen.max()) / 2
+        for side, seen in ((width, across), (height, down))
+    )
+    intrinsics = np.array([[focal, 0, x_px], [0, focal, y_px], [0, 0, 1]])
+    return CornerView(Pinhole(world_to_camera, intrinsics), image_size, floor)
+
+
+def perspective(
+    scene: Scene,
+    renderer: Renderer,
+    image_size: tuple[int, int] = (360, 480),
+    view: CornerView | None = None,
+    colors: UInt8[np.ndarray, "objects 3"] | None = None,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """A shaded picture from above a corner, outside the room: for pages, not for metrics.
+
+    Args:
+        image_size: (height, width), used without a `view`.
+        view: None fits a view to the room; a common view makes several rooms comparable.
+        colors: Colours of the objects; None takes those of their classes.
+    """
+    view = view or corner_view([scene], image_size)
+    colors = object_colors(scene) if colors is None else colors
+    colors = np.concatenate([colors, [FLOOR_COLOR]]).astype(np.uint8)
+    meshes = [*scene_meshes(scene), view.floor]
+    return renderer.shaded(meshes, colors, view.camera, view.image_size, BACKGROUND)
+
+
+def turntable(
+    scene: Scene,
+    renderer: Renderer,
+    count: int = 36,
+    image_size: tuple[int, int] = (240, 320),
+) -> list[UInt8[np.ndarray, "height width 3"]]:
+    """Shaded pictures from `count` directions around a room, at one scale.
+
+    The first has the viewing direction of `perspective`.
+    """
+    floor = corner_view([scene]).floor
+    points = np.concatenate([mesh.vertices_m for mesh in [*scene_meshes(scene), floor]])
+    target, diagonal = (points.min(0) + points.max(0)) / 2, np.linalg.norm(np.ptp(points, axis=0))
+    poses, reach = [], np.zeros(2)
+    for angle in np.arange(count) * 2 * np.pi / count:
+        turned = np.array(
+            [
+                np.cos(angle) * DIRECTION[0] + np.sin(angle) * DIRECTION[2],
+                DIRECTION[1],
+                np.cos(angle) * DIRECTION[2] - np.sin(angle) * DIRECTION[0],
+            ]
+        )
+        poses.append(look_at(target + 2 * diagonal * turned, target))
+        x, y, z = poses[-1][:3, :3] @ points.T + poses[-1][:3, 3:]
+        reach = np.maximum(reach, np.abs([x / z, y / z]).max(axis=1))
+    height, width = image_size
+    focal = 0.96 * min(width / 2 / reach[0], height / 2 / reach[1])
+    intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    views = [CornerView(Pinhole(pose, intrinsics), image_size, floor) for pose in poses]
+    return [perspective(scene, renderer, view=view) for view in views]
+
+
+def floor_rectangle(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper (x, z) of the rectangle around the floor.
+
+    Without a known floor, it is the rectangle around the objects with a margin of 20 cm.
+    """
+    if scene.floor_m is not None and len(scene.floor_m):
+        outline = np.asarray(scene.floor_m, dtype=np.float64)
+        return outline.min(0), outline.max(0)
+    if not scene.objects:
+        return np.array([-1.5, -1.5]), np.array([1.5, 1.5])
+    flat, half = scene.centers_m[:, [0, 2]], scene.sizes_m[:, [0, 2]] / 2
+    return (flat - half).min(0) - 0.2, (flat + half).max(0) + 0.2

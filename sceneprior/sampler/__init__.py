@@ -1,1 +1,0 @@
-"""New rooms, object by object, from what lifting found in the training rooms; ours."""

@@ -1,1 +1,0 @@
-"""A page in the browser: walk the latent space, keep objects, complete rooms (extra `view`)."""

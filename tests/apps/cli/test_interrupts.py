@@ -1,0 +1,85 @@
+"""Ctrl-C ends a command with one sentence and status 130, whatever it falls into."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+SENTENCE = "Stopped by Ctrl-C. Every file that was written is whole.\n"
+
+# Stands for a command: it says "on", and does what Ctrl-C is to fall into. The others come after.
+_COMMAND = """
+import gc, signal, sys, time, weakref
+import sceneprior.apps.cli, sceneprior.apps.cli.commands
+
+def press():
+    signal.raise_signal(signal.SIGINT)
+
+def work():
+    start = time.monotonic()
+    {body}
+    while time.monotonic() - start < 60:
+        time.sleep(0.01)
+    print("went on")
+
+sceneprior.apps.cli.commands.app = work
+sceneprior.apps.cli.main()
+"""
+BODIES = {
+    "plain": "press()",
+    "weak reference": "weakref.finalize; x = type('X', (), {})(); "
+    "r = weakref.ref(x, lambda _: press()); del x",
+    "deletion": "x = type('X', (), {'__del__': lambda _: press()})(); del x",
+    "bare except": "exec('try:\\n    press()\\nexcept:\\n    pass')",
+    "another error": "exec('try:\\n    press()\\nexcept BaseException:\\n    raise ValueError')",
+    "a module": "exec('press()')",
+    "long clean-up": "exec('try:\\n    press()\\nfinally:\\n    time.sleep(1.5)\\n    print(1)')",
+}
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_ctrl_c_is_never_lost(start, body):
+    process = start(
+        [sys.executable, "-c", _COMMAND.format(body=BODIES[body])],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    said, errors = process.communicate(timeout=400)
+    assert (process.returncode, errors) == (130, SENTENCE)
+    assert said == ("1\n" if body == "long clean-up" else "")
+
+
+def test_in_the_background_ctrl_c_stays_ignored(start):
+    body = "press(); print('on'); sys.exit(0)"
+    process = start(
+        [sys.executable, "-c", _COMMAND.format(body=body)], background=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.communicate(timeout=400) == ("on\n", "") and process.returncode == 0
+
+
+@pytest.mark.slow
+def test_homes_end_whole_or_not_at_all_whenever_ctrl_c_comes(start, tmp_path):
+    """At random moments: one sentence and status 130, or a finished folder and status 0."""
+    rng = np.random.default_rng(0)
+    command = [sys.executable, "-m", "sceneprior", "make-homes", "homes", "--rooms", "6"]
+    began = time.monotonic()
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    took = time.monotonic() - began
+    for number in range(10):
+        folder = tmp_path / f"{number}"
+        folder.mkdir()
+        process = start(
+            command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        time.sleep(float(rng.uniform(0.3, took)))  # before, Python itself is not ready
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=400)
+        assert "Traceback" not in errors
+        if process.returncode == 0:
+            assert (folder / "homes" / "splits" / "bedroom.csv").is_file()
+        else:
+            assert process.returncode == 130 and errors.endswith(SENTENCE), errors
+            assert not list(folder.iterdir())

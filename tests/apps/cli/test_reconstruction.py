@@ -1,0 +1,201 @@
+"""reconstruct and eval-svr as commands: files, scores, and sentences for what does not work."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from cli_helpers import everything_in, one_sentence
+from PIL import Image
+
+from sceneprior.core.classes import label_set
+from sceneprior.core.observed_image import image_from_shards
+from sceneprior.paper.fit_image import SCHEDULES, FitSchedule
+
+SOFT = ("--renderer", "software")
+
+
+PAPER = ("--fit", "paper")
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setitem(SCHEDULES, "paper", FitSchedule(steps=6, drop_at=3))
+
+
+@pytest.fixture
+def own(toy_shards, tmp_path):
+    """A view of the toy rooms as a user's files, and the arguments that name them."""
+    image = image_from_shards(toy_shards, "toy/test_00", 0)
+    names = label_set(image.label_set)
+    Image.fromarray(image.instance_ids.astype(np.uint8)).save(tmp_path / "mine.png")
+    rows = "".join(f"{k + 1},{names[c]}\n" for k, c in enumerate(image.object_class))
+    (tmp_path / "classes.csv").write_text("id,class\n" + rows)
+    (tmp_path / "pose.json").write_text(
+        json.dumps({"world_to_camera": image.world_to_camera.tolist()})
+    )
+    values = ",".join(str(image.intrinsics[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return ["--mask", "mine.png", "--classes", "classes.csv", "--intrinsics", values]
+
+
+def files_of(name: str) -> set[str]:
+    return {f"{name}.json", f"{name}.glb", f"{name}.png", f"{name}_seen.png"}
+
+
+def test_reconstruct_a_view_and_a_split(command, toy_run, toy_shards, tmp_path):
+    call = ["reconstruct", "--run", toy_run, "--shards", toy_shards, *SOFT]
+    one = [*call, *PAPER, "--room", "toy/test_01", "--view", 3, "--out", "one"]
+    status, out, errors = command(*one)
+    assert (status, out) == (0, "Wrote 1 room to one\n"), errors
+    name = "toy_test_01_view3"
+    assert {path.name for path in (tmp_path / "one").iterdir()} == files_of(name)
+    scene = json.loads((tmp_path / "one" / f"{name}.json").read_text())
+    seen = image_from_shards(toy_shards, "toy/test_01", 3)
+    assert len(scene["objects"]) == len(seen.rows)
+    extra = scene["extra"]
+    assert (extra["room_id"], extra["view"], extra["image_size"]) == ("toy/test_01", 3, [72, 96])
+    assert 0 <= extra["mask_iou"] <= 1 and 0 < extra["steps"] <= 6
+    picture = Image.open(tmp_path / "one" / f"{name}_seen.png")
+    assert picture.height > 360 and picture.width > 2 * 480 + 360  # two views and a plan
+    before = everything_in(tmp_path)
+    assert "one is not empty; add --overwrite" in one_sentence(command(*one))
+    assert everything_in(tmp_path) == before
+    assert command(*one, "--overwrite")[0] == 0
+    status, out, errors = command(*call, "--split", "test", "--limit", 2, "--out", "two")
+    assert (status, out) == (0, "Wrote 2 rooms to two\n"), errors
+    assert len(list((tmp_path / "two").glob("*_seen.png"))) == 2
+
+
+def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):
+    call = ["reconstruct", "--run", toy_run, *own, *SOFT]
+    status, out, errors = command(*call, "--pose", "pose.json", "--out", "posed")
+    assert (status, out) == (0, "Wrote 1 room to posed\n"), errors
+    assert "without --pose" not in errors and "sofa" not in errors
+    made = {"mine_turning.gif", "rooms.html"}
+    assert {path.name for path in (tmp_path / "posed").iterdir()} == files_of("mine") | made
+    gif = Image.open(tmp_path / "posed" / "mine_turning.gif")
+    assert (gif.n_frames, gif.size, gif.info["duration"]) == (36, (320, 240), 100)
+    page = (tmp_path / "posed" / "rooms.html").read_text()
+    assert page.count("<model-viewer ") == 1 and "what was found from the same camera" in page
+    status, _, errors = command(*call, *PAPER, "--out", "level", "--camera-height", 1.4)
+    assert status == 0 and "Note: without --pose the camera is level, 1.4 m above" in errors
+    extra = json.loads((tmp_path / "level" / "mine.json").read_text())["extra"]
+    rows = (tmp_path / "classes.csv").read_text().splitlines()
+    (tmp_path / "classes.csv").write_text("\n".join([*rows[:1], "1,sofa", *rows[2:]]))
+    _, _, errors = command(*call, "--out", "sofa", "--pose", "pose.json")
+    assert "Note: the run never generates the class sofa; a " in errors
+    status, _, errors = command(*call, "--out", "heights")
+    assert status == 0 and "is level, 1 or 1.2 or 1.4 or 1.6 or 1.8 m above the floor" in errors
+    assert re.search(r"Note: a camera 1(\.[2468])? m above the floor fits best\.", errors)
+    pose = np.array(extra["world_to_camera"])
+    assert (-pose[:3, :3].T @ pose[:3, 3])[1] == pytest.approx(1.4)
+
+
+def test_one_object_at_the_border_is_answered(command, toy_run, own, tmp_path):
+    """A defined answer: one object, of the mask's class, however much of it the border hides."""
+    ids = np.zeros((72, 96), np.uint8)
+    ids[30:50, 80:] = 1
+    Image.fromarray(ids).save(tmp_path / "mine.png")
+    call = ["reconstruct", "--run", toy_run, *own, "--pose", "pose.json", "--out", "one", *SOFT]
+    status, out, errors = command(*call)
+    assert (status, out) == (0, "Wrote 1 room to one\n"), errors
+    label = (tmp_path / "classes.csv").read_text().splitlines()[1].split(",")[1]
+    (item,) = json.loads((tmp_path / "one" / "mine.json").read_text())["objects"]
+    assert item["class"] == label
+    upside_down = json.loads((tmp_path / "pose.json").read_text())["world_to_camera"]
+    flipped = (np.diag([1, -1, -1, 1]) @ np.array(upside_down)).tolist()
+    (tmp_path / "pose.json").write_text(json.dumps({"world_to_camera": flipped}))
+    said = one_sentence(command(*call, "--overwrite"))
+    assert "The camera of pose.json is upside down" in said
+
+
+def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_path):
+    call = ["reconstruct", "--run", toy_run, "--out", "none"]
+    shards = ["--shards", toy_shards]
+    way = "Say what to reconstruct from, in one way"
+    before = everything_in(tmp_path)
+    for arguments, said in (
+        ([], way),
+        (shards, way),
+        ([*shards, "--room", "toy/test_00", "--split", "test"], way),
+        ([*shards, *own], way),
+        (own[:2], "--mask needs --intrinsics beside it, and a PNG --classes, too."),
+        ([*own[:2], *own[4:]], "mine.png needs --classes: a table of the class"),
+        ([*shards, "--room", "attic"], "holds no room 'attic'"),
+        ([*shards, "--room", "toy/test_00", "--view", 8], "has no view 8; its 8 views are 0 to 7."),
+        ([*shards, "--split", "test", "--fit", "slow"], "No fit is called 'slow'"),
+        ([*shards, "--split", "val"], "val"),
+    ):
+        assert said in one_sentence(command(*call, *arguments)), arguments
+    assert everything_in(tmp_path) == before
+    (tmp_path / "camera.json").write_text(
+        '{"fx": 48, "fy": 48, "cx": 48, "cy": 36, "width": 97, "height": 72}'
+    )
+    said = one_sentence(command(*call, *own[:-1], "camera.json"))
+    assert "is of an image of 97 x 72 pixels, but the mask has 96 x 72" in said
+    (tmp_path / "classes.csv").write_text("1,grand piano\n")
+    assert "none of its classes (grand piano)" in one_sentence(command(*call, *own))
+    assert not (tmp_path / "none").exists()
+
+
+def test_eval_svr_of_a_run_and_of_its_scenes(command, toy_run, toy_shards, tmp_path):
+    call = ["eval-svr", "--shards", toy_shards, *SOFT]
+    two = ["--limit", 2]
+    status, out, errors = command(*call, "--run", toy_run, *two, *PAPER, "--out", "run.json")
+    assert status == 0, errors
+    assert "single views" in out and out.endswith("Wrote run.json\n") and "nan" not in out.lower()
+    scores = json.loads((tmp_path / "run.json").read_text())
+    assert set(scores["rows"]) == {"fit", "fit_boxes", "layout_fit", "nearest_room", "random_room"}
+    made = ["reconstruct", "--run", toy_run, "--shards", toy_shards, "--split", "test", *two]
+    made += [*PAPER, *SOFT]
+    assert command(*made, "--out", "scenes")[0] == 0
+    status, out, errors = command(*call, "--scenes", "scenes")
+    assert status == 0 and out.endswith("Wrote scenes/svr.json\n"), errors
+    again = json.loads((tmp_path / "scenes" / "svr.json").read_text())
+    # Files hold boxes to 0.01 mm, and meshes in single precision.
+    for mine, theirs in (("scenes", "fit"), ("scenes_boxes", "fit_boxes")):
+        one, two_ = again["rows"][mine]["summary"], scores["rows"][theirs]["summary"]
+        assert one == pytest.approx(two_, abs=1e-3)
+    for row in ("nearest_room", "random_room"):
+        assert again["rows"][row] == scores["rows"][row]
+
+
+def test_known_rooms_ignore_a_runs_weights(command, toy_run, toy_shards, tmp_path):
+    """They are the same rooms beside every method: a run's own matching has no say."""
+    other = shutil.copytree(toy_run, tmp_path / "other")
+    config = (other / "config.yaml").read_text()
+    for key in ("match_box", "occlusion_slack"):
+        config = re.sub(rf"{key}: [0-9.]+", f"{key}: 0.0", config)
+    (other / "config.yaml").write_text(config)
+    assert config.count(": 0.0\n") >= 2 and config != (toy_run / "config.yaml").read_text()
+    known = []
+    for run in (toy_run, other):
+        call = ["eval-svr", "--shards", toy_shards, "--run", run, "--limit", 2, *SOFT]
+        assert command(*call, "--out", "svr.json")[0] == 0
+        rows = json.loads((tmp_path / "svr.json").read_text())["rows"]
+        known.append((rows["nearest_room"], rows["random_room"]))
+    assert known[0] == known[1]
+
+
+def test_scenes_that_answer_no_image(command, toy_run, toy_shards, tmp_path):
+    made = ["reconstruct", "--run", toy_run, "--shards", toy_shards, "--room", "toy/test_00", *SOFT]
+    assert command(*made, "--out", "scenes")[0] == 0
+    (path,) = (tmp_path / "scenes").glob("*.json")
+    path.with_suffix(".glb").unlink()
+    whole = json.loads(path.read_text())
+    call = ["eval-svr", "--shards", toy_shards, "--scenes", "scenes", *SOFT]
+
+    def said(**changes) -> str:
+        path.write_text(json.dumps({**whole, **changes}))
+        return one_sentence(command(*call))
+
+    assert "has 0 objects, but view 0 of room toy/test_00 shows" in said(objects=[])
+    assert "does not say which image it answers" in said(extra={})
+    attic = {**whole["extra"], "room_id": "attic"}
+    assert "The 'test' split of" in said(extra=attic) and "has no room attic" in said(extra=attic)
+    assert "has no view 9" in said(extra={**whole["extra"], "view": 9})
+    assert "Say what to evaluate" in one_sentence(command(*call, "--run", toy_run))
+    assert "Say what to evaluate" in one_sentence(command("eval-svr", "--shards", toy_shards))
+    shutil.rmtree(tmp_path / "scenes")
+    assert "No folder of scenes at scenes" in one_sentence(command(*call))

@@ -1,0 +1,119 @@
+"""Which steps of the demo are done again, with commands that only leave their results."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sceneprior.apps.experiments.demo import demo_steps, run_demo
+from sceneprior.apps.experiments.steps import StepRunner
+from sceneprior.core.errors import InputError
+from sceneprior.core.settings import find_config
+
+SETTINGS = ("demo.yaml", 20, 4, "auto")
+COMMANDS = ["make-homes", "prep-front", "fit", "synthesize", "eval-fid", "report"]
+
+
+@pytest.fixture
+def ran(tmp_path, monkeypatch):
+    """Arguments of the commands that were called, and their exit status by command."""
+    called: list[list[str]] = []
+    status: dict[str, int] = {}
+    results = {step.arguments[0]: step.result for step in demo_steps(tmp_path, *SETTINGS)}
+
+    def call(runner, arguments, log):
+        assert log is None  # progress goes to the terminal
+        called.append(arguments)
+        if not status.get(arguments[0]):
+            path = results[arguments[0]]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps({"protocol": {}}))
+        return status.get(arguments[0], 0), {"cpu_s": 3.0, "wall_s": 2.0, "peak_memory_gib": 0.5}
+
+    monkeypatch.setattr(StepRunner, "call", call)
+    return called, status
+
+
+def run(out: Path, called: list[list[str]], **changes) -> list[str]:
+    called.clear()
+    run_demo(out, *(SETTINGS if not changes else changes["settings"]))
+    return [arguments[0] for arguments in called]
+
+
+def test_finished_steps_are_not_repeated(ran, tmp_path, capsys):
+    assert run(tmp_path, ran[0]) == COMMANDS
+    said = capsys.readouterr().err
+    assert said.splitlines()[0] == f"$ sceneprior make-homes {tmp_path}/homes --rooms 20 --seed 0"
+    assert "--command" not in said
+    assert run(tmp_path, ran[0]) == []
+    assert "fit: done before, 2 s\n" in capsys.readouterr().err
+
+
+def test_the_page_lists_the_commands_and_the_scores_their_costs(ran, tmp_path):
+    called, _ = ran
+    run(tmp_path, called)
+    page = called[-1]
+    told = [page[at + 1] for at, word in enumerate(page) if word == "--command"]
+    assert [command.split()[:2] for command in told] == [["sceneprior", c] for c in COMMANDS[:-1]]
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert (scores["seconds"], scores["peak_memory_gib"]) == (12.0, 0.5)
+    assert list(scores["steps"]) == ["homes", "shards", "fit", "scenes", "scores", "report"]
+
+
+def test_what_follows_a_step_that_is_done_again_is_done_again(ran, tmp_path):
+    called, status = ran
+    run(tmp_path, called)
+    (tmp_path / "run" / "sampler" / "final.ckpt").unlink()
+    status["synthesize"] = 2
+    with pytest.raises(InputError, match="The demo stopped at 'scenes'"):
+        run(tmp_path, called)
+    status.clear()
+    # Scores of the former prior are there, and are not taken for the new one's.
+    assert run(tmp_path, called) == ["synthesize", "eval-fid", "report"]
+    assert run(tmp_path, called) == []
+    assert run(tmp_path, called, settings=("demo.yaml", 20, 5, "auto")) == ["eval-fid", "report"]
+
+
+def test_costs_add_up_over_a_stop_and_are_unknown_after_a_kill(ran, tmp_path):
+    called, status = ran
+
+    def wall_s():
+        return json.loads((tmp_path / "steps.json").read_text())["fit"].get("wall_s")
+
+    (tmp_path / "run").mkdir()  # begun, but not by the demo: nobody knows what that took
+    status["fit"] = 2
+    with pytest.raises(InputError, match="The demo stopped at 'fit'; mend that and run it again"):
+        run(tmp_path, called)
+    assert wall_s() is None
+    (tmp_path / "run").rmdir()
+    for total in (2.0, 4.0):
+        with pytest.raises(InputError):
+            run(tmp_path, called)
+        assert wall_s() == total
+        (tmp_path / "run").mkdir(exist_ok=True)
+    status.clear()
+    run(tmp_path, called)
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert wall_s() == 6.0 and scores["seconds"] == 16.0
+
+
+def test_a_step_that_was_killed_is_done_again_and_its_costs_are_not_guessed(ran, tmp_path):
+    called, _ = ran
+    run(tmp_path, called)
+    noted = json.loads((tmp_path / "steps.json").read_text())
+    entry = noted["report"]
+    noted["report"] = {key: entry[key] for key in ("arguments", "depends_on")}  # as if killed
+    (tmp_path / "steps.json").write_text(json.dumps(noted))
+    assert run(tmp_path, called) == ["report"]
+    assert json.loads((tmp_path / "scores.json").read_text())["seconds"] == 12.0
+
+
+def test_other_settings_in_the_same_file_are_trained_anew(ran, tmp_path):
+    called, _ = ran
+    config = tmp_path / "mine.yaml"
+    config.write_text(find_config("demo.yaml").read_text())
+    settings = (str(config), *SETTINGS[1:])
+    run(tmp_path, called, settings=settings)
+    assert run(tmp_path, called, settings=settings) == []
+    config.write_text(config.read_text().replace("seed: 0", "seed: 1"))
+    assert run(tmp_path, called, settings=settings) == COMMANDS[2:]

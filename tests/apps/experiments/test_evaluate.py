@@ -1,0 +1,345 @@
+"""eval-fid from the command line: a run, the user's scenes, kept references, refusals."""
+
+import json
+import re
+import shutil
+import sys
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from sceneprior.apps import cli
+from sceneprior.apps.config import load_run
+from sceneprior.apps.experiments.evaluate_views import mask_iou_of_rooms, mask_scores
+from sceneprior.apps.rooms import write_scenes
+from sceneprior.apps.sample import sample_rooms
+from sceneprior.core.classes import label_set
+from sceneprior.core.data.dataset import ViewDataset, allowed_views
+from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.meshes import place
+from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.shards import iterate_rooms
+from sceneprior.core.views import DecodedScenes
+from sceneprior.evaluation.metrics.contents import class_frequencies, frequency_kl
+from sceneprior.paper.sampling import COPIES
+from sceneprior.render.offscreen import SoftwareRenderer
+from sceneprior.render.topdown import box_mesh
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Run `sceneprior <arguments>` in this process: (exit status, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["sceneprior", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        output = capsys.readouterr()
+        return int(end.value.code or 0), output.out, output.err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def scenes(toy_shards, tmp_path_factory):
+    """Four training rooms as boxes, as another method might write them."""
+    folder = tmp_path_factory.mktemp("theirs") / "scenes"
+    rooms = reference_scenes(toy_shards, "train", limit=4)
+    plain = [replace(room.without_meshes(), name=f"room_{k}") for k, room in enumerate(rooms)]
+    write_scenes(plain, folder, SoftwareRenderer())
+    return folder
+
+
+def test_the_users_scenes_are_evaluated_and_again_with_the_reference(
+    command, scenes, toy_shards, tmp_path
+):
+    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
+    status, out, errors = command(*call, "--resamples", 20, "--reference", "reference.npz")
+    assert status == 0, errors
+    assert f"Wrote {scenes / 'scores.json'}" in out.replace("\n", "") and "4 rooms" in out
+    first = json.loads((scenes / "scores.json").read_text())
+    assert first["protocol"]["scenes"] == "scenes" and first["protocol"]["resamples"] == 20
+    assert first["near_copy_share"] == 1 and first["out_of_bounds_share"] == 0
+    # scores.json lies among the scenes now, and is none.
+    status, _, errors = command(
+        *call, "--resamples", 20, "--reference", "reference.npz", "--out", "b.json"
+    )
+    assert status == 0, errors
+    assert json.loads((tmp_path / "b.json").read_text()) == first
+    status, _, errors = command(*call, "-n", 2, "--seed", 3, "--resamples", 0, "--out", "c.json")
+    assert status == 0, errors
+    protocol = json.loads((tmp_path / "c.json").read_text())["protocol"]
+    assert (protocol["n_generated"], protocol["n_scenes_available"]) == (2, 4)
+
+
+def test_fewer_scenes_than_asked_for_are_a_sentence(command, scenes, toy_shards, tmp_path):
+    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
+    status, _, errors = command(*call, "-n", 500, "--out", "s.json")
+    assert status == 2 and not (tmp_path / "s.json").exists()
+    assert errors == (
+        f"Error: 500 scenes are to be evaluated, but {scenes} holds 4; leave out -n to take all of "
+        "them, or make more.\n"
+    )
+
+
+def test_scenes_have_a_page_with_their_scores(command, scenes, toy_shards, tmp_path):
+    given = ["--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
+    scored = tmp_path / "s.json"
+    assert command("eval-fid", *given, "--resamples", 0, "--out", scored)[0] == 0
+    call = ["report", *given, "--out", "page.html"]
+    status, out, errors = command(*call, "--scores", scored)
+    assert (status, out) == (0, "Wrote page.html\n"), errors
+    page = (tmp_path / "page.html").read_text()
+    assert re.findall("<h2>(.*)</h2>", page) == ["New rooms beside real ones", "Scores"]
+    assert "scenes scenes" in page and "scenes as given, which were made elsewhere" in page
+    assert "room_0" not in errors and page.count("<h3>Generated</h3>") == 1
+    status, _, errors = command(*call, "--scores", "missing.json")
+    assert status == 2 and errors.startswith("Error: missing.json holds no scores (")
+    assert (
+        f"write them with `sceneprior eval-fid --scenes {scenes} --shards {toy_shards}`" in errors
+    )
+    status, _, errors = command(*call, "--scores", scenes / "room_0.json")
+    assert status == 2 and "room_0.json holds no scores (another file)" in errors
+    for more in (["--run", "a"], ["--seed", 3]):
+        assert command(*call, *more)[0] == 2
+    status, _, errors = command(*call, "--seed", 3)
+    assert errors == ("Error: --seed belongs to --run; scenes are shown as they are.\n")
+    for words in ([], ["--scenes", scenes], ["--run", "a", "--shards", toy_shards]):
+        status, _, errors = command("report", *words)
+        assert status == 2 and errors == (
+            "Error: Say what to report on: either --run RUN, or --scenes DIR --shards SHARDS.\n"
+        )
+
+
+def test_other_json_among_scenes_is_said(command, scenes, toy_shards, tmp_path):
+    folder = shutil.copytree(scenes, tmp_path / "mixed")
+    (folder / "cameras.json").write_text("[1, 2]")
+    (folder / "room_9.json").write_text('{"objects": []}')
+    call = ["eval-fid", "--scenes", folder, "--shards", toy_shards, "--renderer", "software"]
+    status, _, errors = command(*call, "--resamples", 0)
+    assert status == 0
+    (said,) = (line for line in errors.splitlines() if "Warning: " in line)
+    assert said.endswith(
+        f"4 scenes are read from {folder}; 2 other JSON files there are no scenes ('format' is not "
+        "sceneprior-scene) and are passed over: cameras.json, room_9.json."
+    )
+
+
+def test_copies_are_warned_of_once_a_command(command, toy_run):
+    draw = ["--run", toy_run, "-n", 3, "--renderer", "software"]
+    for words in (
+        ["synthesize", *draw, "--out", "copies"],
+        ["eval-fid", *draw, "--resamples", 0, "--out", "s.json"],
+    ):
+        status, _, errors = command(*words, "--distribution", "kernel")
+        assert status == 0 and errors.count(f"Warning: {COPIES}\n") == 1, errors
+        assert "sample.py" not in errors
+    status, _, errors = command("synthesize", *draw, "--out", "new")
+    assert status == 0 and "Warning" not in errors
+
+
+def test_a_run_whose_rooms_are_copies_is_warned_of_wherever_it_draws(command, toy_run, tmp_path):
+    shutil.copytree(toy_run, tmp_path / "run")
+    config = tmp_path / "run" / "config.yaml"
+    config.write_text(config.read_text().replace("distribution: paper", "distribution: kernel"))
+    soft = ["--run", "run", "--renderer", "software"]
+    way = ["interpolate", *soft, "--from", "seed:1", "--to", "seed:2", "--steps", 2, "--out", "way"]
+    status, _, errors = command(*way)
+    assert status == 0 and errors.count(f"Warning: {COPIES}\n") == 1, errors
+    rooms = load_run(toy_run).room_ids
+    between = ["interpolate", *soft, "--from", rooms[0], "--to", rooms[1], "--steps", 2]
+    assert "Warning" not in command(*between, "--out", "known")[2]  # nothing is drawn
+    evaluated = ["eval-fid", *soft, "-n", 3, "--resamples", 0]
+    status, _, errors = command(*evaluated)
+    assert status == 0 and errors.count(COPIES) == 1
+    status, _, errors = command("report", *soft)
+    assert status == 0 and errors.count(COPIES) == 1
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "learns from masks in 2D; rooms drawn by: kernel, copies: near training rooms" in page
+
+
+def test_a_run_is_evaluated_with_its_own_shards(command, toy_run, tmp_path):
+    call = ["eval-fid", "--run", toy_run, "-n", 5, "--renderer", "software", "--out", "s.json"]
+    status, out, errors = command(*call, "--resamples", 5)
+    assert status == 0, errors
+    assert "5 rooms" in out and "nan" not in out.lower()
+    scores = json.loads((tmp_path / "s.json").read_text())
+    assert scores["protocol"]["latents"] == "paper" and scores["rooms"] == 12
+    assert "latents paper," in " ".join(out.split())
+    assert scores["near_copy_share"] * 5 == round(scores["near_copy_share"] * 5)
+    assert np.isfinite([value for value in scores.values() if isinstance(value, float)]).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ([], "There is nothing to evaluate; give --run RUN, or --scenes DIR with --shards SHARDS."),
+        (["--run", "a", "--scenes", "b"], "Both --run and --scenes came; give --run"),
+        (["--scenes", "b"], "--scenes needs --shards: the folder with the test rooms."),
+        (
+            ["--scenes", "b", "--shards", "c", "--distribution", "paper"],
+            "--distribution belongs to --run; scenes are evaluated as they are.",
+        ),
+        (["--scenes", "b", "--shards", "c"], "No folder of scenes at b;"),
+        (["--run", "a"], "No prior at a;"),
+        (
+            ["--run", "a", "--split", "train"],
+            "Generated rooms are compared with the split test, or",
+        ),
+    ],
+)
+def test_what_cannot_be_evaluated_is_one_sentence(command, tmp_path, arguments, sentence):
+    status, _, errors = command("eval-fid", *arguments, "--renderer", "software")
+    assert status == 2 and errors.startswith(f"Error: {sentence}"), errors
+    assert len(errors.strip().splitlines()) == 1 and list(tmp_path.iterdir()) == []
+
+
+def test_files_of_weights_and_references_are_checked_before_drawing(
+    command, scenes, toy_shards, tmp_path
+):
+    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
+    for option in ("--inception", "--alexnet"):
+        status, _, errors = command(*call, option, "absent.pt")
+        assert status == 2 and "at absent.pt" in errors and errors.count("\n") == 1
+    (tmp_path / "kept.npz").write_text("no")
+    status, _, errors = command(*call, "--reference", "kept.npz")
+    assert status == 2 and "kept.npz is no reference" in errors
+
+
+def test_boxes_are_converted_and_then_evaluated(command, toy_shards, tmp_path):
+    rng = np.random.default_rng(0)
+    for row in range(3):
+        np.savez(
+            tmp_path / f"{row}.npz",
+            class_labels=np.eye(23)[[8, 12]], translations=rng.uniform(0.5, 1, (2, 3)),
+            sizes=np.full((2, 3), 0.4), angles=rng.uniform(-3, 3, (2, 1)),
+        )  # fmt: skip
+    (tmp_path / "theirs").mkdir()
+    for path in tmp_path.glob("*.npz"):
+        path.rename(tmp_path / "theirs" / path.name)
+    call = ["export", "theirs", "--to", "scenes", "--out", "ours", "--label-set", "front3d_bedroom"]
+    assert command(*call)[:2] == (0, "Wrote 3 rooms to ours\n")
+    status, _, errors = command(*call)
+    assert status == 2 and "ours is not empty; add --overwrite" in errors
+    status, _, errors = command(
+        "eval-fid", "--scenes", "ours", "--shards", toy_shards, "--resamples", 0,
+        "--renderer", "software",
+    )  # fmt: skip
+    assert status == 0, errors
+    scores = json.loads((tmp_path / "ours" / "scores.json").read_text())
+    assert scores["mean_objects"] == 2 and scores["out_of_bounds_share"] is None
+
+
+def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
+    command, toy_shards, toy_run, tmp_path
+):
+    shutil.copytree(toy_shards, tmp_path / "bare")
+    for path in (tmp_path / "bare").glob("*/*.h5"):
+        with h5py.File(path, "a") as file:
+            for group in file["rooms"].values():
+                del group["ground_truth"]
+    shutil.copytree(toy_run, tmp_path / "run")
+    config = tmp_path / "run" / "config.yaml"
+    config.write_text(config.read_text().replace(str(toy_shards), str(tmp_path / "bare")))
+    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    assert status == 0, errors
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "<h2>New rooms</h2>" in page and "No test room of these shards is known in 3D" in page
+    assert "<h2>What training saw</h2>" in page and "Real, test split" not in page
+    assert "<h2>Scores</h2>" not in page and "read back in 3D" not in page
+    # Scores that are named have to be there.
+    status, _, errors = command("report", "--run", "run", "--scores", "missing.json")
+    assert status == 2 and errors.startswith("Error: missing.json holds no scores")
+    status, printed, errors = command("eval-fid", "--run", "run", "-n", 3, "--seed", 1)
+    assert status == 0, errors
+    assert "Not measured without rooms in 3D" in printed and "Category KL" in printed
+    scores = json.loads((tmp_path / "run" / "scores.json").read_text())
+    tracked = [s.read_room(r).object_class for s, r in iterate_rooms(toy_shards, "test")]
+    assert scores["mean_objects_test"] == np.mean([len(labels) for labels in tracked])
+    seen = np.bincount(np.concatenate(tracked), minlength=22) / sum(map(len, tracked))
+    made = sample_rooms(load_run(tmp_path / "run"), 3, 1)
+    assert scores["category_kl"] == pytest.approx(frequency_kl(seen, class_frequencies(made)))
+    assert scores["mean_objects"] == np.mean([len(scene.objects) for scene in made])
+    assert scores["type_share_test"] == 1 and scores["train_rooms"]["category_kl"] >= 0
+    low, high = scores["intervals"]["generated"]["mean_objects"]
+    assert low <= scores["mean_objects"] <= high
+    assert 0 < scores["mask_iou_training_views"] < 1
+    assert scores["protocol"]["n_test"] == 4 and "known from views alone" in scores["note"]
+    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "<h2>Scores</h2>" in page and "mean mask IoU in training views" in page
+    (tmp_path / "run" / "scores.json").unlink()
+    # Scenes of any method have scores from views, too.
+    write_scenes(made, tmp_path / "made", SoftwareRenderer())
+    call = ["eval-fid", "--scenes", "made", "--shards", "bare", "--resamples", 0]
+    assert command(*call)[0] == 0
+    again = json.loads((tmp_path / "made" / "scores.json").read_text())
+    assert again["category_kl"] == pytest.approx(scores["category_kl"])
+    assert again["intervals"]["generated"]["mean_objects"] is None
+    # Without a test split, too; the training rooms are compared with what they were.
+    shutil.rmtree(tmp_path / "bare")
+    shutil.copytree(toy_shards, tmp_path / "bare", ignore=shutil.ignore_patterns("test"))
+    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    assert status == 0, errors
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "<h2>New rooms</h2>" in page and "read back in 3D" in page
+    # Runs whose rooms are known still have to be evaluated first.
+    config.write_text(config.read_text().replace(str(tmp_path / "bare"), str(toy_shards)))
+    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    assert status == 2 and "scores.json holds no scores" in errors
+
+
+def test_views_that_training_never_saw_are_held_out(toy_shards, toy_run):
+    trained = load_run(toy_run)
+    assert set(mask_scores(trained, toy_shards)) == {"mask_iou_training_views"}
+    data = trained.config.data.model_copy(update={"view_fraction": 0.5})
+    half = replace(trained, config=trained.config.model_copy(update={"data": data}))
+    (found,) = mask_scores(half, toy_shards).items()
+    assert found[0] == "mask_iou_held_out" and 0 < found[1] < 1
+    seen, others = (allowed_views(0, 3, 8, 0.5, held_out=held) for held in (False, True))
+    assert sorted([*seen, *others]) == list(range(8)) and len(others) == 4
+    with pytest.raises(InputError, match="does not hold the training rooms of this run"):
+        mask_scores(replace(trained, room_ids=("elsewhere",)), toy_shards)
+
+
+def test_rooms_decoded_as_they_are_have_the_masks_that_were_seen(toy_run, toy_shards, monkeypatch):
+    """Toy rooms are boxes; with boxes for a template only pixels on edges may differ."""
+    cube = box_mesh((0.0, 0.0, 0.0), (2.0, 2.0, 2.0))
+    trained = load_run(toy_run)  # its own, since it is changed
+    shape = trained.prior.shape
+    shape.template = torch.from_numpy(cube.vertices_m).float()
+    shape.faces = torch.from_numpy(cube.faces)
+    rooms = ViewDataset(toy_shards, "train", views_per_room=4, rotations=1, mask_step=1)
+    views = rooms.__getitems__([(row, 0) for row in range(8)])
+    truth = {scene.name: scene for scene in reference_scenes(toy_shards, "train", None, True)}
+    rooms, slots = len(views.room_ids), 6
+    logits = torch.zeros(rooms, slots, len(label_set("front3d_bedroom")))
+    centers, sizes = torch.zeros(rooms, slots, 3), torch.full((rooms, slots, 3), 0.1)
+    for row, name in enumerate(views.room_ids):
+        scene = truth[name]
+        count = len(scene.objects)
+        # In another order than the tracks': matching has to find it out.
+        centers[row, :count] = torch.from_numpy(scene.centers_m).float().flip(0)
+        sizes[row, :count] = torch.from_numpy(scene.sizes_m).float().flip(0)
+        logits[row, range(count), scene.class_indices[::-1].copy()] = 5
+
+    def iou(stage, centers):
+        def decode(logits_, with_shape):
+            template = shape.template.expand(rooms, slots, -1, -1)
+            vertices = place(template, centers, sizes) if with_shape else None
+            return DecodedScenes(logits, centers, sizes, torch.ones(rooms, slots), None, vertices)
+
+        monkeypatch.setattr(trained.prior, "forward", decode)
+        return mask_iou_of_rooms(replace(trained, stage=stage), views)
+
+    for stage in ("layout", "shape"):
+        assert iou(stage, centers) > 0.95
+        assert iou(stage, centers + 0.5) < 0.5
+    # Void hides every other column; what decoded objects would show there is not compared.
+    views.instance_ids[..., ::2] = slots + 1
+    assert iou("shape", centers) > 0.95

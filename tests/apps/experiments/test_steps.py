@@ -1,0 +1,125 @@
+"""The runner of steps, with real processes that do next to nothing."""
+
+import json
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+
+import pytest
+
+from sceneprior.apps.experiments.steps import Step, failure_reason, is_done, open_runner
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import only_writer
+
+
+@pytest.fixture
+def version(tmp_path) -> Step:
+    """A command that ends at once; its log is what it leaves."""
+    return Step("say", ["--version"], tmp_path / "say.log", depends_on=["a"])
+
+
+def test_a_step_is_printed_logged_noted_and_done(version, tmp_path, capsys):
+    with open_runner(tmp_path) as runner:
+        runner.do(version, tmp_path, version.result)
+    assert capsys.readouterr().err == "$ sceneprior --version\n"
+    assert version.result.read_text().startswith("sceneprior 0.")
+    noted = json.loads((tmp_path / "steps.json").read_text())["say"]
+    assert noted["arguments"] == ["--version"] and noted["finished"]
+    assert noted["cpu_s"] > 0 and noted["wall_s"] > 0 and 0 <= noted["peak_memory_gib"] < 10
+    assert is_done(version, tmp_path)
+    other = Step("say", ["--version"], version.result, depends_on=["b"])
+    assert not is_done(other, tmp_path)
+    version.result.unlink()
+    assert not is_done(version, tmp_path)
+
+
+def test_a_failed_step_is_its_own_sentence_and_forgets_what_came_after(version, tmp_path):
+    (tmp_path / "steps.json").write_text('{"first": {}, "fail": {}, "say": {"finished": true}}')
+    step = Step("fail", ["inspect", "nowhere"], tmp_path / "no", depends_on=[])
+    with open_runner(tmp_path) as runner, pytest.raises(InputError, match="nowhere"):
+        runner.do(step, tmp_path, tmp_path / "fail.log")
+    noted = json.loads((tmp_path / "steps.json").read_text())
+    assert list(noted) == ["first", "fail"] and not noted["fail"]["finished"]
+
+
+def test_nothing_begins_once_the_runner_is_stopped(version, tmp_path):
+    with open_runner(tmp_path) as runner:
+        with pytest.raises(KeyboardInterrupt):
+            runner.stop()
+        with pytest.raises(KeyboardInterrupt):
+            runner.do(version, tmp_path, version.result)
+    assert not (tmp_path / "steps.json").exists()
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_signals_are_answered_only_while_a_runner_is_open(tmp_path, name):
+    number = signal.Signals[name]
+    before = signal.signal(number, signal.SIG_DFL)
+    with pytest.raises(KeyboardInterrupt), open_runner(tmp_path) as runner:
+        with pytest.raises(InputError, match="Another run is writing to"), only_writer(tmp_path):
+            pass
+        signal.raise_signal(number)
+    assert runner.stopped and signal.signal(number, before) == signal.SIG_DFL
+
+
+@pytest.mark.parametrize(
+    ("name", "background"), [("SIGINT", False), ("SIGTERM", False), ("SIGTERM", True)]
+)
+def test_a_signal_stops_the_command_that_runs_and_what_it_took_is_noted(
+    tmp_path, monkeypatch, name, background
+):
+    """A stand-in for the interpreter: it waits, and ends as SIGINT wants it."""
+    script = tmp_path / "python"
+    script.write_text(f"#!{sys.executable}\nprint('on', flush=True)\nimport time; time.sleep(60)\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(script))
+    log = tmp_path / "log"
+    step = Step("wait", [], tmp_path / "no", depends_on=[])
+
+    def send() -> None:
+        while not (log.exists() and log.read_text()):
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.Signals[name])
+
+    # A shell starts what runs in the background so, and children inherit it.
+    ignored = signal.SIG_IGN if background else signal.default_int_handler
+    before = signal.signal(signal.SIGINT, ignored)
+    sender = threading.Thread(target=send)
+    try:
+        with pytest.raises(KeyboardInterrupt), open_runner(tmp_path) as runner:
+            sender.start()
+            runner.do(step, tmp_path, log)
+    finally:
+        sender.join()
+        signal.signal(signal.SIGINT, before)
+    noted = json.loads((tmp_path / "steps.json").read_text())["wait"]
+    assert not noted["finished"] and 0 < noted["wall_s"] < 30
+    assert "KeyboardInterrupt" in log.read_text()
+
+
+def test_memory_is_that_of_the_largest_process(tmp_path, monkeypatch):
+    """A stand-in for the interpreter: a shell whose child holds 100 MB."""
+    shell = tmp_path / "python"
+    shell.write_text(f'#!/bin/sh\n{sys.executable} -c "bytearray(100 << 20)"\ntrue\n')
+    shell.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(shell))
+    with open_runner(tmp_path) as runner:
+        status, costs = runner.call([], None)
+    # Linux counts what a process held before `exec`, which is what this one holds.
+    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    assert status == 0 and 0.1 < costs["peak_memory_gib"] < max(1, 1.1 * own)
+
+
+def test_a_command_that_failed_is_told_by_its_own_sentence(tmp_path):
+    log = tmp_path / "fit.log"
+    log.write_text("10%\nError: ValueError: odd.\nThis should not happen. Run again.\n")
+    assert failure_reason(log, 1) == "ValueError: odd."
+    log.write_text("\n 73%\n")
+    assert failure_reason(log, 1) == "73%"
+    assert failure_reason(log, -9) == "killed by SIGKILL; the same command goes on"
+    log.write_text("")
+    assert failure_reason(log, 1) == f"it said nothing in {log}"
+    assert failure_reason(None, 3) == "exit status 3"

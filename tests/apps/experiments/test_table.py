@@ -1,0 +1,148 @@
+"""Scores of made-up runs: what stands in which cell of the tables."""
+
+import csv
+import io
+from dataclasses import replace
+
+import pytest
+
+from sceneprior.apps.experiments.makers import LIFTED, PAPER
+from sceneprior.apps.experiments.table import NEW_ROOMS, Row, as_csv, markdown, write_tables
+
+PROTOCOL = {"n_generated": 200, "n_test": 38, "n_train_rooms": 149, "shards": "front"}
+
+
+def row(
+    title, seed, fd, group="from masks in 2D", rooms="Bedrooms", latents="paper",
+    made_by=PAPER.said, rank=0, **more
+) -> Row:  # fmt: skip
+    scores = {
+        "protocol": PROTOCOL,
+        "fd_effnet_lite0": fd,
+        "category_kl": 0.1,
+        "independent": {"fd_effnet_lite0": 61.0, "category_kl": 0.13},
+        "independent_meshes": {"fd_effnet_lite0": 49.0},
+        "train_rooms": {"fd_effnet_lite0": 39.0, "category_kl": 0.12},
+        "shuffled": {"layout_classifier_accuracy": 0.81},
+        **more,
+    }
+    costs = {"cpu_s": 300.0 + 60 * seed, "steps": 4500, "parameters": 1_250_000}
+    return Row(rooms, group, title, latents, seed, scores, costs, made_by, rank)
+
+
+@pytest.fixture
+def rows() -> list[Row]:
+    return [
+        row("Ours", 0, 47.0, box_iou_3d=0.66),
+        row("GAN_x", 0, 58.25),
+        row("ATISS", 0, 44.0, "from boxes in 3D"),
+        row("Ours", 1, 49.0, box_iou_3d=0.68),
+    ]
+
+
+def cells(table: str, name: str) -> dict[str, str]:
+    lines = [line for line in table.splitlines() if line.startswith("|")]
+    head, line = (
+        [cell.strip() for cell in found.strip("|").split("|")]
+        for found in (lines[0], next(x for x in lines if x.startswith(f"| {name} ")))
+    )
+    return dict(zip(head, line, strict=True))
+
+
+def test_a_cell_is_the_mean_of_seeds_and_half_their_range(rows):
+    table = markdown(rows, NEW_ROOMS)
+    ours = cells(table, "Ours")
+    assert ours["FD ↓"] == "48.0 ± 1.0" and ours["train box IoU ↑"] == "0.67 ± 0.01"
+    assert (ours["steps"], ours["CPU min"], ours["parameters (M)"]) == ("4,500", "5.5", "1.25")
+    gan = cells(table, "GAN_x")
+    assert gan["FD ↓"] == "58.2" and gan["train box IoU ↑"] == "–"
+    assert cells(table, "Independent objects, as boxes")["FD ↓"] == "61.0"
+    furnished = cells(table, "Independent objects, with meshes")
+    assert (furnished["FD ↓"], furnished["category KL ↓"]) == ("49.0", "–")
+    real = cells(table, "Real training rooms")
+    assert (real["FD ↓"], real["category KL ↓"], real["steps"]) == ("39.0", "0.120", "–")
+    assert "FID ↓" not in table.splitlines()[4]  # nobody has it
+
+
+def test_methods_stand_under_their_group_in_the_order_they_came(rows):
+    order = [line.strip("| ").split(" |")[0] for line in markdown(rows, NEW_ROOMS).splitlines()[6:]]
+    assert order[:10] == [
+        "*reference*", "Independent objects, as boxes", "Independent objects, with meshes",
+        "Shuffled furniture, as boxes", "Real training rooms", "*from masks in 2D*", "Ours",
+        "GAN_x", "*from boxes in 3D*", "ATISS",
+    ]  # fmt: skip
+
+
+def test_every_distribution_of_latents_has_a_row_that_names_it(rows):
+    near = replace(rows[0], variant="kernel, copies: near training rooms", costs={})
+    near = replace(near, scores=near.scores | {"fd_effnet_lite0": 45.0})
+    table = markdown([rows[0], near, *rows[1:]], NEW_ROOMS)
+    lines = [line for line in table.splitlines() if line.startswith("| Ours ")]
+    assert [line.split(" | ")[1] for line in lines] == [
+        "paper",
+        "kernel, copies: near training rooms",
+    ]
+    # Both seeds of the first are one row; what training took stands there alone.
+    assert "48.0 ± 1.0" in lines[0] and "5.5" in lines[0]
+    assert "45.0" in lines[1] and lines[1].endswith("| – | – | – |")
+    assert cells(table, "Real training rooms")["latents"] == "–"
+    assert {len(line.split(" |")) for line in table.splitlines() if line.startswith("|")} == {
+        len(lines[0].split(" |"))
+    }
+    found = list(csv.DictReader(io.StringIO(as_csv([rows[0], near], NEW_ROOMS))))
+    assert [line["latents"] for line in found] == ["paper", "kernel, copies: near training rooms"]
+
+
+def test_each_kind_of_rooms_has_a_table_that_says_what_it_is_of(rows):
+    both = markdown([*rows, row("Ours", 0, 40.0, rooms="Living rooms")], NEW_ROOMS)
+    assert both.index("### Bedrooms") < both.index("### Living rooms")
+    assert "200 generated rooms a run against 38 test rooms of front; 149 real" in both
+    assert "seeds 0, 1." in both and both.count("| method |") == 2
+
+
+def test_the_csv_has_a_line_a_run_in_full_precision(rows):
+    lines = list(csv.DictReader(io.StringIO(as_csv(rows, NEW_ROOMS))))
+    assert [(line["method"], line["seed"]) for line in lines][-1] == ("Ours", "1")
+    assert lines[1]["fd_effnet_lite0"] == "58.25" and lines[1]["box_iou_3d"] == ""
+    assert lines[0]["cpu_s"] == "300.0"
+
+
+def test_what_nobody_knows_is_left_open(rows):
+    lost = replace(rows[1], costs={**rows[1].costs, "cpu_s": None})
+    table = [rows[0], lost]
+    assert cells(markdown(table, NEW_ROOMS), "GAN_x")["CPU min"] == "–"
+    lines = list(csv.DictReader(io.StringIO(as_csv(table, NEW_ROOMS))))
+    assert lines[1]["cpu_s"] == "" and lines[1]["steps"] == "4500"
+
+
+def test_two_files_are_written(rows, tmp_path):
+    write_tables(rows, tmp_path / "new", NEW_ROOMS)
+    assert {p.name for p in (tmp_path / "new").iterdir()} == {"table.md", "table.csv"}
+
+
+def test_a_table_first_says_which_rows_are_the_papers_method_and_which_ours(rows):
+    sampled = row("Lifted method: sampler", 0, 40.0, made_by=LIFTED)
+    said = markdown([*rows, sampled], NEW_ROOMS).removeprefix("### Bedrooms\n\n")
+    assert said.startswith(
+        "Rows of the paper's method and variations of it: 'Ours', 'GAN_x', 'ATISS'; of the "
+        "lifted method: 'Lifted method: sampler'. 200 generated rooms a run"
+    )
+    assert "of the lifted method: none." in markdown(rows, NEW_ROOMS)
+    made_by = [
+        line["made by"] for line in csv.DictReader(io.StringIO(as_csv([sampled], NEW_ROOMS)))
+    ]
+    assert made_by == ["the lifted method"]
+
+
+def test_groups_stand_in_the_order_of_their_ranks(rows):
+    last = [replace(one, group="copies", rank=9) for one in rows[:2]]
+    text = markdown([*last, *rows], NEW_ROOMS)
+    assert (
+        text.index("*from masks in 2D*") < text.index("*from boxes in 3D*") < text.index("*copies*")
+    )
+
+
+def test_scenes_have_no_seed(rows):
+    given = replace(rows[1], seed=None, title="Theirs")
+    assert "seeds 0, 1." in markdown([given, *rows], NEW_ROOMS)
+    assert next(csv.DictReader(io.StringIO(as_csv([given], NEW_ROOMS))))["seed"] == ""

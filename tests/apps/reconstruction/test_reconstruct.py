@@ -1,0 +1,167 @@
+"""Whole reconstructions on a toy run: options, starts, answers in the masks' order."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from sceneprior.apps.config import load_run
+from sceneprior.apps.reconstruction import reconstruct as reconstruct_module
+from sceneprior.apps.reconstruction.reconstruct import (
+    FitOptions,
+    layout_losses_of_rooms,
+    reconstruct,
+    starting_latents,
+)
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.observed_image import as_views, images_of_split, rows_of
+from sceneprior.paper import fit_image as fitting
+from sceneprior.paper.fit_image import (
+    SCHEDULES,
+    FitSchedule,
+    decode_images,
+    view_loss,
+)
+from sceneprior.paper.view_loss import seen_masks
+
+
+@pytest.fixture(scope="module")
+def trained(toy_run):
+    return load_run(toy_run)
+
+
+@pytest.fixture(scope="module")
+def images(toy_shards):
+    return images_of_split(toy_shards, "test", 0)[0]
+
+
+@pytest.fixture(scope="module")
+def views(images):
+    return as_views(images, 4)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setitem(SCHEDULES, "short", FitSchedule(steps=10, drop_at=6, patience=0))
+
+
+def test_objects_answer_for_masks_in_their_order(trained, images):
+    found = reconstruct(trained, images, FitOptions("short"))
+    assert [one.image.name for one in found] == [image.name for image in images]
+    for one in found:
+        assert len(one.scene.objects) == len(one.image.rows)
+        for item in one.scene.objects:
+            assert item.mesh is not None and item.label != "void"
+            low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
+            np.testing.assert_allclose((low + high) / 2, item.center_m, atol=1e-4)
+            np.testing.assert_allclose(high - low, item.size_m, atol=1e-4)
+
+
+def test_grids_are_fitted_by_classes_and_boxes_alone(grid_prior, images, monkeypatch):
+    """No step decodes a grid; the answer has the surfaces of one object a mask."""
+    decoded, decode = [], grid_prior.prior.decode
+
+    def counted(z, with_shape=True, wanted=None):
+        decoded.append(with_shape)
+        return decode(z, with_shape, wanted)
+
+    monkeypatch.setattr(grid_prior.prior, "decode", counted)
+    found = reconstruct(grid_prior, images[:2], FitOptions("short"))
+    assert decoded[-1] and not any(decoded[:-1]) and len(decoded) > 10
+    for one in found:
+        assert one.mask_iou is None and len(one.scene.objects) == len(one.image.rows)
+        for item in one.scene.objects:
+            away = np.abs(item.mesh.vertices_m - np.array(item.center_m))
+            assert (away <= np.array(item.size_m) / 2 + 1e-6).all()
+
+
+def test_images_of_any_size_and_number_come_back_in_their_order(trained, images, monkeypatch):
+    half = replace(
+        images[1],
+        instance_ids=images[1].instance_ids[::2, ::2],
+        intrinsics=np.diag([0.5, 0.5, 1]) @ images[1].intrinsics,
+    )
+    monkeypatch.setattr(reconstruct_module, "BATCH", 2)
+    given = [images[3], half, images[0], images[2]]
+    found = reconstruct(trained, given, FitOptions("short"))
+    assert [one.image is image for one, image in zip(found, given, strict=True)] == [True] * 4
+    alone = reconstruct(trained, [images[0]], FitOptions("short"))[0]
+    assert found[2].score == pytest.approx(alone.score, rel=1e-3)
+
+
+def test_more_restarts_are_never_worse_and_the_best_is_kept(trained, images):
+    one, three = (reconstruct(trained, images, FitOptions("short", restarts=n)) for n in (1, 3))
+    # The first start is the same; sums in another order may move its score a little.
+    assert all(b.score <= a.score + 1e-3 for a, b in zip(one, three, strict=True))
+    assert any(b.score < a.score - 1e-3 for a, b in zip(one, three, strict=True))
+
+
+def test_options_and_images_that_cannot_be(trained, images):
+    with pytest.raises(InputError, match="No fit is called 'long'; choose from objects, paper"):
+        reconstruct(trained, images, FitOptions("long"))
+    with pytest.raises(
+        InputError, match="restarts are of latents, which the fit `paper` finds; name"
+    ):
+        reconstruct(trained, images, FitOptions(restarts=2))
+    with pytest.raises(InputError, match="restarts is 0; an image needs at least one"):
+        reconstruct(trained, images, FitOptions(restarts=0))
+    other = replace(images[0], label_set="scannet")
+    with pytest.raises(InputError, match="label set 'scannet', but the run was trained on 'front3"):
+        reconstruct(trained, [other], FitOptions("short"))
+
+
+def test_an_object_of_a_class_that_the_run_never_generates(trained, images):
+    """Whatever else looks like its mask stands for it, and is told; its class stays the image's."""
+    names = label_set(images[0].label_set)
+    with torch.no_grad():
+        rooms = [trained.prior(row.unsqueeze(0), False).class_logits[0] for row in trained.logits]
+    generated = {names[int(logits.argmax())] for room in rooms for logits in room}
+    assert "sofa" not in generated  # no toy room has one
+    classes = images[0].object_class.copy()
+    classes[0] = names.index("sofa")
+    other = replace(images[0], object_class=classes)
+    plain, one = reconstruct(trained, [images[0], other], FitOptions())
+    assert [item.label for item in one.scene.objects] == [names[index] for index in classes]
+    assert set(one.taken_for) - set(plain.taken_for) == {"sofa"}
+    assert one.taken_for["sofa"] in generated
+
+
+def test_masks_are_fitted_at_the_runs_size(trained, images, monkeypatch):
+    """A quarter of 96 x 72 pixels in this run, whatever the size of an image."""
+    assert trained.config.data.mask_step == 4
+    sizes = []
+
+    def drawn(vertices_m, faces, views, settings):
+        sizes.append(views.observed_ids.shape[-2:])
+        return seen_masks(vertices_m, faces, views, settings)
+
+    monkeypatch.setattr(fitting, "seen_masks", drawn)
+    reconstruct(trained, images[:1], FitOptions("short"))
+    assert set(sizes) == {(18, 24)}
+
+
+def test_nearest_starts_are_the_rooms_of_least_layout_loss(trained, toy_shards):
+    views = as_views(images_of_split(toy_shards, "train", 0)[0], 4)
+    losses = layout_losses_of_rooms(trained, views)
+    assert losses.shape == (12, 12)
+    room = 5
+    first = rows_of(views, torch.tensor([room]))
+    own = trained.prior.latent_space(trained.logits[3:4])
+    scenes = replace(decode_images(trained, own, first), vertices_m=None)
+    assert_close(
+        losses[room, 3], view_loss(trained, scenes, first, masks=False).score[0],
+        rtol=1e-4, atol=1e-5,
+    )  # fmt: skip
+    starts = starting_latents(trained, views, 2)
+    best = trained.prior.latent_space(trained.logits)[losses[room].argmin()]
+    assert torch.equal(starts[room, 0], best)
+
+
+def test_more_starts_than_rooms(trained, views):
+    with pytest.raises(
+        InputError, match="13 nearest training rooms were asked for, but the run ha"
+    ):
+        starting_latents(trained, views, 13)

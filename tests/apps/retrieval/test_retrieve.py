@@ -1,0 +1,211 @@
+"""Retrieval: the supplement's rules, one by one, and the fast search against the slow one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_folder import blocks, corner_sofa
+
+from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels, unit_mesh
+from sceneprior.apps.retrieval.retrieve import (
+    _rough_distances,
+    _turned_views,
+    extruded,
+    most_similar,
+    placed,
+    retrieval_report,
+    retrieve,
+    retrieve_all,
+)
+from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.surfaces import surface_points
+from sceneprior.core.geometry.turns import QUARTERS
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m
+
+POINTS = 256
+
+
+def cad_models(points: int = POINTS, **of_classes) -> CadModels:
+    """label -> {model id: trimesh}."""
+    meshes = {
+        name: unit_mesh(Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
+        for of_class in of_classes.values()
+        for name, mesh in of_class.items()
+    }
+    by_class = {
+        label: ClassModels(
+            tuple(of_class),
+            np.stack(
+                [
+                    surface_points(meshes[name].vertices_m, meshes[name].faces, points)
+                    for name in of_class
+                ]
+            ).astype(np.float32),
+        )
+        for label, of_class in of_classes.items()
+    }
+    return CadModels(by_class, meshes.__getitem__)
+
+
+@pytest.fixture(scope="module")
+def models():
+    plain = blocks(((0, 0.5, 0), (1, 1, 1)))
+    table = blocks(((0, 0.7, 0), (1.2, 0.1, 0.8)), ((0.5, 0.35, 0), (0.1, 0.7, 0.7)))
+    return cad_models(sofa={"plain": plain, "corner": corner_sofa(), "table": table})
+
+
+def brute_chamfer(a: np.ndarray, b: np.ndarray) -> float:
+    apart = np.linalg.norm(a[:, None] - b[None], axis=2)
+    return float(apart.min(axis=1).mean() + apart.min(axis=0).mean()) / 2
+
+
+def room(*objects: SceneObject) -> Scene:
+    return Scene("room", "front3d_living", objects)
+
+
+@pytest.mark.parametrize("step", [1, 4])
+def test_rough_distances_are_chamfer_distances_of_every_nth_point(rng, step):
+    of_class = rng.uniform(-0.5, 0.5, (7, 64, 3)).astype(np.float32)
+    points, size = rng.normal(size=(64, 3)), np.array([2.0, 0.7, 0.4])
+    choices = rng.permutation(7 * QUARTERS)[:19]
+    rough = _rough_distances(_turned_views(points, tuple(size)), of_class, choices, step)
+    for choice, got in zip(choices, rough, strict=True):
+        model, turn = divmod(int(choice), QUARTERS)
+        unit = Mesh(of_class[model].astype(np.float64), np.zeros((0, 3), np.int64))
+        item = SceneObject("sofa", (0.0, 0.0, 0.0), tuple(size))
+        in_room = placed(unit, item, 90 * turn).vertices_m
+        # Squared distances in float32, as a difference of squares of a few metres.
+        assert got == pytest.approx(brute_chamfer(points[::step], in_room[::step]), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("center_y", "height", "wanted"),
+    [
+        (1.0, 0.4, (0.6, 1.2)),  # exactly 1 m: down to the floor, the top stays
+        (1.001, 0.4, (1.001, 0.4)),
+        (0.3, 0.6, (0.3, 0.6)),  # stands already
+        (0.2, 0.6, (0.25, 0.5)),  # came from below the floor
+        (-1.0, 0.5, (-1.0, 0.5)),  # all of it is below: nothing to stand on
+    ],
+)
+def test_low_boxes_are_extruded_to_the_floor(center_y, height, wanted):
+    item = extruded(SceneObject("sofa", (1.0, center_y, 2.0), (0.5, height, 0.7)))
+    assert (item.center_m[1], item.size_m[1]) == pytest.approx(wanted)
+    assert (item.center_m[0], item.center_m[2], *item.size_m[::2]) == (1.0, 2.0, 0.5, 0.7)
+
+
+@pytest.mark.parametrize("turn", [0, 90, 180, 270])
+@pytest.mark.parametrize("size", [(2.0, 0.8, 1.2), (0.7, 1.9, 1.5)])
+def test_a_model_in_disguise_is_found_with_its_turn(models, turn, size):
+    """The corner sofa itself, turned and stretched into a box, has distance nearly 0."""
+    item = SceneObject("sofa", (1.0, size[1] / 2, -2.0), size)
+    mesh = placed(models.load("corner"), item, turn)
+    np.testing.assert_allclose(
+        mesh.vertices_m.min(0), np.subtract(item.center_m, np.divide(size, 2))
+    )
+    np.testing.assert_allclose(mesh.vertices_m.max(0), np.add(item.center_m, np.divide(size, 2)))
+    best = most_similar(replace(item, mesh=mesh), models.by_class["sofa"])
+    assert (best.model_id, best.turn_deg) == ("corner", turn)
+    assert best.distance_m < 0.15  # two samples of one surface
+    made = retrieve(room(replace(item, mesh=mesh)), models)
+    np.testing.assert_allclose(made.objects[0].mesh.vertices_m, mesh.vertices_m)
+
+
+def test_turns_are_yaws():
+    """docs/conventions.md: a yaw of 90 degrees turns +z towards +x."""
+    unit = Mesh(np.array([[0, 0, 0.5]]), np.zeros((0, 3), np.int64))
+    item = SceneObject("sofa", (0.0, 0.0, 0.0), (2.0, 1.0, 4.0))
+    np.testing.assert_allclose(placed(unit, item, 0).vertices_m[0], [0, 0, 2])
+    np.testing.assert_allclose(placed(unit, item, 90).vertices_m[0], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(placed(unit, item, 270).vertices_m[0], [-1, 0, 0], atol=1e-12)
+
+
+def random_furniture(rng):
+    """Two to five blocks on one another: many pieces, some much alike."""
+    parts = []
+    for _ in range(rng.integers(2, 6)):
+        size = rng.uniform(0.1, 1.0, 3)
+        parts.append((tuple(rng.uniform(-0.5, 0.5, 3)), tuple(size)))
+    return blocks(*parts)
+
+
+def test_the_fast_search_finds_the_winner_of_the_slow_one(rng):
+    models = cad_models(1024, sofa={f"m{k:02d}": random_furniture(rng) for k in range(80)})
+    for _ in range(8):
+        size = tuple(rng.uniform(0.4, 2.2, 3))
+        like = random_furniture(rng)
+        item = SceneObject("sofa", (0.0, size[1] / 2, 0.0), size)
+        unit = unit_mesh(Mesh(np.asarray(like.vertices), np.asarray(like.faces)))
+        item = replace(item, mesh=placed(unit, item, 0))
+        slow = most_similar(item, models.by_class["sofa"], keep=None)
+        assert most_similar(item, models.by_class["sofa"]) == slow
+
+
+def test_without_a_mesh_the_box_is_compared(models):
+    made = retrieve(room(SceneObject("sofa", (0.0, 0.9, 0.0), (1.0, 0.6, 1.0))), models)
+    assert made.extra["retrieval"][0]["model_id"] == "plain"
+    assert made.objects[0].size_m == pytest.approx((1.0, 1.2, 1.0))
+
+
+def test_classes_without_models_keep_their_objects_and_the_report_says_so(models):
+    own = Mesh(np.eye(3), np.array([[0, 1, 2]]))
+    lamp = SceneObject("pendant_lamp", (0.0, 2.2, 0.0), (0.5, 0.5, 0.5), own)
+    sofa = SceneObject("sofa", (0.0, 0.4, 0.0), (2.0, 0.8, 1.0))
+    made = retrieve(replace(room(lamp, sofa), extra={"seed": 3}), models)
+    assert made.objects[0] == lamp and made.extra["retrieval"][0] is None
+    assert made.extra["seed"] == 3 and made.objects[1].mesh is not None
+    report = retrieval_report([made], replace(models, broken={"x": "gone"}))
+    assert report["classes_without_models"] == ["pendant_lamp"]
+    assert (report["objects"], report["objects_with_a_model"]) == (2, 1)
+    assert report["classes"]["pendant_lamp"]["mean_distance_m"] is None
+    assert report["classes"]["sofa"]["models"] == 3 and report["broken_models"] == {"x": "gone"}
+
+
+def test_a_mesh_without_a_model_stays_in_step_with_its_box(models):
+    """A plant above the floor, whose class has no model, grows down to it with its box."""
+    low, high = np.array([1.0, 0.3, 0.0]), np.array([1.6, 1.1, 0.4])
+    center, size = (low + high) / 2, high - low
+    vertices = np.vstack([low, high, [1.1, 0.5, 0.2]])
+    plant = SceneObject("plant", tuple(center), tuple(size), Mesh(vertices, np.array([(0, 1, 2)])))
+    (item,) = retrieve(room(plant), models).objects
+    assert item.center_m == pytest.approx((1.3, 0.55, 0.2))
+    assert item.size_m == pytest.approx((0.6, 1.1, 0.4))
+    grown = vertices * (1, 1.1 / 0.8, 1) - (0, 0.3 * 1.1 / 0.8, 0)
+    np.testing.assert_allclose(item.mesh.vertices_m, grown, atol=1e-12)
+
+
+def test_rooms_without_objects_and_objects_without_volume_have_defined_answers(models):
+    assert retrieve(room(), models).extra["retrieval"] == []
+    flat = SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
+    point = SceneObject("sofa", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    collapsed = SceneObject(
+        "sofa", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0), Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    )
+    made = retrieve(room(flat, point, collapsed), models)
+    assert all(np.isfinite(found["distance_m"]) for found in made.extra["retrieval"])
+    assert made.extra["retrieval"][2]["model_id"] == "plain"  # by its box
+
+
+def test_what_is_no_number_is_a_sentence(models):
+    with pytest.raises(InputError, match=r"room: the box of object 0 \(sofa\) is .*nan"):
+        retrieve(room(SceneObject("sofa", (0.0, float("nan"), 0.0), (1.0, 1.0, 1.0))), models)
+    with pytest.raises(InputError, match="sides that are not negative"):
+        retrieve(room(SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, -1.0, 1.0))), models)
+
+
+def test_a_model_fills_the_axis_aligned_box_so_the_turned_one_goes(models):
+    turned = Turned(np.pi / 6, (1.0, 1.0, 2.0))
+    item = SceneObject("sofa", (0.0, 0.5, 0.0), bound_m(turned), turned=turned)
+    assert retrieve(room(item), models).objects[0].turned is None
+
+
+def test_many_scenes_are_the_same_as_one_by_one(models, rng):
+    scenes = [
+        replace(
+            room(SceneObject("sofa", (0.0, 0.4, 0.0), tuple(rng.uniform(0.3, 2, 3)))), name=str(k)
+        )
+        for k in range(6)
+    ]
+    many = list(retrieve_all(scenes, models))
+    assert [scene.name for scene in many] == [str(k) for k in range(6)]
+    assert [m.extra for m in many] == [retrieve(scene, models).extra for scene in scenes]

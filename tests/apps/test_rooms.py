@@ -1,0 +1,77 @@
+"""Folders of rooms: what is written over, what is not, and the overview."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneprior.apps.rooms import (
+    OVERVIEW_TILE,
+    overview,
+    write_scene,
+    write_scenes,
+)
+from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.render.offscreen import open_renderer
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return open_renderer("software")
+
+
+@pytest.fixture
+def scene() -> Scene:
+    pyramid = Mesh(
+        np.array([[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1], [0, 1.5, 0]]),
+        np.array([[0, 1, 2], [0, 2, 3], [0, 4, 1], [1, 4, 2], [2, 4, 3], [3, 4, 0]]),
+    )
+    return Scene(
+        "room",
+        "front3d_bedroom",
+        (
+            SceneObject("double_bed", (0.0, 0.75, 0.0), (2.0, 1.5, 2.0), pyramid),
+            SceneObject("nightstand", (1.5, 0.25, -0.5), (0.5, 0.5, 0.4)),
+        ),
+        extra={"seed": 3},
+    )
+
+
+def test_new_scenes_leave_none_of_the_old_ones_behind_and_everything_else_alone(
+    scene, renderer, tmp_path
+):
+    rooms = [replace(scene, name=name) for name in "abc"]
+    write_scenes(rooms, tmp_path, renderer)
+    (tmp_path / "latents.npz").write_bytes(b"of the old rooms")
+    (tmp_path / "scores.json").write_text('{"format": "sceneprior-scores"}')
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "c.glb.0123abcd.part").write_bytes(b"of a process that was killed")
+    (tmp_path / "film.part").write_bytes(b"mine, too")
+    write_scenes(rooms[1:2], tmp_path, renderer, overwrite=True)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "b.json", "b.glb", "b.png", "overview.png", "scores.json", "notes.txt", "film.part",
+    }  # fmt: skip
+
+
+def test_a_failed_write_leaves_nothing_under_the_final_name(scene, tmp_path, renderer, monkeypatch):
+    def torn(picture, file, **_):
+        file.write(b"half of a PNG")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", torn)
+    with pytest.raises(OSError, match="No space left"):
+        write_scene(scene, tmp_path, "room", renderer)
+    # The GLB was whole; without the JSON, which comes last, nobody takes it for a scene.
+    assert [path.name for path in tmp_path.iterdir()] == ["room.glb"]
+
+
+def test_an_overview_holds_each_room_in_its_place(renderer):
+    empty = Scene("empty", "front3d_bedroom")
+    bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
+    height, width = OVERVIEW_TILE
+    sheet = overview([empty] * 4 + [Scene("bed", "front3d_bedroom", (bed,))], renderer)
+    assert sheet.shape == (2 * height, 4 * width, 3)
+    tiles = sheet.reshape(2, height, 4, width, 3).swapaxes(1, 2).reshape(8, -1, 3)
+    colourful = (np.ptp(tiles.astype(int), axis=-1) > 60).sum(axis=1)
+    assert colourful[4] > 1000 and not np.delete(colourful, 4).any()

@@ -1,0 +1,170 @@
+"""Runs of all baselines: they train, stop, resume, generate, and are evaluated and reported."""
+
+import csv
+import shutil
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from sceneprior.apps.cli.commands import app
+from sceneprior.apps.config import load_any_run
+from sceneprior.apps.experiments.evaluate import evaluate_run, report_run
+from sceneprior.apps.sample import sample_rooms
+from sceneprior.baselines.atiss.stage import AtissStage
+from sceneprior.baselines.gan.stage import GanStage
+from sceneprior.baselines.single_view.im3d import Im3dStage
+from sceneprior.baselines.single_view.total3d import Total3dStage
+from sceneprior.baselines.sync2gen.stage import Sync2genStage
+from sceneprior.core.errors import InputError
+from sceneprior.core.settings import dump_settings
+from sceneprior.evaluation.room_sets import without_void
+from sceneprior.evaluation.synthesis import EvalOptions
+from sceneprior.training import fit as train
+from sceneprior.training.callbacks import RollingCheckpoint
+from sceneprior.training.checkpoints import find_checkpoint, read_checkpoint
+from sceneprior.training.fit import fit
+
+CPU = {"accelerator": "cpu", "devices": 1}
+LOGGED = {
+    "atiss2d": {"mask"},
+    "gan": {"discriminator", "objects", "real_score", "fake_score"},
+    "atiss": {"class", "position", "angle", "size"},
+    "sync2gen": {"existence", "position", "size", "kl", "left_out"},
+    "usl": {"box", "frustum", "mask"},
+    "total3d": {"offset", "size", "bin", "residual", "corners", "chamfer", "edges"},
+    "im3d": {"offset", "size", "bin", "residual", "corners", "refined", "refined_corners",
+             "shape", "overlap"},
+}  # fmt: skip
+"""Curves of the last stage of each baseline, beside its loss."""
+STAGES = {name: (name,) for name in LOGGED} | {"atiss2d": ("layout", "shape")}
+MODULES = {
+    "gan": GanStage, "atiss": AtissStage, "sync2gen": Sync2genStage, "total3d": Total3dStage,
+    "im3d": Im3dStage,
+}  # fmt: skip
+WITHOUT_LATENTS = ("gan", "atiss", "sync2gen")
+
+
+@pytest.mark.parametrize("method", LOGGED)
+def test_a_run_leaves_its_checkpoints_and_curves(baseline_run, method):
+    run, stages = baseline_run(method), STAGES[method]
+    assert {path.name for path in run.iterdir()} == {"config.yaml", *stages}
+    last = stages[-1]
+    assert find_checkpoint(run, stages) == (last, run / last / "final.ckpt")
+    with (run / last / "metrics.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["train/loss"]]
+    assert rows and all(row[f"train/{name}"] for row in rows for name in LOGGED[method])
+    if method in ("atiss", "sync2gen"):
+        assert float(rows[-1]["train/loss"]) < float(rows[0]["train/loss"])
+    assert not load_any_run(run).prior.training
+
+
+class Stop(RollingCheckpoint):
+    """Presses Ctrl-C in the middle of the second epoch of the last stage."""
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        if (trainer.current_epoch, batch_idx) == (1, 1) and self.folder.name != "layout":
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("method", LOGGED)
+def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
+    baseline_config, baseline_run, method, tmp_path, monkeypatch
+):
+    config, run, last = baseline_config(method), tmp_path / "run", STAGES[method][-1]
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "RollingCheckpoint", Stop)
+        with pytest.raises(KeyboardInterrupt):
+            fit(config, run, trainer_options=CPU)
+    assert read_checkpoint(run / last / "last.ckpt")["epoch"] == 0
+    fit(config, run, resume=True, trainer_options=CPU)
+    wanted, reached = (
+        read_checkpoint(folder / last / "final.ckpt") for folder in (baseline_run(method), run)
+    )
+    assert wanted["state_dict"].keys() == reached["state_dict"].keys()
+    for key, value in wanted["state_dict"].items():
+        assert torch.equal(reached["state_dict"][key], value), key
+    assert len(wanted["optimizer_states"]) == (2 if method == "gan" else 1)
+    for one, other in zip(wanted["optimizer_states"], reached["optimizer_states"], strict=True):
+        for key, moments in one["state"].items():
+            assert torch.equal(moments["exp_avg_sq"], other["state"][key]["exp_avg_sq"])
+
+
+@pytest.mark.parametrize("method", MODULES)
+def test_a_loss_that_is_no_number_names_its_rooms(baseline_config, method, tmp_path, monkeypatch):
+    original = MODULES[method].training_step
+
+    def poisoned(self, batch, batch_idx):
+        for parameter in self.parameters():
+            parameter.data.fill_(torch.nan)
+        return original(self, batch, batch_idx)
+
+    monkeypatch.setattr(MODULES[method], "training_step", poisoned)
+    with pytest.raises(FloatingPointError, match=r"The loss is nan on rooms toy/train_\d\d, toy/"):
+        fit(baseline_config(method), tmp_path / "run", trainer_options=CPU)
+    assert not list(tmp_path.rglob("final.ckpt"))
+
+
+@pytest.mark.parametrize("method", ("atiss2d", "gan"))
+def test_the_command_line_trains_generates_and_evaluates(baseline_config, method, tmp_path):
+    epochs = ("layout__epochs", "shape__epochs") if method == "atiss2d" else ("training__epochs",)
+    config, run = tmp_path / "tiny.yaml", tmp_path / "run"
+    dump_settings(baseline_config(method, **dict.fromkeys(epochs, 1)), config)
+    for words in (
+        ["fit", "--config", str(config), "--run", str(run), "--accelerator", "cpu"],
+        ["synthesize", "--run", str(run), "-n", "3", "--out", str(tmp_path / "rooms"),
+         "--renderer", "software"],
+        ["eval-fid", "--run", str(run), "-n", "4", "--renderer", "software"],
+    ):  # fmt: skip
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 0, result.output
+    assert len(list((tmp_path / "rooms").rglob("*.glb"))) == 3
+
+
+@pytest.mark.parametrize("method", ("atiss2d", *WITHOUT_LATENTS))
+def test_new_rooms_depend_on_the_seed_alone(baseline_run, method):
+    trained = load_any_run(baseline_run(method))
+    assert trained.remembers_rooms == (method == "atiss2d")
+    rooms = [sample_rooms(load_any_run(baseline_run(method)), 9, seed) for seed in (2, 2, 3)]
+    boxes = [
+        [[(item.label, item.center_m, item.size_m) for item in room.objects] for room in rooms_]
+        for rooms_ in rooms
+    ]
+    assert boxes[0] == boxes[1] != boxes[2]
+    assert [room.name for room in rooms[0][:2]] == ["seed2_0000", "seed2_0001"]
+    objects = [item for room in rooms[0] for item in room.objects]
+    makes_meshes = method in ("atiss2d", "gan")
+    assert objects and all((item.mesh is not None) == makes_meshes for item in objects)
+    assert all(min(item.size_m) > 0 for item in objects)
+    yaws = [room.extra.get("yaw_rad") for room in rooms[0]]
+    if method == "atiss":
+        assert [len(yaw) for yaw in yaws] == [len(room.objects) for room in rooms[0]]
+    else:
+        assert not any(yaws)
+
+
+@pytest.mark.parametrize("method", WITHOUT_LATENTS)
+def test_a_run_is_evaluated_and_reported_by_its_new_rooms_alone(baseline_run, method, tmp_path):
+    run, options = baseline_run(method), EvalOptions(renderer="software")
+    scores = evaluate_run(run, 4, options, tmp_path / "scores.json")
+    assert scores["protocol"]["stage"] == method
+    assert scores["protocol"]["latents"] == ("paper" if method == "gan" else "its own")
+    rooms = [without_void(room) for room in sample_rooms(load_any_run(run), 4, 0)]
+    assert "box_iou_3d" not in scores
+    assert scores["mean_objects"] == sum(len(room.objects) for room in rooms) / 4
+    report_run(run, tmp_path / "scores.json", tmp_path / "page.html", 0, (), "software")
+    page = (tmp_path / "page.html").read_text()
+    assert "New rooms beside real ones" in page and "The sphere unfolding" not in page
+    if method != "gan":
+        assert "prior learnt from true boxes in 3D" in page
+        assert f"the method {method}, which learns from true boxes in 3D" in page
+        assert "What training saw" not in page and "latent sphere" not in page
+
+
+@pytest.mark.parametrize("method", MODULES)
+def test_a_config_of_another_network_is_refused(baseline_run, method, tmp_path):
+    run = shutil.copytree(baseline_run(method), tmp_path / "run")
+    text = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(text.replace("width: ", "width: 2", 1))
+    with pytest.raises(InputError, match=r"does not fit the run's config.yaml .*use the config it"):
+        load_any_run(run)

@@ -1,0 +1,57 @@
+"""Label sets: the shipped ones, and lists of one's own that are their own names."""
+
+import numpy as np
+import pytest
+
+from sceneprior.core.classes import LABEL_SETS, class_colors, label_set, label_set_name
+from sceneprior.core.errors import InputError
+from sceneprior.render.topdown import topdown_protocol
+
+
+def test_the_papers_sets():
+    assert {name: len(label_set(name)) for name in LABEL_SETS} == {
+        "front3d_bedroom": 22, "front3d_living": 15, "scannet": 19,
+        "front3d_dining": 15, "front3d_library": 15, "front3d_kitchen": 9, "front3d_all": 22,
+    }  # fmt: skip
+    assert all(classes[0] == "void" for classes in LABEL_SETS.values())
+
+
+def test_a_list_of_ones_own_is_its_own_name():
+    name = label_set_name(["bed", "night stand"])
+    assert name == "void,bed,night stand"
+    assert label_set(name) == ("void", "bed", "night stand")
+    assert len(class_colors(len(label_set(name)))) == 3
+    assert topdown_protocol(name).window_m == 12.8
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("attic", "No label set is called 'attic'; there are front3d_bedroom, front3d_living, "
+         "scannet, front3d_dining, front3d_library, front3d_kitchen, front3d_all, or write your "
+         "own as void,bed,chair."),
+        ("bed,chair", "No label set is called 'bed,chair'; there are"),
+        ("void,bed,bed", "The class 'bed' is twice in the label set; once is enough."),
+        ("void,void", "The class 'void' is twice in the label set; once is enough."),
+        ("void,", "'' is no class name: 1 to 60 printable characters, no space at either end."),
+        ("void, bed", "' bed' is no class name"),
+        ("void,b\ned", "is no class name"),
+        ("void," + "x" * 61, "is no class name: 1 to 60 printable characters"),
+    ],
+)  # fmt: skip
+def test_what_is_no_label_set(name, said):
+    with pytest.raises(InputError) as error:
+        label_set(name)
+    assert said in str(error.value)
+
+
+def test_what_is_no_list_of_names():
+    with pytest.raises(InputError, match="The class name 'bed, large' holds a comma, which parts"):
+        label_set_name(["bed, large"])
+    with pytest.raises(InputError, match=r"A label set needs a class beside void\."):
+        label_set_name([])
+
+
+def test_colours_differ():
+    colors = class_colors(22)
+    assert len(np.unique(colors, axis=0)) == 22 and colors[0].tolist() == [128, 128, 128]

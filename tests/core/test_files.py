@@ -1,0 +1,108 @@
+"""Files are whole or absent, whatever fails on the way."""
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sceneprior.core import files
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import PART, check_writable, only_writer, remove_parts, write_whole
+
+
+def test_written_in_new_folders_and_replaced(tmp_path):
+    path = tmp_path / "a" / "b" / "file.bin"
+    write_whole(path, b"one")
+    write_whole(path, b"two")
+    assert path.read_bytes() == b"two" and [p.name for p in path.parent.iterdir()] == ["file.bin"]
+
+
+def test_bytes_texts_and_functions_are_written_alike(tmp_path):
+    def write(path):
+        assert path.name.endswith(PART)
+        path.write_text("ä\n")
+
+    for name, content in {"bytes": "ä\n".encode(), "text": "ä\n", "function": write}.items():
+        write_whole(tmp_path / name, content)
+        assert (tmp_path / name).read_bytes() == b"\xc3\xa4\n"
+    with pytest.raises(ZeroDivisionError):
+        write_whole(tmp_path / "text", lambda path: path.write_text("half") / 0)
+    assert (tmp_path / "text").read_text() == "ä\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bytes", "function", "text"]
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_what_was_there_stays_if_writing_fails(tmp_path, monkeypatch, step):
+    path = tmp_path / "file.bin"
+    write_whole(path, b"before")
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(files.os if step == "fsync" else files.Path, step, full)
+    with pytest.raises(OSError, match="No space left") as error:
+        write_whole(path, b"after")
+    assert error.value.filename == str(path)
+    assert path.read_bytes() == b"before" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_leftovers_go_and_nothing_else(tmp_path):
+    (tmp_path / "deep").mkdir()
+    for name in (f"x.12{PART}", f"deep/y.h5.ab{PART}", "deep/part", "z.partly"):
+        (tmp_path / name).touch()
+    remove_parts(tmp_path)
+    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == ["part", "z.partly"]
+
+
+def test_the_second_writer_is_told_which_process_is_the_first(tmp_path):
+    code = (
+        "import sys, time\nfrom pathlib import Path\n"
+        "from sceneprior.core.files import only_writer\n"
+        "with only_writer(Path(sys.argv[1])):\n    print('on', flush=True)\n    time.sleep(400)"
+    )
+    folder = tmp_path / "deep" / "run"
+    first = subprocess.Popen([sys.executable, "-c", code, folder], stdout=subprocess.PIPE)
+    try:
+        assert first.stdout.readline() == b"on\n"
+        with pytest.raises(InputError, match="is writing to") as error, only_writer(folder):
+            pass
+        who = f" (process {first.pid})"
+        # Some file systems hide from the kernel's list of locks which folder is locked.
+        assert str(error.value).replace(who, "") == (
+            f"Another run is writing to {folder}; wait for it, or choose another folder."
+        )
+        if f":{folder.stat().st_ino} " in Path("/proc/locks").read_text():
+            assert who in str(error.value)
+    finally:
+        first.kill()
+        first.communicate()
+    with only_writer(folder):  # what a killed process held is free
+        pass
+    assert folder.is_dir()  # it was there before
+
+
+def test_a_folder_made_to_be_locked_goes_again_unless_something_lies_in_it(tmp_path):
+    with only_writer(tmp_path / "a" / "b"):
+        assert (tmp_path / "a" / "b").is_dir()
+    assert not list(tmp_path.iterdir())
+    with only_writer(tmp_path / "a" / "b"):
+        (tmp_path / "a" / "b" / "file").touch()
+    assert (tmp_path / "a" / "b" / "file").is_file()
+
+
+def test_whether_a_place_can_be_written_is_found_without_a_trace(tmp_path, monkeypatch):
+    check_writable(tmp_path / "new" / "scores.json")
+    check_writable(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+    def read_only(*_):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(files.Path, "write_bytes", read_only)
+    with pytest.raises(OSError, match="Read-only") as error:
+        check_writable(tmp_path / "new" / "scores.json")
+    assert error.value.filename == str(tmp_path / "new" / "scores.json")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,84 @@
+"""Mixtures of logistics against scipy's, and draws against their densities."""
+
+import numpy as np
+import torch
+from scipy import integrate, stats
+from torch.testing import assert_close
+
+from sceneprior.core.mixtures import LEAST_SCALE, MOST_SCALE, LogisticMixture, draw_index
+
+
+def some_mixture(numbers: int = 2, mixtures: int = 3) -> LogisticMixture:
+    features = torch.randn(mixtures * (1 + 2 * numbers), generator=torch.Generator().manual_seed(1))
+    return LogisticMixture.of(features.double(), numbers)
+
+
+def test_densities_are_those_of_scipy():
+    mixture = some_mixture()
+    values = torch.tensor([[0.2, -0.4], [3.0, 1.0]], dtype=torch.float64)
+    weights = mixture.weight_logits.softmax(dim=-1)
+    expected = []
+    for value in values:
+        each = [
+            weight * np.prod(stats.logistic.pdf(value, mean, scale.exp()))
+            for weight, mean, scale in zip(weights, mixture.means, mixture.log_scales, strict=True)
+        ]
+        expected.append(np.log(sum(float(one) for one in each)))
+    every = LogisticMixture(*(part.expand(2, *part.shape) for part in mixture))
+    assert_close(every.log_prob(values), torch.tensor(expected, dtype=torch.float64))
+
+
+def test_a_density_integrates_to_one():
+    mixture = some_mixture(numbers=1)
+
+    def density(x: float) -> float:
+        return float(mixture.log_prob(torch.tensor([x], dtype=torch.float64)).exp())
+
+    assert abs(integrate.quad(density, -200, 200, limit=400, points=[-2, 0, 2])[0] - 1) < 1e-5
+
+
+def test_scales_stay_within_their_bounds():
+    wide = LogisticMixture.of(torch.tensor([0.0, 0.0, 1e4]), 1)
+    narrow = LogisticMixture.of(torch.tensor([0.0, 0.0, -1e4]), 1)
+    assert_close(wide.log_scales.exp().item(), MOST_SCALE, rtol=1e-6, atol=0)
+    assert_close(narrow.log_scales.exp().item(), LEAST_SCALE, rtol=1e-6, atol=0)
+
+
+def test_draws_follow_the_density():
+    mixture, draws = some_mixture(numbers=1), 4000
+    generator = torch.Generator().manual_seed(2)
+    uniform = torch.rand(2, draws, generator=generator, dtype=torch.float64)
+    values = mixture.drawn(uniform[0], uniform[1].unsqueeze(-1))[:, 0].numpy()
+    weights = mixture.weight_logits.softmax(dim=-1).numpy()
+
+    def below(x: np.ndarray) -> np.ndarray:
+        each = [
+            weight * stats.logistic.cdf(x, mean, np.exp(scale))
+            for weight, mean, scale in zip(
+                weights, mixture.means[:, 0].numpy(), mixture.log_scales[:, 0].numpy(), strict=True
+            )
+        ]
+        return sum(each)
+
+    assert stats.kstest(values, below).pvalue > 0.01
+
+
+def test_one_value_is_the_first_of_several():
+    mixture = some_mixture()
+    choice, place = torch.tensor(0.3).double(), torch.tensor([0.2, 0.9]).double()
+    several = mixture.drawn(choice.expand(1), place.expand(1, 2))
+    assert torch.equal(mixture.draw(choice, place), several[0])
+
+
+def test_gradients_are_right():
+    values = torch.tensor([[0.1, 0.7]], dtype=torch.float64, requires_grad=True)
+    features = torch.randn(1, 10, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda f, v: LogisticMixture.of(f, 2).log_prob(v), (features, values)
+    )
+
+
+def test_impossible_choices_are_never_drawn():
+    logits = torch.tensor([-torch.inf, 0.0, -torch.inf, 0.0, -torch.inf])
+    uniform = torch.tensor([0.0, 0.49, 0.51, 1 - 2**-24])
+    assert draw_index(logits.expand(4, -1), uniform).tolist() == [1, 1, 3, 3]

@@ -1,0 +1,96 @@
+"""Void furniture is unknown: what stands behind it is lifted as if behind an object."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from toy_rooms import look_at
+
+from sceneprior.core.classes import VOID
+from sceneprior.core.instances.observations import observe
+from sceneprior.core.scene import Mesh
+from sceneprior.lifted.lifting.boxes import lift_boxes
+from sceneprior.lifted.lifting.lifted import ShapeGrid
+from sceneprior.lifted.lifting.rays import draw_rays
+from sceneprior.lifted.lifting.shapes import lift_shapes
+from sceneprior.lifted.lifting.thinning import thin_shapes
+from sceneprior.render.offscreen import Pinhole, SoftwareRenderer
+
+GRID = ShapeGrid(cells=24, margin=1.15)
+BED_M = np.array([1.6, 0.6, 2.0])
+
+
+def room_of(chest_class: int):
+    """A solid bed with a chest at its foot, from twelve sides; most see the bed over the chest."""
+    unit = trimesh.creation.box()
+    boxes = [(BED_M, (0.0, 0.3, -0.6)), (np.array([1.6, 0.8, 0.5]), (0.0, 0.4, 0.75))]
+    meshes = [
+        Mesh(np.asarray(unit.vertices) * size_m + center_m, np.asarray(unit.faces))
+        for size_m, center_m in boxes
+    ]
+    lens = np.array([[80.0, 0, 80], [0, 80, 60], [0, 0, 1]])
+    poses = np.stack(
+        [
+            look_at(np.array([2.4 * np.sin(a), 1.0 + 0.4 * (k % 2), 2.4 * np.cos(a)]),
+                    np.array([0.0, 0.4, 0.0]))
+            for k, a in enumerate(np.linspace(-2.0, 2.0, 12))
+        ]
+    )  # fmt: skip
+    images = SoftwareRenderer().instance_ids_of_views(
+        meshes, [Pinhole(pose, lens) for pose in poses], (120, 160)
+    )
+    return observe(images, [9, chest_class]).room_views("room", poses, lens)
+
+
+def lifted_bed(room):
+    """Its box and its volume in m3."""
+    boxes = lift_boxes(room)
+    hulls = lift_shapes(room, boxes, GRID)
+    rays = draw_rays(room, boxes, 1024, GRID.margin)
+    thin = thin_shapes(hulls, rays, boxes.sizes_m, np.asarray(room.object_class, dtype=np.int64))
+    cell_m3 = (GRID.margin * boxes.sizes_m[0] / GRID.cells).prod()
+    return boxes.centers_m[0], boxes.sizes_m[0], thin[0].sum() * cell_m3
+
+
+def test_a_bed_behind_a_void_chest_keeps_its_height_and_volume():
+    """The box is that of the room in which the chest is an object, to the bit. Fewer rays tell
+    something of the shape: the chest's box is not known."""
+    known, void = room_of(3), room_of(VOID)
+    assert len(known.object_class) == 2 and len(void.object_class) == 1
+    assert ((void.instance_ids == 2) == (known.instance_ids == 2)).all()
+    center_m, size_m, volume_m3 = lifted_bed(void)
+    wanted_center_m, wanted_size_m, wanted_m3 = lifted_bed(known)
+    np.testing.assert_array_equal(center_m, wanted_center_m)
+    np.testing.assert_array_equal(size_m, wanted_size_m)
+    assert volume_m3 == pytest.approx(wanted_m3, rel=0.05)
+    assert size_m[1] == pytest.approx(BED_M[1], abs=0.1)
+    assert volume_m3 == pytest.approx(BED_M.prod(), rel=0.15)
+
+
+def test_rays_through_void_tell_nothing():
+    room = room_of(VOID)
+    boxes = lift_boxes(room)
+    ids = room.instance_ids.copy()
+    ids[ids == 0] = 2  # void wherever the bed is not
+    pool = draw_rays(replace(room, instance_ids=ids), boxes, 200, GRID.margin)
+    assert pool.hits.all(), "no ray is empty"
+
+
+def test_rays_through_an_object_without_a_box_tell_nothing():
+    """One view alone does not tell where an object is; its box is a placeholder."""
+    room = room_of(3)
+    boxes = lift_boxes(room)
+    visible = room.visible.copy()
+    visible[1:, 1] = False
+    once = replace(room, visible=visible)
+    unknown = lift_boxes(once)
+    assert unknown.explained[1] == 0 < unknown.explained[0]
+    for at_m in (boxes.centers_m[1], -3 * boxes.centers_m[1]):
+        centers_m = unknown.centers_m.copy()
+        centers_m[1] = at_m
+        pool = draw_rays(once, unknown._replace(centers_m=centers_m), 400, GRID.margin)
+        without = np.where(room.instance_ids == 2, 3, room.instance_ids)
+        as_void = draw_rays(replace(once, instance_ids=without), unknown, 400, GRID.margin)
+        for one, other in zip(pool, as_void, strict=True):
+            np.testing.assert_array_equal(one[0], other[0])

@@ -1,0 +1,102 @@
+"""Known rooms as answers: their own masks choose them, and never for their own image."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprior.core.errors import InputError
+from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.observed_image import images_of_split
+from sceneprior.lifted.reconstruction.known_rooms import (
+    KnownAnswer,
+    known_rooms,
+    mask_overlap,
+    nearest_answers,
+    random_answers,
+    turn_scene,
+)
+from sceneprior.render.offscreen import open_renderer
+
+
+@pytest.fixture(scope="module")
+def rooms(toy_shards):
+    return known_rooms(toy_shards)
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return open_renderer("software")
+
+
+def test_every_room_is_there_in_four_turns(rooms):
+    assert len(rooms.scenes) == 4 * 12
+    turned = turn_scene(rooms.furnished(0), 1)
+    for item, again, box in zip(
+        turned.objects, rooms.furnished(1).objects, rooms.scenes[1].objects, strict=True
+    ):
+        assert item.center_m == again.center_m == box.center_m
+        assert item.size_m == again.size_m == box.size_m and box.mesh is None
+        assert np.array_equal(item.mesh.vertices_m, again.mesh.vertices_m)
+        assert np.ptp(item.mesh.vertices_m, axis=0) == pytest.approx(item.size_m, abs=1e-6)
+    home = turn_scene(turned, 3)
+    for item, again in zip(home.objects, rooms.scenes[0].objects, strict=True):
+        assert item.center_m == pytest.approx(again.center_m)
+    # +z goes towards +x: what stood at (0, z) stands at (z, 0).
+    x, y, z = rooms.scenes[0].objects[0].center_m
+    assert turned.objects[0].center_m == pytest.approx((z, y, -x))
+
+
+def test_the_image_of_a_known_room_finds_it_under_another_name(rooms, toy_shards, renderer):
+    images = images_of_split(toy_shards, "train", 0, limit=4)[0]
+    strangers = [replace(image, room_id="unknown") for image in images]
+    for image, answer in zip(images, nearest_answers(rooms, strangers, renderer), strict=True):
+        assert answer.scene.name == image.room_id
+        assert answer.scene.extra["turned_degrees"] == 0
+        assert mask_overlap(answer, image, renderer) > 0.9
+    for image, answer in zip(images, nearest_answers(rooms, images, renderer), strict=True):
+        assert answer.scene.name != image.room_id
+
+
+def test_overlap_is_one_for_the_room_itself_and_none_for_nothing(toy_shards, renderer):
+    image = images_of_split(toy_shards, "test", 0, limit=1)[0][0]
+    truth = reference_scenes(toy_shards, "test", 1, tracked_only=True)[0]
+    objects = tuple(truth.objects[row] for row in image.rows)
+    nothing = KnownAnswer(truth, (None,) * len(objects))
+    # Masks are compared on a coarser grid, whose pixel centres lie elsewhere.
+    assert mask_overlap(KnownAnswer(truth, objects), image, renderer) > 0.95
+    assert mask_overlap(nothing, image, renderer) == 0
+
+
+def test_void_pixels_are_left_out_of_the_overlap(toy_shards, renderer):
+    image = images_of_split(toy_shards, "test", 0, limit=1)[0][0]
+    truth = reference_scenes(toy_shards, "test", 1, tracked_only=True)[0]
+    answer = KnownAnswer(truth, tuple(truth.objects[row] for row in image.rows))
+    ids = image.instance_ids.astype(np.int32)
+    ids[:, ::2] = len(image.object_class) + 1
+    known, void = (mask_overlap(answer, replace(image, instance_ids=part), renderer)
+                   for part in (ids * (ids <= len(image.object_class)), ids))  # fmt: skip
+    assert known < 0.7 < 0.9 < void
+
+
+def names_of(answers) -> list[tuple[str, int]]:
+    return [(one.scene.name, one.scene.extra["turned_degrees"]) for one in answers]
+
+
+def test_random_rooms_come_from_the_seed_and_are_never_the_images_own(rooms, toy_shards):
+    images = images_of_split(toy_shards, "train", 0)[0]
+    drawn = [random_answers(rooms, images, seed) for seed in range(3)]
+    again = random_answers(rooms, images, 0)
+    assert names_of(again) == names_of(drawn[0]) != names_of(drawn[1])
+    for answers in drawn:
+        for image, answer in zip(images, answers, strict=True):
+            assert answer.scene.name != image.room_id
+            assert len(answer.objects) == len(image.rows)
+            assert all(item is None or item.mesh is not None for item in answer.objects)
+
+
+def test_a_room_that_is_the_only_one_is_no_baseline(rooms, toy_shards):
+    image = images_of_split(toy_shards, "train", 0, limit=1)[0][0]
+    only = replace(rooms, scenes=tuple(s for s in rooms.scenes if s.name == image.room_id))
+    with pytest.raises(InputError, match="The shards' only training room is toy/train_00 itself"):
+        random_answers(only, [image], 0)

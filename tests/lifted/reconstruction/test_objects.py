@@ -1,0 +1,196 @@
+"""Answers object by object: outlines, places, and what is chosen, each on cases made by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from sceneprior.apps.config import load_run
+from sceneprior.apps.reconstruction.own_image import level_camera
+from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.core.geometry.turns import quarter_rotation, turn_vectors
+from sceneprior.core.observed_image import ObservedImage, images_of_split
+from sceneprior.lifted.reconstruction import candidates
+from sceneprior.lifted.reconstruction.candidates import candidates_of, with_shapes
+from sceneprior.lifted.reconstruction.objects import answer_images, likeliest_box
+from sceneprior.lifted.reconstruction.outlines import Outlines, outlines_of, projected_extents
+from sceneprior.lifted.reconstruction.placing import Placed, place_objects
+
+CUBE = torch.tensor([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+CAMERA = np.array([[48.0, 0, 48], [0, 48, 36], [0, 0, 1]])
+
+
+@pytest.fixture(scope="module")
+def trained(toy_run):
+    return load_run(toy_run)
+
+
+@pytest.fixture(scope="module")
+def images(toy_shards):
+    return images_of_split(toy_shards, "test", 0)[0]
+
+
+def painted(*rectangles, clear=True) -> ObservedImage:
+    """Rectangles x1, y1, x2, y2 of 96 x 72 pixels, the later ones in front."""
+    ids = np.zeros((72, 96), dtype=np.uint8)
+    for k, (x1, y1, x2, y2) in enumerate(rectangles, start=1):
+        ids[y1:y2, x1:x2] = k
+    boxes = np.array(rectangles, dtype=np.float32) / (96, 72, 96, 72)
+    sides = np.full((len(rectangles), 4), clear)
+    classes = np.ones(len(rectangles), dtype=np.int64)
+    pose = level_camera(1.6).astype(np.float32)
+    return ObservedImage("painted", "front3d_bedroom", classes, ids, boxes.astype(np.float32),
+                         sides, pose, CAMERA)  # fmt: skip
+
+
+def cameras(count: int) -> Outlines:
+    one = outlines_of(painted((40, 30, 60, 50)))
+    return Outlines(*(part.expand(count, *part.shape[1:]) for part in one))
+
+
+def seen(points_m) -> Outlines:
+    """The cameras of `cameras`, with masks that end where these objects do."""
+    given = cameras(len(points_m))
+    extents = projected_extents(points_m, given)[0]
+    border = extents.new_tensor([0, 0, 1, 1, 0, 1, 2, 1])
+    return given._replace(extents=extents.minimum(border), clear=torch.ones_like(given.clear))
+
+
+def test_outlines_of_a_rectangle_are_its_sides_and_corners():
+    outlines = outlines_of(painted((24, 18, 48, 54)))
+    left, top, right, bottom = 0.25, 0.25, 0.5, 0.75
+    expected = [-left, -top, right, bottom, -left - top, right - top, right + bottom, bottom - left]
+    assert_close(outlines.extents, torch.tensor([expected]))
+    assert outlines.clear.all()
+
+
+def test_a_corner_that_something_hides_or_the_image_cuts_is_not_clear():
+    hidden = outlines_of(painted((24, 18, 48, 54), (48, 44, 70, 60)))
+    assert hidden.clear[0].tolist() == [True] * 6 + [False, True]
+    cut = outlines_of(painted((60, 40, 96, 72)))
+    assert cut.clear[0].tolist() == [True] * 5 + [False, False, False]
+    # Sides that preparing calls hidden, by what has no id, hide the corners between them.
+    assert not outlines_of(painted((24, 18, 48, 54), clear=False)).clear.any()
+
+
+def test_a_corner_that_void_hides_is_not_clear():
+    image = painted((24, 18, 48, 54))
+    image.instance_ids[44:60, 48:70] = 2
+    assert outlines_of(image).clear[0].tolist() == [True] * 6 + [False, True]
+
+
+def test_slopes_of_extents_are_those_of_finite_differences():
+    torch.manual_seed(0)
+    points = (CUBE * torch.tensor([1.0, 0.8, 0.6]) + torch.tensor([0.3, 0.5, -1.0])).double()
+    given = Outlines(*(p.double() if p.is_floating_point() else p for p in cameras(1)))
+    _, slope, behind = projected_extents(points[None], given)
+    assert behind.item() == 0
+    for axis, column in ((0, 0), (2, 1)):
+        step = torch.zeros(3, dtype=torch.float64)
+        step[axis] = 1e-6
+        ends = [projected_extents((points + s * step)[None], given)[0] for s in (1, -1)]
+        assert_close(slope[..., column], (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("place", [(0.0, -1.5), (1.2, -2.5), (-1.5, -0.5), (2.6, -1.0)])
+def test_an_object_of_the_right_size_goes_where_it_stands(place):
+    """The last one is cut by the image's side."""
+    size, center = torch.tensor([[1.0, 0.8, 0.6]]), torch.tensor([[place[0], 0.4, place[1]]])
+    masks = seen(CUBE * size[:, None] + center[:, None])
+    placed = place_objects(CUBE[None], size, torch.zeros(1), masks)
+    assert_close(placed.centers_m, center, atol=0.01, rtol=0)
+    assert placed.energy.item() < 0.2
+    wrong = place_objects(CUBE[None], size * 1.4, torch.zeros(1), masks)
+    assert wrong.energy.item() > placed.energy.item() + 0.5
+
+
+def test_a_hidden_half_costs_little():
+    """What reaches further than its mask where something hides it may well be right."""
+    size, center = torch.tensor([[1.0, 0.8, 0.6]]), torch.tensor([[0.2, 0.4, -1.5]])
+    masks = seen(CUBE * size[:, None] + center[:, None])
+    extents, clear = masks.extents.clone(), masks.clear.clone()
+    right = [2, 5, 6]
+    extents[:, right] -= 0.12
+    open_ = place_objects(CUBE[None], size, torch.zeros(1), masks._replace(extents=extents))
+    clear[:, right] = False
+    hidden = Outlines(extents, clear, *masks[2:])
+    placed = place_objects(CUBE[None], size, torch.zeros(1), hidden)
+    assert placed.energy.item() < 0.5 * open_.energy.item()
+    assert_close(placed.centers_m, center, atol=0.02, rtol=0)
+
+
+def test_the_box_that_most_agree_with_wins_over_a_slightly_likelier_one():
+    centers = torch.tensor([[0.0, 0, 0], [3.0, 0, 0], [3.02, 0, 0], [2.98, 0, 0]])
+    placed = Placed(centers, torch.tensor([0.9, 1.0, 1.0, 1.0]))
+    assert likeliest_box(placed, torch.ones(4, 3), torch.arange(4)) == 1
+    lone = placed._replace(energy=torch.tensor([0.0, 9.0, 9.0, 9.0]))
+    assert likeliest_box(lone, torch.ones(4, 3), torch.arange(4)) == 0
+
+
+def test_candidates_are_the_objects_of_decoded_rooms(trained):
+    rough = candidates_of(trained)
+    room, slot = int(rough.room[3]), int(rough.slot[3])
+    decoded = trained.prior(trained.logits[room : room + 1])
+    assert_close(rough.sizes_m[3], decoded.sizes_m[0, slot], rtol=1e-4, atol=1e-5)
+    shaped = with_shapes(trained, rough)
+    surface = (decoded.vertices_m[0, slot] - decoded.centers_m[0, slot]) / decoded.sizes_m[0, slot]
+    directions = icosphere(1)[0]
+    reach = (shaped.points[3] * directions).sum(dim=1)
+    assert_close(reach, (surface @ directions.T).amax(dim=0), rtol=1e-3, atol=1e-4)
+
+
+def test_a_run_whose_rooms_are_all_empty_says_so(trained, images, monkeypatch):
+    monkeypatch.setattr(
+        candidates, "kept_objects", lambda logits, _: torch.zeros_like(logits, dtype=torch.bool)
+    )
+    with pytest.raises(
+        InputError, match=r"All 12 training rooms .* train it longer, or .*\(--fit paper\)"
+    ):
+        answer_images(trained, images)
+
+
+def test_candidates_of_looks_reach_as_far_as_their_meshes(sampler_run):
+    trained = load_run(sampler_run)
+    shaped = with_shapes(trained, candidates_of(trained))
+    room, slot = int(shaped.room[2]), int(shaped.slot[2])
+    decoded = trained.prior(trained.logits[room : room + 1])
+    mesh = trained.prior.shape.mesh(int(decoded.looks[0, slot]), np.array([0.0, 0, 0, 1, 1, 1]))
+    directions = icosphere(1)[0]
+    wanted = (mesh.vertices_m @ directions.numpy().T).max(axis=0)
+    reach = (shaped.points[2] * directions).sum(dim=1)
+    assert_close(reach, torch.from_numpy(wanted).float(), rtol=1e-4, atol=1e-5)
+
+
+def test_a_turned_point_is_where_its_turned_mesh_is():
+    point = torch.tensor([[[0.1, 0.2, 0.5]]])
+    for quarter in range(4):
+        turned = turn_vectors(point, torch.tensor([quarter]))[0, 0].numpy()
+        np.testing.assert_allclose(turned, quarter_rotation(quarter) @ point[0, 0].numpy())
+
+
+def test_answers_have_one_object_a_mask_of_its_class_with_its_mesh_in_its_box(trained, images):
+    answers = answer_images(trained, images)
+    for image, answer in zip(images, answers, strict=True):
+        assert answer.scene.class_indices.tolist() == image.object_class.tolist()
+        for item in answer.scene.objects:
+            low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
+            np.testing.assert_allclose((low + high) / 2, item.center_m, atol=1e-3)
+            np.testing.assert_allclose(high - low, item.size_m, atol=1e-3)
+    alone = answer_images(trained, images[1:2])[0]
+    np.testing.assert_allclose(alone.scene.centers_m, answers[1].scene.centers_m, atol=1e-3)
+    assert alone.energy == pytest.approx(answers[1].energy, abs=1e-3)
+
+
+def test_one_object_and_one_at_the_border(trained, images):
+    """Both have a defined answer: of the second only a corner is in the image."""
+    image = painted((40, 30, 60, 50))
+    classes = images[0].object_class[:1]
+    border = painted((90, 60, 96, 72))
+    for one in (image, border):
+        (answer,) = answer_images(trained, [replace(one, object_class=classes)])
+        (item,) = answer.scene.objects
+        assert np.isfinite([*item.center_m, *item.size_m, answer.energy]).all()
+        assert min(item.size_m) > 0

@@ -1,0 +1,65 @@
+"""What rooms hold: lists of classes, and what they may hang on."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from sceneprior.lifted.sampler.contents import END, Contents
+
+CLASSES, SLOTS = 5, 4
+
+
+@pytest.fixture
+def contents(torch_rng) -> Contents:
+    """Of four classes, of which one is unknown."""
+    found = Contents(CLASSES, 16, 0.0).eval()
+    found.known[[END, 1, 2, 4]] = True
+    return found
+
+
+@torch.no_grad()
+def test_likelihoods_are_those_of_one_class_after_the_other(contents):
+    contents = contents.double()
+    labels = torch.tensor([[1, 2, 1], [4, 0, 0], [0, 0, 0]])
+    extents_m = torch.tensor([[3.0, 4.0], [2.0, 2.0], [5.0, 1.0]]).double()
+    fast = contents.negative_log_likelihood(labels, labels > 0, extents_m)
+    for row, listed in enumerate(([1, 2, 1], [4], [])):
+        slow = 0.0
+        for step in range(len(listed) + 1):
+            counts = torch.tensor(listed[:step], dtype=torch.int64).bincount(minlength=CLASSES)
+            logits = contents(counts.double(), extents_m[row]).log_softmax(dim=-1)
+            slow -= float(logits[(*listed, END)[step]])
+        assert slow == pytest.approx(float(fast[row]), rel=1e-9)
+
+
+def test_lists_are_drawn_as_the_network_says(contents):
+    """Far more rooms than can hang on luck: shares of lists are their probabilities."""
+    count = 20_000
+    uniform = torch.rand(count, SLOTS, generator=torch.Generator().manual_seed(0))
+    extents_m = torch.tensor([[3.0, 4.0]]).expand(count, -1)
+    there = torch.zeros(count, CLASSES)
+    drawn = contents.draw(there, torch.full((count,), SLOTS), extents_m, uniform)
+    assert not (drawn == 3).any(), "nobody knows this class"
+    ended = (drawn == END).cumsum(dim=1) > 0
+    assert not (drawn * ended).any(), "a list has one end"
+    for listed in ([1], [2, 4], [4, 4, 1]):
+        padded = torch.tensor([*listed, *[END] * (SLOTS - len(listed))])
+        share = (drawn == padded).all(dim=1).float().mean()
+        label = torch.tensor([listed])
+        likely = contents.negative_log_likelihood(label, label > 0, extents_m[:1])
+        assert_close(share, (-likely[0]).exp(), atol=0.01, rtol=0)
+
+
+def test_lists_go_on_from_what_is_given_and_keep_to_the_room(contents):
+    count = 500
+    uniform = torch.rand(count, SLOTS, generator=torch.Generator().manual_seed(1))
+    extents_m = torch.tensor([[3.0, 4.0]]).expand(count, -1)
+    there = torch.eye(CLASSES)[2].expand(count, -1)
+    free = torch.arange(count) % (SLOTS + 1)
+    drawn = contents.draw(there, free, extents_m, uniform)
+    assert ((drawn != END).sum(dim=1) <= free).all()
+    assert ((drawn != END).sum(dim=1) == free)[free == 1].any()
+    first = contents(there[0], extents_m[0]).softmax(dim=-1)
+    share = (drawn[free > 0, 0] == END).float().mean()
+    assert_close(share, first[END], atol=0.06, rtol=0)
+    assert there.sum() == count, "what was given stays as it was"

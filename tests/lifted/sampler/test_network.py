@@ -1,0 +1,210 @@
+"""The sampler's network: order does not matter, and likelihoods are those of a plain loop."""
+
+import copy
+
+import pytest
+import torch
+from rooms_of_boxes import sampler_rooms, small_sampler
+from torch.testing import assert_close
+
+from sceneprior.core.geometry.turns import QUARTERS
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.prototypes import turned_looks
+from sceneprior.lifted.sampler.contents import END
+from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
+from sceneprior.lifted.sampler.network import Frame
+from sceneprior.lifted.sampler.placement import BESIDE, EDGES, KNOWN, Placement
+from sceneprior.lifted.sampler.rooms import (
+    SYMMETRIES,
+    SamplerRooms,
+    frames_of,
+    large_first,
+    rectangles_of,
+    shuffled,
+)
+
+
+@pytest.fixture(scope="module")
+def rooms() -> SamplerRooms:
+    return sampler_rooms()
+
+
+@pytest.fixture(scope="module")
+def sampler(rooms):
+    return small_sampler(rooms).double()
+
+
+def in_float64(rooms: RoomBoxes) -> RoomBoxes:
+    return rooms.changed(lambda part: part.double() if part.is_floating_point() else part)
+
+
+def as_they_are(rooms: RoomBoxes) -> torch.Tensor:
+    return torch.zeros(len(rooms.boxes_m), dtype=torch.int64)
+
+
+def read(sampler, rooms: RoomBoxes, rectangle_m: torch.Tensor, coming=None, symmetry=None):
+    if coming is None:
+        coming = torch.zeros(len(rooms.boxes_m), len(sampler.may_meet)).double()
+    frame = Frame(rectangle_m, as_they_are(rooms) if symmetry is None else symmetry)
+    return sampler.read(rooms, coming, frame, sampler.tokens(rooms, rectangle_m))
+
+
+def test_order_and_padding_change_nothing(sampler, rooms):
+    whole = in_float64(rooms.rooms)
+    frame = rectangles_of(whole)
+    plain = read(sampler, whole, frame)
+    order = torch.tensor([[2, 0, 1]]).expand(len(frame), -1)
+    mixed = read(sampler, whole.take(order), frame)
+    assert_close(mixed.context, plain.context)
+    there = torch.take_along_dim(plain.objects, order.unsqueeze(-1), dim=1)
+    assert_close(mixed.objects[mixed.before.is_object], there[mixed.before.is_object])
+    wrong = whole.boxes_m.where(whole.is_object.unsqueeze(-1), 99.0)
+    filled = RoomBoxes(whole.object_class, whole.is_object, wrong, looks=whole.looks)
+    assert torch.equal(read(sampler, filled, frame).context, plain.context)
+
+
+@torch.no_grad()
+def test_likelihoods_are_those_of_one_object_after_the_other(sampler, rooms):
+    whole = in_float64(rooms.rooms)
+    symmetry = torch.arange(len(whole.boxes_m))
+    fast = negative_log_likelihood(sampler, whole, symmetry, torch.Generator().manual_seed(4))
+    generator = torch.Generator().manual_seed(4)
+    listed = shuffled(whole, generator)
+    uniform = torch.rand(whole.is_object.shape, generator=generator).double()
+    mixed = whole.take(large_first(whole.object_class, sampler.footprints_m2, uniform))
+    frames = frames_of(mixed, generator)
+    classes = len(sampler.may_meet)
+    for row in range(len(whole.boxes_m)):
+        one = mixed.changed(lambda part, row=row: part[row : row + 1])
+        frame, count = frames[row : row + 1], int(one.is_object.sum())
+        slow = dict.fromkeys(fast, 0.0)
+        for step in range(count + 1):
+            labels = [*listed.object_class[row, :count].tolist(), END]
+            counts = torch.tensor(labels[:step], dtype=torch.int64).bincount(minlength=classes)
+            logits = sampler.contents(counts[None].double(), frame[:, 2:]).log_softmax(dim=-1)
+            slow["class"] -= float(logits[0, labels[step]])
+        for step in range(count):
+            rest = one.object_class[0, step:count]
+            before = one.changed(lambda part, step=step: part[:, :step])
+            following = one.changed(lambda part, step=step: part[:, step : step + 1])
+            coming = rest.bincount(minlength=classes)[None].double()
+            reading = read(sampler, before, frame, coming, symmetry[row : row + 1])
+            for name, value in sampler.log_prob(reading, following).items():
+                slow[name] -= float(value)
+        for name, value in slow.items():
+            assert value == pytest.approx(float(fast[name][row]), rel=1e-9), name
+
+
+def test_rooms_without_objects_hold_nothing_and_are_likely_for_it(sampler, rooms):
+    nothing = in_float64(rooms.rooms).only(torch.zeros(len(rooms), 1).bool())
+    found = negative_log_likelihood(
+        sampler, nothing, as_they_are(nothing), torch.Generator().manual_seed(0)
+    )
+    assert (found["class"] > 0).all()
+    assert not any(found[name].any() for name in ("look", "size", "place"))
+
+
+def test_how_often_a_look_comes_turns_with_the_room(sampler, rooms):
+    """A look that is likely in a room as it is, is as likely turned where the room is turned."""
+    whole = in_float64(rooms.rooms).changed(lambda part: part[:1])
+    frame = rectangles_of(whole)
+    plain = read(sampler, whole, frame)
+    label = torch.tensor([1])
+    before = sampler.look_logits(plain, label)
+    with torch.no_grad():
+        sampler.frequency[0, 2] += 3.0
+    try:
+        for number in range(SYMMETRIES):
+            shown = torch.tensor([number])
+            reading = plain._replace(frame=Frame(frame, shown))
+            gain = sampler.look_logits(reading, label) - before
+            at = turned_looks(torch.tensor([[2]]), shown % QUARTERS, shown >= QUARTERS)
+            likelier = (gain > 1.5) & before.isfinite()
+            assert likelier.nonzero()[:, 1].tolist() == at[0].tolist()
+    finally:
+        with torch.no_grad():
+            sampler.frequency[0, 2] -= 3.0
+
+
+def test_the_network_knows_what_is_to_come(sampler, rooms):
+    whole = in_float64(rooms.rooms)
+    coming = torch.eye(len(sampler.may_meet)).double()[1].expand(len(rooms), -1)
+    frame = rectangles_of(whole)
+    alone, more = read(sampler, whole, frame).context, read(sampler, whole, frame, coming).context
+    assert not torch.isclose(alone, more).all(dim=-1).any()
+
+
+def test_looks_of_other_classes_are_ruled_out(sampler, rooms):
+    whole = in_float64(rooms.rooms)
+    reading = read(sampler, whole, rectangles_of(whole))
+    logits = sampler.look_logits(reading, torch.full((len(rooms),), 2))
+    assert torch.equal(logits.isfinite(), (sampler.look_class == 2).expand_as(logits))
+
+
+def test_gradients_of_the_likelihood_are_right(rooms):
+    sampler = small_sampler(rooms, width=8).double().requires_grad_(True)
+    two = in_float64(rooms.rooms).changed(lambda part: part[:2])
+
+    def loss(query: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+        changed = {"query": query, "placement.of_object.2.weight": weight}
+        parts = torch.func.functional_call(
+            _Likelihood(sampler), {f"sampler.{k}": v for k, v in changed.items()}, (two,)
+        )
+        return torch.stack(list(parts.values())).sum()
+
+    start = (sampler.query, sampler.placement.of_object[2].weight)
+    leaves = [value.detach().clone().requires_grad_(True) for value in start]
+    assert torch.autograd.gradcheck(loss, leaves, fast_mode=True)
+
+
+class _Likelihood(torch.nn.Module):
+    def __init__(self, sampler):
+        super().__init__()
+        self.sampler = copy.deepcopy(sampler)
+
+    def forward(self, rooms: RoomBoxes) -> dict[str, torch.Tensor]:
+        generator = torch.Generator().manual_seed(0)
+        return negative_log_likelihood(self.sampler, rooms, as_they_are(rooms), generator)
+
+
+def test_places_move_with_the_room():
+    """A rectangle and objects that move by a metre move the places, but for those at the middle of
+    the floor; nothing else does."""
+    torch.manual_seed(0)
+    placement = Placement(8).double()
+    rng = torch.Generator().manual_seed(1)
+    query, objects = (torch.randn(*n, 8, generator=rng).double() for n in ((3,), (3, 2)))
+    size_m = torch.rand(3, 2, generator=rng).double() + 0.2
+    frame = torch.tensor([0.0, 1.0, 4.0, 3.0]).double().expand(3, -1)
+    boxes_m = torch.rand(3, 2, 4, generator=rng).double()
+    here = torch.tensor([[True, True], [True, False], [False, False]])
+    before = placement(query, size_m, frame, objects, boxes_m, here)
+    by = torch.tensor([1.0, -2.0, 0.0, 0.0]).double()
+    after = placement(query, size_m, frame + by, objects, boxes_m + by, here)
+    at_floor = torch.arange(KNOWN) == KNOWN - 1
+    x = ~at_floor.repeat_interleave(KNOWN * EDGES)
+    z = ~at_floor.repeat_interleave(EDGES).repeat(KNOWN)
+    beside = torch.ones(2 * BESIDE, dtype=torch.bool)
+    moves = torch.stack([torch.cat([x, beside]), torch.cat([z, beside])], dim=-1)
+    assert_close(after.means, before.means + by[:2] * moves)
+    assert torch.equal(after.weight_logits, before.weight_logits)
+    assert before.weight_logits[2].isfinite().sum() == KNOWN**2 * EDGES
+
+
+def test_an_object_larger_than_the_rectangle_stands_in_its_middle():
+    placement = Placement(8)
+    nothing = torch.zeros(1, 0, 8), torch.zeros(1, 0, 4), torch.zeros(1, 0, dtype=torch.bool)
+    frame = torch.tensor([[1.0, 2.0, 0.5, 0.5]])
+    # Along either axis three places of the rectangle, and the floor's middle.
+    middles = torch.cartesian_prod(torch.tensor([1.0, 1, 1, 0]), torch.tensor([2.0, 2, 2, 0]))
+    middles = middles.unsqueeze(1)
+    for name, weight in placement.named_parameters():
+        if name.startswith("of_rectangle.2"):
+            torch.nn.init.zeros_(weight)
+    found = placement(torch.randn(1, 8), torch.full((1, 2), 3.0), frame, *nothing)
+    assert_close(found.means, middles.expand(1, -1, EDGES, 2).flatten(1, 2))
+
+
+def test_void_ends_a_room(sampler):
+    assert END == 0
+    assert not (sampler.look_class == END).any()

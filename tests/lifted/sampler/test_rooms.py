@@ -1,0 +1,162 @@
+"""What the sampler learns from: sets of lifted objects, turned and mirrored exactly."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from rooms_of_boxes import CLASSES, lifted_rooms, sampler_rooms
+from torch.testing import assert_close
+
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.lifting.dataset import LiftedDataset
+from sceneprior.lifted.sampler.rooms import (
+    FRAME_M,
+    LOOSELY,
+    SYMMETRIES,
+    SamplerRooms,
+    frames_of,
+    gaps_m,
+    large_first,
+    rectangle_sides,
+    rectangles_of,
+    shared_extents,
+    shuffled,
+    turned_rooms,
+)
+
+
+@pytest.fixture(scope="module")
+def rooms() -> SamplerRooms:
+    return sampler_rooms()
+
+
+def with_looks(lifted: LiftedDataset) -> SamplerRooms:
+    return SamplerRooms(lifted).see_looks(lifted_rooms().find_prototypes(99))
+
+
+def test_objects_without_a_label_or_a_box_are_left_out():
+    lifted = lifted_rooms()
+    lifted.object_classes[0] = 0
+    lifted.boxes[1].explained[2] = 0
+    lifted.boxes[1].sizes_m[2] = 0
+    found = with_looks(lifted).rooms
+    assert found.is_object.sum(dim=1).tolist()[:2] == [1, 2]
+    assert found.object_class[0, 0] == 2
+
+
+def test_other_rooms_take_the_looks_of_the_training_rooms(rooms):
+    other = sampler_rooms(seed=5)
+    assert np.array_equal(other.prototypes.grids, rooms.prototypes.grids)
+    assert other.rooms.looks.max() < 8 * len(rooms.prototypes.grids)
+
+
+def test_a_blank_draw_is_an_empty_room(rooms):
+    batch = rooms.__getitems__([(1, 0), (2, -1)])
+    assert batch.is_object.any(dim=1).tolist() == [True, False]
+    assert batch.room_ids == ("room1", "room2")
+    assert batch.looks is not None
+
+
+def test_rectangles_hold_all_footprints_and_no_more():
+    boxes_m = torch.tensor([[[0.0, 1, 0, 2, 2, 1], [2.0, 1, 1, 1, 1, 1], [9.0, 9, 9, 9, 9, 9]]])
+    here = torch.tensor([[True, True, False]])
+    found = rectangles_of(RoomBoxes(here.long(), here, boxes_m))
+    assert_close(found, torch.tensor([[0.75, 0.5, 3.5, 2.0]]))
+    assert not rectangles_of(RoomBoxes(here.long() * 0, here & False, boxes_m)).any()
+
+
+def test_frames_hold_the_rectangle_and_a_little_more(rooms):
+    generator = torch.Generator().manual_seed(0)
+    low, high = rectangle_sides(rectangles_of(rooms.rooms))
+    outs = []
+    for _ in range(50):
+        frame_low, frame_high = rectangle_sides(frames_of(rooms.rooms, generator))
+        outs += [low - frame_low, frame_high - high]
+    out = torch.cat(outs)
+    assert out.min() >= -1e-5
+    assert_close(out.square().mean().sqrt().item(), FRAME_M, rtol=0.1, atol=0)
+
+
+def test_gaps_to_the_sides_of_a_rectangle():
+    box = torch.tensor([[[0.5, 0.5, 0.0, 1.0, 1.0, 1.0]]])
+    one = RoomBoxes(torch.ones(1, 1, dtype=torch.int64), torch.ones(1, 1, dtype=torch.bool), box)
+    assert gaps_m(one, torch.tensor([[0.0, 0.0, 4.0, 2.0]])).tolist() == [[2.0, 0.5, 1.0, 0.5]]
+
+
+def test_boxes_share_what_they_do_along_each_axis():
+    a = torch.tensor([0.0, 0, 0, 2, 2, 2])
+    b = torch.tensor([1.0, 0, 5, 2, 1, 1])
+    assert shared_extents(a, b).tolist() == [1.0, 1.0, 0.0]
+
+
+def test_symmetries_move_boxes_looks_and_rectangles_together(rooms):
+    batch = rooms.rooms
+    seen = set()
+    for number in range(SYMMETRIES):
+        turned = turned_rooms(batch, torch.full((len(rooms),), number))
+        assert torch.equal(turned.object_class, batch.object_class)
+        sizes = batch.boxes_m[..., 3:].sort(dim=-1).values
+        assert torch.equal(turned.boxes_m[..., 3:].sort(dim=-1).values, sizes)
+        # The look's own extents turn with the box's: the L-shaped sofa has no symmetry.
+        shown = torch.from_numpy(rooms.prototypes.shown())[turned.looks][..., -3:]
+        off = (shown.exp() - turned.boxes_m[..., 3:]).abs() / turned.boxes_m[..., 3:]
+        assert off[turned.is_object].max() < 0.1
+        same = torch.equal(turned.boxes_m, batch.boxes_m) and torch.equal(turned.looks, batch.looks)
+        assert same == (number == 0)
+        seen.add(int(turned.looks[0, 0] % 8))
+    assert len(seen) == SYMMETRIES
+
+
+def test_shuffling_keeps_the_set_and_puts_padding_last(rooms):
+    batch = rooms.rooms
+    mixed = shuffled(batch, torch.Generator().manual_seed(3))
+    counts = batch.is_object.sum(dim=1)
+    assert torch.equal(mixed.is_object, torch.arange(3)[None] < counts[:, None])
+    for row, count in enumerate(counts.tolist()):
+        before, after = (
+            {(int(r.object_class[row, k]), *r.boxes_m[row, k].tolist()) for k in range(count)}
+            for r in (batch, mixed)
+        )
+        assert before == after
+
+
+def test_classes_may_meet_that_do_often_enough():
+    lifted = lifted_rooms(12)
+    for room in (1, 3, 5):  # of six with a third object: its box stands in the second's
+        lifted.boxes[room].centers_m[2] = lifted.boxes[room].centers_m[1]
+    found = with_looks(lifted).may_meet(CLASSES)
+    assert found.nonzero().tolist() == [[2, 3], [3, 2]]
+    lifted.boxes[1].centers_m[2] += 5
+    lifted.boxes[3].centers_m[2] += 5
+    assert not with_looks(lifted).may_meet(CLASSES).any()
+
+
+def test_boxes_that_graze_do_not_meet():
+    lifted = lifted_rooms(2)
+    boxes = lifted.boxes[0]
+    boxes.centers_m[1] = boxes.centers_m[0] + np.array(
+        [(boxes.sizes_m[0, 0] + boxes.sizes_m[1, 0]) / 2 - 0.04, 0, 0]
+    )
+    assert not with_looks(lifted).may_meet(CLASSES).any()
+
+
+def test_rooms_are_drawn_of_common_prototypes_alone(rooms):
+    prototypes = rooms.prototypes._replace(common=np.arange(len(rooms.prototypes.grids)) < 1)
+    prototypes = prototypes._replace(object_class=np.abs(prototypes.object_class))
+    seen = sampler_rooms().see_looks(prototypes)
+    assert seen.prototypes.object_class.tolist()[1:] == [-1] * (len(prototypes.grids) - 1)
+    assert seen.rooms.is_object.any() and (seen.rooms.looks[seen.rooms.is_object] < 8).all()
+
+
+def test_what_is_large_tends_to_come_first_and_padding_comes_last():
+    footprints_m2 = torch.tensor([1.0, 4.0, 1.0, 0.5 / math.exp(LOOSELY)])
+    labels = torch.tensor([[3, 2, 1, 0, 2]]).expand(4000, -1)
+    uniform = torch.rand(labels.shape, generator=torch.Generator().manual_seed(0))
+    ordered = labels.gather(1, large_first(labels, footprints_m2, uniform))
+    assert (ordered[:, 4] == 0).all() and (ordered[:, 3] == 3).all()
+    first = (ordered[:, 0] == 1).float().mean()
+    assert 0.5 < first < 1, "four times as large: mostly"
+    same = torch.tensor([[1, 1]]).expand(4000, -1)
+    swapped = large_first(same, footprints_m2, uniform[:, :2])[:, 0].float().mean()
+    assert abs(swapped - 0.5) < 0.05

@@ -1,0 +1,140 @@
+"""Prototypes: what looks alike in some pose is one, and looks turn as their rooms do."""
+
+import numpy as np
+import pytest
+import torch
+from rooms_of_boxes import CELLS, lifted_rooms
+
+from sceneprior.core.geometry.turns import turn_grids
+from sceneprior.lifted.prototypes import (
+    POSES,
+    choose_prototypes,
+    described,
+    distances,
+    looks_apart,
+    pooled,
+    turn_of,
+    turned_extents,
+    turned_looks,
+)
+
+RNG = np.random.default_rng(0)
+# Nothing in common with itself mirrored or turned.
+ODD = RNG.random((CELLS,) * 3) < 0.5
+SIZE = np.array([2.0, 0.5, 1.0])
+
+
+def in_poses() -> tuple[np.ndarray, np.ndarray]:
+    grids = np.concatenate([turn_grids(ODD[None], *turn_of(pose)) for pose in range(POSES)])
+    return grids, np.concatenate([turned_extents(SIZE[None], pose) for pose in range(POSES)])
+
+
+def test_one_object_in_all_its_poses_is_one_prototype():
+    grids, sizes = in_poses()
+    labels, usable = np.ones(POSES, dtype=np.int64), np.ones(POSES, dtype=bool)
+    found = choose_prototypes(grids, sizes, labels, usable, most=99)
+    assert len(found.grids) == 1
+    looks = found.looks_of(grids, sizes, labels)
+    shown = found.shown()
+    for row, look in enumerate(looks):
+        assert look // POSES == 0
+        assert np.array_equal(turn_grids(found.grids, *turn_of(int(look % POSES)))[0], grids[row])
+        assert np.allclose(shown[look][-3:], np.log(sizes[row]))
+        assert np.allclose(shown[look][:-3], pooled(grids[row : row + 1], 4).ravel())
+
+
+def test_other_classes_and_other_sizes_are_other_prototypes():
+    grids = np.stack([ODD] * 9)
+    sizes = np.stack([SIZE] * 6 + [2 * SIZE] * 3)
+    labels = np.array([1] * 3 + [2] * 6)
+    found = choose_prototypes(grids, sizes, labels, np.ones(9, dtype=bool), most=99)
+    assert sorted(found.object_class.tolist()) == [1, 2, 2]
+    assert found.looks_of(grids, sizes, np.full(9, 3)).tolist() == [-1] * 9  # no such class
+    fewer = choose_prototypes(grids, sizes, labels, np.ones(9, dtype=bool), most=1)
+    assert sorted(fewer.object_class.tolist()) == [1, 2]  # one a class stays
+
+
+def test_an_odd_shape_is_a_prototype_but_no_common_one():
+    grids = np.stack([ODD] * 3 + [~ODD] * 2)
+    sizes, labels = np.stack([SIZE] * 5), np.ones(5, dtype=np.int64)
+    found = choose_prototypes(grids, sizes, labels, np.ones(5, dtype=bool), most=99)
+    assert np.array_equal(found.grids, np.stack([ODD, ~ODD]))
+    assert found.common.tolist() == [True, False]
+    assert (found.looks_of(grids, sizes, labels) // POSES).tolist() == [0, 0, 0, 1, 1]
+    # Of common ones alone, it looks like the one that others share.
+    assert (found.common_alone().looks_of(grids, sizes, labels) // POSES == 0).all()
+    # But a class has at least one.
+    alone = choose_prototypes(grids[:1], sizes[:1], labels[:1], np.ones(1, dtype=bool), most=99)
+    assert alone.common.tolist() == [True]
+
+
+def test_what_is_not_usable_is_no_prototype():
+    lifted = lifted_rooms()
+    sizes = np.concatenate([room.sizes_m for room in lifted.boxes])
+    usable = lifted.object_classes != 3
+    found = choose_prototypes(lifted.grids(), sizes, lifted.object_classes, usable, most=99)
+    assert set(found.object_class.tolist()) == {1, 2}
+
+
+def test_distances_are_those_of_a_loop():
+    grids = RNG.random((3, CELLS, CELLS, CELLS)) < 0.5
+    sizes = RNG.uniform(0.3, 2, (3, 3))
+    ours, pose = distances(described(grids, sizes), described(grids[:2], sizes[:2]))
+    for a in range(3):
+        for b in range(2):
+            each = []
+            for way in range(POSES):
+                there = pooled(turn_grids(grids[b : b + 1], *turn_of(way)), 8)[0]
+                differ = np.log(sizes[a]) - np.log(turned_extents(sizes[b : b + 1], way)[0])
+                here = pooled(grids[a : a + 1], 8)[0]
+                relative = ((here - there) ** 2).sum() / np.sqrt(here.sum() * there.sum())
+                each.append(relative + 0.3 * np.abs(differ).sum())
+            assert ours[a, b] == pytest.approx(min(each), abs=1e-6)
+            assert each[pose[a, b]] == pytest.approx(min(each), abs=1e-6)
+
+
+@pytest.mark.parametrize("layers", [CELLS // 8, CELLS // 2])
+def test_thin_things_are_as_far_apart_as_full_ones(layers):
+    """A floor from a ceiling, or a lower half from an upper one."""
+    both = np.zeros((2, CELLS, CELLS, CELLS), dtype=bool)
+    both[0, :, :layers], both[1, :, -layers:] = True, True
+    sizes = np.ones((2, 3))
+    apart, _ = distances(described(both, sizes), described(both, sizes))
+    assert apart == pytest.approx(np.array([[0, 2], [2, 0]]))
+
+
+@pytest.mark.parametrize("codes", [3, 40])
+def test_codes_are_as_far_apart_as_the_grids_of_looks(codes):
+    grids = RNG.random((4, CELLS, CELLS, CELLS)) < 0.5
+    found = looks_apart(grids, codes)
+    flat = np.concatenate(
+        [
+            turn_grids(grid[None], *turn_of(pose)).reshape(1, -1)
+            for grid in grids
+            for pose in range(8)
+        ]
+    )
+    apart, wanted = (
+        ((each[:, None] - each[None]) ** 2).sum(axis=-1)
+        for each in (found, flat.astype(np.float64))
+    )
+    if codes == 40:  # 32 looks: nothing is left out
+        np.testing.assert_allclose(apart, wanted, rtol=0, atol=0.01)
+        assert not found[:, 31:].round(3).any()
+    else:  # the most that so few numbers can say
+        centred = flat - flat.mean(axis=0)
+        kept = (np.linalg.svd(centred, compute_uv=False)[:codes] ** 2).sum()
+        assert (found**2).sum() == pytest.approx(kept, rel=1e-4)
+        assert (apart < wanted + 0.01).all()
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("quarters", range(4))
+def test_looks_turn_as_grids_do(quarters, mirrored):
+    looks = torch.arange(POSES)[None] + 3 * POSES
+    turned = turned_looks(looks, torch.tensor([quarters]), torch.tensor([mirrored]))[0]
+    assert (turned // POSES == 3).all()
+    for pose, after in enumerate((turned % POSES).tolist()):
+        here = turn_grids(ODD[None], *turn_of(pose))
+        there = turn_grids(here, quarters, mirrored)
+        assert np.array_equal(turn_grids(ODD[None], *turn_of(after)), there)

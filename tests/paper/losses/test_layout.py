@@ -1,0 +1,189 @@
+"""The layout terms against loops in Python floats, and their gradients against differences."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from references import losses as by_hand
+from torch.testing import assert_close
+
+from sceneprior.core.geometry.cameras import boxes_of_points
+from sceneprior.core.geometry.corners import box_corners
+from sceneprior.paper.losses.layout import (
+    box_loss,
+    class_loss,
+    completeness_loss,
+    frustum_loss,
+    layout_losses,
+    take,
+)
+from sceneprior.paper.losses.matching import Matches, match_objects
+
+OVERSHOOT = (1.0, 0.3)
+
+
+def matched(batch, overshoot=1.0) -> Matches:
+    return match_objects(batch.scenes, batch.boxes, batch.views, 5.0, overshoot)
+
+
+def test_take_reorders_predictions_to_the_objects_they_answer_for(batch):
+    matches = matched(batch)
+    boxes = take(batch.boxes.boxes, matches.prediction, dim=2)
+    inside = take(batch.boxes.in_frustum, matches.prediction, dim=2)
+    centers = take(batch.scenes.centers_m, matches.prediction, dim=1)
+    for room in range(3):
+        for item in range(4):
+            slot = int(matches.prediction[room, item])
+            assert torch.equal(centers[room, item], batch.scenes.centers_m[room, slot])
+            assert torch.equal(boxes[room, :, item], batch.boxes.boxes[room, :, slot])
+            assert torch.equal(inside[room, :, item], batch.boxes.in_frustum[room, :, slot])
+
+
+@pytest.mark.parametrize("overshoot", OVERSHOOT)
+def test_all_four_terms_are_their_loops(batch, overshoot):
+    views, scenes = batch.views, batch.scenes
+    matches = matched(batch, overshoot)
+    losses = layout_losses(scenes, batch.boxes, views, matches, overshoot)
+    slot = matches.prediction.tolist()
+    valid = matches.valid.tolist()
+    visible, inside = views.visible.tolist(), batch.boxes.in_frustum.tolist()
+    rooms, count, items = range(3), range(6), range(4)
+    box_counted = [
+        [[visible[r][v][k] and valid[r][k] and inside[r][v][slot[r][k]] for k in items]
+         for v in count] for r in rooms
+    ]  # fmt: skip
+    ray_counted = [
+        [[visible[r][v][k] and valid[r][k] and not inside[r][v][slot[r][k]] for k in items]
+         for v in count] for r in rooms
+    ]  # fmt: skip
+    assert str(box_counted).count("True") > 5 and str(ray_counted).count("True") > 5
+    predicted, observed = batch.boxes.boxes.tolist(), views.boxes.tolist()
+    clear = views.sides_clear.tolist()
+    centers, poses = scenes.centers_m.tolist(), views.world_to_camera.tolist()
+    intrinsics = views.intrinsics.tolist()
+
+    def box(r, v, k):
+        return by_hand.box_distance(
+            predicted[r][v][slot[r][k]], observed[r][v][k], clear[r][v][k], overshoot
+        )
+
+    def ray(r, v, k):
+        x1, y1, x2, y2 = observed[r][v][k]
+        middle = ((x1 + x2) / 2 * 32, (y1 + y2) / 2 * 24)
+        return by_hand.frustum_angle(centers[r][slot[r][k]], poses[r][v], intrinsics[r][v], middle)
+
+    logits = scenes.class_logits.tolist()
+    wanted = {
+        "class": by_hand.class_loss(
+            [[logits[r][slot[r][k]] for k in items] for r in rooms],
+            views.object_class.tolist(),
+            valid,
+        ),
+        "box": by_hand.mean_of_objects(box, box_counted),
+        "completeness": by_hand.completeness_loss(scenes.completeness_logits.tolist(), (4, 2, 3)),
+        "frustum": by_hand.mean_of_objects(ray, ray_counted),
+    }
+    assert list(losses) == list(wanted)
+    for name, loss in losses.items():
+        assert float(loss) == pytest.approx(wanted[name], rel=1e-12), name
+
+
+def test_nothing_seen_is_zero_loss_not_nan(batch):
+    none = torch.zeros_like(batch.views.visible)
+    views = replace(batch.views, visible=none)
+    scenes = replace(batch.scenes, centers_m=batch.scenes.centers_m.clone().requires_grad_())
+    matches = match_objects(scenes, batch.boxes, views)
+    losses = layout_losses(scenes, batch.boxes, views, matches)
+    assert losses["class"] == losses["box"] == losses["frustum"] == 0
+    losses["frustum"].backward()
+    assert (scenes.centers_m.grad == 0).all()
+
+
+def test_box_loss_is_zero_on_the_spot_and_an_occluder_forgives_going_further():
+    observed = torch.tensor([[[[0.2, 0.2, 0.6, 0.6]]]], dtype=torch.float64)
+    counted = torch.ones(1, 1, 1, dtype=torch.bool)
+    clear = torch.tensor([[[[True, True, False, True]]]])
+    assert box_loss(observed, observed, clear, counted, 0.3) == 0
+    further = observed + torch.tensor([0, 0, 0.1, 0])
+    short = observed - torch.tensor([0, 0, 0.1, 0])
+    assert float(box_loss(further, observed, clear, counted, 0.3)) == pytest.approx(0.03)
+    assert float(box_loss(further, observed, clear, counted, 1.0)) == pytest.approx(0.1)
+    assert float(box_loss(short, observed, clear, counted, 0.3)) == pytest.approx(0.1)
+
+
+def test_the_frustum_loss_is_one_minus_the_cosine(batch):
+    """A camera at the origin looks along z; its object is seen straight ahead."""
+    views = replace(
+        batch.views,
+        world_to_camera=torch.eye(4, dtype=torch.float64).expand(3, 6, 4, 4),
+        boxes=torch.tensor([0.4, 0.4, 0.6, 0.6], dtype=torch.float64).expand(3, 6, 4, 4),
+    )
+    counted = torch.zeros(3, 6, 4, dtype=torch.bool)
+    counted[0, 0, 0] = True
+    for angle in (0.0, 0.5, 2.5, math.pi):
+        center = torch.tensor([3 * math.sin(angle), 0, 3 * math.cos(angle)], dtype=torch.float64)
+        loss = frustum_loss(center.expand(3, 4, 3), views, counted)
+        assert float(loss) == pytest.approx(1 - math.cos(angle), abs=1e-12)
+
+
+def test_completeness_wants_ones_for_the_first_n_and_zeros_after(batch):
+    sure = torch.full((3, 5), -30.0, dtype=torch.float64)
+    for room, count in enumerate((4, 2, 3)):
+        sure[room, :count] = 30
+    good = replace(batch.scenes, completeness_logits=sure)
+    assert float(completeness_loss(good, batch.views)) < 1e-12
+    wrong = replace(batch.scenes, completeness_logits=-sure)
+    assert float(completeness_loss(wrong, batch.views)) == pytest.approx(30)
+
+
+def test_every_layout_term_passes_gradcheck(batch):
+    """With the matches held fixed, as in a training step."""
+    views, matches = batch.views, matched(batch)
+    seen = views.visible & matches.valid[:, None]
+
+    def boxes(centers, sizes):
+        corners = box_corners(centers, sizes)
+        return boxes_of_points(corners, views.world_to_camera, views.intrinsics, views.image_size)
+
+    def box(centers, sizes):
+        found = boxes(centers, sizes)
+        predicted = take(found.boxes, matches.prediction, 2)
+        inside = take(found.in_frustum, matches.prediction, 2)
+        return box_loss(predicted, views.boxes, views.sides_clear, seen & inside, 0.3)
+
+    def frustum(centers):
+        return frustum_loss(take(centers, matches.prediction, 1), views, seen)
+
+    def classes(logits):
+        return class_loss(replace(batch.scenes, class_logits=logits), views, matches)
+
+    def completeness(logits):
+        return completeness_loss(replace(batch.scenes, completeness_logits=logits), views)
+
+    scenes = batch.scenes
+    for term, inputs in (
+        (box, (scenes.centers_m, scenes.sizes_m)),
+        (frustum, (scenes.centers_m,)),
+        (classes, (scenes.class_logits,)),
+        (completeness, (scenes.completeness_logits,)),
+    ):
+        leaves = tuple(value.clone().requires_grad_() for value in inputs)
+        (gradient,) = torch.autograd.grad(term(*leaves), leaves[:1])
+        assert gradient.abs().max() > 1e-4, term.__name__
+        assert torch.autograd.gradcheck(term, leaves, eps=1e-7, atol=1e-6), term.__name__
+
+
+def test_turning_the_room_and_its_cameras_together_changes_no_term(batch):
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[0, 0] = turn[2, 2] = 0.0
+    turn[0, 2], turn[2, 0] = 1.0, -1.0
+    before = layout_losses(batch.scenes, batch.boxes, batch.views, matched(batch))
+    views = replace(batch.views, world_to_camera=batch.views.world_to_camera @ turn.T)
+    centers = batch.scenes.centers_m @ turn[:3, :3].T
+    scenes = replace(batch.scenes, centers_m=centers, sizes_m=batch.scenes.sizes_m[..., [2, 1, 0]])
+    corners = box_corners(scenes.centers_m, scenes.sizes_m)
+    boxes = boxes_of_points(corners, views.world_to_camera, views.intrinsics, views.image_size)
+    after = layout_losses(scenes, boxes, views, match_objects(scenes, boxes, views))
+    for name in before:
+        assert_close(after[name], before[name], rtol=0, atol=1e-10)

@@ -1,0 +1,119 @@
+"""Hungarian matching against trying every permutation."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from references.losses import best_assignment, pair_cost
+from torch.testing import assert_close
+
+from sceneprior.paper.losses.matching import match_objects, matching_cost
+
+OVERSHOOT = (1.0, 0.3, 0.0)
+
+
+def costs_by_hand(batch, room, overshoot, box_weight=5.0):
+    views, scenes = batch.views, batch.scenes
+    return [
+        [
+            pair_cost(
+                scenes.class_logits[room, slot].tolist(),
+                batch.boxes.boxes[room, :, slot].tolist(),
+                int(views.object_class[room, item]),
+                views.boxes[room, :, item].tolist(),
+                views.visible[room, :, item].tolist(),
+                views.sides_clear[room, :, item].tolist(),
+                box_weight,
+                overshoot,
+            )
+            for item in range(views.is_object.shape[1])
+        ]
+        for slot in range(scenes.class_logits.shape[1])
+    ]
+
+
+@pytest.mark.parametrize("overshoot", OVERSHOOT)
+def test_costs_are_the_papers_pair_by_pair(batch, overshoot):
+    for weight in (5.0, 0.0):
+        found = matching_cost(batch.scenes, batch.boxes, batch.views, weight, overshoot)
+        for room in range(3):
+            by_hand = torch.tensor(costs_by_hand(batch, room, overshoot, weight)).double()
+            # What padding costs is never asked.
+            count = int(batch.views.is_object[room].sum())
+            assert_close(found[room, :, :count], by_hand[:, :count], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("overshoot", OVERSHOOT)
+def test_no_permutation_is_cheaper(batch, overshoot):
+    matches = match_objects(batch.scenes, batch.boxes, batch.views, 5.0, overshoot)
+    for room, count in enumerate(batch.views.is_object.sum(dim=1).tolist()):
+        cost = [row[:count] for row in costs_by_hand(batch, room, overshoot)[:count]]
+        best, total = best_assignment(cost)
+        mine = matches.prediction[room, :count].tolist()
+        # One-to-one onto the first n predictions alone, though there are five.
+        assert sorted(mine) == list(range(count))
+        assert sum(cost[row][item] for item, row in enumerate(mine)) == pytest.approx(total)
+        seen = batch.views.visible[room, :, :count].any(dim=0).tolist()
+        for item in range(count):
+            if seen[item] and all(seen):
+                assert mine[item] == best[item]
+
+
+def test_the_first_n_predictions_are_used_even_if_a_later_one_is_perfect(batch):
+    """Room 1 has two objects; prediction 4 is made to fit the first of them exactly."""
+    boxes = batch.boxes.boxes.clone()
+    boxes[1, :, 4] = batch.views.boxes[1, :, 0]
+    matches = match_objects(batch.scenes, batch.boxes._replace(boxes=boxes), batch.views)
+    assert set(matches.prediction[1, :2].tolist()) == {0, 1}
+
+
+def test_objects_that_no_drawn_view_sees_and_padding_match_nothing(batch):
+    matches = match_objects(batch.scenes, batch.boxes, batch.views)
+    assert torch.equal(matches.valid, batch.views.is_object & batch.views.visible.any(dim=1))
+    assert not matches.valid[2, 1] and not matches.valid[1, 2:].any()
+    assert (matches.prediction[1, 2:] == 0).all()
+    # Whatever they are said to be, the others are matched as before.
+    classes = batch.views.object_class.clone()
+    classes[2, 1] = (classes[2, 1] + 1) % 6
+    again = match_objects(batch.scenes, batch.boxes, replace(batch.views, object_class=classes))
+    assert torch.equal(again.prediction, matches.prediction)
+
+
+def test_an_unseen_object_leaves_the_best_predictions_to_the_others(batch):
+    matches = match_objects(batch.scenes, batch.boxes, batch.views)
+    cost = costs_by_hand(batch, 2, 1.0)
+    pairs = [(a, b) for a in range(3) for b in range(3) if a != b]
+    best = min(pairs, key=lambda pair: cost[pair[0]][0] + cost[pair[1]][2])
+    assert tuple(matches.prediction[2, [0, 2]].tolist()) == best
+
+
+def test_more_objects_than_slots_says_what_to_set(batch):
+    scenes = batch.scenes
+    few = replace(
+        scenes,
+        class_logits=scenes.class_logits[:, :3],
+        centers_m=scenes.centers_m[:, :3],
+        sizes_m=scenes.sizes_m[:, :3],
+        completeness_logits=scenes.completeness_logits[:, :3],
+    )
+    boxes = type(batch.boxes)(batch.boxes.boxes[:, :, :3], batch.boxes.in_frustum[:, :, :3])
+    message = (
+        "A room holds 4 tracked objects but the prior generates 3; "
+        "set model.max_objects to at least 4."
+    )
+    with pytest.raises(ValueError) as error:
+        match_objects(few, boxes, batch.views)
+    assert str(error.value) == message
+
+
+def test_a_prediction_that_is_no_number_is_left_to_the_loss_to_report(batch):
+    boxes = batch.boxes.boxes.clone()
+    boxes[0, :, 1] = torch.nan
+    matches = match_objects(batch.scenes, batch.boxes._replace(boxes=boxes), batch.views)
+    assert sorted(matches.prediction[0].tolist()) == [0, 1, 2, 3]
+
+
+def test_matching_carries_no_gradient(batch):
+    logits = batch.scenes.class_logits.clone().requires_grad_()
+    matches = match_objects(replace(batch.scenes, class_logits=logits), batch.boxes, batch.views)
+    assert not matches.prediction.requires_grad

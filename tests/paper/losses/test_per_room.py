@@ -1,0 +1,77 @@
+"""Losses of each room alone: what a batch of that one room has."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from sceneprior.core.geometry.cameras import Boxes2D
+from sceneprior.paper.losses.averages import mean_of_objects
+from sceneprior.paper.losses.layout import layout_losses
+from sceneprior.paper.losses.matching import Matches, match_objects
+from sceneprior.paper.losses.shape import mask_loss
+
+
+def only(thing, room: int):
+    """The same batch, of one room."""
+    changes = {
+        item.name: getattr(thing, item.name)[room : room + 1]
+        for item in fields(thing)
+        if isinstance(getattr(thing, item.name), Tensor)
+    }
+    return replace(thing, **changes)
+
+
+@pytest.mark.parametrize("target", ["first_n", "stop"])
+def test_layout_terms(batch, target):
+    matches = match_objects(batch.scenes, batch.boxes, batch.views)
+    found = layout_losses(
+        batch.scenes, batch.boxes, batch.views, matches, 0.3, target, per_room=True
+    )
+    for room in range(3):
+        alone = layout_losses(
+            only(batch.scenes, room),
+            Boxes2D(*(part[room : room + 1] for part in batch.boxes)),
+            only(batch.views, room),
+            Matches(*(part[room : room + 1] for part in matches)),
+            0.3,
+            target,
+        )
+        assert alone.keys() == found.keys()
+        for name, value in alone.items():
+            assert found[name].shape == (3,)
+            assert_close(found[name][room], value, rtol=1e-6, atol=1e-9)
+
+
+def test_mask_term(batch, torch_rng):
+    ids = torch.randint(0, 4, (*batch.views.visible.shape[:2], 6, 8), generator=torch_rng)
+    views = replace(batch.views, instance_ids=ids)
+    matches = match_objects(batch.scenes, batch.boxes, views)
+    shape = (*views.visible.shape[:2], batch.scenes.centers_m.shape[1], 6, 8)
+    rendered = torch.rand(shape, generator=torch_rng, dtype=batch.scenes.centers_m.dtype)
+    found, overlap = mask_loss(rendered, views, matches, 0.2, per_room=True)
+    for room in range(3):
+        mine = Matches(*(part[room : room + 1] for part in matches))
+        alone, told = mask_loss(rendered[room : room + 1], only(views, room), mine, 0.2)
+        assert_close(found[room], alone, rtol=1e-6, atol=1e-9)
+        for name, value in told.items():
+            assert_close(overlap[name][room], value, rtol=1e-6, atol=1e-9)
+
+
+def test_a_gate_below_zero_lets_every_mask_count(batch, torch_rng):
+    ids = torch.randint(0, 4, (*batch.views.visible.shape[:2], 6, 8), generator=torch_rng)
+    views = replace(batch.views, instance_ids=ids)
+    matches = match_objects(batch.scenes, batch.boxes, views)
+    empty = torch.zeros(*views.visible.shape[:2], batch.scenes.centers_m.shape[1], 6, 8)
+    assert mask_loss(empty, views, matches, 0.5)[0] == 0
+    loss, overlap = mask_loss(empty, views, matches, -1.0)
+    assert loss > 0 and overlap["mask_used"] == 1
+
+
+def test_a_room_without_anything_that_counts_is_zero():
+    values = torch.tensor([[1.0, 3.0], [5.0, 7.0]])
+    counted = torch.tensor([[True, True], [False, False]])
+    assert mean_of_objects(values, counted, per_room=True).tolist() == [2.0, 0.0]
+    assert mean_of_objects(values, counted).item() == 2.0

@@ -1,0 +1,143 @@
+"""The mask term: gate, averages, gradients, and no jump where a mask is all but certain."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from references import losses as by_hand
+from torch.testing import assert_close
+
+from sceneprior.paper.losses.matching import match_objects
+from sceneprior.paper.losses.shape import mask_loss, soft_iou
+
+
+def masks(batch, seed=0, sharp=1.0):
+    """Soft masks (rooms, views, slots, 6, 8): the observed ones, blurred and partly wrong. Two
+    rooms have void pixels, with ids above their numbers of objects."""
+    generator = torch.Generator().manual_seed(seed)
+    ids = batch.views.instance_ids
+    matches = match_objects(batch.scenes, batch.boxes, batch.views)
+    rendered = torch.rand(3, 6, 5, 6, 8, generator=generator, dtype=torch.float64)
+    for room, item in matches.valid.nonzero().tolist():
+        slot = int(matches.prediction[room, item])
+        for view in range(0, 6, 2):  # every other view overlaps
+            mine = (ids[room, view] == item + 1).double()
+            rendered[room, view, slot] = 0.15 * rendered[room, view, slot] + 0.8 * mine
+    return rendered, matches
+
+
+@pytest.mark.parametrize("gate", [0.0, 0.3, 0.5, 0.99])
+def test_the_mask_loss_is_its_loop(batch, gate):
+    rendered, matches = masks(batch)
+    views = batch.views
+    loss, log = mask_loss(rendered, views, matches, gate)
+    objects, ious, used = [], [], 0
+    for room, item in matches.valid.nonzero().tolist():
+        slot = int(matches.prediction[room, item])
+        each = []
+        for view in views.visible[room, :, item].nonzero()[:, 0].tolist():
+            known = views.instance_ids[room, view] <= int(views.is_object[room].sum())
+            mine = (rendered[room, view, slot] * known).tolist()
+            observed = (views.instance_ids[room, view] == item + 1).tolist()
+            ious.append(by_hand.iou(mine, observed))
+            passed = ious[-1] > gate
+            used += passed
+            each.append(by_hand.mask_cross_entropy(mine, observed) if passed else 0.0)
+        objects.append(sum(each) / len(each))
+    assert float(loss) == pytest.approx(sum(objects) / len(objects), rel=1e-6)
+    assert float(log["mask_iou"]) == pytest.approx(sum(ious) / len(ious), rel=1e-9)
+    assert float(log["mask_used"]) == pytest.approx(used / len(ious))
+    assert {0.0: used == len(ious), 0.99: used == 0}.get(gate, 0 < used < len(ious))
+
+
+def test_what_a_prediction_covers_of_void_is_neither_punished_nor_rewarded(batch):
+    rendered, matches = masks(batch)
+    ids = torch.where(batch.views.instance_ids == 0, 99, batch.views.instance_ids)
+    views = replace(batch.views, instance_ids=ids)
+    void = ids > views.is_object.sum(dim=1)[:, None, None, None]
+    found = []
+    for over_void in (0.0, 0.6, 1.0):
+        drawn = rendered.where(~void[:, :, None], over_void).requires_grad_()
+        loss, log = mask_loss(drawn, views, matches, 0.3)
+        (slope,) = torch.autograd.grad(loss, drawn)
+        assert slope.any() and not (slope * void[:, :, None]).any()
+        found.append([float(value) for value in (loss.detach(), *log.values())])
+    assert found[0] == found[1] == found[2]
+
+
+def test_the_gate_is_strict_and_lets_no_gradient_through(batch):
+    rendered, matches = masks(batch)
+    views = batch.views
+    room, item = matches.valid.nonzero()[0].tolist()
+    slot = int(matches.prediction[room, item])
+    view = int(views.visible[room, :, item].nonzero()[0])
+    ids = torch.zeros_like(views.instance_ids)
+    ids[room, view, :2, :2] = item + 1
+    rendered = torch.zeros_like(rendered)
+    rendered[room, view, slot, :2, :4] = 0.999  # IoU 4 of 8, a little less
+    rendered[room, view, slot, 0, 0] = 1.0
+    visible = torch.zeros_like(views.visible)
+    visible[room, view, item] = True
+    views = replace(views, instance_ids=ids, visible=visible)
+    exact = float(
+        soft_iou(rendered[room, view, slot][None], (ids[room, view] == item + 1)[None].double())
+    )
+    assert exact == pytest.approx(0.5, abs=1e-3)
+    for gate, passes in ((exact - 1e-9, True), (exact, False)):
+        leaf = rendered.clone().requires_grad_()
+        loss, log = mask_loss(leaf, views, matches, gate)
+        loss.backward()
+        used = float(log["mask_used"].detach())
+        found = (float(loss.detach()) > 0, bool(leaf.grad.any()), used)
+        assert found == (passes, passes, float(passes))
+
+
+def test_mask_loss_passes_gradcheck(batch):
+    rendered, matches = masks(batch)
+    rendered = rendered.clamp(0.02, 0.98)
+
+    def loss_of(corner):  # of every mask: all its pixels enter alike, and would take 7 s
+        whole = rendered.clone()
+        whole[..., :2, :3] = corner
+        return mask_loss(whole, batch.views, matches, 0.3)[0]
+
+    corner = rendered[..., :2, :3].clone().requires_grad_()
+    assert torch.autograd.gradcheck(loss_of, (corner,), eps=1e-7, atol=1e-6)
+
+
+def test_only_visible_pairs_count(batch):
+    rendered, matches = masks(batch)
+    leaf = rendered.requires_grad_()
+    mask_loss(leaf, batch.views, matches, 0.0)[0].backward()
+    for room in range(3):
+        for view in range(6):
+            items = (batch.views.visible[room, view] & matches.valid[room]).nonzero()[:, 0]
+            slots = set(matches.prediction[room, items].tolist())
+            pulled = set(leaf.grad[room, view].flatten(1).any(dim=1).nonzero()[:, 0].tolist())
+            assert pulled == slots
+
+
+def test_certain_masks_pull_no_harder_than_doubtful_ones(batch):
+    """Where a float32 mask rounds to 0 or 1 and is wrong, torch alone would pull with 1e12."""
+    rendered, matches = masks(batch)
+    for value in (0.0, 1.0):
+        certain = rendered.float()
+        certain[..., :1, :1] = value
+        leaf = certain.requires_grad_()
+        loss, _ = mask_loss(leaf, batch.views, matches, 0.0)
+        loss.backward()
+        assert not leaf.grad[..., :1, :1].any()
+        # Other pixels: rendered between 0 and 0.95 of a number from torch.rand.
+        assert 0 < leaf.grad.abs().max() < 10
+
+
+def test_soft_iou_of_nothing_is_zero():
+    empty = torch.zeros(1, 3, 4)
+    assert soft_iou(empty, empty) == 0
+    assert_close(soft_iou(empty + 1, empty + 1), torch.ones(1))
+
+
+def test_views_without_images_are_an_error_that_says_so(batch):
+    rendered, matches = masks(batch)
+    with pytest.raises(ValueError, match="These views have no instance ids; load the data"):
+        mask_loss(rendered, replace(batch.views, instance_ids=None), matches)

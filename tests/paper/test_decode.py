@@ -1,0 +1,156 @@
+"""From decoded batches to scenes: where a scene ends, what is furniture, what is unfolded."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny_runs import tiny_config, tiny_lifted
+
+from sceneprior.apps.config import load_run
+from sceneprior.apps.experiments.evaluate import UNFOLDING_STEPS, read_curves, unfold
+from sceneprior.apps.sample import sample_rooms
+from sceneprior.core.classes import label_set
+from sceneprior.core.scene import Scene
+from sceneprior.core.views import DecodedScenes
+from sceneprior.lifted.prototypes import POSES, Prototypes
+from sceneprior.paper import decode
+from sceneprior.paper.decode import decode_latents, decode_training_rooms, to_rooms
+from sceneprior.paper.prior import ScenePrior
+
+NAMES = label_set("front3d_bedroom")
+
+
+@pytest.fixture
+def decoded(torch_rng) -> DecodedScenes:
+    """Two rooms of four objects of classes 9, 13, 0 (void), 21."""
+    logits = torch.zeros(2, 4, 22)
+    for item, label in enumerate((9, 13, 0, 21)):
+        logits[:, item, label] = 3
+    return DecodedScenes(
+        class_logits=logits,
+        centers_m=torch.rand(2, 4, 3, generator=torch_rng),
+        sizes_m=torch.rand(2, 4, 3, generator=torch_rng) + 0.1,
+        completeness_logits=torch.tensor([[2.0, 0.1, 5.0, 0.3], [1.0, -0.01, 5.0, 5.0]]),
+        vertices_m=torch.rand(2, 4, 6, 3, generator=torch_rng),
+    )
+
+
+@pytest.fixture
+def prior(tmp_path) -> ScenePrior:
+    """Whose meshes have two triangles."""
+    prior = tiny_config(tmp_path).build_prior()
+    prior.shape.faces = torch.tensor([[0, 1, 2], [3, 4, 5]])
+    return prior
+
+
+def scenes_of(*arguments) -> list[Scene]:
+    return [room.scene for room in to_rooms(*arguments)]
+
+
+def labels(scene) -> list[str]:
+    return [item.label for item in scene.objects]
+
+
+def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded, prior):
+    rooms = to_rooms(decoded, prior, "front3d_bedroom", ["a", "b"])
+    assert [room.predictions for room in rooms] == [[0, 1, 3], [0]]
+    assert torch.equal(rooms[0].class_logits, decoded.class_logits[0, [0, 1, 3]])
+    first, second = scenes_of(decoded, prior, "front3d_bedroom", ["a", "b"])
+    assert (first.name, second.name) == ("a", "b")
+    # void is decoded like any class, but is no furniture; what follows it stays.
+    assert labels(first) == ["double_bed", "nightstand", "wardrobe"]
+    # The second ends before its second object, though later ones score high again.
+    assert labels(second) == ["double_bed"]
+    for item, source in zip(first.objects, (0, 1, 3), strict=True):
+        np.testing.assert_array_equal(item.center_m, decoded.centers_m[0, source])
+        np.testing.assert_array_equal(item.size_m, decoded.sizes_m[0, source])
+        np.testing.assert_array_equal(item.mesh.vertices_m, decoded.vertices_m[0, source])
+        np.testing.assert_array_equal(item.mesh.faces, prior.faces)
+
+
+def test_a_stop_flag_ends_a_scene_after_the_object_that_has_it(decoded, prior):
+    stops = replace(
+        decoded, completeness_logits=torch.tensor([[-2.0, 0.1, -5, 3], [-1, -1, -1, -1]])
+    )
+    first, second = scenes_of(stops, prior, "front3d_bedroom", ["a", "b"], "stop")
+    assert labels(first) == ["double_bed", "nightstand"]
+    assert labels(second) == ["double_bed", "nightstand", "wardrobe"]
+
+
+def test_nothing_complete_is_an_empty_room_and_no_vertices_are_boxes(decoded, prior):
+    none = replace(decoded, completeness_logits=-torch.ones(2, 4), vertices_m=None)
+    assert [scene.objects for scene in scenes_of(none, prior, "front3d_bedroom", ["a", "b"])] == [
+        (),
+        (),
+    ]
+    boxes = replace(decoded, vertices_m=None)
+    assert scenes_of(boxes, prior, "front3d_bedroom", ["a", "b"])[0].objects[0].mesh is None
+
+
+def test_looks_become_meshes_in_the_boxes_of_objects_that_are_kept(decoded, tmp_path):
+    grids = np.zeros((2, 8, 8, 8), dtype=bool)
+    grids[0, :, :4] = True  # the lower half of every frame
+    grids[1, :4] = True
+    prior = tiny_lifted(tmp_path).build_prior()
+    prior.shape.learn_prototypes(
+        Prototypes(grids, np.ones((2, 3)), np.array([9, 13]), np.ones(2, dtype=bool))
+    )
+    looks = torch.tensor([[0, POSES, 0, 0], [0, 0, 0, 0]])
+    chosen = replace(decoded, vertices_m=None, looks=looks)
+    scenes = scenes_of(chosen, prior, "front3d_bedroom", ["a", "b"])
+    for item, share in zip(scenes[0].objects, ([1, 0.5, 1], [0.5, 1, 1], [1, 0.5, 1]), strict=True):
+        low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
+        bottom = np.subtract(item.center_m, np.divide(item.size_m, 2))
+        np.testing.assert_allclose(low, bottom, atol=1e-6)
+        np.testing.assert_allclose(high - low, np.multiply(item.size_m, share), atol=1e-6)
+
+
+def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(toy_run, monkeypatch):
+    trained = load_run(toy_run)
+    scenes = sample_rooms(trained, 5, 7)
+    assert [scene.name for scene in scenes] == [f"seed7_000{k}" for k in range(5)]
+    monkeypatch.setattr(decode, "BATCH", 2)
+    again = sample_rooms(trained, 5, 7)
+    for one, other in zip(scenes, again, strict=True):
+        assert labels(one) == labels(other)
+        np.testing.assert_allclose(one.centers_m, other.centers_m, atol=1e-5)
+    for scene in scenes:
+        for item in scene.objects:
+            # Stage 2 has run: meshes, which fill their boxes (fit_box).
+            low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
+            np.testing.assert_allclose(high - low, item.size_m, rtol=1e-4)
+
+
+def test_training_rooms_are_decoded_under_their_own_names(toy_run):
+    trained = load_run(toy_run)
+    decoded = decode_training_rooms(trained)
+    assert [scene.name for scene in decoded] == list(trained.room_ids)
+    z = trained.prior.latent_space(trained.logits)
+    for one, other in zip(decoded, decode_latents(trained, z, ["x"] * len(z)), strict=True):
+        np.testing.assert_array_equal(one.centers_m, other.centers_m)
+
+
+def test_a_run_that_stopped_before_the_shape_stage_gives_boxes(toy_run):
+    trained = replace(load_run(toy_run), stage="layout")
+    scenes = decode_training_rooms(trained)
+    assert all(item.mesh is None for scene in scenes for item in scene.objects)
+
+
+def test_unfolding_walks_from_one_training_room_to_another(toy_run):
+    trained = load_run(toy_run)
+    steps = unfold(trained)
+    assert [scene.name for scene in steps] == [f"step_{k}" for k in range(UNFOLDING_STEPS)]
+    z = trained.prior.latent_space(trained.logits)
+    far = int((z @ z[0]).argmin())
+    rooms = decode_training_rooms(trained)
+    for step, room in ((steps[0], rooms[0]), (steps[-1], rooms[far])):
+        assert labels(step) == labels(room)
+        np.testing.assert_allclose(step.centers_m, room.centers_m, atol=1e-4)
+
+
+def test_curves_are_read_back_by_stage_and_term(toy_run):
+    curves = read_curves(toy_run)
+    assert [epoch for epoch, _ in curves["layout/loss"]] == list(range(20))
+    assert [epoch for epoch, _ in curves["shape/mask_iou"]] == [0, 1, 2]
+    assert "layout/mask" not in curves

@@ -1,0 +1,147 @@
+"""Fitting latents: RMSProp as PyTorch has it, image by image, until nothing moves."""
+
+import itertools
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.nn import functional as F
+from torch.testing import assert_close
+
+from sceneprior.apps.config import load_run
+from sceneprior.core.errors import InputError
+from sceneprior.core.observed_image import as_views, images_of_split, rows_of
+from sceneprior.paper import fit_image as fitting
+from sceneprior.paper.fit_image import (
+    SCHEDULES,
+    FitSchedule,
+    decode_images,
+    fit_latents,
+    view_loss,
+)
+
+SHORT = FitSchedule(steps=12, drop_at=8, patience=0)
+
+
+@pytest.fixture(scope="module")
+def trained(toy_run):
+    return load_run(toy_run)
+
+
+@pytest.fixture(scope="module")
+def views(toy_shards):
+    return as_views(images_of_split(toy_shards, "test", 0)[0], 4)
+
+
+@pytest.fixture(scope="module")
+def start(trained, views):
+    return trained.prior.latent_space(trained.logits[:1]).expand(len(views.is_object), -1)
+
+
+def by_pytorch(trained, views, start, schedule):
+    """The schedule in PyTorch's own words; the best of what it passes through."""
+    x = start.clone().requires_grad_()
+    optimizer = torch.optim.RMSprop([x], lr=schedule.learning_rate)
+    drop = torch.optim.lr_scheduler.MultiStepLR(optimizer, [schedule.drop_at], schedule.decay)
+    passed, scores = [], []
+    for _ in range(schedule.steps):
+        loss = view_loss(trained, decode_images(trained, x, views), views)
+        passed.append(x.detach().clone())
+        scores.append(loss.score)
+        optimizer.zero_grad()
+        loss.total.sum().backward()
+        optimizer.step()
+        drop.step()
+    best = torch.stack(scores).argmin(dim=0)
+    return F.normalize(torch.stack(passed)[best, torch.arange(len(start))], dim=1)
+
+
+def test_it_is_pytorchs_rmsprop_with_the_papers_drop(trained, views, start):
+    fit = fit_latents(trained, views, start, SHORT)
+    assert_close(fit.z, by_pytorch(trained, views, start, SHORT), rtol=1e-4, atol=1e-5)
+    assert_close(fit.z.norm(dim=1), torch.ones(len(start)), rtol=1e-6, atol=0)
+    assert fit.steps.tolist() == [12] * len(start)
+
+
+def test_the_network_stays_as_it_was(trained, views, start):
+    before = {name: value.clone() for name, value in trained.prior.state_dict().items()}
+    fit_latents(trained, views, start, SHORT)
+    assert all(
+        torch.equal(before[name], value) for name, value in trained.prior.state_dict().items()
+    )
+
+
+def test_the_score_never_rises_and_mostly_falls(trained, views, start):
+    with torch.no_grad():
+        before = view_loss(trained, decode_images(trained, start, views), views)
+    fit = fit_latents(trained, views, start, FitSchedule(steps=60, drop_at=40))
+    assert (fit.loss.score <= before.score + 1e-6).all()
+    assert fit.loss.score.mean() < before.score.mean() - 0.05
+
+
+def test_alone_or_among_others_an_image_has_the_same_answer(trained, views, start):
+    together = fit_latents(trained, views, start, SHORT)
+    for row in range(len(start)):
+        alone = fit_latents(trained, rows_of(views, torch.tensor([row])), start[:1], SHORT)
+        # Sums in another order; a matching that is a tie could still tell them apart.
+        assert_close(alone.z[0], together.z[row], rtol=1e-3, atol=1e-4)
+
+
+def test_images_that_do_not_move_stop_early_and_others_go_on(trained, views, start):
+    hopeless = FitSchedule(steps=60, drop_at=50, patience=20, least_gain=2.0)
+    fit = fit_latents(trained, views, start, hopeless)
+    # Nothing gains 200%: down at the first check, done at the second.
+    assert fit.steps.tolist() == [40] * len(start)
+    eager = fit_latents(trained, views, start, replace(hopeless, patience=0))
+    assert eager.steps.tolist() == [60] * len(start)
+    assert (eager.loss.score <= fit.loss.score + 1e-6).all()
+
+
+def test_completeness_takes_no_part(trained, views, start):
+    scenes = decode_images(trained, start, views)
+    other = replace(scenes, completeness_logits=scenes.completeness_logits + 50)
+    one, two = (view_loss(trained, s, views, masks=False).total for s in (scenes, other))
+    assert torch.equal(one, two)
+
+
+def test_images_of_fewer_objects_go_on_when_the_full_ones_are_done(
+    trained, views, start, monkeypatch
+):
+    counts = views.is_object.sum(dim=1)
+    assert counts.min() < counts.max()  # so that those that go on are padded to fewer objects
+    full = {name for name, n in zip(views.room_ids, counts, strict=True) if n == counts.max()}
+    ages = itertools.count(1)
+
+    def staged(trained, scenes, views, *more):
+        """The full images never gain anything, the others do at every step."""
+        loss = view_loss(trained, scenes, views, *more)
+        score = [1.0 if name in full else 1.0 / next(ages) for name in views.room_ids]
+        return loss._replace(score=torch.tensor(score))
+
+    monkeypatch.setattr(fitting, "view_loss", staged)
+    fit = fit_latents(trained, views, start, FitSchedule(50, 20, patience=20, least_gain=0.0))
+    assert fit.steps.tolist() == [40 if name in full else 50 for name in views.room_ids]
+
+
+def test_the_papers_schedule():
+    assert (SCHEDULES["paper"].steps, SCHEDULES["paper"].drop_at) == (1000, 500)
+
+
+def test_without_masks_only_the_layout_counts(trained, views, start):
+    fit = fit_latents(trained, views, start, SHORT, masks=False)
+    assert (fit.loss.mask_iou == 0).all()
+    assert torch.equal(fit.loss.score, fit.loss.total)
+
+
+def test_more_objects_than_the_prior_generates(trained, views, start):
+    many = torch.arange(7) % views.is_object.shape[1]
+    crowded = replace(
+        views,
+        object_class=views.object_class[:, many],
+        is_object=torch.ones(4, 7, dtype=torch.bool),
+        boxes=views.boxes[:, :, many],
+        visible=views.visible[:, :, many],
+        sides_clear=views.sides_clear[:, :, many],
+    )
+    with pytest.raises(InputError, match=r"toy_test_00_view\d shows 7 objects, but .* at most 6"):
+        fit_latents(trained, crowded, start)

@@ -1,0 +1,150 @@
+"""Walks on the sphere: even steps, objects that keep who they are, pictures from one view."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import nn
+
+from sceneprior.apps.config import load_run
+from sceneprior.core.classes import class_colors
+from sceneprior.core.errors import InputError
+from sceneprior.core.views import DecodedScenes
+from sceneprior.paper.decode import decode_latents, decode_rooms
+from sceneprior.paper.interpolate import (
+    TILE,
+    animation,
+    interpolate,
+    mixed_colors,
+    path_latents,
+    strip,
+    write_pictures,
+)
+from sceneprior.paper.latents import LatentCube
+from sceneprior.paper.prior import ScenePrior
+from sceneprior.paper.shape_decoder import ShapeDecoder, ShapeDecoderConfig
+from sceneprior.render.offscreen import open_renderer
+from sceneprior.render.topdown import corner_view, perspective
+
+
+@pytest.fixture(scope="module")
+def trained(toy_run):
+    return load_run(toy_run)
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return open_renderer("software")
+
+
+def test_steps_are_even_and_end_where_they_should(trained):
+    scenes = interpolate(trained, "toy/train_00", "seed:4", 7)
+    z = torch.from_numpy(np.stack([scene.latent for scene in scenes]))
+    angles = torch.acos((z[1:] * z[:-1]).sum(dim=1).clamp(-1, 1))
+    torch.testing.assert_close(angles, angles.mean().expand(6), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(z.norm(dim=1), torch.ones(7))
+    assert [scene.name for scene in scenes] == [f"step_{k:02d}" for k in range(7)]
+    assert [scene.extra["along"] for scene in scenes] == pytest.approx(
+        np.linspace(0, 1, 7), abs=1e-6
+    )
+    assert (scenes[0].extra["from"], scenes[0].extra["to"]) == ("toy/train_00", "seed:4")
+    first = decode_latents(trained, trained.prior.latent_space(trained.logits[:1]), ["step_00"])[0]
+    assert len(first.objects) == len(scenes[0].objects) > 0
+    np.testing.assert_allclose(first.centers_m, scenes[0].centers_m, atol=1e-5)
+
+
+def test_from_a_room_to_itself_nothing_changes(trained):
+    scenes = interpolate(trained, "seed:4", "seed:4", 3)
+    np.testing.assert_allclose(scenes[0].latent, scenes[2].latent, atol=1e-6)
+    np.testing.assert_allclose(scenes[0].centers_m, scenes[2].centers_m, atol=1e-5)
+
+
+def test_opposite_ends_are_a_sentence_and_in_a_cube_no_trouble(trained):
+    start = trained.prior.latent_space(trained.logits[:1])[0]
+    with pytest.raises(InputError) as error:
+        path_latents(trained, start, -start, 5)
+    assert str(error.value) == (
+        "The two ends are opposite points of the sphere, and every great circle leads from one to "
+        "the other; choose another end, or go by way of a third room."
+    )
+
+    cubic = replace(trained, prior=Cubic())
+    z = path_latents(cubic, start, -start, 5)
+    torch.testing.assert_close(z[2], torch.zeros(16), rtol=0, atol=1e-7)
+
+
+class Cubic(ScenePrior):
+    """A prior that has its latent space and nothing else."""
+
+    def __init__(self):
+        nn.Module.__init__(self)
+        self.latent_space = LatentCube(16)
+
+
+class Decoder(ScenePrior):
+    """Three predictions: a bed, one that turns from a table into void, and one past the end."""
+
+    def __init__(self, classes: int):
+        nn.Module.__init__(self)
+        self.classes = classes
+        self.shape = ShapeDecoder(4, ShapeDecoderConfig(width=8, level=0))
+
+    def decode(self, z, with_shape):
+        logits = torch.full((len(z), 3, self.classes), -9.0)
+        logits[:, 0, 9] = 3.0
+        logits[:, 1, 19] = z[:, 0]  # table against void
+        logits[:, 1, 0] = 0.0
+        logits[:, 2, 5] = 3.0
+        return DecodedScenes(
+            logits, torch.zeros(len(z), 3, 3), torch.ones(len(z), 3, 3),
+            torch.tensor([1.0, 1.0, -1.0]).expand(len(z), 3),
+        )  # fmt: skip
+
+
+def test_objects_are_known_by_their_prediction_and_colours_never_jump(trained):
+    path = replace(trained, prior=Decoder(22), stage="layout")
+    z = torch.linspace(2, -2, 101).unsqueeze(1).expand(-1, 16)
+    rooms = decode_rooms(path, z, [str(k) for k in range(101)])
+    assert [room.predictions for room in rooms[:50]] == [[0, 1]] * 50
+    assert [room.predictions for room in rooms[51:]] == [[0]] * 50
+    assert [item.label for item in rooms[0].scene.objects] == ["double_bed", "table"]
+    # Void has no share in a colour; what is certain has its class's.
+    np.testing.assert_allclose(mixed_colors(rooms[0]), class_colors(22)[[9, 19]], atol=2)
+
+    turning = Decoder(22)
+    soft = torch.linspace(-3, 3, 61)
+    decoded = turning.decode(soft.unsqueeze(1).expand(-1, 16), False)
+    decoded.class_logits[:, 1, 0] = -9.0
+    decoded.class_logits[:, 1, 13] = 0.0  # a nightstand turns into a table
+    turning.decode = lambda z, with_shape: decoded
+    turned = decode_rooms(replace(path, prior=turning), z[:61], [""] * 61)
+    assert {room.scene.objects[1].label for room in turned} == {"nightstand", "table"}
+    colors = np.array([mixed_colors(room)[1] for room in turned], dtype=int)
+    ends = np.abs(colors[0] - colors[-1]).max()
+    assert ends > 20 and np.abs(np.diff(colors, axis=0)).max() <= 0.04 * ends + 1
+
+
+def test_pictures_are_taken_from_one_view(trained, renderer, tmp_path):
+    scenes = interpolate(trained, "seed:1", "seed:2", 3)
+    write_pictures(trained, scenes, tmp_path, renderer)
+    z = torch.from_numpy(np.stack([scene.latent for scene in scenes]))
+    height, width = TILE
+    assert Image.open(tmp_path / "strip.png").size == (3 * width, height)
+    rooms = decode_rooms(trained, z, ["a", "b", "c"])
+    view = corner_view([room.scene for room in rooms], TILE)
+    pictures = [perspective(r.scene, renderer, view=view, colors=mixed_colors(r)) for r in rooms]
+    sheet = strip(pictures * 4)  # more than a row
+    assert sheet.shape == (2 * height, 9 * width, 3)
+    np.testing.assert_array_equal(sheet[:height, :width], sheet[:height, 3 * width : 4 * width])
+    assert (sheet[height:, 3 * width :] == 255).all()
+    gif = Image.open(io.BytesIO(animation(pictures)))
+    assert (gif.size, gif.n_frames, gif.info["loop"]) == ((width, height), 4, 0)  # there and back
+    gif.seek(1)
+    # Colours of one palette, within what 255 of them can tell apart.
+    apart = np.abs(np.asarray(gif.convert("RGB"), int) - sheet[:height, width : 2 * width])
+    assert np.quantile(apart, 0.99) <= 12
+    whole = Image.open(tmp_path / "animation.gif")
+    assert whole.n_frames <= 2 * 8 and whole.size == (width, height)

@@ -1,0 +1,132 @@
+"""The latent spaces: the hypersphere with its geodesics, and the cube of ablation c1."""
+
+import math
+
+import pytest
+import torch
+from torch.nn import functional as F
+from torch.testing import assert_close
+
+from sceneprior.paper.latents import LatentCube, LatentSphere
+
+
+def test_latents_are_positive_mixtures_of_unit_anchors_on_the_unit_sphere(torch_rng):
+    sphere = LatentSphere(7, 12, seed=3)
+    assert_close(sphere.anchors.norm(dim=-1), torch.ones(7), rtol=0, atol=1e-6)
+    logits = torch.randn(5, 7, generator=torch_rng)
+    z = sphere(logits)
+    assert_close(z.norm(dim=-1), torch.ones(5), rtol=0, atol=1e-6)
+    for room in range(5):
+        shares = [math.exp(value) for value in logits[room].tolist()]
+        mixed = sum(
+            share / sum(shares) * anchor
+            for share, anchor in zip(shares, sphere.anchors.double(), strict=True)
+        )
+        assert_close(z[room].double(), mixed / mixed.norm(), rtol=0, atol=1e-6)
+
+
+def test_one_overwhelming_logit_is_its_anchor():
+    sphere = LatentSphere(7, 12)
+    assert_close(sphere(50 * torch.eye(7)), sphere.anchors, rtol=0, atol=1e-6)
+
+
+def test_a_constant_added_to_all_logits_changes_nothing(torch_rng):
+    sphere = LatentSphere(7, 12).double()
+    logits = torch.randn(5, 7, generator=torch_rng, dtype=torch.float64)
+    assert_close(sphere(logits + 3.5), sphere(logits), rtol=0, atol=1e-14)
+
+
+def test_anchors_come_from_the_seed_and_travel_with_the_model():
+    assert torch.equal(LatentSphere(7, 12, 3).anchors, LatentSphere(7, 12, 3).anchors)
+    assert not torch.equal(LatentSphere(7, 12, 3).anchors, LatentSphere(7, 12, 4).anchors)
+    assert "anchors" in LatentSphere(7, 12).state_dict()
+    assert not list(LatentSphere(7, 12).parameters())
+
+
+@pytest.mark.parametrize("angle", [1e-8, 1e-4, 0.3, 2.0, 3.1])
+def test_slerp_walks_at_equal_angles_on_the_unit_sphere(torch_rng, angle):
+    start, other = F.normalize(
+        torch.randn(2, 9, generator=torch_rng, dtype=torch.float64), dim=-1
+    ).unbind()
+    across = F.normalize(other - (other @ start) * start, dim=-1)
+    end = math.cos(angle) * start + math.sin(angle) * across
+    along = torch.linspace(0, 1, 6, dtype=torch.float64)
+    path = LatentSphere(7, 9).between(start.expand(6, -1), end.expand(6, -1), along)
+    assert path.shape == (6, 9)
+    assert_close(path[0], start, rtol=0, atol=1e-12)
+    assert_close(path[-1], end, rtol=0, atol=1e-12)
+    assert_close(path.norm(dim=-1), torch.ones(6, dtype=torch.float64), rtol=0, atol=1e-12)
+    chords = (path[1:] - path[:-1]).norm(dim=-1)  # 2 sin(step / 2), exact for small angles, too
+    assert_close(
+        2 * torch.asin(chords / 2), torch.full((5,), angle / 5).double(), rtol=1e-6, atol=0
+    )
+    # In the plane of the two ends.
+    assert (
+        path - (path @ start)[:, None] * start - (path @ across)[:, None] * across
+    ).abs().max() < (1e-12)
+
+
+def test_opposite_points_have_no_shortest_path():
+    start = F.normalize(torch.ones(4), dim=-1)
+    with pytest.raises(ValueError, match="opposite points; any great circle joins them"):
+        LatentSphere(7, 4).between(start[None], -start[None], torch.ones(1))
+
+
+def test_what_the_sphere_knows_of_near_between_and_steps(torch_rng):
+    sphere = LatentSphere(7, 12).double()
+    z = sphere(torch.randn(5, 7, generator=torch_rng, dtype=torch.float64))
+    near = sphere.nearness(z[:2], z)
+    assert near.shape == (2, 5) and near.argmax(dim=1).tolist() == [0, 1]
+    angles = torch.acos(near.clamp(-1, 1))
+    assert_close((z[:2, None] - z).norm(dim=-1), 2 * torch.sin(angles / 2), rtol=0, atol=1e-7)
+    along = torch.tensor([0.2, 0.9], dtype=torch.float64)
+    way = sphere.between(z[:2], z[2:4], along)
+    total = torch.acos((z[:2] * z[2:4]).sum(dim=-1))
+    assert_close(torch.acos((way * z[:2]).sum(dim=-1)), along * total, rtol=0, atol=1e-7)
+    moved = sphere.step(z, 0.3, 4)
+    assert torch.equal(moved, sphere.step(z, 0.3, 4)) and not torch.equal(
+        moved, sphere.step(z, 0.3, 5)
+    )
+    assert_close(moved.norm(dim=-1), torch.ones(5, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert 0.1 < (moved - z).norm(dim=-1).mean() < 0.5  # steps of about 0.3
+
+
+def test_standard_normal_logits_are_spread_uniformly_over_the_cube(torch_rng):
+    cube = LatentCube(12)
+    z = cube(torch.randn(20_000, 12, generator=torch_rng))
+    edge = 2 * cube.half_edge
+    assert z.abs().max() <= cube.half_edge
+    # 240,000 numbers in ten bins: a standard error is 0.0006.
+    shares = torch.histc(z, 10, -cube.half_edge, cube.half_edge) / z.numel()
+    assert (shares - 0.1).abs().max() < 0.003
+    # As long as the sphere's, in the mean square; the decoder scales both alike.
+    assert float(z.square().sum(dim=-1).mean()) == pytest.approx(1, abs=0.01)
+    assert edge == pytest.approx(1.0)  # 2 * sqrt(3 / 12)
+
+
+def test_a_coordinate_of_the_cube_is_the_normal_distribution_function(torch_rng):
+    from scipy.stats import norm
+
+    cube = LatentCube(3)
+    logits = torch.randn(4, 3, generator=torch_rng, dtype=torch.float64)
+    wanted = 2 * torch.from_numpy(norm.cdf(logits.numpy())) - 1
+    assert_close(cube(logits), wanted, rtol=0, atol=1e-12)  # half its edge is sqrt(3 / 3)
+    assert torch.autograd.gradcheck(cube, (logits.requires_grad_(),))
+    assert not cube.state_dict()
+
+
+def test_what_the_cube_knows_of_near_between_and_steps(torch_rng):
+    cube = LatentCube(12)
+    z = cube(torch.randn(50, 12, generator=torch_rng, dtype=torch.float64))
+    near = cube.nearness(z[:2], z)
+    # cdist takes differences of squares for many points: half the digits.
+    assert_close(-near, (z[:2, None] - z).norm(dim=-1), rtol=0, atol=1e-6)
+    along = torch.tensor([0.0, 0.25], dtype=torch.float64)
+    points = cube.between(z[:2], z[2:4], along)
+    assert torch.equal(points[0], z[0])
+    assert_close(points[1], 0.75 * z[1] + 0.25 * z[3])
+    moved = cube.step(z, 0.3, 4)
+    assert torch.equal(moved, cube.step(z, 0.3, 4)) and not torch.equal(moved, cube.step(z, 0.3, 5))
+    assert moved.abs().max() <= cube.half_edge
+    length = (moved - z).norm(dim=-1)
+    assert 0.2 < length.mean() < 0.3  # about 0.3, less what the faces hold back

@@ -1,0 +1,108 @@
+"""Boxes and classes of object features: where they start, and what they can never be."""
+
+import math
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from sceneprior.paper.layout_decoder import LayoutDecoder, above_floor
+
+
+@pytest.mark.parametrize("heads", ["joint", "separate"])
+def test_before_training_all_objects_stand_near_the_floor_centre(torch_rng, heads):
+    torch.manual_seed(0)
+    model = LayoutDecoder(64, 22, heads=heads)
+    # Features leave a LayerNorm: about N(0, 1).
+    layout, shared = model(torch.randn(8, 13, 64, generator=torch_rng))
+    assert layout.class_logits.shape == (8, 13, 22)
+    assert layout.centers_m.shape == layout.sizes_m.shape == (8, 13, 3)
+    assert layout.completeness_logits.shape == (8, 13)
+    assert shared.shape == (8, 13, 128)
+    assert layout.centers_m[..., [0, 2]].abs().max() < 0.3
+    assert_close(layout.sizes_m, torch.full((8, 13, 3), 0.7), rtol=0, atol=0.1)
+    bottom = layout.centers_m[..., 1] - layout.sizes_m[..., 1] / 2
+    assert bottom.min() >= 0 and bottom.max() < 0.3
+    # They are not all alike: objects can part.
+    assert layout.centers_m.std(dim=1).min() > 1e-3
+
+
+@pytest.mark.parametrize("heads", ["joint", "separate"])
+def test_no_box_reaches_below_the_floor_whatever_the_weights(torch_rng, heads):
+    torch.manual_seed(0)
+    model = LayoutDecoder(16, 5, heads=heads).double()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.normal_(0, 2, generator=torch_rng)
+    layout, _ = model(torch.randn(50, 10, 16, generator=torch_rng, dtype=torch.float64))
+    bottom = layout.centers_m[..., 1] - layout.sizes_m[..., 1] / 2
+    assert (bottom >= -1e-9).all() and (bottom.abs() < 1e-9).any() and (bottom > 1).any()
+    assert (layout.sizes_m >= 0).all()
+
+
+def test_without_void_it_is_never_likely_and_the_rest_is_as_it_was(torch_rng):
+    torch.manual_seed(0)
+    model = LayoutDecoder(16, 5)
+    x = torch.randn(3, 4, 16, generator=torch_rng)
+    plain, _ = model(x)
+    model.void = False
+    layout, _ = model(x)
+    assert (layout.class_logits[..., 0] == -torch.inf).all()
+    assert torch.equal(layout.class_logits[..., 1:], plain.class_logits[..., 1:])
+    layout.class_logits.softmax(dim=-1).square().sum().backward()
+    last = model.mlp2[-1].weight
+    assert (last.grad[0] == 0).all() and (last.grad[1:5] != 0).any() and last.grad.isfinite().all()
+
+
+def test_the_layout_is_what_supplement_a_says(torch_rng):
+    """MLP2(MLP1(x)), then SoftPlus on sizes and ReLU on y, one object at a time."""
+    torch.manual_seed(1)
+    model = LayoutDecoder(6, 4).double()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.3 * torch.randn(parameter.shape, generator=torch_rng).double()
+    x = torch.randn(2, 3, 6, generator=torch_rng, dtype=torch.float64)
+    layout, shared = model(x)
+    one, two = model.mlp1, model.mlp2
+    for room in range(2):
+        for item in range(3):
+            hidden = (one[0].weight @ x[room, item] + one[0].bias).clamp(min=0)
+            feature = one[2].weight @ hidden + one[2].bias
+            assert_close(shared[room, item], feature)
+            hidden = (two[1].weight @ feature.clamp(min=0) + two[1].bias).clamp(min=0)
+            out = (two[3].weight @ hidden + two[3].bias).tolist()
+            sizes = [math.log1p(math.exp(value)) for value in out[7:10]]
+            center = [out[4], max(out[5], 0) + sizes[1] / 2, out[6]]
+            found = [
+                *layout.class_logits[room, item].tolist(),
+                *layout.centers_m[room, item].tolist(),
+                *layout.sizes_m[room, item].tolist(),
+                layout.completeness_logits[room, item].item(),
+            ]
+            assert_close(torch.tensor(found), torch.tensor([*out[:4], *center, *sizes, out[10]]))
+
+
+def test_above_the_floor_is_relu_and_keeps_the_gradient_that_lifts():
+    y = torch.tensor([-1.0, -1.0, 0.0, 2.0, 2.0], requires_grad=True)
+    above = above_floor(y)
+    assert torch.equal(above, y.relu())
+    upstream = torch.tensor([-3.0, 3.0, -3.0, -3.0, 3.0])
+    (above * upstream).sum().backward()
+    assert y.grad.tolist() == [-3.0, 0.0, -3.0, -3.0, 3.0]
+
+
+@pytest.mark.parametrize("free", [True, False])
+def test_an_object_on_the_floor_leaves_it_only_if_it_may(free):
+    decoder = LayoutDecoder(8, 4, floor_gradient=free)
+    features = torch.randn(1, 2, 8, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        decoder.mlp2.rows()[-6][1].fill_(-1.0)
+    start = float(decoder(features)[0].centers_m[..., 1].detach().mean())
+    optimizer = torch.optim.Adam(decoder.parameters(), lr=1e-2)
+    for _ in range(200):
+        layout, _ = decoder(features)
+        bottom = layout.centers_m[..., 1] - layout.sizes_m[..., 1] / 2
+        optimizer.zero_grad()
+        (bottom - 2).abs().mean().backward()
+        optimizer.step()
+    assert (float(bottom.detach().mean()) > 1.5) == free and start > 0

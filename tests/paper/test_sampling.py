@@ -1,0 +1,188 @@
+"""Latents of new rooms (seeds, covariances, neighbours), and by the names that users give them."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from sceneprior.apps.config import load_run
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene
+from sceneprior.paper.latents import LatentCube, LatentSphere
+from sceneprior.paper.sampling import (
+    DISTRIBUTIONS,
+    draw_latents,
+    read_latent,
+    sample_latents,
+    sample_logits,
+    write_latents,
+)
+
+MANY = 20_000
+
+
+@pytest.fixture
+def sphere() -> LatentSphere:
+    return LatentSphere(7, 12, seed=1)
+
+
+@pytest.fixture
+def trained(torch_rng) -> torch.Tensor:
+    """Logits of 40 rooms, correlated."""
+    mix = torch.randn(7, 7, generator=torch_rng)
+    return torch.randn(40, 7, generator=torch_rng) @ mix + torch.randn(7, generator=torch_rng)
+
+
+@pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+def test_a_seed_gives_the_same_points_on_the_unit_sphere(sphere, trained, distribution):
+    one = sample_latents(sphere, trained, 9, 3, distribution)
+    assert one.shape == (9, 12)
+    assert_close(one.norm(dim=-1), torch.ones(9), rtol=0, atol=1e-5)
+    assert torch.equal(one, sample_latents(sphere, trained, 9, 3, distribution))
+    assert not torch.equal(one, sample_latents(sphere, trained, 9, 4, distribution))
+
+
+def test_the_papers_distribution_is_standard_normal_whatever_was_trained(trained):
+    drawn = sample_logits(trained, MANY, 0, "paper")
+    assert torch.equal(drawn, sample_logits(100 * trained, MANY, 0, "paper"))
+    assert drawn.mean(dim=0).abs().max() < 0.04
+    assert (drawn.T.cov() - torch.eye(7)).abs().max() < 0.05
+
+
+def test_distributions_that_cannot_be_followed_are_sentences(sphere, trained):
+    with pytest.raises(InputError) as error:
+        sample_latents(sphere, trained, 3, 0, "guess")
+    assert str(error.value) == ("No sampling distribution 'guess'; choose from kernel, paper.")
+    with pytest.raises(InputError) as error:
+        sample_latents(sphere, trained[:1], 3, 0, "kernel")
+    assert str(error.value) == (
+        "The kernel distribution needs the latents of at least 2 training rooms, and this prior "
+        "keeps 1 (a packed one keeps them if packed with --latents); use --distribution paper, or "
+        "leave it out."
+    )
+    assert sample_latents(sphere, trained[:1], 3, 0, "paper").shape == (3, 12)
+
+
+def test_kernel_draws_around_each_training_room_in_turn():
+    generator = torch.Generator().manual_seed(0)
+    trained = 5 * torch.randn(12, 40, generator=generator, dtype=torch.float64)
+    trained -= trained.mean(dim=1, keepdim=True)
+    drawn = sample_logits(trained, 24, seed=0, distribution="kernel")
+    # Twelve points in forty dimensions lie far apart: the nearest is the one drawn around.
+    nearest = torch.cdist(drawn, trained).argmin(dim=1)
+    assert sorted(nearest[:12].tolist()) == sorted(nearest[12:].tolist()) == list(range(12))
+
+
+def test_kernel_stays_in_the_span_of_few_rooms(trained):
+    """Two rooms span a line: draws lie on it."""
+    drawn = sample_logits(trained[:2], 50, 0, "kernel").double()
+    centred = trained[:2].double() - trained[:2].double().mean(dim=1, keepdim=True)
+    along = centred[1] - centred[0]
+    along = along / along.norm()
+    away = drawn - centred[0]
+    assert_close(
+        away - (away @ along)[:, None] * along, torch.zeros(50, 7).double(), rtol=0, atol=1e-5
+    )
+
+
+def test_kernel_does_not_see_what_a_softmax_does_not(sphere, trained, torch_rng):
+    shifted = trained + 5 * torch.randn(40, 1, generator=torch_rng)
+    plain = sphere.double()(sample_logits(trained.double(), 20, 0, "kernel"))
+    moved = sphere(sample_logits(shifted.double(), 20, 0, "kernel"))
+    assert_close(moved, plain, rtol=0, atol=1e-5)
+
+
+def test_kernel_keeps_mean_and_covariance():
+    generator = torch.Generator().manual_seed(0)
+    trained = torch.randn(50, 3, generator=generator, dtype=torch.float64) * torch.tensor([1, 2, 3])
+    centred = trained - trained.mean(dim=1, keepdim=True)
+    drawn = sample_logits(trained, 200_000, seed=0, distribution="kernel")
+    torch.testing.assert_close(drawn.mean(0), centred.mean(0), rtol=0, atol=0.01)
+    torch.testing.assert_close(torch.cov(drawn.T), torch.cov(centred.T), rtol=0.05, atol=0.02)
+
+
+@pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+def test_every_distribution_stays_in_the_cube_and_goes_by_its_seed(trained, distribution):
+    cube = LatentCube(7)
+    one = sample_latents(cube, trained, 9, 3, distribution)
+    assert one.shape == (9, 7) and one.abs().max() <= cube.half_edge
+    assert torch.equal(one, sample_latents(cube, trained, 9, 3, distribution))
+    assert not torch.equal(one, sample_latents(cube, trained, 9, 4, distribution))
+
+
+def test_in_the_cube_a_constant_added_to_the_logits_is_no_freedom(trained):
+    drawn = sample_logits(trained, MANY, 0, "kernel", LatentCube.shift_free).double()
+    wanted = trained.double()
+    spread = wanted.std(dim=0)
+    assert ((drawn.mean(dim=0) - wanted.mean(dim=0)) / spread).abs().max() < 0.04
+    assert ((drawn.T.cov() - wanted.T.cov()) / spread[:, None] / spread).abs().max() < 0.05
+
+
+@pytest.fixture(scope="module")
+def toy_prior(toy_run):
+    return load_run(toy_run)
+
+
+def test_rooms_and_seeds(toy_prior):
+    room = toy_prior.room_ids[3]
+    wanted = toy_prior.prior.latent_space(toy_prior.logits)[3]
+    torch.testing.assert_close(read_latent(toy_prior, room), wanted)
+    drawn, _ = draw_latents(toy_prior, 1, seed=7)
+    assert torch.equal(read_latent(toy_prior, "seed:7"), drawn[0])
+    assert not torch.equal(read_latent(toy_prior, "seed:8"), drawn[0])
+
+
+def rooms_of(z, names):
+    pairs = zip(z.numpy(), names, strict=True)
+    return [Scene(name, "front3d_bedroom", latent=latent) for latent, name in pairs]
+
+
+def test_files(toy_prior, tmp_path):
+    z, names = draw_latents(toy_prior, 4, seed=2)
+    write_latents(tmp_path, rooms_of(z, names))
+    npz = tmp_path / "latents.npz"
+    # Close: a file's vector is normalised once more.
+    torch.testing.assert_close(read_latent(toy_prior, str(npz)), z[0])
+    torch.testing.assert_close(read_latent(toy_prior, f"{npz}:2"), z[2])
+    torch.testing.assert_close(read_latent(toy_prior, f"{npz}:seed2_0003"), z[3])
+    np.save(tmp_path / "one.npy", 5 * z[1].numpy())  # brought back onto the sphere
+    torch.testing.assert_close(read_latent(toy_prior, str(tmp_path / "one.npy")), z[1])
+    (tmp_path / "a.json").write_text(json.dumps(z.tolist()))
+    torch.testing.assert_close(read_latent(toy_prior, f"{tmp_path}/a.json:1"), z[1])
+    (tmp_path / "b.json").write_text(json.dumps({"latents": z.tolist(), "names": list("wxyz")}))
+    torch.testing.assert_close(read_latent(toy_prior, f"{tmp_path}/b.json:y"), z[2])
+
+
+def test_what_is_no_latent_is_a_sentence(toy_prior, tmp_path):
+    def said(text: object) -> str:
+        with pytest.raises(InputError) as error:
+            read_latent(toy_prior, str(text))
+        return str(error.value)
+
+    assert said("house/room") == (
+        "'house/room' is neither a training room of this run (such as toy/train_00), nor "
+        "seed:NUMBER, nor a file of latents (.npz, .npy, .json)."
+    )
+    assert "neither a training room" in said("seed:-1") and "neither" in said(tmp_path)
+    write_latents(tmp_path, rooms_of(torch.eye(16)[:2], "ab"))
+    npz = tmp_path / "latents.npz"
+    assert f"{npz} has no latent '2': it holds 2 and names such as a." == said(f"{npz}:2")
+    assert "has no latent 'c'" in said(f"{npz}:c")
+    np.save(tmp_path / "long.npy", np.ones(17))
+    assert "has a latent of shape (17,), but this prior's have 16 numbers" in said(
+        tmp_path / "long.npy"
+    )
+    np.save(tmp_path / "zero.npy", np.zeros(16))
+    assert "all zeros or holds no numbers" in said(tmp_path / "zero.npy")
+    np.save(tmp_path / "nan.npy", np.full(16, np.nan))
+    assert "all zeros or holds no numbers" in said(tmp_path / "nan.npy")
+    np.save(tmp_path / "deep.npy", np.zeros((2, 2, 16)))
+    assert "holds no latents (ValueError: an array of shape (2, 2, 16))" in said(
+        tmp_path / "deep.npy"
+    )
+    (tmp_path / "bad.json").write_text('{"vectors": []}')
+    assert "holds no latents (ValueError: it has no 'latents')" in said(tmp_path / "bad.json")
+    npz.write_bytes(npz.read_bytes()[:100])
+    assert "holds no latents (" in said(npz)

@@ -1,0 +1,199 @@
+"""The public door: units, settings, errors, and who is in front of whom."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from silhouette_scenes import COMPOSITING, MODES, SIZE, cast, random_scene, sphere_scene
+from torch.testing import assert_close
+from toy_rooms import look_at
+
+from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.render.offscreen.zbuffer import rasterize
+from sceneprior.render.silhouettes.render import (
+    RenderedScene,
+    render_scene,
+    render_silhouettes,
+    sigma_from_ndc,
+)
+
+
+def lumpy_room() -> dict:
+    """Five lumpy balls that hide each other, two cameras that see all of them."""
+    sphere, faces = icosphere(2)
+    sphere = sphere.double()
+    lumps = 1 + 0.3 * torch.sin(4 * sphere[:, :1] + 1) * torch.cos(5 * sphere[:, 1:2])
+    rng = np.random.default_rng(3)
+    places = torch.from_numpy(rng.uniform(-0.8, 0.8, (5, 1, 3)))
+    sizes = torch.from_numpy(rng.uniform(0.2, 0.6, (5, 1, 3)))
+    poses = np.stack([look_at(np.array(eye), np.zeros(3)) for eye in ([0, 0.6, 3.0], [2.5, 1, 1])])
+    lens = torch.tensor([[60.0, 0, 41], [0, 55, 29], [0, 0, 1]], dtype=torch.float64)
+    return {
+        "vertices_m": (sphere * lumps * sizes + places)[None],
+        "faces": faces,
+        "world_to_camera": torch.from_numpy(poses)[None],
+        "intrinsics": lens.expand(1, 2, 3, 3),
+        "image_size": (60, 80),
+    }
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("mode", MODES)
+def test_front_and_depth_are_the_z_buffers(mode, dtype):
+    scene = lumpy_room()
+    vertices = cast(scene, dtype)["vertices_m"].clone().requires_grad_()
+    drawn = render_scene(**cast(scene, dtype) | {"vertices_m": vertices}, mode=mode)
+    assert drawn.front.dtype == torch.int32 and drawn.depth_m.dtype == dtype
+    assert drawn.masks.requires_grad
+    assert not drawn.front.requires_grad and not drawn.depth_m.requires_grad
+    points = scene["vertices_m"][0]
+    joined = torch.cat([scene["faces"] + item * points.shape[1] for item in range(5)]).numpy()
+    for view in range(2):
+        face, depth = rasterize(
+            points.flatten(0, 1).numpy(),
+            joined,
+            scene["world_to_camera"][0, view].numpy(),
+            (60.0, 55.0, 41.0, 29.0),
+            (60, 80),
+        )
+        ids = np.where(face >= 0, face // len(scene["faces"]), -1)
+        assert len(np.unique(ids)) == 6
+        np.testing.assert_array_equal(drawn.front[0, view].numpy(), ids)
+        # The z-buffer keeps 1 / z in float32.
+        np.testing.assert_allclose(drawn.depth_m[0, view].detach().numpy(), depth, rtol=2e-6)
+
+
+def test_a_pixel_centre_on_a_shared_edge_reads_three_quarters_in_the_exact_mode_alone():
+    # Both faces may miss it: 1 - 0.5 * 0.5. Which of them contains it is left to rounding, so
+    # `front` may name nobody there. The fast mode knows one shape, without a crack.
+    square = torch.tensor([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]).double()
+    scene = sphere_scene() | {
+        "vertices_m": square[None, None] * torch.tensor([9, 9, 1]),
+        "faces": torch.tensor([[0, 1, 2], [0, 2, 3]]),
+    }
+    for backend in ("cpu", "reference"):
+        exact = render_scene(**scene, mode="exact", backend=backend)
+        fast = render_scene(**scene, mode="fast", backend=backend)
+        diagonal = exact.masks[0, 0, 0, range(24), range(4, 28)]
+        assert_close(diagonal, torch.full_like(diagonal, 0.75), rtol=0, atol=1e-12)
+        assert (fast.masks == 1).all() and (fast.front == 0).all() and (fast.depth_m == 1).all()
+
+
+def test_masks_are_render_silhouettes_own():
+    scene = random_scene(17, views=2)
+    for mode in MODES:
+        for compositing in COMPOSITING:
+            options = {"mode": mode, "compositing": compositing}
+            drawn = render_scene(**scene, **options)
+            assert isinstance(drawn, RenderedScene)
+            assert torch.equal(drawn.masks, render_silhouettes(**scene, **options))
+            if compositing == "layered" and mode == "exact":  # these are the defaults
+                assert torch.equal(drawn.masks, render_silhouettes(**scene, backend="cpu"))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_sigma_and_blur_in_squared_ndc_are_squared_pixels_by_the_shorter_side(mode):
+    assert sigma_from_ndc(1e-4, (90, 120)) == pytest.approx(0.2025)  # from oracle_silhouettes.md
+    assert sigma_from_ndc(1e-4, (240, 180)) == pytest.approx(0.81)
+    scene = sphere_scene()
+    default = render_silhouettes(**scene, mode=mode)
+    half = min(SIZE) / 2
+    for same in (
+        {"sigma_px2": 1e-4 * half**2},
+        {"sigma_ndc": 1e-4},
+        {"sigma_ndc": 1e-4, "blur_ndc": math.log(1 / 1e-4 - 1) * 1e-4},
+    ):
+        assert_close(render_silhouettes(**scene, mode=mode, **same), default, rtol=0, atol=1e-14)
+    # A blur of r pixels reaches just so far, whatever the sigma. The pixel centre (16, 12) is
+    # away from the outline by more; so is any that is covered by less than exp(-r**2 / sigma).
+    wide = render_silhouettes(**scene, mode=mode, sigma_px2=9.0, compositing="alone")
+    cut = render_silhouettes(
+        **scene, mode=mode, sigma_px2=9.0, blur_ndc=4 / half**2, compositing="alone"
+    )
+    least = 1 / (1 + math.exp(4 / 9))
+    assert (wide[cut == 0] < 1).all() and wide[(wide > 0) & (cut == 0)].numel() > 100
+    assert cut[cut > 0].min() >= least - 1e-12
+    if mode == "fast":
+        kept = (cut > 0) & (cut < 1)
+        assert torch.equal(cut[kept], wide[kept])
+
+
+def test_no_blur_at_all_is_a_hard_mask_in_the_fast_mode():
+    scene = sphere_scene()
+    drawn = render_scene(**scene, mode="fast", blur_ndc=0.0)
+    for item in (0, 1):
+        assert torch.equal(drawn.masks[:, :, item], (drawn.front == item).double())
+
+
+def test_a_vertex_that_is_no_number_names_object_and_room():
+    for value in (math.nan, math.inf, -math.inf):
+        scene = random_scene(0)
+        scene["vertices_m"][1, 2, 3, 0] = value
+        message = r"^object 2 of room 1 has a vertex that is not finite$"
+        with pytest.raises(ValueError, match=message):
+            render_silhouettes(**scene)
+
+
+@pytest.mark.parametrize("which", ["world_to_camera", "intrinsics"])
+def test_a_camera_that_is_no_number_names_view_and_room(which):
+    scene = random_scene(0)
+    scene[which] = scene[which].clone()
+    scene[which][1, 2, 0, 1] = math.nan
+    message = r"^view 2 of room 1 has a pose or intrinsics that is not finite$"
+    with pytest.raises(ValueError, match=message):
+        render_silhouettes(**scene)
+
+
+@pytest.mark.parametrize("corner", [-1, 9])
+def test_a_face_without_its_vertex_is_refused(corner):
+    scene = random_scene(0)
+    scene["faces"][3, 1] = corner
+    message = f"^faces name vertices {min(corner, 0)} to {max(corner, 8)}, but each object has "
+    with pytest.raises(ValueError, match=message + "vertices 0 to 8$"):
+        render_silhouettes(**scene)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "quick"}, "mode is 'quick'; expected exact or fast"),
+        ({"compositing": "soft"}, "compositing is 'soft'; expected layered, paper or alone"),
+        ({"backend": "mps"}, "backend is 'mps'; expected auto, cpu, cuda or reference"),
+        ({"image_size": (0, 8)}, r"image_size is \(0, 8\); both sides must be at least 1"),
+        ({"image_size": (8, -1)}, r"image_size is \(8, -1\); both sides must be at least 1"),
+        ({"sigma_px2": 0.0}, "sigma_px2 is 0.0; it must be positive"),
+        ({"sigma_px2": math.nan}, "sigma_px2 is nan; it must be positive"),
+        ({"sigma_ndc": 0.0}, "sigma_ndc is 0.0; it must be positive"),
+        ({"sigma_ndc": -1e-4}, "sigma_ndc is -0.0001; it must be positive"),
+        ({"blur_ndc": -1e-4}, "blur_ndc is -0.0001; it must not be negative"),
+        ({"blur_ndc": math.nan}, "blur_ndc is nan; it must not be negative"),
+        (
+            {"sigma_px2": 1.0, "sigma_ndc": 1e-4},
+            "sigma_px2 and sigma_ndc are both given; they say the same in two units",
+        ),
+    ],
+)
+def test_wrong_settings_are_named(options, message):
+    for draw in (render_silhouettes, render_scene):
+        with pytest.raises(ValueError, match=f"^{message}$"):
+            draw(**random_scene(0) | options)
+
+
+def test_the_package_exports_the_renderer_and_loads_torch_only_for_it():
+    code = (
+        "import sys\n"
+        "import sceneprior.render.offscreen.zbuffer\n"
+        "assert 'torch' not in sys.modules\n"
+        "from sceneprior.render.silhouettes import (\n"
+        "    RenderedScene, render_scene, render_silhouettes)\n"
+        "for noun in (RenderedScene, render_scene, render_silhouettes):\n"
+        "    assert noun.__module__ == 'sceneprior.render.silhouettes.render'\n"
+        "assert 'triton' not in sys.modules\n"
+        "assert 'sceneprior.render.silhouettes.cpu.backend' not in sys.modules\n"
+        "import sceneprior.render.silhouettes as package\n"
+        "assert not hasattr(package, 'nonsense')\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

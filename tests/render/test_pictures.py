@@ -1,0 +1,53 @@
+"""Contact sheets and painted ids, pixel by pixel."""
+
+import io
+
+import numpy as np
+from PIL import Image
+
+from sceneprior.render.pictures import CAPTION_PX, contact_sheet, paint_ids, png_bytes
+
+
+def plain(height, width, value):
+    return np.full((height, width, 3), value, dtype=np.uint8)
+
+
+def test_tiles_stand_in_rows_and_the_rest_is_white():
+    sheet = contact_sheet([plain(4, 6, 10), plain(2, 6, 20), plain(4, 3, 30)], columns=2)
+    assert sheet.shape == (8, 12, 3) and sheet.dtype == np.uint8
+    assert (sheet[:4, :6] == 10).all() and (sheet[:2, 6:] == 20).all()
+    assert (sheet[4:, :3] == 30).all()
+    assert (sheet[2:4, 6:] == 255).all() and (sheet[4:, 3:] == 255).all()
+    assert contact_sheet([plain(4, 6, 10)], columns=3).shape == (4, 18, 3)
+
+
+def test_gaps_and_captions_are_beside_the_tiles():
+    tiles = [plain(30, 40, 10)] * 3
+    sheet = contact_sheet(tiles, 2, ["one", "two", "three"], gap_px=5)
+    row = 5 + CAPTION_PX + 30
+    assert sheet.shape == (2 * row + 5, 2 * 45 + 5, 3)
+    for top, left in ((row - 30, 5), (row - 30, 50), (2 * row - 30, 5)):
+        assert (sheet[top : top + 30, left : left + 40] == 10).all()
+        assert (sheet[top - CAPTION_PX : top, left : left + 40] < 200).any()
+    assert (sheet[-5:] == 255).all() and (sheet[:, :4] == 255).all()
+
+
+def test_ids_have_their_colours_and_dark_borders():
+    ids = np.array([[0, 0, 1, 1], [0, 0, 1, 1], [2, 2, 2, 2]])
+    picture = paint_ids(ids, np.array([[100, 0, 0], [0, 60, 0]]), (9, 9, 9))
+    assert picture[0].tolist() == [[9, 9, 9], [9, 9, 9], [50, 0, 0], [100, 0, 0]]
+    assert picture[2].tolist() == [[0, 30, 0]] * 4
+
+
+def test_void_is_painted_grey():
+    ids = np.array([[2, 2], [0, 0]])
+    picture = paint_ids(ids, np.array([[100, 0, 0]]), (9, 9, 9))
+    assert picture.tolist() == [[[128, 128, 128]] * 2, [[4, 4, 4]] * 2]
+
+
+def test_a_png_gives_the_picture_back():
+    picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
+    for given in (picture, Image.fromarray(picture)):
+        with Image.open(io.BytesIO(png_bytes(given, compress_level=1))) as read:
+            assert read.format == "PNG"
+            np.testing.assert_array_equal(np.asarray(read), picture)

@@ -1,0 +1,130 @@
+"""Where a metre lands in the picture, and in which colour."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprior.core.classes import class_colors
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.render.offscreen import open_renderer
+from sceneprior.render.topdown import (
+    TopDownProtocol,
+    box_mesh,
+    look_at,
+    perspective,
+    topdown,
+    topdown_protocol,
+    turntable,
+)
+
+BED, LAMP = 9, 14  # rows of double_bed and pendant_lamp in the bedroom label set
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return open_renderer("software")
+
+
+def bedroom(*objects: SceneObject) -> Scene:
+    return Scene("room", "front3d_bedroom", objects)
+
+
+def test_a_cube_covers_exactly_its_pixels_with_x_right_and_z_down(renderer):
+    # 12.5 mm a pixel: 1 m is 80 pixels, and the origin is the corner shared by pixels 255, 256.
+    cube = SceneObject("double_bed", (1.0, 0.5, 2.0), (1.0, 1.0, 1.0))
+    image = topdown(bedroom(cube), renderer)
+    expected = np.full((512, 512, 3), 255, np.uint8)
+    expected[256 + 120 : 256 + 200, 256 + 40 : 256 + 120] = class_colors(22)[BED]
+    np.testing.assert_array_equal(image, expected)
+
+
+def test_what_is_nearest_to_the_ceiling_wins_whatever_the_order(renderer):
+    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (2.0, 0.6, 2.0))
+    lamp = SceneObject("pendant_lamp", (0.0, 2.2, 0.0), (0.5, 0.4, 0.5))
+    image = topdown(bedroom(bed, lamp), renderer)
+    np.testing.assert_array_equal(image, topdown(bedroom(lamp, bed), renderer))
+    assert tuple(image[256, 256]) == tuple(class_colors(22)[LAMP])
+    assert (image == class_colors(22)[BED]).all(-1).sum() == 160**2 - 40**2
+
+
+def test_what_lies_beyond_the_window_is_cut(renderer):
+    outside = SceneObject("desk", (3.2, 0.4, 0.0), (1.0, 0.8, 1.0))
+    image = topdown(bedroom(outside), renderer)
+    assert (image != 255).any(-1).sum() == 40 * 80  # half of the square metre
+
+
+def test_an_empty_room_is_background(renderer):
+    assert (topdown(bedroom(), renderer) == 255).all()
+    assert perspective(bedroom(), renderer, (60, 80)).shape == (60, 80, 3)
+
+
+def test_outlines_only_darken_borders(renderer):
+    scene = bedroom(SceneObject("desk", (0.0, 0.4, 0.0), (1.0, 0.8, 1.0)))
+    plain, lined = topdown(scene, renderer), topdown(scene, renderer, outlines=True)
+    changed = (plain != lined).any(-1)
+    # Four sides of 80 pixels: above and left inside the desk, where they share a corner, below
+    # and right just outside, where they do not meet.
+    assert changed.sum() == 4 * 80 - 1
+    assert (lined[changed] <= 127).all()
+
+
+def test_protocols_hold_the_rooms_they_are_for():
+    assert topdown_protocol("front3d_bedroom").metres_per_pixel == 0.0125
+    assert topdown_protocol("front3d_living").metres_per_pixel == 0.025
+    assert TopDownProtocol().as_dict()["metres_per_pixel"] == 0.0125
+    with pytest.raises(InputError, match="No label set is called 'kitchen'"):
+        topdown_protocol("kitchen")
+
+
+def test_a_box_mesh_is_closed_and_faces_outwards():
+    mesh = box_mesh((1.0, 2.0, 3.0), (2.0, 3.0, 4.0))
+    a, b, c = np.swapaxes(mesh.vertices_m[mesh.faces], 0, 1)
+    # The divergence theorem: signed tetrahedra sum to the volume only if all faces face out.
+    assert np.einsum("fi,fi->f", a, np.cross(b, c)).sum() / 6 == pytest.approx(24.0, abs=1e-12)
+    np.testing.assert_allclose(mesh.vertices_m.min(0), [0.0, 0.5, 1.0])
+    np.testing.assert_allclose(mesh.vertices_m.max(0), [2.0, 3.5, 5.0])
+
+
+def test_look_at_puts_the_target_on_the_axis_and_up_above():
+    eye, target = np.array([3.0, 4.0, 5.0]), np.array([0.0, 1.0, 0.0])
+    matrix = look_at(eye, target)
+    np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1.0)
+    np.testing.assert_allclose(
+        matrix @ [*target, 1], [0, 0, np.linalg.norm(eye - target), 1], atol=1e-12
+    )
+    assert (matrix @ [0.0, 2.0, 0.0, 1])[1] < 0  # a point above the target is higher: y is down
+
+
+def test_the_whole_room_fits_into_the_perspective(renderer):
+    scene = bedroom(
+        SceneObject("wardrobe", (-1.5, 1.0, -1.0), (1.0, 2.0, 0.6)),
+        SceneObject("pendant_lamp", (1.0, 2.4, 1.0), (0.5, 0.5, 0.5)),
+    )
+    image = perspective(scene, renderer, (120, 160))
+    rows, columns = np.nonzero((image != 255).any(-1))
+    # 4% of air, half of it on each side, in the direction that is the tighter one.
+    fill = (np.ptp(rows) + 1) / 120, (np.ptp(columns) + 1) / 160
+    assert max(fill) == pytest.approx(0.96, abs=0.02)
+    assert rows.min() + rows.max() == pytest.approx(119, abs=2)
+    assert columns.min() + columns.max() == pytest.approx(159, abs=2)
+
+
+def test_a_turntable_goes_once_round_at_one_scale(renderer):
+    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
+    lamp = SceneObject("pendant_lamp", (1.0, 2.0, 0.0), (0.3, 0.3, 0.3))
+    scene = Scene("room", "front3d_bedroom", (bed, lamp))
+    pictures = turntable(scene, renderer, count=4, image_size=(60, 80))
+    assert len(pictures) == 4 and {picture.shape for picture in pictures} == {(60, 80, 3)}
+    assert len({picture.tobytes() for picture in pictures}) == 4
+    # Nothing is cut off, and somewhere the room comes near the picture's edge.
+    shown = [np.argwhere((picture != 255).any(axis=-1)) for picture in pictures]
+    low, high = np.concatenate(shown).min(axis=0), np.concatenate(shown).max(axis=0)
+    assert (low >= 1).all() and (high <= [58, 78]).all()
+    assert min(low[0], low[1], 59 - high[0], 79 - high[1]) <= 3
+    # Half way round, what was in front of the bed is behind it: the same floor from the other side.
+    half = turntable(replace(scene, objects=(bed,)), renderer, count=2, image_size=(60, 80))
+    apart = np.abs(half[0].astype(int) - half[1]).max(axis=-1)
+    assert (apart > 40).mean() < 0.02  # the bed and its floor look the same from both sides
