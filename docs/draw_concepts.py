@@ -28,25 +28,25 @@ from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
 from data_prep.inspection.pictures import draw_view
-from sceneprior.classes import class_colors, label_set
-from sceneprior.data.dataset import FlatViews
-from sceneprior.generation.decode import decode_latents
-from sceneprior.generation.interpolate import interpolate
-from sceneprior.generation.sample import latent_of
-from sceneprior.geometry.cameras import project
-from sceneprior.geometry.meshes import icosphere, place
-from sceneprior.losses.matching import match_objects, matching_cost
-from sceneprior.losses.shape import soft_iou
-from sceneprior.models.latents import LatentSphere
-from sceneprior.offscreen import Renderer, open_renderer
-from sceneprior.pictures import contact_sheet, paint_ids, png_bytes
-from sceneprior.shards import RoomViews, Shard, thinned
-from sceneprior.silhouettes import render_silhouettes
-from sceneprior.topdown import corner_view, perspective
-from sceneprior.training.method import TrainedPrior
-from sceneprior.training.objective import proxy_boxes
-from sceneprior.viewer.latent_map import make_map
-from sceneprior.views import SceneViews
+from sceneprior.apps.viewer.latent_map import make_map
+from sceneprior.core.classes import class_colors, label_set
+from sceneprior.core.data.dataset import FlatViews
+from sceneprior.core.geometry.cameras import project
+from sceneprior.core.geometry.meshes import icosphere, place
+from sceneprior.core.shards import RoomViews, Shard, thinned
+from sceneprior.core.views import SceneViews
+from sceneprior.paper.decode import decode_latents
+from sceneprior.paper.interpolate import interpolate
+from sceneprior.paper.latents import LatentSphere
+from sceneprior.paper.losses.matching import match_objects, matching_cost
+from sceneprior.paper.losses.shape import soft_iou
+from sceneprior.paper.sampling import latent_of
+from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.view_loss import proxy_boxes
+from sceneprior.render.offscreen import Renderer, open_renderer
+from sceneprior.render.pictures import contact_sheet, paint_ids, png_bytes
+from sceneprior.render.silhouettes import render_silhouettes
+from sceneprior.render.topdown import corner_view, perspective
 
 ROOM = "ec8d5242-490a-5e93-abcb-dabba44460e2_MasterBedroom-1031"
 OTHER_ROOM = "64d75c66-85a5-5a21-babd-22c310a1ae1d_MasterBedroom-1175"
@@ -58,7 +58,7 @@ OF_THE_BED = [22, 2, 10, 12, 14, 17, 18, 30, 31, 33]
 MASK_STEP = 4  # masks are compared at 120 x 90, the paper's size
 LAMBDA_B = 5.0  # of Eq. S2
 STEPS, RATE_M = 60, 0.02
-"""Of the descent of the sphere's vertices."""
+"""Number of steps and learning rate (metres) when the sphere's vertices are fitted."""
 PULL = 20.0  # metres of arrow for a gradient of 1 / m
 
 
@@ -234,14 +234,14 @@ def views_of(room: RoomViews, numbers: list[int]) -> SceneViews:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """A figure as `write` writes pictures."""
+    """Write a figure as `write` writes pictures."""
     buffer = io.BytesIO()
     figure.savefig(buffer)
     write(np.asarray(Image.open(buffer).convert("RGB")), path)
 
 
 def write(picture: np.ndarray, path: Path) -> None:
-    """As a PNG of 255 colours, which is a third as large."""
+    """Write a picture as a PNG of 255 colours, a third of the size of full colour."""
     few = Image.fromarray(picture).quantize(255, dither=Image.Dither.NONE)
     path.write_bytes(png_bytes(few, optimize=True))
 

@@ -5,7 +5,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from typer.main import get_command
 
-from sceneprior.cli import app
+from sceneprior.apps.cli.commands import app
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
