@@ -51,9 +51,6 @@ def label_set(name: str) -> tuple[str, ...]:
 
         >>> label_set("void,bed,night stand")
         ('void', 'bed', 'night stand')
-
-    Raises:
-        InputError: no label set has this name, or the list is invalid.
     """
     if name.startswith(_OWN):
         return own_label_set(name.split(",")[1:])
@@ -66,12 +63,7 @@ def label_set(name: str) -> tuple[str, ...]:
 
 
 def own_label_set(names: Sequence[str]) -> tuple[str, ...]:
-    """Check a user's list of class names, given without `void`, and prepend `void`.
-
-    Raises:
-        InputError: the list is empty, or a name is empty, too long, repeated, or has a comma or
-            unprintable characters.
-    """
+    """Check a user's list of class names, given without `void`, and prepend `void`."""
     classes = ("void", *names)
     for name in classes:
         if name != name.strip() or not 0 < len(name) <= _LONGEST_NAME or not name.isprintable():

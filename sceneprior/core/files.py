@@ -24,10 +24,7 @@ def write_whole(path: Path, content: bytes | str | Callable[[Path], object]) -> 
 
     The content is written to `<name>.<random>.part` in the same folder, synced to disk, and
     renamed. A killed process leaves at most such a `.part` file, which `remove_parts` deletes.
-
-    Args:
-        path: File to write; missing folders are created.
-        content: Bytes, a text (UTF-8), or a function that writes to the path it gets.
+    Missing folders are created. `content` may be a function that writes to the path it gets.
 
     Raises:
         OSError: the file cannot be written; `filename` is set, and an existing file is unchanged.
@@ -82,8 +79,7 @@ def remove_parts(folder: Path) -> None:
 def check_writable(path: Path) -> None:
     """Check that a file or folder can be written, before the work whose result it will hold.
 
-    Raises:
-        OSError: it cannot be written; `filename` is set.
+    The `OSError` of one that cannot be written names it.
     """
     path = Path(path)
     folder = path if path.is_dir() else path.parent
@@ -104,10 +100,6 @@ def only_writer(folder: Path) -> Iterator[None]:
     """Lock a folder for writing by this process, and create it if it is missing.
 
     Folders created here are removed again if they stay empty.
-
-    Raises:
-        InputError: another process holds the lock.
-        OSError: the folder cannot be created.
     """
     folder = Path(folder)
     made = _missing_folders(folder)
@@ -169,11 +161,7 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        InputError: the file cannot be read, or is not JSON.
-    """
+    """Read a JSON file."""
     try:
         return json.loads(path.read_bytes())
     except OSError as error:

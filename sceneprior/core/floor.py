@@ -8,11 +8,7 @@ from sceneprior.core.scene import Scene
 
 
 def floor_polygon(scene: Scene) -> shapely.Geometry | None:
-    """Polygon of a scene's floor; None if the scene has no outline.
-
-    Raises:
-        InputError: the outline encloses no area.
-    """
+    """Polygon of a scene's floor; None if the scene has no outline."""
     if scene.floor_m is None:
         return None
     outline = np.asarray(scene.floor_m, dtype=np.float64)

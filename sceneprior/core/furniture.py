@@ -22,11 +22,7 @@ CATEGORY_TABLE = Path(__file__).with_name("front3d_categories.csv")
 
 
 def model_info_path(folder: Path, option: str = "--future") -> Path:
-    """Path of 3D-FUTURE's list of models; `option` is the command-line option named in errors.
-
-    Raises:
-        InputError: the folder is missing, or has no list.
-    """
+    """Path of 3D-FUTURE's list of models; `option` is the command-line option named in errors."""
     if not folder.is_dir():
         raise InputError(f"No folder at {folder}; {option} names the folder of 3D-FUTURE models.")
     for name in ("model_info.json", "model_info_revised.json"):
@@ -39,11 +35,7 @@ def model_info_path(folder: Path, option: str = "--future") -> Path:
 
 
 def model_categories(folder: Path, option: str = "--future") -> dict[str, str]:
-    """Category by model id: lower case, "a / b" as "a/b"; "others" if the release has null.
-
-    Raises:
-        InputError: the folder is missing, or is not 3D-FUTURE's.
-    """
+    """Category by model id: lower case, "a / b" as "a/b"; "others" if the release has null."""
     path = model_info_path(folder, option)
     data = read_json(path)
     try:
@@ -108,11 +100,7 @@ def class_of_category(category: str, label_set_name: str) -> str:
 
 
 def read_obj(path: Path) -> Mesh:
-    """Read the triangles of a Wavefront OBJ, without materials, normals and unused vertices.
-
-    Raises:
-        InputError: the file cannot be read, or holds no triangle.
-    """
+    """Read the triangles of a Wavefront OBJ, without materials, normals and unused vertices."""
     vertices: list[list[str]] = []
     polygons: list[list[str]] = []
     try:

@@ -25,14 +25,8 @@ def reference_scenes(
 ) -> list[Scene]:
     """Ground-truth rooms of a split, in the order of the shards.
 
-    Args:
-        shards: Folder of view shards with ground truth; meshes lie in its `models/`.
-        tracked_only: Leave out furniture that no camera saw, for comparison with decoded training
-            rooms.
-        meshes: Also read the meshes; boxes alone take much less memory.
-
-    Raises:
-        ShardError: a shard, the ground truth or a model file is missing or damaged.
+    `tracked_only` leaves out furniture that no camera saw, for comparison with decoded training
+    rooms. Without `meshes`, objects are boxes, which take much less memory.
     """
     return [
         reference_scene(*room, shards, tracked_only, meshes)
@@ -72,9 +66,6 @@ def independent_rooms(
     independent of each other.
 
     `with_meshes` keeps the real meshes, a stronger baseline; otherwise objects are boxes.
-
-    Raises:
-        InputError: no real room holds an object.
     """
     pool = [item for scene in real for item in scene.objects]
     if not pool:
@@ -99,11 +90,7 @@ def shuffled_rooms(real: Sequence[Scene], count: int, seed: int) -> list[Scene]:
     """Real rooms with shuffled positions: a baseline with real contents but random layouts.
 
     Each object, as a box, takes the x and z of an object drawn at random from all rooms, and keeps
-    its own height.
-
-    Args:
-        real: Rooms with at least one object in total.
-        count: Number of rooms, drawn without replacement; at most as many as there are real ones.
+    its own height. The rooms are drawn without replacement.
     """
     generator = np.random.default_rng(seed)
     places = [item.center_m for scene in real for item in scene.objects]
@@ -177,11 +164,7 @@ def model_path(shards: Path, model_id: str) -> Path:
 
 @lru_cache(maxsize=4096)
 def read_model(path: Path) -> Mesh:
-    """Read a model of a folder of shards (`model_path`) in its own frame.
-
-    Raises:
-        ShardError: the file is missing or damaged.
-    """
+    """Read a model of a folder of shards (`model_path`) in its own frame."""
     if not path.is_file():
         raise ShardError(
             f"{path} is missing, but a room's ground truth stands on it. Keep `models/` beside "

@@ -54,9 +54,7 @@ class LogisticMixture(NamedTuple):
     ) -> Float[Tensor, "*batch draws numbers"]:
         """Sample several values per mixture by inverse transform of uniform numbers.
 
-        Args:
-            choice: Uniform numbers that choose the components.
-            place: Uniform numbers, the quantiles within the chosen components.
+        `choice` chooses the components, `place` the quantiles within them.
         """
         logits = self.weight_logits.unsqueeze(-2).expand(*choice.shape, -1)
         chosen = draw_index(logits, choice).unsqueeze(-1)

@@ -45,16 +45,7 @@ class ObservedImage:
 
 
 def image_of_room(room: RoomViews, view: int, label_set: str) -> ObservedImage:
-    """Extract one view of a room, reduced to the objects visible in it.
-
-    Args:
-        room: Room that was read with its images.
-        view: Index of the view.
-        label_set: Label set of the room's classes.
-
-    Raises:
-        InputError: the room has no such view, or the view shows no object.
-    """
+    """Extract one view of a room read with its images, reduced to the objects visible in it."""
     if not 0 <= view < (count := len(room.visible)):
         raise InputError(
             f"Room {room.room_id} has no view {view}; its {count} views are 0 to {count - 1}."
@@ -85,12 +76,7 @@ def image_of_room(room: RoomViews, view: int, label_set: str) -> ObservedImage:
 
 
 def image_from_shards(folder: Path, room_id: str, view: int) -> ObservedImage:
-    """Read one view of a room of the test or train split.
-
-    Raises:
-        InputError: neither split holds the room; or see `image_of_room`.
-        ShardError: a shard is missing or damaged.
-    """
+    """Read one view of a room of the test or train split."""
     found: list[str] = []
     for split in ("test", "train"):
         if not any((Path(folder) / split).glob("*.h5")):
@@ -111,18 +97,8 @@ def images_of_split(
     """Sample views of each room of a split from those that show an object.
 
     The views of a room depend on the seed and its id alone, not on other rooms; with a larger
-    `views`, further views are added.
-
-    Args:
-        limit: Number of rooms to read, from the first.
-        views: Views per room, or all of them if there are fewer.
-
-    Returns:
-        The images, and the ids of the rooms left out because no view shows an object.
-
-    Raises:
-        ShardError: a shard is missing or damaged.
-        InputError: no view of any room shows an object.
+    `views` per room, further views are added. Also returns the ids of the rooms left out because no
+    view shows an object.
     """
     images: list[ObservedImage] = []
     blank: list[str] = []
@@ -142,15 +118,8 @@ def images_of_split(
 
 
 def as_views(images: Sequence[ObservedImage], mask_step: int) -> SceneViews:
-    """Stack images into a batch: one room with one view each, padded to the largest object count.
-
-    Args:
-        images: At least one, all of one size.
-        mask_step: Downsampling step of the instance ids: a run's `data.mask_step`.
-
-    Raises:
-        InputError: the images differ in size.
-    """
+    """Stack images of one size into a batch: one room with one view each, padded to the largest
+    object count."""
     sizes = sorted({image.instance_ids.shape for image in images})
     if len(sizes) > 1:
         raise InputError(

@@ -89,9 +89,6 @@ def match_scenes(decoded: Scene, truth: Scene) -> SceneMatch:
         cost = 1 - IoU + 0.01 * (distance of the centres in metres)
 
     Classes are ignored, so that class accuracy is not measured on pairs chosen by class.
-
-    Raises:
-        InputError: the scenes use different label sets.
     """
     from scipy.optimize import linear_sum_assignment
 

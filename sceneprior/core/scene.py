@@ -64,11 +64,7 @@ class Mesh:
 
 
 def mesh_of_file(vertices_m: np.ndarray, faces: np.ndarray) -> Mesh:
-    """Check a mesh read from a file: a valid `Mesh` with at least one triangle.
-
-    Raises:
-        InputError: it is not a valid mesh, or has no triangle.
-    """
+    """Check a mesh read from a file: a valid `Mesh` with at least one triangle."""
     mesh = Mesh(np.asarray(vertices_m), np.asarray(faces))
     if not len(mesh.faces):
         raise InputError("A mesh has no triangle.")
@@ -263,12 +259,7 @@ class _SceneEntry(_Entry):
 
 
 def read_scene(path: Path) -> Scene:
-    """Read a scene's JSON.
-
-    Raises:
-        InputError: the file is missing, not JSON, not of this format, names unknown classes, or
-            has implausible numbers.
-    """
+    """Read a scene's JSON."""
     path = Path(path)
     data = read_json(path)
     try:
@@ -311,12 +302,7 @@ def read_scene(path: Path) -> Scene:
 
 
 def check_box(path: Path, label: str, center_m: Sequence[float], size_m: Sequence[float]) -> None:
-    """Reject an implausible box; all readers of boxes use this check.
-
-    Raises:
-        InputError: a number is not finite, a side is not positive, or the box is so large or so far
-            from the floor's centre that its unit must be wrong.
-    """
+    """Reject an implausible box; all readers of boxes use this check."""
     said = f"{path}: a {label} has centre {[*center_m]} and size {[*size_m]}"
     if not np.isfinite([*center_m, *size_m]).all() or min(size_m) <= 0:
         raise InputError(f"{said}; expected finite metres, and sizes above 0.")
@@ -328,11 +314,7 @@ def check_box(path: Path, label: str, center_m: Sequence[float], size_m: Sequenc
 
 
 def check_floor(path: Path, outline_m: np.ndarray) -> None:
-    """Reject an implausibly large floor outline.
-
-    Raises:
-        InputError: a corner is not finite, or too far from the floor's centre.
-    """
+    """Reject an implausibly large floor outline."""
     far = np.abs(outline_m).max(initial=0)
     if not far <= FARTHEST_M:
         raise InputError(

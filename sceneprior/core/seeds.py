@@ -7,10 +7,6 @@ LARGEST_SEED = 2**32 - 1
 
 
 def check_seed(seed: int) -> None:
-    """Check that a seed is in the valid range.
-
-    Raises:
-        InputError: the seed is below 0 or above `LARGEST_SEED`.
-    """
+    """Check that a seed is in the valid range."""
     if not 0 <= seed <= LARGEST_SEED:
         raise InputError(f"The seed is {seed}; expected a whole number from 0 to {LARGEST_SEED}.")

@@ -92,9 +92,6 @@ def find_config(name: str) -> Path:
 
     A name has a folder, as in `lifted/bedroom.yaml`, or is bare, as in `bedroom.yaml`, which means
     the first of that name in `CONFIG_FOLDERS`.
-
-    Raises:
-        ConfigError: there is no such config.
     """
     path = Path(name)
     if path.is_file():
@@ -116,11 +113,7 @@ def find_config(name: str) -> Path:
 
 
 def read_settings(name: str, overrides: tuple[str, ...] = ()) -> tuple[Path, dict[str, Any]]:
-    """Read a config with `section.key=value` overrides; returns its path and its data.
-
-    Raises:
-        ConfigError: the config is not found or not YAML, or an override is malformed.
-    """
+    """Read a config with `section.key=value` overrides; returns its path and its data."""
     path = find_config(name)
     data = read_yaml(path)
     for override in overrides:
@@ -129,11 +122,7 @@ def read_settings(name: str, overrides: tuple[str, ...] = ()) -> tuple[Path, dic
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML file of settings.
-
-    Raises:
-        ConfigError: the file cannot be read, or is not a YAML mapping.
-    """
+    """Read a YAML file of settings."""
     try:
         if path.stat().st_size > MOST_BYTES:
             raise yaml.YAMLError(f"it has more than {MOST_BYTES:,} bytes")
@@ -155,12 +144,7 @@ def shortened(said: object) -> str:
 
 
 def check_settings(model: type[_S], data: dict[str, Any], source: str) -> _S:
-    """Validate plain data as a model.
-
-    Raises:
-        ConfigError: the data is invalid; the message names the source, the key and, for an unknown
-            key, the nearest valid one.
-    """
+    """Validate plain data as a model."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -168,11 +152,7 @@ def check_settings(model: type[_S], data: dict[str, Any], source: str) -> _S:
 
 
 def apply_override(data: dict[str, Any], override: str, option: str = "--set") -> None:
-    """Change plain data by `section.key=value`; `option` is the command-line option, for errors.
-
-    Raises:
-        ConfigError: the text has another form, its value is not YAML, or its section is a value.
-    """
+    """Change plain data by `section.key=value`; `option` is the command-line option, for errors."""
     key, equals, text = override.partition("=")
     if not equals:
         raise ConfigError(f"{option} takes section.key=value, got '{override}'.")
@@ -230,11 +210,8 @@ def _section_of(
 ) -> tuple[list[str], type[BaseModel], list[str]]:
     """Translate a pydantic error location to the YAML's keys.
 
-    Pydantic inserts the name of a section's variant (`decoder: {name: lstm}`) after its key.
-
-    Returns:
-        The keys as in the YAML, the section of the last key, and the names of the variants that
-        this key may have.
+    Pydantic inserts the name of a section's variant (`decoder: {name: lstm}`) after its key. Also
+    returns the section of the last key, and the names of the variants that this key may have.
     """
     section, keys, inner = model, list[str](), list[type[BaseModel]]()
     for part in location:

@@ -121,15 +121,8 @@ def shard_bytes(
 ) -> bytes:
     """Encode rooms as the bytes of a shard; the same rooms give the same bytes.
 
-    The shard, a few MB, is built in memory because HDF5 does not recover from a full disk.
-
-    Args:
-        name: Name of the shard, for messages.
-        label_set_name: Name of the rooms' label set.
-        rooms: Rooms to write; from a generator, one is held in memory at a time.
-
-    Raises:
-        ShardError: the arrays of a room disagree with each other.
+    The shard, a few MB, is built in memory because HDF5 does not recover from a full disk. From a
+    generator, one room is held in memory at a time. `name` is for messages.
     """
     import h5py
 
@@ -213,15 +206,8 @@ def _images(views: RoomViews) -> np.ndarray:
 
 
 def check_views(where: str, views: RoomViews) -> None:
-    """Check that the arrays of a room have consistent shapes and valid ids.
-
-    Args:
-        where: Beginning of the message.
-        views: The room.
-
-    Raises:
-        ShardError: a shape is inconsistent, or an instance id is too large.
-    """
+    """Check that the arrays of a room have consistent shapes and valid ids; `where` begins the
+    message."""
     where = f"{where}, room {views.room_id}"
     count, objects = views.visible.shape
     height, width = views.image_size
@@ -244,11 +230,7 @@ def _shape(sides: tuple[_Side, ...], sizes: dict[str, int]) -> tuple[_Side, ...]
 
 
 class Shard(contextlib.AbstractContextManager["Shard"]):
-    """One shard, open for reading; close it, or use it in a `with` block.
-
-    Raises:
-        ShardError: the file is missing, damaged or of another format.
-    """
+    """One shard, open for reading; close it, or use it in a `with` block."""
 
     def __init__(self, path: Path):
         self.path = Path(path)
@@ -382,14 +364,7 @@ def _read_arrays(
 ) -> dict[str, np.ndarray]:
     """Read arrays of the format; each is checked before memory is allocated for it.
 
-    Args:
-        group: Group with the arrays.
-        arrays: Type and shape of each array.
-        sizes: Known lengths of named sides; lengths found here are added.
-        classes: Number of classes in the label set.
-
-    Raises:
-        ValueError: a type, shape or value is not of the format.
+    `sizes` holds the known lengths of named sides; lengths found here are added.
     """
     read: dict[str, np.ndarray] = {}
     for name, (dtype, sides) in arrays.items():
@@ -469,11 +444,7 @@ def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:
 
 
 def list_shards(folder: Path, split: str) -> list[Path]:
-    """List the shards of a split (`train`, `val` or `test`), sorted.
-
-    Raises:
-        ShardError: there is no shard.
-    """
+    """List the shards of a split (`train`, `val` or `test`), sorted."""
     folder = Path(folder)
     if not folder.is_dir():
         raise ShardError(f"No folder of shards at {folder}; make one with {PREPARE}.")
@@ -495,11 +466,7 @@ def iterate_rooms(folder: Path, split: str) -> Iterator[tuple[Shard, str]]:
 
 
 def read_index(folder: Path) -> dict[str, Any]:
-    """Read a folder's `index.json`: label set, room type, counts and recipe.
-
-    Raises:
-        ShardError: the folder is not finished, or the file is damaged.
-    """
+    """Read a folder's `index.json`: label set, room type, counts and recipe."""
     path = Path(folder) / INDEX_NAME
     try:
         return json.loads(path.read_text())

@@ -55,11 +55,7 @@ class SceneViews(_Batch):
 
     @property
     def observed_ids(self) -> Integer[Tensor, "rooms views height width"]:
-        """Instance-id images, for callers that need them.
-
-        Raises:
-            ValueError: the views were loaded without images.
-        """
+        """Instance-id images, for callers that need them."""
         if self.instance_ids is None:
             raise ValueError("These views have no instance ids; load the data with a mask_step.")
         return self.instance_ids

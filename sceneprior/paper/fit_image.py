@@ -94,10 +94,8 @@ def view_loss(
 ) -> ViewLoss:
     """The losses of training, per image (a room of `views`) and without completeness.
 
-    Args:
-        scenes: At least as many objects per room as the fullest image shows. Objects without
-            meshes (before the shape stage, or with occupancy grids) have no masks.
-        masks: Compare masks, too; `views` then needs instance ids.
+    The scenes have at least as many objects as the fullest image shows. Masks are compared only of
+    objects with meshes, which need the shape stage and no occupancy grids.
     """
     weights, drawing = trained.config.view_terms
     boxes = seen_boxes(scenes, views, drawing)
@@ -137,10 +135,6 @@ def fit_latents(
 
     Images are independent: an image takes the same steps alone and in a batch, apart from rounding,
     which grows over a thousand steps.
-
-    Raises:
-        InputError: an image shows more objects than the prior can generate.
-        FloatingPointError: a loss is not a number.
     """
     refuse_crowds(trained, views)
     points, square = start.detach().clone(), torch.zeros_like(start)

@@ -37,14 +37,8 @@ def interpolate(trained: TrainedPrior, start: Point, end: Point, steps: int) -> 
     """Rooms `step_00`, `step_01`, ... on the way from one latent to another.
 
     A room's `extra` holds `along`, its position from 0 to 1, and `slots`, the prediction that each
-    object comes from: objects with the same slot in two rooms are the same object, moved.
-
-    Args:
-        start, end: See `latent_of`.
-        steps: Number of rooms, both ends included; at least 2.
-
-    Raises:
-        InputError: an end is unknown, or the two are opposite.
+    object comes from: objects with the same slot in two rooms are the same object, moved. `steps`
+    counts both ends, which `latent_of` reads.
     """
     z = path_latents(trained, latent_of(trained, start), latent_of(trained, end), steps)
     names = [f"step_{k:02d}" for k in range(steps)]
@@ -67,11 +61,7 @@ def path_latents(
     end: Float[Tensor, " dimension"],
     steps: int,
 ) -> Float[Tensor, "steps dimension"]:
-    """Evenly spaced points of the geodesic (in a cube: the straight line), both ends included.
-
-    Raises:
-        InputError: the ends are opposite points of the sphere.
-    """
+    """Evenly spaced points of the geodesic (in a cube: the straight line), both ends included."""
     along = torch.linspace(0, 1, steps, dtype=start.dtype)
     try:
         space = trained.prior.latent_space

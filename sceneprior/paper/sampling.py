@@ -54,9 +54,6 @@ def sample_latents(
 ) -> Float[Tensor, "count dimension"]:
     """Sample `count` points of the latent space, given the logits `trained` of the training rooms;
     the same seed gives the same points. `sample_logits` describes the distributions.
-
-    Raises:
-        InputError: an unknown distribution, or fewer than two training rooms to sample around.
     """
     if distribution not in DISTRIBUTIONS:
         raise InputError(
@@ -146,9 +143,6 @@ def write_latents(folder: Path, scenes: Sequence[Scene]) -> None:
 def latent_of(trained: TrainedPrior, point: Point) -> Float[Tensor, " dimension"]:
     """The point of a run's latent space for a name (`read_latent`), for a scene (the latent it was
     decoded from), or for a vector (the nearest point).
-
-    Raises:
-        InputError: the name is unknown, the scene has no latent, or the vector has another size.
     """
     if isinstance(point, str):
         return read_latent(trained, point)
@@ -183,9 +177,6 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
     A name is the id of a training room; `seed:7`, the room that `synthesize -n 1 --seed 7` makes;
     or a file of latents: `FILE` (its first), `FILE:3` (counted from 0), `FILE:NAME`. Files are
     `latents.npz`, an .npy of (D,) or (n, D) numbers, or a .json of such lists.
-
-    Raises:
-        InputError: the name is unknown, or the file does not hold a latent of this run's size.
     """
     file, _, item = text.rpartition(":")
     path, item = (Path(file), item) if file.endswith(_ENDINGS) else (Path(text), "0")
@@ -205,8 +196,7 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
 def named_latent(trained: TrainedPrior, name: str, or_else: str) -> Float[Tensor, " dimension"]:
     """The latent of a training room, named by its id, or of the room that `seed:7` names.
 
-    Raises:
-        InputError: the name is unknown; the message lists valid names, `or_else` last.
+    The error for another name lists the valid ones, `or_else` last.
     """
     if name in trained.room_ids:
         row = trained.room_ids.index(name)

@@ -34,16 +34,9 @@ from sceneprior.training.steps import (
 
 
 class LatentStage(lightning.LightningModule, ABC):
-    """A stage that trains the network and the latents of the training rooms.
+    """A stage that trains the network, and the latents: one row of logits per training room.
 
-    Args:
-        prior: The network of the previous stage; a fresh one in the first.
-        latents: One row of logits per training room.
-        rooms: The data set that the stage is trained on.
-        stage: The stage's settings.
-        loss: Weights of the losses, by their names.
-        completeness_target: The model's setting.
-        seed: The run's seed.
+    `loss` has the weights of the losses by their names; `completeness_target` is the model's.
     """
 
     trains_shape: ClassVar[bool] = True

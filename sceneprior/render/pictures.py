@@ -19,13 +19,10 @@ def contact_sheet(
     captions: Sequence[str] = (),
     gap_px: int = 0,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Lay pictures out in rows on white, from left to right.
+    """Lay pictures out in rows of `columns` on white, from left to right.
 
-    Args:
-        tiles: At least one. Cells have the size of the largest; smaller tiles go to the upper left.
-        columns: Cells per row, even if there are fewer tiles.
-        captions: One above each tile, or none at all.
-        gap_px: White space around each tile.
+    Cells have the size of the largest tile; smaller ones go to the upper left. There is one caption
+    above each tile, or none at all, and white space of `gap_px` around it.
     """
     height, width = (max(tile.shape[axis] for tile in tiles) for axis in (0, 1))
     above = gap_px + (CAPTION_PX if captions else 0)
@@ -54,10 +51,7 @@ def paint_ids(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Paint instance ids, with one colour per object and dark borders between objects.
 
-    Args:
-        ids: 0 = no object, k + 1 = object k, n + 1 = void, which is grey.
-        colors: RGB of each of n objects, 0 to 255.
-        background: RGB of pixels without an object.
+    The ids of n objects are 0 = no object, k + 1 = object k, n + 1 = void, which is grey.
     """
     border = np.zeros(ids.shape, dtype=bool)
     border[:, 1:] |= ids[:, 1:] != ids[:, :-1]

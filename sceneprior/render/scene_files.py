@@ -109,11 +109,7 @@ def scene_to_obj(scene: Scene, materials: str) -> tuple[str, bytes]:
 
 
 def scene_to_usd(scene: Scene) -> str:
-    """The scene as the text of a USD stage: y up, metres, one mesh per object under `/room`.
-
-    Raises:
-        InputError: the package `usd-core` is missing.
-    """
+    """The scene as the text of a USD stage: y up, metres, one mesh per object under `/room`."""
     try:
         from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
     except ImportError:
@@ -193,11 +189,7 @@ def _empty_glb() -> bytes:
 
 
 def read_glb_meshes(path: Path) -> dict[str, Mesh]:
-    """Meshes of a GLB by node name, with vertices in the room frame in metres.
-
-    Raises:
-        InputError: the file is missing or not a GLB.
-    """
+    """Meshes of a GLB by node name, with vertices in the room frame in metres."""
     import trimesh
 
     try:
@@ -249,9 +241,6 @@ def load_scene_folder(folder: Path) -> list[Scene]:
 
     JSON files of the package's other formats, such as scores, are skipped; JSON files of unknown
     formats are skipped with a warning.
-
-    Raises:
-        InputError: the folder is missing, holds no scene, or a file in it is damaged.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -307,11 +296,7 @@ def _is_box_list(path: Path) -> bool:
 
 
 def check_names(scenes: Sequence[Scene]) -> None:
-    """Check that the scenes' names are unique and can be file names.
-
-    Raises:
-        InputError: a name occurs twice or cannot be a file name.
-    """
+    """Check that the scenes' names are unique and can be file names."""
     counts = Counter(scene.name for scene in scenes)
     for name, count in counts.items():
         if count > 1:

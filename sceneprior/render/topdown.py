@@ -48,9 +48,6 @@ def topdown_protocol(label_set_name: str) -> TopDownProtocol:
 
     The windows hold the largest rooms that ATISS's filter accepts (6 x 6 m bedrooms, 12 x 12 m
     living rooms).
-
-    Raises:
-        InputError: no label set has this name.
     """
     label_set(label_set_name)
     return TopDownProtocol(window_m=6.4 if label_set_name == "front3d_bedroom" else 12.8)
@@ -85,11 +82,8 @@ def topdown(
     """Orthographic picture of a room from above: one flat colour per class, without shading.
 
     Image right is +x, image down is +z, and the room's origin is the centre of the image. Of
-    objects above each other, the highest surface is drawn.
-
-    Args:
-        protocol: None takes the protocol of the scene's label set.
-        outlines: Darken the borders between objects: for readers, never for metrics.
+    objects above each other, the highest surface is drawn. None takes the protocol of the scene's
+    label set. `outlines` darkens the borders between objects: for readers, never for metrics.
 
     Source:
         The paper, section 4.2: 512 x 512, orthographic, a colour per category.
@@ -165,10 +159,8 @@ def perspective(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """A shaded picture from above a corner, outside the room: for pages, not for metrics.
 
-    Args:
-        image_size: (height, width), used without a `view`.
-        view: None fits a view to the room; a common view makes several rooms comparable.
-        colors: Colours of the objects; None takes those of their classes.
+    Without a `view`, one of `image_size` is fitted to the room; a common view makes several rooms
+    comparable. `colors` of the objects are those of their classes unless given.
     """
     view = view or corner_view([scene], image_size)
     colors = object_colors(scene) if colors is None else colors

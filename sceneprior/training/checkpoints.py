@@ -26,9 +26,6 @@ _RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "pytorch-lightn
 def find_checkpoint(run: Path, stages: Sequence[str]) -> tuple[str, Path]:
     """Stage and path of the checkpoint that commands load, given a run's `stages` in order: that
     of the last finished stage, or else the newest of the last stage begun.
-
-    Raises:
-        InputError: the run has not saved a checkpoint yet.
     """
     for name in ("final.ckpt", "last.ckpt"):
         for stage in reversed(stages):
@@ -51,11 +48,7 @@ def write_checkpoint(trainer: "lightning.Trainer", folder: Path, name: str) -> N
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The contents of a checkpoint: tensors and plain data only.
-
-    Raises:
-        InputError: the file is damaged, or not a checkpoint.
-    """
+    """The contents of a checkpoint: tensors and plain data only."""
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
@@ -72,11 +65,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def check_resumable(path: Path, module: nn.Module) -> None:
-    """Check that a stage can be resumed from a checkpoint.
-
-    Raises:
-        InputError: it is damaged, lacks what the trainer needs, or belongs to another network.
-    """
+    """Check that a stage can be resumed from a checkpoint."""
     saved = read_checkpoint(path)
     missing = [name for name in _RESUMED if name not in saved]
     shapes = {name: getattr(value, "shape", None) for name, value in saved["state_dict"].items()}
@@ -94,9 +83,6 @@ def read_networks(
 ) -> tuple[nn.ModuleDict, tuple[str, ...]]:
     """The networks of a checkpoint, and the ids of the rooms that it was trained on. `build` makes
     the freshly initialised networks for a number of rooms.
-
-    Raises:
-        InputError: the checkpoint is damaged, of other networks, or not written by `fit`.
     """
     saved = read_checkpoint(path)
     try:

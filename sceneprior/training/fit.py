@@ -36,21 +36,11 @@ def fit(
     loggers: tuple[str, ...] = ("csv", "tensorboard"),
     trainer_options: dict[str, Any] | None = None,
 ) -> None:
-    """Train the stages that `config.stages()` lists.
+    """Train the stages that `config.stages()` lists; config, checkpoints and logs go to `run`.
 
-    Args:
-        config: The run's settings.
-        run: Folder for config, checkpoints and logs.
-        resume: Continue an interrupted run: finished stages are not trained again.
-        loggers: Any of `csv`, `tensorboard`, `wandb`.
-        trainer_options: Passed on to Lightning's Trainer (devices, accelerator, precision); its
-            `callbacks` are called after those of `fit`.
-
-    Raises:
-        InputError: the run exists and is not resumed, its settings differ from `config`, another
-            process trains it, or the shards do not fit it. A run refused at its start leaves no
-            files behind.
-        OSError: the run's folder cannot be written; `filename` is set.
+    `resume` continues an interrupted run, whose finished stages are not trained again. A run that
+    is refused at its start leaves no files behind. `trainer_options` are passed on to Lightning's
+    Trainer (devices, accelerator, precision); its `callbacks` are called after those of `fit`.
     """
     run, config = Path(run), config.with_label_set()
     for name in loggers:

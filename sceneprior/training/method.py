@@ -81,11 +81,7 @@ class RunConfig(Section, ABC):
         return self
 
     def with_label_set(self) -> "RunConfig":
-        """The same config, with `shards` replaced by the label set of `data.shards`.
-
-        Raises:
-            ShardError: the label set is `shards`, and there are no training shards.
-        """
+        """The same config, with `shards` replaced by the label set of `data.shards`."""
         if self.label_set != OF_SHARDS:
             return self
         with Shard(list_shards(Path(self.data.shards), "train")[0]) as shard:
@@ -115,20 +111,12 @@ class RunConfig(Section, ABC):
         """A copy of a module's current networks, on the CPU and in evaluation mode."""
 
     def load(self, stage: str, path: Path) -> "Trained":
-        """The networks in a stage's checkpoint, in evaluation mode.
-
-        Raises:
-            InputError: the checkpoint is damaged, or belongs to another network.
-        """
+        """The networks in a stage's checkpoint, in evaluation mode."""
         networks, room_ids = read_networks(path, partial(self.networks, stage))
         return self.trained(networks, stage, room_ids)
 
     def check_rooms(self, rooms: Any, max_objects: int | None) -> None:
-        """Check that training rooms fit the config.
-
-        Raises:
-            InputError: another label set, or more objects than the network generates.
-        """
+        """Check that training rooms fit the config."""
         shards = self.data.shards
         if rooms.label_set != self.label_set:
             raise InputError(

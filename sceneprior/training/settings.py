@@ -51,11 +51,7 @@ class TrainConfig(Section):
 
 
 def without_samples(data: dict[str, Any], source: str) -> dict[str, Any]:
-    """The settings of a run without the section `samples`, which runs had until version 0.1.0.
-
-    Raises:
-        ConfigError: the section asks for evaluations during training, which are no longer made.
-    """
+    """The settings of a run without the section `samples`, which runs had until version 0.1.0."""
     samples = data.get("samples", {})
     every = samples.get("every", 0) if isinstance(samples, dict) else samples
     if every != 0:

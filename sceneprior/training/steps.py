@@ -34,9 +34,6 @@ def check_finite(total: Tensor, views: SceneViews | LiftedRooms | RoomBoxes) -> 
     """Stop at the first loss that is not finite, and name the rooms of its batch.
 
     All processes stop together: if one stopped alone, the others would wait for it.
-
-    Raises:
-        FloatingPointError: the loss is NaN or infinite, here or in another process.
     """
     value = total.item()
     finite = math.isfinite(value)

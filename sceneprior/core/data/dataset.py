@@ -49,11 +49,7 @@ class RoomDataset(Dataset):
         read: Callable[[Shard, str], _Room],
         limit: int | None = None,
     ) -> list[_Room]:
-        """Call `read` on each room of a split, or on the first `limit`, and collect the results.
-
-        Raises:
-            ShardError: a shard is missing or damaged, or its label set differs from the first's.
-        """
+        """Call `read` on each room of a split, or on the first `limit`, and collect the results."""
         rooms = []
         for shard, room_id in islice(iterate_rooms(folder, split), limit):
             if self.label_set and shard.label_set != self.label_set:
@@ -144,14 +140,10 @@ class FlatViews:
         objects: int,
         blank: Bool[Tensor, " batch"] | None = None,
     ) -> dict[str, Any]:
-        """Gather views of rooms as fields of `SceneViews`.
+        """Gather views of rooms, by their indices within the room, as fields of `SceneViews`.
 
-        Args:
-            room: Index of each room.
-            view: Indices of the views within their room.
-            quarter: Number of quarter turns about +y by which each room is rotated.
-            objects: Number of objects to pad to.
-            blank: Rooms to return without objects.
+        Each room is rotated by `quarter` quarter turns about +y, and padded to `objects`; `blank`
+        rooms are returned without objects.
         """
         slot = torch.arange(objects, device=self.boxes.device)
         count = self.object_count[room][:, None]
@@ -197,7 +189,6 @@ class ViewDataset(RoomDataset):
     them to a GPU, where batches are then made. Masks are read view by view.
 
     Args:
-        folder, split, rotations, limit: See `RoomDataset`.
         views_per_room: Number of views sampled each time a room is drawn.
         view_fraction: Share of each room's views that may be sampled, chosen once by `seed`.
         held_out: Sample the other views instead, which training does not use; every room must have

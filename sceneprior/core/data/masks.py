@@ -41,11 +41,7 @@ class MaskStore:
         )
 
     def read(self, room: int, views: np.ndarray) -> np.ndarray:
-        """Read images of a room: (views, H/step, W/step), 0 = background, k + 1 = object k.
-
-        Raises:
-            ShardError: the shard is missing or damaged.
-        """
+        """Read images of a room: (views, H/step, W/step), 0 = background, k + 1 = object k."""
         packed = self._packed.setdefault(room, {})
         wanted = views.tolist()
         missing = sorted(set(wanted).difference(packed))

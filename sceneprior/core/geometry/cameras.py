@@ -23,16 +23,9 @@ def project(
     world_to_camera: Float[Tensor, "rooms views 4 4"],
     intrinsics: Float[Tensor, "rooms views 3 3"],
 ) -> Float[Tensor, "rooms views objects points 3"]:
-    """Project points into every view of their room.
+    """Project world points into every view of their room: u and v in pixels, depth z in metres.
 
-    Args:
-        points_m: World positions in metres.
-        world_to_camera: Rigid transforms, column vectors.
-        intrinsics: Pixels.
-
-    Returns:
-        u and v in pixels and the depth z in metres. If z is below `MIN_DEPTH_M`, u and v are
-        computed with that depth; the returned depth is unchanged.
+    If z is below `MIN_DEPTH_M`, u and v are computed with that depth; the returned z is unchanged.
     """
     rooms, views = world_to_camera.shape[:2]
     _, objects, points, _ = points_m.shape
@@ -55,16 +48,11 @@ def boxes_of_points(
 ) -> Boxes2D:
     """2D bounding box of each object's projected points in every view (paper, section 3.4).
 
-    Args:
-        points_m: Points of each object (mesh vertices or box corners), world metres.
-        world_to_camera: Rigid transforms.
-        intrinsics: Pixels of an image of `image_size`.
-        image_size: (height, width) in pixels.
-
-    Returns:
-        Boxes x1, y1, x2, y2 relative to the image size, clamped to [0, 1]; and `in_frustum`, true
-        if some point is in front of the camera and the unclamped box intersects the image. Outside
-        the frustum, the clamped box has no useful gradient, and the frustum loss is used instead.
+    The points are mesh vertices or box corners in world metres, the intrinsics pixels of an image
+    of `image_size`, (height, width). Boxes x1, y1, x2, y2 are relative to that size, clamped to
+    [0, 1]. `in_frustum` is true if some point is in front of the camera and the unclamped box
+    intersects the image. Outside the frustum, the clamped box has no useful gradient, and the
+    frustum loss is used instead.
     """
     height, width = image_size
     rooms, views = world_to_camera.shape[:2]

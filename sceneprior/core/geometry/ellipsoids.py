@@ -31,12 +31,8 @@ def boxes_of_ellipsoids(
     depth `MIN_DEPTH_M` is clipped there, and a side may then be an extreme of the ellipse in which
     the plane cuts it. Rows, v, are treated likewise.
 
-    Args:
-        centers_m: Centres of the 3D boxes, world metres.
-        sizes_m: Full extents of the 3D boxes.
-        world_to_camera: Rigid transforms.
-        intrinsics: Pixels of an image of `image_size`; skew is allowed.
-        image_size: (height, width) in pixels.
+    Arguments have the units of `boxes_of_points`; sizes are full extents, and intrinsics may have
+    skew.
 
     Returns:
         Boxes x1, y1, x2, y2 relative to the image size, clamped to [0, 1]; and `in_frustum`. Both

@@ -9,10 +9,6 @@ FIELD_OF_VIEW_DEG = (5.0, 160.0)
 def odd_field_of_view(focal_px: float, image_size: tuple[int, int]) -> str:
     """Describe why a focal length is implausible, and guess the cause; "" if it is plausible.
 
-    Args:
-        focal_px: Focal length in pixels of the image, above 0.
-        image_size: (height, width).
-
     Example: a focal length given as a fraction of the width.
 
         >>> odd_field_of_view(0.8, (480, 640)).partition(",")[0]

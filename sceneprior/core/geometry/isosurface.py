@@ -25,19 +25,14 @@ def surface_of(
     Only cells whose centres lie in the box are used. The outermost of them extend to the sides of
     the box, where the surface is closed with sharp corners. Small components are dropped.
 
-    Args:
-        logits: Logits at the centres of the grid's cells, positive inside the object.
-        center_m, size_m: Centre and size of the object's box.
-        margin: Size of the grid relative to the box, about the same centre.
-        most_faces: Approximate number of faces after decimation.
+    Logits are at the centres of the grid's cells, positive inside the object. `margin` is the size
+    of the grid relative to the box, about the same centre; the mesh is decimated to about
+    `most_faces`.
 
     Returns:
         Vertices in metres and outward triangles of a closed mesh, in which each edge is used
         equally often in both directions (twice each if decimation has merged two sheets). If
         nothing or everything in the box is occupied, the mesh is the box itself.
-
-    Raises:
-        ValueError: a logit is not a finite number.
 
     Source:
         Lewiner et al., "Efficient implementation of Marching Cubes' cases with topological

@@ -20,15 +20,6 @@ def surface_points(
     Sampling is stratified: the surface is divided into `count` strata of equal area, in the order
     of the faces, with one point each. So every k-th point (`points[::k]`) covers the surface
     evenly, too.
-
-    Args:
-        vertices: Vertices in any unit.
-        faces: Vertex indices of each triangle.
-        count: Number of points, at least one.
-        seed: Seed of the random positions.
-
-    Raises:
-        ValueError: the area of the mesh is zero or not finite.
     """
     corners = np.asarray(vertices, dtype=np.float64)[faces]
     sides = corners[:, 1:] - corners[:, :1]
@@ -61,9 +52,6 @@ def chamfer_sum(
 
         sum over both directions of mean_i min_j |p_i - q_j|**k,  k = 1 and 2
 
-    Raises:
-        InputError: a set is empty.
-
     Example: two points, one metre apart.
 
         >>> chamfer_sum(np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]))
@@ -86,8 +74,7 @@ def chamfer_mean(
 ) -> float:
     """Chamfer distance averaged over both directions, half of `chamfer_sum`, in the points' unit.
 
-    Args:
-        a_tree: Tree of `a_points`, for repeated comparisons.
+    `a_tree` is that of `a_points`, for repeated comparisons.
     """
     there, back = nearest_distances(a_points, b_points, a_tree)
     return float(there.mean() + back.mean()) / 2
@@ -98,11 +85,7 @@ def nearest_distances(
     b_points: Float[np.ndarray, "m 3"],
     a_tree: cKDTree | None = None,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"]]:
-    """Distance of each point to its nearest neighbour in the other set: a to b, and b to a.
-
-    Raises:
-        InputError: a set is empty.
-    """
+    """Distance of each point to its nearest neighbour in the other set: a to b, and b to a."""
     if not len(a_points) or not len(b_points):
         raise InputError(
             f"Surfaces are compared by points, but {len(a_points)} and {len(b_points)} came."

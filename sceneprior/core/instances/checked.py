@@ -15,11 +15,7 @@ _REPR.maxstring = _LONGEST
 
 
 def checked(model: type[_M], data: dict[str, Any], where: str) -> _M:
-    """Validate plain data as a model.
-
-    Raises:
-        InputError: the data is invalid; the message names the key.
-    """
+    """Validate plain data as a model."""
     try:
         return model.model_validate(data)
     except ValidationError as error:

@@ -54,10 +54,6 @@ def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
     Returns:
         (height, width) uint16, k + 1 for the k-th annotation, 0 for background; and class names by
         id.
-
-    Raises:
-        InputError: it is not such a JSON, it does not describe exactly one image, the image is too
-            large, or a mask is damaged or not of the image's size.
     """
     data = read_json(path)
     if not isinstance(data, dict):

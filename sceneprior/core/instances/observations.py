@@ -50,10 +50,8 @@ def observe(images: np.ndarray, classes: np.ndarray | Sequence[int]) -> Observat
 
     The pixels of a visible object stay in every image, even where its mask is too narrow to count.
 
-    Args:
-        images: (T, H, W) unsigned ids, k + 1 for given object k.
-        classes: Class index of each given object. Void furniture is not tracked but may occlude
-            objects, so its pixels get the id after the last object's.
+    Images are (T, H, W) unsigned ids, k + 1 for given object k. Void furniture is not tracked but
+    may occlude objects, so its pixels get the id after the last object's.
     """
     views, height, width = images.shape
     classes = np.asarray(classes, dtype=np.int16)
@@ -99,10 +97,7 @@ def clear_sides(
 ) -> tuple[bool, bool, bool, bool]:
     """Find the sides of a mask's box that no other object touches: left, upper, right, lower.
 
-    Args:
-        image: (H, W) ids.
-        number: Id of the mask.
-        rows, columns: Box of the mask.
+    `number` is the mask's id in the image of ids.
     """
     top, left = max(rows.start - TOUCH_PX, 0), max(columns.start - TOUCH_PX, 0)
     around = image[top : rows.stop + TOUCH_PX, left : columns.stop + TOUCH_PX]

@@ -21,20 +21,12 @@ def mask_size(path: Path, rgb: bool = False) -> tuple[int, int]:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Read a mask of tracked ids, (height, width) uint16: one value per object, 0 for background.
-
-    Raises:
-        InputError: the file is missing, not a PNG, truncated, or has more than one channel.
-    """
+    """Read a mask of tracked ids, (height, width) uint16: one value per object, 0 for none."""
     return _pixels(path, rgb=False).astype(np.uint16)
 
 
 def read_rgb(path: Path) -> np.ndarray:
-    """Read a mask with colour-coded ids, as in COCO's panoptic format: (height, width, 3) uint8.
-
-    Raises:
-        InputError: the file is missing, not a PNG of 8-bit RGB, or truncated.
-    """
+    """Read a mask with colour-coded ids, as in COCO's panoptic format: (height, width, 3) uint8."""
     return _pixels(path, rgb=True)
 
 

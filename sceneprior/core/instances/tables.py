@@ -29,9 +29,6 @@ def read_class_table(path: Path) -> dict[int, str]:
     under `segments_info` or `labels`: `[{"id": 1, "label": "bed", "score": 0.9}, ...]`. In a list,
     the id may also be called `value` or `instance_id`, and the class `class`, `class_name` or
     `name`; a row with id 0 is skipped. A CSV has rows `id,class`, with or without a header.
-
-    Raises:
-        InputError: the file cannot be read; an id is not a number from 1 to 65,535 or is repeated.
     """
     try:
         content = path.read_text(encoding="utf-8-sig")
@@ -113,15 +110,8 @@ class IdTable:
     """Maps values of masks to consecutive ids for `observe`.
 
     The k-th instance of the table gets k + 1, and unlisted values get the next id, which is void
-    and may occlude objects.
-
-    Args:
-        of_id: Class name of each value, from `read_class_table`.
-        label_set_name: Label set; other classes become void, and parts of the room background.
-        where: Beginning of error messages.
-
-    Raises:
-        InputError: none of the classes is in the label set.
+    and may occlude objects. `of_id` is that of `read_class_table`; classes outside the label set
+    become void, and parts of the room background. `where` begins error messages.
     """
 
     def __init__(self, of_id: dict[int, str], label_set_name: str, where: str):

@@ -36,17 +36,8 @@ def match_objects(
 
     with 2D boxes b relative to the image size. In a room with n tracked objects, only the first n
     predictions take part. An object that no drawn view sees has zero cost: its match is arbitrary
-    and enters no loss.
-
-    Args:
-        scenes, boxes_2d: Predictions, and their 2D boxes in the views.
-        views: The observations: tracked objects and their 2D boxes.
-        box_weight: lambda_B.
-        occlusion_slack: See `side_distance`.
-        first_n: False matches among all predictions, for predictions without an order.
-
-    Raises:
-        ValueError: a room holds more objects than the prior can generate.
+    and enters no loss. Without `first_n`, all predictions take part, for predictions without an
+    order. `box_weight` is lambda_B, `occlusion_slack` that of `side_distance`.
     """
     cost = matching_cost(scenes, boxes_2d, views, box_weight, occlusion_slack)
     counts = views.is_object.sum(dim=-1)

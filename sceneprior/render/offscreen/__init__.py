@@ -29,13 +29,8 @@ APT_LINE = "apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mes
 def open_renderer(kind: str = "auto") -> Renderer:
     """Open the renderer of this process.
 
-    Args:
-        kind: `pyrender` (GPU or software GL), `software` (the package's z-buffer), or `auto`:
-            pyrender if GL works, else software with a printed note. The environment variable
-            SCENEPRIOR_RENDERER overrides `auto`.
-
-    Raises:
-        InputError: an unknown kind, or `pyrender` on a machine where GL does not work.
+    It is `pyrender` (GPU or software GL), `software` (the package's z-buffer), or `auto`: pyrender
+    if GL works, else software with a printed note. SCENEPRIOR_RENDERER overrides `auto`.
     """
     if kind == "auto":
         kind = os.environ.get(ENVIRONMENT_VARIABLE) or "auto"

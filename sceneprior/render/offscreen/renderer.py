@@ -50,9 +50,8 @@ class Renderer(abc.ABC):
     ) -> np.ndarray:
         """The mesh that is visible at each pixel centre, in many views of one room.
 
-        Returns:
-            (views, height, width) uint16: 0 for none, k + 1 for `meshes[k]`. Both sides of a face
-            are drawn.
+        (views, height, width) uint16: 0 for none, k + 1 for `meshes[k]`. Both sides of a face are
+        drawn.
         """
 
     def instance_ids(

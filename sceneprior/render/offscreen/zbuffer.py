@@ -38,8 +38,6 @@ def rasterize(
         world_to_camera: (4, 4), OpenCV axes (x right, y down, z forward).
         projection: fx, fy, cx, cy with u = fx * x / z + cx (perspective) or u = fx * x + cx
             (orthographic, fx in pixels per metre); v likewise from y.
-        image_size: (height, width) in pixels.
-        perspective: False for an orthographic camera.
         labels: (F,) non-negative label of each triangle; None takes its index.
 
     Returns:

@@ -37,10 +37,6 @@ def draw(
     every mesh takes 8 bytes (14 while drawing in fast mode, 24 more for gradients in exact mode).
     The result is deterministic. Compiled kernels round the numbers of `settings` to float32,
     whatever the precision of `pixels`.
-
-    Raises:
-        ValueError: tensors that are not on a CUDA device, or an image with a side of more than
-            32,767 pixels.
     """
     if not (pixels.is_cuda or INTERPRETED):
         raise ValueError(
