@@ -32,6 +32,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.meshes import icosphere
 from sceneprior.core.scene import Mesh
 from sceneprior.render.offscreen import Pinhole, open_renderer
+from sceneprior.render.topdown import look_at
 
 SIZE = (360, 480)
 PIECES, VIEWS = 12, 20
@@ -50,16 +51,10 @@ def furnished_room() -> list[Mesh]:
 def looking_in(angle: float) -> Pinhole:
     """A camera 2.6 m from the middle and 1.6 m up, with a field of view of 90 degrees."""
     eye = np.array([2.6 * np.cos(angle), 1.6, 2.6 * np.sin(angle)])
-    forward = np.array([0, 0.6, 0]) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, (0, 1, 0))
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    matrix[:3, 3] = -matrix[:3, :3] @ eye
     height, width = SIZE
     return Pinhole(
-        matrix, np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
+        look_at(eye, np.array([0, 0.6, 0])),
+        np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]]),
     )
 
 

@@ -11,7 +11,6 @@ is compared with an exhaustive search over all models by all points.
 """
 
 import argparse
-import csv
 import json
 import os
 import time
@@ -22,20 +21,14 @@ from scipy.spatial import cKDTree
 
 from sceneprior.apps.retrieval.cad_models import POINTS, CadModels, ClassModels, unit_mesh
 from sceneprior.apps.retrieval.retrieve import extruded, most_similar, retrieve_all
-from sceneprior.core.furniture import CATEGORY_TABLE
+from sceneprior.core.furniture import category_table
+from sceneprior.core.geometry.corners import BOX_FACES, CUBE_CORNERS
 from sceneprior.core.geometry.meshes import icosphere
 from sceneprior.core.geometry.surfaces import surface_points
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 
 OBJECTS = 6
 LABEL_SET = "front3d_bedroom"
-_CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
-_FACES = np.array(
-    [
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ]
-)  # fmt: skip
 
 
 def main() -> None:
@@ -78,11 +71,10 @@ def main() -> None:
 def class_shares() -> dict[str, float]:
     """Shares of 3D-FUTURE's models in the classes of bedrooms."""
     counts: dict[str, int] = {}
-    with CATEGORY_TABLE.open(newline="") as file:
-        for row in csv.DictReader(file):
-            if row["bedroom_class"] != "void":
-                label = row["bedroom_class"]
-                counts[label] = counts.get(label, 0) + int(row["models_in_3d_future"])
+    for row in category_table().values():
+        if row["bedroom_class"] != "void":
+            label = row["bedroom_class"]
+            counts[label] = counts.get(label, 0) + int(row["models_in_3d_future"])
     total = sum(counts.values())
     return {label: count / total for label, count in counts.items()}
 
@@ -105,8 +97,8 @@ def piece(rng: np.random.Generator) -> Mesh:
     """A union of two to seven blocks that fills the unit box."""
     count = rng.integers(2, 8)
     middles, sides = rng.uniform(-0.5, 0.5, (count, 1, 3)), rng.uniform(0.05, 1.0, (count, 1, 3))
-    vertices = (middles + sides * _CUBE).reshape(-1, 3)
-    faces = (_FACES + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
+    vertices = (middles + sides * CUBE_CORNERS / 2).reshape(-1, 3)
+    faces = (BOX_FACES + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
     return unit_mesh(Mesh(vertices, faces))
 
 

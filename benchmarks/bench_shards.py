@@ -19,11 +19,11 @@ import argparse
 import json
 import os
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ import cv2
 import h5py
 import numpy as np
 import torch
+from timed_fit import made_shards
 from torch.utils.data import default_collate
 
 from sceneprior.core.data.dataset import FlatViews, ViewDataset
@@ -38,19 +39,6 @@ from sceneprior.core.shards import RoomViews, iterate_rooms, list_shards
 
 SCENES, VIEWS, STEP = 16, 20, 4
 CLASSES = 22
-
-
-def prepare(folder: Path, rooms: int) -> Path:
-    """Make and prepare procedural homes; returns the shards."""
-    homes, out = folder / "homes", folder / "shards"
-    commands = (
-        ["make-homes", str(homes), "--rooms", str(rooms)],
-        ["prep-front", "--front", str(homes / "3D-FRONT"), "--future",
-         str(homes / "3D-FUTURE-model"), "--out", str(out), "--renderer", "software"],
-    )  # fmt: skip
-    for command in commands:
-        subprocess.run([sys.executable, "-m", "sceneprior", *command], check=True, stdout=-1)
-    return out
 
 
 def sizes(shards: Path) -> dict[str, float]:
@@ -78,10 +66,13 @@ def memory(shards: Path) -> dict[str, float]:
     assert data.masks is not None
     for room in range(len(data)):
         data.masks.read(room, np.arange(len(data._allowed[room])))
+    packed = [image for room in data.masks._packed.values() for image in room.values()]
     return {
-        "boxes_and_cameras_mb_per_100k_views": flat.bytes / views / 10,
-        "masks_mb_per_100k_views": data.masks.bytes / views / 10,
-    }
+        "boxes_and_cameras_mb_per_100k_views": sum(
+            getattr(flat, item.name).nbytes for item in fields(flat)
+        ) / views / 10,
+        "masks_mb_per_100k_views": sum(map(sys.getsizeof, packed)) / views / 10,
+    }  # fmt: skip
 
 
 def write_view_files(folder: Path, room: RoomViews) -> list[Path]:
@@ -203,7 +194,7 @@ def main() -> None:
     torch.set_num_threads(1)
     figures: dict[str, Any] = {"cores": os.cpu_count(), "load_average": os.getloadavg()}
     with tempfile.TemporaryDirectory() as name:
-        shards = arguments.shards or prepare(Path(name), rooms=48)
+        shards = arguments.shards or made_shards(Path(name), 48, workers=1)
         views = Path(name) / "views"
         views.mkdir()
         figures |= sizes(shards) | memory(shards) | speeds(shards, views, arguments.repeats)

@@ -27,6 +27,7 @@ from bench_boxes import boxes_ratio
 
 from sceneprior.core.geometry.meshes import icosphere
 from sceneprior.render.silhouettes import render_scene
+from sceneprior.render.topdown import look_at
 
 SIZE = (90, 120)
 OBJECTS, VIEWS = 13, 20
@@ -39,7 +40,9 @@ def furnished_room(level: int, device: str = "cpu", rooms: int = 1) -> dict[str,
     place = generator.uniform((-2, 0.2, -2), (2, 1.2, 2), (rooms, OBJECTS, 3))
     half = generator.uniform(0.15, 0.6, (rooms, OBJECTS, 3))
     vertices = sphere * torch.from_numpy(half)[:, :, None] + torch.from_numpy(place)[:, :, None]
-    poses = [looking_in(2 * np.pi * view / VIEWS) for view in range(VIEWS)]
+    angles = 2 * np.pi * np.arange(VIEWS) / VIEWS
+    eyes = [np.array([2.6 * np.cos(angle), 1.6, 2.6 * np.sin(angle)]) for angle in angles]
+    poses = [look_at(eye, np.array([0, 0.6, 0])) for eye in eyes]
     height, width = SIZE
     intrinsics = torch.tensor([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
     room = {
@@ -49,19 +52,6 @@ def furnished_room(level: int, device: str = "cpu", rooms: int = 1) -> dict[str,
         "intrinsics": intrinsics.expand(rooms, VIEWS, 3, 3),
     }
     return {key: value.to(device) for key, value in room.items()} | {"image_size": SIZE}
-
-
-def looking_in(angle: float) -> np.ndarray:
-    """`world_to_camera` of a camera 2.6 m from the middle and 1.6 m up (OpenCV axes)."""
-    eye = np.array([2.6 * np.cos(angle), 1.6, 2.6 * np.sin(angle)])
-    forward = np.array([0, 0.6, 0]) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, (0, 1, 0))
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, -np.cross(right, forward), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
-    return pose
 
 
 def forward_backward(room: dict[str, Any], **options: Any) -> Callable[[], None]:

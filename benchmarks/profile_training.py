@@ -14,8 +14,6 @@ import argparse
 import itertools
 import platform
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -28,6 +26,7 @@ from unittest import mock
 import numba
 import torch
 from lightning.pytorch.profilers import Profiler
+from timed_fit import made_shards
 
 from sceneprior.apps.config import load_config
 from sceneprior.lifted import stages as lifted_stages
@@ -113,18 +112,6 @@ def watched(profiler: StepProfiler) -> Iterator[None]:
         yield
 
 
-def make_shards(folder: Path) -> Path:
-    """Make and prepare procedural bedrooms; returns the shards."""
-    homes, shards = folder / "homes", folder / "shards"
-    for words in (
-        ["make-homes", homes, "--rooms", ROOMS],
-        ["prep-front", "--front", homes / "3D-FRONT", "--future", homes / "3D-FUTURE-model",
-         "--splits", homes / "splits" / "bedroom.csv", "--out", shards],
-    ):  # fmt: skip
-        subprocess.run([sys.executable, "-m", "sceneprior", *map(str, words)], check=True)
-    return shards
-
-
 def profile(name: str, shards: Path, run: Path, threads: int, steps: int) -> list[dict[str, float]]:
     """Train a few steps of each stage; returns the medians in ms by stage and part."""
     changes = [f"data.shards={shards}", "data.workers=0"]
@@ -160,7 +147,7 @@ def main() -> None:
     parser.add_argument("--shards", type=Path, help="prepared bedrooms; made here if not given")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        shards = options.shards or make_shards(Path(name))
+        shards = options.shards or made_shards(Path(name), ROOMS, workers=1)
         print(f"{platform.processor() or platform.machine()}, torch {torch.__version__}, ms a step")
         print("| stage | threads |", " | ".join(SHOWN), "| CPU | clock |")
         print("| --- |", " | ".join(["---:"] * (len(SHOWN) + 3)), "|")

@@ -60,14 +60,14 @@ def write_changed(path: Path, content: bytes | str) -> None:
     write_whole(path, content)
 
 
-def json_text(data: Any, indent: int = 1) -> str:
+def json_text(data: Any) -> str:
     """Format plain data as JSON; NaN and infinity raise a `ValueError`."""
-    return json.dumps(data, indent=indent, allow_nan=False) + "\n"
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
-def write_json(path: Path, data: Any, indent: int = 1) -> None:
+def write_json(path: Path, data: Any) -> None:
     """Write plain data as JSON atomically; see `json_text` and `write_whole`."""
-    write_whole(path, json_text(data, indent))
+    write_whole(path, json_text(data))
 
 
 def remove_parts(folder: Path) -> None:

@@ -18,7 +18,6 @@ from sceneprior.core.files import read_json
 from sceneprior.core.scene import Mesh
 
 MODEL_FILE = "raw_model.obj"
-CATEGORY_TABLE = Path(__file__).with_name("front3d_categories.csv")
 
 
 def model_info_path(folder: Path, option: str = "--future") -> Path:
@@ -73,7 +72,7 @@ def category_table() -> dict[str, dict[str, str]]:
 
     A row has the class in bedrooms (`bedroom_class`) and in living rooms (`living_room_class`).
     """
-    with CATEGORY_TABLE.open(newline="") as file:
+    with Path(__file__).with_name("front3d_categories.csv").open(newline="") as file:
         return {row["model_info_category"]: row for row in csv.DictReader(file)}
 
 

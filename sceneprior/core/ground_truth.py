@@ -134,16 +134,11 @@ def reference_scene(
         if meshes:
             mesh = _placed(Path(shards), truth.model_ids[row], truth.model_to_room[row])
         label = names[int(truth.object_class[row])]
-        box = _triple(truth.centers_m[row]), _triple(truth.sizes_m[row])
+        box = tuple(truth.centers_m[row].tolist()), tuple(truth.sizes_m[row].tolist())
         objects.append(SceneObject(label, *box, mesh))
     floor = np.asarray(truth.floor_m, dtype=np.float64)
     extra = {"room_id": room_id, "height_m": truth.height_m}
     return Scene(room_id, shard.label_set, tuple(objects), floor, extra)
-
-
-def _triple(values: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return (x, y, z)
 
 
 def _placed(shards: Path, model_id: str, model_to_room: np.ndarray) -> Mesh | None:

@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import json
+import operator
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -301,7 +302,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
             one_chunk_each = images.chunks == (1, *images.shape[1:]) and (
                 (images.compression, images.shuffle, images.fletcher32) == ("gzip", False, False)
             )
-            read = _inflate if one_chunk_each else _select
+            read = _inflate if one_chunk_each else operator.getitem
             return _known_ids(
                 group, np.stack([read(images, view)[thinned(step)] for view in views])
             )
@@ -409,18 +410,13 @@ def _known_ids(group: "h5py.Group", ids: np.ndarray) -> np.ndarray:
     return ids
 
 
-def _select(images: "h5py.Dataset", view: int) -> np.ndarray:
-    image: np.ndarray = images[view]
-    return image
-
-
 def _inflate(images: "h5py.Dataset", view: int) -> np.ndarray:
     """Read and decompress the single chunk of an image, which is faster than h5py's selections."""
     size = images.dtype.itemsize * images.shape[1] * images.shape[2]
     at = range(len(images))[view]  # negative indices count from the end, as in h5py
     unfiltered, chunk = images.id.read_direct_chunk((at, 0, 0))
     if unfiltered:  # HDF5 may skip a filter that gains nothing
-        return _select(images, view)
+        return images[view]
     return np.frombuffer(zlib_ng.decompress(chunk, bufsize=size), images.dtype).reshape(
         images.shape[1:]
     )

@@ -8,11 +8,13 @@ import torch
 from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor
 
-_B = TypeVar("_B", bound="_Batch")
+_B = TypeVar("_B", bound="Batch")
 
 
 @dataclass(frozen=True)
-class _Batch:
+class Batch:
+    """Tensors that are moved and sliced together."""
+
     def changed(self: _B, change: Callable[[Tensor], Tensor]) -> _B:
         """Copy of the batch with `change` applied to every tensor."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
@@ -26,7 +28,7 @@ class _Batch:
 
 
 @dataclass(frozen=True)
-class SceneViews(_Batch):
+class SceneViews(Batch):
     """Views of a batch of rooms; objects are padded to the largest room's count.
 
     Cameras are OpenCV pinholes (x right, y down, z forward); see docs/conventions.md.
@@ -100,7 +102,7 @@ class DecodedScenes:
 
 
 @dataclass(frozen=True)
-class LiftedRooms(_Batch):
+class LiftedRooms(Batch):
     """Tracked objects of a batch of rooms, lifted to 3D from masks alone (`lifted/lifting`).
 
     Objects are padded to the largest room's count.
@@ -123,7 +125,7 @@ class LiftedRooms(_Batch):
 
 
 @dataclass(frozen=True)
-class RoomBoxes(_Batch):
+class RoomBoxes(Batch):
     """A batch of rooms as labelled 3D boxes: 3D supervision, and the output of methods using it.
 
     Objects are padded to the largest room's count; their order has no meaning.

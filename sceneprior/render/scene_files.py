@@ -5,7 +5,7 @@ import re
 import warnings
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,42 +39,26 @@ def save_scene(scene: Scene, path: Path, renderer: Renderer | None = None) -> No
         InputError: the path has another suffix.
     """
     path = Path(path)
-    if path.suffix not in WRITERS:
-        raise InputError(
-            f"{path} ends with '{path.suffix}', which is no format of scenes; end it with one of "
-            f"{', '.join(WRITERS)}."
-        )
-    WRITERS[path.suffix](scene, path, renderer)
-
-
-def _write_json(scene: Scene, path: Path, _: Renderer | None) -> None:
-    write_json(path, scene_to_json(scene))
-
-
-def _write_glb(scene: Scene, path: Path, _: Renderer | None) -> None:
-    write_whole(path, scene_to_glb(scene))
-
-
-def _write_obj(scene: Scene, path: Path, _: Renderer | None) -> None:
-    materials = path.with_suffix(".mtl")
-    text, described = scene_to_obj(scene, materials.name)
-    write_whole(materials, described)
-    write_whole(path, text)
-
-
-def _write_png(scene: Scene, path: Path, renderer: Renderer | None) -> None:
-    picture = topdown(scene, renderer or open_renderer(), outlines=True)
-    write_whole(path, png_bytes(picture))
-
-
-def _write_usd(scene: Scene, path: Path, _: Renderer | None) -> None:
-    write_whole(path, scene_to_usd(scene))
-
-
-WRITERS: Mapping[str, Callable[[Scene, Path, Renderer | None], None]] = {
-    ".json": _write_json, ".glb": _write_glb, ".obj": _write_obj, ".usda": _write_usd,
-    ".png": _write_png,
-}  # fmt: skip
+    match path.suffix:
+        case ".json":
+            write_json(path, scene_to_json(scene))
+        case ".glb":
+            write_whole(path, scene_to_glb(scene))
+        case ".obj":
+            materials = path.with_suffix(".mtl")
+            text, described = scene_to_obj(scene, materials.name)
+            write_whole(materials, described)
+            write_whole(path, text)
+        case ".usda":
+            write_whole(path, scene_to_usd(scene))
+        case ".png":
+            picture = topdown(scene, renderer or open_renderer(), outlines=True)
+            write_whole(path, png_bytes(picture))
+        case suffix:
+            raise InputError(
+                f"{path} ends with '{suffix}', which is no format of scenes; end it with one of "
+                ".json, .glb, .obj, .usda, .png."
+            )
 
 
 def scene_to_glb(scene: Scene, floor: Mesh | None = None) -> bytes:

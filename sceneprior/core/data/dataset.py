@@ -1,8 +1,7 @@
 """Data sets that hold the rooms of one split in memory and make batches of their views."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from itertools import islice
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -16,7 +15,7 @@ from sceneprior.core.data.masks import MaskStore
 from sceneprior.core.errors import ShardError
 from sceneprior.core.geometry.turns import turn_vectors
 from sceneprior.core.shards import RoomViews, Shard, iterate_rooms
-from sceneprior.core.views import SceneViews
+from sceneprior.core.views import Batch, SceneViews
 
 BLANK = -1
 """Epoch number that stands for padding: the room comes without objects."""
@@ -43,15 +42,11 @@ class RoomDataset(Dataset):
         self.plain_ids: list[str] = []
 
     def read_rooms(
-        self,
-        folder: Path,
-        split: str,
-        read: Callable[[Shard, str], _Room],
-        limit: int | None = None,
+        self, folder: Path, split: str, read: Callable[[Shard, str], _Room]
     ) -> list[_Room]:
-        """Call `read` on each room of a split, or on the first `limit`, and collect the results."""
+        """Call `read` on each room of a split, and collect the results."""
         rooms = []
-        for shard, room_id in islice(iterate_rooms(folder, split), limit):
+        for shard, room_id in iterate_rooms(folder, split):
             if self.label_set and shard.label_set != self.label_set:
                 raise ShardError(
                     f"{shard.path} is labelled '{shard.label_set}' but its neighbours "
@@ -75,7 +70,7 @@ class RoomDataset(Dataset):
 
 
 @dataclass(frozen=True)
-class FlatViews:
+class FlatViews(Batch):
     """All views of a split as flat arrays, without the images.
 
     A view takes 100 bytes, a sighting 21. A sighting is a pair of a view and a tracked object of
@@ -119,17 +114,6 @@ class FlatViews:
             boxes=joined("boxes", 4),
             visible=joined("visible"),
             sides_clear=joined("sides_clear", 4),
-        )
-
-    @property
-    def bytes(self) -> int:
-        """Total memory of the tensors."""
-        return sum(getattr(self, item.name).nbytes for item in fields(self))
-
-    def to(self, device: torch.device | str) -> "FlatViews":
-        """Copy of the arrays on `device`."""
-        return FlatViews(
-            **{item.name: getattr(self, item.name).to(device) for item in fields(self)}
         )
 
     def gather(
@@ -207,7 +191,6 @@ class ViewDataset(RoomDataset):
         view_fraction: float = 1.0,
         mask_step: int | None = None,
         seed: int = 0,
-        limit: int | None = None,
         held_out: bool = False,
     ):
         super().__init__(rotations)
@@ -218,7 +201,7 @@ class ViewDataset(RoomDataset):
             places.append((shard.path, room_id))
             return shard.read_room(room_id)
 
-        rooms = self.read_rooms(folder, split, read, limit)
+        rooms = self.read_rooms(folder, split, read)
         self.flat = FlatViews.of(rooms)
         self.masks = None if mask_step is None else MaskStore(places, mask_step)
         self._image_sizes = tuple(room.image_size for room in rooms)

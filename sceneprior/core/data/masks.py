@@ -1,6 +1,5 @@
 """Compressed in-memory store of a split's downsampled instance-id images."""
 
-import sys
 from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,14 +30,6 @@ class MaskStore:
     def __getstate__(self) -> dict[str, Any]:
         # Open files cannot be pickled; each worker process opens its own.
         return {**self.__dict__, "_shards": OrderedDict()}
-
-    @property
-    def bytes(self) -> int:
-        """Memory of the compressed images, including Python's overhead."""
-        rooms = self._packed.values()
-        return sum(
-            sys.getsizeof(views) + sum(map(sys.getsizeof, views.values())) for views in rooms
-        )
 
     def read(self, room: int, views: np.ndarray) -> np.ndarray:
         """Read images of a room: (views, H/step, W/step), 0 = background, k + 1 = object k."""

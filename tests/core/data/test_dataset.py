@@ -219,14 +219,6 @@ def test_a_blank_draw_is_a_room_in_which_there_is_nothing(toy_shards):
     assert torch.equal(mixed.visible[1, :, :count], plain.visible[0])
 
 
-def test_a_limit_takes_the_first_rooms_across_shards(toy_shards):
-    every = dataset(toy_shards, rotations=4)
-    for limit in (1, 6, 8, 50):
-        some = dataset(toy_shards, rotations=4, limit=limit)
-        assert some.room_ids == every.room_ids[: 4 * limit]
-        assert torch.equal(some.__getitems__([(2, 5)]).boxes, every.__getitems__([(2, 5)]).boxes)
-
-
 def test_the_loader_gives_whole_batches_and_learns_of_epochs(toy_shards):
     data = dataset(toy_shards)
     loader = make_loader(data, 5, 0, 0)
