@@ -27,7 +27,7 @@ from sceneprior.apps.config import load_run
 from sceneprior.apps.experiments.evaluate import decoded_and_true
 from sceneprior.core.geometry.isosurface import surface_of
 from sceneprior.core.geometry.meshes import icosphere
-from sceneprior.core.geometry.surfaces import chamfer_sum
+from sceneprior.core.geometry.surfaces import chamfer_of, nearest_distances
 from sceneprior.core.overlaps import match_scenes
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
@@ -129,7 +129,8 @@ def distances(
             mesh = shape(decoded.objects[mine], target)
             a, b = sample_surface(mesh, points, 0), sample_surface(target.mesh, points, 1)
             volumes = volume_iou(mesh, target.mesh)
-            found.append(Fidelity(target.label, chamfer_sum(a, b).l2_m, f_score(a, b), volumes))
+            chamfer_m = chamfer_of(*nearest_distances(a, b)).l2_m
+            found.append(Fidelity(target.label, chamfer_m, f_score(a, b), volumes))
     return found
 
 

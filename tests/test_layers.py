@@ -39,7 +39,7 @@ MAY_TOO = {
 }
 
 OWNERS = {
-    "h5py": ["sceneprior/core/shards.py"],
+    "h5py": ["sceneprior/core/shard"],
     "pyrender": ["sceneprior/render/offscreen/"],
     "OpenGL": ["sceneprior/render/offscreen/"],
     "numba": [

@@ -13,7 +13,8 @@ import trimesh
 from sceneprior.core.classes import label_set
 from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Mesh
-from sceneprior.core.shards import RoomGroundTruth, RoomViews, shard_bytes
+from sceneprior.core.shard_writing import shard_bytes
+from sceneprior.core.shards import RoomGroundTruth, RoomViews
 from sceneprior.render.offscreen import Pinhole, SoftwareRenderer
 
 LABEL_SET = "front3d_bedroom"

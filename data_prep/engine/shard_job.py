@@ -13,13 +13,8 @@ from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Source, sen
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json, write_whole
 from sceneprior.core.scene import Mesh
-from sceneprior.core.shards import (
-    MODELS_FOLDER,
-    RoomGroundTruth,
-    RoomViews,
-    check_views,
-    shard_bytes,
-)
+from sceneprior.core.shard_writing import check_views, shard_bytes
+from sceneprior.core.shards import MODELS_FOLDER, RoomGroundTruth, RoomViews
 from sceneprior.render.offscreen import Renderer, open_renderer
 
 

@@ -14,13 +14,8 @@ from data_prep.inspection.checks import array_problems, mask_problems, truth_pro
 from data_prep.inspection.verdicts import disagreement, room_problems
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError, ShardError
-from sceneprior.core.shards import (
-    MODELS_FOLDER,
-    Shard,
-    list_shards,
-    read_index,
-    room_checksum,
-)
+from sceneprior.core.shard_writing import room_checksum
+from sceneprior.core.shards import MODELS_FOLDER, Shard, list_shards, read_index
 
 _TRIED_ROOMS = 2
 """Rooms per shard in which camera repairs are tried; the others likely have the same fault."""

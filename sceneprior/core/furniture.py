@@ -50,11 +50,7 @@ def model_categories(folder: Path, option: str = "--future") -> dict[str, str]:
 
 
 def tidy_category(text: str) -> str:
-    """Normalise a category as in the table: lower case, "a / b" as "a/b".
-
-    >>> tidy_category("King-size Bed")
-    'king-size bed'
-    """
+    """Normalise a category as in the table: lower case, "a / b" as "a/b"."""
     return text.strip().lower().replace(" / ", "/")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
@@ -237,12 +237,7 @@ _Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
 _Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
-class _Entry(BaseModel):
-    # Strict, because "1.8" and true are not valid lengths.
-    model_config = ConfigDict(strict=True)
-
-
-class _ObjectEntry(_Entry):
+class _ObjectEntry(BaseModel):
     label: str = Field(alias="class")
     center_m: _Triple
     size_m: _Triple
@@ -250,7 +245,7 @@ class _ObjectEntry(_Entry):
     own_size_m: _Triple | None = None
 
 
-class _SceneEntry(_Entry):
+class _SceneEntry(BaseModel):
     name: str | None = None
     label_set: str
     objects: Annotated[list[_ObjectEntry], Field(max_length=MOST_OBJECTS)]
@@ -269,7 +264,8 @@ def read_scene(path: Path) -> Scene:
                 f"{_short(data['version'])}; expected '{FORMAT}' version {VERSION}. Write it "
                 "again with `sceneprior synthesize`."
             )
-        entry = _SceneEntry.model_validate(data)
+        # Strict, because "1.8" and true are not valid lengths.
+        entry = _SceneEntry.model_validate(data, strict=True)
         # `extra` is written again with the scene, so it must be valid JSON without NaN.
         json_text(entry.extra)
     except InputError:

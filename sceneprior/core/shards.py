@@ -1,10 +1,9 @@
-"""View shards: HDF5 files written by data preparation, read by training (docs/shard_format.md)."""
+"""View shards: HDF5 files written by `shard_writing`, read by training (docs/shard_format.md)."""
 
 import contextlib
-import hashlib
 import json
 import operator
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,16 @@ from zlib_ng import zlib_ng
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import ShardError
 from sceneprior.core.files import is_name
+from sceneprior.core.shard_arrays import (
+    IMAGES,
+    TRUTH_ARRAYS,
+    UNOCCLUDED,
+    VIEW_ARRAYS,
+    checked_images,
+    known_ids,
+    read_arrays,
+    shape_of,
+)
 
 if TYPE_CHECKING:
     import h5py
@@ -91,145 +100,6 @@ class RoomGroundTruth:
     None if only objects with masks can occlude, so that `sides_clear` suffices."""
 
 
-_Side = int | str
-_VIEW_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
-    "object_class": ("int16", ("n",)),
-    "world_to_camera": ("float32", ("T", 4, 4)),
-    "intrinsics": ("float32", ("T", 3, 3)),
-    "boxes": ("float32", ("T", "n", 4)),
-    "visible": ("bool", ("T", "n")),
-    "mask_pixels": ("int32", ("T", "n")),
-    "sides_clear": ("bool", ("T", "n", 4)),
-}
-"""Type and shape of each array of a room; T views, n objects, images of H x W pixels."""
-_IMAGES: tuple[_Side, ...] = ("T", "H", "W")
-_TRUTH_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
-    "object_class": ("int16", ("m",)),
-    "centers_m": ("float32", ("m", 3)),
-    "sizes_m": ("float32", ("m", 3)),
-    "yaw_rad": ("float32", ("m",)),
-    "model_to_room": ("float32", ("m", 4, 4)),
-    "floor_m": ("float32", ("P", 2)),
-}
-_UNOCCLUDED: dict[str, tuple[str, tuple[_Side, ...]]] = {"unoccluded": ("bool", ("T", "n"))}
-"""Optional array of rooms in which more than objects can occlude objects."""
-_MOST_DEFLATED = 1032
-"""Maximum compression ratio of DEFLATE."""
-
-
-def shard_bytes(
-    name: str, label_set_name: str, rooms: Iterable[tuple[RoomViews, RoomGroundTruth | None]]
-) -> bytes:
-    """Encode rooms as the bytes of a shard; the same rooms give the same bytes.
-
-    The shard, a few MB, is built in memory because HDF5 does not recover from a full disk. From a
-    generator, one room is held in memory at a time. `name` is for messages.
-    """
-    import h5py
-
-    with h5py.File(name, "w", driver="core", backing_store=False) as file:
-        file.attrs["version"] = VERSION
-        _write_text(file, "format", FORMAT)
-        _write_text(file, "label_set", label_set_name)
-        _write_text(file, "classes", json.dumps(label_set(label_set_name)))
-        for views, truth in rooms:
-            check_views(name, views)
-            # HDF5 treats "/" as a group separator, and ids such as <house>/<room> contain it.
-            key = views.room_id.replace("/", "|")
-            _write_room(file.create_group(f"rooms/{key}"), views, truth)
-        file.flush()
-        return file.id.get_file_image()
-
-
-def _write_room(group: "h5py.Group", views: RoomViews, truth: RoomGroundTruth | None) -> None:
-    _write_text(group, "room_id", views.room_id)
-    group.attrs["image_size"] = views.image_size
-    _write_text(group, "sha256", room_checksum(views, truth))
-    for name in _VIEW_ARRAYS:
-        group.create_dataset(name, data=getattr(views, name))
-    ids = _images(views)
-    # Level 8 gives half the size of level 4 and takes 1 ms a view; level 9 takes 3 ms for the last
-    # 3%. Larger data is slower to read, too.
-    group.create_dataset(
-        "instance_ids", data=ids, chunks=(1, *ids.shape[1:]), compression="gzip",
-        compression_opts=8, shuffle=False,
-    )  # fmt: skip
-    if truth is not None:
-        hidden = group.create_group("ground_truth")
-        for name in _TRUTH_ARRAYS:
-            hidden.create_dataset(name, data=getattr(truth, name))
-        if truth.unoccluded is not None:
-            hidden.create_dataset("unoccluded", data=truth.unoccluded)
-        _write_text(hidden, "model_ids", json.dumps(truth.model_ids))
-        hidden.attrs["height_m"] = truth.height_m
-
-
-def _write_text(group: "h5py.Group", name: str, text: str) -> None:
-    """Write a text as an attribute of fixed length, or of variable length if it is too long.
-
-    HDF5 keeps texts of variable length in a heap, and a single damaged byte there can make it read
-    forever.
-    """
-    import h5py
-
-    data = text.encode()
-    length = len(data) if 0 < len(data) < 2**15 else None
-    group.attrs.create(name, data, dtype=h5py.string_dtype("utf-8", length))
-
-
-def room_checksum(views: RoomViews, truth: RoomGroundTruth | None) -> str:
-    """SHA-256 of all data of a room in a shard, as specified in docs/shard_format.md."""
-    size = [int(side) for side in views.image_size]
-    parts: dict[str, Any] = {"room_id": views.room_id, "image_size": size}
-    parts |= {name: getattr(views, name) for name in _VIEW_ARRAYS}
-    parts["instance_ids"] = _images(views)
-    if truth is not None:
-        parts |= {f"ground_truth/{name}": getattr(truth, name) for name in _TRUTH_ARRAYS}
-        parts |= {"model_ids": truth.model_ids, "height_m": float(truth.height_m)}
-        if truth.unoccluded is not None:
-            parts["ground_truth/unoccluded"] = truth.unoccluded
-    summary = hashlib.sha256()
-    for name, value in parts.items():
-        if isinstance(value, np.ndarray):
-            summary.update(f"{name} {value.dtype.str} {value.shape}\n".encode())
-            summary.update(np.ascontiguousarray(value).data)
-        else:
-            summary.update(f"{name} {json.dumps(value)}\n".encode())
-    return summary.hexdigest()
-
-
-def _images(views: RoomViews) -> np.ndarray:
-    if views.instance_ids is None:
-        raise ShardError(
-            f"Room {views.room_id} was read without its images; read them to write it."
-        )
-    return views.instance_ids
-
-
-def check_views(where: str, views: RoomViews) -> None:
-    """Check that the arrays of a room have consistent shapes and valid ids; `where` begins the
-    message."""
-    where = f"{where}, room {views.room_id}"
-    count, objects = views.visible.shape
-    height, width = views.image_size
-    sizes = {"T": count, "n": objects, "H": height, "W": width}
-    shapes = {name: shape for name, (_, shape) in _VIEW_ARRAYS.items()} | {"instance_ids": _IMAGES}
-    for name, sides in shapes.items():
-        came, shape = getattr(getattr(views, name), "shape", None), _shape(sides, sizes)
-        if came != shape:
-            raise ShardError(f"{where}: {name} has shape {came}, expected {shape}.")
-    highest = int(_images(views).max(initial=0))
-    if highest > objects + 1:
-        raise ShardError(
-            f"{where}: an instance id is {highest}, but the room has {objects} objects, and "
-            f"{objects + 1} is void."
-        )
-
-
-def _shape(sides: tuple[_Side, ...], sizes: dict[str, int]) -> tuple[_Side, ...]:
-    return tuple(sizes.get(side, side) if isinstance(side, str) else side for side in sides)
-
-
 class Shard(contextlib.AbstractContextManager["Shard"]):
     """One shard, open for reading; close it, or use it in a `with` block."""
 
@@ -288,24 +158,22 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
         with self._group(room_id) as group:
             height, width = (int(side) for side in group.attrs["image_size"])
             sizes = {"H": height, "W": width}
-            arrays = _read_arrays(group, _VIEW_ARRAYS, sizes, self._classes)
-            stored = _checked_images(group)
-            if stored.shape != (shape := _shape(_IMAGES, sizes)):
+            arrays = read_arrays(group, VIEW_ARRAYS, sizes, self._classes)
+            stored = checked_images(group)
+            if stored.shape != (shape := shape_of(IMAGES, sizes)):
                 raise ValueError(f"instance_ids has shape {stored.shape}, expected {shape}")
-            ids = _known_ids(group, stored[()]) if images else None
+            ids = known_ids(group, stored[()]) if images else None
         return RoomViews(room_id=room_id, instance_ids=ids, image_size=(height, width), **arrays)
 
     def read_instance_ids(self, room_id: str, views: Sequence[int], step: int = 1) -> np.ndarray:
         """Read instance-id images of some views, downsampled: (views, H/step, W/step)."""
         with self._group(room_id) as group:
-            images = _checked_images(group)
+            images = checked_images(group)
             one_chunk_each = images.chunks == (1, *images.shape[1:]) and (
                 (images.compression, images.shuffle, images.fletcher32) == ("gzip", False, False)
             )
             read = _inflate if one_chunk_each else operator.getitem
-            return _known_ids(
-                group, np.stack([read(images, view)[thinned(step)] for view in views])
-            )
+            return known_ids(group, np.stack([read(images, view)[thinned(step)] for view in views]))
 
     def has_ground_truth(self, room_id: str) -> bool:
         """Test whether a room has 3D ground truth; the user's posed pictures have none."""
@@ -327,8 +195,8 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
                     "eval-fid` compares what views tell (docs/posed_data.md)."
                 )
             hidden = group["ground_truth"]
-            known = _TRUTH_ARRAYS | (_UNOCCLUDED if "unoccluded" in hidden else {})
-            arrays = _read_arrays(hidden, known, {}, self._classes)
+            known = TRUTH_ARRAYS | (UNOCCLUDED if "unoccluded" in hidden else {})
+            arrays = read_arrays(hidden, known, {}, self._classes)
             model_ids = tuple(json.loads(_decoded(hidden.attrs["model_ids"])))
             if len(model_ids) != len(arrays["object_class"]):
                 raise ValueError(f"it has {len(model_ids)} model_ids")
@@ -355,59 +223,6 @@ def _text(attributes: Any, name: str) -> str:
     if not isinstance(value, str) or not value.isprintable():
         raise ValueError(f"its {name} is no text")
     return value
-
-
-def _read_arrays(
-    group: "h5py.Group",
-    arrays: dict[str, tuple[str, tuple[_Side, ...]]],
-    sizes: dict[str, int],
-    classes: int,
-) -> dict[str, np.ndarray]:
-    """Read arrays of the format; each is checked before memory is allocated for it.
-
-    `sizes` holds the known lengths of named sides; lengths found here are added.
-    """
-    read: dict[str, np.ndarray] = {}
-    for name, (dtype, sides) in arrays.items():
-        stored = group[name]
-        for side, length in zip(sides, stored.shape, strict=False):
-            if isinstance(side, str):
-                sizes.setdefault(side, length)
-        shape = _shape(sides, sizes)
-        if stored.shape != shape:
-            raise ValueError(f"{name} has shape {stored.shape}, expected {shape}")
-        if stored.dtype != dtype:
-            raise ValueError(f"{name} holds {stored.dtype}, expected {dtype}")
-        _check_size(name, stored)
-        read[name] = stored[()]
-        if dtype == "float32" and not np.isfinite(read[name]).all():
-            raise ValueError(f"{name} holds numbers that are not finite")
-    if not ((read["object_class"] >= 0) & (read["object_class"] < classes)).all():
-        raise ValueError(f"object_class is not below {classes}, the size of its label set")
-    return read
-
-
-def _checked_images(group: "h5py.Group") -> "h5py.Dataset":
-    images = group["instance_ids"]
-    if images.dtype not in ("uint8", "uint16") or images.ndim != 3:
-        raise ValueError(f"instance_ids is {images.dtype} {images.shape}, expected uint8 (T, H, W)")
-    _check_size("instance_ids", images)
-    return images
-
-
-def _check_size(name: str, stored: "h5py.Dataset") -> None:
-    """Reject a data set that claims more bytes than it can hold; a damaged shape may be huge."""
-    if stored.nbytes > _MOST_DEFLATED * stored.id.get_storage_size():
-        raise ValueError(f"{name} claims {stored.nbytes} bytes, more than are stored")
-
-
-def _known_ids(group: "h5py.Group", ids: np.ndarray) -> np.ndarray:
-    objects = group["object_class"].shape[0]
-    if (highest := int(ids.max(initial=0))) > objects + 1:
-        raise ValueError(
-            f"an instance id is {highest}, but it has {objects} objects, and {objects + 1} is void"
-        )
-    return ids
 
 
 def _inflate(images: "h5py.Dataset", view: int) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from sceneprior.core.errors import InputError, InputWarning
@@ -97,16 +97,13 @@ def sample_logits(
     # centred^T centred is the covariance; the SVD gives its square root even where it is singular.
     _, scale, axes = torch.linalg.svd(centred / (len(logits) - 1) ** 0.5, full_matrices=False)
     drawn = (noise[:, : len(scale)] * scale) @ axes
-    start = centred[_rooms_in_turn(len(logits), count, generator)]
+    # No room repeats before all have occurred.
+    rooms = len(logits)
+    rounds = [torch.randperm(rooms, generator=generator) for _ in range(-(-count // rooms))]
+    start = centred[torch.cat(rounds)[:count]]
     # Shrunk towards the mean by as much as the noise adds, so that the covariance is preserved.
     drawn = (1 - BANDWIDTH**2) ** 0.5 * start + BANDWIDTH * drawn
     return (mean + drawn).to(trained.dtype)
-
-
-def _rooms_in_turn(rooms: int, count: int, generator: torch.Generator) -> Int[Tensor, " count"]:
-    """Room indices in random order; none repeats before all have occurred."""
-    rounds = [torch.randperm(rooms, generator=generator) for _ in range(-(-count // rooms))]
-    return torch.cat(rounds)[:count]
 
 
 def draw_latents(

@@ -30,7 +30,6 @@ class ShapeDecoderConfig(ShapeModuleConfig):
     (false) the two may drift apart."""
 
     def build(self, features: int) -> "ShapeDecoder":
-        """The module for object features of this width, freshly initialised."""
         return ShapeDecoder(features, self)
 
 

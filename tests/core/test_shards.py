@@ -8,6 +8,7 @@ import pytest
 from toy_rooms import write_shard
 
 from sceneprior.core.errors import ShardError
+from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import (
     RoomGroundTruth,
     RoomViews,
@@ -15,7 +16,6 @@ from sceneprior.core.shards import (
     iterate_rooms,
     list_shards,
     read_index,
-    room_checksum,
 )
 
 
@@ -163,7 +163,7 @@ def test_a_failure_midway_leaves_nothing(tmp_path, monkeypatch):
     def full_disk(*_):
         raise OSError("No space left on device")
 
-    monkeypatch.setattr("sceneprior.core.shards._write_room", full_disk)
+    monkeypatch.setattr("sceneprior.core.shard_writing._write_room", full_disk)
     with pytest.raises(OSError, match="No space"):
         write_shard(tmp_path / "a.h5", "front3d_bedroom", [(make_room(), None)])
     assert not list(tmp_path.iterdir())

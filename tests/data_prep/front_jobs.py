@@ -12,7 +12,8 @@ from front_files import FrontFolder, bedroom
 from data_prep.engine.build import Job
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
-from sceneprior.core.shards import Shard, room_checksum
+from sceneprior.core.shard_writing import room_checksum
+from sceneprior.core.shards import Shard
 
 SMALL = ("views.image_size=[90, 120]", "views.per_m2=0.5", "views.min_object_pixels=20")
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import DataLoader, Sampler, default_convert
 
 from sceneprior.core.data.dataset import BLANK
 
@@ -43,10 +43,6 @@ class DrawSampler(Sampler[list[tuple[int, int]]]):
             yield [(int(row), self.epoch) for row in mine] or [(int(batch[0]), BLANK)]
 
 
-def _as_it_is(batch: Any) -> Any:
-    return batch
-
-
 def make_loader(
     dataset: Any,
     batch_size: int,
@@ -64,7 +60,7 @@ def make_loader(
     return DataLoader(
         dataset,
         batch_sampler=DrawSampler(len(dataset), batch_size, seed, rank, world),
-        collate_fn=_as_it_is,
+        collate_fn=default_convert,
         num_workers=workers,
         persistent_workers=workers > 0,
         multiprocessing_context="spawn" if workers else None,

@@ -45,23 +45,17 @@ class ChamferSum(NamedTuple):
     """Sum of the mean squared distances, in square metres: the usual CD."""
 
 
-def chamfer_sum(
-    a_points_m: Float[np.ndarray, "n 3"], b_points_m: Float[np.ndarray, "m 3"]
-) -> ChamferSum:
-    """Chamfer distance of two point sets, summed over both directions as in PyTorch3D.
+def chamfer_of(there_m: Float[np.ndarray, " n"], back_m: Float[np.ndarray, " m"]) -> ChamferSum:
+    """Chamfer distance of two point sets from their `nearest_distances`, summed as in PyTorch3D.
 
         sum over both directions of mean_i min_j |p_i - q_j|**k,  k = 1 and 2
 
     Example: two points, one metre apart.
 
-        >>> chamfer_sum(np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]))
+        >>> a, b = np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]])
+        >>> chamfer_of(*nearest_distances(a, b))
         ChamferSum(l2_m=2.0, squared_m2=2.0)
     """
-    return chamfer_of(*nearest_distances(a_points_m, b_points_m))
-
-
-def chamfer_of(there_m: Float[np.ndarray, " n"], back_m: Float[np.ndarray, " m"]) -> ChamferSum:
-    """Chamfer distance, as in `chamfer_sum`, from known `nearest_distances`."""
     return ChamferSum(
         float(there_m.mean() + back_m.mean()), float((there_m**2).mean() + (back_m**2).mean())
     )
@@ -72,7 +66,7 @@ def chamfer_mean(
     b_points: Float[np.ndarray, "m 3"],
     a_tree: cKDTree | None = None,
 ) -> float:
-    """Chamfer distance averaged over both directions, half of `chamfer_sum`, in the points' unit.
+    """Chamfer distance averaged over both directions, half of `chamfer_of`, in the points' unit.
 
     `a_tree` is that of `a_points`, for repeated comparisons.
     """

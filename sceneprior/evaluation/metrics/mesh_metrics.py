@@ -14,7 +14,7 @@ from sceneprior.core.scene import Mesh
 
 POINTS = 10_000
 """Points sampled per surface. Two samples of one sphere of radius 1 m still have a Chamfer distance
-(`chamfer_sum(...).l2_m`) of 35 mm; with 1,000 points, 112 mm."""
+(`ChamferSum.l2_m`) of 35 mm; with 1,000 points, 112 mm."""
 F_THRESHOLD_M = 0.05
 """Distance to the other surface up to which a point counts as correct for the F-score."""
 

@@ -33,11 +33,6 @@ def share_of_batch(count: Tensor) -> Float[Tensor, ""]:
     gradient equals that of a single process on the whole batch. The share is 1 for one process.
 
     Every process must call this, in the same order: it waits for the others.
-
-    Example: with one process, a mean is taken as it is.
-
-        >>> share_of_batch(torch.tensor(7)).item()
-        1.0
     """
     mine = count.detach().to(torch.float32)
     if not (dist.is_available() and dist.is_initialized()):

@@ -16,8 +16,6 @@ from sceneprior.core.scene import Mesh
 from sceneprior.render.offscreen.gl_ids import id_renderer_class
 from sceneprior.render.offscreen.renderer import Camera, Pinhole, Renderer
 
-_NO_GL_VARIABLE = "SCENEPRIOR_NO_GL"
-"""Environment variable that tests set to simulate a machine without GL."""
 _FAR_M = 200.0
 
 
@@ -31,8 +29,6 @@ def _probe_gl() -> str:
     PyOpenGL is not imported for this: its errors without GL are unhelpful, and it chooses its
     platform once per process.
     """
-    if os.environ.get(_NO_GL_VARIABLE):
-        raise NoGLError(f"{_NO_GL_VARIABLE} is set")
     try:
         ctypes.CDLL("libGL.so.1")
         egl = ctypes.CDLL("libEGL.so.1")
@@ -61,20 +57,19 @@ _failure: str | None = None
 
 def open_pyrender() -> "_PyrenderRenderer":
     global _pyrender, _failure
+    if _pyrender is None and _failure is None:
+        try:
+            _load_triton_before_mesa()
+            platform = _probe_gl()
+            if "OpenGL" not in sys.modules:  # PyOpenGL chooses at its first import
+                os.environ.setdefault("PYOPENGL_PLATFORM", platform)
+            _pyrender = _PyrenderRenderer()
+        except NoGLError as error:
+            _failure = str(error)
+        except Exception as error:
+            _failure = f"no GL context can be made ({type(error).__name__}: {error})"
+            _failure = " ".join(_failure.split())[:200]
     if _pyrender is None:
-        if _failure is None:
-            try:
-                _load_triton_before_mesa()
-                platform = _probe_gl()
-                if "OpenGL" not in sys.modules:  # PyOpenGL chooses at its first import
-                    platform = os.environ.setdefault("PYOPENGL_PLATFORM", platform)
-                _pyrender = _PyrenderRenderer()
-                return _pyrender
-            except NoGLError as error:
-                _failure = str(error)
-            except Exception as error:
-                _failure = f"no GL context can be made ({type(error).__name__}: {error})"
-                _failure = " ".join(_failure.split())[:200]
         raise NoGLError(_failure)
     return _pyrender
 

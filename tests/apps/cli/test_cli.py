@@ -99,9 +99,8 @@ def test_an_existing_run_wants_resume_and_the_same_settings(command, toy_run, to
 def test_without_gl_pyrender_is_a_sentence_with_the_apt_line(
     command, toy_run, tmp_path, monkeypatch
 ):
-    monkeypatch.setenv("SCENEPRIOR_NO_GL", "1")
     monkeypatch.setattr(offscreen.gl, "_pyrender", None)
-    monkeypatch.setattr(offscreen.gl, "_failure", None)
+    monkeypatch.setattr(offscreen.gl, "_failure", "libEGL or libGL is not installed")
     said = one_sentence(
         command("synthesize", "--run", toy_run, "--out", "made", "--renderer", "pyrender")
     )

@@ -8,7 +8,7 @@ import trimesh
 from scipy.spatial.distance import cdist
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.surfaces import chamfer_sum
+from sceneprior.core.geometry.surfaces import chamfer_of, nearest_distances
 from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.core.scene import Mesh
 from sceneprior.evaluation.metrics.mesh_metrics import (
@@ -68,7 +68,7 @@ def test_chamfer_and_f_score_are_the_definition(rng):
     a, b = rng.normal(size=(70, 3)), rng.normal(size=(50, 3))
     apart = cdist(a, b)
     there, back = apart.min(axis=1), apart.min(axis=0)
-    found = chamfer_sum(a, b)
+    found = chamfer_of(*nearest_distances(a, b))
     assert found.l2_m == pytest.approx(there.mean() + back.mean(), rel=1e-12)
     assert found.squared_m2 == pytest.approx((there**2).mean() + (back**2).mean(), rel=1e-12)
     precision, recall = (there <= 0.4).mean(), (back <= 0.4).mean()
@@ -78,7 +78,7 @@ def test_chamfer_and_f_score_are_the_definition(rng):
 
 def test_chamfer_of_spheres_within_each_other_is_the_gap():
     inner, outer = sample_surface(sphere(1), 20_000, 0), sample_surface(sphere(1.5), 20_000, 1)
-    found = chamfer_sum(inner, outer)
+    found = chamfer_of(*nearest_distances(inner, outer))
     # The nearest of 20,000 points lies a little aside: by about sqrt(area / (4 n)), 9 to 19 mm,
     # which lengthens a distance of 0.5 m by less than a millimetre. Level-5 spheres are 0.4 mm off.
     assert found.l2_m == pytest.approx(2 * 0.5, abs=2e-3)
@@ -88,7 +88,7 @@ def test_chamfer_of_spheres_within_each_other_is_the_gap():
 
 def test_a_surface_beside_itself():
     points = sample_surface(sphere(1), 500, 0)
-    assert chamfer_sum(points, points) == (0, 0)
+    assert chamfer_of(*nearest_distances(points, points)) == (0, 0)
     assert f_score(points, points) == 1
     moved = points + np.array([0, 0.04, 0])
     assert f_score(points, moved) == 1  # every point finds its own copy 4 cm away, at the furthest
@@ -96,7 +96,7 @@ def test_a_surface_beside_itself():
 
 def test_empty_surfaces_are_refused():
     with pytest.raises(InputError, match="0 and 1 came"):
-        chamfer_sum(np.zeros((0, 3)), np.zeros((1, 3)))
+        nearest_distances(np.zeros((0, 3)), np.zeros((1, 3)))
 
 
 def test_turned_boxes_share_what_trimesh_says(rng):
