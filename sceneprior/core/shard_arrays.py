@@ -1,0 +1,90 @@
+"""Arrays of a room in a view shard: their types and shapes, checked as they are read."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import h5py
+
+_Side = int | str
+VIEW_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
+    "object_class": ("int16", ("n",)),
+    "world_to_camera": ("float32", ("T", 4, 4)),
+    "intrinsics": ("float32", ("T", 3, 3)),
+    "boxes": ("float32", ("T", "n", 4)),
+    "visible": ("bool", ("T", "n")),
+    "mask_pixels": ("int32", ("T", "n")),
+    "sides_clear": ("bool", ("T", "n", 4)),
+}
+"""Type and shape of each array of a room; T views, n objects, images of H x W pixels."""
+IMAGES: tuple[_Side, ...] = ("T", "H", "W")
+TRUTH_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
+    "object_class": ("int16", ("m",)),
+    "centers_m": ("float32", ("m", 3)),
+    "sizes_m": ("float32", ("m", 3)),
+    "yaw_rad": ("float32", ("m",)),
+    "model_to_room": ("float32", ("m", 4, 4)),
+    "floor_m": ("float32", ("P", 2)),
+}
+UNOCCLUDED: dict[str, tuple[str, tuple[_Side, ...]]] = {"unoccluded": ("bool", ("T", "n"))}
+"""Optional array of rooms in which more than objects can occlude objects."""
+_MOST_DEFLATED = 1032
+"""Maximum compression ratio of DEFLATE."""
+
+
+def shape_of(sides: tuple[_Side, ...], sizes: dict[str, int]) -> tuple[_Side, ...]:
+    return tuple(sizes.get(side, side) if isinstance(side, str) else side for side in sides)
+
+
+def read_arrays(
+    group: "h5py.Group",
+    arrays: dict[str, tuple[str, tuple[_Side, ...]]],
+    sizes: dict[str, int],
+    classes: int,
+) -> dict[str, np.ndarray]:
+    """Read arrays of the format; each is checked before memory is allocated for it.
+
+    `sizes` holds the known lengths of named sides; lengths found here are added.
+    """
+    read: dict[str, np.ndarray] = {}
+    for name, (dtype, sides) in arrays.items():
+        stored = group[name]
+        for side, length in zip(sides, stored.shape, strict=False):
+            if isinstance(side, str):
+                sizes.setdefault(side, length)
+        shape = shape_of(sides, sizes)
+        if stored.shape != shape:
+            raise ValueError(f"{name} has shape {stored.shape}, expected {shape}")
+        if stored.dtype != dtype:
+            raise ValueError(f"{name} holds {stored.dtype}, expected {dtype}")
+        _check_size(name, stored)
+        read[name] = stored[()]
+        if dtype == "float32" and not np.isfinite(read[name]).all():
+            raise ValueError(f"{name} holds numbers that are not finite")
+    if not ((read["object_class"] >= 0) & (read["object_class"] < classes)).all():
+        raise ValueError(f"object_class is not below {classes}, the size of its label set")
+    return read
+
+
+def checked_images(group: "h5py.Group") -> "h5py.Dataset":
+    images = group["instance_ids"]
+    if images.dtype not in ("uint8", "uint16") or images.ndim != 3:
+        raise ValueError(f"instance_ids is {images.dtype} {images.shape}, expected uint8 (T, H, W)")
+    _check_size("instance_ids", images)
+    return images
+
+
+def _check_size(name: str, stored: "h5py.Dataset") -> None:
+    """Reject a data set that claims more bytes than it can hold; a damaged shape may be huge."""
+    if stored.nbytes > _MOST_DEFLATED * stored.id.get_storage_size():
+        raise ValueError(f"{name} claims {stored.nbytes} bytes, more than are stored")
+
+
+def known_ids(group: "h5py.Group", ids: np.ndarray) -> np.ndarray:
+    objects = group["object_class"].shape[0]
+    if (highest := int(ids.max(initial=0))) > objects + 1:
+        raise ValueError(
+            f"an instance id is {highest}, but it has {objects} objects, and {objects + 1} is void"
+        )
+    return ids
