@@ -43,30 +43,9 @@ def boxes_ratio(
     views: int = 20,
     objects: int = 13,
     level: int = 4,
-    threads: int | None = None,
 ) -> dict[str, float]:
-    """Median seconds of a step in closed form and with an icosphere, and their ratio.
-
-    Args:
-        repeats: Timed steps of each variant, after one warm-up step.
-        rooms, views, objects: Size of the batch.
-        level: Level of the icosphere; 4 is the authors'.
-        threads: Number of torch threads; None keeps the current number.
-
-    Returns:
-        `closed_s`, `points_s` and `ratio` = points_s / closed_s.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads or before)
-    try:
-        return _boxes_ratio(repeats, rooms, views, objects, level)
-    finally:
-        torch.set_num_threads(before)
-
-
-def _boxes_ratio(
-    repeats: int, rooms: int, views: int, objects: int, level: int
-) -> dict[str, float]:
+    """Median seconds of a step in closed form and with an icosphere (the authors' has level 4), and
+    their ratio, after one warm-up step."""
     centers, sizes, cameras, intrinsics = make_batch(rooms, views, objects)
     sphere = icosphere(level)[0].expand(rooms, objects, -1, -1)
 
@@ -103,8 +82,9 @@ def processor() -> str:
 def main() -> None:
     print(f"{processor()}, load {os.getloadavg()[0]:.1f}; torch {torch.__version__}")
     for threads in sorted({1, torch.get_num_threads()}):
+        torch.set_num_threads(threads)
         for name, level, rooms in (("162 vertices", 2, 128), ("2,562 (authors)", 4, 32)):
-            found = boxes_ratio(repeats=3, rooms=rooms, level=level, threads=threads)
+            found = boxes_ratio(repeats=3, rooms=rooms, level=level)
             print(
                 f"{threads} threads, {rooms} rooms: closed form {found['closed_s'] * 1e3:.1f} ms, "
                 f"{name} {found['points_s'] * 1e3:,.0f} ms: {found['ratio']:,.0f} times as fast",

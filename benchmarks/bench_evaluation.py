@@ -34,12 +34,8 @@ def measure(work: Callable[[], T]) -> tuple[T, dict[str, float]]:
 
 
 def time_evaluation(run: Path, shards: Path | None, count: int, renderer: str) -> dict[str, Any]:
-    """Seconds of synthesis and of scoring, without and with a reference file.
-
-    Returns:
-        `synthesize`, `score`, `write_reference` (its first use), `score_with_reference` and
-        `without_intervals`, each with `cpu_s` and `wall_s`; they are also printed as measured.
-    """
+    """Seconds of synthesis and of scoring, without and with a reference file, which its first use
+    writes; they are also printed as measured."""
     seconds: dict[str, Any] = {}
 
     def timed(name: str, work: Callable[[], T]) -> T:

@@ -50,9 +50,7 @@ def main() -> None:
 def timed(*arguments: str, new_kernels: bool = False, until_said: bool = False) -> dict[str, float]:
     """Median seconds of Python with these arguments, in which `ROOMS` is replaced by a new folder.
 
-    Args:
-        new_kernels: Start with an empty Numba cache.
-        until_said: Stop the process at its first line of output.
+    `new_kernels` starts with an empty Numba cache; `until_said` stops at the first line of output.
     """
     walls, cpus = [], []
     for _ in range(REPEATS):

@@ -157,14 +157,9 @@ def timed_fit(
 ) -> dict[str, StageTimes]:
     """Train a run from its start, at least 3 epochs per stage; returns the times by stage.
 
-    Args:
-        config: The run; see `paper_run`.
-        run: A folder that does not exist yet.
-        options: Lightning's options: accelerator, devices, precision.
-        matmul: Precision of float32 matrix products: `high`, which `fit` uses, is TF32 on GPUs that
-            have it; `highest` is float32.
-        ended: Called with the name and times of each stage as soon as it ends, since the next stage
-            may exceed the device's memory.
+    `matmul` is the precision of float32 matrix products: `high`, which `fit` uses, is TF32 on GPUs
+    that have it; `highest` is float32. `ended` is called with each stage as soon as it ends, since
+    the next one may exceed the device's memory.
     """
     clock = Clock(matmul, ended)
     options = options | {"callbacks": [clock]}
