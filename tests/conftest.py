@@ -12,6 +12,7 @@ from pathlib import Path
 # Some are imported only to come before our modules: whatever these import first, jaxtyping's hook
 # has compiled from source, since it looks for .pyc files of a name of its own (2,600 modules).
 import beartype  # noqa: F401
+import compiled  # noqa: F401 (before our modules, whose kernels it keeps from the hook)
 import lightning  # noqa: F401
 import numpy as np
 import pydantic  # noqa: F401

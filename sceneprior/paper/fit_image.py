@@ -94,8 +94,9 @@ def view_loss(
 ) -> ViewLoss:
     """The losses of training, per image (a room of `views`) and without completeness.
 
-    The scenes have at least as many objects as the fullest image shows. Masks are compared only of
-    objects with meshes, which need the shape stage and no occupancy grids.
+    The scenes have at least as many objects as the fullest image shows. `masks` compares masks as
+    well, for which `views` needs instance ids; objects without meshes (before the shape stage, or
+    with occupancy grids) have none.
     """
     weights, drawing = trained.config.view_terms
     boxes = seen_boxes(scenes, views, drawing)

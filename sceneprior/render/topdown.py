@@ -82,8 +82,8 @@ def topdown(
     """Orthographic picture of a room from above: one flat colour per class, without shading.
 
     Image right is +x, image down is +z, and the room's origin is the centre of the image. Of
-    objects above each other, the highest surface is drawn. None takes the protocol of the scene's
-    label set. `outlines` darkens the borders between objects: for readers, never for metrics.
+    objects above each other, the highest surface is drawn. Without a `protocol`, it is that of the
+    scene's label set. `outlines` darkens the borders between objects, for readers, not for metrics.
 
     Source:
         The paper, section 4.2: 512 x 512, orthographic, a colour per category.

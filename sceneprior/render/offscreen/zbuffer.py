@@ -1,7 +1,6 @@
 """Hard rasteriser: a z-buffer of triangles, sampled at pixel centres."""
 
 import math
-from typing import no_type_check
 
 import numpy as np
 from numba import njit
@@ -58,12 +57,13 @@ def rasterize(
     image = np.full(pixels + _NARROW_PX - 1, -1, dtype=np.int32)
     # 1 / z, or -z for an orthographic camera; both are linear in screen space over a triangle.
     nearness = np.full(pixels + _NARROW_PX - 1, -np.inf, dtype=np.float32)
+    fx, fy, cx, cy = (float(value) for value in projection)
     _draw(
         np.ascontiguousarray(vertices, dtype=np.float64),
         np.ascontiguousarray(faces, dtype=np.int32),
         np.ascontiguousarray(np.arange(len(faces)) if labels is None else labels, dtype=np.int32),
         np.ascontiguousarray(world_to_camera, dtype=np.float64),
-        *(float(value) for value in projection), perspective, height, width, image, nearness,
+        fx, fy, cx, cy, perspective, height, width, image, nearness,
     )  # fmt: skip
     with np.errstate(divide="ignore"):
         depth = 1 / nearness if perspective else -nearness
@@ -71,10 +71,8 @@ def rasterize(
     return image[:pixels].reshape(image_size), depth[:pixels].reshape(image_size)
 
 
-# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 # error_model: numpy's division does not raise; a NaN fails the test of the area.
 @njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
 def _draw(
     vertices, faces, labels, world_to_camera, fx, fy, cx, cy, perspective,
     height, width, image, nearness,
@@ -113,7 +111,6 @@ def _draw(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
 def _project(x, y, z, fx, fy, cx, cy, perspective):
     """u, v and nearness of a point in front of the camera."""
     if perspective:
@@ -123,7 +120,6 @@ def _project(x, y, z, fx, fy, cx, cy, perspective):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
 def _clip(a, b, c, out):
     """Clip a triangle to the part beyond the near plane; returns its three or four corners."""
     count = 0
@@ -144,7 +140,6 @@ def _clip(a, b, c, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-@no_type_check
 def _fill(points, a, b, c, label, height, width, image, nearness):
     """Draw the triangle of three rows (u, v, nearness) of `points`."""
     # Scalars instead of rows, since creating array views for every triangle is slow.
@@ -199,7 +194,6 @@ def _fill(points, a, b, c, label, height, width, image, nearness):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-@no_type_check
 def _near_at(x, row_b, row_c, triangle, wanted):
     """Nearness of a triangle at a pixel centre; -inf outside it or if not `wanted`."""
     dx_b, dx_c, a_near, slope_b, slope_c = triangle
@@ -212,7 +206,6 @@ def _near_at(x, row_b, row_c, triangle, wanted):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-@no_type_check
 def _nearer(near, label, old_near, old_label):
     """The nearer of two (nearness, label) pairs; the old one if they are equally near."""
     return (near, label) if near > old_near else (old_near, old_label)

@@ -13,6 +13,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import compiled  # noqa: F401 (the second pytest reads no conftest.py)
 import pytest
 import torch
 from torch.testing import assert_close

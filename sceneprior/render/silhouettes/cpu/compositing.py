@@ -17,8 +17,6 @@ behind.
 The objects are ordered by their depth at the pixel (see faces.py), without a gradient.
 """
 
-from typing import no_type_check
-
 import numpy as np
 from numba import njit
 
@@ -28,9 +26,7 @@ MODES = ("alone", "layered", "paper")
 ALONE, LAYERED, PAPER = range(3)
 
 
-# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 @njit(inline="always")
-@no_type_check
 def _in_row(bounds, origin, objects, row, here):
     """Write the objects whose window meets an image row to `here`, and return their number."""
     count = 0
@@ -42,7 +38,6 @@ def _in_row(bounds, origin, objects, row, here):
 
 
 @njit(inline="always")
-@no_type_check
 def _in_strip(bounds, starts, origin, row, strip, here, count, who, where):
     """Write those objects whose window meets a strip to `who`, and the buffer offset of the row to
     `where`; return their number."""
@@ -59,7 +54,6 @@ def _in_strip(bounds, starts, origin, row, strip, here, count, who, where):
 
 
 @njit(inline="always")
-@no_type_check
 def _sort(order, where, found, lane, sequence, depth):
     """Sort the objects that touch a pixel, nearest first; insertion sort, since they are few."""
     count = 0
@@ -78,7 +72,6 @@ def _sort(order, where, found, lane, sequence, depth):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
 def _compose(first, last, odds, order, bounds, starts, mode, visible, front, front_depth):
     """Fill the dense `visible` (initially 0), `front` (-1) and `front_depth` (inf)."""
     _, objects, height, width = visible.shape
@@ -122,7 +115,6 @@ def _compose(first, last, odds, order, bounds, starts, mode, visible, front, fro
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
 def _compose_backward(first, last, odds, order, bounds, starts, mode, upstream, packed):
     """Compute -dL/dlog(missed), packed in windows, from the dense dL/dvisible."""
     _, objects, height, width = upstream.shape

@@ -11,7 +11,7 @@ them to 8 or 16 pixels at a time. Meshes are independent and each is handled by 
 result does not depend on the number of threads.
 """
 
-from typing import Any, no_type_check
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -25,9 +25,7 @@ _LOOSE: Any = {"contract", "reassoc", "nsz", "arcp"}
 """LLVM flags that allow reordered, fused and vectorised sums, but keep infinities intact."""
 
 
-# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 @njit(inline="always")
-@no_type_check
 def _from_edge(px, py, ax, ay, bx, by, over_length2, zero, one):
     """Vector from edge ab's nearest point to p, that point's parameter, twice area (a, b, p)."""
     ux, uy, x, y = bx - ax, by - ay, px - ax, py - ay
@@ -36,7 +34,6 @@ def _from_edge(px, py, ax, ay, bx, by, over_length2, zero, one):
 
 
 @njit(inline="always")
-@no_type_check
 def _at_pixel(k, column, row, face, T):
     """Vectors from the edges' nearest points to a strip's k-th pixel; its barycentric weights."""
     ax, ay, bx, by, cx, cy, over_area, over1, over2, over3 = face
@@ -51,7 +48,6 @@ def _at_pixel(k, column, row, face, T):
 
 
 @njit(fastmath=_LOOSE, error_model="numpy", nogil=True)
-@no_type_check
 def _draw_strip(odds, order, start, count, column, row, face, nearness, over_sigma, blur):
     T = odds.dtype.type
     zero, one, most, slack = T(0), T(1), T(80), T(-SLACK)
@@ -71,7 +67,6 @@ def _draw_strip(odds, order, start, count, column, row, face, nearness, over_sig
 
 
 @njit(fastmath=_LOOSE, error_model="numpy", nogil=True)
-@no_type_check
 def _strip_gradient(upstream, start, count, column, row, face, over_sigma, blur):
     """Contribution of a strip's pixels to the gradient of a face's three corners, times -1/2."""
     T = upstream.dtype.type
@@ -115,13 +110,11 @@ def _strip_gradient(upstream, start, count, column, row, face, over_sigma, blur)
 
 
 @njit(inline="always")
-@no_type_check
 def _over_length2(ax, ay, bx, by, one, least):
     return one / max((bx - ax) * (bx - ax) + (by - ay) * (by - ay), least)
 
 
 @njit(inline="always")
-@no_type_check
 def _region(pixels, depths, corners, bounds, reach, near, T):
     """Rows and strips of the window that a face reaches (none if it is not drawn); the face."""
     ia, ib, ic = corners
@@ -144,7 +137,6 @@ def _region(pixels, depths, corners, bounds, reach, near, T):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
 def _cover(first, last, pixels, depths, faces, bounds, starts, sigma, blur, near, odds, order):
     """Fill `odds` (initially 1) and `order` (initially -inf) of all windows."""
     T = pixels.dtype.type
@@ -170,7 +162,6 @@ def _cover(first, last, pixels, depths, faces, bounds, starts, sigma, blur, near
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
 def _cover_backward(
     first, last, pixels, depths, faces, bounds, starts, sigma, blur, near, upstream, gradient
 ):

@@ -11,8 +11,6 @@ cost grows with pixels and outline length, not with faces times blur. docs/silho
 difference from the exact formula.
 """
 
-from typing import no_type_check
-
 import numpy as np
 from numba import njit
 
@@ -22,9 +20,7 @@ from sceneprior.render.silhouettes.reference import ASIDE_PX, MIN_AREA_PX2, PIEC
 from sceneprior.render.silhouettes.topology import topology_of
 
 
-# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 @njit(error_model="numpy", nogil=True)
-@no_type_check
 def _depth_strip(
     order, start, count, column, row, ax, ay, over_area, bx, by, cx, cy, near_a, near_b, near_c
 ):  # fmt: skip
@@ -43,7 +39,6 @@ def _depth_strip(
 
 
 @njit(nogil=True, error_model="numpy")
-@no_type_check
 def _rasterize(
     points, nearness, faces, edge_of, way, row0, row1, strip0, strip1, start, most, order, layers
 ):  # fmt: skip
@@ -84,7 +79,6 @@ def _rasterize(
 
 
 @njit(nogil=True, error_model="numpy")
-@no_type_check
 def _faces_over(x, y, ax, ay, by, slope, falls):
     """Number of faces over a point, summed over the edges to its right; vectorised."""
     faces = 0
@@ -96,7 +90,6 @@ def _faces_over(x, y, ax, ay, by, slope, falls):
 
 
 @njit(inline="always")
-@no_type_check
 def _cut(start, step, low, high, first, last):
     """Cut the part [first, last] of a line to low <= start + t * step <= high."""
     if step == 0.0:
@@ -106,7 +99,6 @@ def _cut(start, step, low, high, first, last):
 
 
 @njit(nogil=True, error_model="numpy")
-@no_type_check
 def _candidates(points, edges, layers):
     """Edges across which the number of faces changes: their indices, ends and dx / dy, and the
     decrease in the number of faces when crossing to the right along a row."""
@@ -121,7 +113,6 @@ def _candidates(points, edges, layers):
 
 
 @njit(nogil=True, error_model="numpy")
-@no_type_check
 def _trace(
     candidates, layers, row0, row1, strip0, strip1, start, blur, distance, edge, share
 ):  # fmt: skip
@@ -162,7 +153,6 @@ def _trace(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
 def _cover(
     first, last, pixels, nearness, faces, edges, edge_of, way, bounds, starts, sigma, blur, most,
     odds, order, edge, share,
@@ -194,7 +184,6 @@ def _cover(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
 def _cover_backward(
     first, last, pixels, edges, bounds, starts, sigma, odds, order, edge, share, upstream, gradient
 ):  # fmt: skip

@@ -3,8 +3,6 @@
 The dozen small torch operations of `project` would take as long as drawing.
 """
 
-from typing import no_type_check
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -16,9 +14,7 @@ from sceneprior.core.geometry.cameras import MIN_DEPTH_M
 from sceneprior.render.silhouettes.cpu.threads import in_threads
 
 
-# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 @njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
 def _project(first, last, points, cameras, views, pixels, depths):
     least = points.dtype.type(MIN_DEPTH_M)
     for image in range(first, last):
@@ -33,7 +29,6 @@ def _project(first, last, points, cameras, views, pixels, depths):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
 def _project_backward(first, last, cameras, pixels, depths, objects, upstream, gradient):
     """Add dL/dpoints to `gradient`. Items are objects, so each vertex belongs to one thread."""
     rooms, points, _ = gradient.shape

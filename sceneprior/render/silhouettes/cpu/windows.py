@@ -9,7 +9,7 @@ contiguous memory and the compiler vectorises it:
                                        + column % 8
 """
 
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -41,9 +41,7 @@ def windows_of(
     return Windows(bounds, np.concatenate([[0], np.cumsum(area)]))
 
 
-# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 @njit(inline="always")
-@no_type_check
 def pixel_range(low, high, size):
     """First and one past the last pixel whose centre lies in [low, high], within the image."""
     first = int(min(max(np.ceil(low - 0.5), 0.0), float(size)))
@@ -52,7 +50,6 @@ def pixel_range(low, high, size):
 
 
 @njit(cache=True, nogil=True)
-@no_type_check
 def _bounds(first, last, pixels, depths, drawn, reach, near, height, width, bounds):
     for mesh in range(first, last):
         if not drawn[mesh]:

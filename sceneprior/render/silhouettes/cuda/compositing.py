@@ -4,8 +4,6 @@ There is one program per image tile. Few objects meet in a tile, so all pairs ar
 of sorting. `missed` and `order` are the outputs of `cover_tiles` or `trace_tiles`.
 """
 
-from typing import no_type_check
-
 from sceneprior.render.silhouettes.cuda.kernels import TILE, holds, packed_at, tl, triton
 
 CERTAIN = tl.constexpr(1.5e-8)
@@ -13,7 +11,6 @@ CERTAIN = tl.constexpr(1.5e-8)
 
 
 @triton.jit
-@no_type_check
 def _tile_pixels(height, width):  # pragma: no cover - compiled
     """Image, tile and pixels of this program."""
     columns = tl.cdiv(width, TILE)
@@ -27,7 +24,6 @@ def _tile_pixels(height, width):  # pragma: no cover - compiled
 
 
 @triton.jit
-@no_type_check
 def _missed_before(
     missed, order, windows, first_tiles, mesh, objects, k, z, tile_row, tile_column, row, column
 ):  # pragma: no cover - compiled  # fmt: skip
@@ -43,7 +39,6 @@ def _missed_before(
 
 
 @triton.jit
-@no_type_check
 def composite_tiles(
     missed, order, windows, first_tiles, masks, front, depth, objects, height, width,
     MODE: tl.constexpr,
@@ -90,7 +85,6 @@ def composite_tiles(
 
 
 @triton.jit
-@no_type_check
 def composite_backward(
     missed, order, windows, first_tiles, masks, upstream, packed, objects, height, width,
     MODE: tl.constexpr,

@@ -4,8 +4,6 @@ In the backward pass, each face sums over its pixels, then each vertex over the 
 it, always in the same order.
 """
 
-from typing import no_type_check
-
 import torch
 from torch import Tensor
 
@@ -31,7 +29,6 @@ VERTICES = 128
 
 
 @triton.jit
-@no_type_check
 def corner_gradients(
     pixels, faces, face_bounds, windows, first_tiles, upstream, by_corner,
     vertex_count, face_count, block_count, sigma, blur, FACES: tl.constexpr, PIXELS: tl.constexpr,
@@ -119,7 +116,6 @@ def corner_gradients(
 
 
 @triton.jit
-@no_type_check
 def gather_vertices(
     by_corner, corners, first_corners, windows, gradient, vertex_count, corner_count,
     VERTICES: tl.constexpr,

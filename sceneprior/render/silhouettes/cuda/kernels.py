@@ -20,8 +20,6 @@ deterministic. `missed` is 1 - coverage, the probability that the mesh misses th
 are chosen for an H200 by counting instructions and registers, not yet by measurement.
 """
 
-from typing import no_type_check
-
 try:
     import triton
     import triton.language as tl
@@ -47,9 +45,7 @@ EMPTY = tl.constexpr(32767)
 MIN_AREA, SLACK = tl.constexpr(reference.MIN_AREA_PX2), tl.constexpr(reference.SLACK)
 
 
-# no_type_check: the tests' type hook wraps every function, and Triton cannot compile a wrapper.
 @triton.jit
-@no_type_check
 def corners_of(
     pixels, faces, face, first_vertex, mask, real: tl.constexpr
 ):  # pragma: no cover - compiled
@@ -67,7 +63,6 @@ def corners_of(
 
 
 @triton.jit
-@no_type_check
 def are_drawn(depths, a, b, c, area, mask, near):  # pragma: no cover - compiled
     """True for faces that lie in front of the near plane and are not degenerate."""
     za, zb = tl.load(depths + a, mask=mask, other=0), tl.load(depths + b, mask=mask, other=0)
@@ -76,7 +71,6 @@ def are_drawn(depths, a, b, c, area, mask, near):  # pragma: no cover - compiled
 
 
 @triton.jit
-@no_type_check
 def window(windows, first_tiles, mesh):  # pragma: no cover - compiled
     """(base, stride): pixel (row, column) of a mesh is packed at base + row * stride + column."""
     top, left = tl.load(windows + mesh * 4), tl.load(windows + mesh * 4 + 1)
@@ -86,7 +80,6 @@ def window(windows, first_tiles, mesh):  # pragma: no cover - compiled
 
 
 @triton.jit
-@no_type_check
 def packed_at(windows, first_tiles, mesh, row, column):  # pragma: no cover - compiled
     """Packed indices of a mesh's pixels."""
     base, stride = window(windows, first_tiles, mesh)
@@ -94,7 +87,6 @@ def packed_at(windows, first_tiles, mesh, row, column):  # pragma: no cover - co
 
 
 @triton.jit
-@no_type_check
 def bits_of(hit, lane):  # pragma: no cover - compiled
     """BLOCK booleans as the bits of one word."""
     bit = tl.full((BLOCK,), 1, tl.uint32) << lane.to(tl.uint32)
@@ -102,7 +94,6 @@ def bits_of(hit, lane):  # pragma: no cover - compiled
 
 
 @triton.jit
-@no_type_check
 def tile_pixels(windows, first_tiles, tile_meshes):  # pragma: no cover - compiled
     """Mesh, top row and left column of this program's tile; its pixels and their packed indices."""
     tile = tl.program_id(0).to(tl.int64)
@@ -118,7 +109,6 @@ def tile_pixels(windows, first_tiles, tile_meshes):  # pragma: no cover - compil
 
 
 @triton.jit
-@no_type_check
 def holds(windows, mesh, tile_row, tile_column):  # pragma: no cover - compiled
     """True if an image tile lies in the mesh's window."""
     top, left = tl.load(windows + mesh * 4), tl.load(windows + mesh * 4 + 1)
@@ -128,7 +118,6 @@ def holds(windows, mesh, tile_row, tile_column):  # pragma: no cover - compiled
 
 
 @triton.jit
-@no_type_check
 def hits(bounds, first, count, row_size, row, column):  # pragma: no cover - compiled
     """Bit mask: bit i is set if entry first + i of the bounds meets the tile at (row, column)."""
     lane = tl.arange(0, BLOCK)
@@ -142,7 +131,6 @@ def hits(bounds, first, count, row_size, row, column):  # pragma: no cover - com
 
 
 @triton.jit
-@no_type_check
 def first_bit(bits):  # pragma: no cover - compiled
     """Index of the lowest set bit, read from the exponent of its float32 value."""
     lowest = bits ^ (bits & (bits - 1))
@@ -150,7 +138,6 @@ def first_bit(bits):  # pragma: no cover - compiled
 
 
 @triton.jit
-@no_type_check
 def to_edge(px, py, ax, ay, bx, by):  # pragma: no cover - compiled
     """Vector from edge ab's nearest point to p, that point's parameter, twice area (p, a, b)."""
     ex, ey = bx - ax, by - ay
@@ -161,7 +148,6 @@ def to_edge(px, py, ax, ay, bx, by):  # pragma: no cover - compiled
 
 
 @triton.jit
-@no_type_check
 def cover_tiles(
     pixels, inverse_depths, faces, face_bounds, block_bounds, windows, first_tiles, tile_meshes,
     missed, order, vertex_count, block_count, sigma, blur,

@@ -1,7 +1,5 @@
 """Triton kernels of the fast mode: coverage of packed windows by outlines, and its gradient."""
 
-from typing import no_type_check
-
 from sceneprior.render.silhouettes.cuda.kernels import (
     BLOCK,
     MIN_AREA,
@@ -28,9 +26,7 @@ PER_PROGRAM, PIXELS = tl.constexpr(8), tl.constexpr(8)
 """Pieces per program of `end_gradients`, and pixels processed at once for each."""
 
 
-# no_type_check: the tests' type hook wraps every function, and Triton cannot compile a wrapper.
 @triton.jit
-@no_type_check
 def _ends_of(lines, line, count, mask):  # pragma: no cover - compiled
     """x and y of both ends of lines, which are stored as rows of `count`."""
     x0 = tl.load(lines + line, mask=mask, other=0)
@@ -40,7 +36,6 @@ def _ends_of(lines, line, count, mask):  # pragma: no cover - compiled
 
 
 @triton.jit
-@no_type_check
 def sum_layers(
     pixels, depths, faces, windows, first_faces, edge_faces, edge_ways, layers,
     vertex_count, edge_count, near,
@@ -69,7 +64,6 @@ def sum_layers(
 
 
 @triton.jit
-@no_type_check
 def certify_pieces(
     points, piece_meshes, lines, layers, first_lines, clear, piece_count, line_count
 ):  # pragma: no cover - compiled
@@ -99,7 +93,6 @@ def certify_pieces(
 
 
 @triton.jit
-@no_type_check
 def _pieces_near(
     shapes, clear, first, last, piece_count, top_row, left_column, reach
 ):  # pragma: no cover - compiled
@@ -117,7 +110,6 @@ def _pieces_near(
 
 
 @triton.jit
-@no_type_check
 def _to_piece(px, py, x0, y0, x1, y1):  # pragma: no cover - compiled
     """Vector from the nearest point of a piece to p, and that point's parameter in [0, 1]."""
     ux, uy = x1 - x0, y1 - y0
@@ -128,7 +120,6 @@ def _to_piece(px, py, x0, y0, x1, y1):  # pragma: no cover - compiled
 
 
 @triton.jit
-@no_type_check
 def trace_tiles(
     pixels, nearness, faces, face_bounds, block_bounds, windows, first_tiles, tile_meshes,
     shapes, clear, first_pieces, missed, order, nearest,
@@ -195,7 +186,6 @@ def trace_tiles(
 
 
 @triton.jit
-@no_type_check
 def end_gradients(
     shapes, spans, piece_meshes, clear, windows, first_tiles, missed, order, nearest, upstream,
     by_end, piece_count, sigma, reach,

@@ -1,6 +1,6 @@
 """Windows, the tiles of the image that each mesh may touch, and the launch of kernels."""
 
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,9 +23,7 @@ REACH_MARGIN_PX = 1e-3
 """Added to the blur radius, so that a face misses no pixel by rounding."""
 
 
-# no_type_check: the tests' type hook wraps every function, and Triton cannot compile a wrapper.
 @triton.jit
-@no_type_check
 def _store4(to, row_size, first, second, third, fourth, mask):  # pragma: no cover - compiled
     tl.store(to, first.to(tl.int16), mask=mask)
     tl.store(to + row_size, second.to(tl.int16), mask=mask)
@@ -34,7 +32,6 @@ def _store4(to, row_size, first, second, third, fourth, mask):  # pragma: no cov
 
 
 @triton.jit
-@no_type_check
 def bound_faces(
     pixels, depths, faces, drawn, face_bounds, block_bounds, windows,
     vertex_count, face_count, block_count, height, width, reach, near, GROUP: tl.constexpr,
