@@ -7,14 +7,11 @@ from rich.text import Text
 
 _FAILURES_SHOWN = 10
 _NOTES_SHOWN = 10
+_COUNTS = ("rooms", "views", "objects")
 
 
 def report_tables(report: dict[str, Any]) -> list[Table]:
-    """Format the report as tables: outcomes, splits, classes, notes, failures, expected counts.
-
-    Args:
-        report: The report from `make_report`.
-    """
+    """Format the report of `make_report` as tables, from outcomes to expected counts."""
     tables = [_outcome(report), _splits(report), _classes(report)]
     if report["notes"]:
         tables.append(_notes(report["notes"]))
@@ -49,19 +46,11 @@ def _notes(kinds: dict[str, int]) -> Table:
 
 
 def _splits(report: dict[str, Any]) -> Table:
-    table = Table(
-        "split", "rooms", "views", "objects", "views a room", "objects a room", "objects a view"
-    )
+    keys = ("views_per_room", "objects_per_room", "objects_per_view")
+    table = Table("split", *_COUNTS, "views a room", "objects a room", "objects a view")
     for split, counts in report["counts"].items():
-        means = report["per_split"][split]
-        table.add_row(
-            split,
-            *(str(counts[key]) for key in ("rooms", "views", "objects")),
-            *(
-                f"{means[key]:.2f}"
-                for key in ("views_per_room", "objects_per_room", "objects_per_view")
-            ),
-        )
+        means = [f"{report['per_split'][split][key]:.2f}" for key in keys]
+        table.add_row(split, *(str(counts[key]) for key in _COUNTS), *means)
     return table
 
 
