@@ -61,20 +61,18 @@ def _place_sofa(room: Furnisher, groups: list[str]) -> Piece | None:
     return room.against_wall(room.catalog["sofa"], 0.5, [wall], where=where, tries=10)
 
 
-def _coffee_table(room: Furnisher, group: str) -> bool:
+def _coffee_table(room: Furnisher, group: str) -> Piece | None:
     tables = room.models("coffee_table", below=0.8 * room.anchor.size_m[0])
-    return room.before(room.anchor, tables, (0.3, 0.45), angled=0.05) is not None
+    return room.before(room.anchor, tables, (0.3, 0.45), angled=0.05)
 
 
-def _side_tables(room: Furnisher, group: str) -> bool:
+def _side_tables(room: Furnisher, group: str) -> object:
     small = room.models("table", below=0.75)
     count = int(group[-1])
-    if room.twins_beside(small, count):
-        return True
-    return count == 1 and room.standing_free(small, 0.1) is not None
+    return room.twins_beside(small, count) or (count == 1 and room.standing_free(small, 0.1))
 
 
-def _armchair(room: Furnisher, group: str) -> bool:
+def _armchair(room: Furnisher, group: str) -> Piece | None:
     """Place an armchair at a side of the coffee table, facing it, or near a wall."""
     tables = [piece for piece in room.plan.pieces if piece.model.name == "coffee_table"]
     chairs, sofa = room.catalog["armchair"], room.anchor
@@ -84,19 +82,19 @@ def _armchair(room: Furnisher, group: str) -> bool:
         anchor = replace(table, yaw_rad=yaw, scale=(1.0, 1.0, 1.0))
         gap = table.half_extent(table.yaw_rad - yaw)[1] - anchor.size_m[2] / 2
         gaps = (gap + 0.25, gap + 0.5)
-        if room.before(anchor, chairs, gaps, angled=SEAT_ANGLED, sideways=(-0.3, 0.3), tries=6):
-            return True
-    return room.standing_free(chairs, SEAT_ANGLED, (sofa.x, sofa.z)) is not None
+        if at := room.before(anchor, chairs, gaps, (-0.3, 0.3), angled=SEAT_ANGLED, tries=6):
+            return at
+    return room.standing_free(chairs, SEAT_ANGLED, (sofa.x, sofa.z))
 
 
-def _second_sofa(room: Furnisher, group: str) -> bool:
+def _second_sofa(room: Furnisher, group: str) -> Piece | None:
     """Place a short second sofa at a wall perpendicular to the first's."""
     yaw = room.anchor.yaw_rad
     across = [wall for wall in room.plan.walls if abs(np.cos(wall.yaw_rad - yaw)) < 0.5]
-    return room.against_wall(room.models("sofa", below=2.2), 0.4, across) is not None
+    return room.against_wall(room.models("sofa", below=2.2), 0.4, across)
 
 
-def _lamp(room: Furnisher, group: str) -> bool:
+def _lamp(room: Furnisher, group: str) -> Piece | None:
     """Hang a lamp: first over the dining table, then over the coffee table, then mid-room."""
     plan, rng = room.plan, room.rng
     hanging = [piece for piece in plan.pieces if piece.y > 0]
@@ -104,19 +102,19 @@ def _lamp(room: Furnisher, group: str) -> bool:
     tables = large + [piece for piece in plan.pieces if piece.model.name == "coffee_table"]
     if len(hanging) < len(tables) and rng.random() < 0.8:
         table = tables[len(hanging)]
-        pendants, lowest = room.catalog["pendant_lamp"], table.top + 0.6
-        if room.hang(pendants, (table.x, table.z), lowest, LAMP_ANGLED, table.yaw_rad):
-            return True
+        pendants, above, lowest = room.catalog["pendant_lamp"], (table.x, table.z), table.top + 0.6
+        if lamp := room.hang(pendants, above, lowest, LAMP_ANGLED, table.yaw_rad):
+            return lamp
     x, z = room.lamp_position()
     if hanging:
         x, z = x + rng.uniform(-0.25, 0.25) * plan.width, z + rng.uniform(-0.25, 0.25) * plan.depth
     kind = "ceiling_lamp" if rng.random() < 0.55 else "pendant_lamp"
-    return room.hang(room.catalog[kind], (x, z), 1.7, LAMP_ANGLED) is not None
+    return room.hang(room.catalog[kind], (x, z), 1.7, LAMP_ANGLED)
 
 
-def _loose(room: Furnisher, group: str) -> bool:
+def _loose(room: Furnisher, group: str) -> Piece | None:
     sofa = (room.anchor.x, room.anchor.z)
-    return room.standing_free(room.models(group, below=0.9), SEAT_ANGLED, sofa) is not None
+    return room.standing_free(room.models(group, below=0.9), SEAT_ANGLED, sofa)
 
 
 LIVING_ROOM = RoomType(

@@ -41,11 +41,7 @@ class ModelHulls:
 
     @cachedmethod(lambda self: self._cache, key=lambda self, model_id: model_id)
     def get(self, model_id: str) -> Hull:
-        """Hull of all vertices in the model's frame; the ground truth's boxes use all, too.
-
-        Raises:
-            ShardError: the file is missing or damaged.
-        """
+        """Hull of all vertices in the model's frame; the ground truth's boxes use all, too."""
         path = self.folder / f"{model_id}.ply"
         try:
             mesh = trimesh.load_mesh(path, process=False)
@@ -85,10 +81,10 @@ def true_bodies(
 
 def found_bodies(views: RoomViews) -> list[Body | None]:
     """Upright boxes found from the masks alone; None if the views do not determine them."""
-    found = fit_upright(views, views.image_size, views.world_to_camera, views.intrinsics)
+    found, _ = fit_upright(views, views.image_size, views.world_to_camera, views.intrinsics)
     return [
         Body("found", Hull(corners, np.array(BOX_EDGES))) if np.isfinite(corners).all() else None
-        for corners in found.corners_m
+        for corners in found
     ]
 
 

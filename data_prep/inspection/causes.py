@@ -12,7 +12,6 @@ from data_prep.inspection.agreement import (
     Comparison,
     compare,
     compare_boxes,
-    passes,
     projections,
 )
 from data_prep.inspection.bodies import Body, found_bodies
@@ -48,10 +47,9 @@ def try_repairs(bodies: Bodies, views: RoomViews) -> dict[str, Trial]:
         if repaired is not None:
             again = found_bodies(repaired) if found else bodies
             trials[cause] = Trial(compare(again, repaired).agreement)
-    if not found:
-        for cause, measure in _OF_TRUTH.items():
-            if (trial := measure(bodies, views)) is not None:
-                trials[cause] = trial
+    for cause, measure in () if found else _OF_TRUTH.items():
+        if (trial := measure(bodies, views)) is not None:
+            trials[cause] = trial
     return trials
 
 
@@ -67,7 +65,7 @@ def likely_cause(
             sums[cause] = Trial(before.agreement + trial.agreement, before.factor)
     good = {
         cause: trial for cause, trial in sums.items()
-        if cause != CHANCE and passes(kind, trial.agreement.of(kind), share, least)
+        if cause != CHANCE and trial.agreement.passes(kind, share, least)
     }  # fmt: skip
     if not good:
         return "is an axis or a unit wrong?"
@@ -89,9 +87,8 @@ def chance_of(trials: Iterable[dict[str, Trial]], kind: str) -> float:
 def out_of_order(bodies: Bodies, views: RoomViews) -> tuple[np.ndarray, Comparison]:
     """Match cameras to frames one to one, so that they fit the masks best.
 
-    Returns:
-        For each frame, the index of the frame whose camera fits, (T,), its own if no other fits
-        better; and the comparison with these cameras.
+    Returns, for each frame, the index of the frame whose camera fits, (T,), its own if no other
+    fits better; and the comparison with these cameras.
     """
     boxes = projections(bodies, views)[:, None]  # one per camera, the same for all frames
     frames = len(views.visible)

@@ -1,71 +1,20 @@
-"""`sceneprior inspect`: the command around contents.py and verify.py."""
+"""The tables and sentences that `sceneprior inspect` prints."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
-import typer
+from rich.table import Column, Table
 
-if TYPE_CHECKING:
-    from rich.table import Table
+from data_prep.inspection.agreement import Agreement
+from data_prep.inspection.bodies import KINDS
+from data_prep.inspection.contents import count_shards, describe_room
+from data_prep.inspection.verify import FolderCheck
 
-    from data_prep.inspection.agreement import Agreement
-    from data_prep.inspection.verify import FolderCheck
-
-SHEET_NAME = "inspect.png"
 _WORST_SHOWN = 5
-_PROBLEMS_SHOWN = 10
+_JUDGED = ("in 3D", "masks within", "mean 2D IoU")
 
 
-def inspect_command(
-    shards: Annotated[Path, typer.Argument(help="Folder of shards.")],
-    room: Annotated[str | None, typer.Option(help="This room only, and its plan.")] = None,
-    png: Annotated[
-        Path | None, typer.Option(help=f"The sheet of pictures (default: SHARDS/{SHEET_NAME}).")
-    ] = None,
-    pictures: Annotated[int, typer.Option(min=1, help="Views on the sheet.")] = 24,
-    boxes_3d: Annotated[
-        bool, typer.Option("--boxes-3d/--no-boxes-3d", help="Draw the ground truth's 3D boxes.")
-    ] = True,
-    verify: Annotated[
-        bool, typer.Option("--verify", help="Check everything instead of drawing.")
-    ] = False,
-    workers: Annotated[int, typer.Option(min=1, help="Processes for --verify.")] = 1,
-) -> None:
-    """Say what a folder of shards holds and draw a sheet of it, or check it with --verify.
-
-    Exit status: 0, or 3 if --verify finds something wrong.
-    """
-    from rich.console import Console
-
-    from data_prep.inspection.contents import draw_sheet
-    from sceneprior.core.errors import InputError
-    from sceneprior.core.files import write_whole
-    from sceneprior.render.pictures import png_bytes
-
-    console = Console()
-    if verify:
-        _verify(console, shards, room, workers)
-    else:
-        for table in _count_tables(shards) if room is None else [_room_table(shards, room)]:
-            console.print(table)
-    if png is not None or not verify:
-        target = png or shards / SHEET_NAME
-        sheet = draw_sheet(shards, room, pictures, boxes_3d)
-        try:
-            write_whole(target, png_bytes(sheet))
-        except OSError as error:
-            raise InputError(
-                f"{target} cannot be written ({error.strerror or error}); name another file with "
-                "--png."
-            ) from None
-        typer.echo(f"Drew {target}.")
-
-
-def _count_tables(shards: Path) -> "list[Table]":
-    from rich.table import Table
-
-    from data_prep.inspection.contents import count_shards
-
+def count_tables(shards: Path) -> list[Table]:
+    """Counts of each split, and its objects of each class."""
     counts = count_shards(shards)
     totals = Table(
         "split", "rooms", "views", "objects", "objects a room", "objects a view", "known in 3D",
@@ -91,11 +40,8 @@ def _count_tables(shards: Path) -> "list[Table]":
     return [totals, histogram]
 
 
-def _room_table(shards: Path, room: str) -> "Table":
-    from rich.table import Table
-
-    from data_prep.inspection.contents import describe_room
-
+def room_table(shards: Path, room: str) -> Table:
+    """The objects of one room."""
     table = Table("object", "class", "views", "share of image", "centre, m", "size, m", title=room)
     for k, row in enumerate(describe_room(shards, room)):
         place = [
@@ -107,29 +53,9 @@ def _room_table(shards: Path, room: str) -> "Table":
     return table
 
 
-def _verify(console: "object", shards: Path, room: str | None, workers: int) -> None:
-    from data_prep.inspection.verify import verify
-
-    found = verify(shards, room, workers)
-    for table in _check_tables(found):
-        console.print(table)  # type: ignore[attr-defined]
-    for sentence in found.problems[1:_PROBLEMS_SHOWN]:
-        typer.echo(sentence, err=True)
-    if found.problems:
-        more = len(found.problems) - 1
-        others = f" ({more} more problem{'s' * (more > 1)}, listed above)" if more else ""
-        typer.echo(f"Error: {found.problems[0]}{others}", err=True)
-        raise typer.Exit(3)
-    typer.echo(f"{shards}: all is well. {_summary(found)}")
-
-
-def _check_tables(found: "FolderCheck") -> "list[Table]":
-    from rich.table import Column, Table
-
-    from data_prep.inspection.agreement import Agreement
-
-    judged = ("in 3D", "masks within", "mean 2D IoU")
-    totals = Table("split", "rooms", "views", "checksums", *judged)
+def check_tables(found: FolderCheck) -> list[Table]:
+    """Results of a check: each split, and the rooms that agree least."""
+    totals = Table("split", "rooms", "views", "checksums", *_JUDGED)
     for split, checks in found.rooms.items():
         rooms = [check for check in checks if check.room_id]
         totals.add_row(
@@ -139,42 +65,35 @@ def _check_tables(found: "FolderCheck") -> "list[Table]":
             f"{sum(check.has_checksum for check in rooms)} rooms",
             *_judged(sum((check.agreement for check in rooms), Agreement())),
         )
-    every = [check for checks in found.rooms.values() for check in checks]
+    agreements = [(check.room_id, check.agreement) for check in found.every]
     worst = sorted(
-        (check for check in every if check.agreement.tallies),
-        key=lambda check: (
-            min(tally.share for tally in check.agreement.tallies.values()),
-            check.room_id,
-        ),
+        (min(tally.share for tally in agreement.tallies.values()), room_id, _judged(agreement))
+        for room_id, agreement in agreements
+        if agreement.tallies
     )
     # Folded, because the end of an id, its room's name, must survive narrow terminals.
-    table = Table(Column("worst rooms", overflow="fold"), *judged)
-    for check in worst[:_WORST_SHOWN]:
-        table.add_row(check.room_id, *_judged(check.agreement))
+    table = Table(Column("worst rooms", overflow="fold"), *_JUDGED)
+    for _, room_id, cells in worst[:_WORST_SHOWN]:
+        table.add_row(room_id, *cells)
     return [totals, table] if worst else [totals]
 
 
-def _judged(agreement: "Agreement") -> tuple[str, str, str]:
+def _judged(agreement: Agreement) -> list[str]:
     """Table cells: 3D representation, share of masks within projections, IoU if fully visible."""
-    from data_prep.inspection.bodies import KINDS
-
-    tallies = agreement.tallies
-    return (
-        "\n".join(KINDS[kind] for kind in tallies) or "-",
-        "\n".join(f"{tally.share:.1%} of {tally.masks}" for tally in tallies.values()) or "-",
-        "\n".join(
-            f"{tally.mean_iou:.3f} of {tally.whole}" if tally.whole else "-"
-            for tally in tallies.values()
+    cells = [
+        (
+            KINDS[kind],
+            f"{tally.share:.1%} of {tally.masks}",
+            f"{tally.mean_iou:.3f} of {tally.whole}" if tally.whole else "-",
         )
-        or "-",
-    )
+        for kind, tally in agreement.tallies.items()
+    ]
+    return ["\n".join(lines) for lines in zip(*cells, strict=True)] or ["-"] * 3
 
 
-def _summary(found: "FolderCheck") -> str:
-    from data_prep.inspection.bodies import KINDS
-
-    rooms = [check for checks in found.rooms.values() for check in checks]
-    without = sum(not check.has_checksum for check in rooms)
+def summary(found: FolderCheck) -> str:
+    """Say how well a folder without problems agrees."""
+    without = sum(not check.has_checksum for check in found.every)
     parts = ["Checksums, shapes, ranges, 2D boxes and masks agree"]
     if without:
         parts.append(f"{without} rooms carry no checksum (shards of an earlier release)")
