@@ -25,11 +25,7 @@ class Group:
 
 
 def read_properties(path: Path) -> dict[str, str]:
-    """Read the `key = value` lines of `<scene>.txt`.
-
-    Raises:
-        InputError: the file is missing or not text.
-    """
+    """Read the `key = value` lines of `<scene>.txt`."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -42,9 +38,6 @@ def axis_alignment(path: Path, properties: dict[str, str]) -> np.ndarray:
     """Rigid transform, (4, 4) float64, that aligns the scan's walls with the axes; z is up.
 
     The identity if the file has none, as for scans of version 1 and test scans.
-
-    Raises:
-        InputError: it is not 16 numbers, or not a rigid transform.
     """
     if "axisAlignment" not in properties:
         return np.eye(4)
@@ -75,11 +68,7 @@ def axis_alignment(path: Path, properties: dict[str, str]) -> np.ndarray:
 
 
 def read_groups(path: Path) -> tuple[list[Group], list[str]]:
-    """Read the objects of `<scene>.aggregation.json`, sorted by id, with notes on oddities.
-
-    Raises:
-        InputError: the file is missing, truncated, or not an aggregation.
-    """
+    """Read the objects of `<scene>.aggregation.json`, sorted by id, with notes on oddities."""
     data = _read_json(path, "a scan without annotations (ScanNet's test scans) cannot be prepared")
     found: dict[int, Group] = {}
     notes = []
@@ -104,11 +93,7 @@ def read_groups(path: Path) -> tuple[list[Group], list[str]]:
 
 
 def read_segments(path: Path) -> np.ndarray:
-    """Read the segment of each mesh vertex from `<scene>_vh_clean_2...segs.json`: (V,) int64.
-
-    Raises:
-        InputError: the file is missing, truncated, or not a segmentation.
-    """
+    """Read the segment of each mesh vertex from `<scene>_vh_clean_2...segs.json`: (V,) int64."""
     data = _read_json(path, "it tells which part of the mesh is which object")
     try:
         segments = np.asarray(data["segIndices"])
@@ -123,11 +108,7 @@ def read_segments(path: Path) -> np.ndarray:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read `<scene>_vh_clean_2.ply` in the scan's frame, z up: vertices float64, metres.
-
-    Raises:
-        InputError: the file is missing, truncated, or holds no finite vertices.
-    """
+    """Read `<scene>_vh_clean_2.ply` in the scan's frame, z up: vertices float64, metres."""
     from trimesh.exchange.ply import load_ply
 
     if not path.is_file():

@@ -39,11 +39,7 @@ class Labels:
 
 
 def read_labels(path: Path) -> Labels:
-    """Read `scannetv2-labels.combined.tsv`; of a repeated category, the last row wins.
-
-    Raises:
-        InputError: the file is missing or is not that table.
-    """
+    """Read `scannetv2-labels.combined.tsv`; of a repeated category, the last row wins."""
     path = Path(path)
     try:
         with path.open(encoding="utf-8", newline="") as file:

@@ -25,9 +25,6 @@ def find_scans(folder: Path) -> list[Path]:
 
     A scan folder is named like `scene0000_00` or holds a `.sens` of its own name. It is listed even
     if its `.sens` is missing, so that the report mentions it.
-
-    Raises:
-        InputError: the folder is missing, or holds no scans.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -62,11 +59,7 @@ def space_of(scan_id: str) -> str:
 def split_scans(
     folders: Sequence[Path], train: Path | None = None, val: Path | None = None
 ) -> ScanSplits:
-    """Split scans by the official lists, one scan id per line; `val` becomes the split `test`.
-
-    Raises:
-        InputError: a list cannot be read, a scan is in both, or no scan is in any.
-    """
+    """Split scans by the official lists, one scan id per line; `val` becomes the split `test`."""
     listed: dict[str, str] = {}
     for path, split in ((train, "train"), (val, "test")):
         for scan_id in [] if path is None else _read_list(path):
