@@ -30,7 +30,6 @@ class ShardReport:
     renderer: str | None
     """Name of the renderer; None if nothing was drawn."""
     lines: list[Line]
-    """One per room."""
 
     def has(self, status: str) -> bool:
         """Test whether any room has this status: prepared, filtered or failed."""

@@ -43,9 +43,7 @@ class FrontSource:
     name: ClassVar = "3d-front"
     draws: ClassVar = True
     front: Path
-    """Folder of house JSONs."""
     future: Path
-    """Folder of furniture models."""
     recipe: Recipe
     splits: Path | None = None
     """CSV of `room id,split`; None splits 8:1:1 into train, val and test, seeded."""

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from rich.table import Column, Table
 
+from data_prep.engine.report_tables import make_table
 from data_prep.inspection.agreement import Agreement
 from data_prep.inspection.bodies import KINDS
 from data_prep.inspection.contents import count_shards, describe_room
@@ -16,28 +17,22 @@ _JUDGED = ("in 3D", "masks within", "mean 2D IoU")
 def count_tables(shards: Path) -> list[Table]:
     """Counts of each split, and its objects of each class."""
     counts = count_shards(shards)
-    totals = Table(
+    totals = []
+    for split, row in counts.items():
+        sizes = row["image_sizes"]
+        several = ", ".join(f"{rooms} rooms: {size}" for size, rooms in sizes.items())
+        image_size = next(iter(sizes)) if len(sizes) == 1 else several
+        known = f"{row['with_truth']} rooms" if row["with_truth"] else "no room"
+        means = f"{row['objects'] / max(row['rooms'], 1):.2f}", f"{row['seen']:.2f}"
+        whole = row["rooms"], row["views"], row["objects"]
+        totals.append((split, *whole, *means, known, image_size))
+    columns = (
         "split", "rooms", "views", "objects", "objects a room", "objects a view", "known in 3D",
         "image size",
     )  # fmt: skip
-    for split, row in counts.items():
-        sizes = row["image_sizes"]
-        totals.add_row(
-            split,
-            str(row["rooms"]),
-            str(row["views"]),
-            str(row["objects"]),
-            f"{row['objects'] / max(row['rooms'], 1):.2f}",
-            f"{row['seen']:.2f}",
-            f"{row['with_truth']} rooms" if row["with_truth"] else "no room",
-            ", ".join(f"{n} rooms: {s}" for s, n in sizes.items())
-            if len(sizes) > 1
-            else next(iter(sizes), ""),
-        )
-    histogram = Table("class", *counts)
-    for name in sorted({name for row in counts.values() for name in row["classes"]}):
-        histogram.add_row(name, *(str(row["classes"].get(name, 0)) for row in counts.values()))
-    return [totals, histogram]
+    names = sorted({name for row in counts.values() for name in row["classes"]})
+    classes = [(name, *(row["classes"].get(name, 0) for row in counts.values())) for name in names]
+    return [make_table(columns, totals), make_table(("class", *counts), classes)]
 
 
 def room_table(shards: Path, room: str) -> Table:
@@ -55,27 +50,25 @@ def room_table(shards: Path, room: str) -> Table:
 
 def check_tables(found: FolderCheck) -> list[Table]:
     """Results of a check: each split, and the rooms that agree least."""
-    totals = Table("split", "rooms", "views", "checksums", *_JUDGED)
+    totals = []
     for split, checks in found.rooms.items():
         rooms = [check for check in checks if check.room_id]
-        totals.add_row(
-            split,
-            str(len(rooms)),
-            str(sum(check.views for check in rooms)),
-            f"{sum(check.has_checksum for check in rooms)} rooms",
-            *_judged(sum((check.agreement for check in rooms), Agreement())),
-        )
+        views, sums = sum(room.views for room in rooms), sum(room.has_checksum for room in rooms)
+        agreement = sum((check.agreement for check in rooms), Agreement())
+        totals.append((split, len(rooms), views, f"{sums} rooms", *_judged(agreement)))
     agreements = [(check.room_id, check.agreement) for check in found.every]
     worst = sorted(
         (min(tally.share for tally in agreement.tallies.values()), room_id, _judged(agreement))
         for room_id, agreement in agreements
         if agreement.tallies
     )
-    # Folded, because the end of an id, its room's name, must survive narrow terminals.
-    table = Table(Column("worst rooms", overflow="fold"), *_JUDGED)
-    for _, room_id, cells in worst[:_WORST_SHOWN]:
-        table.add_row(room_id, *cells)
-    return [totals, table] if worst else [totals]
+    tables = [make_table(("split", "rooms", "views", "checksums", *_JUDGED), totals)]
+    if worst:
+        # Folded, because the end of an id, its room's name, must survive narrow terminals.
+        columns = (Column("worst rooms", overflow="fold"), *_JUDGED)
+        rows = [(room_id, *cells) for _, room_id, cells in worst[:_WORST_SHOWN]]
+        tables.append(make_table(columns, rows))
+    return tables
 
 
 def _judged(agreement: Agreement) -> list[str]:

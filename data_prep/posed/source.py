@@ -30,13 +30,11 @@ class PosedSource:
     folder: Path
     """One room, or a folder of rooms."""
     label_set: str
-    """Name for `sceneprior.core.classes.label_set`."""
     posed_settings: PosedSettings = field(default_factory=PosedSettings)
     test_share: float = 0.1
     """Share of rooms in the split `test`, at least one of several; 0 puts all rooms in `train`."""
     seed: int = 0
     only: str | None = None
-    """Name of a room; a prefix suffices."""
 
     def settings(self, only: str | None) -> dict[str, Any]:
         """See `Source.settings`.

@@ -20,7 +20,6 @@ class Group:
 
     object_id: int
     category: str
-    """Raw category chosen by the annotators."""
     segments: frozenset[int]
 
 

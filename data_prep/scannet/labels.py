@@ -22,7 +22,6 @@ class Labels:
     nyu40: dict[str, str]
     """NYU40 class by raw category, both in lower case."""
     source: str
-    """Name of the table, for messages."""
 
     def knows(self, category: str) -> bool:
         """Test whether the table lists a raw category."""

@@ -97,13 +97,12 @@ class Scan:
     frames: tuple[int, ...]
     """Frame number of each view."""
     world_to_camera: np.ndarray
-    """(views, 4, 4) float64, OpenCV axes, from the room frame."""
+    """(views, 4, 4) float64, from the room frame."""
     intrinsics: np.ndarray
     """(3, 3) float64, in pixels of an image of `settings.image_size`."""
     masks: Path
     settings: ScanSettings
     notes: tuple[str, ...]
-    """Parts of the scan that were left out, with reasons."""
 
     @property
     def scan_id(self) -> str:

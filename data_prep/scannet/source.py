@@ -31,17 +31,14 @@ class ScanNetSource:
     room_type: ClassVar = "scannet"
     draws: ClassVar = False
     scans: Path
-    """Folder of scan folders."""
     labels: Path
     """scannetv2-labels.combined.tsv."""
     scan_settings: ScanSettings = field(default_factory=ScanSettings)
     train: Path | None = None
-    """scannetv2_train.txt."""
     val: Path | None = None
-    """scannetv2_val.txt, the split `test`. Without lists, spaces are split 9:1, seeded."""
+    """The official lists; `val` is the split `test`. Without, spaces are split 9:1, seeded."""
     seed: int = 0
     only: str | None = None
-    """Name of a scan; a prefix suffices."""
 
     @property
     def expected(self) -> Expected | None:
@@ -73,11 +70,10 @@ class ScanNetSource:
         names = [path.name for path in folders]
         left_out: list[Line] = []
         if self.train or self.val:
-            found = split_scans(folders, self.train, self.val)
-            split_of = found.split_of
+            split_of, missing = split_scans(folders, self.train, self.val)
             for scan_ids, why in (
-                (found.skipped, "it is in no list"),
-                (found.missing, f"a list names it, but {self.scans} has no such folder"),
+                ([name for name in names if name not in split_of], "it is in no list"),
+                (missing, f"a list names it, but {self.scans} has no such folder"),
             ):
                 left_out += [Line(name, name, "filtered", "split", why) for name in scan_ids]
         else:
