@@ -3,7 +3,6 @@
 Heavy imports stand inside the functions, so that the command line starts quickly.
 """
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +11,7 @@ import typer
 from sceneprior.core.seeds import LARGEST_SEED
 
 if TYPE_CHECKING:
-    from data_prep.engine.source import Source
+    from data_prep.engine.build import Job
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -97,6 +96,7 @@ def prep_front(
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
+    from data_prep.engine.build import Job
     from data_prep.front.recipe import load_recipe
     from data_prep.front.source import FrontSource
 
@@ -105,7 +105,7 @@ def prep_front(
         changes.append(f"views.per_m2={views_per_m2}")
     rules = load_recipe(recipe, tuple(changes))
     source = FrontSource(front, future, rules, splits, seed, only, rgb)
-    run_job(source, out, workers, scheduler, renderer, strict, retry_failed)
+    run_job(Job(source, out, workers, scheduler, renderer, strict, retry_failed))
 
 
 def recipe(
@@ -145,13 +145,14 @@ def prep_scannet(
 
     Exit status: 0, or 3 if scans failed (the others are prepared; report.csv says why).
     """
+    from data_prep.engine.build import Job
     from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings
     from data_prep.scannet.source import ScanNetSource
 
     size = FULL_SIZE if full_size else QUARTER_SIZE
     settings = ScanSettings(frame_step, max_views, masks, size)
     source = ScanNetSource(scans, labels, settings, train_list, val_list, seed, only)
-    run_job(source, out, workers, scheduler, "auto", strict, retry_failed)
+    run_job(Job(source, out, workers, scheduler, "auto", strict, retry_failed))
 
 
 def prep_posed(
@@ -197,6 +198,7 @@ def prep_posed(
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
+    from data_prep.engine.build import Job
     from data_prep.posed.labels import read_label_set
     from data_prep.posed.source import PosedSource
     from data_prep.posed.views import PosedSettings
@@ -206,7 +208,7 @@ def prep_posed(
     source = PosedSource(rooms, classes, settings, test_share, seed, only)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
-    run_job(source, out, workers, scheduler, "auto", strict, retry_failed=False)
+    run_job(Job(source, out, workers, scheduler, "auto", strict))
 
 
 def inspect(
@@ -273,25 +275,16 @@ def _verify(shards: Path, room: str | None, workers: int) -> None:
     typer.echo(f"{shards}: all is well. {summary(found)}")
 
 
-def run_job(
-    source: "Source",
-    out: Path,
-    workers: int | None,
-    scheduler: str | None,
-    renderer: str,
-    strict: bool,
-    retry_failed: bool,
-) -> None:
-    """Build shards from a source and print the report, for every `prep-*` command."""
+def run_job(job: "Job") -> None:
+    """Build shards and print the report, for every `prep-*` command."""
     from rich.console import Console
 
-    from data_prep.engine.build import Job, build_shards
+    from data_prep.engine.build import build_shards
     from data_prep.engine.report_tables import report_tables
     from data_prep.engine.shard_job import RoomFailedError
 
-    workers = workers or len(os.sched_getaffinity(0))
     try:
-        summary = build_shards(Job(source, out, workers, scheduler, renderer, strict, retry_failed))
+        summary = build_shards(job)
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to go on.", err=True)
         raise typer.Exit(130) from None
@@ -305,8 +298,8 @@ def run_job(
     if summary.shards_open:
         made += f", {summary.shards_open} still to make: run without --only"
     drawn = f"; {summary.renderer}" if summary.renderer else ""
-    typer.echo(f"{out}: {summary} ({made}{drawn})")
-    if source.only is None and not summary.counts["test"]["rooms"]:
+    typer.echo(f"{job.out}: {summary} ({made}{drawn})")
+    if job.source.only is None and not summary.counts["test"]["rooms"]:
         typer.echo(
             "Note: the 'test' split is empty. `fit` and `synthesize` need none; eval-fid compares "
             "with test rooms: prepare more rooms, or name some in a file of splits.",

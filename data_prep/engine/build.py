@@ -5,6 +5,7 @@ Every `prep-*` command runs this engine. It prepares the source's rooms shard by
 a report at the end.
 """
 
+import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -29,8 +30,8 @@ class Job:
 
     source: Source
     out: Path
-    workers: int = 1
-    """Number of processes on this machine; 1 works in this process."""
+    workers: int | None = 1
+    """Number of processes on this machine; 1 works in this process, None takes all cores."""
     scheduler: str | None = None
     """Address of a Dask scheduler whose workers are used instead of local processes."""
     renderer: str = "auto"
@@ -48,7 +49,8 @@ def build_shards(job: Job) -> Summary:
         # The workers' working directories differ from this process's.
         source, out = _with_absolute_paths(source), out.absolute()
     settings = job_settings(source, source.only)  # rejects wrong input folders before `out` exists
-    engine = cluster(job.scheduler) if job.scheduler else pool(job.workers)
+    cores = len(os.sched_getaffinity(0))
+    engine = cluster(job.scheduler) if job.scheduler else pool(job.workers or cores)
     with claimed(out), engine as run:
         plan = read_plan(out, source, settings, job.renderer)
         if plan is None:
@@ -133,8 +135,6 @@ def _refuse_failures(job: Job, lines: Iterable[Line]) -> None:
 
 
 def _with_absolute_paths(source: Any) -> Any:
-    paths = {item.name: getattr(source, item.name) for item in fields(source)}
-    return replace(
-        source,
-        **{name: value.absolute() for name, value in paths.items() if isinstance(value, Path)},
-    )
+    values = {item.name: getattr(source, item.name) for item in fields(source)}
+    paths = {name: value.absolute() for name, value in values.items() if isinstance(value, Path)}
+    return replace(source, **paths)

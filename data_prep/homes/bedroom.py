@@ -50,10 +50,6 @@ EXTRAS: Offers = {
 """Furniture of a bedroom besides bed, nightstands, wardrobe and lamp."""
 
 
-def _draw_bed(rng: np.random.Generator) -> str:
-    return str(rng.choice(list(BEDS), p=list(BEDS.values())))
-
-
 def _draw_groups(rng: np.random.Generator, count: int, bed: str) -> list[str]:
     chances = [0.62, 0.24, 0.14] if bed == "double_bed" else [0.1, 0.55, 0.35]
     nightstands = int(rng.choice([2, 1, 0], p=chances))
@@ -79,10 +75,6 @@ def _place_bed(room: Furnisher, groups: list[str]) -> Piece | None:
         where = wall.length * room.rng.uniform(0.42, 0.58)
         return room.against_wall(models, 0.5, [wall], where=where, tries=8)
     return room.against_wall(models, 0.4, [wall], corner=0.75, tries=8)
-
-
-def _nightstands(room: Furnisher, group: str) -> bool:
-    return room.twins_beside(room.catalog["nightstand"], int(group[-1]))
 
 
 def _bedside_lamps(room: Furnisher, group: str) -> bool:
@@ -138,11 +130,13 @@ BEDROOM = RoomType(
     name="bedroom",
     label_set="front3d_bedroom",
     counts=COUNTS,
-    draw_first=_draw_bed,
+    draw_first=lambda rng: str(rng.choice(list(BEDS), p=list(BEDS.values()))),
     draw_groups=_draw_groups,
     place_first=_place_bed,
     rules={
-        "nightstands": _nightstands,
+        "nightstands": lambda room, group: room.twins_beside(
+            room.catalog["nightstand"], int(group[-1])
+        ),
         "tv_stand": opposite_the_anchor,
         "wardrobe": along_wall(0.5),
         "children_cabinet": along_wall(0.5),

@@ -130,13 +130,6 @@ def _posed(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[RoomViews], 
     return lambda views: replace(views, world_to_camera=change(views.world_to_camera))
 
 
-def _inverse(poses: np.ndarray) -> np.ndarray:
-    """Invert rigid transforms, (T, 4, 4)."""
-    inverse = _transposed(poses)
-    inverse[:, :3, 3:] = -inverse[:, :3, :3] @ poses[:, :3, 3:]
-    return inverse
-
-
 def _transposed(poses: np.ndarray) -> np.ndarray:
     turned = poses.copy()
     turned[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
@@ -228,11 +221,11 @@ def _how_well(trial: Trial) -> float:
 
 
 _ANY: dict[str, Callable[[RoomViews], RoomViews | None]] = {
-    "world_to_camera seems to hold camera-to-world matrices; inverted": _posed(_inverse),
+    "world_to_camera seems to hold camera-to-world matrices; inverted": _posed(np.linalg.inv),
     "the cameras seem to have OpenGL axes (y up, z backward) instead of OpenCV's; with y and z "
     "flipped": _posed(lambda poses: _OPENGL_AXES @ poses),
     "world_to_camera seems to hold camera-to-world matrices with OpenGL axes; inverted, and with "
-    "y and z flipped": _posed(lambda poses: _OPENGL_AXES @ _inverse(poses)),
+    "y and z flipped": _posed(lambda poses: _OPENGL_AXES @ np.linalg.inv(poses)),
     "the rotations of world_to_camera seem to be transposed; transposed back": _posed(_transposed),
     "the intrinsics seem to be those of pictures of another size; scaled to these": _of_this_size,
     CHANCE: _posed(_dealt_out),
