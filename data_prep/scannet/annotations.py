@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from data_prep.frames import is_pose, pose_fault
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import shown
 from sceneprior.core.scene import Mesh
-
-_RIGID_SLACK = 1e-2
 
 
 @dataclass(frozen=True)
@@ -48,20 +47,10 @@ def axis_alignment(path: Path, properties: dict[str, str]) -> np.ndarray:
             f"{path}: axisAlignment is {len(words)} words, expected 16 numbers. "
             "Download the scan again."
         ) from None
-    turn = matrix[:3, :3]
-    if (
-        not np.isfinite(matrix).all()
-        or np.abs(turn.T @ turn - np.eye(3)).max() > _RIGID_SLACK
-        or np.abs(matrix[3] - (0, 0, 0, 1)).max() > _RIGID_SLACK
-    ):
+    if not is_pose(matrix[None])[0]:
         raise InputError(
-            f"{path}: axisAlignment does not turn and move the scan, it distorts it; "
-            "the file is damaged. Download the scan again."
-        )
-    if np.linalg.det(turn) < 0:
-        raise InputError(
-            f"{path}: axisAlignment mirrors the scan (its determinant is -1, expected 1); the file "
-            "is damaged, or an axis was flipped. Download the scan again."
+            f"{path}: axisAlignment does not turn and move the scan: {pose_fault(matrix)}; the "
+            "file is damaged, or an axis was flipped. Download the scan again."
         )
     return matrix
 

@@ -57,9 +57,6 @@ class ScanSettings:
         for name in ("frame_step", "max_views"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}; it counts from 1.")
-        if min(self.image_size) < 1:
-            height, width = self.image_size
-            raise InputError(f"image_size is {width} x {height} pixels; both must be at least 1.")
 
 
 @dataclass(frozen=True)
