@@ -54,7 +54,7 @@ def test_alignment_is_row_major_and_may_be_absent(tmp_path):
         ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 nan", "it holds NaN or infinity; the file is damaged"),
         ("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", "its axes have the length 2, expected 1"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1", "it is left-handed, a mirror"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0 1 0 0 1", "its last row is not 0, 0, 0, 1"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0 1 0 0 1", "it is transposed: its translation is in the last row"),
         ("inf 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "it holds NaN or infinity"),
     ],
 )
