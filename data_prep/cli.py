@@ -3,29 +3,29 @@
 Heavy imports stand inside the functions, so that the command line starts quickly.
 """
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from data_prep.homes.command import make_homes_command
-from data_prep.inspection.command import inspect_command
 from sceneprior.core.seeds import LARGEST_SEED
 
 if TYPE_CHECKING:
-    from data_prep.engine.source import Source
+    from data_prep.engine.build import Job
 
 
 def add_commands(app: typer.Typer) -> None:
     """Mount the prep-* commands, inspect and make-homes."""
-    app.command("make-homes")(make_homes_command)
+    app.command("make-homes")(make_homes)
     app.command("prep-front")(prep_front)
     app.command("recipe")(recipe)
     app.command("prep-scannet")(prep_scannet)
     app.command("prep-posed")(prep_posed)
-    app.command("inspect")(inspect_command)
+    app.command("inspect")(inspect)
 
+
+_SHEET = "inspect.png"
+_PROBLEMS_SHOWN = 10
 
 OutOption = Annotated[Path, typer.Option(help="Folder for the shards.")]
 WorkersOption = Annotated[
@@ -41,6 +41,23 @@ StrictOption = Annotated[bool, typer.Option("--strict", help="Stop at the first 
 RetryOption = Annotated[
     bool, typer.Option("--retry-failed", help="Try rooms again that failed in an earlier run.")
 ]
+
+
+def make_homes(
+    out: Annotated[Path, typer.Argument(help="A new folder for the homes.")],
+    rooms: Annotated[
+        int, typer.Option(help="How many rooms; seven in ten are train, one val, two test.")
+    ] = 400,
+    room_type: Annotated[str, typer.Option(help="bedroom or living.")] = "bedroom",
+    seed: Annotated[
+        int, typer.Option(min=0, max=LARGEST_SEED, help="The same seed writes the same bytes.")
+    ] = 0,
+) -> None:
+    """Make furnished homes in 3D-FRONT's on-disk format."""
+    from data_prep.homes import make
+
+    make.make_homes(out, rooms, room_type, seed)
+    typer.echo(f"Wrote {rooms} {room_type} rooms to {out}")
 
 
 def prep_front(
@@ -79,6 +96,7 @@ def prep_front(
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
+    from data_prep.engine.build import Job
     from data_prep.front.recipe import load_recipe
     from data_prep.front.source import FrontSource
 
@@ -87,7 +105,7 @@ def prep_front(
         changes.append(f"views.per_m2={views_per_m2}")
     rules = load_recipe(recipe, tuple(changes))
     source = FrontSource(front, future, rules, splits, seed, only, rgb)
-    run_job(source, out, workers, scheduler, renderer, strict, retry_failed)
+    run_job(Job(source, out, workers, scheduler, renderer, strict, retry_failed))
 
 
 def recipe(
@@ -127,13 +145,14 @@ def prep_scannet(
 
     Exit status: 0, or 3 if scans failed (the others are prepared; report.csv says why).
     """
+    from data_prep.engine.build import Job
     from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings
     from data_prep.scannet.source import ScanNetSource
 
     size = FULL_SIZE if full_size else QUARTER_SIZE
     settings = ScanSettings(frame_step, max_views, masks, size)
     source = ScanNetSource(scans, labels, settings, train_list, val_list, seed, only)
-    run_job(source, out, workers, scheduler, "auto", strict, retry_failed)
+    run_job(Job(source, out, workers, scheduler, "auto", strict, retry_failed))
 
 
 def prep_posed(
@@ -179,6 +198,7 @@ def prep_posed(
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
+    from data_prep.engine.build import Job
     from data_prep.posed.labels import read_label_set
     from data_prep.posed.source import PosedSource
     from data_prep.posed.views import PosedSettings
@@ -188,33 +208,83 @@ def prep_posed(
     source = PosedSource(rooms, classes, settings, test_share, seed, only)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
-    run_job(source, out, workers, scheduler, "auto", strict, retry_failed=False)
+    run_job(Job(source, out, workers, scheduler, "auto", strict))
 
 
-def run_job(
-    source: "Source",
-    out: Path,
-    workers: int | None,
-    scheduler: str | None,
-    renderer: str,
-    strict: bool,
-    retry_failed: bool,
+def inspect(
+    shards: Annotated[Path, typer.Argument(help="Folder of shards.")],
+    room: Annotated[str | None, typer.Option(help="This room only, and its plan.")] = None,
+    png: Annotated[
+        Path | None, typer.Option(help=f"The sheet of pictures (default: SHARDS/{_SHEET}).")
+    ] = None,
+    pictures: Annotated[int, typer.Option(min=1, help="Views on the sheet.")] = 24,
+    boxes_3d: Annotated[
+        bool, typer.Option("--boxes-3d/--no-boxes-3d", help="Draw the ground truth's 3D boxes.")
+    ] = True,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Check everything instead of drawing.")
+    ] = False,
+    workers: Annotated[int, typer.Option(min=1, help="Processes for --verify.")] = 1,
 ) -> None:
-    """Build shards from a source and print the report, for every `prep-*` command.
+    """Say what a folder of shards holds and draw a sheet of it, or check it with --verify.
 
-    Raises:
-        InputError: see `build_shards`; `main` prints it and exits with status 2.
-        typer.Exit: 3 if rooms failed, 130 after Ctrl-C.
+    Exit status: 0, or 3 if --verify finds something wrong.
     """
     from rich.console import Console
 
-    from data_prep.engine.build import Job, build_shards
+    from data_prep.inspection.contents import draw_sheet
+    from data_prep.inspection.tables import count_tables, room_table
+    from sceneprior.core.errors import InputError
+    from sceneprior.core.files import write_whole
+    from sceneprior.render.pictures import png_bytes
+
+    if verify:
+        _verify(shards, room, workers)
+    else:
+        for table in count_tables(shards) if room is None else [room_table(shards, room)]:
+            Console().print(table)
+    if png is not None or not verify:
+        target = png or shards / _SHEET
+        sheet = draw_sheet(shards, room, pictures, boxes_3d)
+        try:
+            write_whole(target, png_bytes(sheet))
+        except OSError as error:
+            raise InputError(
+                f"{target} cannot be written ({error.strerror or error}); name another file with "
+                "--png."
+            ) from None
+        typer.echo(f"Drew {target}.")
+
+
+def _verify(shards: Path, room: str | None, workers: int) -> None:
+    from rich.console import Console
+
+    from data_prep.inspection.tables import check_tables, summary
+    from data_prep.inspection.verify import verify
+
+    found = verify(shards, room, workers)
+    for table in check_tables(found):
+        Console().print(table)
+    for sentence in found.problems[1:_PROBLEMS_SHOWN]:
+        typer.echo(sentence, err=True)
+    if found.problems:
+        more = len(found.problems) - 1
+        others = f" ({more} more problem{'s' * (more > 1)}, listed above)" if more else ""
+        typer.echo(f"Error: {found.problems[0]}{others}", err=True)
+        raise typer.Exit(3)
+    typer.echo(f"{shards}: all is well. {summary(found)}")
+
+
+def run_job(job: "Job") -> None:
+    """Build shards and print the report, for every `prep-*` command."""
+    from rich.console import Console
+
+    from data_prep.engine.build import build_shards
     from data_prep.engine.report_tables import report_tables
     from data_prep.engine.shard_job import RoomFailedError
 
-    workers = workers or len(os.sched_getaffinity(0))
     try:
-        summary = build_shards(Job(source, out, workers, scheduler, renderer, strict, retry_failed))
+        summary = build_shards(job)
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to go on.", err=True)
         raise typer.Exit(130) from None
@@ -228,8 +298,8 @@ def run_job(
     if summary.shards_open:
         made += f", {summary.shards_open} still to make: run without --only"
     drawn = f"; {summary.renderer}" if summary.renderer else ""
-    typer.echo(f"{out}: {summary} ({made}{drawn})")
-    if source.only is None and not summary.counts["test"]["rooms"]:
+    typer.echo(f"{job.out}: {summary} ({made}{drawn})")
+    if job.source.only is None and not summary.counts["test"]["rooms"]:
         typer.echo(
             "Note: the 'test' split is empty. `fit` and `synthesize` need none; eval-fid compares "
             "with test rooms: prepare more rooms, or name some in a file of splits.",

@@ -36,13 +36,7 @@ def choose_frames(
 
     Frames with a bad pose or without a mask are dropped first, so that a recording that lost
     tracking keeps as many views as possible. The rest is thinned evenly; the first and the last
-    frame stay.
-
-    Args:
-        camera_to_world: (frames, 4, 4), as recorded.
-        with_mask: Frame numbers that have a mask.
-        step: ScanNet's exports have 15.
-        at_most: The paper has 100.
+    frame stay. ScanNet's exports have a step of 15, and the paper has 100 views.
 
     Example: 7 candidates, one lost, thinned to 3.
 
@@ -101,15 +95,9 @@ def pose_fault(camera_to_world: np.ndarray) -> str:
 
 
 def room_cameras(camera_to_world: np.ndarray, room_from_scan: np.ndarray) -> np.ndarray:
-    """World-to-camera transforms in the room frame.
+    """World-to-camera transforms in the room frame, float64, of good poses with OpenCV axes.
 
-    Args:
-        camera_to_world: (views, 4, 4) good poses in the scan's own frame, OpenCV axes.
-        room_from_scan: (4, 4) rigid.
-
-    Returns:
-        (views, 4, 4) float64. The rotation is the nearest exact one, so that a camera's centre
-        and its rays agree to rounding.
+    The rotation is the nearest exact one, so that a camera's centre and its rays agree to rounding.
     """
     poses = np.asarray(room_from_scan, dtype=np.float64) @ camera_to_world.astype(np.float64)
     u, _, v = np.linalg.svd(poses[:, :3, :3])
@@ -151,15 +139,8 @@ def mask_intrinsics(
       fourth row from the third on shifts the image by 0.5 full-size pixels. The principal point
       moves by the mean offset, so that points project onto the pixels that show them.
 
-    Args:
-        intrinsic_color: (4, 4) matrix of the `.sens` file, in pixels of the colour frame.
-        color_size, mask_size, image_size: (height, width).
-
-    Returns:
-        (3, 3) float64, pixels of the stored image.
-
-    Raises:
-        InputError: masks and colour frames differ in aspect ratio.
+    `intrinsic_color` is the (4, 4) matrix of the `.sens` file, in pixels of the colour frame; sizes
+    are (height, width). Masks and colour frames must have the same aspect ratio.
 
     Example: half size; the second pixel of each pair stays, 0.25 small pixels right of the centre.
 

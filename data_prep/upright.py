@@ -24,28 +24,6 @@ _SIDES_AT_LEAST = 8
 """Unoccluded sides, over all views, that determine the seven parameters of a box."""
 
 
-class UprightBoxes(NamedTuple):
-    """One box per object, rotated about +y only; NaN where the views do not determine it."""
-
-    centers_m: np.ndarray
-    """(n, 3) in the cameras' world, whose y points up."""
-    sizes_m: np.ndarray
-    """(n, 3) along the box's own axes."""
-    yaw_rad: np.ndarray
-    """(n,)"""
-    misfit_px: np.ndarray
-    """(n,) mean distance between the projected sides and the unoccluded sides of the 2D boxes."""
-
-    @property
-    def corners_m(self) -> np.ndarray:
-        """Corners, (n, 8, 3), in the order of `CUBE_CORNERS`."""
-        return _corners(self._numbers)
-
-    @property
-    def _numbers(self) -> np.ndarray:
-        return np.concatenate([self.centers_m, np.log(self.sizes_m), self.yaw_rad[:, None]], axis=1)
-
-
 class _Given(NamedTuple):
     """Observations that the boxes of n objects are fitted to, at most V views of each."""
 
@@ -76,17 +54,17 @@ def fit_upright(
     image_size: tuple[int, int],
     world_to_camera: np.ndarray,
     intrinsics: np.ndarray,
-) -> UprightBoxes:
-    """Fit an upright box to the 2D boxes of each object.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fit a box, rotated about +y only, to the 2D boxes of each object in T views.
 
     Robust least squares over the distances between the sides of the projected box and of the 2D
     box. A side that may be occluded counts only where the 2D box reaches beyond the projected box.
+    `world_to_camera`, (T, 4, 4), has OpenCV axes and metres; the world's y points up.
 
-    Args:
-        seen: Observations in T views.
-        image_size: (H, W).
-        world_to_camera: (T, 4, 4), OpenCV axes, metres; the world's y points up.
-        intrinsics: (T, 3, 3) in pixels.
+    Returns:
+        Corners of the boxes in the order of `CUBE_CORNERS`, (n, 8, 3), NaN where the views do not
+        determine a box; and the mean distance in pixels between the projected sides and the
+        unoccluded sides of the 2D boxes, (n,).
     """
     given = _given(seen, image_size, world_to_camera, intrinsics)
     start, told = _starts(given)
@@ -103,7 +81,7 @@ def fit_upright(
             better = mean < misfit[told]
             rows = np.flatnonzero(told)[better]
             best[rows], misfit[rows] = found[better], mean[better]
-    return UprightBoxes(best[:, :3], np.exp(best[:, 3:6]), best[:, 6], misfit)
+    return _corners(best), misfit
 
 
 def _given(
@@ -191,11 +169,7 @@ def _cost(off: np.ndarray) -> np.ndarray:
 def _misfits(numbers: np.ndarray, given: _Given) -> np.ndarray:
     """Signed distances in pixels from the sides of the 2D boxes to those of the projected boxes.
 
-    Args:
-        numbers: (n, C, 7) parameters of C candidate boxes per object.
-
-    Returns:
-        (n, C, V, 4)
+    (n, C, 7) parameters of C candidate boxes per object give (n, C, V, 4) distances.
     """
     corners = _corners(numbers)
     points = corners[:, :, None] @ given.poses[:, None, :, :3, :3].swapaxes(-1, -2)

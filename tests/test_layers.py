@@ -60,10 +60,7 @@ OWNERS = {
         "sceneprior/baselines/", "sceneprior/apps/decoders.py", "sceneprior/apps/experiments/",
         "data_prep/",
     ],
-    "typer": [
-        "sceneprior/apps/cli/", "data_prep/cli.py", "data_prep/homes/command.py",
-        "data_prep/inspection/command.py",
-    ],
+    "typer": ["sceneprior/apps/cli/", "data_prep/cli.py"],
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
     "skimage": ["sceneprior/core/geometry/isosurface.py"],

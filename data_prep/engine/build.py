@@ -5,21 +5,22 @@ Every `prep-*` command runs this engine. It prepares the source's rooms shard by
 a report at the end.
 """
 
+import os
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from data_prep.engine.cluster import cluster
 from data_prep.engine.finish import REPORT_FILES, Summary, finish
 from data_prep.engine.output import claimed, writing
-from data_prep.engine.plan import Plan, ShardPlan, job_settings, read_plan, write_plan
-from data_prep.engine.report import Line, line_of
+from data_prep.engine.plan import PLAN_NAME, Plan, ShardPlan, job_settings, read_plan
 from data_prep.engine.selection import is_asked_for
 from data_prep.engine.shard_job import RoomFailedError, ShardReport, make_shard, read_finished
-from data_prep.engine.source import Source
+from data_prep.engine.source import Line, Source
 from data_prep.engine.workers import Run, pool
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import write_json
 from sceneprior.render.offscreen import open_renderer
 
 
@@ -29,38 +30,33 @@ class Job:
 
     source: Source
     out: Path
-    workers: int = 1
-    """Number of processes on this machine; 1 works in this process."""
+    workers: int | None = 1
+    """Number of processes on this machine; 1 works in this process, None takes all cores."""
     scheduler: str | None = None
     """Address of a Dask scheduler whose workers are used instead of local processes."""
     renderer: str = "auto"
     strict: bool = False
-    """Stop at the first room that fails."""
     retry_failed: bool = False
-    """Rebuild shards in which rooms failed before."""
 
 
 def build_shards(job: Job) -> Summary:
     """Prepare a data set. A second run with the same settings makes only the missing shards.
 
-    Raises:
-        RoomFailedError: a room failed, with `strict`.
-        InputError: an input folder is wrong; a split is empty; `out` holds shards made with other
-            settings, is being written by another run, or cannot be written; the cluster cannot be
-            reached.
+    With `strict`, a room that fails raises a `RoomFailedError`.
     """
     source, out = job.source, Path(job.out)
     if job.scheduler:
         # The workers' working directories differ from this process's.
         source, out = _with_absolute_paths(source), out.absolute()
     settings = job_settings(source, source.only)  # rejects wrong input folders before `out` exists
-    engine = cluster(job.scheduler) if job.scheduler else pool(job.workers)
+    cores = len(os.sched_getaffinity(0))
+    engine = cluster(job.scheduler) if job.scheduler else pool(job.workers or cores)
     with claimed(out), engine as run:
         plan = read_plan(out, source, settings, job.renderer)
         if plan is None:
             plan = _make_plan(source, settings, job, run)
             with writing(out):
-                write_plan(out, plan)
+                write_json(out / PLAN_NAME, asdict(plan))
         _refuse_failures(job, plan.left_out)
         return _carry_out(replace(job, source=source, out=out), plan, run)
 
@@ -68,9 +64,8 @@ def build_shards(job: Job) -> Summary:
 def _make_plan(source: Source, settings: dict[str, Any], job: Job, run: Run) -> Plan:
     kind = next(run(_renderer_kind, [(job.renderer,)], None)) if source.draws else None
     survey = source.survey(run)
-    left_out = tuple(line_of(item) for item in survey.left_out)
-    _refuse_failures(job, left_out)
-    return Plan({**settings, "renderer": kind}, survey.rooms, left_out)
+    _refuse_failures(job, survey.left_out)
+    return Plan({**settings, "renderer": kind}, survey.rooms, survey.left_out)
 
 
 def _renderer_kind(kind: str) -> str:
@@ -140,8 +135,6 @@ def _refuse_failures(job: Job, lines: Iterable[Line]) -> None:
 
 
 def _with_absolute_paths(source: Any) -> Any:
-    paths = {item.name: getattr(source, item.name) for item in fields(source)}
-    return replace(
-        source,
-        **{name: value.absolute() for name, value in paths.items() if isinstance(value, Path)},
-    )
+    values = {item.name: getattr(source, item.name) for item in fields(source)}
+    paths = {name: value.absolute() for name, value in values.items() if isinstance(value, Path)}
+    return replace(source, **paths)

@@ -23,10 +23,6 @@ def cluster(address: str) -> Iterator[Run]:
     machine, `dask worker tcp://... --nworkers auto --nthreads 1`. Every machine needs this package,
     and the folders of data and shards under the same paths. If a worker dies, another takes over
     its task.
-
-    Raises:
-        InputError: dask is not installed; nothing answers at `address`; there are no workers; the
-            workers lack this package or have another version of it; or the connection is lost.
     """
     with contextlib.ExitStack() as stack:
         clients: list[Any] = []

@@ -74,9 +74,7 @@ class Summary:
 def finish(out: Path, plan: Plan, totals: Summary) -> None:
     """Write the report, then the index, which marks the folder as finished.
 
-    Raises:
-        InputError: no room of `train`, or none at all, was prepared (the report is written all the
-            same); `out` cannot be written.
+    Without any prepared room, or any of `train`, only the report is written: an `InputError`.
     """
     if plan.settings["only"] is None and totals.source.only is not None:
         # A run with `--only` made the last missing shard: report on the whole data set.

@@ -13,11 +13,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 @contextlib.contextmanager
 def claimed(out: Path) -> Iterator[None]:
-    """Lock `out` for this run, and remove the partial files of a killed run.
-
-    Raises:
-        InputError: another run writes to `out`, or it cannot be written.
-    """
+    """Lock `out` for this run, and remove the partial files of a killed run."""
     with contextlib.ExitStack() as until_done:
         with writing(out):
             until_done.enter_context(only_writer(out))
@@ -29,15 +25,7 @@ def claimed(out: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def writing(out: Path, what: str = "") -> Iterator[None]:
-    """Turn an OSError into an InputError that says which work is kept and how to go on.
-
-    Args:
-        out: Output folder of the job.
-        what: Work that is lost, such as the rooms of a shard.
-
-    Raises:
-        InputError: the block raised an OSError.
-    """
+    """Turn an OSError into an InputError that names the lost work, `what`, and how to go on."""
     try:
         yield
     except OSError as error:

@@ -3,16 +3,14 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from data_prep.engine.report import Line
-from data_prep.engine.source import SPLITS, RoomTask, Source
+from data_prep.engine.source import SPLITS, Line, RoomTask, Source
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import write_json
 from sceneprior.core.shards import INDEX_NAME
 
 PLAN_NAME = "plan.json"
@@ -51,18 +49,9 @@ class Plan:
 
 
 def job_settings(source: Source, only: str | None) -> dict[str, Any]:
-    """Settings that must be equal for a run to resume in a folder; the renderer is checked apart.
-
-    Raises:
-        InputError: the source's folders are wrong.
-    """
+    """Settings that must be equal for a run to resume in a folder, except the renderer."""
     settings = {"plan_version": PLAN_VERSION, "source": source.name, "only": only}
     return json.loads(json.dumps(settings | source.settings(only)))
-
-
-def write_plan(out: Path, plan: Plan) -> None:
-    """Write plan.json."""
-    write_json(out / PLAN_NAME, asdict(plan))
 
 
 def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str) -> Plan | None:
@@ -70,9 +59,6 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
 
     `--renderer auto` resumes with the renderer of that run; `--only` may work on part of a folder
     that was begun without it.
-
-    Raises:
-        InputError: the folder was begun with other settings, or its plan is damaged.
     """
     path = out / PLAN_NAME
     if not path.is_file():
@@ -108,11 +94,7 @@ def digest(text: str) -> str:
 
 
 def digest_of_files(paths: Sequence[Path]) -> str:
-    """Fingerprint of names and sizes: quick, and enough to notice another release.
-
-    Raises:
-        InputError: a file is gone.
-    """
+    """Fingerprint of names and sizes: quick, and enough to notice another release."""
     try:
         return digest("".join(f"{path.name} {path.stat().st_size}\n" for path in paths))
     except OSError as error:

@@ -5,51 +5,19 @@ import io
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, replace
 from typing import Any
 
-from data_prep.engine.source import SPLITS, Expected, LeftOut, PreparedRoom, RoomTask
+from data_prep.engine.source import SPLITS, Expected, Line, PreparedRoom, RoomTask
 from sceneprior.core.classes import label_set
 
 _COLUMNS = ("room_id", "house", "split", "status", "rule", "reason", "views", "objects", "notes")
 
 
-@dataclass
-class Line:
-    """One line of the report: a room, or a house that could not be read."""
-
-    room_id: str
-    house: str
-    status: str
-    """prepared, filtered or failed."""
-    rule: str = ""
-    """Rule that filtered the room."""
-    reason: str = ""
-    split: str = ""
-    views: int = 0
-    objects: int = 0
-    """Tracked objects: those visible in at least one view."""
-    visible: int = 0
-    """Objects visible in a view, summed over the views."""
-    notes: list[str] = field(default_factory=list)
-    """Parts of the room that were left out, with reasons."""
-    classes: dict[str, int] = field(default_factory=dict)
-    """Tracked objects of each class."""
-    unknown_categories: dict[str, int] = field(default_factory=dict)
-    """Number of pieces per unknown category; see `PreparedRoom`."""
-
-
-def line_of(
-    result: PreparedRoom | LeftOut, task: RoomTask | None = None, label_set_name: str = ""
-) -> Line:
-    """Line of a prepared room, or of one left out by the survey (no task) or later."""
-    if isinstance(result, LeftOut):
-        return Line(
-            result.room_id, result.house, result.status, result.rule, result.reason,
-            split=task.split if task else "", notes=list(result.notes),
-            unknown_categories=dict(result.unknown_categories),
-        )  # fmt: skip
-    assert task is not None
+def line_of(result: PreparedRoom | Line, task: RoomTask, label_set_name: str) -> Line:
+    """Line of a room that was prepared, or left out, with its split."""
+    if isinstance(result, Line):
+        return replace(result, split=task.split)
     names = label_set(label_set_name)
     views = result.views
     return Line(
@@ -82,12 +50,9 @@ def count_splits(lines: Iterable[Line]) -> dict[str, dict[str, int]]:
 def make_report(
     lines: Sequence[Line], about: dict[str, Any], expected: Expected | None = None
 ) -> dict[str, Any]:
-    """Build the report of a job; it does not depend on time, workers or interruptions.
+    """Build the report of a job, with the entries `about` at its top.
 
-    Args:
-        lines: One per room considered.
-        about: Entries at the top of the report, such as source, recipe and renderer.
-        expected: Counts stated in the recipe, for comparison.
+    It does not depend on time, workers or interruptions.
     """
     prepared = [line for line in lines if line.status == "prepared"]
     filtered: dict[str, list[str]] = {}
@@ -114,7 +79,7 @@ def make_report(
         "per_split": {
             split: _means([line for line in prepared if line.split == split]) for split in SPLITS
         },
-        "classes": _classes(prepared),
+        "classes": _sums(line.classes for line in prepared),
         "unknown_categories": _sums(line.unknown_categories for line in lines),
     }
     if expected is not None:
@@ -124,12 +89,10 @@ def make_report(
 
 def compare(expected: Expected, prepared: Sequence[Line]) -> list[dict[str, Any]]:
     """Compare each count stated in the recipe: one row of name, expected, found, difference."""
-    found = {
-        "rooms": len(prepared),
-        **{split: sum(line.split == split for line in prepared) for split in SPLITS},
-        "views": sum(line.views for line in prepared),
-        "objects": sum(line.objects for line in prepared),
-    }
+    counts = count_splits(prepared)
+    found = {split: count["rooms"] for split, count in counts.items()}
+    for what in ("rooms", "views", "objects"):
+        found[what] = sum(count[what] for count in counts.values())
     return [
         {"what": what, "expected": count, "found": found[what], "difference": found[what] - count}
         for what, count in expected.model_dump().items()
@@ -156,12 +119,8 @@ def _means(lines: Sequence[Line]) -> dict[str, Any]:
             str(count): rooms
             for count, rooms in sorted(Counter(line.objects for line in lines).items())
         },
-        "classes": _classes(lines),
+        "classes": _sums(line.classes for line in lines),
     }
-
-
-def _classes(lines: Iterable[Line]) -> dict[str, int]:
-    return _sums(line.classes for line in lines)
 
 
 def _sums(counts: Iterable[dict[str, int]]) -> dict[str, int]:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
-from data_prep.engine.source import LeftOut, Survey
+from data_prep.engine.source import Line, Survey
 from sceneprior.core.errors import InputError
 
 
@@ -34,11 +34,7 @@ def is_asked_for(only: str | None, room_id: str, house: str) -> bool:
 
 
 def read_splits(path: Path) -> dict[str, str]:
-    """Read the split of each room id from a CSV of `room id,split`; other rows are skipped.
-
-    Raises:
-        InputError: the file cannot be read, or has no such row.
-    """
+    """Read the split of each room id from a CSV of `room id,split`; other rows are skipped."""
     try:
         rows = list(csv.reader(io.StringIO(Path(path).read_text())))
     except (OSError, UnicodeDecodeError) as error:
@@ -74,18 +70,11 @@ def _size(share: float, rooms: int, left: int) -> int:
 
 
 def select(survey: Survey, only: str | None, where: str, splits: str = "") -> Survey:
-    """Reduce a survey to the rooms that `--only` selects.
+    """Reduce a survey to the rooms that `--only` selects; one to prepare must be left.
 
-    Args:
-        survey: Rooms of the whole data set.
-        only: Value of `--only`.
-        where: End of the sentence "No room of ...": "FOLDER passes the recipe NAME".
-        splits: Origin of the splits, named in the error if `train` is empty; "" for seeded splits,
-            whose `train` never is. `val` and `test` may be empty.
-
-    Raises:
-        InputError: no room is left to prepare (the most frequent reason is given), or none to
-            train on.
+    `where` ends the error's sentence "No room of ...": "FOLDER passes the recipe NAME". `splits` is
+    the origin of the splits, named in the error if `train` is empty; "" for seeded splits, whose
+    `train` never is. `val` and `test` may be empty.
     """
     rooms = tuple(room for room in survey.rooms if is_asked_for(only, room.room_id, room.house))
     left_out = tuple(
@@ -102,7 +91,7 @@ def select(survey: Survey, only: str | None, where: str, splits: str = "") -> Su
     return Survey(rooms, left_out)
 
 
-def _in_words(left_out: Iterable[LeftOut]) -> str:
+def _in_words(left_out: Iterable[Line]) -> str:
     reasons = [item.reason for item in left_out]
     # Reasons that differ only in numbers count as one; the first is quoted.
     shapes = Counter(re.sub(r"[\d.]+", "#", reason) for reason in reasons)

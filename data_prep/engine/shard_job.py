@@ -8,8 +8,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from data_prep.engine.output import writing
 from data_prep.engine.plan import PLAN_NAME, ShardPlan
-from data_prep.engine.report import Line, line_of
-from data_prep.engine.source import LeftOut, PreparedRoom, RoomTask, Source, sentence_of
+from data_prep.engine.report import line_of
+from data_prep.engine.source import Line, PreparedRoom, RoomTask, Source, sentence_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json, write_whole
 from sceneprior.core.scene import Mesh
@@ -25,7 +25,6 @@ class ShardReport:
     renderer: str | None
     """Name of the renderer; None if nothing was drawn."""
     lines: list[Line]
-    """One per room."""
 
     def has(self, status: str) -> bool:
         """Test whether any room has this status: prepared, filtered or failed."""
@@ -50,11 +49,7 @@ def make_shard(
     """Prepare the rooms of one shard and write it.
 
     Models are written first, then the report, then the shard, so that a shard with a report is
-    complete (`read_finished`).
-
-    Raises:
-        RoomFailedError: a room failed, with `strict`; neither report nor shard is written.
-        InputError: `out` cannot be written, or is not the job's folder as this worker sees it.
+    complete (`read_finished`). With `strict`, neither is written if a room fails.
     """
     if not (out / PLAN_NAME).is_file():
         raise InputError(
@@ -105,7 +100,7 @@ def _prepared(
         if strict and line.status == "failed":
             raise RoomFailedError.of(line)
         lines.append(line)
-        if isinstance(result, LeftOut):
+        if isinstance(result, Line):
             continue
         for model_id, mesh in result.models.items():
             _write_model(out / MODELS_FOLDER / f"{model_id}.ply", mesh)
@@ -114,7 +109,7 @@ def _prepared(
         yield result.views, result.truth
 
 
-def _prepare(source: Source, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
+def _prepare(source: Source, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:
     """Prepare one room; any exception becomes the failure of this room alone."""
     try:
         result = source.prepare(task, renderer)
@@ -126,7 +121,7 @@ def _prepare(source: Source, task: RoomTask, renderer: Renderer | None) -> Prepa
                     raise InputError(f"its file '{name}' would lie outside the folder of shards")
         return result
     except Exception as error:
-        return LeftOut(task.room_id, task.house, "failed", sentence_of(error))
+        return Line(task.room_id, task.house, "failed", reason=sentence_of(error))
 
 
 def _write_model(path: Path, mesh: Mesh) -> None:

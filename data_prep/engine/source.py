@@ -7,7 +7,7 @@ A source reads the files of a data set and knows no processes, shards or reports
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from data_prep.engine.workers import Run
 from sceneprior.core.errors import InputError
@@ -27,11 +27,9 @@ class Expected(Section):
     of: str = ""
     """Origin of the counts, data and author: "3D-FRONT, ATISS's index"."""
     rooms: int | None = None
-    """Prepared rooms."""
     train: int | None = None
     val: int | None = None
     test: int | None = None
-    """Prepared rooms of the split."""
     views: int | None = None
     objects: int | None = None
 
@@ -51,22 +49,31 @@ class RoomTask:
     """Further JSON values that the source needs to read the room."""
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """A room, or a whole house, that is not prepared, and the reason."""
+@dataclass
+class Line:
+    """One line of the report: a room, or a house that could not be read."""
 
     room_id: str
     """Id of the room; the house's name if its list of rooms could not be read."""
     house: str
-    status: Literal["filtered", "failed"]
-    """filtered: excluded by a rule; failed: the files are faulty."""
-    reason: str
-    """A sentence."""
+    status: str
+    """prepared; filtered: excluded by a rule; failed: the files are faulty."""
     rule: str = ""
     """Name of the rule that filters it: a rule of the recipe, or `split`, `no_view`, ..."""
-    notes: tuple[str, ...] = ()
-    unknown_categories: Mapping[str, int] = field(default_factory=dict)
-    """Number of pieces per unknown category, as in `PreparedRoom`."""
+    reason: str = ""
+    """Why it is not prepared, as a sentence."""
+    split: str = ""
+    views: int = 0
+    objects: int = 0
+    """Tracked objects: those visible in at least one view."""
+    visible: int = 0
+    """Objects visible in a view, summed over the views."""
+    notes: list[str] = field(default_factory=list)
+    """Parts of the room that were left out, with reasons."""
+    classes: dict[str, int] = field(default_factory=dict)
+    """Tracked objects of each class."""
+    unknown_categories: dict[str, int] = field(default_factory=dict)
+    """Number of pieces per unknown category; see `PreparedRoom`."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +82,8 @@ class Survey:
 
     rooms: tuple[RoomTask, ...]
     """Rooms in the order of the shards, with unique ids."""
-    left_out: tuple[LeftOut, ...] = ()
+    left_out: tuple[Line, ...] = ()
+    """Rooms, or whole houses, that are not prepared."""
 
 
 @dataclass(frozen=True)
@@ -100,61 +108,49 @@ class Source(Protocol):
 
     Methods may depend only on the source's fields and on the files, not on earlier calls or on the
     process they run in.
+
+    Attributes:
+        name: Name of the data set in `index.json`: "3d-front".
+        label_set: Name of the label set, for `sceneprior.core.classes.label_set`.
+        room_type: Type of the rooms; also in the shards' names: `train/<room_type>_0000.h5`.
+        draws: True if `prepare` needs a renderer; otherwise it gets None.
+        only: Requested part: HOUSE, HOUSE/ROOM or a room id (selection.py); None for everything.
+        expected: Counts that the recipe expects, for the report.
     """
 
     @property
-    def name(self) -> str:
-        """Name of the data set in `index.json`: "3d-front"."""
-
+    def name(self) -> str: ...
     @property
-    def label_set(self) -> str:
-        """Name of the label set, for `sceneprior.core.classes.label_set`."""
-
+    def label_set(self) -> str: ...
     @property
-    def room_type(self) -> str:
-        """Type of the rooms; also in the shards' names: `train/<room_type>_0000.h5`."""
-
+    def room_type(self) -> str: ...
     @property
-    def draws(self) -> bool:
-        """True if `prepare` needs a renderer; otherwise it gets None."""
-
+    def draws(self) -> bool: ...
     @property
-    def only(self) -> str | None:
-        """Requested part: HOUSE, HOUSE/ROOM or a room id (selection.py); None for everything."""
-
+    def only(self) -> str | None: ...
     @property
-    def expected(self) -> Expected | None:
-        """Counts that the recipe expects, for the report."""
+    def expected(self) -> Expected | None: ...
 
     def settings(self, only: str | None) -> dict[str, Any]:
         """Settings that the shards' bytes depend on, as JSON, without paths.
 
         Called first, in the main process, so it also rejects wrong folders. A run may resume in a
-        folder only if its settings are equal. `index.json` repeats `recipe` and `seed`.
-
-        Args:
-            only: Value of `--only` to assume: the source's own, or None for everything.
-
-        Raises:
-            InputError: the data set is not at the source's paths.
+        folder only if its settings are equal. `index.json` repeats `recipe` and `seed`. `only` is
+        the value of `--only` to assume: the source's own, or None for everything.
         """
 
     def survey(self, run: Run) -> Survey:
         """Make one cheap pass over the data set and list the rooms to prepare.
 
-        Args:
-            run: `run(function, argument_lists, title)` does the work in worker processes and
-                yields the results in order.
-
-        Raises:
-            InputError: nothing is left, or a split is empty.
+        `run(function, argument_lists, title)` does the work in worker processes and yields the
+        results in order. It is an `InputError` if nothing is left, or `train` is empty.
         """
 
-    def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
+    def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:
         """Read one room and observe it in all its views, in a worker process.
 
         The result depends on the task alone, not on the worker or on earlier tasks. An exception
-        counts as a failed room, like LeftOut with status "failed".
+        counts as a failed room, like a `Line` with status "failed".
         """
 
 

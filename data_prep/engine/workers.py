@@ -26,9 +26,6 @@ def pool(workers: int) -> Iterator[Run]:
     """Open a process pool as `run(function, argument_lists, title)`, which yields results in order.
 
     A single worker is this process itself. A progress bar goes to stderr if there is a title.
-
-    Raises:
-        InputError: a worker process died.
     """
     if workers <= 1:
 

@@ -18,10 +18,7 @@ from sceneprior.render.offscreen import Renderer
 def prepare_room(
     room: Room, count: int, recipe: Recipe, seed: int, renderer: Renderer
 ) -> tuple[RoomViews, RoomGroundTruth] | None:
-    """Render one room and measure the visible objects; None if no view shows an object.
-
-    The result depends on the seed and the room alone.
-    """
+    """Render one room and measure the visible objects; None if no view shows an object."""
     word = hashlib.sha256(f"{seed}:{room.room_id}".encode()).digest()
     rng = np.random.default_rng(int.from_bytes(word[:16], "little"))
     names = label_set(recipe.label_set)
@@ -59,25 +56,20 @@ def _draw_views(
     renderer: Renderer,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Render `count` views; a rejected view (`sees_enough`) is redrawn, and the best try stays."""
-    cameras = [spots.draw() for _ in range(count)]
-    images = renderer.instance_ids_of_views(meshes, cameras, rules.image_size)
-    scores = np.zeros(count)
-    open_views = []
-    for view in range(count):
-        good, scores[view] = sees_enough(pixel_counts(images[view], len(meshes))[is_object], rules)
-        if not good:
-            open_views.append(view)
-    for _ in range(rules.tries - 1):
+    best: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
+    open_views = list(range(count))
+    for _ in range(rules.tries):
         if not open_views:
             break
-        retries = [spots.draw() for _ in open_views]
-        drawn = renderer.instance_ids_of_views(meshes, retries, rules.image_size)
+        cameras = [spots.draw() for _ in open_views]
+        images = renderer.instance_ids_of_views(meshes, cameras, rules.image_size)
         still_open = []
-        for view, camera, image in zip(open_views, retries, drawn, strict=True):
+        for view, camera, image in zip(open_views, cameras, images, strict=True):
             good, score = sees_enough(pixel_counts(image, len(meshes))[is_object], rules)
-            if good or score > scores[view]:
-                cameras[view], images[view], scores[view] = camera, image, score
+            if good or view not in best or score > best[view][0]:
+                best[view] = score, camera.world_to_camera, image
             if not good:
                 still_open.append(view)
         open_views = still_open
-    return np.stack([camera.world_to_camera for camera in cameras]), images
+    _, world_to_camera, chosen = zip(*(best[view] for view in range(count)), strict=True)
+    return np.stack(world_to_camera), np.stack(chosen)

@@ -1,6 +1,6 @@
 """Room and Furniture: a furnished room in its own frame, the result of reading any 3D source."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -48,9 +48,8 @@ class Room:
     floor: shapely.Polygon | shapely.MultiPolygon
     """Floor plan in x and z, metres."""
     height_m: float
-    """Height from floor to ceiling."""
     furniture: tuple[Furniture, ...]
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
     """Parts of the room that were left out, with reasons."""
     without_model: tuple[tuple[str, str], ...] = ()
     """Model id and category of each piece that is left out for lack of a model."""

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -21,34 +20,8 @@ _CRACK_M = 0.1
 Floor: TypeAlias = shapely.Polygon | shapely.MultiPolygon
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Pose and scale of a room's child in the house."""
-
-    matrix: np.ndarray
-    """(4, 4) float64: scale, rotation, translation."""
-    scale: np.ndarray
-    """(3,) as stated in the file; negative if mirrored."""
-
-
-@dataclass(frozen=True)
-class Surface:
-    """A floor, wall or ceiling in the house's frame."""
-
-    vertices_m: np.ndarray
-    """(V, 3)."""
-    faces: np.ndarray
-    """(F, 3); F may be 0."""
-    unusable: int
-    """Number of triangles with missing vertices or implausible coordinates."""
-
-
 def numbers(values: Any) -> np.ndarray:
-    """Parse a list of numbers, a list of strings of numbers, or one string with all of them.
-
-    Raises:
-        InputError: `values` is something else.
-    """
+    """Parse a list of numbers, a list of strings of numbers, or one string with all of them."""
     if isinstance(values, str):
         values = values.replace(",", " ").strip("[]() ").split()
     if values is None or not isinstance(values, list):
@@ -59,15 +32,16 @@ def numbers(values: Any) -> np.ndarray:
         raise InputError("what should be a list of numbers holds something else") from None
 
 
-def placement_of(child: dict[str, Any], required: tuple[str, ...] = ()) -> Placement:
-    """Read the placement of a child; quaternions are (x, y, z, w), of any nonzero length.
+def placement_of(
+    child: dict[str, Any], required: tuple[str, ...] = ()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Read the pose of a room's child in the house: `pos`, `rot` and `scale`, by default identity.
 
-    Args:
-        child: Entry with `pos`, `rot` and `scale`, which default to the identity.
-        required: Keys that must be present.
+    Quaternions are (x, y, z, w), of any nonzero length. The keys in `required` must be present.
 
-    Raises:
-        InputError: the placement is incomplete, or its numbers are implausible.
+    Returns:
+        (4, 4) float64 matrix of scale, rotation and translation; and the scale, (3,), as stated in
+        the file, negative if mirrored.
     """
     for key in required:
         if child.get(key) is None:
@@ -94,14 +68,15 @@ def placement_of(child: dict[str, Any], required: tuple[str, ...] = ()) -> Place
     matrix = np.eye(4)
     matrix[:3, :3] = rotation * scale
     matrix[:3, 3] = place
-    return Placement(matrix, scale)
+    return matrix, scale
 
 
-def surface_of(mesh: dict[str, Any], child: dict[str, Any]) -> Surface:
-    """Triangles of a `mesh` entry in the house's frame, placed as its child says.
+def surface_of(mesh: dict[str, Any], child: dict[str, Any]) -> tuple[np.ndarray, int]:
+    """Triangles of a floor, wall or ceiling in the house's frame, placed as its child says.
 
-    Raises:
-        InputError: the entry holds something other than numbers.
+    Returns:
+        (F, 3, 3) in metres, where F may be 0; and the number of left out triangles, those with
+        missing vertices or implausible coordinates.
     """
     vertices = numbers(mesh.get("xyz") or [])
     faces = numbers(mesh.get("faces") or [])
@@ -110,18 +85,14 @@ def surface_of(mesh: dict[str, Any], child: dict[str, Any]) -> Surface:
     there = faces[((faces >= 0) & (faces < len(vertices))).all(axis=1)].astype(np.int64)
     usable = np.abs(vertices) < FAR_M
     there = there[usable[there].all(axis=(1, 2))]
-    matrix = placement_of(child).matrix
+    matrix, _ = placement_of(child)
     placed = np.where(usable, vertices, 0.0) @ matrix[:3, :3].T + matrix[:3, 3]
-    return Surface(placed, there, len(faces) - len(there))
+    return placed[there], len(faces) - len(there)
 
 
-def floor_of(surfaces: Iterable[Surface]) -> tuple[Floor, float]:
-    """Union of all floor triangles in x and z, and the height of the largest floor mesh.
-
-    Raises:
-        InputError: there is no floor.
-    """
-    triangles = [surface.vertices_m[surface.faces] for surface in surfaces if len(surface.faces)]
+def floor_of(surfaces: Iterable[np.ndarray]) -> tuple[Floor, float]:
+    """Union of all floor triangles in x and z, and the height of the largest floor mesh."""
+    triangles = [surface for surface in surfaces if len(surface)]
     polygons = [shapely.polygons(corners[:, :, [0, 2]]) for corners in triangles]
     areas = [float(shapely.area(group).sum()) for group in polygons]
     if not areas or max(areas) < _LEAST_FLOOR_M2:
@@ -179,14 +150,10 @@ def _wall_angle(floor: Floor) -> float:
     return float(best + np.average(offset[agreeing], weights=lengths[agreeing]))
 
 
-def height_of(surfaces: dict[str, list[Surface]], floor_y: float) -> float:
+def height_of(surfaces: dict[str, list[np.ndarray]], floor_y: float) -> float:
     """Room height: up to the top of the inner walls, else of the ceiling, else the default."""
     for kind in ("WallInner", "Ceiling"):
-        tops = [
-            float(surface.vertices_m[surface.faces][..., 1].max())
-            for surface in surfaces.get(kind, [])
-            if len(surface.faces)
-        ]
+        tops = [float(part[..., 1].max()) for part in surfaces.get(kind, []) if len(part)]
         if tops and max(tops) - floor_y > 1.0:
             return max(tops) - floor_y
     return DEFAULT_HEIGHT_M

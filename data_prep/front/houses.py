@@ -1,11 +1,11 @@
-"""Parses a house's JSON file and checks the parts that all its rooms share."""
+"""Finds and parses houses' JSON files, and checks the parts that all rooms of a house share."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json
+from sceneprior.core.files import is_name, read_json
 
 
 @dataclass(frozen=True)
@@ -17,17 +17,39 @@ class House:
     rooms: list[Any]
     """Entries of `scene.room`, unchecked."""
     furniture: dict[str, dict[str, Any]]
-    """Furniture entries by uid."""
     meshes: dict[str, dict[str, Any]]
-    """Mesh entries by uid."""
+    """Furniture and mesh entries by uid."""
+
+
+def house_files(folder: Path) -> list[Path]:
+    """The house files of a 3D-FRONT folder, sorted; an `InputError` if it holds none."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(
+            f"No folder at {folder}; --front names the folder of 3D-FRONT's house JSONs."
+        )
+    if (folder / "model_info.json").exists():
+        raise InputError(f"{folder} holds furniture models, not houses; give it as --future.")
+    inside = folder / "3D-FRONT"
+    files = [] if inside.is_dir() else sorted(folder.glob("*.json"))
+    if not files:
+        hint = f"; did you mean {inside}?" if inside.is_dir() else "."
+        raise InputError(f"{folder} holds no house JSONs (<uid>.json){hint}")
+    return files
+
+
+def shown(text: Any) -> str:
+    """Make a text from a house file printable and short, for reports."""
+    if is_name(text):
+        return str(text)
+    try:
+        return ascii(text)[:60]
+    except RecursionError:
+        return "something deeply nested"
 
 
 def parse_house(path: Path) -> House:
-    """Read the JSON of one house.
-
-    Raises:
-        InputError: the file is not a house.
-    """
+    """Read the JSON of one house; an `InputError` if it is none."""
     data = read_json(path)
     lists = {
         "furniture": _inside(data, "furniture"),

@@ -20,11 +20,7 @@ _CACHE_BYTES = 512 * 2**20
 
 
 class ModelBank:
-    """3D-FUTURE's models: all categories, and meshes on demand in a cache of `cache_bytes`.
-
-    Raises:
-        InputError: the folder is missing, or is not 3D-FUTURE's.
-    """
+    """3D-FUTURE's models: all categories, and meshes on demand in a cache of `cache_bytes`."""
 
     def __init__(self, folder: Path, cache_bytes: int = _CACHE_BYTES):
         self.folder = Path(folder)
@@ -50,9 +46,6 @@ class ModelBank:
 
         About a hundred models of the release are in centimetres. A model with a side longer than
         10 m is taken for one of them and scaled by 0.01; `unit_of` finds those that are smaller.
-
-        Raises:
-            InputError: the mesh is missing or damaged.
         """
         path = self.folder / model_id / MODEL_FILE
         return self._read(path, file_stamp(path))

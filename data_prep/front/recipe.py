@@ -131,11 +131,7 @@ class Recipe(Section):
 
 
 def find_recipe(text: str) -> Path:
-    """Find the file of a recipe, given a path that ends in .yaml or the name of a bundled recipe.
-
-    Raises:
-        InputError: there is no such recipe.
-    """
+    """Find the file of a recipe: a path that ends in .yaml, or the name of a bundled recipe."""
     if Path(text).suffix in (".yaml", ".yml"):
         if not Path(text).is_file():
             raise InputError(f"No recipe at {text}; `sceneprior recipe bedroom` prints one.")
@@ -148,12 +144,7 @@ def find_recipe(text: str) -> Path:
 
 
 def load_recipe(text: str, changes: tuple[str, ...] = ()) -> Recipe:
-    """Read a recipe (`find_recipe`), with changes such as `views.per_m2=3` or `max_floor_m=null`.
-
-    Raises:
-        InputError: there is no such recipe, it has an unknown rule, or it uses a class outside its
-            label set.
-    """
+    """Read a recipe with changes such as `views.per_m2=3` or `max_floor_m=null`."""
     path = find_recipe(text)
     data = {"name": path.stem, **read_yaml(path)}
     for change in changes:
@@ -181,11 +172,7 @@ def _lines(path: Path, key: str) -> list[str]:
 
 
 def recipe_text(name: str) -> str:
-    """Text of a bundled recipe with all its categories written out, as a template.
-
-    Raises:
-        InputError: no bundled recipe has this name.
-    """
+    """Text of a bundled recipe with all its categories written out, as a template."""
     if Path(name).suffix in (".yaml", ".yml"):
         raise InputError(
             f"{name} is a file, not a recipe of the package, which `sceneprior recipe` prints; use "

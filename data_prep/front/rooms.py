@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from data_prep.front.files import shown
 from data_prep.front.furnished import Furniture, Room
 from data_prep.front.geometry import (
-    Surface,
     floor_of,
     height_of,
     in_frame,
@@ -19,7 +17,7 @@ from data_prep.front.geometry import (
     room_frame,
     surface_of,
 )
-from data_prep.front.houses import House, is_valid, key_of, parse_house
+from data_prep.front.houses import House, is_valid, key_of, parse_house, shown
 from data_prep.front.models import ModelBank, unit_of
 from data_prep.front.recipe import Recipe
 from sceneprior.core.errors import InputError
@@ -53,16 +51,10 @@ def read_house(
     wanted: Callable[[str, str], bool] = lambda room_id, room_type: True,
     load_models: bool = True,
 ) -> HouseRooms:
-    """Read the wanted rooms of one house.
+    """Read the rooms of one house for which `wanted(room id, room type)` is true.
 
-    Args:
-        house: `<house uid>.json`, or the result of `parse_house`.
-        models: Meshes of the furniture; `load_models=False` leaves every mesh empty (a survey).
-        recipe: Maps categories to classes and limits the scales.
-        wanted: Predicate of (room id, room type).
-
-    Raises:
-        InputError: the file is not a house.
+    The recipe maps categories to classes and limits the scales. `load_models=False` leaves every
+    mesh empty (a survey).
     """
     if not isinstance(house, House):
         house = parse_house(house)
@@ -79,8 +71,7 @@ def read_house(
         if not wanted(room_id, room_type):
             continue
         if not is_name(name):
-            why = f"its instanceid, {shown(name)}, can be no name"
-            result.failures.append((room_id, why))
+            result.failures.append((room_id, f"its instanceid, {shown(name)}, can be no name"))
             continue
         if room_id in seen:
             result.failures.append((room_id, "another room of the house has the same instanceid"))
@@ -147,20 +138,20 @@ class _RoomReader:
 
     def _surfaces(
         self, children: list[dict[str, Any]], notes: list[str]
-    ) -> dict[str, list[Surface]]:
-        surfaces: dict[str, list[Surface]] = {}
+    ) -> dict[str, list[np.ndarray]]:
+        surfaces: dict[str, list[np.ndarray]] = {}
         for child in children:
             mesh = self.house.meshes.get(key_of(child.get("ref")))
             kind = mesh.get("type") if mesh else None
             if mesh is None or kind not in ("Floor", "WallInner", "Ceiling"):
                 continue
             try:
-                surface = surface_of(mesh, child)
+                surface, unusable = surface_of(mesh, child)
             except InputError as error:
                 notes.append(f"a {kind} mesh is left out: {error}")
                 continue
-            if surface.unusable:
-                notes.append(f"a {kind} mesh has {surface.unusable} triangles without places")
+            if unusable:
+                notes.append(f"a {kind} mesh has {unusable} triangles without places")
             surfaces.setdefault(kind, []).append(surface)
         return surfaces
 
@@ -175,9 +166,9 @@ class _RoomReader:
         for child, entry in placed:
             model_id = str(entry.get("jid") or "")
             try:
-                placement = placement_of(child, required=("pos", "rot"))
-                self._check_scale(model_id, placement.scale)
-                key = model_id.encode(errors="replace") + np.round(placement.matrix, 4).tobytes()
+                matrix, scale = placement_of(child, required=("pos", "rot"))
+                self._check_scale(model_id, scale)
+                key = model_id.encode(errors="replace") + np.round(matrix, 4).tobytes()
                 if key in seen:
                     notes.append(f"{shown(model_id)} stands twice at the same place; one is kept")
                     continue
@@ -188,26 +179,18 @@ class _RoomReader:
                 continue
             category = self.models.category(model_id)
             unit = np.diag([*[unit_of(model, entry)] * 3, 1.0])
-            pieces.append(
-                Furniture(
-                    label=self.recipe.class_of(category),
-                    category=category,
-                    model_id=model_id,
-                    model=model,
-                    model_to_room=room_from_house @ placement.matrix @ unit,
-                )
-            )
+            label, model_to_room = self.recipe.class_of(category), room_from_house @ matrix @ unit
+            pieces.append(Furniture(label, category, model_id, model, model_to_room))
         return pieces
 
     def _check_scale(self, model_id: str, scale: np.ndarray) -> None:
         """Apply the recipe's two rules on scales; a piece scaled to zero is always left out."""
         limits, text = self.recipe.scale_range, ", ".join(f"{value:g}" for value in scale)
+        name = shown(model_id)
         if limits and not all(limits[0] <= abs(value) <= limits[1] for value in scale):
-            why = f"{shown(model_id)} is scaled by {text}, beyond scale_range"
-            raise _FilteredError("scale_range", why)
+            raise _FilteredError("scale_range", f"{name} is scaled by {text}, beyond scale_range")
         if not self.recipe.allow_mirrored and (scale < 0).any():
-            why = f"{shown(model_id)} is mirrored, scaled by {text}"
-            raise _FilteredError("allow_mirrored", why)
+            raise _FilteredError("allow_mirrored", f"{name} is mirrored, scaled by {text}")
         if (np.abs(scale) < _FLAT).any():
             raise InputError(f"it is scaled by {text}, to nothing")
 

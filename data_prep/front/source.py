@@ -12,7 +12,7 @@ from data_prep.engine.selection import house_may_match, read_splits, seeded_spli
 from data_prep.engine.source import (
     SPLITS,
     Expected,
-    LeftOut,
+    Line,
     PreparedRoom,
     RoomTask,
     Survey,
@@ -20,14 +20,13 @@ from data_prep.engine.source import (
 )
 from data_prep.engine.workers import Run
 from data_prep.front.drawing import prepare_room
-from data_prep.front.files import house_files
 from data_prep.front.filters import broken_rule, outside_floor, unknown_categories
 from data_prep.front.furnished import Room
-from data_prep.front.houses import House, parse_house
+from data_prep.front.houses import House, house_files, parse_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import Recipe
 from data_prep.front.rgb import rgb_files
-from data_prep.front.rooms import HouseRooms, read_house
+from data_prep.front.rooms import read_house
 from data_prep.front.viewpoints import view_counts
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import file_stamp
@@ -44,15 +43,12 @@ class FrontSource:
     name: ClassVar = "3d-front"
     draws: ClassVar = True
     front: Path
-    """Folder of house JSONs."""
     future: Path
-    """Folder of furniture models."""
     recipe: Recipe
     splits: Path | None = None
     """CSV of `room id,split`; None splits 8:1:1 into train, val and test, seeded."""
     seed: int = 0
     only: str | None = None
-    """HOUSE, HOUSE/ROOM or a room id; a prefix of the house's name suffices."""
     rgb: bool = False
     """True also renders shaded pictures, `rgb/<room>/<view>.png` (rgb.py); no effect on shards."""
 
@@ -92,9 +88,9 @@ class FrontSource:
         """Read every house once, without meshes, and list the rooms to draw."""
         files = self._houses(self.only)
         found: list[tuple[str, str, int]] = []
-        left_out: list[LeftOut] = []
-        chunks = [files[i : i + _HOUSES_PER_TASK] for i in range(0, len(files), _HOUSES_PER_TASK)]
-        arguments = [(self, chunk) for chunk in chunks]
+        left_out: list[Line] = []
+        starts = range(0, len(files), _HOUSES_PER_TASK)
+        arguments = [(self, files[i : i + _HOUSES_PER_TASK]) for i in starts]
         for rooms, lost in run(_survey_houses, arguments, "reading houses"):
             found += rooms
             left_out += lost
@@ -117,22 +113,21 @@ class FrontSource:
             if split in SPLITS:
                 tasks.append(RoomTask(room_id, house, split, views))
             else:
-                why = "it is in no split"
-                left_out.append(LeftOut(room_id, house, "filtered", why, rule="split"))
+                left_out.append(Line(room_id, house, "filtered", "split", "it is in no split"))
         where = f"{self.front} passes the recipe {self.recipe.name}"
         survey = Survey(tuple(tasks), tuple(left_out))
         return select(survey, self.only, where, str(self.splits or ""))
 
-    def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
+    def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:
         """Read one room with its meshes and draw its views."""
         assert renderer is not None
         path = Path(self.front) / f"{task.house}.json"
         house = _parsed(path, file_stamp(path))
-        read = self.read(house, load_models=True, room_id=task.room_id)
+        read = read_house(house, self.bank, self.recipe, lambda its_id, _: its_id == task.room_id)
         if not read.rooms:
             reasons = [why for _, why in read.failures] + [why for *_, why in read.filtered]
             why = reasons[0] if reasons else "its house lost it meanwhile"
-            return LeftOut(task.room_id, task.house, "failed", why)
+            return Line(task.room_id, task.house, "failed", reason=why)
         room = read.rooms[0]
         # Checked again, now with meshes: unreadable models may leave too little furniture.
         broken = broken_rule(room, self.recipe)
@@ -146,30 +141,16 @@ class FrontSource:
         models = {piece.model_id: piece.model for piece in pieces}
         pictures = {}
         if self.rgb:
-            colors = [self._bank.color(piece.model_id) for piece in room.furniture]
+            colors = [self.bank.color(piece.model_id) for piece in room.furniture]
             pictures = rgb_files(room, colors, made[0], self.label_set, renderer)
         notes = room.notes
         if outside := outside_floor(room):
             notes += (f"{outside} of {len(room.furniture)} pieces stand outside of the floor",)
-        return PreparedRoom(
-            *made, models=models, files=pictures, notes=notes,
-            unknown_categories=unknown_categories(room, self.recipe),
-        )  # fmt: skip
-
-    def read(self, house: House, load_models: bool, room_id: str | None = None) -> HouseRooms:
-        """Read the rooms of a house that are of the recipe's type, or the one with this id."""
-        return read_house(
-            house,
-            self._bank,
-            self.recipe,
-            lambda its_id, its_type: (
-                self.recipe.of_type(its_type) if room_id is None else its_id == room_id
-            ),
-            load_models,
-        )
+        return PreparedRoom(*made, models, pictures, notes, unknown_categories(room, self.recipe))
 
     @property
-    def _bank(self) -> ModelBank:
+    def bank(self) -> ModelBank:
+        """The furniture models."""
         folder = Path(self.future)
         return _bank(folder, file_stamp(model_info_path(folder)))
 
@@ -210,36 +191,41 @@ def _room_types(files: list[Path]) -> list[str]:
     return [f"{name} ({count})" for name, count in types.most_common()]
 
 
-def _filtered(room: Room, house: str, recipe: Recipe, rule: str, reason: str) -> LeftOut:
-    unknown = unknown_categories(room, recipe)
-    return LeftOut(room.room_id, house, "filtered", reason, rule, room.notes, unknown)
+def _filtered(room: Room, house: str, recipe: Recipe, rule: str, reason: str) -> Line:
+    return Line(
+        room.room_id, house, "filtered", rule, reason, notes=[*room.notes],
+        unknown_categories=unknown_categories(room, recipe),
+    )  # fmt: skip
 
 
 def _survey_houses(
     source: FrontSource, files: list[Path]
-) -> tuple[list[tuple[str, str, int]], list[LeftOut]]:
+) -> tuple[list[tuple[str, str, int]], list[Line]]:
     """Read houses; returns (room id, house, views) of the rooms to draw, and the rooms left out."""
+    recipe = source.recipe
+
+    def of_type(room_id: str, room_type: str) -> bool:
+        return recipe.of_type(room_type)
+
     found: list[tuple[str, str, int]] = []
-    left_out: list[LeftOut] = []
+    left_out: list[Line] = []
     for path in files:
         house = path.stem
         try:
-            read = source.read(parse_house(path), load_models=False)
+            read = read_house(parse_house(path), source.bank, recipe, of_type, load_models=False)
         except Exception as error:
-            left_out.append(LeftOut(house, house, "failed", sentence_of(error)))
+            left_out.append(Line(house, house, "failed", reason=sentence_of(error)))
             continue
-        left_out += [LeftOut(room_id, house, "failed", why) for room_id, why in read.failures]
-        left_out += [
-            LeftOut(room_id, house, "filtered", why, rule=rule)
-            for room_id, rule, why in read.filtered
-        ]
+        left_out += [Line(room_id, house, "failed", reason=why) for room_id, why in read.failures]
+        for room_id, rule, why in read.filtered:
+            left_out.append(Line(room_id, house, "filtered", rule, why))
         good = []
         for room in read.rooms:
-            broken = broken_rule(room, source.recipe)
+            broken = broken_rule(room, recipe)
             if broken is None:
                 good.append(room)
             else:
-                left_out.append(_filtered(room, house, source.recipe, *broken))
-        counts = view_counts([float(room.floor.area) for room in good], source.recipe.views)
+                left_out.append(_filtered(room, house, recipe, *broken))
+        counts = view_counts([float(room.floor.area) for room in good], recipe.views)
         found += [(room.room_id, house, views) for room, views in zip(good, counts, strict=True)]
     return found, left_out

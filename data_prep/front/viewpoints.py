@@ -70,12 +70,10 @@ def camera_pose(eye_m: np.ndarray, yaw_rad: float, pitch_rad: float) -> np.ndarr
 
 
 class Viewpoints:
-    """Samples cameras in one room, aimed at one object after the other.
+    """Samples cameras above a room's floor, aimed at one object after the other.
 
-    Args:
-        room: Cameras stand on its floor.
-        boxes_m: (pieces, 2, 3) lower and upper corners of all furniture in the room frame.
-        targets_m: (k, 3) centres of the objects to aim at.
+    `boxes_m`, (pieces, 2, 3), are the lower and upper corners of all furniture in the room frame,
+    and `targets_m`, (k, 3), the centres of the objects to aim at.
     """
 
     def __init__(
@@ -164,10 +162,9 @@ class Viewpoints:
 
 
 def sees_enough(pixels: np.ndarray, rules: ViewRules) -> tuple[bool, float]:
-    """Test whether a view is accepted, and score it; scores rank the rejected views.
+    """Test whether a view with these visible pixels of each object is accepted, and score it.
 
-    Args:
-        pixels: Visible pixels of each object.
+    Scores rank the rejected views.
     """
     height, width = rules.image_size
     seen = int((pixels >= rules.min_object_pixels).sum())

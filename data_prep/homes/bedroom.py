@@ -50,10 +50,6 @@ EXTRAS: Offers = {
 """Furniture of a bedroom besides bed, nightstands, wardrobe and lamp."""
 
 
-def _draw_bed(rng: np.random.Generator) -> str:
-    return str(rng.choice(list(BEDS), p=list(BEDS.values())))
-
-
 def _draw_groups(rng: np.random.Generator, count: int, bed: str) -> list[str]:
     chances = [0.62, 0.24, 0.14] if bed == "double_bed" else [0.1, 0.55, 0.35]
     nightstands = int(rng.choice([2, 1, 0], p=chances))
@@ -81,10 +77,6 @@ def _place_bed(room: Furnisher, groups: list[str]) -> Piece | None:
     return room.against_wall(models, 0.4, [wall], corner=0.75, tries=8)
 
 
-def _nightstands(room: Furnisher, group: str) -> bool:
-    return room.twins_beside(room.catalog["nightstand"], int(group[-1]))
-
-
 def _bedside_lamps(room: Furnisher, group: str) -> bool:
     nightstands = [piece for piece in room.plan.pieces if piece.model.name == "nightstand"]
     small = sorted(room.catalog["pendant_lamp"], key=lambda model: model.size_m[0])[:4]
@@ -92,61 +84,59 @@ def _bedside_lamps(room: Furnisher, group: str) -> bool:
     return all([room.hang(twin, (n.x, n.z), n.top + 0.3, 0.0) for n in nightstands[:2]])
 
 
-def _sofa(room: Furnisher, group: str) -> bool:
+def _sofa(room: Furnisher, group: str) -> Piece | None:
     sofa = room.against_wall(room.models("sofa", below=2.4), clearance=0.5)
     if sofa is None or not group.endswith("coffee_table"):
-        return sofa is not None
-    return room.before(sofa, room.models("coffee_table", below=1.3), (0.25, 0.4)) is not None
+        return sofa
+    return room.before(sofa, room.models("coffee_table", below=1.3), (0.25, 0.4))
 
 
-def _bench(room: Furnisher, group: str) -> bool:
+def _bench(room: Furnisher, group: str) -> object:
     """Place a bench at the foot of the bed, or a small stool anywhere."""
-    if room.rng.random() < 0.6:
-        long = room.models("stool", above=0.8)
-        if room.before(room.anchor, long, (0.03, 0.12), tries=6):
-            return True
-    return room.standing_free(room.models("stool", below=0.8), ANGLED) is not None
+    long, small = room.models("stool", above=0.8), room.models("stool", below=0.8)
+    at_foot = room.rng.random() < 0.6 and room.before(room.anchor, long, (0.03, 0.12), tries=6)
+    return at_foot or room.standing_free(small, ANGLED)
 
 
-def _armchair(room: Furnisher, group: str) -> bool:
+def _armchair(room: Furnisher, group: str) -> Piece | None:
     """Place an armchair near a wall, facing the middle of the room, perhaps with a small table."""
     middle = (room.plan.width / 2, room.plan.depth / 2)
     chair = room.standing_free(room.catalog["armchair"], ANGLED, middle)
     _, _, companion = group.partition(" and ")
     if chair is None or not companion:
-        return chair is not None
+        return chair
     small = room.models(companion, below=0.9)
     upright = chair.at(chair.x, chair.z, round(chair.yaw_rad / (np.pi / 2)) * np.pi / 2)
-    if room.before(upright, small, (0.15, 0.35), angled=0.2, tries=6):
-        return True
-    return room.standing_free(small, 0.2) is not None
+    before = room.before(upright, small, (0.15, 0.35), angled=0.2, tries=6)
+    return before or room.standing_free(small, 0.2)
 
 
-def _lamp(room: Furnisher, group: str) -> bool:
+def _lamp(room: Furnisher, group: str) -> Piece | None:
     """Hang a lamp over the middle of the room, or between there and the bed."""
     kind = "pendant_lamp" if room.rng.random() < 0.76 else "ceiling_lamp"
     x, z = room.lamp_position()
     if room.rng.random() < 0.35:
         x, z = (x + room.anchor.x) / 2, (z + room.anchor.z) / 2
-    if room.hang(room.catalog[kind], (x, z), 1.65, LAMP_ANGLED):
-        return True
-    return room.hang(room.catalog["ceiling_lamp"], (x, z), 1.65, LAMP_ANGLED) is not None
+    lamp = room.hang(room.catalog[kind], (x, z), 1.65, LAMP_ANGLED)
+    return lamp or room.hang(room.catalog["ceiling_lamp"], (x, z), 1.65, LAMP_ANGLED)
 
 
-def _loose(room: Furnisher, group: str) -> bool:
+def _loose(room: Furnisher, group: str) -> Piece | None:
     angled = ANGLED if group == "chair" else 0.2
-    return room.standing_free(room.models(group, below=0.8), angled) is not None
+    return room.standing_free(room.models(group, below=0.8), angled)
 
 
 BEDROOM = RoomType(
     name="bedroom",
     label_set="front3d_bedroom",
     counts=COUNTS,
-    draw_first=_draw_bed,
+    draw_first=lambda rng: str(rng.choice(list(BEDS), p=list(BEDS.values()))),
     draw_groups=_draw_groups,
     place_first=_place_bed,
     rules={
-        "nightstands": _nightstands,
+        "nightstands": lambda room, group: room.twins_beside(
+            room.catalog["nightstand"], int(group[-1])
+        ),
         "tv_stand": opposite_the_anchor,
         "wardrobe": along_wall(0.5),
         "children_cabinet": along_wall(0.5),

@@ -74,8 +74,8 @@ class Model:
     jid: str
     name: str
     """Class in the label sets."""
-    category: str
     super_category: str
+    category: str
     style_name: str
     size_m: Vector
     """Width, height and depth: full extents along x, y, z."""
@@ -91,10 +91,8 @@ class Model:
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
         """All parts as one mesh."""
-        offsets = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
-        faces = [p.faces + offset for p, offset in zip(self.parts, offsets, strict=True)]
-        vertices = np.concatenate([part.vertices for part in self.parts])
-        return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
+        arrays = [part.vertices for part in self.parts], [part.faces for part in self.parts]
+        return trimesh.Trimesh(*trimesh.util.append_faces(*arrays), process=False)
 
 
 Catalog = dict[str, list[Model]]
@@ -112,19 +110,10 @@ def _variants(seed: int, name: str) -> list[Model]:
     rng = np.random.default_rng(np.random.SeedSequence(own))
     models = []
     for index, size in enumerate(_sizes(name, rng)):
-        super_category, category = _category(name, size, index)
-        models.append(
-            Model(
-                jid=str(uuid.uuid5(uuid.NAMESPACE_OID, f"sceneprior homes {seed} {name} {index}")),
-                name=name,
-                category=category,
-                super_category=super_category,
-                style_name=("Modern", "Japanese", "Vintage/Retro")[index % 3],
-                size_m=size,
-                style=index,
-                seed=(*own, index),
-            )
-        )
+        jid = str(uuid.uuid5(uuid.NAMESPACE_OID, f"sceneprior homes {seed} {name} {index}"))
+        style_name = ("Modern", "Japanese", "Vintage/Retro")[index % 3]
+        kinds = _category(name, size, index)
+        models.append(Model(jid, name, *kinds, style_name, size, index, (*own, index)))
     return models
 
 

@@ -13,8 +13,8 @@ from data_prep.homes.rooms import empty_room, is_liveable
 Offers = dict[str, tuple[int, float]]
 """Number of pieces and sampling weight per group of pieces, such as "desk and chair"."""
 
-Rule = Callable[[Furnisher, str], bool]
-"""Places the pieces of a group; returns False if one of them does not fit."""
+Rule = Callable[[Furnisher, str], object]
+"""Places the pieces of a group; returns None or False if one of them does not fit."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,12 @@ def furnish(room_type: RoomType, catalog: Catalog, rng: np.random.Generator, sha
         growth = 1 + 0.02 * min(attempt, room_type.growing_tries)
         area = (base + per_piece * count) * rng.uniform(0.85, 1.2) * growth
         plan = empty_room(rng, area, room_type.sides_m, room_type.l_shaped_chance)
-        arranged = _arrange(room_type, Furnisher(plan, catalog, rng), groups)
+        room = Furnisher(plan, catalog, rng)
+        anchor = room_type.place_first(room, groups)
+        if anchor is None:
+            continue
+        room.anchor = anchor
+        arranged = all(room_type.rules[group.split(" ")[0]](room, group) for group in groups[1:])
         if arranged and is_liveable(plan, room_type.reach):
             return plan
     raise RuntimeError(
@@ -74,14 +79,6 @@ def count_at(histogram: dict[int, int], share: float) -> int:
     """Number of pieces at the quantile `share`, in [0, 1), of a histogram."""
     total = np.cumsum(list(histogram.values()))
     return list(histogram)[int(np.searchsorted(total, share * total[-1], side="right"))]
-
-
-def _arrange(room_type: RoomType, furnisher: Furnisher, groups: list[str]) -> bool:
-    anchor = room_type.place_first(furnisher, groups)
-    if anchor is None:
-        return False
-    furnisher.anchor = anchor
-    return all(room_type.rules[group.split(" ")[0]](furnisher, group) for group in groups[1:])
 
 
 def draw_basics(
@@ -127,18 +124,36 @@ def draw_extras(
 
 def along_wall(clearance: float) -> Rule:
     """Make a rule that places one piece of the class named by the group, its back to a wall."""
+    return lambda room, group: room.against_wall(room.catalog[group], clearance)
 
-    def place(furnisher: Furnisher, group: str) -> bool:
-        return furnisher.against_wall(furnisher.catalog[group], clearance) is not None
+
+def table_and_seat(angled: float) -> Rule:
+    """Make a rule that places "desk and chair": a desk along a wall, then a chair that faces it.
+
+    `angled` is the chance of a rotated chair.
+    """
+
+    def place(room: Furnisher, group: str) -> Piece | None:
+        first, _, seat = group.partition(" and ")
+        table = room.against_wall(room.catalog[first], clearance=0.75 if seat else 0.5)
+        if table is None or not seat:
+            return table
+        return room.before(table, room.models(seat, below=0.75), (0.02, 0.12), angled=angled)
 
     return place
 
 
-def table_and_seat(angled: float) -> Rule:
-    """Make a rule for groups such as "desk and chair"; `angled` is the chance of a rotated seat."""
-    return lambda furnisher, group: furnisher.pair_along_wall(group, angled)
-
-
-def opposite_the_anchor(furnisher: Furnisher, group: str) -> bool:
-    """Place one piece of the class named by the group, facing the bed or the sofa (a `Rule`)."""
-    return furnisher.opposite(furnisher.anchor, furnisher.catalog[group]) is not None
+def opposite_the_anchor(room: Furnisher, group: str) -> Piece | None:
+    """Place a piece of the class named by the group at the wall that the bed or the sofa faces."""
+    anchor = room.anchor
+    facing = [
+        wall
+        for wall in room.plan.walls
+        if np.cos(wall.yaw_rad - anchor.yaw_rad) < -0.9 and wall.length > 1.5
+    ]
+    if not facing:
+        return None
+    wall = max(facing, key=lambda wall: wall.length)
+    along_x, along_z = wall.along
+    where = abs(along_x) * abs(anchor.x - wall.x) + abs(along_z) * abs(anchor.z - wall.z)
+    return room.against_wall(room.catalog[group], walls=[wall], where=where, tries=15)

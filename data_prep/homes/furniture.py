@@ -103,13 +103,9 @@ def build(
     rng: np.random.Generator,
     tables: dict[str, Table] | None = None,
 ) -> Parts:
-    """Build the parts of one piece of furniture, about as large as `size_m`.
+    """Build the parts of a piece of furniture, about as large as `size_m`, from `tables`.
 
-    Args:
-        tables: Tables by name; those of this package if None.
-
-    Raises:
-        ValueError: a row cannot be evaluated; the message names the table and the row.
+    A row that cannot be evaluated is a ValueError that names the table and the row.
     """
     names = VOCABULARY | {draw: getattr(rng, draw) for draw in ("uniform", "random", "integers")}
     names["books"] = partial(_books, rng)

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from data_prep.homes.dining import place_dining
 from data_prep.homes.furnish import (
     Offers,
     RoomType,
@@ -14,7 +13,7 @@ from data_prep.homes.furnish import (
     opposite_the_anchor,
     table_and_seat,
 )
-from data_prep.homes.layout import Piece
+from data_prep.homes.layout import Piece, Plan
 from data_prep.homes.placement import Furnisher
 
 COUNTS = {4: 40, 5: 65, 6: 90, 7: 110, 8: 120, 9: 120, 10: 110, 11: 95, 12: 78, 13: 60, 14: 44,
@@ -23,8 +22,9 @@ COUNTS = {4: 40, 5: 65, 6: 90, 7: 110, 8: 120, 9: 120, 10: 110, 11: 95, 12: 78, 
 for lack of a real histogram."""
 
 SEAT_ANGLED = 0.55
-"""Chance that a seat is rotated off the axes."""
 LAMP_ANGLED = 0.12
+CHAIR_ANGLED = 0.12
+"""Chances that a seat, a lamp, and a dining chair are rotated off the axes."""
 
 EXTRAS: Offers = {
     "armchair": (1, 0.5),
@@ -61,20 +61,79 @@ def _place_sofa(room: Furnisher, groups: list[str]) -> Piece | None:
     return room.against_wall(room.catalog["sofa"], 0.5, [wall], where=where, tries=10)
 
 
-def _coffee_table(room: Furnisher, group: str) -> bool:
+def _coffee_table(room: Furnisher, group: str) -> Piece | None:
     tables = room.models("coffee_table", below=0.8 * room.anchor.size_m[0])
-    return room.before(room.anchor, tables, (0.3, 0.45), angled=0.05) is not None
+    return room.before(room.anchor, tables, (0.3, 0.45), angled=0.05)
 
 
-def _side_tables(room: Furnisher, group: str) -> bool:
+def _dining(room: Furnisher, group: str) -> bool:
+    """Place "dining 6", a table with six chairs, preferably not in front of the sofa."""
+    plan, rng = room.plan, room.rng
+    count = int(group.split(" ")[1])
+    tables = room.models("table", above=1.5 if count > 4 else 1.0)
+    chairs = [model for model in room.models("chair", below=0.68) if model.size_m[2] < 0.72]
+    for attempt in range(40):
+        table, chair = room.pick(tables), room.pick(chairs)
+        yaw = float(rng.integers(4)) * np.pi / 2
+        half_x, half_z = table.half_extent(yaw)
+        around = chair.model.size_m[2] + 0.1
+        if 2 * (half_x + around) > plan.width or 2 * (half_z + around) > plan.depth:
+            continue
+        x = rng.uniform(half_x + around, plan.width - half_x - around)
+        z = rng.uniform(half_z + around, plan.depth - half_z - around)
+        table = table.at(x, z, yaw)
+        if attempt < 30 and _is_before(room.anchor, table):
+            continue
+        places = _chair_places(table, chair.size_m[0], count)
+        if len(places) < count or not plan.fits(table):
+            continue
+        ring = [_chair_at(room, table, chair, *place) for place in places]
+        if not all(plan.fits(piece) for piece in ring):
+            continue
+        trial = Plan(plan.width, plan.depth, plan.height, plan.notch, [table])
+        if all([trial.add(piece) for piece in ring]):
+            plan.pieces += [table, *ring]
+            return True
+    return False
+
+
+def _is_before(sofa: Piece, table: Piece) -> bool:
+    """Test whether the table stands in front of the sofa."""
+    sin, cos = np.sin(sofa.yaw_rad), np.cos(sofa.yaw_rad)
+    dx, dz = table.x - sofa.x, table.z - sofa.z
+    half = table.half_extent(table.yaw_rad - sofa.yaw_rad)[0]
+    sideways, forward = abs(dx * cos - dz * sin), dx * sin + dz * cos
+    return sideways < half + 0.4 * sofa.size_m[0] and forward < 4.0
+
+
+def _chair_places(table: Piece, width: float, count: int) -> list[tuple[float, float]]:
+    """Places (rotation, sideways) of up to `count` chairs: long sides in pairs, then the ends."""
+    long = int((table.size_m[0] + 0.05) // (width + 0.06))
+    row = max(1, min(long, count // 2 if count <= 4 else (count - 1) // 2))
+    step = table.size_m[0] / row
+    sides = [(turn, (k + 0.5 - row / 2) * step) for k in range(row) for turn in (0.0, np.pi)]
+    ends = [(np.pi / 2, 0.0), (-np.pi / 2, 0.0)] if table.size_m[2] > 0.6 else []
+    return (sides + ends)[:count]
+
+
+def _chair_at(room: Furnisher, table: Piece, chair: Piece, turn: float, sideways: float) -> Piece:
+    towards = table.yaw_rad + turn
+    askew = room.random_turn(CHAIR_ANGLED) * 0.6
+    half = table.size_m[2] / 2 if abs(np.cos(turn)) > 0.5 else table.size_m[0] / 2
+    off = half + chair.half_extent(askew)[1] + room.rng.uniform(0.02, 0.07)
+    sin, cos = np.sin(towards), np.cos(towards)
+    x = table.x + off * sin + sideways * cos
+    z = table.z + off * cos - sideways * sin
+    return chair.at(x, z, towards + np.pi + askew)
+
+
+def _side_tables(room: Furnisher, group: str) -> object:
     small = room.models("table", below=0.75)
     count = int(group[-1])
-    if room.twins_beside(small, count):
-        return True
-    return count == 1 and room.standing_free(small, 0.1) is not None
+    return room.twins_beside(small, count) or (count == 1 and room.standing_free(small, 0.1))
 
 
-def _armchair(room: Furnisher, group: str) -> bool:
+def _armchair(room: Furnisher, group: str) -> Piece | None:
     """Place an armchair at a side of the coffee table, facing it, or near a wall."""
     tables = [piece for piece in room.plan.pieces if piece.model.name == "coffee_table"]
     chairs, sofa = room.catalog["armchair"], room.anchor
@@ -84,19 +143,19 @@ def _armchair(room: Furnisher, group: str) -> bool:
         anchor = replace(table, yaw_rad=yaw, scale=(1.0, 1.0, 1.0))
         gap = table.half_extent(table.yaw_rad - yaw)[1] - anchor.size_m[2] / 2
         gaps = (gap + 0.25, gap + 0.5)
-        if room.before(anchor, chairs, gaps, angled=SEAT_ANGLED, sideways=(-0.3, 0.3), tries=6):
-            return True
-    return room.standing_free(chairs, SEAT_ANGLED, (sofa.x, sofa.z)) is not None
+        if at := room.before(anchor, chairs, gaps, (-0.3, 0.3), angled=SEAT_ANGLED, tries=6):
+            return at
+    return room.standing_free(chairs, SEAT_ANGLED, (sofa.x, sofa.z))
 
 
-def _second_sofa(room: Furnisher, group: str) -> bool:
+def _second_sofa(room: Furnisher, group: str) -> Piece | None:
     """Place a short second sofa at a wall perpendicular to the first's."""
     yaw = room.anchor.yaw_rad
     across = [wall for wall in room.plan.walls if abs(np.cos(wall.yaw_rad - yaw)) < 0.5]
-    return room.against_wall(room.models("sofa", below=2.2), 0.4, across) is not None
+    return room.against_wall(room.models("sofa", below=2.2), 0.4, across)
 
 
-def _lamp(room: Furnisher, group: str) -> bool:
+def _lamp(room: Furnisher, group: str) -> Piece | None:
     """Hang a lamp: first over the dining table, then over the coffee table, then mid-room."""
     plan, rng = room.plan, room.rng
     hanging = [piece for piece in plan.pieces if piece.y > 0]
@@ -104,19 +163,19 @@ def _lamp(room: Furnisher, group: str) -> bool:
     tables = large + [piece for piece in plan.pieces if piece.model.name == "coffee_table"]
     if len(hanging) < len(tables) and rng.random() < 0.8:
         table = tables[len(hanging)]
-        pendants, lowest = room.catalog["pendant_lamp"], table.top + 0.6
-        if room.hang(pendants, (table.x, table.z), lowest, LAMP_ANGLED, table.yaw_rad):
-            return True
+        pendants, above, lowest = room.catalog["pendant_lamp"], (table.x, table.z), table.top + 0.6
+        if lamp := room.hang(pendants, above, lowest, LAMP_ANGLED, table.yaw_rad):
+            return lamp
     x, z = room.lamp_position()
     if hanging:
         x, z = x + rng.uniform(-0.25, 0.25) * plan.width, z + rng.uniform(-0.25, 0.25) * plan.depth
     kind = "ceiling_lamp" if rng.random() < 0.55 else "pendant_lamp"
-    return room.hang(room.catalog[kind], (x, z), 1.7, LAMP_ANGLED) is not None
+    return room.hang(room.catalog[kind], (x, z), 1.7, LAMP_ANGLED)
 
 
-def _loose(room: Furnisher, group: str) -> bool:
+def _loose(room: Furnisher, group: str) -> Piece | None:
     sofa = (room.anchor.x, room.anchor.z)
-    return room.standing_free(room.models(group, below=0.9), SEAT_ANGLED, sofa) is not None
+    return room.standing_free(room.models(group, below=0.9), SEAT_ANGLED, sofa)
 
 
 LIVING_ROOM = RoomType(
@@ -129,7 +188,7 @@ LIVING_ROOM = RoomType(
     rules={
         "coffee_table": _coffee_table,
         "tv_stand": opposite_the_anchor,
-        "dining": place_dining,
+        "dining": _dining,
         "side": _side_tables,
         "sofa": _second_sofa,
         "armchair": _armchair,

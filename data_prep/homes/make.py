@@ -37,19 +37,8 @@ def make_homes(out: Path, rooms: int, room_type: str, seed: int) -> None:
         OUT/3D-FUTURE-model/<jid>/raw_model.obj, OUT/3D-FUTURE-model/model_info.json
         OUT/splits/<room type>.csv    rows `<house uid>_<room instanceid>,train|val|test`
 
-    The same arguments write the same bytes, and room k does not depend on `rooms`. The folder
-    appears only when it is complete.
-
-    Args:
-        out: A folder that does not exist yet, or an empty one.
-        rooms: Number of rooms, at least 2; 70% are for training.
-        room_type: "bedroom" or "living".
-        seed: 0 or more.
-
-    Raises:
-        InputError: an argument is out of its range, `out` holds files, or another process writes
-            there.
-        OSError: `out` cannot be written; `filename` is set.
+    The same arguments write the same bytes, and room k does not depend on `rooms`. The folder is
+    new, or an empty one, and appears only when it is complete.
     """
     out = Path(out).expanduser().absolute()
     _check(out, rooms, room_type, seed)
@@ -78,8 +67,6 @@ def _check(out: Path, rooms: int, room_type: str, seed: int) -> None:
             f"Expected at least 2 rooms, one to train on and one to test on, but got {rooms}; "
             f"try --rooms 400."
         )
-    if seed < 0:
-        raise InputError(f"A seed is 0 or more, but got {seed}; try --seed 0.")
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; choose a new folder for the homes.")
     if out.exists() and any(out.iterdir()):

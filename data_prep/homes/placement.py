@@ -73,14 +73,11 @@ class Furnisher:
         tries: int = 40,
         where: float | None = None,
     ) -> Piece | None:
-        """Place a piece with its back to a wall.
+        """Place a piece with its back to one of the walls, by default of all.
 
-        Args:
-            clearance: Metres that stay clear in front of it.
-            walls: Walls to choose from; all of the plan's if None.
-            corner: Chance to try an end of the wall.
-            where: Desired position of its centre along the wall in metres, with a standard
-                deviation of 0.15.
+        `clearance` metres stay clear in front of it, `corner` is the chance to try an end of the
+        wall, and `where` the desired position of its centre along the wall in metres, with a
+        standard deviation of 0.15.
         """
         choice = self.plan.walls if walls is None else walls
         lengths = np.array([wall.length for wall in choice])
@@ -100,20 +97,6 @@ class Furnisher:
             return piece.at(*wall.point(start + width / 2, off), wall.yaw_rad)
 
         return self._try(models, tries, propose, clearance)
-
-    def opposite(self, anchor: Piece, models: list[Model]) -> Piece | None:
-        """Place a piece against the wall that the anchor faces, on the anchor's axis."""
-        facing = [
-            wall
-            for wall in self.plan.walls
-            if np.cos(wall.yaw_rad - anchor.yaw_rad) < -0.9 and wall.length > 1.5
-        ]
-        if not facing:
-            return None
-        wall = max(facing, key=lambda wall: wall.length)
-        along_x, along_z = wall.along
-        where = abs(along_x) * abs(anchor.x - wall.x) + abs(along_z) * abs(anchor.z - wall.z)
-        return self.against_wall(models, walls=[wall], where=where, tries=15)
 
     def before(
         self,
@@ -196,15 +179,6 @@ class Furnisher:
             return piece.at(x, z, yaw, bottom)
 
         return self._try(models, 20, propose)
-
-    def pair_along_wall(self, group: str, angled: float) -> bool:
-        """Place "desk and chair": the first against a wall, the second in front, facing it."""
-        first, _, seat = group.partition(" and ")
-        table = self.against_wall(self.catalog[first], clearance=0.75 if seat else 0.5)
-        if table is None or not seat:
-            return table is not None
-        seats = self.models(seat, below=0.75)
-        return self.before(table, seats, (0.02, 0.12), angled=angled) is not None
 
     def lamp_position(self) -> tuple[float, float]:
         """Centre of the largest rectangle of the floor."""

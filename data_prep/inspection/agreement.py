@@ -65,18 +65,18 @@ class Agreement:
         return self.tallies.get(kind, Tally())
 
     def failing(self, share: float = 1.0, least: int = 1) -> list[str]:
-        """Kinds that reach less than `share` of the minima.
+        """Kinds that do not pass."""
+        return [kind for kind in self.tallies if not self.passes(kind, share, least)]
+
+    def passes(self, kind: str, share: float = 1.0, least: int = 1) -> bool:
+        """Test whether both measures of a kind reach this share of the minima.
 
         A measure counts only if it is taken over at least `least` masks.
         """
-        return [kind for kind in self.tallies if not passes(kind, self.of(kind), share, least)]
-
-
-def passes(kind: str, tally: Tally, share: float = 1.0, least: int = 1) -> bool:
-    """Test whether both measures reach this share of the minima; see `Agreement.failing`."""
-    if tally.masks >= least and tally.share < share * HELD_AT_LEAST[kind]:
-        return False
-    return tally.whole < least or tally.mean_iou >= share * IOU_AT_LEAST[kind]
+        tally = self.of(kind)
+        if tally.masks >= least and tally.share < share * HELD_AT_LEAST[kind]:
+            return False
+        return tally.whole < least or tally.mean_iou >= share * IOU_AT_LEAST[kind]
 
 
 def _sum(a: Tally, b: Tally) -> Tally:

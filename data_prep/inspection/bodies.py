@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from cachetools import LRUCache, cachedmethod
+from cachetools import cachedmethod
 
 from data_prep.inspection.projection import Hull, hull_of
 from data_prep.upright import fit_upright
@@ -15,7 +15,6 @@ from sceneprior.core.shards import RoomGroundTruth, RoomViews
 
 KINDS = {"mesh": "meshes", "box": "3D boxes", "found": "boxes found from the masks"}
 """Names of the types of 3D representations, for messages."""
-_MODEL_BYTES = 256 << 20
 _BOX_SLACK_M = 0.005
 """Tolerance between the stored box and the placed mesh, whose vertices are float32."""
 
@@ -31,21 +30,15 @@ class Body(NamedTuple):
 
 
 class ModelHulls:
-    """Convex hulls of `models/<id>.ply` in a folder of shards, with a cache."""
+    """Convex hulls of `models/<id>.ply` in a folder of shards; each is read once."""
 
     def __init__(self, folder: Path):
         self.folder = Path(folder)
-        self._cache: LRUCache[str, Hull] = LRUCache(
-            _MODEL_BYTES, lambda hull: hull.points_m.nbytes + hull.edges.nbytes
-        )
+        self._hulls: dict[str, Hull] = {}
 
-    @cachedmethod(lambda self: self._cache, key=lambda self, model_id: model_id)
+    @cachedmethod(lambda self: self._hulls, key=lambda self, model_id: model_id)
     def get(self, model_id: str) -> Hull:
-        """Hull of all vertices in the model's frame; the ground truth's boxes use all, too.
-
-        Raises:
-            ShardError: the file is missing or damaged.
-        """
+        """Hull of all vertices in the model's frame; the ground truth's boxes use all, too."""
         path = self.folder / f"{model_id}.ply"
         try:
             mesh = trimesh.load_mesh(path, process=False)
@@ -85,10 +78,10 @@ def true_bodies(
 
 def found_bodies(views: RoomViews) -> list[Body | None]:
     """Upright boxes found from the masks alone; None if the views do not determine them."""
-    found = fit_upright(views, views.image_size, views.world_to_camera, views.intrinsics)
+    found, _ = fit_upright(views, views.image_size, views.world_to_camera, views.intrinsics)
     return [
         Body("found", Hull(corners, np.array(BOX_EDGES))) if np.isfinite(corners).all() else None
-        for corners in found.corners_m
+        for corners in found
     ]
 
 

@@ -12,7 +12,6 @@ from data_prep.inspection.agreement import (
     Comparison,
     compare,
     compare_boxes,
-    passes,
     projections,
 )
 from data_prep.inspection.bodies import Body, found_bodies
@@ -48,10 +47,9 @@ def try_repairs(bodies: Bodies, views: RoomViews) -> dict[str, Trial]:
         if repaired is not None:
             again = found_bodies(repaired) if found else bodies
             trials[cause] = Trial(compare(again, repaired).agreement)
-    if not found:
-        for cause, measure in _OF_TRUTH.items():
-            if (trial := measure(bodies, views)) is not None:
-                trials[cause] = trial
+    for cause, measure in () if found else _OF_TRUTH.items():
+        if (trial := measure(bodies, views)) is not None:
+            trials[cause] = trial
     return trials
 
 
@@ -67,7 +65,7 @@ def likely_cause(
             sums[cause] = Trial(before.agreement + trial.agreement, before.factor)
     good = {
         cause: trial for cause, trial in sums.items()
-        if cause != CHANCE and passes(kind, trial.agreement.of(kind), share, least)
+        if cause != CHANCE and trial.agreement.passes(kind, share, least)
     }  # fmt: skip
     if not good:
         return "is an axis or a unit wrong?"
@@ -89,9 +87,8 @@ def chance_of(trials: Iterable[dict[str, Trial]], kind: str) -> float:
 def out_of_order(bodies: Bodies, views: RoomViews) -> tuple[np.ndarray, Comparison]:
     """Match cameras to frames one to one, so that they fit the masks best.
 
-    Returns:
-        For each frame, the index of the frame whose camera fits, (T,), its own if no other fits
-        better; and the comparison with these cameras.
+    Returns, for each frame, the index of the frame whose camera fits, (T,), its own if no other
+    fits better; and the comparison with these cameras.
     """
     boxes = projections(bodies, views)[:, None]  # one per camera, the same for all frames
     frames = len(views.visible)
@@ -131,13 +128,6 @@ def _other_ids(bodies: Bodies, views: RoomViews) -> Trial | None:
 
 def _posed(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[RoomViews], RoomViews]:
     return lambda views: replace(views, world_to_camera=change(views.world_to_camera))
-
-
-def _inverse(poses: np.ndarray) -> np.ndarray:
-    """Invert rigid transforms, (T, 4, 4)."""
-    inverse = _transposed(poses)
-    inverse[:, :3, 3:] = -inverse[:, :3, :3] @ poses[:, :3, 3:]
-    return inverse
 
 
 def _transposed(poses: np.ndarray) -> np.ndarray:
@@ -231,11 +221,11 @@ def _how_well(trial: Trial) -> float:
 
 
 _ANY: dict[str, Callable[[RoomViews], RoomViews | None]] = {
-    "world_to_camera seems to hold camera-to-world matrices; inverted": _posed(_inverse),
+    "world_to_camera seems to hold camera-to-world matrices; inverted": _posed(np.linalg.inv),
     "the cameras seem to have OpenGL axes (y up, z backward) instead of OpenCV's; with y and z "
     "flipped": _posed(lambda poses: _OPENGL_AXES @ poses),
     "world_to_camera seems to hold camera-to-world matrices with OpenGL axes; inverted, and with "
-    "y and z flipped": _posed(lambda poses: _OPENGL_AXES @ _inverse(poses)),
+    "y and z flipped": _posed(lambda poses: _OPENGL_AXES @ np.linalg.inv(poses)),
     "the rotations of world_to_camera seem to be transposed; transposed back": _posed(_transposed),
     "the intrinsics seem to be those of pictures of another size; scaled to these": _of_this_size,
     CHANCE: _posed(_dealt_out),

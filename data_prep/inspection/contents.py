@@ -27,13 +27,9 @@ _GAP_PX, _LINE_PX = 8, 15
 def count_shards(folder: Path) -> dict[str, dict[str, Any]]:
     """Count the contents of each split.
 
-    Returns:
-        Per split: rooms, views, objects, seen (visible objects per view), with_truth (rooms with
-        3D ground truth), image_sizes (rooms per size such as "480 x 360"), classes (objects per
-        class).
-
-    Raises:
-        ShardError: the folder is not a finished folder of shards, or a shard is damaged.
+    The counts are rooms, views, objects, seen (visible objects per view), with_truth (rooms with 3D
+    ground truth), image_sizes (rooms per size such as "480 x 360"), and classes (objects per
+    class).
     """
     names = label_set(read_index(folder)["label_set"])
     table: dict[str, dict[str, Any]] = {}
@@ -62,12 +58,8 @@ def count_shards(folder: Path) -> dict[str, dict[str, Any]]:
 def describe_room(folder: Path, room_id: str) -> list[dict[str, Any]]:
     """Describe the objects of a room.
 
-    Returns:
-        Per object: class, views (number that show it), share (mean area of its 2D box relative to
-        the image), and center_m and size_m, which are None without 3D ground truth.
-
-    Raises:
-        InputError: no room has this id.
+    An object has class, views (number that show it), share (mean area of its 2D box relative to
+    the image), and center_m and size_m, which are None without 3D ground truth.
     """
     ((path, _, _),) = _choose(folder, room_id, 1)
     with Shard(path) as shard:
@@ -94,17 +86,7 @@ def describe_room(folder: Path, room_id: str) -> list[dict[str, Any]]:
 def draw_sheet(
     folder: Path, room_id: str | None = None, pictures: int = 24, boxes_3d: bool = True
 ) -> Image.Image:
-    """Draw views of a folder, or of one room and its plan, on one sheet; see `LEGEND`.
-
-    Args:
-        folder: Folder of shards.
-        room_id: Room to show; None samples rooms throughout the folder.
-        pictures: Number of views.
-        boxes_3d: Also draw the ground truth's 3D boxes.
-
-    Raises:
-        InputError: no room has this id.
-    """
+    """Draw views of a folder, or of one room and its plan, on one sheet; see `LEGEND`."""
     captions: list[str] = []
     tiles: list[np.ndarray] = []
     for path, name, view in _choose(folder, room_id, pictures):

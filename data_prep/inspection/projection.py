@@ -27,16 +27,9 @@ def wire_pixels(
     world_to_camera: np.ndarray,
     intrinsics: np.ndarray,
 ) -> list[Segment]:
-    """Project edges to lines in the image, clipped at the near plane.
+    """Project edges, pairs of rows of points, to lines in the image, clipped at the near plane.
 
-    Args:
-        points_m: (P, 3) in the room frame.
-        edges: Pairs of rows.
-        world_to_camera: (4, 4).
-        intrinsics: (3, 3), pixels.
-
-    Returns:
-        u1, v1, u2, v2 of every edge that lies at least partly beyond the near plane.
+    Returns u1, v1, u2, v2 of every edge that lies at least partly beyond the near plane.
 
     Example: a line that begins 1 m behind the camera is visible from the near plane on.
 
@@ -91,13 +84,7 @@ def hull_of(points_m: np.ndarray) -> Hull:
 def boxes_around(hull: Hull, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """2D bounding box of a projected body in each view, not clipped at the image borders.
 
-    Args:
-        hull: Body in the room frame.
-        world_to_camera: (T, 4, 4).
-        intrinsics: (T, 3, 3), pixels.
-
-    Returns:
-        (T, 4) x1, y1, x2, y2 in pixels, of the part beyond the near plane; NaN if there is none.
+    (T, 4) x1, y1, x2, y2 in pixels, of the part beyond the near plane; NaN if there is none.
     """
     poses = np.asarray(world_to_camera, dtype=np.float64)
     camera = hull.points_m @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]

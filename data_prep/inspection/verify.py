@@ -48,19 +48,20 @@ class FolderCheck:
     """Sentences, each with its place; empty if all is well."""
 
     @property
+    def every(self) -> list[RoomCheck]:
+        """Rooms of all splits."""
+        return [room for rooms in self.rooms.values() for room in rooms]
+
+    @property
     def agreement(self) -> Agreement:
         """Agreement summed over all rooms."""
-        every = [room.agreement for rooms in self.rooms.values() for room in rooms]
-        return sum(every, Agreement())
+        return sum((room.agreement for room in self.every), Agreement())
 
 
 def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> FolderCheck:
     """Check the consistency of a folder of shards.
 
     With `room_id`, only this room is checked, and the counts of the index are not.
-
-    Raises:
-        InputError: it is not a finished folder of shards, or holds no such room.
     """
     folder = Path(folder)
     index = read_index(folder)
@@ -76,14 +77,14 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
         with pool(workers) as run:
             rooms[split] = [room for part in run(_check_shard, arguments, f"checking {split}")
                             for room in part]  # fmt: skip
-    every = [room for checks in rooms.values() for room in checks]
-    if not every:
+    found = FolderCheck(rooms, ())
+    if not found.every:
         raise InputError(
             f"{folder} has no room '{room_id}'; its report.csv lists the rooms."
             if room_id is not None
             else f"{folder} holds no rooms; prepare them again."
         )
-    for room in every:
+    for room in found.every:
         path = str(folder / room.shard)
         where = path + (f", room {room.room_id}" if room.room_id else "")
         for sentence in room.problems:
@@ -91,13 +92,13 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
             text = sentence if sentence.startswith(path) else f"{where}: {sentence}"
             problems.append(text if text.endswith("?") else f"{text}.")
     if room_id is None:
-        if all(room.views for room in every):  # otherwise a problem already says what is missing
+        # Without a room's views, a problem already says what is missing.
+        if all(room.views for room in found.every):
             problems += _count_problems(folder, index, rooms)
-        agreement = sum((room.agreement for room in every), Agreement())
-        trials = [room.trials for room in every if room.trials]
-        for kind in agreement.failing():
-            problems.append(f"{folder}: {disagreement(agreement, kind, trials)}")
-    return FolderCheck(rooms, tuple(problems))
+        trials = [room.trials for room in found.every if room.trials]
+        for kind in found.agreement.failing():
+            problems.append(f"{folder}: {disagreement(found.agreement, kind, trials)}")
+    return replace(found, problems=tuple(problems))
 
 
 def _count_problems(

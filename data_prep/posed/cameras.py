@@ -24,15 +24,11 @@ def upright_cameras(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotate cameras to a world whose y points up, in metres.
 
-    Args:
-        up: One of `UP`; `auto` is z, or `cameras` for a world without an axis that points up.
+    `up` is one of `UP`; `auto` is z, or `cameras` for a world without an axis that points up.
 
     Returns:
         Camera-to-world matrices, (views, 4, 4) with OpenCV axes, and the (4, 4) transform from the
         file's world (in metres) to this one.
-
-    Raises:
-        InputError: the cameras are too far apart for metres, or do not determine the up direction.
     """
     poses = np.stack([recording.frames[i].camera_to_world for i in frames])
     poses[:, :3, 3] *= recording.metres_per_unit or metres_per_unit
@@ -73,17 +69,10 @@ def _turn_of_cameras(recording: Recording, poses: np.ndarray) -> np.ndarray:
 def cameras_in_room(
     recording: Recording, upright: np.ndarray, turn: np.ndarray, floor: float
 ) -> np.ndarray:
-    """World-to-camera transforms in the room frame, (views, 4, 4).
+    """World-to-camera transforms in the room frame, (views, 4, 4), of `upright_cameras`.
 
     In the room frame, y points up, the floor is at y = 0, and the origin is at `floor_center_m` or,
     without one, below the centre of the cameras' bounding box.
-
-    Args:
-        upright, turn: See `upright_cameras`.
-        floor: Height of the floor in the upright world.
-
-    Raises:
-        InputError: the lowest camera is below the floor.
     """
     eyes = upright[:, :3, 3]
     low, high = eyes.min(axis=0), eyes.max(axis=0)

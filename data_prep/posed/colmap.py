@@ -55,11 +55,7 @@ def model_files(folder: Path) -> tuple[Path, Path] | None:
 
 
 def read_model(cameras: Path, images: Path) -> list[ColmapImage]:
-    """Read the images of a model, sorted by name.
-
-    Raises:
-        InputError: a file is damaged, or a camera model is not supported.
-    """
+    """Read the images of a model, sorted by name."""
     binary = cameras.suffix == ".bin"
     try:
         known = dict((_binary_cameras if binary else _text_cameras)(cameras))
@@ -129,8 +125,7 @@ def _text_images(path: Path) -> Iterator[tuple[str, list[float], int]]:
 
 
 def _take(file: BinaryIO, form: str) -> tuple[Any, ...]:
-    size = struct.calcsize(f"<{form}")
-    return struct.unpack(f"<{form}", file.read(size))
+    return struct.unpack(f"<{form}", file.read(struct.calcsize(f"<{form}")))
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -140,10 +135,8 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
             if model not in _MODELS:
                 yield number, _camera(path, f"number {model}", (width, height), [])
             name, keys = _MODELS[model]
-            yield (
-                number,
-                _camera(path, name, (width, height), [*_take(file, f"{len(keys.split())}d")]),
-            )
+            values = [*_take(file, f"{len(keys.split())}d")]
+            yield number, _camera(path, name, (width, height), values)
 
 
 def _binary_images(path: Path) -> Iterator[tuple[str, list[float], int]]:

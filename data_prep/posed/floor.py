@@ -4,8 +4,6 @@ An upright 3D box is fitted to the 2D boxes of each piece in all views; the floo
 of the lowest boxes. The boxes are used for nothing else.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from data_prep.upright import fit_upright, own_sides
@@ -20,33 +18,20 @@ _LOWER_SIDES = 2
 """Minimum number of views in which the lower side of a piece is unoccluded."""
 
 
-@dataclass(frozen=True)
-class FoundFloor:
-    """Height of the floor, and its evidence."""
-
-    height_m: float
-    """Height along the up axis of the cameras' world."""
-    pieces: int
-    """Number of pieces that stand on it."""
-
-
 def find_floor(
     seen: Observations, world_to_camera: np.ndarray, intrinsics: np.ndarray
-) -> FoundFloor | None:
-    """Find the height at which the lowest pieces end; None if fewer than two pieces agree.
+) -> tuple[float, int] | None:
+    """Find the height at which the lowest pieces end, along y, and the number of these pieces.
 
-    Args:
-        seen: Observations in the views; boxes are relative to the image.
-        world_to_camera: (views, 4, 4), OpenCV axes, metres; the world's y points up.
-        intrinsics: (views, 3, 3) in pixels.
+    The cameras' world is in metres, and its y points up. None if fewer than two pieces agree.
     """
     height, width = seen.instance_ids.shape[1:]
-    boxes = fit_upright(seen, (height, width), world_to_camera, intrinsics)
-    believed = boxes.misfit_px < _MISFIT_SHARE * max(width, height)
+    corners, misfit_px = fit_upright(seen, (height, width), world_to_camera, intrinsics)
+    believed = misfit_px < _MISFIT_SHARE * max(width, height)
     believed &= own_sides(seen, (height, width))[..., 3].sum(axis=0) >= _LOWER_SIDES
-    ends = (boxes.centers_m[:, 1] - boxes.sizes_m[:, 1] / 2)[believed].tolist()
+    ends = corners[believed, :, 1].min(axis=1).tolist()
     for end in sorted(ends):
         same = [other for other in ends if 0 <= other - end <= _AGREE_M]
         if len(same) >= max(2, len(ends) / 4):  # a single one may be wrong
-            return FoundFloor(float(np.median(same)), len(same))
+            return float(np.median(same)), len(same)
     return None

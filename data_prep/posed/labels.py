@@ -11,17 +11,10 @@ TABLES = ("classes.json", "classes.csv", PANOPTIC)
 
 
 def read_label_set(text: str) -> str:
-    """Resolve `--label-set` to the name of a label set.
+    """Resolve `--label-set` to the name of a label set, as for `label_set` in a config.
 
-    Args:
-        text: Name of a label set, or a file with one class per line or a JSON list. The file need
-            not contain `void`; lines that begin with # are skipped.
-
-    Returns:
-        Name for `sceneprior.core.classes.label_set` and for `label_set` in a config.
-
-    Raises:
-        InputError: `text` is neither, or the file holds no valid list.
+    The text is such a name, or a file with one class per line or a JSON list. The file need not
+    contain `void`; lines that begin with # are skipped.
     """
     path = Path(text)
     if not path.is_file():
@@ -53,13 +46,7 @@ def read_label_set(text: str) -> str:
 
 
 def find_table(folder: Path) -> Path:
-    """Find the table that maps a room's ids to classes.
-
-    It is `classes.json`, `classes.csv`, or COCO's `panoptic.json`.
-
-    Raises:
-        InputError: there is none, or more than one.
-    """
+    """Find the only table in a folder that maps the room's ids to classes: one of `TABLES`."""
     found = [Path(folder) / name for name in TABLES if (Path(folder) / name).is_file()]
     if len(found) != 1:
         named = " and ".join(path.name for path in found) or f"no {' or '.join(TABLES)}"

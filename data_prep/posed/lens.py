@@ -83,13 +83,7 @@ def straighten(lens: Lens, intrinsics: np.ndarray, size: tuple[int, int]) -> Str
 
     The view is an axis-aligned rectangle inside the undistorted picture, stretched to the
     picture's size. Each pixel takes the nearest source pixel, since ids cannot be interpolated.
-
-    Args:
-        intrinsics: (3, 3) of the distorted picture, pixel centres at i + 0.5.
-        size: (height, width) of the distorted picture.
-
-    Raises:
-        InputError: the distortion cannot be inverted up to the picture's border.
+    Intrinsics and size are those of the distorted picture, pixel centres at i + 0.5.
     """
     height, width = size
     K = np.asarray(intrinsics, dtype=np.float64)

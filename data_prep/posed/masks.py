@@ -24,14 +24,7 @@ def png_size(folder: Path, frame: PosedFrame) -> tuple[int, int]:
 class RoomMasks:
     """Masks of one room, all of one size, and notes about them.
 
-    Args:
-        folder: Folder of the room.
-        label_set_name: Name for `sceneprior.core.classes.label_set`.
-        size: (height, width) of every PNG.
-        stored: (height, width) of the downsampled images.
-
-    Raises:
-        InputError: the room's table of classes cannot be used.
+    `size` is that of every PNG, and `stored` that of the downsampled images: (height, width).
     """
 
     def __init__(
@@ -60,14 +53,7 @@ class RoomMasks:
         return notes
 
     def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray]:
-        """Read a frame's ids for `observe` and their intrinsics.
-
-        Returns:
-            (height, width) uint32 ids at the stored size, and (3, 3) intrinsics.
-
-        Raises:
-            InputError: a PNG is missing, damaged or of another size, or the camera cannot be used.
-        """
+        """Read a frame's uint32 ids for `observe`, at the stored size, and their intrinsics."""
         values = self._values(frame)
         K, picture = frame_intrinsics(frame, self._size)
         # `mask_intrinsics` expects pixel centres at integers, as in ScanNet.

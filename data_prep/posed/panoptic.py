@@ -26,32 +26,28 @@ _STUFF = "background"
 _Id = Annotated[int, Field(ge=0, lt=2**24)]
 
 
-class _Category(BaseModel):
+class _Strict(BaseModel):
     model_config = ConfigDict(strict=True)
 
+
+class _Category(_Strict):
     id: int
     name: str
     isthing: int = 1
 
 
-class _Segment(BaseModel):
-    model_config = ConfigDict(strict=True)
-
+class _Segment(_Strict):
     id: _Id
     category_id: int
     iscrowd: int = 0
 
 
-class _Annotation(BaseModel):
-    model_config = ConfigDict(strict=True)
-
+class _Annotation(_Strict):
     file_name: str = ""
     segments_info: list[_Segment]
 
 
-class _Panoptic(BaseModel):
-    model_config = ConfigDict(strict=True)
-
+class _Panoptic(_Strict):
     categories: list[_Category]
     annotations: list[_Annotation]
 
@@ -69,9 +65,6 @@ class PanopticIds:
         """Read a PNG as new ids, (height, width) int32.
 
         0 is background, k + 1 the k-th segment, n + 1 any id that is missing from the JSON.
-
-        Raises:
-            InputError: the file is not an RGB PNG.
         """
         red, green, blue = np.moveaxis(read_rgb(path).astype(np.int64), 2, 0)
         ids = red + 256 * green + 65536 * blue
@@ -82,11 +75,7 @@ class PanopticIds:
 
 
 def read_panoptic(path: Path, label_set_name: str) -> PanopticIds:
-    """Read a room's panoptic annotations. Stuff is background, unless the label set has its class.
-
-    Raises:
-        InputError: the file is damaged, or its ids are not tracked over frames.
-    """
+    """Read a room's annotations. Stuff is background, unless the label set has its class."""
     data = read_json(path)
     room = checked(_Panoptic, data if isinstance(data, dict) else {}, str(path))
     names = {

@@ -106,11 +106,7 @@ class Recording:
 
 
 def path_text(name: str) -> str:
-    """Validate a file name and return it unchanged.
-
-    Raises:
-        InputError: no file can have this name.
-    """
+    """Check that a file can have this name, and return it unchanged."""
     try:
         longest = max(map(len, name.encode().split(b"/")))
     except UnicodeEncodeError:
@@ -126,12 +122,16 @@ def ids_path(folder: Path, name: str) -> Path:
     It is `instances/<the same path>.png` if that exists (for frames in several folders), else
     `instances/<stem>.png`.
     """
-    path = Path(path_text(name))
-    path = path.with_suffix("") if path.suffix.lower() in _PICTURES else path
-    whole = folder / INSTANCES / f"{path}.png"
+    path = Path(_as_png(path_text(name)))
+    whole = folder / INSTANCES / path
     if ".." not in path.parts and not path.is_absolute() and whole.is_file():
         return whole
-    return folder / INSTANCES / f"{path.name}.png"
+    return folder / INSTANCES / path.name
+
+
+def _as_png(name: str) -> str:
+    path = Path(name)
+    return f"{path.with_suffix('') if path.suffix.lower() in _PICTURES else path}.png"
 
 
 def check_one_png_a_frame(path: Path, frames: tuple[PosedFrame, ...]) -> None:
@@ -142,13 +142,9 @@ def check_one_png_a_frame(path: Path, frames: tuple[PosedFrame, ...]) -> None:
         if other is not frame.name:
             raise InputError(
                 f"{path}: frames {shown(other)} and {shown(frame.name)} would share the ids in "
-                f"{frame.instances}; put them where the frames lie, in {INSTANCES}/{_plain(other)}."
+                f"{frame.instances}; put them where the frames lie, in "
+                f"{INSTANCES}/{_as_png(other)}."
             )
-
-
-def _plain(name: str) -> str:
-    path = Path(name)
-    return f"{path.with_suffix('') if path.suffix.lower() in _PICTURES else path}.png"
 
 
 def room_name(folder: Path) -> str:
@@ -160,39 +156,27 @@ def room_name(folder: Path) -> str:
 def frame_intrinsics(
     frame: PosedFrame, mask_size: tuple[int, int]
 ) -> tuple[np.ndarray, tuple[int, int]]:
-    """Pinhole intrinsics of a frame, and the size of the picture that they refer to.
+    """Pinhole intrinsics of a frame, and the (height, width) of the picture that they refer to.
 
     `w`, `h` default to the mask's size, `mask_size` (height, width); `cx`, `cy` to the image
     centre; `fl_x` to the value from `camera_angle_x`; `fl_y` to the one from `camera_angle_y`, or
     to `fl_x`. Pixel centres are at i + 0.5, as in nerfstudio, COLMAP and this package.
-
-    Returns:
-        (3, 3) float64 in pixels, and (height, width).
-
-    Raises:
-        InputError: there is no focal length, or a value is out of range.
     """
     camera = frame.camera
+    where = f"frame {shown(frame.name)}"
     width = mask_size[1] if camera.w is None else camera.w
     height = mask_size[0] if camera.h is None else camera.h
     if width < 1 or height < 1 or width % 1 or height % 1:
-        raise InputError(
-            f"frame {shown(frame.name)}: w, h are {width}, {height}; expected pixel counts"
-        )
+        raise InputError(f"{where}: w, h are {width}, {height}; expected pixel counts")
     fl_x = camera.fl_x or _focal(frame, "camera_angle_x", width)
     if fl_x is None:
-        raise InputError(
-            f"frame {shown(frame.name)} has no fl_x and no camera_angle_x, here or for the whole "
-            "file"
-        )
+        raise InputError(f"{where} has no fl_x and no camera_angle_x, here or for the whole file")
     fl_y = camera.fl_y or _focal(frame, "camera_angle_y", height) or fl_x
     if fl_x <= 0 or fl_y <= 0:
-        raise InputError(
-            f"frame {shown(frame.name)}: fl_x, fl_y are {fl_x}, {fl_y}; expected above 0"
-        )
+        raise InputError(f"{where}: fl_x, fl_y are {fl_x}, {fl_y}; expected above 0")
     for key, focal in (("fl_x", fl_x), ("fl_y", fl_y)):
         if odd := odd_field_of_view(focal, (int(height), int(width))):
-            raise InputError(f"frame {shown(frame.name)}, {key}: {odd}")
+            raise InputError(f"{where}, {key}: {odd}")
     cx = width / 2 if camera.cx is None else camera.cx
     cy = height / 2 if camera.cy is None else camera.cy
     return np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1.0]]), (int(height), int(width))

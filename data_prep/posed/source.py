@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from data_prep.engine.plan import digest, digest_of_files
 from data_prep.engine.selection import house_may_match, seeded_split, select
-from data_prep.engine.source import Expected, LeftOut, PreparedRoom, RoomTask, Survey, sentence_of
+from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey, sentence_of
 from data_prep.engine.workers import Run
 from data_prep.posed.cameras import seems_up
 from data_prep.posed.labels import TABLES
@@ -30,13 +30,11 @@ class PosedSource:
     folder: Path
     """One room, or a folder of rooms."""
     label_set: str
-    """Name for `sceneprior.core.classes.label_set`."""
     posed_settings: PosedSettings = field(default_factory=PosedSettings)
     test_share: float = 0.1
     """Share of rooms in the split `test`, at least one of several; 0 puts all rooms in `train`."""
     seed: int = 0
     only: str | None = None
-    """Name of a room; a prefix suffices."""
 
     def settings(self, only: str | None) -> dict[str, Any]:
         """See `Source.settings`.
@@ -71,12 +69,12 @@ class PosedSource:
         """Read every room's poses and the size of its masks."""
         rooms = find_rooms(self.folder)
         sizes: dict[str, tuple[int, int]] = {}
-        left_out: list[LeftOut] = []
+        left_out: list[Line] = []
         looked = run(_look, [(self, room) for room in rooms], "reading rooms")
         for room, found in zip(rooms, looked, strict=True):
             name = room_name(room)
             if isinstance(found, str):
-                left_out.append(LeftOut(name, name, "failed", found))
+                left_out.append(Line(name, name, "failed", reason=found))
             else:
                 sizes[name] = found
         # Batches hold images of several rooms, so all must have one size.
@@ -87,14 +85,14 @@ class PosedSource:
                     f"its views are {size[1]} x {size[0]} pixels, those of most rooms {usual[1]} x "
                     f"{usual[0]}, and a folder of shards has one size; prepare its folder by itself"
                 )
-                left_out.append(LeftOut(name, name, "filtered", why, "image_size"))
+                left_out.append(Line(name, name, "filtered", "image_size", why))
         names = [name for name, size in sizes.items() if size == usual]
         split_of = seeded_split(names, self.seed, self.test_share)
         tasks = tuple(RoomTask(name, name, split_of[name]) for name in names)
         survey = Survey(tasks, tuple(left_out))
         return select(survey, self.only, f"{self.folder} can be prepared")
 
-    def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
+    def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:
         """Read one room and label its views."""
         folders = {room_name(room): room for room in find_rooms(self.folder)}
         if task.house not in folders:
@@ -103,7 +101,7 @@ class PosedSource:
         made = prepare_posed(recording, self.label_set, self.posed_settings)
         if made is None:
             why = f"none of its {len(recording.frames)} frames shows any object"
-            return LeftOut(task.room_id, task.house, "filtered", why, "no_view")
+            return Line(task.room_id, task.house, "filtered", "no_view", why)
         return made
 
     def assumptions(self) -> list[str]:
@@ -155,9 +153,6 @@ def find_rooms(folder: Path) -> list[Path]:
     """Find rooms: the folder itself if it holds poses (`room_files`), else its sub-folders, sorted.
 
     Sub-folders with `instances/` but no poses are included, so that the report mentions them.
-
-    Raises:
-        InputError: there is no room.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -6,6 +6,7 @@ The keys of a JSON are `frames`, camera keys (see Camera) for all frames, `floor
 and the pictures themselves are never opened.
 """
 
+import contextlib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -65,12 +66,7 @@ def room_files(folder: Path) -> list[Path]:
 
 
 def read_recording(folder: Path) -> Recording:
-    """Read the frames of one room (`room_files`).
-
-    Raises:
-        InputError: a file is missing or damaged, a key is missing or of a wrong type, or a camera
-            model is not supported; the message names the file, the frame and the key.
-    """
+    """Read the frames of one room (`room_files`); errors name the file, the frame and the key."""
     files = room_files(Path(folder)) or [Path(folder) / FILE_NAME]
     jsons = [(path, read_json(path)) for path in files if path.suffix == ".json"]
     rooms = [
@@ -144,10 +140,9 @@ def _frame(path: Path, data: dict[str, Any], number: int) -> PosedFrame:
 
 def _matrix(where: str, value: Any) -> np.ndarray:
     """Parse a (4, 4) matrix, which may lack its last row. NaN (a lost pose) is allowed."""
-    try:
+    matrix = np.zeros(0)
+    with contextlib.suppress(TypeError, ValueError):
         matrix = number_array(value)
-    except (TypeError, ValueError):
-        matrix = np.zeros(0)
     if matrix.shape == (3, 4):
         matrix = np.concatenate([matrix, [[0, 0, 0, 1]]])
     if matrix.shape != (4, 4):

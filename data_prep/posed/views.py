@@ -49,11 +49,7 @@ class PosedSettings:
 
 
 def usable_frames(recording: Recording) -> list[PosedFrame]:
-    """Frames with a PNG of ids, in the file's order; their poses may be invalid.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Frames with a PNG of ids, in the file's order; their poses may be invalid."""
     frames = [frame for frame in recording.frames if frame.instances.is_file()]
     if not frames:
         raise InputError(
@@ -73,14 +69,7 @@ def stored_size(recording: Recording, settings: PosedSettings) -> tuple[int, int
 def prepare_posed(
     recording: Recording, label_set_name: str, settings: PosedSettings
 ) -> PreparedRoom | None:
-    """Label the views of one room, without 3D ground truth.
-
-    Returns:
-        The room; None if no view shows an object of the label set.
-
-    Raises:
-        InputError: a file is missing, damaged, or does not fit the others.
-    """
+    """Label the views of one room; None if no view shows an object of the label set."""
     size = png_size(recording.folder, usable_frames(recording)[0])
     poses = np.stack([frame.camera_to_world for frame in recording.frames])
     with_mask = [i for i, frame in enumerate(recording.frames) if frame.instances.is_file()]
@@ -130,9 +119,10 @@ def _unsaid_floor(
     """Estimate or assume the height of an unknown floor, with a note that says which."""
     lowest = float(upright[:, 1, 3].min())
     found = find_floor(seen, room_cameras(upright, np.eye(4)), intrinsics)
-    if found is not None and found.height_m < lowest:
-        under = f"{lowest - found.height_m:.2f} m below the lowest camera"
-        return found.height_m, f"the floor is found where {found.pieces} pieces end, {under}"
+    if found is not None and found[0] < lowest:
+        level, pieces = found
+        under = f"{lowest - level:.2f} m below the lowest camera"
+        return level, f"the floor is found where {pieces} pieces end, {under}"
     height = settings.camera_height_m
     why = "too few pieces show where they end"
     return lowest - height, f"the floor is assumed {height:g} m below the lowest camera ({why})"

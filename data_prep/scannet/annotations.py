@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from data_prep.frames import is_pose, pose_fault
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import shown
 from sceneprior.core.scene import Mesh
-
-_RIGID_SLACK = 1e-2
 
 
 @dataclass(frozen=True)
@@ -20,16 +19,11 @@ class Group:
 
     object_id: int
     category: str
-    """Raw category chosen by the annotators."""
     segments: frozenset[int]
 
 
 def read_properties(path: Path) -> dict[str, str]:
-    """Read the `key = value` lines of `<scene>.txt`.
-
-    Raises:
-        InputError: the file is missing or not text.
-    """
+    """Read the `key = value` lines of `<scene>.txt`."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -42,9 +36,6 @@ def axis_alignment(path: Path, properties: dict[str, str]) -> np.ndarray:
     """Rigid transform, (4, 4) float64, that aligns the scan's walls with the axes; z is up.
 
     The identity if the file has none, as for scans of version 1 and test scans.
-
-    Raises:
-        InputError: it is not 16 numbers, or not a rigid transform.
     """
     if "axisAlignment" not in properties:
         return np.eye(4)
@@ -56,30 +47,16 @@ def axis_alignment(path: Path, properties: dict[str, str]) -> np.ndarray:
             f"{path}: axisAlignment is {len(words)} words, expected 16 numbers. "
             "Download the scan again."
         ) from None
-    turn = matrix[:3, :3]
-    if (
-        not np.isfinite(matrix).all()
-        or np.abs(turn.T @ turn - np.eye(3)).max() > _RIGID_SLACK
-        or np.abs(matrix[3] - (0, 0, 0, 1)).max() > _RIGID_SLACK
-    ):
+    if not is_pose(matrix[None])[0]:
         raise InputError(
-            f"{path}: axisAlignment does not turn and move the scan, it distorts it; "
-            "the file is damaged. Download the scan again."
-        )
-    if np.linalg.det(turn) < 0:
-        raise InputError(
-            f"{path}: axisAlignment mirrors the scan (its determinant is -1, expected 1); the file "
-            "is damaged, or an axis was flipped. Download the scan again."
+            f"{path}: axisAlignment does not turn and move the scan: {pose_fault(matrix)}; the "
+            "file is damaged, or an axis was flipped. Download the scan again."
         )
     return matrix
 
 
 def read_groups(path: Path) -> tuple[list[Group], list[str]]:
-    """Read the objects of `<scene>.aggregation.json`, sorted by id, with notes on oddities.
-
-    Raises:
-        InputError: the file is missing, truncated, or not an aggregation.
-    """
+    """Read the objects of `<scene>.aggregation.json`, sorted by id, with notes on oddities."""
     data = _read_json(path, "a scan without annotations (ScanNet's test scans) cannot be prepared")
     found: dict[int, Group] = {}
     notes = []
@@ -104,11 +81,7 @@ def read_groups(path: Path) -> tuple[list[Group], list[str]]:
 
 
 def read_segments(path: Path) -> np.ndarray:
-    """Read the segment of each mesh vertex from `<scene>_vh_clean_2...segs.json`: (V,) int64.
-
-    Raises:
-        InputError: the file is missing, truncated, or not a segmentation.
-    """
+    """Read the segment of each mesh vertex from `<scene>_vh_clean_2...segs.json`: (V,) int64."""
     data = _read_json(path, "it tells which part of the mesh is which object")
     try:
         segments = np.asarray(data["segIndices"])
@@ -123,11 +96,7 @@ def read_segments(path: Path) -> np.ndarray:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read `<scene>_vh_clean_2.ply` in the scan's frame, z up: vertices float64, metres.
-
-    Raises:
-        InputError: the file is missing, truncated, or holds no finite vertices.
-    """
+    """Read `<scene>_vh_clean_2.ply` in the scan's frame, z up: vertices float64, metres."""
     from trimesh.exchange.ply import load_ply
 
     if not path.is_file():

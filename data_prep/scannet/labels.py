@@ -22,7 +22,6 @@ class Labels:
     nyu40: dict[str, str]
     """NYU40 class by raw category, both in lower case."""
     source: str
-    """Name of the table, for messages."""
 
     def knows(self, category: str) -> bool:
         """Test whether the table lists a raw category."""
@@ -39,11 +38,7 @@ class Labels:
 
 
 def read_labels(path: Path) -> Labels:
-    """Read `scannetv2-labels.combined.tsv`; of a repeated category, the last row wins.
-
-    Raises:
-        InputError: the file is missing or is not that table.
-    """
+    """Read `scannetv2-labels.combined.tsv`; of a repeated category, the last row wins."""
     path = Path(path)
     try:
         with path.open(encoding="utf-8", newline="") as file:

@@ -1,6 +1,5 @@
 """Reads single instance masks from a zip, without unpacking it to disk."""
 
-import contextlib
 import io
 import re
 import zipfile
@@ -24,16 +23,8 @@ _HEADER_BYTES = 26
 class MaskArchive:
     """An open archive of masks: 8-bit grey PNGs, value = objectId + 1, 0 = no object.
 
-    The stem of a member is its frame number (`instance-filt/123.png`), in any folder. Close the
-    archive, or use it in a `with` block.
-
-    Attributes:
-        frames: Numbers of the frames with a mask, ascending.
-        image_size: (height, width) of every mask.
-
-    Raises:
-        InputError: the file is missing, damaged or truncated; a member's path leads out of the
-            archive; two members have the same frame number; no member is a mask.
+    The stem of a member is its frame number (`instance-filt/123.png`), in any folder. `frames` are
+    the numbers of the frames with a mask, ascending, and `image_size` is every mask's.
     """
 
     def __init__(self, path: Path):
@@ -44,32 +35,22 @@ class MaskArchive:
             raise InputError(
                 f"{self.path} cannot be opened as a zip ({error}); download it again."
             ) from None
-        with contextlib.ExitStack() as undo:
-            undo.callback(self.close)
+        try:
             self._members = self._list()
             self.frames = tuple(sorted(self._members))
             self.image_size = self._size(self.frames[0])
-            undo.pop_all()  # success: keep the archive open
+        except BaseException:
+            self._zip.close()
+            raise
 
     def __enter__(self) -> "MaskArchive":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file."""
         self._zip.close()
 
     def read(self, frame: int) -> np.ndarray:
-        """Read the mask of one frame, (height, width) uint8: objectId + 1, or 0 for no object.
-
-        Raises:
-            InputError: there is no such frame; the member is damaged, not 8-bit grey, or differs in
-                size from the archive's first.
-        """
-        if frame not in self._members:
-            raise InputError(f"{self.path} has no mask of frame {frame}.")
+        """Read the mask of one frame, (height, width) uint8: objectId + 1, or 0 for no object."""
         size = self._size(frame)
         if size != self.image_size:
             raise InputError(

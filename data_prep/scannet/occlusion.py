@@ -13,17 +13,11 @@ _CUT_SHARE = 0.005
 
 
 def unoccluded(scan: Scan, chosen: np.ndarray) -> np.ndarray:
-    """Find the views that show an instance without occlusion by anything else.
+    """Find the views that show each chosen instance without occlusion, (views, len(chosen)) bool.
 
     The 2D box of its visible vertices is compared with the 2D box of all its vertices. Everything
-    in the scan's mesh occludes: walls, doors, objects, unannotated surfaces.
-
-    Args:
-        scan: Scan with its mesh and cameras.
-        chosen: Indices of instances; `len(scan.instances)` and above are never unoccluded.
-
-    Returns:
-        (views, len(chosen)) bool.
+    in the scan's mesh occludes: walls, doors, objects, unannotated surfaces. Indices from
+    `len(scan.instances)` on are never unoccluded.
     """
     mesh, (height, width) = scan.mesh, scan.settings.image_size
     K = scan.intrinsics

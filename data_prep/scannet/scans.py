@@ -57,9 +57,6 @@ class ScanSettings:
         for name in ("frame_step", "max_views"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}; it counts from 1.")
-        if min(self.image_size) < 1:
-            height, width = self.image_size
-            raise InputError(f"image_size is {width} x {height} pixels; both must be at least 1.")
 
 
 @dataclass(frozen=True)
@@ -68,8 +65,6 @@ class Instance:
 
     object_id: int
     """Id of the object; its value in the masks is one more."""
-    category: str
-    """Raw category chosen by the annotators."""
     label: str
     """Class of the label set `scannet`; `void` outside its 19 classes."""
     is_shell: bool
@@ -88,14 +83,10 @@ class Scan:
     """A scan: objects and cameras in memory, masks still in their zip."""
 
     folder: Path
-    scene_type: str
-    """Type of room, such as "Bedroom / Hotel"; empty if the scan has none."""
     instances: tuple[Instance, ...]
     """Objects in the order of their ids, without those that have no vertices."""
     mesh: Mesh
     """The whole scanned mesh in the room frame, with its unannotated parts."""
-    room_from_scan: np.ndarray
-    """(4, 4) float64, rigid transform from the scan's frame (z up) to the room frame."""
     floor_m: np.ndarray
     """(4, 2) x, z of the bounding rectangle of the objects."""
     height_m: float
@@ -103,13 +94,12 @@ class Scan:
     frames: tuple[int, ...]
     """Frame number of each view."""
     world_to_camera: np.ndarray
-    """(views, 4, 4) float64, OpenCV axes, from the room frame."""
+    """(views, 4, 4) float64, from the room frame."""
     intrinsics: np.ndarray
     """(3, 3) float64, in pixels of an image of `settings.image_size`."""
     masks: Path
     settings: ScanSettings
     notes: tuple[str, ...]
-    """Parts of the scan that were left out, with reasons."""
 
     @property
     def scan_id(self) -> str:
@@ -125,10 +115,6 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
     centre of their bounding rectangle in x and z. ScanNet has no floor plans, and its annotated
     floors cover only the parts that the camera saw. If no object has a class, the box of the whole
     mesh is used instead.
-
-    Raises:
-        InputError: a file is missing or damaged, files do not belong together, or no frame has
-            both a pose and a mask. The message names the file and what to do.
     """
     folder, settings = Path(folder), settings or ScanSettings()
     name = folder.name
@@ -184,8 +170,7 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
         kind, is_shell = labels.label(group.category), labels.is_shell(group.category)
         corners = box[0] - origin, box[1] - origin
         surface = None if kind == "void" else surface_of(mesh, part)
-        item = Instance(group.object_id, group.category, kind, is_shell, *corners, part, surface)
-        instances.append(item)
+        instances.append(Instance(group.object_id, kind, is_shell, *corners, part, surface))
     half = (upper - lower)[[0, 2]] / 2
     choice, world_to_camera, intrinsics, masks = _read_cameras(folder, room_from_scan, settings)
     every = f"of {choice.candidates} frames (every {settings.frame_step})"
@@ -196,10 +181,8 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
         notes += [f"{count} {every} {why}; skipped"] * bool(count)
     return Scan(
         folder=folder,
-        scene_type=properties.get("sceneType", ""),
         instances=tuple(instances),
         mesh=mesh,
-        room_from_scan=room_from_scan,
         floor_m=np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half,
         height_m=float(whole[1][1] - origin[1]),
         frames=choice.frames,

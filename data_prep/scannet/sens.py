@@ -38,14 +38,10 @@ class Recording:
 
 
 def read_recording(path: Path) -> Recording:
-    """Read the header and the pose of every frame.
+    """Read the header and the pose of every frame; errors name the file, the frame and the byte.
 
     Only the 96 bytes before each frame's pictures are read, so that a recording of several GB needs
     about a hundred bytes of memory per frame.
-
-    Raises:
-        InputError: the file is missing, of another version, truncated, or has impossible sizes;
-            the message names file, frame and byte.
 
     Source: ScanNet's SensReader (sensorData.h), version 4.
     """

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from data_prep.engine.plan import digest
 from data_prep.engine.selection import house_may_match, seeded_split, select
-from data_prep.engine.source import Expected, LeftOut, PreparedRoom, RoomTask, Survey
+from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey
 from data_prep.engine.workers import Run
 from data_prep.scannet.labels import LABEL_SET, Labels, read_labels
 from data_prep.scannet.scans import ScanSettings, read_scan
@@ -31,17 +31,14 @@ class ScanNetSource:
     room_type: ClassVar = "scannet"
     draws: ClassVar = False
     scans: Path
-    """Folder of scan folders."""
     labels: Path
     """scannetv2-labels.combined.tsv."""
     scan_settings: ScanSettings = field(default_factory=ScanSettings)
     train: Path | None = None
-    """scannetv2_train.txt."""
     val: Path | None = None
-    """scannetv2_val.txt, the split `test`. Without lists, spaces are split 9:1, seeded."""
+    """The official lists; `val` is the split `test`. Without, spaces are split 9:1, seeded."""
     seed: int = 0
     only: str | None = None
-    """Name of a scan; a prefix suffices."""
 
     @property
     def expected(self) -> Expected | None:
@@ -71,15 +68,14 @@ class ScanNetSource:
         """List the scans on disk and their splits, without opening any scan."""
         folders = find_scans(self.scans)
         names = [path.name for path in folders]
-        left_out: list[LeftOut] = []
+        left_out: list[Line] = []
         if self.train or self.val:
-            found = split_scans(folders, self.train, self.val)
-            split_of = found.split_of
+            split_of, missing = split_scans(folders, self.train, self.val)
             for scan_ids, why in (
-                (found.skipped, "it is in no list"),
-                (found.missing, f"a list names it, but {self.scans} has no such folder"),
+                ([name for name in names if name not in split_of], "it is in no list"),
+                (missing, f"a list names it, but {self.scans} has no such folder"),
             ):
-                left_out += [LeftOut(name, name, "filtered", why, "split") for name in scan_ids]
+                left_out += [Line(name, name, "filtered", "split", why) for name in scan_ids]
         else:
             # Split by space, because rescans of a room must not be in both splits.
             half = seeded_split(list(dict.fromkeys(map(space_of, names))), self.seed)
@@ -89,14 +85,14 @@ class ScanNetSource:
         where = f"{self.scans} is to be prepared"
         return select(Survey(tasks, tuple(left_out)), self.only, where, hint)
 
-    def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | LeftOut:
+    def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:
         """Read one scan and label its views."""
         labels = _labels(Path(self.labels), Path(self.labels).stat().st_mtime_ns)
         scan = read_scan(Path(self.scans) / task.house, labels, self.scan_settings)
         made = prepare_scan(scan)
         if made is None:
             why = f"none of its {len(scan.frames)} views shows any object"
-            return LeftOut(task.room_id, task.house, "filtered", why, "no_view", scan.notes)
+            return Line(task.room_id, task.house, "filtered", "no_view", why, notes=[*scan.notes])
         return made
 
     def _folders(self, only: str | None) -> list[Path]:

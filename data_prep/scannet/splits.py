@@ -2,22 +2,9 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from sceneprior.core.errors import InputError
-
-
-@dataclass(frozen=True)
-class ScanSplits:
-    """Scans to prepare, and their splits."""
-
-    split_of: dict[str, str]
-    """Split (train or test) by scan id, in the order of the folders."""
-    skipped: tuple[str, ...]
-    """Scans on disk that are in no list."""
-    missing: tuple[str, ...]
-    """Scans in a list that are not on disk."""
 
 
 def find_scans(folder: Path) -> list[Path]:
@@ -25,9 +12,6 @@ def find_scans(folder: Path) -> list[Path]:
 
     A scan folder is named like `scene0000_00` or holds a `.sens` of its own name. It is listed even
     if its `.sens` is missing, so that the report mentions it.
-
-    Raises:
-        InputError: the folder is missing, or holds no scans.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -61,11 +45,11 @@ def space_of(scan_id: str) -> str:
 
 def split_scans(
     folders: Sequence[Path], train: Path | None = None, val: Path | None = None
-) -> ScanSplits:
+) -> tuple[dict[str, str], list[str]]:
     """Split scans by the official lists, one scan id per line; `val` becomes the split `test`.
 
-    Raises:
-        InputError: a list cannot be read, a scan is in both, or no scan is in any.
+    Returns the split of each listed scan, in the order of the folders, and the listed scans that
+    are not on disk.
     """
     listed: dict[str, str] = {}
     for path, split in ((train, "train"), (val, "test")):
@@ -81,12 +65,7 @@ def split_scans(
             "check that --train-list and --val-list are ScanNet's scannetv2_train.txt and "
             "scannetv2_val.txt."
         )
-    here = set(names)
-    return ScanSplits(
-        split_of,
-        tuple(name for name in names if name not in listed),
-        tuple(name for name in listed if name not in here),
-    )
+    return split_of, [name for name in listed if name not in split_of]
 
 
 def _read_list(path: Path) -> list[str]:

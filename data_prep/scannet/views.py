@@ -1,8 +1,5 @@
 """Labels the views of one scan and returns the arrays stored in shards."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-
 import numpy as np
 
 from data_prep.engine.source import PreparedRoom
@@ -17,41 +14,26 @@ from sceneprior.core.scene import Mesh
 from sceneprior.core.shards import RoomGroundTruth
 
 
-@dataclass(frozen=True)
-class LabelledView:
-    """Instance ids of one frame."""
-
-    frame: int
-    """Number of the frame in the recording."""
-    world_to_camera: np.ndarray
-    """(4, 4) float64."""
-    ids: np.ndarray
-    """(height, width): 0 = no object or the room's shell, k + 1 = instance k of the scan, and
-    len(instances) + 1 = an object id that is missing from the aggregation."""
-    unlisted: tuple[int, ...]
-    """Object ids in the mask that are missing from the aggregation."""
-
-
-def labelled_views(scan: Scan) -> Iterator[LabelledView]:
-    """Read the scan's views in the order of their frames, one mask in memory at a time.
+def instance_images(scan: Scan) -> tuple[np.ndarray, list[int]]:
+    """Read the instance ids of all views, and the object ids missing from the aggregation.
 
     Masks are downsampled without averaging (`sampled_lines`); `scan.intrinsics` accounts for the
     offset of the sampled pixels' centres.
 
-    Raises:
-        InputError: a mask is damaged, or of another size than the first.
+    Returns:
+        (views, height, width): 0 = no object or the room's shell, k + 1 = instance k of the scan,
+        and len(instances) + 1 = an object id that is missing; and the missing ids, ascending.
     """
     table, known = _ids_of_values(scan)
+    images, unlisted = [], set()
     with MaskArchive(scan.masks) as masks:
-        height, width = scan.settings.image_size
-        rows = sampled_lines(masks.image_size[0], height)
-        columns = sampled_lines(masks.image_size[1], width)
-        for frame, world_to_camera in zip(scan.frames, scan.world_to_camera, strict=True):
-            values = masks.read(frame)[np.ix_(rows, columns)]
-            unlisted = np.setdiff1d(np.unique(values), known)
-            yield LabelledView(
-                frame, world_to_camera, table[values], tuple((unlisted.astype(int) - 1).tolist())
-            )
+        sizes = zip(masks.image_size, scan.settings.image_size, strict=True)
+        lines = np.ix_(*(sampled_lines(*size) for size in sizes))
+        for frame in scan.frames:
+            values = masks.read(frame)[lines]
+            images.append(table[values])
+            unlisted.update(np.setdiff1d(values, known).tolist())
+    return np.stack(images), sorted(value - 1 for value in unlisted)
 
 
 def prepare_scan(scan: Scan) -> PreparedRoom | None:
@@ -62,31 +44,23 @@ def prepare_scan(scan: Scan) -> PreparedRoom | None:
     it. The room's shell (walls, floor, doors, ...) is ignored because it is nearly always behind;
     a wall corner or an open door that does occlude a side goes unnoticed. The ground truth's
     `unoccluded` accounts for these, but only `inspect --verify` uses it.
-
-    Raises:
-        InputError: a mask is damaged, or of another size than the first.
     """
     names = label_set(LABEL_SET)
-    images: list[np.ndarray] = []
-    unlisted: set[int] = set()
-    for view in labelled_views(scan):
-        images.append(view.ids)
-        unlisted.update(view.unlisted)
+    images, unlisted = instance_images(scan)
     # The last entry stands for ids without an object, which may occlude others.
     labels = [*(item.label for item in scan.instances), "void"]
     classes = np.array([names.index(label) for label in labels], dtype=np.int16)
-    seen = observe(np.stack(images), classes)
+    seen = observe(images, classes)
     del images  # `seen` has its own
     if not len(seen.tracked):
         return None
     notes = scan.notes
     if unlisted:
-        listed = ", ".join(map(str, sorted(unlisted)))
+        listed = ", ".join(map(str, unlisted))
         notes += (f"masks show objects that the aggregation does not have ({listed}): void",)
     views = seen.room_views(scan.scan_id, scan.world_to_camera, scan.intrinsics)
     order = np.concatenate([seen.tracked, seen.unseen])
-    truth, models = _ground_truth(scan, order, classes[order])
-    truth = replace(truth, unoccluded=unoccluded(scan, seen.tracked))
+    truth, models = _ground_truth(scan, order, classes[order], unoccluded(scan, seen.tracked))
     return PreparedRoom(views, truth, models, notes=notes)
 
 
@@ -104,7 +78,7 @@ def _ids_of_values(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ground_truth(
-    scan: Scan, order: np.ndarray, classes: np.ndarray
+    scan: Scan, order: np.ndarray, classes: np.ndarray, whole: np.ndarray
 ) -> tuple[RoomGroundTruth, dict[str, Mesh]]:
     """Ground truth of these instances, and their surfaces as models centred at the origin."""
     lower = np.array([scan.instances[k].lower_m for k in order])
@@ -133,5 +107,6 @@ def _ground_truth(
         model_to_room=places.astype(np.float32),
         floor_m=scan.floor_m.astype(np.float32),
         height_m=scan.height_m,
+        unoccluded=whole,
     )
     return truth, models

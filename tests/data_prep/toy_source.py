@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from toy_rooms import LABEL_SET, make_toy_room
 
-from data_prep.engine.source import Expected, LeftOut, PreparedRoom, RoomTask, Survey
+from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh
 
@@ -35,9 +35,9 @@ class ToySource:
             RoomTask(room_id, "box", "test" if k % 5 == 4 else "train", extra={"number": k})
             for k, room_id in enumerate(ids)
         )
-        return Survey(tuple(tasks), (LeftOut("box_x", "box", "filtered", "it is odd", "odd"),))
+        return Survey(tuple(tasks), (Line("box_x", "box", "filtered", "odd", "it is odd"),))
 
-    def prepare(self, task: RoomTask, renderer: Any) -> PreparedRoom | LeftOut:
+    def prepare(self, task: RoomTask, renderer: Any) -> PreparedRoom | Line:
         assert renderer is None
         number = task.extra["number"]
         views, truth = make_toy_room(task.room_id, np.random.default_rng(number))
@@ -46,7 +46,7 @@ class ToySource:
             case None:
                 return made
             case "filtered":
-                return LeftOut(task.room_id, task.house, "filtered", "it is dark", "light")
+                return Line(task.room_id, task.house, "filtered", "light", "it is dark")
             case "sentence":
                 raise InputError("its file is truncated")
             case "unforeseen":

@@ -6,7 +6,7 @@ from front_files import bedroom, room
 from front_reading import extent, only_room
 from PIL import Image
 
-from data_prep.front.files import house_files
+from data_prep.front.houses import house_files
 from data_prep.front.models import ModelBank
 from sceneprior.core.errors import InputError
 from sceneprior.core.furniture import read_obj

@@ -3,12 +3,12 @@
 import typer
 from typer.testing import CliRunner
 
-from data_prep.homes.command import make_homes_command
+from data_prep.cli import make_homes
 
 
 def test_command_writes_into_an_empty_folder(tmp_path):
     app = typer.Typer()
-    app.command()(make_homes_command)
+    app.command()(make_homes)
     arguments = [str(tmp_path), "--rooms", "3", "--room-type", "living", "--seed", "3"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output

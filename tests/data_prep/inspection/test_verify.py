@@ -12,7 +12,7 @@ from rich.console import Console
 
 from data_prep.engine.build import build_shards
 from data_prep.inspection.agreement import Agreement, Tally
-from data_prep.inspection.command import _check_tables
+from data_prep.inspection.tables import check_tables
 from data_prep.inspection.verify import FolderCheck, RoomCheck, verify
 from sceneprior.core.errors import InputError, ShardError
 
@@ -41,7 +41,7 @@ def test_the_worst_rooms_keep_their_names_in_a_narrow_terminal():
     name = "2bc95aea-aa71-57ad-9ed2-3852b7420110_LivingDiningRoom-1010"
     check = RoomCheck("train/a.h5", name, agreement=Agreement({"mesh": Tally(9, 9)}))
     console = Console(width=60, record=True)
-    console.print(_check_tables(FolderCheck({"train": [check]}, ()))[1])
+    console.print(check_tables(FolderCheck({"train": [check]}, ()))[1])
     said = "".join(line.split("│")[1].strip() for line in console.export_text().splitlines()[3:-1])
     assert said == name
 

@@ -7,7 +7,7 @@ import pytest
 from scan_files import make_scan, write_table
 
 from data_prep.engine.build import Job, build_shards
-from data_prep.engine.source import LeftOut, RoomTask
+from data_prep.engine.source import Line, RoomTask
 from data_prep.engine.workers import pool
 from data_prep.scannet.scans import ScanSettings
 from data_prep.scannet.source import ScanNetSource
@@ -91,7 +91,7 @@ def test_a_scan_that_shows_nothing_is_filtered(source):
         box.category = "backpack"
     scan.write(mask_size=(242, 324))
     out = source.prepare(RoomTask(IDS[0], IDS[0], "train"), None)
-    assert isinstance(out, LeftOut) and (out.status, out.rule) == ("filtered", "no_view")
+    assert isinstance(out, Line) and (out.status, out.rule) == ("filtered", "no_view")
     assert out.reason == "none of its 5 views shows any object"
     assert any("usable pose" in note for note in out.notes)
 

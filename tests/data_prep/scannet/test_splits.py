@@ -31,14 +31,12 @@ def test_scans_are_found_in_order_also_without_their_recording(scans):
 
 def test_the_lists_decide_and_the_rest_is_named(scans, tmp_path):
     train, val = lists(tmp_path, "scene0000_01\nscene0000_00\nscene0700_00\n\n", "scene0001_00\r\n")
-    found = split_scans(find_scans(scans), train, val)
-    assert found.split_of == {
+    split_of, missing = split_scans(find_scans(scans), train, val)
+    assert split_of == {
         "scene0000_00": "train", "scene0000_01": "train", "scene0001_00": "test",
     }  # fmt: skip
-    assert list(found.split_of) == sorted(found.split_of)
-    assert found.skipped == ("mine", "scene0002_00")
-    assert found.missing == ("scene0700_00",)
-    assert split_scans(find_scans(scans), None, val).split_of == {"scene0001_00": "test"}
+    assert list(split_of) == sorted(split_of) and missing == ["scene0700_00"]
+    assert split_scans(find_scans(scans), None, val)[0] == {"scene0001_00": "test"}
 
 
 def test_a_space_is_scanned_more_than_once():

@@ -20,7 +20,7 @@ from scan_files import (
 from toy_rooms import write_shard
 
 from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings, read_scan
-from data_prep.scannet.views import labelled_views, prepare_scan
+from data_prep.scannet.views import instance_images, prepare_scan
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import Shard
@@ -216,9 +216,9 @@ def test_the_shell_touches_everything_and_hides_nothing(scan, labels):
 def test_ids_without_an_object_hide_and_are_told(scan, labels):
     image = picture((2, 5, 10, 30, 40), (90, 30, 20, 40, 30), (255, 70, 0, 80, 10))
     made = painted(scan, labels, {0: image})
-    (view,) = labelled_views(made)
-    assert view.frame == 0 and view.unlisted == (89, 254)
-    assert view.ids[20, 35] == 5 and view.ids[20, 10] == 2  # four instances
+    (ids,), unlisted = instance_images(made)
+    assert unlisted == [89, 254]
+    assert ids[20, 35] == 5 and ids[20, 10] == 2  # four instances
     room = prepare_scan(made)
     assert room.views.sides_clear.tolist() == [[[True, True, False, True]]]
     assert "masks show objects that the aggregation does not have (89, 254): void" in room.notes
