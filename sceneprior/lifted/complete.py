@@ -90,7 +90,7 @@ def complete(
             "latents; leave the classes out, or train with a section `sampler`."
         )
     starts = _starts(trained, given, count * RESTARTS, seed, distribution)
-    z, loss = fit_latents(trained, starts, repeated(given, count * RESTARTS), steps)
+    z, loss = fit_latents_to_objects(trained, starts, repeated(given, count * RESTARTS), steps)
     # Starts are sorted, best first; dealing them out in turn gives every answer good ones.
     best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
     z = z.view(len(scenes), RESTARTS, count, -1).take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
@@ -195,7 +195,7 @@ def _starts(
     return torch.cat([z[some.argsort(stable=True)[:each]] for some in losses])
 
 
-def fit_latents(
+def fit_latents_to_objects(
     trained: TrainedPrior,
     starts: Float[Tensor, "rooms dimension"],
     given: RoomBoxes,
