@@ -88,8 +88,8 @@ class DetectionEncoder(nn.Module):
 
     def forward(self, found: Detections) -> Float[Tensor, "masks width"]:
         """One feature vector per mask."""
-        known = F.one_hot(found.object_class, self.classes).to(found.numbers)
-        numbers = self.numbers(torch.cat([found.numbers, known], dim=-1))
+        numbers, known = found.numbers, F.one_hot(found.object_class, self.classes)
+        numbers = self.numbers(torch.cat([numbers, known.to(numbers)], dim=-1))
         return F.relu(self.join(torch.cat([self.crop(found.crops), numbers], dim=-1).relu()))
 
 
