@@ -19,8 +19,6 @@ ANYWHERE = 0.05
 """Weight of a uniform density over `AREA_M2` in each mixture, which bounds the pull of a pair."""
 AREA_M2 = 64.0
 STEP_M = 0.02
-MOMENTUM = 0.05
-"""Share of the newest batch in the running error of each class."""
 BATCH = 64
 """Rooms per batch in refinement."""
 
@@ -31,6 +29,7 @@ class PairPrior(nn.Module):
     offsets_m: Tensor
     known: Tensor
     error_m2: Tensor
+    """Mean squared error of decoded centres per class, in square metres."""
 
     def __init__(self, classes: int):
         super().__init__()
@@ -54,19 +53,6 @@ class PairPrior(nn.Module):
             pick = pick.repeat(-(-COMPONENTS // len(mine)))[:COMPONENTS]
             self.offsets_m[index // classes, index % classes] = mine[pick]
             self.known[index // classes, index % classes] = True
-
-    def note_errors(
-        self, squared: Float[Tensor, " labels"], count: Float[Tensor, " labels"]
-    ) -> None:
-        """Update the running mean squared error of centres per class.
-
-        Args:
-            squared: Sum of a batch's squared errors per class without void, in square metres.
-            count: Objects in that sum.
-        """
-        newest = squared / count.clamp(min=1)
-        weight = MOMENTUM * (count > 0)
-        self.error_m2[1:] += weight * (newest - self.error_m2[1:])
 
     def energy(
         self, rooms: RoomBoxes, start_m: Float[Tensor, "rooms objects 2"]

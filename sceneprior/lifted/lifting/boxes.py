@@ -33,10 +33,8 @@ def lift_boxes(
     An object's visual hull is carved coarse to fine. Its box is then shrunk, side after side, as
     long as every ray through one of its pixels meets a cell of the hull inside.
 
-    Args:
-        views: A room, read with its images.
-        chosen: The views to use; None uses all.
-        seed: Seed of the choice of pixels whose rays are used.
+    `views` is a room, read with its images, of which only the views `chosen` are used (None: all).
+    `seed` chooses the pixels whose rays are used.
     """
     rng = np.random.default_rng(seed)
     rows = np.arange(len(views.visible)) if chosen is None else chosen

@@ -22,15 +22,8 @@ def lift_shapes(
 ) -> Bool[np.ndarray, "objects x y z"]:
     """The visual hull of each of a room's objects, on a grid in the frame of its box.
 
-    Args:
-        views: A room, read with its images.
-        boxes: The room's boxes from `lift_boxes`.
-        shape: The grid.
-        chosen: The views to use; None uses all.
-
-    Returns:
-        True in cells that the object may fill, indexed x, y, z; all False for an object without a
-        box. Cells outside the box are False.
+    True in cells that the object may fill, never outside the box; all False for an object without
+    a box. `views` and `chosen` are those of `lift_boxes`.
     """
     rows = np.arange(len(views.visible)) if chosen is None else chosen
     cells, margin = shape.cells, shape.margin
