@@ -63,22 +63,12 @@ def complete(
 ) -> list[list[Scene]]:
     """Furnish the rest of rooms; all rooms and all answers are computed in one batch.
 
-    Args:
-        scenes: The given objects of each room: classes, boxes, optionally meshes. If there are
-            none, the answers are rooms that the run generates. A sampler stays within the
-            bounding rectangle of a scene's floor.
-        count: Answers per room.
-        seed, distribution: `sampler`, or the distribution of the latents that answers start from;
-            see `draw_latents`.
-        steps: Steps of the fit; 0 leaves the sampled latents as they are.
-        classes: Classes to add, and no others; None leaves the choice to the sampler.
-
-    Returns:
-        The answers of each room: see `insert`. If `classes` were given, `extra["no_place"]` lists
-        those for which the sampler found no free place.
-
-    Raises:
-        InputError: a given object cannot be used, or there are more than the run's rooms hold.
+    Given objects may lack meshes; if there are none, the answers are rooms that the run generates.
+    A sampler stays within the bounding rectangle of a scene's floor. `distribution` is `sampler`,
+    or that of the latents that answers start from (`draw_latents`); with 0 `steps` of the fit,
+    these stay as they are. `classes` are added, and no others; None leaves the choice to the
+    sampler. The answers' `extra` is that of `insert`; if `classes` were given, `no_place` lists
+    those for which the sampler found no free place.
     """
     check_seed(seed)
     given = gather_given(trained, scenes)
@@ -129,25 +119,21 @@ def _drawn(
         assert trained.sampler is not None, "drawn_by_sampler has asked"
         may_meet = trained.sampler.may_meet.cpu().numpy()
         made = [insert(room, scene, may_meet, seed=seed) for room in rooms]
-        answers.append([_with_no_place(room, classes) for room in made])
+        if classes is not None:
+            made = [_with_no_place(room, classes) for room in made]
+        answers.append(made)
     return answers
 
 
-def _with_no_place(room: Scene, classes: Sequence[str] | None) -> Scene:
+def _with_no_place(room: Scene, classes: Sequence[str]) -> Scene:
     """An answer with `extra["no_place"]`: the requested objects that it lacks, by class."""
-    if classes is None:
-        return room
     added = Counter(item.label for item in room.objects[len(room.extra["given"]) :])
     lacking = sorted((Counter(classes) - added).elements())
     return replace(room, extra={**room.extra, "no_place": lacking})
 
 
 def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> RoomBoxes:
-    """Given objects as tensors.
-
-    Raises:
-        InputError: a class is not in the run's label set, a box is invalid, or there are too many.
-    """
+    """Given objects as tensors; an `InputError` for those that the run cannot use."""
     config = trained.config
     names, most = label_set(config.label_set), config.model.max_objects
     counts = torch.tensor([len(scene.objects) for scene in scenes])

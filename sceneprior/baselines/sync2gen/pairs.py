@@ -76,25 +76,22 @@ class PairPrior(nn.Module):
         of_pairs = (log_prob * counted).sum(dim=-1) / counted.sum(dim=-1).clamp(min=1)
         return ((stray - of_pairs) * rooms.is_object).sum(dim=-1)
 
+    @torch.enable_grad()
     def refine(self, rooms: RoomBoxes, steps: int) -> RoomBoxes:
         """Reduce the energy by `steps` steps of Adam on the floor positions."""
-        if steps == 0:
-            return rooms
-        moved = [self._refine(part, steps) for part in rooms.split(BATCH)]
+        moved = []
+        for part in rooms.split(BATCH):
+            start_m = part.boxes_m[..., [0, 2]]
+            part = replace(part, boxes_m=part.boxes_m.clone().requires_grad_())
+            # Adam updates each number by its own gradient: a room does not depend on the others in
+            # its batch, and heights and sizes, which have no gradient, stay.
+            optimizer = torch.optim.Adam([part.boxes_m], lr=STEP_M)
+            for _ in range(steps):
+                optimizer.zero_grad()
+                self.energy(part, start_m).sum().backward()
+                optimizer.step()
+            moved.append(part.boxes_m.detach())
         return replace(rooms, boxes_m=torch.cat(moved))
-
-    @torch.enable_grad()
-    def _refine(self, rooms: RoomBoxes, steps: int) -> Float[Tensor, "rooms objects 6"]:
-        start_m = rooms.boxes_m[..., [0, 2]]
-        rooms = replace(rooms, boxes_m=rooms.boxes_m.clone().requires_grad_())
-        # Adam updates each number by its own gradient: a room does not depend on the others in its
-        # batch, and heights and sizes, which have no gradient, stay.
-        optimizer = torch.optim.Adam([rooms.boxes_m], lr=STEP_M)
-        for _ in range(steps):
-            optimizer.zero_grad()
-            self.energy(rooms, start_m).sum().backward()
-            optimizer.step()
-        return rooms.boxes_m.detach()
 
 
 def _offsets(

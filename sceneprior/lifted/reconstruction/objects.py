@@ -25,7 +25,7 @@ from sceneprior.lifted.reconstruction.candidates import (
     with_shapes,
 )
 from sceneprior.lifted.reconstruction.known_rooms import turn_object
-from sceneprior.lifted.reconstruction.outlines import Outlines, joined, outlines_of
+from sceneprior.lifted.reconstruction.outlines import Outlines, outlines_of
 from sceneprior.lifted.reconstruction.placing import Placed, place_objects
 from sceneprior.paper.decode import scene_of
 from sceneprior.paper.trained import TrainedPrior
@@ -70,7 +70,8 @@ def answer_images(trained: TrainedPrior, images: Sequence[ObservedImage]) -> lis
 
     For a class that the run never generates, objects of all classes are tried.
     """
-    masks = joined([outlines_of(image) for image in images])
+    outlines = [outlines_of(image) for image in images]
+    masks = Outlines(*(torch.cat(parts) for parts in zip(*outlines, strict=True)))
     classes = torch.from_numpy(np.concatenate([image.object_class for image in images]))
     rough = candidates_of(trained)
     first = _of_classes(rough, classes)

@@ -47,11 +47,8 @@ def place_objects(
 
     The energy is the sum of absolute differences in eight directions over `SPREAD`. It is minimised
     by Gauss-Newton steps, reweighted in each step; the best position on the way is kept. Heights
-    are fixed: objects that the prior puts on the floor stay there.
-
-    Args:
-        points: Points of each object's surface; its box is [-0.5, 0.5]^3.
-        masks: One entry per object.
+    are fixed: objects that the prior puts on the floor stay there. `points` lie on each object's
+    surface, whose box is [-0.5, 0.5]^3; `masks` has one entry per object.
     """
     heights_m = bottom_m + sizes_m[:, 1] / 2
     shape_m = points * sizes_m[:, None]
