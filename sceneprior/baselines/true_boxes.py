@@ -19,13 +19,7 @@ from sceneprior.core.views import RoomBoxes
 
 class TruthDataset(RoomDataset):
     """The boxes of all furniture in the rooms of a split, in memory, visible to a camera or not.
-
-    Rows and turns are those of `ViewDataset`.
-
-    Raises:
-        ShardError: a shard is missing, damaged, without ground truth, or of another label set than
-            the first.
-    """
+    Rows and turns are those of `ViewDataset`."""
 
     counted = "objects"
 
@@ -74,11 +68,7 @@ class TruthDataset(RoomDataset):
 
 
 def check_ground_truth(shard: Shard, room_id: str) -> None:
-    """Refuse a room without 3D ground truth.
-
-    Raises:
-        ShardError: it has none.
-    """
+    """Refuse a room without 3D ground truth with a `ShardError`."""
     if not shard.has_ground_truth(room_id):
         raise ShardError(
             f"{shard.path}, room {room_id} carries no 3D ground truth, which this method learns "

@@ -55,11 +55,8 @@ class AtissStage(OneStage):
 
 
 def part_of_rooms(rooms: RoomBoxes, seed: int) -> tuple[RoomBoxes, RoomBoxes]:
-    """Shuffle each room's n objects and keep the first k, with k drawn evenly from 0 to n.
-
-    Returns:
-        The kept objects, and the next object of each room, whose class is `END` if all are kept.
-    """
+    """Shuffle each room's n objects and keep the first k, with k drawn evenly from 0 to n. Also
+    returns the next object of each room, whose class is `END` if all are kept."""
     generator = torch.Generator().manual_seed(seed)
     count = rooms.is_object.sum(dim=1)
     device = rooms.boxes_m.device

@@ -41,11 +41,7 @@ class TrueViews(NamedTuple):
 
 
 class TrueViewDataset(ViewDataset):
-    """A `ViewDataset` of unturned rooms with the boxes and shapes of their ground truth.
-
-    Raises:
-        ShardError: a room has no ground truth, or a model is missing.
-    """
+    """A `ViewDataset` of unturned rooms with the boxes and shapes of their ground truth."""
 
     def __init__(self, folder: Path, split: str, **options: Any):
         super().__init__(folder, split, **options)

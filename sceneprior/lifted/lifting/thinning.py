@@ -55,34 +55,24 @@ def thin_shapes(
     alike = lookalikes(hulls, sizes_m, object_class)
     thin = np.zeros_like(hulls)
     filled = np.flatnonzero(hulls.any(axis=(1, 2, 3)))
-    in_threads(_thin_some, len(filled), filled, hulls, rays, alike, seed, thin)
+
+    def thin_some(first: int, last: int) -> None:
+        for item in filled[first:last].tolist():
+            # A generator per object makes the result independent of the number of threads.
+            rng = np.random.default_rng([seed, item])
+            pool = _pool_of(item, rays, alike[item], rng)
+            others = [
+                turn_grids(hulls[other.item][None], other.quarters, other.mirrored)[0]
+                for other in alike[item]
+            ]
+            share = np.mean(np.stack([hulls[item], *others]), axis=0, dtype=np.float32)
+            logits = np.asarray(START * (2 * share - 1), np.float32)
+            picked = rng.integers(len(pool.hits), size=(STEPS, RAYS))
+            _fit(logits, pool, picked, rng.random((STEPS, RAYS)))
+            thin[item] = hulls[item] & ndimage.binary_dilation(logits > 0, np.ones((3, 3, 3)))
+
+    in_threads(thin_some, len(filled))
     return thin
-
-
-def _thin_some(
-    first: int,
-    last: int,
-    items: Int[np.ndarray, " filled"],
-    hulls: np.ndarray,
-    rays: RayPool,
-    alike: list[list[Lookalike]],
-    seed: int,
-    thin: np.ndarray,
-) -> None:
-    for item in items[first:last].tolist():
-        # A generator per object makes the result independent of the number of threads.
-        rng = np.random.default_rng([seed, item])
-        pool = _pool_of(item, rays, alike[item], rng)
-        others = [
-            turn_grids(hulls[other.item][None], other.quarters, other.mirrored)[0]
-            for other in alike[item]
-        ]
-        filled = np.mean(np.stack([hulls[item], *others]), axis=0, dtype=np.float32)
-        logits = np.asarray(START * (2 * filled - 1), np.float32)
-        picked = rng.integers(len(pool.hits), size=(STEPS, RAYS))
-        offsets = rng.random((STEPS, RAYS))
-        _fit(logits, pool, picked, offsets)
-        thin[item] = hulls[item] & ndimage.binary_dilation(logits > 0, np.ones((3, 3, 3)))
 
 
 def _pool_of(item: int, rays: RayPool, alike: list[Lookalike], rng: np.random.Generator) -> RayPool:
