@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from sceneprior.core.views import LiftedRooms
+from sceneprior.lifted.config import LiftedLossConfig, LiftedStageConfig
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.losses import (
     latent_loss,
@@ -13,7 +14,6 @@ from sceneprior.lifted.losses import (
     shape_code_loss,
 )
 from sceneprior.lifted.occupancy import OccupancyDecoder
-from sceneprior.lifted.settings import LiftedLossConfig, LiftedStageConfig
 from sceneprior.paper.stages import LatentStage
 from sceneprior.training.steps import batch_seed, full_precision
 

@@ -8,8 +8,8 @@ from pydantic import Field
 from torch import Tensor
 
 from sceneprior.baselines.atiss.network import END, Atiss, AtissModel
-from sceneprior.baselines.box_training import BoxConfig, room_means
 from sceneprior.baselines.one_stage import OneStage, OneStageTraining
+from sceneprior.baselines.true_boxes import BoxConfig, room_means
 from sceneprior.core.views import RoomBoxes
 from sceneprior.training.steps import batch_seed, full_precision
 

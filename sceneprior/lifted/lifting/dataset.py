@@ -206,8 +206,7 @@ def _find_shapes(
 
     def find() -> dict[str, np.ndarray]:
         from sceneprior.lifted.lifting.rays import RayPool, draw_rays
-        from sceneprior.lifted.lifting.shapes import lift_shapes
-        from sceneprior.lifted.lifting.symmetry import made_symmetric
+        from sceneprior.lifted.lifting.shapes import lift_shapes, made_symmetric
         from sceneprior.lifted.lifting.thinning import thin_shapes
 
         hulls, rays = [], []
