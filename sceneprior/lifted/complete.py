@@ -71,9 +71,10 @@ def complete(
     those for which the sampler found no free place.
     """
     check_seed(seed)
+    names = [f"complete_{k:02d}" for k in range(count)]
     given = gather_given(trained, scenes)
     if (with_sampler := drawn_by_sampler(trained, distribution)) is not None:
-        return _drawn(with_sampler, scenes, given, count, seed, classes)
+        return _drawn(with_sampler, scenes, given, names, seed, classes)
     if classes is not None:
         raise InputError(
             "Which classes to add can be asked of a sampler alone, and these rooms come from "
@@ -84,7 +85,6 @@ def complete(
     # Starts are sorted, best first; dealing them out in turn gives every answer good ones.
     best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
     z = z.view(len(scenes), RESTARTS, count, -1).take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
-    names = [f"complete_{k:02d}" for k in range(count)]
     return [
         [insert(room, scene, seed=seed) for room in decode_latents(trained, own, names)]
         for scene, own in zip(scenes, z, strict=True)
@@ -95,12 +95,12 @@ def _drawn(
     trained: TrainedLifted,
     scenes: Sequence[Scene],
     given: RoomBoxes,
-    count: int,
+    names: Sequence[str],
     seed: int,
     classes: Sequence[str] | None,
 ) -> list[list[Scene]]:
     """Answers drawn by a run's sampler, by room."""
-    names = [f"complete_{k:02d}" for k in range(count)]
+    count = len(names)
     coming = None if classes is None else class_rows(trained, classes)
     most = trained.config.model.max_objects
     fullest = int(given.is_object.sum(dim=1).max()) + len(classes or ())
@@ -112,10 +112,8 @@ def _drawn(
     answers = []
     for scene, one in zip(scenes, given.split(1), strict=True):
         frame = None if scene.floor_m is None else floor_rectangle(scene).expand(count, -1)
-        whole = Given(
-            repeated(one, count), frame, None if coming is None else coming.expand(count, -1)
-        )
-        rooms = sample_scenes(trained, names, seed, whole)
+        wanted = None if coming is None else coming.expand(count, -1)
+        rooms = sample_scenes(trained, names, seed, Given(repeated(one, count), frame, wanted))
         assert trained.sampler is not None, "drawn_by_sampler has asked"
         may_meet = trained.sampler.may_meet.cpu().numpy()
         made = [insert(room, scene, may_meet, seed=seed) for room in rooms]

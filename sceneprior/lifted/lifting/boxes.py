@@ -60,10 +60,8 @@ def _lift(
         inside = np.argwhere(hull.emptiness <= limit)
         if not len(inside):
             break
-        low_m, high_m = (
-            hull.low_m + (inside.min(axis=0) - 1) * hull.cell_m,
-            hull.low_m + (inside.max(axis=0) + 2) * hull.cell_m,
-        )
+        low_m = hull.low_m + (inside.min(axis=0) - 1) * hull.cell_m
+        high_m = hull.low_m + (inside.max(axis=0) + 2) * hull.cell_m
     in_hull = emptiness <= limit
     first, last = smallest_box(where, in_hull, hull.emptiness.shape[0])
     trim = np.where(last - first > 1, TRIM, 0.0)

@@ -174,11 +174,9 @@ def _carve(
             box, start = boxes_px[view], starts[view]
             for j in range(cells):
                 y = low_m[1] + (j + 0.5) * size_m[1]
-                a, b, c = (
-                    m[0, 0] * x + m[0, 1] * y,
-                    m[1, 0] * x + m[1, 1] * y,
-                    m[2, 0] * x + m[2, 1] * y,
-                )
+                a = m[0, 0] * x + m[0, 1] * y
+                b = m[1, 0] * x + m[1, 1] * y
+                c = m[2, 0] * x + m[2, 1] * y
                 for k in range(cells):
                     depth[k] = c + m[2, 2] * z[k] + m[2, 3]
                     u[k] = (a + m[0, 2] * z[k] + m[0, 3]) / depth[k]

@@ -81,32 +81,29 @@ def answer_images(trained: TrainedPrior, images: Sequence[ObservedImage]) -> lis
     shaped = with_shapes(trained, rough.take(used))
     second = second._replace(candidate=numbered)
     placed = _placed(shaped, second, masks)
-    chosen = torch.tensor(
-        [
-            int(rows[likeliest_box(placed, _turned_sizes(shaped, second.take(rows)), rows)])
-            for rows in (second.mask == torch.arange(len(classes))[:, None])
-            .nonzero()[:, 1]
-            .split(second.mask.bincount(minlength=len(classes)).tolist())
-        ]
-    )
-    best = torch.full((len(classes),), torch.inf)
-    best = best.scatter_reduce(0, second.mask, placed.energy, "amin")
+    picks, energies = [], []
+    for mask in range(len(classes)):
+        rows = (second.mask == mask).nonzero()[:, 0]
+        sizes_m = _turned_sizes(shaped, second.take(rows))
+        picks.append(rows[likeliest_box(placed, sizes_m, rows)])
+        energies.append(placed.energy[rows].min())
+    chosen, best = torch.stack(picks), torch.stack(energies)
     objects = _objects(trained, shaped, second.take(chosen), placed.centers_m[chosen])
     names = label_set(trained.config.label_set)
     known = {names[index] for index in rough.object_class.unique().tolist()}
     answers, at = [], 0
     for image in images:
-        rows = slice(at, at + len(image.object_class))
+        own = slice(at, at + len(image.object_class))
         labels = [names[index] for index in image.object_class]
-        pairs = list(zip(labels, objects[rows], strict=True))
+        pairs = list(zip(labels, objects[own], strict=True))
         scene = Scene(
             image.name,
             image.label_set,
             tuple(SceneObject(label, o.center_m, o.size_m, o.mesh) for label, o in pairs),
         )
         taken_for = {label: o.label for label, o in pairs if label not in known}
-        answers.append(ObjectAnswer(scene, float(best[rows].mean()), taken_for))
-        at = rows.stop
+        answers.append(ObjectAnswer(scene, float(best[own].mean()), taken_for))
+        at = own.stop
     return answers
 
 
