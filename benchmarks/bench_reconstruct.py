@@ -26,7 +26,7 @@ from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.observed_image import ObservedImage, as_views, images_of_split
 from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.lifted.reconstruction.known_rooms import known_rooms, nearest_answers
-from sceneprior.paper.fit_image import SCHEDULES, fit_latents
+from sceneprior.paper.fit_image import SCHEDULES, fit_latents_to_images
 from sceneprior.paper.trained import TrainedPrior
 from sceneprior.render.offscreen import open_renderer
 
@@ -45,7 +45,7 @@ def fit_some(trained: TrainedPrior, images: list[ObservedImage], steps: int) -> 
     views = as_views(images, trained.config.data.mask_step)
     schedule = replace(SCHEDULES["paper"], steps=steps, drop_at=steps, patience=0)
     start = trained.prior.latent_space(trained.logits[:1]).expand(len(images), -1)
-    fit_latents(trained, views, start, schedule)
+    fit_latents_to_images(trained, views, start, schedule)
 
 
 def mean_iou(images: list[ObservedImage], answers: Answers, shards: Path) -> float:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from sceneprior.baselines.atiss.encoder import EncoderConfig
+from sceneprior.baselines.atiss.network import EncoderConfig
 from sceneprior.paper.layers import DecoderConfig
 
 

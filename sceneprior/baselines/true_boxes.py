@@ -1,4 +1,4 @@
-"""Batches of the true 3D boxes of a shard folder, for the baselines with 3D supervision.
+"""Training on the true 3D boxes of a shard folder: their batches, config and mean loss.
 
 Only ATISS and Sync2Gen train on them; methods that learn from masks and 2D boxes never open them
 (tests/baselines/test_true_boxes.py).
@@ -9,23 +9,22 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor, nn
 
+from sceneprior.baselines.one_stage import OneStage, OneStageConfig
 from sceneprior.core.data.dataset import BLANK, RoomDataset
 from sceneprior.core.errors import ShardError
 from sceneprior.core.geometry.turns import turn_boxes
 from sceneprior.core.shards import RoomGroundTruth, Shard
 from sceneprior.core.views import RoomBoxes
+from sceneprior.paper.losses.averages import share_of_batch
+from sceneprior.training.method import TrainedSampler, ready_copy
 
 
 class TruthDataset(RoomDataset):
     """The boxes of all furniture in the rooms of a split, in memory, visible to a camera or not.
-
-    Rows and turns are those of `ViewDataset`.
-
-    Raises:
-        ShardError: a shard is missing, damaged, without ground truth, or of another label set than
-            the first.
-    """
+    Rows and turns are those of `ViewDataset`."""
 
     counted = "objects"
 
@@ -74,11 +73,7 @@ class TruthDataset(RoomDataset):
 
 
 def check_ground_truth(shard: Shard, room_id: str) -> None:
-    """Refuse a room without 3D ground truth.
-
-    Raises:
-        ShardError: it has none.
-    """
+    """Refuse a room without 3D ground truth with a `ShardError`."""
     if not shard.has_ground_truth(room_id):
         raise ShardError(
             f"{shard.path}, room {room_id} carries no 3D ground truth, which this method learns "
@@ -90,3 +85,33 @@ def check_ground_truth(shard: Shard, room_id: str) -> None:
 def _read_truth(shard: Shard, room_id: str) -> RoomGroundTruth:
     check_ground_truth(shard, room_id)
     return shard.read_ground_truth(room_id)
+
+
+class BoxConfig(OneStageConfig):
+    """A run that learns from true boxes. Its network is a `BoxSampler` with `fit_statistics`."""
+
+    @property
+    def learns_from(self) -> str:
+        return "true boxes in 3D"
+
+    def open_rooms(self) -> TruthDataset:
+        rooms = TruthDataset(Path(self.data.shards), "train", self.data.rotations)
+        self.check_rooms(rooms, getattr(self.model, "max_objects", None))
+        return rooms
+
+    def build(self, rooms: TruthDataset, previous: Path | None) -> OneStage:
+        stage = super().build(rooms, previous)
+        stage.prior.fit_statistics(rooms.everything())
+        return stage
+
+    def trained(self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]) -> TrainedSampler:
+        return TrainedSampler(ready_copy(networks.prior), room_ids, self, stage)
+
+
+def room_means(
+    losses: dict[str, Float[Tensor, " rooms"]], rooms: RoomBoxes
+) -> dict[str, Float[Tensor, ""]]:
+    """Mean of each loss over the rooms that have an id, of all processes together."""
+    count = len(rooms.room_ids)
+    share = share_of_batch(torch.tensor(count, device=rooms.boxes_m.device))
+    return {name: share * loss.sum() / max(count, 1) for name, loss in losses.items()}

@@ -63,38 +63,28 @@ def complete(
 ) -> list[list[Scene]]:
     """Furnish the rest of rooms; all rooms and all answers are computed in one batch.
 
-    Args:
-        scenes: The given objects of each room: classes, boxes, optionally meshes. If there are
-            none, the answers are rooms that the run generates. A sampler stays within the
-            bounding rectangle of a scene's floor.
-        count: Answers per room.
-        seed, distribution: `sampler`, or the distribution of the latents that answers start from;
-            see `draw_latents`.
-        steps: Steps of the fit; 0 leaves the sampled latents as they are.
-        classes: Classes to add, and no others; None leaves the choice to the sampler.
-
-    Returns:
-        The answers of each room: see `insert`. If `classes` were given, `extra["no_place"]` lists
-        those for which the sampler found no free place.
-
-    Raises:
-        InputError: a given object cannot be used, or there are more than the run's rooms hold.
+    Given objects may lack meshes; if there are none, the answers are rooms that the run generates.
+    A sampler stays within the bounding rectangle of a scene's floor. `distribution` is `sampler`,
+    or that of the latents that answers start from (`draw_latents`); with 0 `steps` of the fit,
+    these stay as they are. `classes` are added, and no others; None leaves the choice to the
+    sampler. The answers' `extra` is that of `insert`; if `classes` were given, `no_place` lists
+    those for which the sampler found no free place.
     """
     check_seed(seed)
+    names = [f"complete_{k:02d}" for k in range(count)]
     given = gather_given(trained, scenes)
     if (with_sampler := drawn_by_sampler(trained, distribution)) is not None:
-        return _drawn(with_sampler, scenes, given, count, seed, classes)
+        return _drawn(with_sampler, scenes, given, names, seed, classes)
     if classes is not None:
         raise InputError(
             "Which classes to add can be asked of a sampler alone, and these rooms come from "
             "latents; leave the classes out, or train with a section `sampler`."
         )
     starts = _starts(trained, given, count * RESTARTS, seed, distribution)
-    z, loss = fit_latents(trained, starts, repeated(given, count * RESTARTS), steps)
+    z, loss = fit_latents_to_objects(trained, starts, repeated(given, count * RESTARTS), steps)
     # Starts are sorted, best first; dealing them out in turn gives every answer good ones.
     best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
     z = z.view(len(scenes), RESTARTS, count, -1).take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
-    names = [f"complete_{k:02d}" for k in range(count)]
     return [
         [insert(room, scene, seed=seed) for room in decode_latents(trained, own, names)]
         for scene, own in zip(scenes, z, strict=True)
@@ -105,12 +95,12 @@ def _drawn(
     trained: TrainedLifted,
     scenes: Sequence[Scene],
     given: RoomBoxes,
-    count: int,
+    names: Sequence[str],
     seed: int,
     classes: Sequence[str] | None,
 ) -> list[list[Scene]]:
     """Answers drawn by a run's sampler, by room."""
-    names = [f"complete_{k:02d}" for k in range(count)]
+    count = len(names)
     coming = None if classes is None else class_rows(trained, classes)
     most = trained.config.model.max_objects
     fullest = int(given.is_object.sum(dim=1).max()) + len(classes or ())
@@ -122,32 +112,26 @@ def _drawn(
     answers = []
     for scene, one in zip(scenes, given.split(1), strict=True):
         frame = None if scene.floor_m is None else floor_rectangle(scene).expand(count, -1)
-        whole = Given(
-            repeated(one, count), frame, None if coming is None else coming.expand(count, -1)
-        )
-        rooms = sample_scenes(trained, names, seed, whole)
+        wanted = None if coming is None else coming.expand(count, -1)
+        rooms = sample_scenes(trained, names, seed, Given(repeated(one, count), frame, wanted))
         assert trained.sampler is not None, "drawn_by_sampler has asked"
         may_meet = trained.sampler.may_meet.cpu().numpy()
         made = [insert(room, scene, may_meet, seed=seed) for room in rooms]
-        answers.append([_with_no_place(room, classes) for room in made])
+        if classes is not None:
+            made = [_with_no_place(room, classes) for room in made]
+        answers.append(made)
     return answers
 
 
-def _with_no_place(room: Scene, classes: Sequence[str] | None) -> Scene:
+def _with_no_place(room: Scene, classes: Sequence[str]) -> Scene:
     """An answer with `extra["no_place"]`: the requested objects that it lacks, by class."""
-    if classes is None:
-        return room
     added = Counter(item.label for item in room.objects[len(room.extra["given"]) :])
     lacking = sorted((Counter(classes) - added).elements())
     return replace(room, extra={**room.extra, "no_place": lacking})
 
 
 def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> RoomBoxes:
-    """Given objects as tensors.
-
-    Raises:
-        InputError: a class is not in the run's label set, a box is invalid, or there are too many.
-    """
+    """Given objects as tensors; an `InputError` for those that the run cannot use."""
     config = trained.config
     names, most = label_set(config.label_set), config.model.max_objects
     counts = torch.tensor([len(scene.objects) for scene in scenes])
@@ -195,7 +179,7 @@ def _starts(
     return torch.cat([z[some.argsort(stable=True)[:each]] for some in losses])
 
 
-def fit_latents(
+def fit_latents_to_objects(
     trained: TrainedPrior,
     starts: Float[Tensor, "rooms dimension"],
     given: RoomBoxes,

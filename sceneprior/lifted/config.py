@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
-from pydantic import model_validator
+from pydantic import Field, model_validator
 from torch import nn
 
 from sceneprior.core.errors import ShardError
+from sceneprior.core.settings import Section
 from sceneprior.core.shards import list_shards
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.lifting.lifted import ShapeGrid
@@ -17,9 +18,9 @@ from sceneprior.lifted.occupancy import OccupancyConfig, OccupancyDecoder
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.rooms import SamplerRooms
 from sceneprior.lifted.sampler.settings import SamplerConfig
-from sceneprior.lifted.settings import LiftedLossConfig, LiftedSamplingConfig, LiftedStageConfig
 from sceneprior.lifted.trained import SAMPLER, TrainedLifted
 from sceneprior.paper.prior import ModelConfig
+from sceneprior.paper.settings import LatentStageConfig
 from sceneprior.paper.trained import PriorConfig
 from sceneprior.paper.transformer import TransformerConfig
 from sceneprior.training.method import Stage, ready_copy
@@ -27,6 +28,42 @@ from sceneprior.training.method import Stage, ready_copy
 if TYPE_CHECKING:
     from sceneprior.lifted.sampler.stage import SamplerStage
     from sceneprior.lifted.stages import LiftedStage
+
+
+class LiftedLossConfig(Section):
+    """Weights of the losses against lifted boxes and shapes."""
+
+    class_: float = Field(1.0, ge=0, alias="class")
+    box: float = Field(5.0, ge=0)
+    completeness: float = Field(1.0, ge=0)
+    shape: float = Field(2.0, ge=0)
+    """Weight of the distance between decoded and lifted shapes."""
+    latents: float = Field(0.0, ge=0)
+    """Weight of the sliced Wasserstein distance between the training rooms' logits and N(0, 1),
+    from which the logits of new rooms are sampled; with it, a larger part of the sphere decodes
+    into rooms."""
+    match_box: float = Field(5.0, ge=0)
+    """lambda_B of the matching cost."""
+
+
+class LiftedStageConfig(LatentStageConfig):
+    """Training of the network and latents on lifted boxes and shapes at once. The learning rate
+    follows a cosine."""
+
+    decoder_learning_rate: float | None = Field(None, gt=0)
+    """Learning rate of the shape decoder; None takes `learning_rate`."""
+
+    @property
+    def shape_rate(self) -> float:
+        return self.decoder_learning_rate or self.learning_rate
+
+
+class LiftedSamplingConfig(Section):
+    """Sampling of new rooms."""
+
+    distribution: Literal["sampler", "kernel", "paper"] = "paper"
+    """`sampler`: drawn object by object, without a latent (needs the section `sampler`). The others
+    are distributions of latents, as in a run of the paper's method."""
 
 
 class LiftedModel(ModelConfig):

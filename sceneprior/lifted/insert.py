@@ -28,14 +28,11 @@ def insert(
       `match_scenes`). A given object without a mesh takes the mesh of its match;
     - of the others, those that overlap a given one badly (`BADLY`), unless their classes may.
 
-    Args:
-        room: Generated, or any other room.
-        given: Objects, and optionally a floor, which the result keeps.
-        may_meet: Pairs of classes that may overlap, such as a chair and its table; None: no pair.
-        extra: For the JSON, beside `given` (the rows of the given objects), `replaced` and
-            `removed` (the number of objects removed for either reason), and `replaced_off_m`
-            (mean distance, over centre and sides, between the matches and the given objects; null
-            if none).
+    The result has the floor of `given`. `may_meet` are pairs of classes that may overlap, such as a
+    chair and its table; None: no pair. `extra` goes into the JSON beside `given` (the rows of the
+    given objects), `replaced` and `removed` (the number of objects removed for either reason), and
+    `replaced_off_m` (mean distance, over centre and sides, between the matches and the given
+    objects; null if none).
     """
     given = replace(given, label_set=room.label_set)
     partners = _partners(room, given)

@@ -1,6 +1,7 @@
-"""The layout loss (Eq. 7) against lifted 3D boxes instead of 2D boxes in views.
+"""The layout loss (Eq. 7) against lifted 3D boxes instead of 2D boxes in views; and the losses of
+shapes and latents.
 
-Not in the paper, which compares 2D boxes in every view at every step. `lifting` estimates each
+None is in the paper, which compares 2D boxes in every view at every step. `lifting` estimates each
 object's 3D box from its masks beforehand, so boxes are compared in 3D, and no frustum loss is
 needed.
 """
@@ -19,6 +20,8 @@ from sceneprior.paper.losses.matching import Matches, assign, class_cost
 PER_METRE = 1 / 6
 """Weight of a metre: the share of the image's width that 1 m spans at a distance of 3 m and a field
 of view of 90 degrees. So lambda_box and lambda_B have about the same effect as for 2D boxes."""
+DIRECTIONS = 32
+"""Projection directions per step; they are drawn anew in each step, so a stage uses thousands."""
 
 
 @torch.no_grad()
@@ -85,13 +88,43 @@ def shape_code_loss(
 
     Squared distances of the codes a count differing grid cells, and cells_j is the number of cells
     that the lifted shape fills. Without the division, a lamp on a cord, which fills a hundredth of
-    its box, would hardly be learnt.
-
-    Args:
-        scenes: With `shape_codes`.
-        matches: As `match_lifted` gives them.
-        codes, cells: Codes and filled cells of the objects' looks (`OccupancyDecoder.targets`).
+    its box, would hardly be learnt. `codes` and `cells` are those of the objects' looks
+    (`OccupancyDecoder.targets`).
     """
     assert scenes.shape_codes is not None, "the prior decodes looks"
     apart = take(scenes.shape_codes, matches.prediction, dim=1) - codes
     return mean_of_objects(apart.square().sum(dim=-1) / cells, matches.valid)
+
+
+def latent_loss(
+    logits: Float[Tensor, "rooms logits"], shift_free: bool, generator: torch.Generator
+) -> Float[Tensor, ""]:
+    """Sliced Wasserstein penalty that matches the training latents to the sampling distribution.
+
+    The paper samples new rooms from the whole sphere, while the latents of training rooms may end
+    up where hardly any sample falls. This is the sliced Wasserstein distance (Bonneel et al. 2015),
+    applied to latents as in Kolouri et al. 2018 (sliced Wasserstein autoencoders), between the
+    logits of all training rooms and as many from N(0, 1).
+
+    With `shift_free`, adding a constant to a room's logits changes nothing, as on the sphere; the
+    distance then ignores it, too. `generator`, on the CPU, draws normal logits and directions.
+    """
+    normal = torch.randn(logits.shape, generator=generator).to(logits)
+    directions = torch.randn(logits.shape[1], DIRECTIONS, generator=generator).to(logits)
+    if shift_free:
+        logits = logits - logits.mean(dim=1, keepdim=True)
+        normal = normal - normal.mean(dim=1, keepdim=True)
+    return sliced_wasserstein(logits, normal, F.normalize(directions, dim=0))
+
+
+def sliced_wasserstein(
+    some: Float[Tensor, "points dimension"],
+    others: Float[Tensor, "points dimension"],
+    directions: Float[Tensor, "dimension directions"],
+) -> Float[Tensor, ""]:
+    """The mean over directions of the squared 2-Wasserstein distance of the projected points.
+
+    In one dimension, the optimal transport between two sets of n points keeps their order.
+    """
+    moved = (some @ directions).sort(dim=0).values - (others @ directions).sort(dim=0).values
+    return moved.square().mean()

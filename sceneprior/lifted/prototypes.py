@@ -71,8 +71,8 @@ class Prototypes(NamedTuple):
                 np.flatnonzero(all_ == label) for all_ in (object_class, self.object_class)
             )
             if len(own):
-                ours = described(grids[rows], sizes_m[rows])
-                apart, pose = distances(ours, described(self.grids[own], self.sizes_m[own]))
+                theirs = (self.grids[own], self.sizes_m[own])
+                apart, pose = distances((grids[rows], sizes_m[rows]), theirs)
                 nearest = apart.argmin(axis=1)
                 looks[rows] = own[nearest] * POSES + pose[np.arange(len(rows)), nearest]
         return looks
@@ -94,7 +94,7 @@ def choose_prototypes(
     apart = []
     for label in np.unique(object_class[usable]):
         rows = np.flatnonzero((object_class == label) & usable)
-        own = described(grids[rows], sizes_m[rows])
+        own = (grids[rows], sizes_m[rows])
         apart.append((rows, distances(own, own)[0]))
     alike = ALIKE
     items, common = _covering(apart, alike)
@@ -148,35 +148,25 @@ def looks_apart(
     return placed
 
 
-class Described(NamedTuple):
-    """Features by which objects are compared."""
-
-    coarse: Float[np.ndarray, "objects u v w"]
-    log_sizes: Float[np.ndarray, "objects 3"]
-
-
-def described(
-    grids: Bool[np.ndarray, "objects x y z"], sizes_m: Float[np.ndarray, "objects 3"]
-) -> Described:
-    """Coarse grids and logarithms of extents."""
-    return Described(pooled(grids, COARSE), np.log(sizes_m))
-
-
 def distances(
-    objects: Described, offered: Described
+    objects: tuple[Bool[np.ndarray, "objects x y z"], Float[np.ndarray, "objects 3"]],
+    offered: tuple[Bool[np.ndarray, "offered x y z"], Float[np.ndarray, "offered 3"]],
 ) -> tuple[Float[np.ndarray, "objects offered"], Int[np.ndarray, "objects offered"]]:
-    """Distance of each object from each offered one in the latter's best pose, and that pose; the
-    first of equal ones."""
-    own, theirs = (each.coarse.reshape(len(each.coarse), -1) for each in (objects, offered))
-    own = own.astype(np.float64)
+    """Distance of each object (grids, extents in metres) from each offered one in the latter's best
+    pose, and that pose; the first of equal ones."""
+    (coarse, log_sizes), (offered_coarse, offered_sizes) = (
+        (pooled(grids, COARSE), np.log(sizes_m)) for grids, sizes_m in (objects, offered)
+    )
+    own = coarse.reshape(len(coarse), -1).astype(np.float64)
+    theirs = offered_coarse.reshape(len(offered_coarse), -1)
     filled = np.sqrt(np.outer(own.sum(axis=1), theirs.sum(axis=1))).clip(min=1e-9)
-    apart = np.full((len(own), len(offered.coarse)), np.inf)
-    best = np.zeros(apart.shape, dtype=np.int64)
+    apart = np.full(filled.shape, np.inf)
+    best = np.zeros(filled.shape, dtype=np.int64)
     for pose in range(POSES):
-        turned = turn_grids(offered.coarse, *turn_of(pose)).reshape(len(offered.coarse), -1)
+        turned = turn_grids(offered_coarse, *turn_of(pose)).reshape(theirs.shape)
         squared = (own**2).sum(1)[:, None] + (turned**2).sum(1) - 2 * own @ turned.T
-        sizes = turned_extents(offered.log_sizes, pose)
-        differ = np.abs(objects.log_sizes[:, None] - sizes).sum(2)
+        sizes = turned_extents(offered_sizes, pose)
+        differ = np.abs(log_sizes[:, None] - sizes).sum(2)
         found = squared / filled + SIZE_WEIGHT * differ
         better = found < apart - 1e-9
         best[better], apart[better] = pose, found[better]

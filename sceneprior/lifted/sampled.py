@@ -11,7 +11,6 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.threads import single_threaded
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.occupancy import OccupancyDecoder
 from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.lifted.sampler.plan import Given
@@ -21,11 +20,7 @@ from sceneprior.paper.trained import TrainedPrior
 
 def drawn_by_sampler(trained: TrainedPrior, distribution: str | None) -> TrainedLifted | None:
     """`trained` if its sampler is to draw new rooms, by `distribution` or else by the run's own
-    settings; None if new rooms come from latents.
-
-    Raises:
-        InputError: the sampler is asked for, but the run has none, or has not trained it yet.
-    """
+    settings; None if new rooms come from latents. An `InputError` if there is no sampler yet."""
     if (distribution or trained.distribution) != SAMPLER:
         return None
     if not isinstance(trained, TrainedLifted) or trained.sampler is None:
@@ -41,16 +36,11 @@ def sample_scenes(
     trained: TrainedLifted, names: Sequence[str], seed: int, given: Given | None = None
 ) -> list[Scene]:
     """A new room with meshes for each name; see `draw_rooms`."""
-    assert trained.sampler is not None, "callers ask trained.sampler first"
-    rooms = draw_rooms(trained.sampler, len(names), seed, given)
-    return looks_to_scenes(trained, rooms, names)
-
-
-def looks_to_scenes(trained: TrainedLifted, rooms: RoomBoxes, names: Sequence[str]) -> list[Scene]:
-    """Scenes of rooms whose objects have looks, with meshes from the run's shape decoder."""
-    assert rooms.looks is not None and trained.sampler is not None
-    shapes = trained.prior.shape
+    sampler, shapes = trained.sampler, trained.prior.shape
+    assert sampler is not None, "callers ask trained.sampler first"
     assert isinstance(shapes, OccupancyDecoder), "whose looks the sampler draws"
+    rooms = draw_rooms(sampler, len(names), seed, given)
+    assert rooms.looks is not None
     classes = label_set(trained.config.label_set)
     scenes = []
     for row, name in enumerate(names):
@@ -59,7 +49,7 @@ def looks_to_scenes(trained: TrainedLifted, rooms: RoomBoxes, names: Sequence[st
             box = rooms.boxes_m[row, item].double().numpy()
             look, index = int(rooms.looks[row, item]), int(rooms.object_class[row, item])
             # A given object whose class has no prototype gets no mesh.
-            known = int(trained.sampler.look_class[look]) == index
+            known = int(sampler.look_class[look]) == index
             mesh = shapes.mesh(look, box) if known else None
             label = classes[index]
             objects.append(SceneObject(label, tuple(box[:3]), tuple(box[3:]), mesh))

@@ -4,16 +4,16 @@ import torch
 from torch import Tensor
 
 from sceneprior.core.views import LiftedRooms
-from sceneprior.lifted.latent_loss import latent_loss
+from sceneprior.lifted.config import LiftedLossConfig, LiftedStageConfig
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.losses import (
+    latent_loss,
     lifted_losses,
     match_lifted,
     needed_predictions,
     shape_code_loss,
 )
 from sceneprior.lifted.occupancy import OccupancyDecoder
-from sceneprior.lifted.settings import LiftedLossConfig, LiftedStageConfig
 from sceneprior.paper.stages import LatentStage
 from sceneprior.training.steps import batch_seed, full_precision
 
@@ -47,11 +47,8 @@ class LiftedStage(LatentStage):
             targets = self.looks.targets(rooms.looks.clamp(min=0))
             losses["shape"] = shape_code_loss(scenes, known, *targets)
             if self.loss.latents:
-                losses["latents"] = self._latent_loss(batch_idx)
+                seed = batch_seed(self.seed, self.trainer, batch_idx) + 1  # not the noise's
+                generator = torch.Generator().manual_seed(seed)
+                space = self.prior.latent_space
+                losses["latents"] = latent_loss(self.latents.weight, space.shift_free, generator)
             return self.total(losses, rooms)
-
-    def _latent_loss(self, batch_idx: int) -> Tensor:
-        generator = torch.Generator().manual_seed(
-            batch_seed(self.seed, self.trainer, batch_idx) + 1  # a seed other than the noise's
-        )
-        return latent_loss(self.latents.weight, self.prior.latent_space.shift_free, generator)

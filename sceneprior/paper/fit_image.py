@@ -117,7 +117,7 @@ def view_loss(
     return ViewLoss(total + weights.mask * mask, score, overlap["mask_iou"], matches)
 
 
-def fit_latents(
+def fit_latents_to_images(
     trained: TrainedPrior,
     views: SceneViews,
     start: Float[Tensor, "images width"],

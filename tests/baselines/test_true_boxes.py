@@ -139,5 +139,6 @@ def test_only_baselines_with_3d_supervision_read_the_ground_truth():
     readers = {n for n in importers["sceneprior.core.ground_truth"] if n.startswith(trains)}
     views = "baselines/single_view"
     assert readers == {f"{views}/truth.py", "lifted/reconstruction/known_rooms.py"}
-    assert importers["TruthDataset"] == {"baselines/box_training.py"}
+    assert importers["TruthDataset"] == set()
+    assert importers["BoxConfig"] == {"baselines/atiss/stage.py", "baselines/sync2gen/stage.py"}
     assert importers["TrueViewDataset"] == {f"{views}/total3d.py"}

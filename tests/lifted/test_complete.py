@@ -17,7 +17,7 @@ from sceneprior.lifted.complete import (
     BOX_WEIGHT,
     _starts,
     complete,
-    fit_latents,
+    fit_latents_to_objects,
     gather_given,
     given_loss,
     log_kept,
@@ -136,7 +136,7 @@ def test_the_fit_comes_nearer_and_stays_on_the_sphere(trained):
         usual = given_loss(
             trained.prior.decode(drawn, with_shape=False), repeated(given, 100)
         ).mean()
-    z, after = fit_latents(trained, starts, each, FEW)
+    z, after = fit_latents_to_objects(trained, starts, each, FEW)
     assert (before < usual).all() and (before.diff() >= 0).all()  # chosen, best first
     assert (after < before).all()
     torch.testing.assert_close(z.norm(dim=1), torch.ones(4))
@@ -166,13 +166,13 @@ def test_the_fit_finds_the_one_latent_that_fits_and_is_held_by_its_start(trained
     given = repeated(gather_given(dial, [scene(bed)]), 3)
     starts = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [0, 1, 0], [-1, -1, 1]]))
     monkeypatch.setattr("sceneprior.lifted.complete.START_WEIGHT", 0.0)
-    z, left = fit_latents(dial, starts, given)
+    z, left = fit_latents_to_objects(dial, starts, given)
     torch.testing.assert_close(z, wanted.expand(3, -1), rtol=0, atol=0.01)  # the last step's length
     torch.testing.assert_close(left, torch.zeros(3), rtol=0, atol=0.05)
     monkeypatch.setattr("sceneprior.lifted.complete.START_WEIGHT", 1000.0)
-    z, _ = fit_latents(dial, starts, given)
+    z, _ = fit_latents_to_objects(dial, starts, given)
     torch.testing.assert_close(z, starts, rtol=0, atol=0.02)
-    torch.testing.assert_close(fit_latents(dial, starts, given, steps=0)[0], starts)
+    torch.testing.assert_close(fit_latents_to_objects(dial, starts, given, steps=0)[0], starts)
 
 
 def test_nothing_given_is_what_the_run_generates(trained):

@@ -5,7 +5,7 @@ from scipy.optimize import linear_sum_assignment
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.lifted.latent_loss import latent_loss, sliced_wasserstein
+from sceneprior.lifted.losses import latent_loss, sliced_wasserstein
 
 
 def points(rows, columns, seed):

@@ -9,7 +9,6 @@ from sceneprior.core.geometry.turns import turn_grids
 from sceneprior.lifted.prototypes import (
     POSES,
     choose_prototypes,
-    described,
     distances,
     looks_apart,
     pooled,
@@ -79,7 +78,7 @@ def test_what_is_not_usable_is_no_prototype():
 def test_distances_are_those_of_a_loop():
     grids = RNG.random((3, CELLS, CELLS, CELLS)) < 0.5
     sizes = RNG.uniform(0.3, 2, (3, 3))
-    ours, pose = distances(described(grids, sizes), described(grids[:2], sizes[:2]))
+    ours, pose = distances((grids, sizes), (grids[:2], sizes[:2]))
     for a in range(3):
         for b in range(2):
             each = []
@@ -99,7 +98,7 @@ def test_thin_things_are_as_far_apart_as_full_ones(layers):
     both = np.zeros((2, CELLS, CELLS, CELLS), dtype=bool)
     both[0, :, :layers], both[1, :, -layers:] = True, True
     sizes = np.ones((2, 3))
-    apart, _ = distances(described(both, sizes), described(both, sizes))
+    apart, _ = distances((both, sizes), (both, sizes))
     assert apart == pytest.approx(np.array([[0, 2], [2, 0]]))
 
 

@@ -16,7 +16,7 @@ from sceneprior.paper.fit_image import (
     SCHEDULES,
     FitSchedule,
     decode_images,
-    fit_latents,
+    fit_latents_to_images,
     view_loss,
 )
 
@@ -57,7 +57,7 @@ def by_pytorch(trained, views, start, schedule):
 
 
 def test_it_is_pytorchs_rmsprop_with_the_papers_drop(trained, views, start):
-    fit = fit_latents(trained, views, start, SHORT)
+    fit = fit_latents_to_images(trained, views, start, SHORT)
     assert_close(fit.z, by_pytorch(trained, views, start, SHORT), rtol=1e-4, atol=1e-5)
     assert_close(fit.z.norm(dim=1), torch.ones(len(start)), rtol=1e-6, atol=0)
     assert fit.steps.tolist() == [12] * len(start)
@@ -65,7 +65,7 @@ def test_it_is_pytorchs_rmsprop_with_the_papers_drop(trained, views, start):
 
 def test_the_network_stays_as_it_was(trained, views, start):
     before = {name: value.clone() for name, value in trained.prior.state_dict().items()}
-    fit_latents(trained, views, start, SHORT)
+    fit_latents_to_images(trained, views, start, SHORT)
     assert all(
         torch.equal(before[name], value) for name, value in trained.prior.state_dict().items()
     )
@@ -74,25 +74,27 @@ def test_the_network_stays_as_it_was(trained, views, start):
 def test_the_score_never_rises_and_mostly_falls(trained, views, start):
     with torch.no_grad():
         before = view_loss(trained, decode_images(trained, start, views), views)
-    fit = fit_latents(trained, views, start, FitSchedule(steps=60, drop_at=40))
+    fit = fit_latents_to_images(trained, views, start, FitSchedule(steps=60, drop_at=40))
     assert (fit.loss.score <= before.score + 1e-6).all()
     assert fit.loss.score.mean() < before.score.mean() - 0.05
 
 
 def test_alone_or_among_others_an_image_has_the_same_answer(trained, views, start):
-    together = fit_latents(trained, views, start, SHORT)
+    together = fit_latents_to_images(trained, views, start, SHORT)
     for row in range(len(start)):
-        alone = fit_latents(trained, rows_of(views, torch.tensor([row])), start[:1], SHORT)
+        alone = fit_latents_to_images(
+            trained, rows_of(views, torch.tensor([row])), start[:1], SHORT
+        )
         # Sums in another order; a matching that is a tie could still tell them apart.
         assert_close(alone.z[0], together.z[row], rtol=1e-3, atol=1e-4)
 
 
 def test_images_that_do_not_move_stop_early_and_others_go_on(trained, views, start):
     hopeless = FitSchedule(steps=60, drop_at=50, patience=20, least_gain=2.0)
-    fit = fit_latents(trained, views, start, hopeless)
+    fit = fit_latents_to_images(trained, views, start, hopeless)
     # Nothing gains 200%: down at the first check, done at the second.
     assert fit.steps.tolist() == [40] * len(start)
-    eager = fit_latents(trained, views, start, replace(hopeless, patience=0))
+    eager = fit_latents_to_images(trained, views, start, replace(hopeless, patience=0))
     assert eager.steps.tolist() == [60] * len(start)
     assert (eager.loss.score <= fit.loss.score + 1e-6).all()
 
@@ -119,7 +121,9 @@ def test_images_of_fewer_objects_go_on_when_the_full_ones_are_done(
         return loss._replace(score=torch.tensor(score))
 
     monkeypatch.setattr(fitting, "view_loss", staged)
-    fit = fit_latents(trained, views, start, FitSchedule(50, 20, patience=20, least_gain=0.0))
+    fit = fit_latents_to_images(
+        trained, views, start, FitSchedule(50, 20, patience=20, least_gain=0.0)
+    )
     assert fit.steps.tolist() == [40 if name in full else 50 for name in views.room_ids]
 
 
@@ -128,7 +132,7 @@ def test_the_papers_schedule():
 
 
 def test_without_masks_only_the_layout_counts(trained, views, start):
-    fit = fit_latents(trained, views, start, SHORT, masks=False)
+    fit = fit_latents_to_images(trained, views, start, SHORT, masks=False)
     assert (fit.loss.mask_iou == 0).all()
     assert torch.equal(fit.loss.score, fit.loss.total)
 
@@ -144,4 +148,4 @@ def test_more_objects_than_the_prior_generates(trained, views, start):
         sides_clear=views.sides_clear[:, :, many],
     )
     with pytest.raises(InputError, match=r"toy_test_00_view\d shows 7 objects, but .* at most 6"):
-        fit_latents(trained, crowded, start)
+        fit_latents_to_images(trained, crowded, start)

@@ -17,7 +17,7 @@ from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import SceneViews
 from sceneprior.lifted.reconstruction.objects import answer_images
 from sceneprior.paper.decode import scene_of
-from sceneprior.paper.fit_image import SCHEDULES, fit_latents, refuse_crowds, view_loss
+from sceneprior.paper.fit_image import SCHEDULES, fit_latents_to_images, refuse_crowds, view_loss
 from sceneprior.paper.trained import TrainedPrior, with_training_latents
 from sceneprior.training.method import Trained, TrainedReconstructor
 
@@ -156,7 +156,7 @@ def _reconstruct_batch(
     starts = starting_latents(trained, views, options.restarts)
     repeated = rows_of(views, torch.arange(len(images)).repeat_interleave(options.restarts))
     schedule = SCHEDULES[options.fit]
-    fit = fit_latents(trained, repeated, starts.flatten(0, 1), schedule, options.masks)
+    fit = fit_latents_to_images(trained, repeated, starts.flatten(0, 1), schedule, options.masks)
     best = fit.loss.score.reshape(len(images), -1).argmin(dim=1)
     rows = best + options.restarts * torch.arange(len(images))
     labels = trained.config.label_set

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from sceneprior.baselines.atiss.encoder import EncoderConfig
 from sceneprior.baselines.atiss.logistics import LogisticMixture
 from sceneprior.core.mixtures import draw_index
+from sceneprior.core.settings import Section
 from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.layers import mlp
 
@@ -29,6 +29,28 @@ OCTAVES = 8
 published 32 octaves exceed the precision of float32."""
 BATCH = 256
 """Rooms per batch in sampling."""
+
+
+class EncoderConfig(Section):
+    """Size of the encoder, which ATISS-2D has as well; the defaults are the published settings."""
+
+    layers: int = Field(4, ge=1, le=100)
+    heads: int = Field(8, ge=1)
+    """Attention heads; must divide the width."""
+    hidden: int = Field(1024, ge=8)
+    """Inner width of the feed-forward layers."""
+    dropout: float = Field(0.1, ge=0, lt=1)
+
+    def build_layers(self, width: int, norm_first: bool = False) -> nn.ModuleList:
+        """Freshly initialised layers, each with its own weights. `nn.TransformerEncoder` would
+        start with copies of one layer."""
+        return nn.ModuleList(
+            nn.TransformerEncoderLayer(
+                width, self.heads, self.hidden, self.dropout, "gelu",
+                batch_first=True, norm_first=norm_first,
+            )
+            for _ in range(self.layers)
+        )  # fmt: skip
 
 
 class AtissModel(EncoderConfig):

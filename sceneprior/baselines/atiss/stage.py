@@ -8,8 +8,8 @@ from pydantic import Field
 from torch import Tensor
 
 from sceneprior.baselines.atiss.network import END, Atiss, AtissModel
-from sceneprior.baselines.box_training import BoxConfig, room_means
 from sceneprior.baselines.one_stage import OneStage, OneStageTraining
+from sceneprior.baselines.true_boxes import BoxConfig, room_means
 from sceneprior.core.views import RoomBoxes
 from sceneprior.training.steps import batch_seed, full_precision
 
@@ -55,11 +55,8 @@ class AtissStage(OneStage):
 
 
 def part_of_rooms(rooms: RoomBoxes, seed: int) -> tuple[RoomBoxes, RoomBoxes]:
-    """Shuffle each room's n objects and keep the first k, with k drawn evenly from 0 to n.
-
-    Returns:
-        The kept objects, and the next object of each room, whose class is `END` if all are kept.
-    """
+    """Shuffle each room's n objects and keep the first k, with k drawn evenly from 0 to n. Also
+    returns the next object of each room, whose class is `END` if all are kept."""
     generator = torch.Generator().manual_seed(seed)
     count = rooms.is_object.sum(dim=1)
     device = rooms.boxes_m.device

@@ -42,9 +42,6 @@ class MapDiscriminator(nn.Module):
         """Scores of patches and of rooms; higher means more real.
 
         A room's features are the mean and the maximum over its views, of any order and number.
-
-        Raises:
-            InputError: the maps are smaller than `SMALLEST_PX`.
         """
         height, width = maps.shape[-2:]
         if min(height, width) < SMALLEST_PX:

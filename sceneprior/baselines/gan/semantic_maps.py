@@ -24,9 +24,8 @@ def observed_maps(
 ) -> Float[Tensor, "rooms views classes height width"]:
     """Maps of the observed views; pixels without an object are `void`."""
     ids = views.observed_ids.long()
-    of_id = F.pad(
-        views.object_class, (1, 1), value=VOID
-    )  # id 0 is nothing, the last id void furniture
+    # Id 0 is nothing, the last id void furniture.
+    of_id = F.pad(views.object_class, (1, 1), value=VOID)
     pixels = of_id.gather(1, ids.flatten(1)).view_as(ids)
     maps = F.one_hot(pixels, classes).movedim(-1, 2).to(views.intrinsics.dtype)
     return F.avg_pool2d(maps.flatten(0, 1), POOLING).unflatten(0, maps.shape[:2])
@@ -115,13 +114,8 @@ def compose_maps(
 
         visible_k = a_k * prod_{j nearer than k} (1 - a_j),    a_k = kept_k coverage_k
 
-    The rest of the pixel is `void`, so that the classes of a map sum to 1.
-
-    Args:
-        coverage: Of each object rendered alone, in [0, 1].
-        depth_m: Of each object; it has no gradient.
-        kept: Existence of each object.
-        classes: Shares that sum to 1, with none of `void`.
+    a_k is the object's coverage when rendered alone, if it exists; depths have no gradient. Objects
+    have no share of `void`, which is the rest of the pixel, so that the classes of a map sum to 1.
     """
     alpha = coverage * kept[:, None, :, None, None]
     order = depth_m.argsort(dim=2)

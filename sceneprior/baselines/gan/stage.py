@@ -37,7 +37,7 @@ from sceneprior.paper.trained import PriorConfig
 from sceneprior.paper.transformer import TransformerConfig
 from sceneprior.training.method import Stage
 from sceneprior.training.settings import TrainConfig
-from sceneprior.training.steps import check_finite, full_precision
+from sceneprior.training.steps import check_finite, full_precision, log_losses
 
 BETAS = (0.0, 0.99)
 """Betas of both Adam optimisers. Momentum would follow an opponent that has moved on."""
@@ -180,14 +180,12 @@ class GanStage(lightning.LightningModule):
         self.discriminator.requires_grad_(True)
         self.average(list(self.prior.parameters()), list(self.generator.parameters()), 0)
         logged = {
-            "loss": loss,
             "discriminator": discriminator_loss,
             "real_score": torch.stack([score.mean() for score in real_scores]).mean(),
             "fake_score": torch.stack([score.mean() for score in fake_scores]).mean(),
             "objects": counts.sum(dim=1).mean(),
         }
-        logged = {f"train/{name}": value.detach() for name, value in logged.items()}
-        self.log_dict(logged, on_step=False, on_epoch=True, batch_size=len(counts))
+        log_losses(self, logged, loss, len(counts))
 
     def on_train_epoch_start(self) -> None:
         """Reduce the rates linearly to 0, which ends the oscillation of the two networks."""

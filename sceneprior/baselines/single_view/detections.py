@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int, Integer
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.core.geometry.cameras import camera_centers
@@ -24,7 +24,7 @@ CHANNELS = 6
 """Channels of a crop: the mask, all other masks with void, the inside of the image, and the pixels'
 rays (3)."""
 NUMBERS = 26
-"""Numbers beside a mask's crop and class, see `_numbers`."""
+"""Numbers beside a mask's crop and class, see `Detections.numbers`."""
 NEAR_M = 0.1
 """Least depth of a centre that is projected into the image."""
 
@@ -36,10 +36,12 @@ class Detections:
     Every view of every room is an image.
     """
 
+    views: SceneViews
     image: Int[Tensor, " masks"]
     slot: Int[Tensor, " masks"]
     """Index among the masks of its image."""
     room: Int[Tensor, " masks"]
+    view: Int[Tensor, " masks"]
     item: Int[Tensor, " masks"]
     """Index of its object in the room."""
     object_class: Int[Tensor, " masks"]
@@ -52,11 +54,42 @@ class Detections:
     frame_to_camera: Float[Tensor, "masks 3 3"]
     intrinsics: Float[Tensor, "masks 3 3"]
     """Intrinsics in units of the image's width and height."""
-    crops: Float[Tensor, "masks channels rows columns"]
-    numbers: Float[Tensor, "masks numbers"]
 
     def __len__(self) -> int:
         return len(self.image)
+
+    @property
+    def numbers(self) -> Float[Tensor, "masks numbers"]:
+        """The 2D box (4), the logs of its width and height (2), its clear sides (4), the rays
+        through its middle and corners (15), and the camera's height (1)."""
+        x1, y1, x2, y2 = self.boxes.unbind(dim=-1)
+        corners = [((x1 + x2) / 2, (y1 + y2) / 2), (x1, y1), (x2, y1), (x1, y2), (x2, y2)]
+        rays = self.rays(torch.stack([torch.stack(place, dim=-1) for place in corners], dim=1))
+        sides = (self.boxes[:, 2:] - self.boxes[:, :2]).clamp(min=1e-3).log()
+        clear = self.views.sides_clear[self.room, self.view, self.item].to(sides)
+        return torch.cat([self.boxes, sides, clear, rays.flatten(1), self.eye_m[:, 1:2]], dim=-1)
+
+    @property
+    def crops(self) -> Float[Tensor, "masks channels rows columns"]:
+        """Each 2D box with its border, stretched to a square, see `CHANNELS`."""
+        ids = self.views.observed_ids[self.room, self.view]
+        steps = (torch.arange(CROP, device=ids.device) + 0.5) / CROP
+        steps = steps * (1 + 2 * MARGIN) - MARGIN
+        low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
+        place = low + steps[:, None] * (high - low)  # masks, steps, (u, v)
+        u, v = (
+            part.expand(-1, CROP, CROP) for part in (place[:, None, :, 0], place[:, :, None, 1])
+        )
+        inside = (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
+        height, width = ids.shape[1:]
+        column = (u * width).long().clamp(0, width - 1)
+        row = (v * height).long().clamp(0, height - 1)
+        seen = ids[torch.arange(len(ids), device=ids.device)[:, None, None], row, column].long()
+        seen = seen * inside
+        own = seen == self.item[:, None, None] + 1
+        rays = self.rays(torch.stack([u, v], dim=-1).flatten(1, 2)).unflatten(1, (CROP, CROP))
+        masks = torch.stack([own, (seen > 0) & ~own, inside], dim=1).to(rays)
+        return torch.cat([masks, rays.movedim(-1, 1)], dim=1)
 
     def rays(self, places: Float[Tensor, "masks points 2"]) -> Float[Tensor, "masks points 3"]:
         """Unit vectors from the camera through places (u, v), in the image's frame."""
@@ -69,13 +102,8 @@ class Detections:
     def centers_at(
         self, offsets: Float[Tensor, "masks 2"], distances_m: Float[Tensor, " masks"]
     ) -> Float[Tensor, "masks 3"]:
-        """Centres in the room.
-
-        Args:
-            offsets: From the middle of the 2D box to the projected centre, in units of the 2D box's
-                width and height.
-            distances_m: From the camera to the centre.
-        """
+        """Centres in the room, from their distances to the camera, and the offsets from the middle
+        of the 2D box to the projected centre in units of the 2D box's width and height."""
         low, high = self.boxes.split(2, dim=-1)
         place = (low + high) / 2 + offsets * (high - low)
         away = self.rays(place.unsqueeze(1))[:, 0] * distances_m.unsqueeze(-1)
@@ -130,11 +158,7 @@ def some_views(views: SceneViews, part: slice) -> SceneViews:
 
 
 def detections_of(views: SceneViews) -> Detections:
-    """The visible masks of all views.
-
-    Raises:
-        ValueError: the views were loaded without their instance ids.
-    """
+    """The visible masks of all views."""
     room, view, item = views.visible.nonzero(as_tuple=True)
     image = room * views.visible.shape[1] + view
     counts = image.bincount(minlength=1)
@@ -145,10 +169,12 @@ def detections_of(views: SceneViews) -> Detections:
     quarter = torch.remainder(-torch.round(yaw / (math.pi / 2)).long(), QUARTERS)
     height, width = views.image_size
     scale = views.intrinsics.new_tensor([[1 / width], [1 / height], [1.0]])
-    found = Detections(
+    return Detections(
+        views=views,
         image=image,
         slot=slot,
         room=room,
+        view=view,
         item=item,
         object_class=views.object_class[room, item],
         boxes=views.boxes[room, view, item],
@@ -156,45 +182,4 @@ def detections_of(views: SceneViews) -> Detections:
         eye_m=camera_centers(poses),
         frame_to_camera=turn_vectors(poses[:, :3, :3], quarter),
         intrinsics=views.intrinsics[room, view] * scale,
-        crops=poses.new_zeros(len(image), 0, 0, 0),
-        numbers=poses.new_zeros(len(image), 0),
     )
-    clear = views.sides_clear[room, view, item]
-    return replace(
-        found,
-        crops=_crops(found, views.observed_ids[room, view]),
-        numbers=_numbers(found, clear),
-    )
-
-
-def _numbers(found: Detections, clear: Bool[Tensor, "masks 4"]) -> Float[Tensor, "masks numbers"]:
-    """The 2D box (4), the logs of its width and height (2), its clear sides (4), the rays through
-    its middle and corners (15), and the camera's height (1)."""
-    x1, y1, x2, y2 = found.boxes.unbind(dim=-1)
-    corners = [((x1 + x2) / 2, (y1 + y2) / 2), (x1, y1), (x2, y1), (x1, y2), (x2, y2)]
-    rays = found.rays(torch.stack([torch.stack(place, dim=-1) for place in corners], dim=1))
-    sides = (found.boxes[:, 2:] - found.boxes[:, :2]).clamp(min=1e-3).log()
-    return torch.cat(
-        [found.boxes, sides, clear.to(sides), rays.flatten(1), found.eye_m[:, 1:2]], dim=-1
-    )
-
-
-def _crops(
-    found: Detections, ids: Integer[Tensor, "masks height width"]
-) -> Float[Tensor, "masks channels rows columns"]:
-    """Each 2D box with its border, stretched to a square, see `CHANNELS`."""
-    steps = (torch.arange(CROP, device=ids.device) + 0.5) / CROP
-    steps = steps * (1 + 2 * MARGIN) - MARGIN
-    low, high = found.boxes[:, None, :2], found.boxes[:, None, 2:]
-    place = low + steps[:, None] * (high - low)  # masks, steps, (u, v)
-    u, v = (part.expand(-1, CROP, CROP) for part in (place[:, None, :, 0], place[:, :, None, 1]))
-    inside = (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
-    height, width = ids.shape[1:]
-    column = (u * width).long().clamp(0, width - 1)
-    row = (v * height).long().clamp(0, height - 1)
-    seen = ids[torch.arange(len(ids), device=ids.device)[:, None, None], row, column].long()
-    seen = seen * inside
-    own = seen == found.item[:, None, None] + 1
-    rays = found.rays(torch.stack([u, v], dim=-1).flatten(1, 2)).unflatten(1, (CROP, CROP))
-    masks = torch.stack([own, (seen > 0) & ~own, inside], dim=1).to(rays)
-    return torch.cat([masks, rays.movedim(-1, 1)], dim=1)

@@ -2,6 +2,13 @@
 
 After Zhang et al., "Holistic 3D Scene Understanding from a Single Image with Implicit Scene
 Representation", CVPR 2021; docs/baselines_single_view.md names the differences.
+
+Shapes are sums of Gaussians in the box's frame (structured implicit functions):
+
+    f(x) = sum_k w_k exp(-|(x - p_k) / r_k|^2 / 2),    inside where f > LEVEL
+
+The box is [-1, 1]^3 and its axes are those of the image's frame. A Gaussian is seven numbers: its
+centre p_k (3), and the logs of its radii r_k (3) and of its weight w_k.
 """
 
 from collections.abc import Iterator
@@ -11,15 +18,9 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from sceneprior.baselines.one_stage import OneStage
-from sceneprior.baselines.single_view.blobs import (
-    Blobs,
-    cell_centers,
-    occupancy_logits,
-    occupancy_loss,
-    overlap_loss,
-)
 from sceneprior.baselines.single_view.detections import Detections, detections_of
 from sceneprior.baselines.single_view.network import Placed, ViewNetwork, as_numpy, last_layer
 from sceneprior.baselines.single_view.total3d import (
@@ -30,19 +31,24 @@ from sceneprior.baselines.single_view.total3d import (
     DetectorModel,
     DetectorTraining,
     Estimate,
+    TrueObjects,
     corner_loss,
     estimate_losses,
+    mean_of_masks,
     pair_geometry,
     presence,
     smooth_l1,
     true_objects,
 )
-from sceneprior.baselines.single_view.truth import TrueViews
+from sceneprior.baselines.single_view.truth import CELLS, TrueViews
 from sceneprior.core.geometry.isosurface import surface_of
+from sceneprior.core.geometry.turns import turn_vectors
 from sceneprior.core.scene import Mesh
 from sceneprior.paper.layers import mlp
 from sceneprior.training.steps import full_precision
 
+STEEP, LEVEL = 10.0, 0.5
+"""The occupancy logit of a point is STEEP (f - LEVEL)."""
 FINE = 32
 """Cells along each side of the grid that a mesh is taken from."""
 
@@ -129,6 +135,45 @@ class SceneGraph(nn.Module):
         return nodes
 
 
+class Blobs(nn.Module):
+    """The Gaussians of each mask's shape, from its features."""
+
+    start: Tensor
+
+    def __init__(self, width: int, count: int):
+        super().__init__()
+        self.layer = last_layer(width, 7 * count)
+        spread = torch.rand(count, 3, generator=torch.Generator().manual_seed(0))
+        self.register_buffer("start", 1.6 * spread - 0.8)
+
+    def forward(self, features: Float[Tensor, "masks width"]) -> Float[Tensor, "masks blobs 7"]:
+        """Seven numbers for each Gaussian. Before training, centres are about `start`."""
+        blobs = self.layer(features).float().unflatten(-1, (-1, 7))
+        centers, log_radii, log_weights = blobs.split([3, 3, 1], dim=-1)
+        centers = (self.start + centers).clamp(-1.2, 1.2)
+        return torch.cat([centers, log_radii - 1.0, log_weights - 0.7], dim=-1)
+
+
+def occupancy_logits(
+    blobs: Float[Tensor, "*batch blobs 7"], points: Float[Tensor, "*batch points 3"]
+) -> Float[Tensor, "*batch points"]:
+    """Logits of points being inside, positive where they are."""
+    centers, log_radii, log_weights = blobs.split([3, 3, 1], dim=-1)
+    # |(x - p) / r|^2 as matrix products, without a tensor of masks x points x blobs x 3.
+    inverse = torch.exp(-2 * log_radii)
+    squares = points**2 @ inverse.transpose(-1, -2)
+    squares = squares - 2 * points @ (centers * inverse).transpose(-1, -2)
+    squares = squares + (centers**2 * inverse).sum(dim=-1).unsqueeze(-2)
+    gaussians = torch.exp(log_weights[..., 0].unsqueeze(-2) - squares.clamp(min=0) / 2)
+    return STEEP * (gaussians.sum(dim=-1) - LEVEL)
+
+
+def cell_centers(cells: int) -> Float[Tensor, "points 3"]:
+    """Centres of the cells of a grid that fills [-1, 1]^3; the last axis changes fastest."""
+    along = (torch.arange(cells) + 0.5) / cells * 2 - 1
+    return torch.cartesian_prod(along, along, along)
+
+
 class Im3d(ViewNetwork):
     """The detector, the graph, and the shape of each object from the graph's nodes."""
 
@@ -178,3 +223,32 @@ class Im3dStage(OneStage):
             losses["shape"] = occupancy_loss(found, blobs, true, self.settings.points)
             losses["overlap"] = overlap_loss(found, refined.in_room(found), blobs.detach())
             return self.total(losses, self.settings.weights(losses), batch.views)
+
+
+def occupancy_loss(
+    found: Detections, blobs: Float[Tensor, "masks blobs 7"], true: TrueObjects, count: int
+) -> Float[Tensor, ""]:
+    """Binary cross entropy of `count` random cells of each true box."""
+    cells = torch.randint(CELLS**3, (len(found), count), device=blobs.device)
+    inside = true.occupied.flatten(1).gather(1, cells).to(blobs)
+    logits = occupancy_logits(blobs, found.to_frame(cell_centers(CELLS).to(blobs)[cells]))
+    return mean_of_masks(F.binary_cross_entropy_with_logits(logits, inside, reduction="none"))
+
+
+def overlap_loss(
+    found: Detections, placed: Placed, blobs: Float[Tensor, "masks blobs 7"]
+) -> Float[Tensor, ""]:
+    """Depth of objects inside each other, which moves boxes apart.
+
+    It is the mean of max(0, 2 sigmoid(logit) - 1) over ordered pairs of an image's objects and over
+    the Gaussians of the first, with the logit of the Gaussian's centre in the second object.
+    Centres outside their own object do not count.
+    """
+    own = occupancy_logits(blobs, blobs[..., :3]) > 0
+    centers_m = placed.points_m(found, blobs[..., :3])
+    together = found.image.unsqueeze(0) == found.image.unsqueeze(1)
+    one, other = together.fill_diagonal_(False).nonzero(as_tuple=True)
+    away_m = centers_m[one] - placed.centers_m[other].unsqueeze(1)
+    unit = away_m / (placed.sizes_m[other].unsqueeze(1) / 2).clamp(min=1e-3)
+    logits = occupancy_logits(blobs[other], turn_vectors(unit, found.quarter[other]))
+    return mean_of_masks((2 * logits.sigmoid() - 1).clamp(min=0) * own[one])

@@ -20,14 +20,12 @@ from sceneprior.baselines.single_view.detections import Detections, detections_o
 from sceneprior.baselines.single_view.network import (
     DetectionEncoder,
     Placed,
-    ViewNetwork,
-    last_layer,
-    meshes_of,
-)
-from sceneprior.baselines.single_view.training import (
     SingleViewConfig,
     SingleViewModel,
     SingleViewTraining,
+    ViewNetwork,
+    last_layer,
+    meshes_of,
 )
 from sceneprior.baselines.single_view.truth import TrueViewDataset, TrueViews
 from sceneprior.core.geometry.corners import box_corners
@@ -42,11 +40,6 @@ BIN = math.log(FURTHEST_M / NEAREST_M) / BINS
 """Width of a bin of log distances."""
 GEOMETRY = 64
 """Sines and cosines of the four numbers that relate two 2D boxes."""
-WEIGHT_OF = {
-    "offset": "box", "size": "box", "bin": "box", "residual": "box", "refined": "box",
-    "refined_corners": "corners",
-}  # fmt: skip
-"""Setting that weighs a loss; other losses have a setting of their own name."""
 
 
 class DetectorModel(SingleViewModel):
@@ -72,8 +65,8 @@ class DetectorTraining(SingleViewTraining):
     """Weight of each mean distance between predicted and true box corners, in metres."""
 
     def weights(self, losses: Iterable[str]) -> dict[str, float]:
-        """Weight of each loss, by its name."""
-        return {name: getattr(self, WEIGHT_OF.get(name, name)) for name in losses}
+        """Weight of each loss: the setting of its name, with or without `refined_`, or `box`."""
+        return {name: getattr(self, name.removeprefix("refined_"), self.box) for name in losses}
 
 
 class DetectorConfig(SingleViewConfig):

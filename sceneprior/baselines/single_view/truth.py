@@ -41,42 +41,35 @@ class TrueViews(NamedTuple):
 
 
 class TrueViewDataset(ViewDataset):
-    """A `ViewDataset` of unturned rooms with the boxes and shapes of their ground truth.
-
-    Raises:
-        ShardError: a room has no ground truth, or a model is missing.
-    """
+    """A `ViewDataset` of unturned rooms with the boxes and shapes of their ground truth."""
 
     def __init__(self, folder: Path, split: str, **options: Any):
         super().__init__(folder, split, **options)
         true = [_read(folder, shard, room_id) for shard, room_id in iterate_rooms(folder, split)]
-        padded = [
+        self._true = [
             torch.nn.utils.rnn.pad_sequence([torch.from_numpy(part) for part in parts], True)
             for parts in zip(*true, strict=True)
         ]
-        self._boxes_m, self._points, self._occupied = padded
+        """The fields of `TrueViews` after `views`."""
 
     def to(self, device: torch.device | str) -> "TrueViewDataset":
         """Move views, boxes and shapes to `device`."""
         super().to(device)
-        self._boxes_m, self._points = self._boxes_m.to(device), self._points.to(device)
-        self._occupied = self._occupied.to(device)
+        self._true = [part.to(device) for part in self._true]
         return self
 
     def log_sizes(self) -> tuple[Float[Tensor, "objects 3"], Int16[Tensor, " objects"]]:
         """Logs of all objects' sizes in metres, and their classes."""
         classes = self.flat.object_class[:-1]  # the last is padding
-        there = torch.arange(self._boxes_m.shape[1]) < self.flat.object_count[:, None]
-        return self._boxes_m[there][:, 3:].clamp(min=1e-3).log(), classes
+        boxes_m = self._true[0]
+        there = torch.arange(boxes_m.shape[1]) < self.flat.object_count[:, None]
+        return boxes_m[there][:, 3:].clamp(min=1e-3).log(), classes
 
     def __getitems__(self, draws: list[tuple[int, int]]) -> TrueViews:  # type: ignore[override]
         views = super().__getitems__(draws)
-        rooms = torch.tensor([row for row, _ in draws], device=self._boxes_m.device)
+        rooms = torch.tensor([row for row, _ in draws], device=views.boxes.device)
         most = views.is_object.shape[1]
-        return TrueViews(
-            views,
-            *(part[rooms, :most] for part in (self._boxes_m, self._points, self._occupied)),
-        )
+        return TrueViews(views, *(part[rooms, :most] for part in self._true))
 
 
 def _read(folder: Path, shard: Any, room_id: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -16,14 +16,12 @@ from sceneprior.baselines.single_view.detections import Detections, detections_o
 from sceneprior.baselines.single_view.network import (
     DetectionEncoder,
     Placed,
-    ViewNetwork,
-    last_layer,
-    meshes_of,
-)
-from sceneprior.baselines.single_view.training import (
     SingleViewConfig,
     SingleViewModel,
     SingleViewTraining,
+    ViewNetwork,
+    last_layer,
+    meshes_of,
 )
 from sceneprior.core.geometry.cameras import boxes_of_points
 from sceneprior.core.scene import Mesh

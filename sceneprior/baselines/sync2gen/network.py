@@ -20,6 +20,8 @@ ATTRIBUTES = 7
 READS = 4
 """Groups of inputs connected to each output of a sparse layer."""
 HIDDEN_GROUP = 8
+MOMENTUM = 0.05
+"""Share of the newest batch in the running error of each class."""
 LEAST_SPREAD_M = 0.05
 LEAST_SIZE_M = 0.02
 
@@ -148,7 +150,10 @@ class Sync2Gen(nn.Module):
         """Update the running errors of decoded centres, which refinement uses."""
         off_m = (decoded - matrix)[..., [1, 3]] * self.spread_m[..., [0, 2]]
         squared = (off_m**2).mean(dim=-1) * matrix[..., 0]
-        self.pairs.note_errors(squared.sum(dim=(0, 2)), matrix[..., 0].sum(dim=(0, 2)))
+        count = matrix[..., 0].sum(dim=(0, 2))
+        newest = squared.sum(dim=(0, 2)) / count.clamp(min=1)
+        known = self.pairs.error_m2[1:]
+        known += MOMENTUM * (count > 0) * (newest - known)
 
     @torch.no_grad()
     def sample(self, count: int, seed: int) -> RoomBoxes:

@@ -19,8 +19,6 @@ ANYWHERE = 0.05
 """Weight of a uniform density over `AREA_M2` in each mixture, which bounds the pull of a pair."""
 AREA_M2 = 64.0
 STEP_M = 0.02
-MOMENTUM = 0.05
-"""Share of the newest batch in the running error of each class."""
 BATCH = 64
 """Rooms per batch in refinement."""
 
@@ -31,6 +29,7 @@ class PairPrior(nn.Module):
     offsets_m: Tensor
     known: Tensor
     error_m2: Tensor
+    """Mean squared error of decoded centres per class, in square metres."""
 
     def __init__(self, classes: int):
         super().__init__()
@@ -55,19 +54,6 @@ class PairPrior(nn.Module):
             self.offsets_m[index // classes, index % classes] = mine[pick]
             self.known[index // classes, index % classes] = True
 
-    def note_errors(
-        self, squared: Float[Tensor, " labels"], count: Float[Tensor, " labels"]
-    ) -> None:
-        """Update the running mean squared error of centres per class.
-
-        Args:
-            squared: Sum of a batch's squared errors per class without void, in square metres.
-            count: Objects in that sum.
-        """
-        newest = squared / count.clamp(min=1)
-        weight = MOMENTUM * (count > 0)
-        self.error_m2[1:] += weight * (newest - self.error_m2[1:])
-
     def energy(
         self, rooms: RoomBoxes, start_m: Float[Tensor, "rooms objects 2"]
     ) -> Float[Tensor, " rooms"]:
@@ -90,25 +76,22 @@ class PairPrior(nn.Module):
         of_pairs = (log_prob * counted).sum(dim=-1) / counted.sum(dim=-1).clamp(min=1)
         return ((stray - of_pairs) * rooms.is_object).sum(dim=-1)
 
+    @torch.enable_grad()
     def refine(self, rooms: RoomBoxes, steps: int) -> RoomBoxes:
         """Reduce the energy by `steps` steps of Adam on the floor positions."""
-        if steps == 0:
-            return rooms
-        moved = [self._refine(part, steps) for part in rooms.split(BATCH)]
+        moved = []
+        for part in rooms.split(BATCH):
+            start_m = part.boxes_m[..., [0, 2]]
+            part = replace(part, boxes_m=part.boxes_m.clone().requires_grad_())
+            # Adam updates each number by its own gradient: a room does not depend on the others in
+            # its batch, and heights and sizes, which have no gradient, stay.
+            optimizer = torch.optim.Adam([part.boxes_m], lr=STEP_M)
+            for _ in range(steps):
+                optimizer.zero_grad()
+                self.energy(part, start_m).sum().backward()
+                optimizer.step()
+            moved.append(part.boxes_m.detach())
         return replace(rooms, boxes_m=torch.cat(moved))
-
-    @torch.enable_grad()
-    def _refine(self, rooms: RoomBoxes, steps: int) -> Float[Tensor, "rooms objects 6"]:
-        start_m = rooms.boxes_m[..., [0, 2]]
-        rooms = replace(rooms, boxes_m=rooms.boxes_m.clone().requires_grad_())
-        # Adam updates each number by its own gradient: a room does not depend on the others in its
-        # batch, and heights and sizes, which have no gradient, stay.
-        optimizer = torch.optim.Adam([rooms.boxes_m], lr=STEP_M)
-        for _ in range(steps):
-            optimizer.zero_grad()
-            self.energy(rooms, start_m).sum().backward()
-            optimizer.step()
-        return rooms.boxes_m.detach()
 
 
 def _offsets(

@@ -6,9 +6,9 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from sceneprior.baselines.box_training import BoxConfig, room_means
 from sceneprior.baselines.one_stage import OneStage, OneStageTraining
 from sceneprior.baselines.sync2gen.network import Sync2Gen, Sync2genModel
+from sceneprior.baselines.true_boxes import BoxConfig, room_means
 from sceneprior.core.views import RoomBoxes
 from sceneprior.training.steps import full_precision
 

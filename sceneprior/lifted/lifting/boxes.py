@@ -1,10 +1,7 @@
 """The smallest 3D box of each tracked object that explains its masks in all views."""
 
-from typing import no_type_check
-
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
-from numba import njit
 
 from sceneprior.core.shards import RoomViews
 from sceneprior.lifted.lifting.hulls import MOST_EMPTY, Sightings, carve, cells_along, sightings_of
@@ -33,10 +30,8 @@ def lift_boxes(
     An object's visual hull is carved coarse to fine. Its box is then shrunk, side after side, as
     long as every ray through one of its pixels meets a cell of the hull inside.
 
-    Args:
-        views: A room, read with its images.
-        chosen: The views to use; None uses all.
-        seed: Seed of the choice of pixels whose rays are used.
+    `views` is a room, read with its images, of which only the views `chosen` are used (None: all).
+    `seed` chooses the pixels whose rays are used.
     """
     rng = np.random.default_rng(seed)
     rows = np.arange(len(views.visible)) if chosen is None else chosen
@@ -65,10 +60,8 @@ def _lift(
         inside = np.argwhere(hull.emptiness <= limit)
         if not len(inside):
             break
-        low_m, high_m = (
-            hull.low_m + (inside.min(axis=0) - 1) * hull.cell_m,
-            hull.low_m + (inside.max(axis=0) + 2) * hull.cell_m,
-        )
+        low_m = hull.low_m + (inside.min(axis=0) - 1) * hull.cell_m
+        high_m = hull.low_m + (inside.max(axis=0) + 2) * hull.cell_m
     in_hull = emptiness <= limit
     first, last = smallest_box(where, in_hull, hull.emptiness.shape[0])
     trim = np.where(last - first > 1, TRIM, 0.0)
@@ -127,33 +120,13 @@ def own_rays(
     each = max(4, RAYS // len(poses))
     origins, directions = [], []
     for ids, pose, camera, clear in zip(seen.ids, poses, intrinsics, sides_clear, strict=True):
-        u, v = _pixels(ids, seen.own_id)
+        v, u = np.nonzero(ids == seen.own_id)
         outermost = np.array([u.argmin(), v.argmin(), u.argmax(), v.argmax()])[clear]
         picked = np.concatenate([rng.integers(len(u), size=each), outermost])
         rays = pixel_directions(u[picked], v[picked], pose, camera)
         directions.append(rays)
         origins.append(np.broadcast_to(-pose[:3, :3].T @ pose[:3, 3], rays.shape))
     return np.concatenate(origins).astype(np.float64), np.concatenate(directions)
-
-
-# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
-@njit(cache=True, nogil=True)
-@no_type_check
-def _pixels(ids, own_id):
-    """Columns and rows of an image's pixels with an id, row by row."""
-    height, width = ids.shape
-    count = 0
-    for row in range(height):
-        for column in range(width):
-            count += ids[row, column] == own_id
-    u, v = np.empty(count, np.int64), np.empty(count, np.int64)
-    at = 0
-    for row in range(height):
-        for column in range(width):
-            if ids[row, column] == own_id:
-                u[at], v[at] = column, row
-                at += 1
-    return u, v
 
 
 def pixel_directions(

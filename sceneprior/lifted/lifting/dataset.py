@@ -39,16 +39,9 @@ class LiftedDataset(RoomDataset):
     those of `ViewDataset`.
 
     Boxes are computed once, at 0.2 CPU seconds per object, and cached as `lifted_<split>.npz`
-    beside the shards if that folder is writable; shapes likewise.
-
-    Args:
-        folder, split, rotations: See `RoomDataset`.
-        view_fraction, seed: As for `ViewDataset`.
-        shape: Grid onto which shapes are lifted, too; None lifts no shapes.
-
-    Raises:
-        ShardError: a shard is missing, damaged, or of another label set than the first; or no
-            object is visible in two views.
+    beside the shards if that folder is writable; shapes likewise, if `shape` gives their grid.
+    `view_fraction` and `seed` are those of `ViewDataset`. If no object is visible in two views, a
+    `ShardError` says so.
     """
 
     counted = "tracked objects"
@@ -116,8 +109,7 @@ class LiftedDataset(RoomDataset):
 
     def find_prototypes(self, most: int) -> Prototypes:
         """At most `most` prototypes that represent the shapes of all usable objects."""
-        given = (self.grids(), self.sizes_m, self.object_classes, self.usable)
-        return choose_prototypes(*given, most)
+        return choose_prototypes(self.grids(), self.sizes_m, self.object_classes, self.usable, most)
 
     def looks_of(self, prototypes: Prototypes) -> Int[np.ndarray, " objects"]:
         """The look of each object; -1 if it is not usable or its class has no prototype."""
@@ -143,7 +135,8 @@ class LiftedDataset(RoomDataset):
     def grids(self) -> Bool[np.ndarray, "objects x y z"]:
         """The lifted shapes of all objects, room after room; see `lift_shapes` and
         `thin_shapes`."""
-        return _unpacked(self._bits, self._cells)
+        flat = np.unpackbits(self._bits, axis=1, count=self._cells**3).view(bool)
+        return flat.reshape(-1, *(self._cells,) * 3)
 
     def to(self, device: torch.device | str) -> "LiftedDataset":
         """Move all boxes and looks to `device`, on which batches are then assembled."""
@@ -209,12 +202,11 @@ def _find_shapes(
     chosen: Sequence[np.ndarray],
     shape: ShapeGrid,
 ) -> UInt8[np.ndarray, "objects bytes"]:
-    """Lifted shapes, packed to eight cells per byte; see `_unpacked`."""
+    """Lifted shapes, packed to eight cells per byte."""
 
     def find() -> dict[str, np.ndarray]:
         from sceneprior.lifted.lifting.rays import RayPool, draw_rays
-        from sceneprior.lifted.lifting.shapes import lift_shapes
-        from sceneprior.lifted.lifting.symmetry import made_symmetric
+        from sceneprior.lifted.lifting.shapes import lift_shapes, made_symmetric
         from sceneprior.lifted.lifting.thinning import thin_shapes
 
         hulls, rays = [], []
@@ -231,21 +223,11 @@ def _find_shapes(
             np.concatenate([each.sizes_m for each in boxes]),
             np.concatenate([room.object_class for room in rooms]),
         )
-        return {"bits": _packed(made_symmetric(thin))}
+        grids = made_symmetric(thin)
+        return {"bits": np.packbits(grids.reshape(len(grids), -1), axis=1)}
 
     key = f"{key} {SHAPES_VERSION} {shape.cells} {shape.margin}"
     return _kept(folder / f"lifted_shapes_{split}.npz", key, find)["bits"]
-
-
-def _packed(grids: Bool[np.ndarray, "objects x y z"]) -> UInt8[np.ndarray, "objects bytes"]:
-    return np.packbits(grids.reshape(len(grids), -1), axis=1)
-
-
-def _unpacked(
-    bits: UInt8[np.ndarray, "objects bytes"], cells: int
-) -> Bool[np.ndarray, "objects x y z"]:
-    flat = np.unpackbits(bits, axis=1, count=cells**3).view(bool)
-    return flat.reshape(-1, cells, cells, cells)
 
 
 def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Visual hulls: the grid cells that no view shows to be outside an object.
+"""Visual hulls: the grid cells that no view, or only a few, show to be outside an object.
 
 Laurentini, "The visual hull concept for silhouette-based image understanding", TPAMI 1994. The hull
 is an outer bound: it extends behind an object wherever no camera sees that space. `boxes.py` finds
@@ -47,9 +47,9 @@ class Hull(NamedTuple):
     low_m: Float[np.ndarray, "3"]
     high_m: Float[np.ndarray, "3"]
     emptiness: Float[np.ndarray, "x y z"]
-    """Share of the views with evidence on a cell that see past it; `NEVER` if it exceeds the
-    carver's limit. The hull is the cells below a threshold, which `boxes.py` chooses, since masks
-    have errors."""
+    """Share of the views with evidence on a cell that see past it, half a view subtracted from
+    these; `NEVER` for a cell that `carve` rules out. The hull is the cells up to a threshold, which
+    `boxes.py` and `shapes.py` choose, since masks have errors."""
 
     @property
     def cell_m(self) -> Float[np.ndarray, "3"]:
@@ -62,16 +62,16 @@ def sightings_of(views: RoomViews, rows: Int[np.ndarray, " views"], item: int) -
     it."""
     assert views.instance_ids is not None, "lifting reads images"
     ids = views.instance_ids[rows]
-    count, height, width = ids.shape
+    height, width = views.image_size
     size = np.array([width, height, width, height])
     # Clipped as a safeguard: compiled code checks no index.
     boxes_px = np.rint(np.nan_to_num(views.boxes[rows, item]) * size).clip(0, size).astype(np.int64)
     boxes_px[:, 2:] = np.maximum(boxes_px[:, 2:], boxes_px[:, :2])
-    columns, lines = (boxes_px[:, 2:] - boxes_px[:, :2] + 1).T
-    ends = np.cumsum(columns * lines)
-    table = np.empty(int(ends[-1]) if count else 0, dtype=np.int32)
-    starts = ends - columns * lines
-    in_threads(_sum_areas, count, ids, item + 1, boxes_px, starts, table)
+    tables = []
+    for image, (x1, y1, x2, y2) in zip(ids, boxes_px, strict=True):
+        own = (image[y1:y2, x1:x2] == item + 1).cumsum(0, np.int32).cumsum(1, np.int32)
+        tables.append(np.pad(own, ((1, 0), (1, 0))).ravel())
+    table, starts = np.concatenate(tables), np.cumsum([0, *map(len, tables)])[:-1]
     intrinsics = views.intrinsics[rows].astype(np.float64)
     matrices = intrinsics @ views.world_to_camera[rows, :3].astype(np.float64)
     return Sightings(ids, item + 1, boxes_px, table, starts, matrices, intrinsics[:, 0, 0].copy())
@@ -85,12 +85,13 @@ def carve(
     reach: float,
     most_empty: float = MOST_EMPTY,
 ) -> Hull:
-    """Count, for every cell of a grid, the views that see past it; stop at more than `most_empty`
-    of them.
+    """Count, for every cell of a grid, the views that see past it, and those that see the object
+    there. A cell is ruled out if more than the share `most_empty` of all views see past it (half a
+    view more is allowed), or if fewer than two see the object there.
 
     A view sees past a cell if the pixel there is background and no pixel of the object lies within
     `reach` cells of it, so that parts thinner than a cell survive. A pixel of another object is no
-    evidence: that object may be an occluder.
+    evidence: that object may be an occluder. Neither is a cell outside the image.
     """
     emptiness = np.empty((cells, cells, cells), dtype=np.float32)
     in_threads(
@@ -106,7 +107,8 @@ def cells_along(
     directions: Float[np.ndarray, "rays 3"],
     samples: int,
 ) -> tuple[Int[np.ndarray, "rays samples 3"], Float[np.ndarray, "rays samples"]]:
-    """Cells at evenly spaced samples of rays, from entry to exit, and their emptiness."""
+    """Cells at evenly spaced samples of rays, from entry to exit, and their emptiness; `NEVER` all
+    along a ray that misses the grid."""
     near, far = pass_through(origins_m, directions, hull.low_m, hull.high_m)
     where = np.empty((len(near), samples, 3), dtype=np.int32)
     emptiness = np.empty((len(near), samples), dtype=np.float32)
@@ -134,22 +136,6 @@ def pass_through(
 
 
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
-@njit(cache=True, nogil=True)
-@no_type_check
-def _sum_areas(first, last, ids, own_id, boxes_px, starts, table):
-    for view in range(first, last):
-        x1, y1, x2, y2 = boxes_px[view]
-        columns, at = x2 - x1 + 1, starts[view]
-        table[at : at + columns] = 0
-        for row in range(y1, y2):
-            at += columns
-            table[at] = so_far = 0
-            for column in range(x1, x2):
-                so_far += ids[view, row, column] == own_id
-                here = at + column - x1 + 1
-                table[here] = table[here - columns] + so_far
-
-
 @njit(cache=True, nogil=True)
 @no_type_check
 def own_in(box_px, table, start, x1, y1, x2, y2):
@@ -188,11 +174,9 @@ def _carve(
             box, start = boxes_px[view], starts[view]
             for j in range(cells):
                 y = low_m[1] + (j + 0.5) * size_m[1]
-                a, b, c = (
-                    m[0, 0] * x + m[0, 1] * y,
-                    m[1, 0] * x + m[1, 1] * y,
-                    m[2, 0] * x + m[2, 1] * y,
-                )
+                a = m[0, 0] * x + m[0, 1] * y
+                b = m[1, 0] * x + m[1, 1] * y
+                c = m[2, 0] * x + m[2, 1] * y
                 for k in range(cells):
                     depth[k] = c + m[2, 2] * z[k] + m[2, 3]
                     u[k] = (a + m[0, 2] * z[k] + m[0, 3]) / depth[k]

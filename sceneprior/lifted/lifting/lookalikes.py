@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.distance import cdist
 
 from sceneprior.core.geometry.turns import quarter_rotation, turn_grids
+from sceneprior.lifted.prototypes import POSES, pooled, turn_of, turned_extents
 
 MOST = 8
 """Maximum number of lookalikes of an object."""
@@ -48,31 +49,22 @@ def lookalikes(
     """
     found: list[list[Lookalike]] = [[] for _ in grids]
     filled = grids.any(axis=(1, 2, 3))
-    ways = [(quarters, mirrored) for mirrored in (False, True) for quarters in range(4)]
     for label in np.unique(object_class[filled]):
         items = np.flatnonzero((object_class == label) & filled)
-        coarse = _halved(grids[items])
+        coarse = pooled(grids[items], grids.shape[1] // 2)
         flat, sizes = coarse.reshape(len(items), -1), np.log(sizes_m[items])
-        apart = np.empty((len(items), len(items), len(ways)))
-        for place, way in enumerate(ways):
-            moved = turn_grids(coarse, *way).reshape(flat.shape)
-            turned = sizes if way[0] % 2 == 0 else sizes[:, ::-1]
-            apart[..., place] = cdist(flat, moved, "cityblock") / flat.shape[1]
-            apart[..., place] += SIZE_WEIGHT * cdist(sizes, turned, "cityblock")
+        apart = np.empty((len(items), len(items), POSES))
+        for pose in range(POSES):
+            moved = turn_grids(coarse, *turn_of(pose)).reshape(flat.shape)
+            turned = turned_extents(sizes, pose)
+            apart[..., pose] = cdist(flat, moved, "cityblock") / flat.shape[1]
+            apart[..., pose] += SIZE_WEIGHT * cdist(sizes, turned, "cityblock")
         for row, item in enumerate(items):
             apart[row, row, 0] = np.inf  # without the object itself, unmoved
             nearest = np.argsort(apart[row], axis=None, kind="stable")[:MOST]
             found[item] = [
-                Lookalike(int(items[other]), *ways[way])
-                for other, way in zip(*np.unravel_index(nearest, apart.shape[1:]), strict=True)
-                if apart[row, other, way] < FARTHEST
+                Lookalike(int(items[other]), *turn_of(int(pose)))
+                for other, pose in zip(*np.unravel_index(nearest, apart.shape[1:]), strict=True)
+                if apart[row, other, pose] < FARTHEST
             ]
     return found
-
-
-def _halved(grids: Bool[np.ndarray, "n x y z"]) -> Float[np.ndarray, "n u v w"]:
-    """Grids of half the resolution: means over 2 x 2 x 2 cells; an odd last cell is left out."""
-    n, cells = len(grids), grids.shape[1] // 2
-    even = grids[:, : 2 * cells, : 2 * cells, : 2 * cells].astype(np.float32)
-    halved: np.ndarray = even.reshape(n, cells, 2, cells, 2, cells, 2).mean(axis=(2, 4, 6))
-    return halved

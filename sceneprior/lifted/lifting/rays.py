@@ -20,15 +20,15 @@ FAR_M = 100.0
 
 
 class RayPool(NamedTuple):
-    """Segments of rays in the objects' frames, the same number for each object; a frame spans [-1,
-    1]."""
+    """Segments of rays in the frames of one or more objects, which span [-1, 1]; as many for each
+    object."""
 
-    starts: Float[np.ndarray, "objects rays 3"]
+    starts: Float[np.ndarray, "*objects rays 3"]
     """Points at which the rays enter the frame."""
-    spans: Float[np.ndarray, "objects rays 3"]
+    spans: Float[np.ndarray, "*objects rays 3"]
     """Vector from there to the point where the ray leaves the frame or its course becomes unknown;
     0 for a ray without information."""
-    hits: Bool[np.ndarray, "objects rays"]
+    hits: Bool[np.ndarray, "*objects rays"]
     """True if the object is met on the segment; otherwise the whole segment is empty."""
 
 
@@ -46,12 +46,8 @@ def draw_rays(
     may hide this one. If that box is unknown, or the pixel is void, the ray carries no information.
     Walls, floor and everything without an id count as background.
 
-    Args:
-        views: A room, read with its images.
-        boxes: The room's boxes from `lift_boxes`.
-        count: Rays per object.
-        margin: Extent of an object's frame, relative to its box.
-        chosen, seed: As for `lift_boxes`.
+    `margin` is the extent of an object's frame, relative to its box; the other arguments are those
+    of `lift_boxes` and its result.
     """
     rng = np.random.default_rng([seed, 1])
     rows = np.arange(len(views.visible)) if chosen is None else chosen
@@ -93,12 +89,12 @@ def _draw(
     has_box = np.concatenate([[False], boxes.explained > 0, [False]])
     has_box[item + 1] = False
     other = has_box[ids]
-    sizes_m = 1.05 * boxes.sizes_m  # a margin for errors of the boxes
-    entered = entry_m(
-        origins_m[other], directions[other],
-        boxes.centers_m[ids[other] - 1], sizes_m[ids[other] - 1],
-    )  # fmt: skip
-    until_m[other] = np.where(np.isfinite(entered), entered, 0)
+    centers_m = boxes.centers_m[ids[other] - 1]
+    its_half_m = 1.05 * boxes.sizes_m[ids[other] - 1] / 2  # a margin for errors of the boxes
+    near, far = pass_through(
+        origins_m[other], directions[other], centers_m - its_half_m, centers_m + its_half_m
+    )
+    until_m[other] = np.where(far > near, near, 0)
     half_m = margin * boxes.sizes_m[item] / 2
     near, far = pass_through(
         origins_m, directions, boxes.centers_m[item] - half_m, boxes.centers_m[item] + half_m
@@ -158,16 +154,3 @@ def _near_outline(first, last, view, u, v, image_size, boxes_px, table, starts, 
         y1, y2 = max(v[i] - NEAR_OUTLINE_PX, 0), min(v[i] + NEAR_OUTLINE_PX + 1, height)
         own = own_in(boxes_px[view[i]], table, starts[view[i]], x1, y1, x2, y2)
         near[i] = 0 < own < (x2 - x1) * (y2 - y1)
-
-
-def entry_m(
-    origins_m: Float[np.ndarray, "rays 3"],
-    directions: Float[np.ndarray, "rays 3"],
-    centers_m: Float[np.ndarray, "*rays 3"],
-    sizes_m: Float[np.ndarray, "*rays 3"],
-) -> Float[np.ndarray, " rays"]:
-    """Distances at which rays enter axis-aligned boxes: 0 from inside, infinite for a miss."""
-    near, far = pass_through(
-        origins_m, directions, centers_m - sizes_m / 2, centers_m + sizes_m / 2
-    )
-    return np.where(far > near, near, np.inf)

@@ -4,7 +4,7 @@ A visual hull is the largest shape that the masks allow, so unobserved space sta
 beds have domes, and armchairs are solid blocks.
 """
 
-from typing import NamedTuple, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -31,14 +31,6 @@ START = 2.0
 """Magnitude of the initial logits: positive in the hull, negative outside."""
 
 
-class _Pool(NamedTuple):
-    """Rays on which one object is fitted: its own and its lookalikes'; see `RayPool`."""
-
-    starts: Float[np.ndarray, "rays 3"]
-    spans: Float[np.ndarray, "rays 3"]
-    hits: Bool[np.ndarray, " rays"]
-
-
 def thin_shapes(
     hulls: Bool[np.ndarray, "objects x y z"],
     rays: RayPool,
@@ -57,48 +49,35 @@ def thin_shapes(
     fray the outlines of the fitted shapes, while those of hulls are sharp. Therefore a hull keeps
     all of its cells with z > 0 and the cells beside these.
 
-    Args:
-        hulls: Hulls of all objects of a data set; see `lift_shapes`.
-        rays: Rays in the same frames.
-        sizes_m: Extents of the objects' boxes.
-        object_class: Classes; only objects of the same class can be lookalikes.
-        seed: Seed of the choice of rays.
+    `hulls` are those of all objects of a data set (`lift_shapes`), `rays` lie in the same frames,
+    and `seed` chooses among them. Only objects of the same class can be lookalikes.
     """
     alike = lookalikes(hulls, sizes_m, object_class)
     thin = np.zeros_like(hulls)
     filled = np.flatnonzero(hulls.any(axis=(1, 2, 3)))
-    in_threads(_thin_some, len(filled), filled, hulls, rays, alike, seed, thin)
+
+    def thin_some(first: int, last: int) -> None:
+        for item in filled[first:last].tolist():
+            # A generator per object makes the result independent of the number of threads.
+            rng = np.random.default_rng([seed, item])
+            pool = _pool_of(item, rays, alike[item], rng)
+            others = [
+                turn_grids(hulls[other.item][None], other.quarters, other.mirrored)[0]
+                for other in alike[item]
+            ]
+            share = np.mean(np.stack([hulls[item], *others]), axis=0, dtype=np.float32)
+            logits = np.asarray(START * (2 * share - 1), np.float32)
+            picked = rng.integers(len(pool.hits), size=(STEPS, RAYS))
+            _fit(logits, pool, picked, rng.random((STEPS, RAYS)))
+            thin[item] = hulls[item] & ndimage.binary_dilation(logits > 0, np.ones((3, 3, 3)))
+
+    in_threads(thin_some, len(filled))
     return thin
 
 
-def _thin_some(
-    first: int,
-    last: int,
-    items: Int[np.ndarray, " filled"],
-    hulls: np.ndarray,
-    rays: RayPool,
-    alike: list[list[Lookalike]],
-    seed: int,
-    thin: np.ndarray,
-) -> None:
-    for item in items[first:last].tolist():
-        # A generator per object makes the result independent of the number of threads.
-        rng = np.random.default_rng([seed, item])
-        pool = _pool_of(item, rays, alike[item], rng)
-        others = [
-            turn_grids(hulls[other.item][None], other.quarters, other.mirrored)[0]
-            for other in alike[item]
-        ]
-        filled = np.mean(np.stack([hulls[item], *others]), axis=0, dtype=np.float32)
-        logits = np.asarray(START * (2 * filled - 1), np.float32)
-        picked = rng.integers(len(pool.hits), size=(STEPS, RAYS))
-        offsets = rng.random((STEPS, RAYS))
-        _fit(logits, pool, picked, offsets)
-        thin[item] = hulls[item] & ndimage.binary_dilation(logits > 0, np.ones((3, 3, 3)))
-
-
-def _pool_of(item: int, rays: RayPool, alike: list[Lookalike], rng: np.random.Generator) -> _Pool:
-    own = _Pool(rays.starts[item], rays.spans[item], rays.hits[item])
+def _pool_of(item: int, rays: RayPool, alike: list[Lookalike], rng: np.random.Generator) -> RayPool:
+    """The rays on which an object is fitted: its own and its lookalikes'."""
+    own = RayPool(rays.starts[item], rays.spans[item], rays.hits[item])
     if not alike:
         return own
     count = int(len(own.hits) * (1 - OWN_SHARE) / OWN_SHARE)
@@ -111,13 +90,13 @@ def _pool_of(item: int, rays: RayPool, alike: list[Lookalike], rng: np.random.Ge
             moved_vectors(vectors[other.item][rows], other.quarters, other.mirrored)
             for vectors in (rays.starts, rays.spans)
         )
-        parts.append(_Pool(starts, spans, rays.hits[other.item][rows]))
-    return _Pool(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        parts.append(RayPool(starts, spans, rays.hits[other.item][rows]))
+    return RayPool(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def _fit(
     logits: Float[np.ndarray, "x y z"],
-    pool: _Pool,
+    pool: RayPool,
     picked: Int[np.ndarray, "steps rays"],
     offsets: Float[np.ndarray, "steps rays"],
 ) -> None:

@@ -46,11 +46,8 @@ class Candidates(NamedTuple):
 
 @torch.no_grad()
 def candidates_of(trained: TrainedPrior) -> Candidates:
-    """All objects of the training rooms as decoded, with beveled boxes for their shapes.
-
-    Raises:
-        InputError: every decoded room is empty.
-    """
+    """All objects of the training rooms as decoded, with beveled boxes for their shapes; an
+    `InputError` if there are none."""
     parts = []
     for rows in torch.arange(len(trained.logits)).split(ROOMS):
         decoded = trained.prior(trained.logits[rows], with_shape=False)

@@ -60,11 +60,7 @@ class KnownRooms:
     sizes_m: Float[Tensor, "rooms objects 3"]
 
     def furnished(self, row: int) -> Scene:
-        """`scenes[row]` with its meshes.
-
-        Raises:
-            ShardError: a model's file is missing or damaged.
-        """
+        """`scenes[row]` with its meshes."""
         scene = self.scenes[row]
         with Shard(self.paths[row // QUARTERS]) as shard:
             home = reference_scene(shard, scene.name, self.folder)
@@ -80,11 +76,7 @@ class KnownAnswer(NamedTuple):
 
 
 def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
-    """The rooms of a split, turned by 0, 90, 180 and 270 degrees.
-
-    Raises:
-        ShardError: the shards or their ground truth cannot be read.
-    """
+    """The rooms of a split, turned by 0, 90, 180 and 270 degrees."""
     rooms = [
         (shard.path, reference_scene(shard, room_id, shards, meshes=False))
         for shard, room_id in iterate_rooms(shards, split)

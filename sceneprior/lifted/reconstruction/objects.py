@@ -25,7 +25,7 @@ from sceneprior.lifted.reconstruction.candidates import (
     with_shapes,
 )
 from sceneprior.lifted.reconstruction.known_rooms import turn_object
-from sceneprior.lifted.reconstruction.outlines import Outlines, joined, outlines_of
+from sceneprior.lifted.reconstruction.outlines import Outlines, outlines_of
 from sceneprior.lifted.reconstruction.placing import Placed, place_objects
 from sceneprior.paper.decode import scene_of
 from sceneprior.paper.trained import TrainedPrior
@@ -70,7 +70,8 @@ def answer_images(trained: TrainedPrior, images: Sequence[ObservedImage]) -> lis
 
     For a class that the run never generates, objects of all classes are tried.
     """
-    masks = joined([outlines_of(image) for image in images])
+    outlines = [outlines_of(image) for image in images]
+    masks = Outlines(*(torch.cat(parts) for parts in zip(*outlines, strict=True)))
     classes = torch.from_numpy(np.concatenate([image.object_class for image in images]))
     rough = candidates_of(trained)
     first = _of_classes(rough, classes)
@@ -80,32 +81,29 @@ def answer_images(trained: TrainedPrior, images: Sequence[ObservedImage]) -> lis
     shaped = with_shapes(trained, rough.take(used))
     second = second._replace(candidate=numbered)
     placed = _placed(shaped, second, masks)
-    chosen = torch.tensor(
-        [
-            int(rows[likeliest_box(placed, _turned_sizes(shaped, second.take(rows)), rows)])
-            for rows in (second.mask == torch.arange(len(classes))[:, None])
-            .nonzero()[:, 1]
-            .split(second.mask.bincount(minlength=len(classes)).tolist())
-        ]
-    )
-    best = torch.full((len(classes),), torch.inf)
-    best = best.scatter_reduce(0, second.mask, placed.energy, "amin")
+    picks, energies = [], []
+    for mask in range(len(classes)):
+        rows = (second.mask == mask).nonzero()[:, 0]
+        sizes_m = _turned_sizes(shaped, second.take(rows))
+        picks.append(rows[likeliest_box(placed, sizes_m, rows)])
+        energies.append(placed.energy[rows].min())
+    chosen, best = torch.stack(picks), torch.stack(energies)
     objects = _objects(trained, shaped, second.take(chosen), placed.centers_m[chosen])
     names = label_set(trained.config.label_set)
     known = {names[index] for index in rough.object_class.unique().tolist()}
     answers, at = [], 0
     for image in images:
-        rows = slice(at, at + len(image.object_class))
+        own = slice(at, at + len(image.object_class))
         labels = [names[index] for index in image.object_class]
-        pairs = list(zip(labels, objects[rows], strict=True))
+        pairs = list(zip(labels, objects[own], strict=True))
         scene = Scene(
             image.name,
             image.label_set,
             tuple(SceneObject(label, o.center_m, o.size_m, o.mesh) for label, o in pairs),
         )
         taken_for = {label: o.label for label, o in pairs if label not in known}
-        answers.append(ObjectAnswer(scene, float(best[rows].mean()), taken_for))
-        at = rows.stop
+        answers.append(ObjectAnswer(scene, float(best[own].mean()), taken_for))
+        at = own.stop
     return answers
 
 

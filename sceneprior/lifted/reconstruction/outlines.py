@@ -13,7 +13,7 @@ DIRECTIONS = ((-1, 0), (0, -1), (1, 0), (0, 1), (-1, -1), (1, -1), (1, 1), (-1, 
 """Image directions (u, v), right and down: those of a 2D box's sides, in their order, then of its
 corners."""
 OCCLUSION_SLACK = 0.15
-"""Weight of extending beyond a mask where an occluder or the image's corner may have cut it off."""
+"""Weight of extending beyond a mask where it may be cut off (not `Outlines.clear`)."""
 NEAR_M = 0.05
 """Smallest depth; points nearer to the camera, or behind it, are moved to this depth."""
 
@@ -25,8 +25,9 @@ class Outlines(NamedTuple):
     """The largest value of u * direction_u + v * direction_v over a mask, u and v relative to the
     image's width and height."""
     clear: Bool[Tensor, "masks 8"]
-    """True if the object itself ends there, rather than being cut off by an occluder or the image's
-    corner. At the image's sides, object and mask both count as ending."""
+    """True if the object itself ends there, since no other object touches the mask, at a corner
+    also at both adjacent sides. At the image's border, sides are clear (there, objects are clipped
+    as masks are), and corners are not."""
     world_to_camera: Float[Tensor, "masks 4 4"]
     intrinsics: Float[Tensor, "masks 3 3"]
     """Intrinsics relative to the image's size."""
@@ -54,8 +55,8 @@ def outlines_of(image: ObservedImage) -> Outlines:
                     for x, y in ((right, 0), (0, down), (right, down))
                 ]
             )
-            # Both adjacent sides must be clear, too: background next to the object may be a wall
-            # that hides part of it.
+            # Both adjacent sides must be clear, too: an object that goes on beyond one of them may
+            # have its corner there.
             own = clear[item, [0 if right < 0 else 2, 1 if down < 0 else 3]].all()
             clear[item, at] = own and bool(np.isin(beside, (0, item + 1)).all())
     scale = np.array([[1 / width], [1 / height], [1]])
@@ -66,20 +67,12 @@ def outlines_of(image: ObservedImage) -> Outlines:
     return Outlines(torch.from_numpy(extents), torch.from_numpy(clear), pose, intrinsics)
 
 
-def joined(outlines: list[Outlines]) -> Outlines:
-    """The outlines of several images, concatenated."""
-    return Outlines(*(torch.cat(parts) for parts in zip(*outlines, strict=True)))
-
-
 def projected_extents(
     points_m: Float[Tensor, "objects points 3"], cameras: Outlines
 ) -> tuple[Float[Tensor, "objects 8"], Float[Tensor, "objects 8 2"], Float[Tensor, " objects"]]:
     """Extents of projected objects in their images, the derivative of these by the object's x and z
-    (metres), and the share of each object's points that are not in front of the camera.
-
-    Args:
-        points_m: Points of each object, in the room frame.
-        cameras: One entry per object.
+    (metres), and the share of each object's points that are not in front of the camera. `points_m`
+    are in the room frame; `cameras` has one entry per object.
     """
     turn, shift = cameras.world_to_camera[:, :3, :3], cameras.world_to_camera[:, None, :3, 3]
     seen = points_m @ turn.transpose(1, 2) + shift
@@ -102,10 +95,8 @@ def beyond(
     extents: Float[Tensor, "objects 8"], observed: Outlines
 ) -> tuple[Float[Tensor, "objects 8"], Float[Tensor, "objects 8"]]:
     """Signed distances by which objects extend beyond their masks, and the weights of these
-    distances.
-
-    Extents are clipped at the image border, outside of which nothing is observed.
-    """
+    distances. Extents are clipped at the image's sides and corners, outside of which nothing is
+    observed."""
     directions = extents.new_tensor(DIRECTIONS)
     border = directions.clamp(min=0).sum(dim=1)
     apart = extents.minimum(border) - observed.extents

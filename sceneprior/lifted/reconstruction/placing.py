@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneprior.core.geometry.cameras import camera_centers
+from sceneprior.core.geometry.cameras import camera_centers, pixel_rays
 from sceneprior.lifted.reconstruction.outlines import Outlines, beyond, projected_extents
 
 STEPS = 12
@@ -47,11 +47,8 @@ def place_objects(
 
     The energy is the sum of absolute differences in eight directions over `SPREAD`. It is minimised
     by Gauss-Newton steps, reweighted in each step; the best position on the way is kept. Heights
-    are fixed: objects that the prior puts on the floor stay there.
-
-    Args:
-        points: Points of each object's surface; its box is [-0.5, 0.5]^3.
-        masks: One entry per object.
+    are fixed: objects that the prior puts on the floor stay there. `points` lie on each object's
+    surface, whose box is [-0.5, 0.5]^3; `masks` has one entry per object.
     """
     heights_m = bottom_m + sizes_m[:, 1] / 2
     shape_m = points * sizes_m[:, None]
@@ -87,10 +84,8 @@ def starting_places(
     height."""
     left, top, right, bottom = masks.extents[:, :4].unbind(dim=1)
     middle = torch.stack([right - left, bottom - top], dim=-1) / 2
-    focal = masks.intrinsics[:, (0, 1), (0, 1)]
-    on_plane = (middle - masks.intrinsics[:, :2, 2]) / focal
-    ray = torch.cat([on_plane, torch.ones_like(on_plane[:, :1])], dim=1)
-    ray = (ray[:, None] @ masks.world_to_camera[:, :3, :3])[:, 0]
+    cameras = (masks.world_to_camera[:, None], masks.intrinsics[:, None])
+    ray = pixel_rays(middle[:, None, None], *cameras)[:, 0, 0]
     eye_m = camera_centers(masks.world_to_camera)
     level = ray[:, ::2].norm(dim=1).clamp(min=1e-6)
     steep = ray[:, 1].abs().clamp(min=1e-6).copysign(ray[:, 1])

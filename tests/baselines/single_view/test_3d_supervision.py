@@ -9,8 +9,8 @@ import torch
 from tiny_runs import tiny_baseline
 from torch.testing import assert_close
 
-from sceneprior.baselines.single_view.blobs import LEVEL, STEEP, occupancy_logits, overlap_loss
 from sceneprior.baselines.single_view.detections import detections_of, some_views
+from sceneprior.baselines.single_view.im3d import LEVEL, STEEP, occupancy_logits, overlap_loss
 from sceneprior.baselines.single_view.network import Placed
 from sceneprior.baselines.single_view.total3d import (
     BIN,

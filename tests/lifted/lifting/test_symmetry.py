@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sceneprior.lifted.lifting.symmetry import made_symmetric
+from sceneprior.lifted.lifting.shapes import made_symmetric
 
 FULL = np.ones((8, 8, 8), dtype=bool)
 
