@@ -65,7 +65,7 @@ def draw_rooms(
         last = number + 1 == PLANS * ROUNDS
         if number % ROUNDS == 0:
             plan = plan_rooms(sampler, given, count, (seed, number // ROUNDS))
-        numbers = uniform_numbers(count, slots * (7 + 3 * PLACES), (seed, PLANS + number))
+        numbers = uniform_numbers(count, slots * (7 + 4 * PLACES), (seed, PLANS + number))
         numbers = numbers.unflatten(1, (slots, -1))
         stuck = []
         for rows in waiting.split(BATCH):
@@ -112,13 +112,9 @@ def _draw(
             break
         reading = _read(sampler, rooms, number, plan, plan.coming[:, step:])
         some = label.where(going, label[going][0])  # finished rooms get a dummy class
-        look, tried_m = _tried(sampler, reading, some, chance)
-        wrong = _wrong(tried_m, some, reading, sampler.may_meet)
-        best = wrong.argmin(dim=1, keepdim=True)  # first minimum
-        fits = wrong.gather(1, best)[:, 0] == 0
-        stuck = stuck | (going & ~fits)
-        placed = going & (fits | (last & keep))
-        box_m = torch.take_along_dim(tried_m, best.unsqueeze(-1), dim=1)[:, 0]
+        look, box_m, wrong = _placed(sampler, reading, some, going, chance)
+        stuck = stuck | (going & (wrong > 0))
+        placed = going & ((wrong == 0) | (last & keep))
         at = (placed.nonzero()[:, 0], number[placed])
         rooms.object_class[at], rooms.is_object[at] = some[placed], True
         rooms.boxes_m[at], looks[at] = box_m[placed], look[placed]
@@ -143,24 +139,38 @@ def _read(
     return sampler.read(before, still, Frame.plain(plan.rectangle_m), tokens)
 
 
-def _tried(
+def _placed(
     sampler: RoomSampler,
     reading: Reading,
     label: Int[Tensor, " rooms"],
+    going: Bool[Tensor, " rooms"],
     chance: Float[Tensor, "rooms numbers"],
-) -> tuple[Int[Tensor, " rooms"], Float[Tensor, "rooms places 6"]]:
-    """A look and a size for an object of a class, and boxes at all sampled places."""
+) -> tuple[Int[Tensor, " rooms"], Float[Tensor, "rooms 6"], Float[Tensor, " rooms"]]:
+    """A look and a box for an object of a class, at the first of `PLACES` sampled places without a
+    violation, and its violation; if all have one, at the place with the least. Rooms that are not
+    `going` get any box."""
     look = draw_index(sampler.look_logits(reading, label), chance[:, 1])
     details = sampler.details(reading, label, look).draw(chance[:, 2], chance[:, 3:7])
     off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)
     size_m = (sampler.look_shown[look, -3:] + off).exp()
     bottom_m = details[:, 3].clamp(min=0)  # the floor
     places = sampler.place(reading, label, look, size_m, bottom_m)
-    numbers = chance[:, 7:].unflatten(1, (PLACES, 3))
-    x, z = places.drawn(numbers[..., 0], numbers[..., 1:]).unbind(dim=-1)
-    y = (bottom_m + size_m[:, 1] / 2).unsqueeze(1).expand_as(x)
-    size_m = size_m.unsqueeze(1).expand(-1, PLACES, -1)
-    return look, torch.cat([torch.stack([x, y, z], dim=-1), size_m], dim=-1)
+    numbers = chance[:, 7:].unflatten(1, (PLACES, 4))
+    x = places.draw_x(numbers[..., :2])
+    centre_m = torch.stack([x[:, 0], bottom_m + size_m[:, 1] / 2, x[:, 0]], dim=-1)
+    boxes_m = torch.cat([centre_m, size_m], dim=-1)
+    wrong = torch.full_like(bottom_m, torch.inf)
+    for number in range(PLACES):
+        rows = (going & (wrong > 0)).nonzero()[:, 0]
+        if not len(rows):
+            break
+        tried_m = boxes_m[rows]
+        tried_m[:, [0, 2]] = places.rows(rows).draw(x[rows, number], numbers[rows, number, 2:])
+        found = _wrong(tried_m, label[rows], reading.rows(rows), sampler.may_meet)
+        better = rows[found < wrong[rows]]
+        boxes_m[better] = tried_m[found < wrong[rows]]
+        wrong[rows] = torch.minimum(found, wrong[rows])
+    return look, boxes_m, wrong
 
 
 def _recognised(
@@ -202,21 +212,21 @@ def _recognised(
 
 
 def _wrong(
-    boxes_m: Float[Tensor, "rooms places 6"],
+    boxes_m: Float[Tensor, "rooms 6"],
     label: Int[Tensor, " rooms"],
     reading: Reading,
     may_meet: Bool[Tensor, "classes classes"],
-) -> Float[Tensor, "rooms places"]:
-    """Violation of a box at a place, 0 if there is none: the intersected shares of the smaller
-    boxes, summed over objects that it should not meet, plus the metres by which it extends beyond
-    the rectangle."""
+) -> Float[Tensor, " rooms"]:
+    """Violation of a box, 0 if there is none: the intersected shares of the smaller boxes, summed
+    over objects that it should not meet, plus the metres by which it extends beyond the
+    rectangle."""
     others = reading.before
-    here, theirs = boxes_m.unsqueeze(2), others.boxes_m.unsqueeze(1)
+    here, theirs = boxes_m.unsqueeze(1), others.boxes_m
     shared = shared_extents(here, theirs).prod(dim=-1)
     least = torch.minimum(here[..., 3:].prod(dim=-1), theirs[..., 3:].prod(dim=-1))
     share = shared / least.clamp(min=1e-9)
     counts = others.is_object & ~may_meet[label[:, None], others.object_class]
-    share = share.where((share > INTERSECTING) & counts.unsqueeze(1), 0.0)
-    middle, extents = reading.frame.rectangle_m.unsqueeze(1).split(2, dim=-1)
-    beyond = (boxes_m[..., [0, 2]] - middle).abs() + (boxes_m[..., [3, 5]] - extents) / 2
+    share = share.where((share > INTERSECTING) & counts, 0.0)
+    middle, extents = reading.frame.rectangle_m.split(2, dim=-1)
+    beyond = (boxes_m[:, [0, 2]] - middle).abs() + (boxes_m[:, [3, 5]] - extents) / 2
     return share.sum(dim=-1) + (beyond.amax(dim=-1) - BEYOND_M).clamp(min=0)

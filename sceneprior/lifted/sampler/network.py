@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.mixtures import LogisticMixture, draw_index
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.prototypes import PARTS, POSES, turned_looks
+from sceneprior.lifted.prototypes import POSES, turned_looks
 from sceneprior.lifted.sampler.contents import Contents
-from sceneprior.lifted.sampler.placement import Placement
+from sceneprior.lifted.sampler.placement import SHOWN, Placement, Places
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, gaps_m, rectangle_sides
 from sceneprior.lifted.sampler.settings import SamplerConfig
 from sceneprior.paper.layers import mlp
@@ -27,8 +27,6 @@ LONGEST_M = 16.0
 so on."""
 LENGTHS = 1 + 2 * OCTAVES
 """Numbers that encode a length."""
-SHOWN = PARTS**3 + 3
-"""Numbers that encode a look: its coarse grid and the logarithms of its extents."""
 RECTANGLES = 6
 """Components of the Gaussian mixture of the rectangle around a room's furniture."""
 DETAILS = 4
@@ -54,7 +52,7 @@ class RoomSampler(nn.Module):
     furniture, the objects placed so far, and a learnt query. The query's output predicts the next
     object, whose class is already known: first its look, then its size relative to that look and
     the height of its bottom, then its place (`Placement`), relative to the rectangle, to the
-    floor's middle or to another object.
+    floor's middle and to the other objects.
 
     Training rooms are presented in all their `SYMMETRIES`. The frequency of each look in each pose
     depends on the orientation of the data; it is learnt for untransformed rooms and transformed
@@ -74,6 +72,7 @@ class RoomSampler(nn.Module):
     rectangle_factors: Tensor
     may_meet: Tensor
     footprints_m2: Tensor
+    backs: Tensor
 
     def __init__(self, settings: SamplerConfig, classes: int, prototypes: int, max_objects: int):
         super().__init__()
@@ -88,8 +87,8 @@ class RoomSampler(nn.Module):
         self.register_buffer("rectangle_factors", torch.zeros(RECTANGLES, 4, 4))
         self.register_buffer("may_meet", torch.zeros(classes, classes, dtype=torch.bool))
         self.register_buffer("footprints_m2", torch.ones(classes))
-        # Small, with exact inputs, so that it overfits first: it gets twice the dropout, at most
-        # 0.5.
+        self.register_buffer("backs", torch.zeros(prototypes, dtype=torch.int64))
+        # Contents and places overfit first: they get twice the dropout, at most 0.5.
         self.contents = Contents(classes, width // 2, min(2 * dropout, 0.5))
         self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
         self.look_embedding = nn.Linear(SHOWN, width)
@@ -110,8 +109,7 @@ class RoomSampler(nn.Module):
         self.offered_look = _head(SHOWN, width, MATCH_WIDTH)
         self.frequency = nn.Parameter(torch.zeros(prototypes, POSES))
         self.details_head = _head(known + width, width, DETAILS * 9)
-        self.place_query = _head(known + width + 4 * LENGTHS, width, width)
-        self.placement = Placement(width)
+        self.placement = Placement(classes, min(2 * dropout, 0.5))
 
     @property
     def drawn_classes(self) -> list[int]:
@@ -159,7 +157,7 @@ class RoomSampler(nn.Module):
         for layer in self.encoder:
             features = layer(features, src_key_padding_mask=nothing)
         features = self.norm(features)
-        return Reading(before, frame, features[:, 0], features[:, 2:])
+        return Reading(before, frame, coming, features[:, 0])
 
     def summary(
         self, before: RoomBoxes, coming: Float[Tensor, "rooms classes"], frame: "Frame"
@@ -167,7 +165,7 @@ class RoomSampler(nn.Module):
         """Features that attention would have to count: objects of each class, those to come, and
         the gaps between the furniture and each side of the rectangle, which are small in a finished
         room."""
-        counts = self.contents.before(before.object_class, before.is_object)[:, -1]
+        counts = self.counts(before)
         furnished = before.is_object.any(dim=1, keepdim=True)
         low, high = rectangle_sides(frame.rectangle_m)
         whole = torch.cat([high - low] * 2, dim=-1)
@@ -201,15 +199,17 @@ class RoomSampler(nn.Module):
         look: Int[Tensor, " rooms"],
         size_m: Float[Tensor, "rooms 3"],
         bottom_m: Float[Tensor, " rooms"],
-    ) -> LogisticMixture:
+    ) -> Places:
         """Distribution of x and z of the centre."""
-        lengths = lengths_shown(torch.cat([size_m, bottom_m.unsqueeze(-1)], dim=-1))
-        known = torch.cat([self._known(reading, label, look), lengths], dim=-1)
-        footprints = reading.before.boxes_m[..., [0, 2, 3, 5]]
+        counts = torch.cat([self.counts(reading.before), reading.coming], dim=-1)
         return self.placement(
-            self.place_query(known), size_m[:, ::2], reading.frame.rectangle_m,
-            reading.objects, footprints, reading.before.is_object,
+            label, look, size_m, bottom_m, reading.frame.rectangle_m, reading.before, counts,
+            self.look_shown, self.backs,
         )  # fmt: skip
+
+    def counts(self, rooms: RoomBoxes) -> Float[Tensor, "rooms classes"]:
+        """Number of objects of each class."""
+        return self.contents.before(rooms.object_class, rooms.is_object)[:, -1]
 
     def log_prob(self, reading: "Reading", coming: RoomBoxes) -> dict[str, Float[Tensor, " rooms"]]:
         """Log-probability of each room's next object given its class, by part. Every room of
@@ -260,10 +260,15 @@ class Reading(NamedTuple):
 
     before: RoomBoxes
     frame: Frame
+    coming: Float[Tensor, "rooms classes"]
+    """Counts of each class still to come."""
     context: Float[Tensor, "rooms width"]
     """Output of the query: the context for the next object."""
-    objects: Float[Tensor, "rooms objects width"]
-    """Output of each object; arbitrary for padding."""
+
+    def rows(self, rows: Int[Tensor, " some"]) -> "Reading":
+        """The outputs of these rooms."""
+        before = self.before.changed(lambda part: part[rows])
+        return Reading(before, self.frame.rows(rows), self.coming[rows], self.context[rows])
 
 
 def lengths_shown(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch shown"]:

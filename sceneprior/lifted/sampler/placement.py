@@ -1,76 +1,318 @@
-"""The distribution of an object's place: a mixture over places relative to room and objects."""
+"""The distribution of an object's place, as a choice between places relative to the room and to the
+objects that are there."""
+
+import math
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from sceneprior.core.mixtures import LogisticMixture
-from sceneprior.paper.layers import mlp
+from sceneprior.core.geometry.turns import QUARTERS
+from sceneprior.core.mixtures import FIRST_SCALE, LogisticMixture
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.prototypes import PARTS
+from sceneprior.lifted.sampler.frames import (
+    backs_of,
+    into_frames,
+    turn_places,
+    turn_rectangles,
+)
+from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, shared_extents
 
-EDGES = 2
-"""Logistics per place that is determined by the room."""
-KNOWN = 4
-"""Reference positions along an axis: flush with either side of the rectangle, its middle, and the
-origin, which is the floor's middle. Places determined by the room are their pairs."""
-BESIDE = 6
-"""Logistics per object that is already placed."""
+SHOWN = PARTS**3 + 3
+"""Numbers that encode a look: its coarse grid and the logarithms of its extents."""
+EMBEDDING = 16
+"""Dimension of the embeddings of classes and of looks. Small, as all inputs here: exact sizes would
+identify a training room."""
+WIDTH = 64
+"""Width of the hidden layers."""
+BY_SIDES = 8
+"""Anchors along an axis that the room gives: flush with the lower side of the rectangle, with its
+upper side, in its middle, and at the origin, which is the floor's middle; a narrow one and a wide
+one each."""
+BY_OBJECT = 7
+"""Anchors along an axis per object that is there: adjacent before it, flush with its lower side,
+centred, flush with its upper side, adjacent behind it, and `APART_M` before and behind it."""
+APART_M = 0.4
+"""Gap of the anchors apart from an object."""
+NARROW_M, WIDE_M = 0.03, 0.2
+"""Scales of narrow and wide logistics for a network output of 0. The room's second anchors and
+those apart from objects are wide."""
+SHIFT_M = 0.3
+"""Shift of an anchor for a network output of 1."""
+GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 1.0, 2.0)
+"""Knots of `ramps` for gaps; negative gaps are overlaps."""
+OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
+"""Knots of `ramps` for offsets of centres and sides."""
+OF_GAP, OF_OFFSET = len(GAPS_M) - 1, len(OFFSETS_M) - 1
+OF_OBJECT, OF_SIDES = OF_GAP + 3 * OF_OFFSET, 2 * OF_GAP
+"""Features of the relation to an object along an axis, and to the two sides of the rectangle."""
+
+
+def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> Tensor:
+    """Piecewise linear features of lengths: each rises from 0 to 1 between two knots.
+
+    Example:
+
+        >>> ramps(torch.tensor([0.5]), (0.0, 1.0, 2.0))
+        tensor([0.5000, 0.0000])
+    """
+    knots = torch.tensor(knots_m).to(lengths_m)
+    rising = (lengths_m.unsqueeze(-1) - knots[:-1]) / knots.diff()
+    return rising.clamp(0, 1).flatten(-2)
 
 
 class Placement(nn.Module):
-    """The distribution of a footprint's centre (x, z).
+    """The distribution of a footprint's centre (x, z) in the object's frame: that of x, times that
+    of z given x.
 
-    A mixture of logistics of two kinds. The means of the first are determined by the room: along x
-    and along z flush with a side of the rectangle, in its middle, or in the middle of the floor,
-    plus a predicted shift. The means of the second are, for each object already placed,
+    Each is a mixture of logistics around anchors: positions flush with a side of the rectangle, in
+    its middle or in the floor's, and for every object there adjacent to it, flush with its sides,
+    centred, or apart. So an object can stand flush with a wall along one axis and adjacent to
+    another object along the other. The weight of an anchor is scored by what an object there would
+    stand next to (`AxisScore`).
 
-        its centre + a * half the sum of both sizes + b * half their difference + c,
-
-    so that a = 1 means "adjacent to it" and b = 1 "flush with its side", whatever the sizes. The
-    network predicts a and b in [-1.5, 1.5], c in metres, and all weights and scales.
+    Args:
+        classes: Size of the label set.
+        dropout: Dropout rate.
     """
 
-    def __init__(self, width: int):
+    def __init__(self, classes: int, dropout: float):
         super().__init__()
-        self.from_query = nn.Linear(width, width)
-        self.from_object = nn.Linear(width, width)
-        # outputs: log-weight, then shift and log-scale of x and z
-        self.of_rectangle = mlp(nn.Linear(width, width), nn.Linear(width, KNOWN**2 * EDGES * 5))
-        # outputs: log-weight, then a, b, c and log-scale of x and z
-        self.of_object = mlp(nn.Linear(width, width), nn.Linear(width, BESIDE * 9))
+        self.class_embedding = nn.Embedding(classes, EMBEDDING)
+        self.look_embedding = nn.Linear(SHOWN, EMBEDDING)
+        self.own = nn.Linear(2 * EMBEDDING + 6 + 2 * classes, WIDTH)
+        self.there = nn.Linear(2 * EMBEDDING + QUARTERS + 4 + 2 * OF_SIDES, WIDTH)
+        self.dropout = nn.Dropout(dropout)
+        self.along_x = AxisScore(classes, OF_OBJECT, OF_SIDES, dropout)
+        # Given x, both axes are known, and the share of the footprints that overlaps.
+        self.along_z = AxisScore(classes, 2 * OF_OBJECT + 1, 2 * OF_SIDES, dropout)
 
     def forward(
         self,
-        query: Float[Tensor, "rooms width"],
-        size_m: Float[Tensor, "rooms 2"],
+        label: Int[Tensor, " rooms"],
+        look: Int[Tensor, " rooms"],
+        size_m: Float[Tensor, "rooms 3"],
+        bottom_m: Float[Tensor, " rooms"],
         rectangle_m: Float[Tensor, "rooms 4"],
-        objects: Float[Tensor, "rooms objects width"],
-        boxes_m: Float[Tensor, "rooms objects 4"],
-        is_object: Bool[Tensor, "rooms objects"],
-    ) -> LogisticMixture:
-        """The mixture for a footprint of `size_m` in a rectangle (centre x, z, extents x, z), given
-        the features `objects` of the objects already placed and their footprints `boxes_m`, in the
-        same format as `rectangle_m`."""
-        own = self.from_query(query)
-        free = ((rectangle_m[:, 2:] - size_m) / 2).clamp(min=0)
-        middle = rectangle_m[:, :2]
-        known = torch.stack([middle - free, middle, middle + free, torch.zeros_like(free)], dim=1)
-        x, z = known.unbind(dim=-1)
-        pairs = [x.repeat_interleave(KNOWN, dim=1), z.repeat(1, KNOWN)]
-        edges = self.of_rectangle(torch.relu(own)).unflatten(-1, (KNOWN**2, EDGES, 5))
-        means = torch.stack(pairs, dim=-1).unsqueeze(2) + edges[..., 1:3]
-        at_edges = (edges[..., 0], means, edges[..., 3:])
+        before: RoomBoxes,
+        counts: Float[Tensor, "rooms counts"],
+        look_shown: Float[Tensor, "looks shown"],
+        backs: Int[Tensor, " prototypes"],
+    ) -> "Places":
+        """The distribution for an object of a class, look and size, given the rectangle (centre
+        x, z, extents x, z), the objects there, and the counts of each class there and to come.
 
-        pair = torch.relu(own.unsqueeze(1) + self.from_object(objects))
-        weight, a, b, c, scale = (
-            self.of_object(pair).unflatten(-1, (BESIDE, 9)).split([1, 2, 2, 2, 2], dim=-1)
+        Args:
+            look_shown: Encoding of every look.
+            backs: Side of every prototype's back; see `backs_of`.
+        """
+        back = backs_of(look, backs)
+        quarters = -back % QUARTERS
+        before, rectangle_m = into_frames(before, back), turn_rectangles(rectangle_m, quarters)
+        looks = before.looks
+        assert looks is not None
+        own_look = into_frames(_alone(label, look, size_m), back).looks
+        assert own_look is not None
+        size_m = torch.where((quarters % 2 == 1)[:, None], size_m.flip(-1), size_m)
+        centre, extents = before.boxes_m.split(3, dim=-1)
+        bottoms_m = centre[..., 1:2] - extents[..., 1:2] / 2
+        to_sides = ramps(torch.cat(gaps_to_sides_m(before.boxes_m, rectangle_m), dim=-1), GAPS_M)
+        there = torch.cat([
+            self.class_embedding(before.object_class), self.look_embedding(look_shown[looks]),
+            torch.eye(QUARTERS).to(extents)[backs_of(looks, backs)], extents, bottoms_m, to_sides,
+        ], dim=-1)  # fmt: skip
+        own = torch.cat([
+            self.class_embedding(label), self.look_embedding(look_shown[own_look[:, 0]]),
+            size_m, bottom_m.unsqueeze(-1), rectangle_m[:, 2:] / 4, counts,
+        ], dim=-1)  # fmt: skip
+        own_box = torch.cat([centre.new_zeros(len(label), 3), size_m], dim=-1).unsqueeze(1)
+        own_box[:, 0, 1] = bottom_m + size_m[:, 1] / 2
+        # Whether the two overlap in height, wherever they stand.
+        level = centre * torch.tensor([0.0, 1.0, 0.0]).to(centre)
+        meets = shared_extents(own_box, torch.cat([level, extents], dim=-1))[..., 1] > 0
+        return Places(
+            self, label, before.object_class,
+            self.dropout(torch.relu(self.own(own))), self.dropout(torch.relu(self.there(there))),
+            size_m[:, ::2], rectangle_m, before.boxes_m[..., [0, 2, 3, 5]], before.is_object,
+            meets, quarters,
+        )  # fmt: skip
+
+
+class AxisScore(nn.Module):
+    """Weights, shifts and scales of the anchors along an axis.
+
+    The score of an anchor is that of a small network, which sums over the objects there, plus a
+    linear function of the same features with tables of coefficients by class and by pair of
+    classes. The tables find within a few steps what the network alone needs ten times as long for:
+    that a nightstand stands adjacent to a bed.
+    """
+
+    def __init__(self, classes: int, of_object: int, of_sides: int, dropout: float):
+        super().__init__()
+        self.pair_table = nn.Parameter(torch.zeros(classes, classes, of_object))
+        self.side_table = nn.Parameter(torch.zeros(classes, of_sides))
+        self.anchor_table = nn.Parameter(torch.zeros(classes, BY_SIDES + BY_OBJECT))
+        self.relation = nn.Linear(of_object, WIDTH)
+        self.own, self.there = nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH)
+        self.pooled, self.sides = nn.Linear(WIDTH, WIDTH), nn.Linear(of_sides, WIDTH)
+        self.anchor = nn.Embedding(BY_SIDES + BY_OBJECT, WIDTH)
+        self.anchor_own = nn.Linear(WIDTH, WIDTH)
+        self.dropout = nn.Dropout(dropout)
+        self.out = nn.Linear(WIDTH, 3)
+        scales_m = (
+            [NARROW_M, WIDE_M] * (BY_SIDES // 2) + [NARROW_M] * (BY_OBJECT - 2) + [WIDE_M] * 2
         )
-        total = (boxes_m[..., 2:] + size_m.unsqueeze(1)).unsqueeze(-2) / 2
-        difference = (boxes_m[..., 2:] - size_m.unsqueeze(1)).unsqueeze(-2) / 2
-        means = boxes_m[..., None, :2] + 1.5 * a.tanh() * total + 1.5 * b.tanh() * difference + c
-        weights = weight[..., 0].masked_fill(~is_object.unsqueeze(-1), -torch.inf)
-        beside = (weights, means, scale)
-        joined = [
-            torch.cat([one.flatten(1, 2), other.flatten(1, 2)], dim=1)
-            for one, other in zip(at_edges, beside, strict=True)
-        ]
-        return LogisticMixture.bounded(*joined)
+        first = torch.tensor([math.log(scale_m / FIRST_SCALE) for scale_m in scales_m])
+        self.first_log_scale: Tensor
+        self.register_buffer("first_log_scale", first, persistent=False)
+        with torch.no_grad():  # so that anchors start near their positions, equally likely
+            self.anchor.weight *= 0.1
+            self.out.weight *= 0.5
+            self.out.bias.zero_()
+
+    def forward(self, places: "Places", anchors: "Anchors") -> LogisticMixture:
+        """The mixture along the axis of the `anchors`."""
+        is_object = places.is_object.unsqueeze(-1)
+        given = (self.own(places.own).unsqueeze(1) + self.there(places.there)).unsqueeze(1)
+        pairs = torch.relu(self.relation(anchors.relations) + given) * is_object.unsqueeze(1)
+        known = self.sides(anchors.sides) + self.anchor(anchors.kind)
+        hidden = (
+            self.pooled(pairs.sum(dim=2) / 2) + known + self.anchor_own(places.own).unsqueeze(1)
+        )
+        logit, shift, scale = self.out(self.dropout(torch.relu(hidden))).unbind(dim=-1)
+        table = self.pair_table[places.label.unsqueeze(1), places.object_class] * is_object
+        logit = logit + torch.einsum("raof,rof->ra", anchors.relations, table)
+        logit = logit + torch.einsum("raf,rf->ra", anchors.sides, self.side_table[places.label])
+        logit = logit + self.anchor_table[places.label][:, anchors.kind]
+        means = anchors.at_m + SHIFT_M * shift
+        return LogisticMixture.bounded(
+            logit.masked_fill(~anchors.exists, -torch.inf),
+            means.unsqueeze(-1),
+            (scale + self.first_log_scale[anchors.kind]).unsqueeze(-1),
+        )
+
+
+class Anchors(NamedTuple):
+    """Positions along an axis, and what an object there would stand next to."""
+
+    at_m: Float[Tensor, "rooms anchors"]
+    exists: Bool[Tensor, "rooms anchors"]
+    """False for the anchors of padding."""
+    kind: Int[Tensor, " anchors"]
+    """0 to 7 for those that the room gives, 8 to 14 for those of an object."""
+    relations: Float[Tensor, "rooms anchors objects features"]
+    sides: Float[Tensor, "rooms anchors features"]
+
+
+class Places(NamedTuple):
+    """The distribution of the next object's centre (x, z) in each room; lengths are in the frames
+    of these objects."""
+
+    placement: Placement
+    label: Int[Tensor, " rooms"]
+    object_class: Int[Tensor, "rooms objects"]
+    own: Float[Tensor, "rooms width"]
+    there: Float[Tensor, "rooms objects width"]
+    size_m: Float[Tensor, "rooms 2"]
+    rectangle_m: Float[Tensor, "rooms 4"]
+    footprints_m: Float[Tensor, "rooms objects 4"]
+    """Centre x, z and extents x, z of the objects there."""
+    is_object: Bool[Tensor, "rooms objects"]
+    meets: Bool[Tensor, "rooms objects"]
+    """True for objects that overlap with the next object in height."""
+    quarters: Int[Tensor, " rooms"]
+    """Quarter turns that take the room to the frame."""
+
+    def rows(self, rows: Int[Tensor, " some"]) -> "Places":
+        """The distribution in these rooms."""
+        return Places(self.placement, *(part[rows] for part in self[1:]))
+
+    def log_prob(self, place_m: Float[Tensor, "rooms 2"]) -> Float[Tensor, " rooms"]:
+        """Log-densities of places in the rooms."""
+        x, z = turn_places(place_m, self.quarters).split(1, dim=-1)
+        return self._along_x().log_prob(x) + self._along_z(x[:, 0]).log_prob(z)
+
+    def draw_x(self, uniform: Float[Tensor, "rooms tries 2"]) -> Float[Tensor, "rooms tries"]:
+        """Positions along x of the frames from uniform numbers."""
+        return self._along_x().drawn(uniform[..., 0], uniform[..., 1:])[..., 0]
+
+    def draw(
+        self, x: Float[Tensor, " rooms"], uniform: Float[Tensor, "rooms 2"]
+    ) -> Float[Tensor, "rooms 2"]:
+        """Places in the rooms, given the position along x of the frames, from uniform numbers."""
+        z = self._along_z(x).draw(uniform[:, 0], uniform[:, 1:])[:, 0]
+        return turn_places(torch.stack([x, z], dim=-1), -self.quarters % QUARTERS)
+
+    def _along_x(self) -> LogisticMixture:
+        at_m, exists, kind = self._anchors(0)
+        relations, sides, _ = self._relations(0, at_m)
+        return self.placement.along_x(self, Anchors(at_m, exists, kind, relations, sides))
+
+    def _along_z(self, x: Float[Tensor, " rooms"]) -> LogisticMixture:
+        at_m, exists, kind = self._anchors(1)
+        relations_x, sides_x, overlap_x = self._relations(0, x.unsqueeze(1))
+        relations_z, sides_z, overlap_z = self._relations(1, at_m)
+        many = at_m.shape[1]
+        least = torch.minimum(
+            self.size_m.prod(dim=-1, keepdim=True), self.footprints_m[..., 2:].prod(dim=-1)
+        )
+        shared = overlap_x * overlap_z / least.clamp(min=1e-6).unsqueeze(1)
+        shared = (shared * self.meets.unsqueeze(1)).clamp(max=1).unsqueeze(-1)
+        relations = [relations_x.expand(-1, many, -1, -1), relations_z, shared.sqrt()]
+        sides = [sides_x.expand(-1, many, -1), sides_z]
+        return self.placement.along_z(
+            self,
+            Anchors(at_m, exists, kind, torch.cat(relations, dim=-1), torch.cat(sides, dim=-1)),
+        )
+
+    def _anchors(self, axis: int) -> tuple[Tensor, Tensor, Tensor]:
+        """`at_m`, `exists` and `kind` of `Anchors` along x (0) or z (1)."""
+        middle, extent = self.rectangle_m[:, axis], self.rectangle_m[:, 2 + axis]
+        size = self.size_m[:, axis]
+        free = ((extent - size) / 2).clamp(min=0)
+        sides = torch.stack([middle - free, middle + free, middle, torch.zeros_like(free)], dim=1)
+        sides = sides.repeat_interleave(2, dim=1)
+        centre, theirs = self.footprints_m[..., axis], self.footprints_m[..., 2 + axis]
+        total, difference = (theirs + size.unsqueeze(1)) / 2, (theirs - size.unsqueeze(1)) / 2
+        away = torch.stack(
+            [-total, -difference, torch.zeros_like(total), difference, total,
+             -total - APART_M, total + APART_M], dim=-1,
+        )  # fmt: skip
+        beside = (centre.unsqueeze(-1) + away).flatten(1)
+        theirs = self.is_object.repeat_interleave(BY_OBJECT, dim=1)
+        kinds = torch.arange(BY_SIDES + BY_OBJECT, device=size.device)
+        return (
+            torch.cat([sides, beside], dim=1),
+            torch.cat([torch.ones_like(sides, dtype=torch.bool), theirs], dim=1),
+            torch.cat([kinds[:BY_SIDES], kinds[BY_SIDES:].repeat(centre.shape[1])]),
+        )
+
+    def _relations(self, axis: int, at_m: Float[Tensor, "rooms anchors"]) -> tuple[Tensor, ...]:
+        """Features along an axis of the relations to the objects there and to the sides of the
+        rectangle, and the overlap with each object in metres."""
+        size = self.size_m[:, axis].unsqueeze(1)
+        offset = self.footprints_m[:, None, :, axis] - at_m.unsqueeze(-1)
+        theirs = self.footprints_m[..., 2 + axis]
+        total, difference = ((theirs + size) / 2).unsqueeze(1), ((theirs - size) / 2).unsqueeze(1)
+        gap = offset.abs() - total
+        offsets = torch.stack([offset, offset - difference, offset + difference], dim=-1)
+        relations = [ramps(gap.unsqueeze(-1), GAPS_M), ramps(offsets, OFFSETS_M)]
+        middle, extent = (self.rectangle_m[:, [at]] for at in (axis, 2 + axis))
+        to_middle = at_m - middle
+        sides = (
+            torch.stack([extent / 2 + to_middle, extent / 2 - to_middle], dim=-1)
+            - size[..., None] / 2
+        )
+        overlap = (-gap).clamp(min=0)
+        return torch.cat(relations, dim=-1), ramps(sides, GAPS_M), overlap
+
+
+def _alone(
+    label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"], size_m: Float[Tensor, "rooms 3"]
+) -> RoomBoxes:
+    """Rooms with one object each, at the origin."""
+    boxes_m = torch.cat([torch.zeros_like(size_m), size_m], dim=-1).unsqueeze(1)
+    is_object = torch.ones_like(label, dtype=torch.bool).unsqueeze(1)
+    return RoomBoxes(label.unsqueeze(1), is_object, boxes_m, looks=look.unsqueeze(1))

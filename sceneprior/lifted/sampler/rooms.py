@@ -158,6 +158,16 @@ def gaps_m(rooms: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]) -> Float[Ten
     return torch.cat([own_low - low, high - own_high], dim=-1)
 
 
+def gaps_to_sides_m(
+    boxes_m: Float[Tensor, "rooms objects 6"], rectangle_m: Float[Tensor, "rooms 4"]
+) -> tuple[Float[Tensor, "rooms objects 2"], Float[Tensor, "rooms objects 2"]]:
+    """Gaps in metres between each box and the lower sides of a rectangle along x and z, and between
+    it and the upper sides."""
+    low, high = rectangle_sides(rectangle_m.unsqueeze(1))
+    centre, half = boxes_m[..., [0, 2]], boxes_m[..., [3, 5]] / 2
+    return centre - half - low, high - centre - half
+
+
 def turned_rooms(rooms: RoomBoxes, symmetry: Int[Tensor, " rooms"]) -> RoomBoxes:
     """Every room in one of its `SYMMETRIES`: from 4 on mirrored, then turned by `symmetry` % 4
     quarters."""

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.sampler.contents import END
+from sceneprior.lifted.sampler.frames import find_backs
 from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
 from sceneprior.lifted.sampler.network import RECTANGLES, RoomSampler
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, SamplerRooms, frames_of, turned_rooms
@@ -30,6 +31,11 @@ from sceneprior.training.steps import (
 
 ORDERS = 4
 """Random orders of every val room over which its likelihood is averaged."""
+TABLES_RATE = 10.0
+"""Learning rate of the tables of `Placement` relative to that of the rest: a pair of classes occurs
+in a few batches of an epoch."""
+TABLES_DECAY = 10.0
+"""Weight decay of these tables relative to that of the rest."""
 CONTENTS_RATE = 5.0
 """Learning rate of `Contents` relative to that of the rest. It is small and independent of the
 rest, and its evidence is rare: one in thirty rooms shows whether a bedroom may lack a bed."""
@@ -116,23 +122,26 @@ class SamplerStage(lightning.LightningModule):
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         rate = self.stage.learning_rate
-        named = list(self.learner.named_parameters())
-        contents = [value for name, value in named if name.startswith("contents.")]
-        rest = [value for name, value in named if not name.startswith("contents.")]
+        decay = self.stage.weight_decay
+        contents, tables, rest = [], [], []
+        for name, value in self.learner.named_parameters():
+            table = name.startswith("placement.") and name.endswith("_table")
+            (contents if name.startswith("contents.") else tables if table else rest).append(value)
         optimizer = torch.optim.AdamW(
             [
                 {"params": rest, "lr": rate},
                 {"params": contents, "lr": CONTENTS_RATE * rate},
+                {"params": tables, "lr": TABLES_RATE * rate, "weight_decay": TABLES_DECAY * decay},
             ],
-            weight_decay=self.stage.weight_decay,
+            weight_decay=decay,
         )
         return with_cosine(optimizer, int(self.trainer.estimated_stepping_batches))
 
 
 def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     """Set the buffers that a fresh sampler takes from the training rooms: the encodings of looks,
-    the mixture of rectangles, the classes that may be sampled and may intersect, and mean
-    footprints."""
+    the mixture of rectangles, the classes that may be sampled and may intersect, mean footprints,
+    and the backs of prototypes."""
     prototypes = rooms.prototypes
     looks = torch.from_numpy(prototypes.shown())
     sampler.look_shown[: len(looks)] = looks
@@ -145,6 +154,7 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     areas_m2 = rooms.rooms.boxes_m[here][:, [3, 5]].prod(dim=-1)
     labels = rooms.rooms.object_class[here]
     sampler.footprints_m2.scatter_reduce_(0, labels, areas_m2, "mean", include_self=False)
+    sampler.backs.copy_(find_backs(rooms.rooms, len(sampler.backs)))
     generator = torch.Generator().manual_seed(0)
     furnished = here.any(dim=1)
     frames = torch.cat([frames_of(rooms.rooms, generator) for _ in range(FRAMES)])

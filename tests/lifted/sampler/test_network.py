@@ -13,7 +13,6 @@ from sceneprior.lifted.prototypes import turned_looks
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
 from sceneprior.lifted.sampler.network import Frame
-from sceneprior.lifted.sampler.placement import BESIDE, EDGES, KNOWN, Placement
 from sceneprior.lifted.sampler.rooms import (
     SYMMETRIES,
     SamplerRooms,
@@ -56,8 +55,6 @@ def test_order_and_padding_change_nothing(sampler, rooms):
     order = torch.tensor([[2, 0, 1]]).expand(len(frame), -1)
     mixed = read(sampler, whole.take(order), frame)
     assert_close(mixed.context, plain.context)
-    there = torch.take_along_dim(plain.objects, order.unsqueeze(-1), dim=1)
-    assert_close(mixed.objects[mixed.before.is_object], there[mixed.before.is_object])
     wrong = whole.boxes_m.where(whole.is_object.unsqueeze(-1), 99.0)
     filled = RoomBoxes(whole.object_class, whole.is_object, wrong, looks=whole.looks)
     assert torch.equal(read(sampler, filled, frame).context, plain.context)
@@ -146,13 +143,13 @@ def test_gradients_of_the_likelihood_are_right(rooms):
     two = in_float64(rooms.rooms).changed(lambda part: part[:2])
 
     def loss(query: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-        changed = {"query": query, "placement.of_object.2.weight": weight}
+        changed = {"query": query, "placement.along_z.pair_table": weight}
         parts = torch.func.functional_call(
             _Likelihood(sampler), {f"sampler.{k}": v for k, v in changed.items()}, (two,)
         )
         return torch.stack(list(parts.values())).sum()
 
-    start = (sampler.query, sampler.placement.of_object[2].weight)
+    start = (sampler.query, sampler.placement.along_z.pair_table)
     leaves = [value.detach().clone().requires_grad_(True) for value in start]
     assert torch.autograd.gradcheck(loss, leaves, fast_mode=True)
 
@@ -165,44 +162,6 @@ class _Likelihood(torch.nn.Module):
     def forward(self, rooms: RoomBoxes) -> dict[str, torch.Tensor]:
         generator = torch.Generator().manual_seed(0)
         return negative_log_likelihood(self.sampler, rooms, as_they_are(rooms), generator)
-
-
-def test_places_move_with_the_room():
-    """A rectangle and objects that move by a metre move the places, but for those at the middle of
-    the floor; nothing else does."""
-    torch.manual_seed(0)
-    placement = Placement(8).double()
-    rng = torch.Generator().manual_seed(1)
-    query, objects = (torch.randn(*n, 8, generator=rng).double() for n in ((3,), (3, 2)))
-    size_m = torch.rand(3, 2, generator=rng).double() + 0.2
-    frame = torch.tensor([0.0, 1.0, 4.0, 3.0]).double().expand(3, -1)
-    boxes_m = torch.rand(3, 2, 4, generator=rng).double()
-    here = torch.tensor([[True, True], [True, False], [False, False]])
-    before = placement(query, size_m, frame, objects, boxes_m, here)
-    by = torch.tensor([1.0, -2.0, 0.0, 0.0]).double()
-    after = placement(query, size_m, frame + by, objects, boxes_m + by, here)
-    at_floor = torch.arange(KNOWN) == KNOWN - 1
-    x = ~at_floor.repeat_interleave(KNOWN * EDGES)
-    z = ~at_floor.repeat_interleave(EDGES).repeat(KNOWN)
-    beside = torch.ones(2 * BESIDE, dtype=torch.bool)
-    moves = torch.stack([torch.cat([x, beside]), torch.cat([z, beside])], dim=-1)
-    assert_close(after.means, before.means + by[:2] * moves)
-    assert torch.equal(after.weight_logits, before.weight_logits)
-    assert before.weight_logits[2].isfinite().sum() == KNOWN**2 * EDGES
-
-
-def test_an_object_larger_than_the_rectangle_stands_in_its_middle():
-    placement = Placement(8)
-    nothing = torch.zeros(1, 0, 8), torch.zeros(1, 0, 4), torch.zeros(1, 0, dtype=torch.bool)
-    frame = torch.tensor([[1.0, 2.0, 0.5, 0.5]])
-    # Along either axis three places of the rectangle, and the floor's middle.
-    middles = torch.cartesian_prod(torch.tensor([1.0, 1, 1, 0]), torch.tensor([2.0, 2, 2, 0]))
-    middles = middles.unsqueeze(1)
-    for name, weight in placement.named_parameters():
-        if name.startswith("of_rectangle.2"):
-            torch.nn.init.zeros_(weight)
-    found = placement(torch.randn(1, 8), torch.full((1, 2), 3.0), frame, *nothing)
-    assert_close(found.means, middles.expand(1, -1, EDGES, 2).flatten(1, 2))
 
 
 def test_void_ends_a_room(sampler):

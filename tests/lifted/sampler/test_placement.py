@@ -1,0 +1,192 @@
+"""Places of objects: they turn with the room, are likely where they are drawn, and density is 1."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.prototypes import POSES, turned_looks
+from sceneprior.lifted.sampler.frames import (
+    backs_of,
+    find_backs,
+    into_frames,
+    turn_places,
+    turn_rectangles,
+)
+from sceneprior.lifted.sampler.placement import Placement, Places, ramps
+
+CLASSES, LOOKS = 4, 3 * POSES
+
+
+@pytest.fixture
+def placement() -> Placement:
+    """With every weight random, tables too."""
+    torch.manual_seed(0)
+    placement = Placement(CLASSES, 0.0).double()
+    with torch.no_grad():
+        for value in placement.parameters():
+            value += 0.1 * torch.randn_like(value)
+    return placement
+
+
+def rooms_with(boxes_m: torch.Tensor, looks: torch.Tensor) -> RoomBoxes:
+    """Rooms with two objects, the last one with one."""
+    is_object = torch.ones_like(looks, dtype=torch.bool)
+    is_object[-1, -1] = False
+    return RoomBoxes(
+        torch.arange(1, 3).expand_as(looks) * is_object, is_object, boxes_m, looks=looks
+    )
+
+
+def distribution(placement: Placement, rooms: RoomBoxes, look, size_m, rectangle_m) -> Places:
+    shown = torch.rand(LOOKS, 67, generator=torch.Generator().manual_seed(1)).double()
+    label, counts = torch.full_like(look, 3), torch.ones(len(look), 2 * CLASSES).double()
+    return placement(
+        label, look, size_m, torch.full_like(size_m[:, 0], 0.1), rectangle_m, rooms, counts, shown,
+        torch.tensor([0, 1, 3]),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def given():
+    rng = torch.Generator().manual_seed(2)
+    boxes_m = torch.rand(3, 2, 6, generator=rng).double()
+    looks = torch.randint(LOOKS, (3, 2), generator=rng)
+    size_m = 0.2 + torch.rand(3, 3, generator=rng).double()
+    rectangle_m = torch.tensor([0.2, -0.3, 4.0, 3.0]).double().expand(3, -1)
+    return rooms_with(boxes_m, looks), torch.tensor([0, 9, 22]), size_m, rectangle_m
+
+
+@pytest.mark.parametrize("quarters", range(QUARTERS))
+def test_places_turn_with_the_room(placement, given, quarters):
+    rooms, look, size_m, rectangle_m = given
+    by, no = torch.full((3,), quarters), torch.zeros(3, dtype=torch.bool)
+    place_m = torch.tensor([[0.5, 0.1], [1.0, -1.0], [-1.5, 0.7]]).double()
+    plain = distribution(placement, rooms, look, size_m, rectangle_m).log_prob(place_m)
+    assert rooms.looks is not None
+    turned = RoomBoxes(
+        rooms.object_class, rooms.is_object, turn_boxes(rooms.boxes_m, by),
+        looks=turned_looks(rooms.looks, by, no),
+    )  # fmt: skip
+    there = distribution(
+        placement, turned, turned_looks(look[:, None], by, no)[:, 0],
+        size_m.flip(-1) if quarters % 2 else size_m, turn_rectangles(rectangle_m, by),
+    )  # fmt: skip
+    assert_close(there.log_prob(turn_places(place_m, by)), plain, rtol=0, atol=1e-12)
+
+
+def test_order_and_padding_of_objects_change_nothing(placement, given):
+    rooms, look, size_m, rectangle_m = given
+    place_m = torch.zeros(3, 2).double()
+    plain = distribution(placement, rooms, look, size_m, rectangle_m).log_prob(place_m)
+    swapped = rooms.take(torch.tensor([[1, 0], [1, 0], [0, 1]]))
+    assert_close(
+        distribution(placement, swapped, look, size_m, rectangle_m).log_prob(place_m), plain
+    )
+    boxes_m = rooms.boxes_m.where(rooms.is_object.unsqueeze(-1), 7.0)
+    filled = RoomBoxes(rooms.object_class, rooms.is_object, boxes_m, looks=rooms.looks)
+    assert torch.equal(
+        distribution(placement, filled, look, size_m, rectangle_m).log_prob(place_m), plain
+    )
+
+
+def test_density_integrates_to_one(placement, given):
+    rooms, look, size_m, rectangle_m = given
+    places = distribution(placement, rooms, look, size_m, rectangle_m).rows(torch.tensor([0]))
+    step = 0.05
+    axis = torch.arange(-9, 9, step).double()
+    grid = torch.cartesian_prod(axis, axis)
+    every = places.rows(torch.zeros(len(grid), dtype=torch.int64))
+    with torch.no_grad():
+        total = float(every.log_prob(grid).exp().sum()) * step**2
+    assert total == pytest.approx(1, abs=0.01)
+
+
+def test_draws_follow_the_density(placement, given):
+    """The mean log-density of draws is that of the density itself: its negative entropy."""
+    rooms, look, size_m, rectangle_m = given
+    one = distribution(placement, rooms, look, size_m, rectangle_m).rows(torch.tensor([1]))
+    many = one.rows(torch.zeros(20000, dtype=torch.int64))
+    uniform = torch.rand(20000, 4, generator=torch.Generator().manual_seed(3)).double()
+    axis = torch.arange(-9, 9, 0.05).double()
+    grid = torch.cartesian_prod(axis, axis)
+    with torch.no_grad():
+        x = many.draw_x(uniform[:, None, :2])[:, 0]
+        drawn = many.log_prob(many.draw(x, uniform[:, 2:]))
+        density = one.rows(torch.zeros(len(grid), dtype=torch.int64)).log_prob(grid)
+    wanted = float((density.exp() * density).sum()) * 0.05**2
+    assert float(drawn.mean()) == pytest.approx(
+        wanted, abs=4 * float(drawn.std()) / 20000**0.5 + 0.02
+    )
+
+
+def test_without_objects_and_larger_than_the_rectangle(placement):
+    """Anchors flush with either side of a rectangle that is too small are its middle."""
+    nothing = torch.zeros(1, 0, dtype=torch.int64)
+    rooms = RoomBoxes(nothing, nothing > 0, torch.zeros(1, 0, 6).double(), looks=nothing)
+    rectangle_m = torch.tensor([[1.0, 2.0, 0.5, 0.5]]).double()
+    found = distribution(
+        placement, rooms, torch.tensor([0]), torch.full((1, 3), 3.0).double(), rectangle_m
+    )
+    at_m, exists, kind = found._anchors(1)
+    assert at_m.tolist() == [[2.0] * 6 + [0.0] * 2]
+    assert exists.all() and kind.tolist() == list(range(8))
+    assert found.log_prob(torch.zeros(1, 2).double()).isfinite().all()
+
+
+def test_an_object_learns_to_stand_beside_another():
+    """A few steps on rooms in which it stands to the right of the bed, wherever that is."""
+    torch.manual_seed(0)
+    placement = Placement(CLASSES, 0.0).double()
+    rng = torch.Generator().manual_seed(4)
+    many = 64
+    boxes_m = torch.tensor([0.0, 0.5, 0.0, 1.5, 1.0, 2.0]).double().repeat(many, 1, 1)
+    boxes_m[:, 0, [0, 2]] = torch.rand(many, 2, generator=rng).double() - 0.5
+    here = torch.ones(many, 1, dtype=torch.bool)
+    looks = torch.zeros(many, 1, dtype=torch.int64)
+    rooms = RoomBoxes(here.long(), here, boxes_m, looks=looks)
+    size_m = torch.tensor([0.5, 0.5, 0.5]).double().repeat(many, 1)
+    frame = torch.tensor([0.0, 0.0, 6.0, 6.0]).double().expand(many, -1)
+    beside_m = boxes_m[:, 0, [0, 2]] + torch.tensor([1.0, -0.75]).double()
+    optimizer = torch.optim.Adam(placement.parameters(), lr=0.02)
+    for _ in range(100):
+        loss = -distribution(placement, rooms, looks[:, 0], size_m, frame).log_prob(beside_m).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    boxes_m[:, 0, [0, 2]] = 2 * torch.rand(many, 2, generator=rng).double() - 1
+    places = distribution(placement, rooms, looks[:, 0], size_m, frame)
+    uniform = torch.rand(many, 4, generator=rng).double()
+    with torch.no_grad():
+        drawn = places.draw(places.draw_x(uniform[:, None, :2])[:, 0], uniform[:, 2:])
+    off = drawn - boxes_m[:, 0, [0, 2]] - torch.tensor([1.0, -0.75]).double()
+    assert (off.norm(dim=-1) < 0.2).double().mean() > 0.8
+
+
+def test_the_back_is_the_side_at_the_wall():
+    """The same prototype before four walls, in the poses that face the room; the bed that is
+    mirrored has its back at the other side along x."""
+    box = torch.tensor([[[-2.0, 0.5, 0.5, 1.0, 1.0, 1.0], [0.0, 0.1, 0.0, 5.0, 0.2, 5.0]]])
+    here = torch.tensor([[True, True]])
+    plain = RoomBoxes(torch.tensor([[1, 2]]), here, box, looks=torch.tensor([[8, 0]]))
+    quarters = torch.arange(QUARTERS).repeat(2)
+    mirrored = torch.arange(2 * QUARTERS) >= QUARTERS
+    many = plain.changed(lambda part: part.repeat(2 * QUARTERS, *[1] * (part.ndim - 1)))
+    assert many.looks is not None
+    rooms = RoomBoxes(
+        many.object_class, many.is_object, turn_boxes(many.boxes_m, quarters, mirrored),
+        looks=turned_looks(many.looks, quarters, mirrored),
+    )  # fmt: skip
+    backs = find_backs(rooms, 2)
+    assert backs.tolist() == [0, 1]  # the rug in the middle is at no side; the first counts
+    assert rooms.looks is not None
+    back = backs_of(rooms.looks[:, 0], backs)
+    turned = into_frames(rooms, back)
+    assert_close(turned.boxes_m[:, 0, 2], torch.full((8,), -2.0))
+
+
+def test_ramps_are_piecewise_linear():
+    lengths = torch.tensor([-1.0, 0.25, 1.5, 9.0])
+    expected = [[0, 0], [0.25, 0], [1, 0.25], [1, 1]]
+    assert torch.stack([ramps(one[None], (0.0, 1.0, 3.0)) for one in lengths]).tolist() == expected
