@@ -19,8 +19,12 @@ from sceneprior.lifted.sampler.plan import (
 )
 from sceneprior.lifted.sampler.rooms import FRAME_M, gaps_m, shared_extents
 
-PLACES = 32
-"""Places sampled for an object, which takes the first without a violation."""
+PLACES = 16
+"""Places sampled for an object in the last attempt, in which it takes the best one."""
+TRIES = 2
+"""Places sampled for an object in each attempt before; it takes the first without a violation. Few,
+since an object whose likely places are taken would end at an unlikely one; the room is furnished
+again instead."""
 LOOKS = 16
 """Looks sampled for a given object, one of which is chosen by the likelihood of its place."""
 INTERSECTING = 0.01
@@ -32,7 +36,7 @@ SIZE_RANGE = 0.5
 """Largest difference between the log extents of an object and of its look."""
 SIZE_DOUBT = 0.1
 """Standard deviation of that difference for given objects."""
-ROUNDS = 8
+ROUNDS = 32
 """Maximum number of attempts to furnish a room before it is planned anew."""
 PLANS = 3
 """Maximum number of plans of a room."""
@@ -47,13 +51,13 @@ def draw_rooms(
     """New rooms with looks; given objects come first, with their own boxes.
 
     A room's contents are sampled first (`plan_rooms`), then its objects one by one, each at the
-    first of `PLACES` sampled places where it neither intersects an object that it should not
+    first of `TRIES` sampled places where it neither intersects an object that it should not
     (`RoomSampler.may_meet`) nor extends beyond the rectangle. A room is furnished again if some
     object has no such place, or if a side of its sampled rectangle stays empty (`OPEN_M`), as
     hardly any training room's does. After `ROUNDS` attempts it is planned again.
 
-    In the last round of `PLANS`, objects without a place are left out; if their classes were
-    requested, they take the place with the least violation instead.
+    In the last attempt, `PLACES` places are sampled. Objects without a place are left out; if their
+    classes were requested, they take the place with the least violation instead.
 
     The same seed draws the same rooms, and the first ones do not depend on `count`.
     """
@@ -112,7 +116,9 @@ def _draw(
             break
         reading = _read(sampler, rooms, number, plan, plan.coming[:, step:])
         some = label.where(going, label[going][0])  # finished rooms get a dummy class
-        look, box_m, wrong = _placed(sampler, reading, some, going, chance)
+        look, box_m, wrong = _placed(
+            sampler, reading, some, going, chance, PLACES if last else TRIES
+        )
         stuck = stuck | (going & (wrong > 0))
         placed = going & ((wrong == 0) | (last & keep))
         at = (placed.nonzero()[:, 0], number[placed])
@@ -145,8 +151,9 @@ def _placed(
     label: Int[Tensor, " rooms"],
     going: Bool[Tensor, " rooms"],
     chance: Float[Tensor, "rooms numbers"],
+    tries: int,
 ) -> tuple[Int[Tensor, " rooms"], Float[Tensor, "rooms 6"], Float[Tensor, " rooms"]]:
-    """A look and a box for an object of a class, at the first of `PLACES` sampled places without a
+    """A look and a box for an object of a class, at the first of `tries` sampled places without a
     violation, and its violation; if all have one, at the place with the least. Rooms that are not
     `going` get any box."""
     look = draw_index(sampler.look_logits(reading, label), chance[:, 1])
@@ -155,12 +162,12 @@ def _placed(
     size_m = (sampler.look_shown[look, -3:] + off).exp()
     bottom_m = details[:, 3].clamp(min=0)  # the floor
     places = sampler.place(reading, label, look, size_m, bottom_m)
-    numbers = chance[:, 7:].unflatten(1, (PLACES, 4))
+    numbers = chance[:, 7:].unflatten(1, (PLACES, 4))[:, :tries]
     x = places.draw_x(numbers[..., :2])
     centre_m = torch.stack([x[:, 0], bottom_m + size_m[:, 1] / 2, x[:, 0]], dim=-1)
     boxes_m = torch.cat([centre_m, size_m], dim=-1)
     wrong = torch.full_like(bottom_m, torch.inf)
-    for number in range(PLACES):
+    for number in range(tries):
         rows = (going & (wrong > 0)).nonzero()[:, 0]
         if not len(rows):
             break

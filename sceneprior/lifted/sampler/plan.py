@@ -61,11 +61,11 @@ def uniform_numbers(count: int, each: int, seed: tuple[int, int]) -> Float[Tenso
 
 
 def plan_rooms(sampler: RoomSampler, given: Given, count: int, seed: tuple[int, int]) -> Plan:
-    """Rectangles and classes, sampled where they are not given, with large furniture tending to
-    come first."""
+    """Rectangles and classes, sampled where they are not given; classes with the largest footprints
+    come first, so that chairs find their table."""
     slots, objects, rectangle_m = sampler.max_objects, given.objects, given.rectangle_m
-    numbers = uniform_numbers(count, 5 * RECTANGLES + 2 * slots, seed)
-    frames, uniform, tickets = numbers.split([5 * RECTANGLES, slots, slots], dim=1)
+    numbers = uniform_numbers(count, 5 * RECTANGLES + slots, seed)
+    frames, uniform = numbers.split([5 * RECTANGLES, slots], dim=1)
     if rectangle_m is None:
         choice, *normal = frames.unflatten(1, (RECTANGLES, 5)).unbind(dim=-1)
         noise = torch.special.ndtri(torch.stack(normal, dim=-1).clamp(1e-6, 1 - 1e-6))
@@ -76,7 +76,7 @@ def plan_rooms(sampler: RoomSampler, given: Given, count: int, seed: tuple[int, 
         free = slots - objects.is_object.sum(dim=1)
         coming = sampler.contents.draw(counts, free, rectangle_m[:, 2:], uniform)
     coming = F.pad(coming, (0, slots - coming.shape[1]))
-    order = large_first(coming, sampler.footprints_m2, tickets)
+    order = large_first(coming, sampler.footprints_m2, torch.zeros(coming.shape))
     drawn = given.rectangle_m is None
     return Plan(objects, rectangle_m, coming.gather(1, order), drawn)
 
