@@ -29,9 +29,6 @@ def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> No
     """Write `<name>.glb`, `<name>.png` and `<name>.json`; see `save_scene`.
 
     The JSON is written last, so that a JSON implies that the other two files exist.
-
-    Raises:
-        InputError: `name` is empty or holds a path separator.
     """
     if not name or Path(name).name != name:
         raise InputError(f"'{name}' cannot name a scene's files; use a plain name such as room_0.")
@@ -40,12 +37,7 @@ def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> No
 
 
 def check_free(folder: Path, overwrite: bool = False) -> None:
-    """Check that a folder can be written, and is empty unless `overwrite` is true.
-
-    Raises:
-        InputError: the path is a file, or the folder is not empty and `overwrite` is false.
-        OSError: the folder cannot be written; `filename` is set.
-    """
+    """Check that a folder can be written, and is empty unless `overwrite` is true."""
     folder = Path(folder)
     if folder.is_file():
         raise InputError(f"{folder} is a file; name a folder.")
@@ -80,10 +72,6 @@ def write_scenes(
 
     Each scene is written under its own name. `overview.png` shows the first few, and `latents.npz`
     is written if all scenes are decoded from latents.
-
-    Raises:
-        InputError: the folder is not empty and `overwrite` is false, or scene names are not unique
-            or no file names.
     """
     check_free(folder, overwrite)
     check_names(scenes)

@@ -23,10 +23,6 @@ def sample_rooms(
 
     Args:
         distribution: `sampler`, or a distribution of latents; None takes the run's default.
-
-    Raises:
-        InputError: the method generates no rooms, or has neither a sampler nor latents but a
-            distribution is given.
     """
     if isinstance(trained, TrainedReconstructor):
         raise InputError(

@@ -42,9 +42,6 @@ def draw_reference(
         train_rows: Indices of the requested training rooms, in this order.
         path: Reference file. An existing file is read. Otherwise all rooms of both splits are
             drawn, so that the file covers any later choice of training rooms, and it is written.
-
-    Raises:
-        InputError: the file is not a reference, or was made from other rooms or settings.
     """
     drawn: dict[str, Features] = {}
     if path is not None and path.is_file():

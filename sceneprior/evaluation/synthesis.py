@@ -93,10 +93,6 @@ def evaluate_synthesis(
         baselines' metrics are under `train_rooms`, `independent`, `independent_meshes` (pictures
         with real meshes), `shuffled` and `decoded_rooms`. `intervals` is by set of rooms, and
         `protocol` lists all that the values depend on. docs/evaluation.md defines each metric.
-
-    Raises:
-        InputError: a set has fewer than two rooms, the label sets differ, or a file of weights or
-            a reference file cannot be used.
     """
     # The weights are checked first, before hours of drawing.
     if options.inception is not None:

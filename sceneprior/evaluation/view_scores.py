@@ -99,9 +99,6 @@ def score_views(
     Args:
         rooms: The room of each view. Views of one room are not independent, so intervals resample
             rooms.
-
-    Raises:
-        InputError: no image shows an object.
     """
     scores = [
         score_pair(pair, points, seed + row)

@@ -45,9 +45,6 @@ def read_box_lists(
         classes: Comma-separated names of the columns (or indices) of `class_labels`; None takes
             the label set without void, followed by `start` and `end` if there are two more columns.
         sizes: `half` or `full` extents.
-
-    Raises:
-        InputError: a file is not a box list, or has a class that the label set lacks.
     """
     if sizes not in SIZES:
         raise InputError(f"No sizes '{sizes}'; they are half (extents, as ATISS has them) or full.")

@@ -36,9 +36,6 @@ def export_scenes(scenes: Sequence[Scene], to: str, folder: Path) -> list[str]:
 
     Returns:
         Notes for the user on objects that were left out.
-
-    Raises:
-        InputError: an unknown format, or room names that are not unique or no file names.
     """
     if to not in FORMATS:
         raise InputError(f"No format '{to}'; choose from {', '.join(FORMATS)}, or scenes.")

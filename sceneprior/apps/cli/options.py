@@ -32,11 +32,7 @@ AcceleratorOption = Annotated[str, typer.Option(help="cpu, gpu or auto; Lightnin
 
 
 def result_file(run: str, out: Path | None, name: str) -> Path:
-    """The file of a run's results: `out` if given, else `name` in the run's folder.
-
-    Raises:
-        InputError: `out` is not given, and the run is not a folder.
-    """
+    """The file of a run's results: `out` if given, else `name` in the run's folder."""
     from sceneprior.apps.priors.where import find_prior
 
     if out is not None:
@@ -48,12 +44,7 @@ def result_file(run: str, out: Path | None, name: str) -> Path:
 
 
 def checked_target(target: Path) -> Path:
-    """Check, before the work begins, that a file can be written; returns it.
-
-    Raises:
-        InputError: the path is a folder.
-        OSError: the file cannot be written.
-    """
+    """Check, before the work begins, that a file can be written; returns it."""
     from sceneprior.core.files import check_writable
 
     if target.is_dir():

@@ -121,9 +121,6 @@ def _do(runner: StepRunner, run: Run, steps: list[Step]) -> str | None:
 
 def count_of(comparison: Comparison, rooms: str) -> int | None:
     """Number of rooms that each run generates, or of test rooms whose views it answers; None: all.
-
-    Raises:
-        InputError: the shards are missing, or runs cannot be scored on them.
     """
     shards = shards_of(comparison, rooms)
     if isinstance(comparison, ViewComparison):

@@ -163,11 +163,7 @@ class Run:
 
 
 def load_comparison(name: str) -> Comparison:
-    """Read a comparison and check the settings of each of its runs.
-
-    Raises:
-        ConfigError: not found, not YAML, an unknown key or a wrong value, in it or in a run.
-    """
+    """Read a comparison and check the settings of each of its runs."""
     path, data = read_settings(name)
     task = data.get("task", "new_rooms")
     if not isinstance(task, str) or task not in TASKS:
@@ -193,11 +189,7 @@ def load_comparison(name: str) -> Comparison:
 def part_of(
     comparison: Comparison, methods: str | None, rooms: str | None, seeds: str | None
 ) -> Comparison:
-    """Some methods, kinds of rooms and seeds of a comparison, each given as `a,b`; None is all.
-
-    Raises:
-        InputError: the comparison has no such entry.
-    """
+    """Some methods, kinds of rooms and seeds of a comparison, each given as `a,b`; None is all."""
     kept_methods = _chosen("method", methods, tuple(comparison.methods))
     kept_rooms = _chosen("kind of rooms", rooms, tuple(comparison.rooms))
     kept_seeds = _chosen("seed", seeds, tuple(str(seed) for seed in comparison.seeds))
@@ -225,9 +217,6 @@ def _chosen(what: str, given: str | None, known: tuple[str, ...]) -> tuple[str, 
 def runs_of(comparison: Comparison, out: Path) -> list[Run]:
     """Every run, scenes first, then seed by seed, so that a comparison that is stopped early is a
     whole one of fewer seeds.
-
-    Raises:
-        ConfigError: the config of rooms or of a method is not found, or not YAML.
     """
     given = [
         Run(key, name, None, rooms.config, (), out / key / name, Path(method.scenes[key]))

@@ -51,9 +51,6 @@ def evaluate_run(
     against masks, where rooms are known from views alone.
 
     The options' seed draws the latents, too; `shards` and `distribution` are by default the run's.
-
-    Raises:
-        InputError: the run, the shards or a file of weights cannot be used.
     """
     trained = load_any_run(run)
     folder = shards or Path(trained.config.data.shards)
@@ -91,9 +88,6 @@ def evaluate_folder(
     Args:
         folder: Scene JSONs (docs/conventions.md), perhaps with the GLBs of their meshes.
         count: So many of them, drawn by the options' seed; None takes all.
-
-    Raises:
-        InputError: there are fewer scenes, or they, the shards or a file of weights cannot be used.
     """
     scenes = load_scene_folder(folder)
     if count is not None and count > len(scenes):
@@ -142,9 +136,6 @@ def report_run(
 
     Args:
         scores: None takes the run's `scores.json`.
-
-    Raises:
-        InputError: the run or its scores cannot be read.
     """
     trained = load_any_run(run)
     config, shards = trained.config, Path(trained.config.data.shards)
@@ -189,9 +180,6 @@ def report_folder(
 
     Args:
         scores: None takes the folder's `scores.json`.
-
-    Raises:
-        InputError: the scenes, the shards or the scores cannot be read.
     """
     scenes = load_scene_folder(folder)
     write_report(
@@ -214,9 +202,6 @@ def report_folder(
 def read_scores(path: Path | None, folder: Path, shards: Path, evaluated: str) -> dict[str, Any]:
     """Read the scores that `eval-fid` wrote to a file. None reads the folder's `scores.json`, which
     may be missing where rooms have no 3D ground truth; `evaluated` is the command that writes it.
-
-    Raises:
-        InputError: the file is missing, or holds no scores.
     """
     if path is None:
         path = folder / "scores.json"

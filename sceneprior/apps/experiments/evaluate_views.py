@@ -53,9 +53,6 @@ def evaluate_from_views(
 ) -> dict[str, Any]:
     """Scores by key of `METRICS`, of those that need no room in 3D, as `evaluate_synthesis` has
     them: of generated rooms, of real training rooms, and of the rooms compared with (`_test`).
-
-    Raises:
-        InputError: no rooms, or other classes than the shards'.
     """
     names = common_label_set(generated)
     rooms = {split: _counted(shards, split, names) for split in ("train", options.split)}
@@ -109,9 +106,6 @@ def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
     """Mean IoU of decoded training rooms' masks with observed ones, in views that training never
     saw (`mask_iou_held_out`, where `data.view_fraction` left some out of every room), or else in
     some that it did (`mask_iou_training_views`). Nothing where shapes are no meshes.
-
-    Raises:
-        InputError: the shards are not those of the run.
     """
     config = trained.config
     if not isinstance(config, PaperConfig):

@@ -105,11 +105,7 @@ def _is_large(tensor: Tensor) -> bool:
 
 
 def unpack(packed: PackedPrior, config: RunConfig, source: str) -> Trained:
-    """Restore the trained method of a file; `config` is the validated `packed.said.settings`.
-
-    Raises:
-        InputError: the weights do not fit these settings.
-    """
+    """Restore the trained method of a file; `config` is the validated `packed.said.settings`."""
     try:
         if packed.said.stage not in config.stage_names:
             raise ValueError(f"no stage of its method is called '{packed.said.stage}'")
@@ -164,11 +160,7 @@ def _check(name: str, tensor: Tensor, classes: int) -> None:
 
 
 def write_packed(packed: PackedPrior, path: Path) -> None:
-    """Write a prior to one file, atomically; the same prior gives the same bytes.
-
-    Raises:
-        InputError: a part of it is larger than `read_packed` accepts.
-    """
+    """Write a prior to one file, atomically; the same prior gives the same bytes."""
     described = packed.said.model_dump(mode="json")
     tensors = {name: tensor.contiguous() for name, tensor in packed.tensors.items()}
     contents = (packed.card.encode(), json_text(described).encode(), tensors_to_bytes(tensors))
@@ -198,11 +190,7 @@ def is_packed(path: Path) -> bool:
 
 
 def read_packed(path: Path) -> PackedPrior:
-    """Read a packed prior. Nothing in it is executed, and nothing is written.
-
-    Raises:
-        InputError: the path is not a packed prior, or is damaged.
-    """
+    """Read a packed prior. Nothing in it is executed, and nothing is written."""
     try:
         card, described, weights = (_contents(path, name) for name in FILES)
         data = json.loads(described)

@@ -24,9 +24,6 @@ def find_prior(where: str | Path) -> Path:
     Args:
         where: A path, which takes precedence; a name of `shipped_priors`; or `hf://OWNER/NAME`,
             which is downloaded once and kept in the Hub's cache.
-
-    Raises:
-        InputError: no such prior exists, or the download fails.
     """
     text = str(where)
     if text.startswith(HUB):

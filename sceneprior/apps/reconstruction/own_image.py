@@ -83,9 +83,6 @@ def read_own_image(
         camera_height_m: Height of an assumed camera; None tries all `CAMERA_HEIGHTS_M`.
         sides: Number of sides of the room from which an assumed camera may look.
         gravity: Direction of gravity for an assumed camera (`read_gravity`); None is level.
-
-    Raises:
-        InputError: a file is missing or cannot be used, the sizes differ, or no object is visible.
     """
     if mask.suffix.lower() == ".json":
         if classes is not None:
@@ -189,9 +186,6 @@ def read_gravity(text: str) -> np.ndarray:
 
     Args:
         text: `x,y,z`, of any length, from a phone's accelerometer or a horizon detector.
-
-    Raises:
-        InputError: the text is not three finite numbers, or the camera is upside down.
     """
     try:
         down = np.array([float(part) for part in text.split(",")])
@@ -235,9 +229,6 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
     `fov` is the horizontal field of view in degrees, `35mm` the 35 mm equivalent focal length in
     millimetres, by the diagonal; for both the principal point is the image centre. A file may state
     the size of its image (`width`, `height`), which is checked.
-
-    Raises:
-        InputError: the text is none of these, is not finite, or is for an image of another size.
     """
     expected = (
         "fx,fy,cx,cy in pixels, fov=DEGREES, 35mm=MILLIMETRES, or a JSON file: "
@@ -317,10 +308,6 @@ def read_pose(path: Path) -> np.ndarray:
 
     Returns:
         `world_to_camera`.
-
-    Raises:
-        InputError: there is no such matrix, it is not a rigid transform, or the camera is upside
-            down or below the floor.
     """
     data = read_json(path)
     try:

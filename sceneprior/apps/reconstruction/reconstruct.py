@@ -68,10 +68,6 @@ def reconstruct(
 
     Scenes have no meshes if the run's shape stage has not been trained. A baseline that predicts
     objects from images directly is used without a fit.
-
-    Raises:
-        InputError: unknown options, a run that cannot reconstruct images, another label set, or,
-            for latent fits, more objects than the prior generates.
     """
     if options.fit not in (OBJECTS, *SCHEDULES):
         raise InputError(
@@ -176,11 +172,7 @@ def _reconstruct_batch(
 def starting_latents(
     trained: TrainedPrior, views: SceneViews, count: int
 ) -> Float[Tensor, "images count width"]:
-    """For each image, the latents of the training rooms with the lowest layout loss on it.
-
-    Raises:
-        InputError: more starts than training rooms.
-    """
+    """For each image, the latents of the training rooms with the lowest layout loss on it."""
     if count > len(trained.logits):
         raise InputError(
             f"{count} nearest training rooms were asked for, but the run has "

@@ -86,9 +86,6 @@ def evaluate_run(
 
     With CAD `models`, the reconstructions are also scored with the objects replaced by retrieved
     models (apps/retrieval).
-
-    Raises:
-        InputError: the run or the shards cannot be used.
     """
     trained = load_any_run(run)
     shards, split = protocol.shards, protocol.split
@@ -132,10 +129,6 @@ def evaluate_scenes(folder: Path, protocol: SvrProtocol) -> dict[str, Any]:
 
     Each scene's `extra` holds its `room_id` and `view`; its objects correspond to the masks of that
     view, in their order.
-
-    Raises:
-        InputError: a scene does not name its view, or has another number of objects.
-        ShardError: a shard is missing or damaged.
     """
     images, scenes = scenes_with_images(folder, protocol.shards, protocol.split)
     answers: dict[str, Answers] = {

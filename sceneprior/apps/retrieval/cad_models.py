@@ -70,10 +70,6 @@ def open_models(
     Args:
         folder: The models of 3D-FUTURE, or shards of `prep-front` with this label set.
         cache: Folder for the cache file of points, which may be deleted at any time.
-
-    Raises:
-        InputError: the folder is neither, has shards of another label set, or has no model of
-            these classes.
     """
     folder = Path(folder)
     names = label_set(label_set_name)

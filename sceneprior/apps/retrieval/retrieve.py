@@ -54,9 +54,6 @@ def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
     `extra["retrieval"]` holds {"model_id", "turn_deg", "distance_m"} for each object, in their
     order. It is None for a class without models; such an object keeps its mesh, extruded with its
     box.
-
-    Raises:
-        InputError: a box is not finite or has a negative side.
     """
     _check(scene)
     objects: list[SceneObject] = []

@@ -144,9 +144,6 @@ class Explorer:
         Args:
             start, end: A training room's id, `seed:7` or `HERE`. Files are not accepted, since the
                 text comes from a browser, which may run on another machine.
-
-        Raises:
-            InputError: an end is unknown, or is `HERE` and the shown room has no latent.
         """
         ends = [
             self.prior.latent(shown.scene)

@@ -67,9 +67,6 @@ class LatentMap:
 def make_map(space: LatentSpace, z: Float[Tensor, "rooms dimension"]) -> LatentMap:
     """Make the map of a latent space from the training rooms' latents z.
 
-    Raises:
-        InputError: there are fewer than three training rooms, which span no plane.
-
     Example: on the sphere in three dimensions, rooms differ most along x, then along y.
 
         >>> space = LatentSphere(4, 3)

@@ -22,11 +22,7 @@ def serve(
     cache: Path | None,
     say: Callable[[str], None],
 ) -> None:
-    """Serve a run, or a folder of scenes, until Ctrl-C; `say` prints a line.
-
-    Raises:
-        InputError: there is nothing to show, or the CAD models cannot be read.
-    """
+    """Serve a run, or a folder of scenes, until Ctrl-C; `say` prints a line."""
     # One room at a time is too little work for several threads.
     torch.set_num_threads(1)
     stop = threading.Event()
@@ -48,11 +44,7 @@ def serve(
 
 
 def open_source(where: str) -> Explorer | Folder:
-    """Open a run or prior, or, if the path is a folder without a run, a folder of scenes.
-
-    Raises:
-        InputError: it is neither, or is damaged.
-    """
+    """Open a run or prior, or, if the path is a folder without a run, a folder of scenes."""
     folder = Path(where)
     if folder.is_dir() and not (folder / "config.yaml").is_file():
         return Folder(load_scene_folder(folder))

@@ -17,11 +17,7 @@ if TYPE_CHECKING:
 
 
 def check_can_serve(host: str, port: int) -> None:
-    """Check, before anything is loaded, that the server can start.
-
-    Raises:
-        InputError: the extra `view` is not installed, or the port is taken.
-    """
+    """Check, before anything is loaded, that the server can start."""
     try:
         import viser  # noqa: F401
     except ImportError:
@@ -46,9 +42,6 @@ def serving(host: str, port: int) -> Iterator["viser.ViserServer"]:
     """Run a server with an empty page; port 0 takes any free port.
 
     Other web sites open in the same browser can neither read the page nor use its controls.
-
-    Raises:
-        InputError: in this version of viser, requests cannot be checked.
     """
     import viser
 

@@ -29,11 +29,7 @@ TYPE_CLASSES: dict[str, tuple[str, ...]] = {
 
 
 def common_label_set(*groups: Sequence[Scene]) -> str:
-    """The label set that all these scenes share.
-
-    Raises:
-        InputError: there are no scenes, or more than one label set.
-    """
+    """The label set that all these scenes share."""
     names = sorted({scene.label_set for scenes in groups for scene in scenes})
     if len(names) != 1:
         came = f"label sets {', '.join(names)}" if names else "no scenes"

@@ -23,9 +23,6 @@ def sample_surface(mesh: Mesh, count: int, seed: int) -> Float[np.ndarray, "coun
     """Draw points uniformly by area from a mesh's surface, inner faces included.
 
     If no face has an area, all points lie on the first face.
-
-    Raises:
-        InputError: the mesh has no faces.
     """
     if not len(mesh.faces):
         raise InputError(
@@ -42,11 +39,7 @@ def f_score(
     b_points_m: Float[np.ndarray, "m 3"],
     threshold_m: float = F_THRESHOLD_M,
 ) -> float:
-    """Harmonic mean of precision (share of a near b) and recall (share of b near a), in [0, 1].
-
-    Raises:
-        InputError: a set is empty.
-    """
+    """Harmonic mean of precision (share of a near b) and recall (share of b near a), in [0, 1]."""
     return f_score_of(*nearest_distances(a_points_m, b_points_m), threshold_m)
 
 
