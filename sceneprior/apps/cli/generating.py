@@ -9,22 +9,25 @@ from typing import Annotated
 import typer
 
 from sceneprior.apps.cli.options import (
+    MODELS_HELP,
+    CacheOption,
+    CountOption,
     DistributionOption,
     OverwriteOption,
     RendererOption,
     RunOption,
+    SeedOption,
 )
-from sceneprior.core.seeds import LARGEST_SEED
 
 
 def synthesize(
     run: RunOption,
     out: Annotated[Path, typer.Option(help="Folder for the scenes.")],
-    count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many rooms.")] = 16,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same rooms.")] = 0,
+    count: CountOption = 16,
+    seed: SeedOption = 0,
     distribution: DistributionOption = None,
     html: Annotated[
-        bool, typer.Option("--html", help="Also rooms.html, one file whose rooms turn.")
+        bool, typer.Option("--html", help="Write rooms.html, too: one page of 3D models.")
     ] = False,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
@@ -50,13 +53,13 @@ def synthesize(
         typer.echo(f"Warning: {warning}", err=True)
 
 
-_END_HELP = "a training room's id, seed:7, or a file of latents: scenes/latents.npz:seed0_0003."
+_END_HELP = "a training room's id, seed:7, or a latent in a file: scenes/latents.npz:seed0_0003."
 
 
 def interpolate(
     run: RunOption,
-    start: Annotated[str, typer.Option("--from", help=f"Where to begin: {_END_HELP}")],
-    end: Annotated[str, typer.Option("--to", help="Where to end: named like the beginning.")],
+    start: Annotated[str, typer.Option("--from", help=f"First room: {_END_HELP}")],
+    end: Annotated[str, typer.Option("--to", help="Last room, named like the first one.")],
     out: Annotated[Path, typer.Option(help="Folder for the rooms and pictures.")],
     steps: Annotated[int, typer.Option(min=2, max=1000, help="Rooms, both ends included.")] = 9,
     overwrite: OverwriteOption = False,
@@ -79,15 +82,13 @@ def interpolate(
 
 def complete(
     run: RunOption,
-    given: Annotated[Path, typer.Option(help="Scene JSON of the objects that are there.")],
+    given: Annotated[Path, typer.Option(help="Scene JSON of the given objects.")],
     out: Annotated[Path, typer.Option(help="Folder for the completed rooms.")],
-    count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many answers.")] = 4,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same answers.")
-    ] = 0,
+    count: CountOption = 4,
+    seed: SeedOption = 0,
     classes: Annotated[
         str | None,
-        typer.Option(help="What to add, and nothing else: double_bed,nightstand (samplers only)."),
+        typer.Option(help="Classes of the objects to add: double_bed,nightstand (samplers only)."),
     ] = None,
     distribution: DistributionOption = None,
     overwrite: OverwriteOption = False,
@@ -114,12 +115,9 @@ def complete(
 
 def retrieve(
     scenes: Annotated[Path, typer.Option(help="Folder of scene JSONs, with their GLBs.")],
-    models: Annotated[Path, typer.Option(help="3D-FUTURE-model, a folder like it, or shards.")],
+    models: Annotated[Path, typer.Option(help=f"CAD models: {MODELS_HELP}")],
     out: Annotated[Path, typer.Option(help="Folder for the scenes with CAD models.")],
-    cache: Annotated[
-        Path | None,
-        typer.Option(help="Folder for the models' points (default: ~/.cache/sceneprior)."),
-    ] = None,
+    cache: CacheOption = None,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
 ) -> None:

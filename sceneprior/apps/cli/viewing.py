@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from sceneprior.apps.cli.options import MODELS_HELP, CacheOption
+
 
 def view(
     where: Annotated[
@@ -12,16 +14,13 @@ def view(
     ],
     models: Annotated[
         Path | None,
-        typer.Option(help="CAD models to swap in: 3D-FUTURE-model, a folder like it, or shards."),
+        typer.Option(help=f"CAD models to replace objects by: {MODELS_HELP}"),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Who may open the page: 0.0.0.0 is anyone in your network.")
+        str, typer.Option(help="Address to serve on; 0.0.0.0 opens the page to your network.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535)] = 8080,
-    cache: Annotated[
-        Path | None,
-        typer.Option(help="Folder for the models' points (default: ~/.cache/sceneprior)."),
-    ] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
+    cache: CacheOption = None,
 ) -> None:
     """View rooms in the browser, and explore the latent space of a run; Ctrl-C ends it."""
     from sceneprior.apps.viewer.server import check_can_serve

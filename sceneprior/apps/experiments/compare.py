@@ -120,8 +120,7 @@ def _do(runner: StepRunner, run: Run, steps: list[Step]) -> str | None:
 
 
 def count_of(comparison: Comparison, rooms: str) -> int | None:
-    """Number of rooms that each run generates, or of test rooms whose views it answers; None: all.
-    """
+    """Rooms that each run generates, or test rooms whose views it answers; None: all."""
     shards = shards_of(comparison, rooms)
     if isinstance(comparison, ViewComparison):
         if not known_in_3d(shards, "test"):
