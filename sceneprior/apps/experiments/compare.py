@@ -76,20 +76,17 @@ def compare(
     count = cache(partial(count_of, comparison))
     for rooms in part.rooms:
         count(rooms)  # refuses shards before anything is trained
-    failures: dict[Run, str] = {}
-    done, left_out = [], []
+    asked, done, failures, left_out = runs_of(part, out), [], [], []
     with open_runner(out) as runner:
-        for run in runs_of(part, out):
-            steps = steps_of(comparison, run, count(run.rooms), options)
-            if failure := _do(runner, run, steps):
-                failures[run] = f"{run.title}: {failure}"
         for run in runs_of(comparison, out):
-            if run in failures or not (run.folder / "scores.json").is_file():
+            if run not in asked and not (run.folder / "scores.json").is_file():
                 continue
             steps = steps_of(comparison, run, count(run.rooms), options)
-            if keeps_settings(run) and all(is_done(step, run.folder) for step in steps):
+            if run in asked and (failure := _do(runner, run, steps)):
+                failures.append(f"{run.title}: {failure}")
+            elif keeps_settings(run) and all(is_done(step, run.folder) for step in steps):
                 done.append(run)
-            else:
+            elif (run.folder / "scores.json").is_file():
                 left_out.append(run.title)
         if done:
             form = VIEWS if isinstance(comparison, ViewComparison) else NEW_ROOMS
@@ -98,7 +95,7 @@ def compare(
             first = {run.method: run for run in reversed(done) if run.rooms == rooms}
             if shown := [first[method] for method in comparison.methods if method in first]:
                 write_figure(comparison, shown, count(rooms), out / f"{rooms}.png", renderer)
-    return Compared(out / "table.md" if done else None, [*failures.values()], left_out)
+    return Compared(out / "table.md" if done else None, failures, left_out)
 
 
 def _do(runner: StepRunner, run: Run, steps: list[Step]) -> str | None:
