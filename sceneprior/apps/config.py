@@ -75,13 +75,7 @@ def check_config(data: dict[str, Any], source: str) -> RunConfig:
 
 
 def load_any_run(run: Path | str) -> Trained:
-    """Load the networks of a run of any method, in evaluation mode.
-
-    For tasks that do with less than a latent space: they ask what kind of `Trained` it is.
-
-    Args:
-        run: As `find_prior` finds it: a run's folder, a packed prior, its name, or one on the Hub.
-    """
+    """Load the networks of a run of any method, which `find_prior` finds, in evaluation mode."""
     path = find_prior(run)
     if is_packed(path):
         packed = read_packed(path)
@@ -96,7 +90,7 @@ def load_run(run: Path | str) -> TrainedPrior:
 
 
 def with_latents(trained: Trained, run: Path | str) -> TrainedPrior:
-    """The same; an InputError where it is a baseline's, which has no latent space."""
+    """The run, if it is a prior; else an InputError: baselines have no latent space."""
     if not isinstance(trained, TrainedPrior):
         works = "synthesize`, `eval-fid` and `report"
         if isinstance(trained, TrainedReconstructor):

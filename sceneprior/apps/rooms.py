@@ -62,18 +62,12 @@ def clear_scenes(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def write_scenes(
-    scenes: Sequence[Scene],
-    folder: Path,
-    renderer: Renderer,
-    overwrite: bool = False,
-) -> None:
-    """Write scenes to a folder (see `check_free`).
+def write_scenes(scenes: Sequence[Scene], folder: Path, renderer: Renderer) -> None:
+    """Write scenes under their own names, in place of the scenes of a folder.
 
-    Each scene is written under its own name. `overview.png` shows the first few, and `latents.npz`
-    is written if all scenes are decoded from latents.
+    `overview.png` shows the first few, and `latents.npz` is written if all scenes are decoded from
+    latents.
     """
-    check_free(folder, overwrite)
     check_names(scenes)
     clear_scenes(folder)
     with ThreadPoolExecutor(os.cpu_count()) as pool, Progress(console=Console(stderr=True)) as bar:

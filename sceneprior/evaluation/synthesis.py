@@ -140,7 +140,7 @@ def evaluate_synthesis(
         "packages": _package_versions(),
     }
     notes = (emptiness(rooms.groups["generated"]), _uncertainty(columns, len(sets["test"].scenes)))
-    return _result(columns) | {
+    return result_of(columns) | {
         "relations": furthest_pairs(sets["generated"], sets["train"], comparison),
         "note": " ".join([*filter(None, notes), NOTE]),
         "protocol": protocol,
@@ -191,7 +191,8 @@ def _left_out(measured: Container[str], options: EvalOptions) -> dict[str, str]:
     }
 
 
-def _result(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
+def result_of(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
+    """Values and intervals of a result file, from the estimates by set of rooms and key."""
     values = {
         name: {key: estimate.value for key, estimate in estimates.items()}
         for name, estimates in columns.items()

@@ -14,7 +14,7 @@ from sceneprior.evaluation.bootstrap import COVERAGE, ratio, resample_counts
 from sceneprior.evaluation.metrics.mesh_metrics import (
     F_THRESHOLD_M,
     POINTS,
-    f_score_of,
+    f_score,
     oriented_box,
     oriented_box_iou_3d,
     sample_surface,
@@ -81,7 +81,7 @@ def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairSco
         oriented_box_iou_3d=oriented_box_iou_3d(*map(oriented_box, surfaces)),
         chamfer_l2_m=distance.l2_m,
         chamfer_squared_m2=distance.squared_m2,
-        f_score=f_score_of(*apart_m, F_THRESHOLD_M),
+        f_score=f_score(*apart_m),
     )
 
 

@@ -43,7 +43,7 @@ def synthesize(
     prior = load(run)
     artist = open_renderer(renderer)
     scenes = prior.sample(count, seed, distribution)
-    write_scenes(scenes, out, artist, overwrite)
+    write_scenes(scenes, out, artist)
     origin = distribution or prior.distribution
     if html:
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
@@ -75,7 +75,7 @@ def interpolate(
     prior = load(run)
     scenes = prior.interpolate(start, end, steps)
     artist = open_renderer(renderer)
-    write_scenes(scenes, out, artist, overwrite)
+    write_scenes(scenes, out, artist)
     write_pictures(prior.with_latents, scenes, out, artist)
     typer.echo(f"Wrote {steps} rooms, strip.png and animation.gif to {out}")
 
@@ -105,7 +105,7 @@ def complete(
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
     prior = load(run)
     scenes = prior.complete(scene, count, seed, distribution, wanted)
-    write_scenes(scenes, out, open_renderer(renderer), overwrite)
+    write_scenes(scenes, out, open_renderer(renderer))
     how = "drawn by the sampler" if scenes[0].latent is None else "of fitted latents"
     typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects, {how}, to {out}")
     for room in scenes:
@@ -125,7 +125,7 @@ def retrieve(
     from rich.console import Console
     from rich.progress import track
 
-    from sceneprior.apps.retrieval.cad_models import default_cache, open_models
+    from sceneprior.apps.retrieval.cad_models import open_models
     from sceneprior.apps.retrieval.retrieve import retrieval_report, retrieve_all
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.core.files import write_json
@@ -137,13 +137,13 @@ def retrieve(
     console = Console(stderr=True)
     rooms = load_scene_folder(scenes)
     cad_models = open_models(
-        models, common_label_set(rooms), cache or default_cache(),
+        models, common_label_set(rooms), cache,
         track=lambda ids: track(ids, "Reading models", console=console, transient=True),
     )  # fmt: skip
     chosen = retrieve_all(rooms, cad_models)
     made = list(track(chosen, "Choosing models", total=len(rooms), console=console))
     report = retrieval_report(made, cad_models)
-    write_scenes(made, out, open_renderer(renderer), overwrite)
+    write_scenes(made, out, open_renderer(renderer))
     write_json(out / "retrieval.json", report)
     typer.echo(f"Gave {report['objects_with_a_model']} of {report['objects']} objects a model")
     if report["classes_without_models"]:

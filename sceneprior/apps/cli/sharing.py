@@ -127,7 +127,7 @@ def export(
         if label_set is None:
             raise InputError("--to scenes needs --label-set: that of the box lists' classes.")
         rooms = read_box_lists(source, label_set, classes, sizes or "half")
-        write_scenes(rooms, out, SoftwareRenderer(), overwrite)
+        write_scenes(rooms, out, SoftwareRenderer())
     else:
         if (label_set, classes, sizes) != (None, None, None):
             raise InputError("--label-set, --classes and --sizes are of box lists: --to scenes.")

@@ -63,13 +63,17 @@ def default_cache() -> Path:
 
 
 def open_models(
-    folder: Path, label_set_name: str, cache: Path, points: int = POINTS, track: Track = iter
+    folder: Path,
+    label_set_name: str,
+    cache: Path | None = None,
+    points: int = POINTS,
+    track: Track = iter,
 ) -> CadModels:
     """Open the models of a label set's classes, with points on their surfaces.
 
     Args:
         folder: The models of 3D-FUTURE, or shards of `prep-front` with this label set.
-        cache: Folder for the cache file of points, which may be deleted at any time.
+        cache: Folder for the cache file of points, by default `default_cache()`.
     """
     folder = Path(folder)
     names = label_set(label_set_name)
@@ -83,7 +87,7 @@ def open_models(
         if label != "void"
     }
     wanted = list(files)
-    drawn, broken = _points_of_models(folder, files, read, Path(cache), points, track)
+    drawn, broken = _points_of_models(folder, files, read, cache or default_cache(), points, track)
     by_class = {}
     for label in names:
         if of_class := [m for m in wanted if labels[m] == label and m not in broken]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from sceneprior.apps.api import load
-from sceneprior.apps.retrieval.cad_models import default_cache, open_models
+from sceneprior.apps.retrieval.cad_models import open_models
 from sceneprior.apps.viewer.explorer import Explorer, Folder
 from sceneprior.apps.viewer.page import Page
 from sceneprior.apps.viewer.server import serving
@@ -28,9 +28,7 @@ def serve(
     stop = threading.Event()
     try:
         source = open_source(where)
-        bank = None
-        if models is not None:
-            bank = open_models(models, source.label_set, cache or default_cache())
+        bank = None if models is None else open_models(models, source.label_set, cache)
         with serving(host, port) as server:
             Page(server, source, Path(where).name, bank)
             say(f"Open http://localhost:{port} in a browser. Ctrl-C ends it.")

@@ -8,7 +8,6 @@ import trimesh
 from jaxtyping import Float
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.surfaces import nearest_distances
 from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.scene import Mesh
 
@@ -35,18 +34,12 @@ def sample_surface(mesh: Mesh, count: int, seed: int) -> Float[np.ndarray, "coun
 
 
 def f_score(
-    a_points_m: Float[np.ndarray, "n 3"],
-    b_points_m: Float[np.ndarray, "m 3"],
+    there_m: Float[np.ndarray, " n"],
+    back_m: Float[np.ndarray, " m"],
     threshold_m: float = F_THRESHOLD_M,
 ) -> float:
-    """Harmonic mean of precision (share of a near b) and recall (share of b near a), in [0, 1]."""
-    return f_score_of(*nearest_distances(a_points_m, b_points_m), threshold_m)
-
-
-def f_score_of(
-    there_m: Float[np.ndarray, " n"], back_m: Float[np.ndarray, " m"], threshold_m: float
-) -> float:
-    """`f_score` from the results of `nearest_distances`."""
+    """Harmonic mean of precision (share of a near b) and recall (share of b near a), in [0, 1],
+    from the `nearest_distances` of points on both surfaces."""
     precision, recall = (float((way <= threshold_m).mean()) for way in (there_m, back_m))
     return 2 * precision * recall / max(precision + recall, 1e-12)
 
