@@ -80,11 +80,7 @@ class Drawing:
         """Draw scenes from above, a few at a time, and compute the networks' features.
 
         The calling thread draws, and one thread per processor runs the networks; the bits do not
-        depend on their number.
-
-        Args:
-            scenes: At least one scene; a stream is consumed batch by batch.
-            on_progress: Called with the number of scenes just done.
+        depend on their number. `on_progress` is called with the number of scenes just done.
         """
         protocol, stream = topdown_protocol(self.label_set), iter(scenes)
         parts: list[Features] = []

@@ -56,7 +56,9 @@ def definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
 def as_markdown() -> str:
     """The lists of metrics in docs/evaluation.md; a test compares the page with this text."""
     parts: dict[str, Sequence[Metric]] = {
-        "Comparison with the test rooms": [metric for metric in METRICS if "test" not in metric.sets],
+        "Comparison with the test rooms": [
+            metric for metric in METRICS if "test" not in metric.sets
+        ],
         "Properties of one set of rooms": [metric for metric in METRICS if "test" in metric.sets],
         "Accuracy of decoded training rooms": DECODED,
     }

@@ -137,11 +137,8 @@ def intervals(
 ) -> dict[str, list[float] | None]:
     """[lower, upper] end for each metric of a summary; None for a metric without a value.
 
-    Rooms are resampled with all objects of all their views. The resamples depend only on the rooms
-    and the seed, so that several methods share them.
-
-    Args:
-        rooms: The room of each score.
+    Rooms (`rooms` has that of each score) are resampled with all objects of all their views. The
+    resamples depend only on the rooms and the seed, so that several methods share them.
     """
     names, number = np.unique(rooms, return_inverse=True)
     counts = resample_counts(len(names), RESAMPLES, seed)

@@ -13,7 +13,7 @@ from sceneprior.apps.experiments.evaluate_views import (
     known_from_views_alone,
     mask_scores,
 )
-from sceneprior.apps.experiments.makers import maker_of_rooms
+from sceneprior.apps.experiments.makers import GIVEN, maker_of_rooms
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json
@@ -83,12 +83,8 @@ def evaluate_run(
 def evaluate_folder(
     folder: Path, count: int | None, options: EvalOptions, out: Path, shards: Path
 ) -> dict[str, Any]:
-    """Score the user's scenes, of any method, against test rooms, and write the scores.
-
-    Args:
-        folder: Scene JSONs (docs/conventions.md), perhaps with the GLBs of their meshes.
-        count: So many of them, drawn by the options' seed; None takes all.
-    """
+    """Score `count` of the user's scenes (None: all), of any method, against test rooms, and write
+    the scores."""
     scenes = load_scene_folder(folder)
     if count is not None and count > len(scenes):
         raise InputError(
@@ -132,11 +128,7 @@ def report_run(
     commands: tuple[str, ...],
     renderer: str,
 ) -> None:
-    """Write the page of a run; of rooms not known in 3D, without what compares with true rooms.
-
-    Args:
-        scores: None takes the run's `scores.json`.
-    """
+    """Write the page of a run; of rooms not known in 3D, without what compares with true rooms."""
     trained = load_any_run(run)
     config, shards = trained.config, Path(trained.config.data.shards)
     found = read_scores(scores, run, shards, f"--run {run}")
@@ -175,26 +167,17 @@ def report_folder(
     commands: tuple[str, ...],
     renderer: str,
 ) -> None:
-    """Write the page of the user's scenes, of any method: that of a run without the parts that a
-    run alone has.
-
-    Args:
-        scores: None takes the folder's `scores.json`.
-    """
+    """Write the page of the user's scenes, of any method, without the parts that only a run has."""
     scenes = load_scene_folder(folder)
     write_report(
         out,
         title="Rooms beside real ones",
         source=f"scenes {folder.resolve().name}",
-        made_by="scenes as given, which were made elsewhere",
+        made_by=GIVEN.said,
         shards=shards,
-        views=False,
         generated=scenes[:ROOMS_SHOWN],
         scores=read_scores(scores, folder, shards, f"--scenes {folder} --shards {shards}"),
         commands=commands,
-        curves={},
-        decoded=[],
-        unfolding=[],
         renderer=open_renderer(renderer),
     )
 

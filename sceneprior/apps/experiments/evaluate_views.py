@@ -128,9 +128,7 @@ def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
 def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
     """Mean IoU of hard masks of decoded training rooms with the observed ones; void is left out.
 
-    Args:
-        trained: A prior of meshes; before the shape stage each box has the plain template in it.
-        views: Of training rooms, with instance ids.
+    The prior decodes meshes; before the shape stage each box has the plain template in it.
     """
     config, prior = trained.config, trained.prior
     assert isinstance(config, PaperConfig), "a run that remembers rooms has a view loss"

@@ -45,8 +45,7 @@ def write_figure(
 ) -> None:
     """Draw what runs on the same rooms make, one run a method, under the truth.
 
-    Args:
-        count: Rooms that each run is evaluated by; None is as `Comparison.count` says.
+    `count` rooms of each run are evaluated (`count_of`).
     """
     of = _answers if isinstance(comparison, ViewComparison) else _rooms
     write_whole(path, png_bytes(sheet(of(comparison, runs, count, renderer)), optimize=True))

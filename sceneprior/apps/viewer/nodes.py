@@ -40,11 +40,7 @@ class _Node:
 class RoomNodes:
     """The nodes of one room, updated in place: only changes are sent to browsers.
 
-    Args:
-        root: Prefix of the nodes' names.
-        x_m: x of the room's origin in the scene.
-        floor_m: Side of the floor's grid.
-        clicked: Called with the index of an object that is clicked.
+    Their names begin with `root`; `clicked` is called with the index of an object that is clicked.
     """
 
     def __init__(

@@ -31,10 +31,7 @@ _TEXT = Markup('<div style="padding: 0 0.8em 0.8em; font-size: 0.875em">{}</div>
 class Page:
     """The page, whose single room is shared by all connected browsers.
 
-    Args:
-        source: Source of the rooms.
-        title: Title of the panel.
-        models: Models for the checkbox `CAD models`; None hides it.
+    The checkbox `CAD models` is hidden without `models`.
     """
 
     def __init__(
@@ -218,9 +215,8 @@ class Page:
             def another() -> None:
                 seed.value += 1  # the update triggers `sample`
 
-            for each in (seed, origin):
-                if each is not None:
-                    each.on_update(lambda _: self._safely(sample))
+            for each in filter(None, (seed, origin)):
+                each.on_update(lambda _: self._safely(sample))
             self._buttons({"Sample": sample, "Next seed": another})
 
     def _add_path(self, explorer: Explorer) -> None:
