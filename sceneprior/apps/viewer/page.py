@@ -102,9 +102,6 @@ class Page:
             said = f"Right: {room.origin}; {distance_m:.2f} m away in layout."
             self._nearest_said.content = _html(said)
 
-    def _again(self) -> None:
-        self.show(self.shown)
-
     def _clicked(self, item: int) -> None:
         def keep() -> None:
             if item < len(self.shown.scene.objects):
@@ -182,7 +179,7 @@ class Page:
 
     def _box(self, name: str, value: bool, visible: bool = True) -> Any:
         box = self.server.gui.add_checkbox(name, value, visible=visible)
-        box.on_update(lambda _: self._safely(self._again))
+        box.on_update(lambda _: self._safely(lambda: self.show(self.shown)))
         return box
 
     def _buttons(self, tasks: dict[str, Callable[[], None]]) -> None:
@@ -215,8 +212,9 @@ class Page:
             def another() -> None:
                 seed.value += 1  # the update triggers `sample`
 
-            for each in filter(None, (seed, origin)):
-                each.on_update(lambda _: self._safely(sample))
+            for each in (seed, origin):
+                if each is not None:
+                    each.on_update(lambda _: self._safely(sample))
             self._buttons({"Sample": sample, "Next seed": another})
 
     def _add_path(self, explorer: Explorer) -> None:

@@ -45,7 +45,8 @@ def serving(host: str, port: int) -> Iterator["viser.ViserServer"]:
     """
     import viser
 
-    with _quiet(), _checking_requests(host) as checked:
+    quiet = contextlib.redirect_stdout(io.StringIO())
+    with quiet, _checking_requests(host) as checked:
         server = viser.ViserServer(host, port, verbose=False)
     try:
         if not checked:
@@ -55,7 +56,7 @@ def serving(host: str, port: int) -> Iterator["viser.ViserServer"]:
             )
         yield server
     finally:
-        with _quiet():
+        with quiet:
             server.stop()
 
 
@@ -138,9 +139,3 @@ def _checking_requests(host: str) -> Iterator[list[bool]]:
         yield checked
     finally:
         server.serve = serve  # type: ignore[misc]
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield

@@ -83,16 +83,11 @@ def oriented_box_iou_3d(a: OrientedBox, b: OrientedBox) -> float:
         >>> round(oriented_box_iou_3d(cube, cube._replace(yaw_rad=np.pi / 4)), 6)
         0.707107
     """
-    low, high = zip(*(_heights(box) for box in (a, b)), strict=True)
+    low, high = ([box.center_m[1] + side * box.size_m[1] / 2 for box in (a, b)] for side in (-1, 1))
     height = max(min(high) - max(low), 0.0)
     shared = shapely.intersection(_footprint(a), _footprint(b)).area * height
     union = a.size_m.prod() + b.size_m.prod() - shared
     return float(shared / union) if union > 0 else 0.0
-
-
-def _heights(box: OrientedBox) -> tuple[float, float]:
-    middle, half = box.center_m[1], box.size_m[1] / 2
-    return middle - half, middle + half
 
 
 def _footprint(box: OrientedBox) -> shapely.Polygon:
