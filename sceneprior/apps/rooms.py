@@ -30,8 +30,6 @@ def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> No
 
     The JSON is written last, so that a JSON implies that the other two files exist.
     """
-    if not name or Path(name).name != name:
-        raise InputError(f"'{name}' cannot name a scene's files; use a plain name such as room_0.")
     for ending in (".glb", ".png", ".json"):
         save_scene(scene, Path(folder) / f"{name}{ending}", renderer)
 
