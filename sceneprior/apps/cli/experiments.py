@@ -28,9 +28,9 @@ def compare(
     out: Annotated[Path, typer.Option(help="Folder for runs, tables and pictures.")] = Path(
         "out/compare"
     ),
-    methods: Annotated[str | None, typer.Option(help="Methods to run: lifted,lstm.")] = None,
-    rooms: Annotated[str | None, typer.Option(help="Kinds of rooms to run: bedroom.")] = None,
-    seeds: Annotated[str | None, typer.Option(help="Seeds to run: 0,1.")] = None,
+    methods: Annotated[str | None, typer.Option(help="Methods, such as lifted,lstm.")] = None,
+    rooms: Annotated[str | None, typer.Option(help="Kinds of rooms, such as bedroom.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Seeds, such as 0,1 (default: all).")] = None,
     inception: InceptionOption = None,
     accelerator: AcceleratorOption = "auto",
     renderer: RendererOption = "auto",

@@ -32,7 +32,7 @@ SeedOption = Annotated[
         min=0, max=LARGEST_SEED, help="Seed of all random choices: the same seed, the same result."
     ),
 ]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 InceptionOption = Annotated[
     Path | None, typer.Option(help="The file inception-2015-12-05.pt (TorchScript), for FID.")
 ]

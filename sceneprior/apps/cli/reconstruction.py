@@ -43,7 +43,7 @@ def reconstruct(
     intrinsics: Annotated[
         str | None, typer.Option(help="Intrinsics: fov=73, 35mm=26, fx,fy,cx,cy or a JSON file.")
     ] = None,
-    pose: Annotated[Path | None, typer.Option(help="Pose of your camera, JSON.")] = None,
+    pose: Annotated[Path | None, typer.Option(help="JSON of your camera's pose.")] = None,
     camera_height: Annotated[
         float | None,
         typer.Option(min=0.1, help="Height of your camera in m, without --pose (tries several)."),
@@ -122,10 +122,10 @@ def eval_svr(
     shards: Annotated[Path, typer.Option(help="Shards with 3D ground truth.")],
     run: Annotated[str | None, typer.Option(help="Run whose fits to evaluate.")] = None,
     scenes: Annotated[
-        Path | None, typer.Option(help="Folder of `reconstruct` or `retrieve`, not --run.")
+        Path | None, typer.Option(help="Scenes of `reconstruct` or `retrieve`, in place of --run.")
     ] = None,
     split: Annotated[str, typer.Option(help="Split: train, val or test.")] = "test",
-    views: Annotated[int, typer.Option(min=1, help="Views of each room, if it has them.")] = 1,
+    views: Annotated[int, typer.Option(min=1, help="Views of each room, at the most.")] = 1,
     limit: LimitOption = None,
     out: Annotated[
         Path | None, typer.Option(help="JSON file (default: svr.json in RUN or SCENES).")

@@ -98,7 +98,7 @@ def priors(
 
 def export(
     source: Annotated[
-        Path, typer.Argument(help="Folder of scenes; of box lists for `--to scenes`.")
+        Path, typer.Argument(help="Folder of scenes, or of box lists for `--to scenes`.")
     ],
     to: Annotated[str, typer.Option(help="Format: atiss, threed-front, obj or usd; or scenes.")],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],

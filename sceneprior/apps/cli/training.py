@@ -21,7 +21,7 @@ def fit(
         Path | None, typer.Option(help="Folder for checkpoints and logs (default: runs/<config>).")
     ] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Setting: model.width=256; repeatable.")
+        list[str] | None, typer.Option("--set", help="Changed key: model.width=256; repeatable.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue a stopped run.")] = False,
     logger: Annotated[
@@ -59,7 +59,7 @@ def report(
         Path | None, typer.Option(help="Shards that --scenes were evaluated on.")
     ] = None,
     scores: Annotated[
-        Path | None, typer.Option(help="Scores (default: scores.json in RUN or SCENES).")
+        Path | None, typer.Option(help="Scores file (default: scores.json in RUN or SCENES).")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="HTML file (default: report.html in RUN or SCENES).")

@@ -14,7 +14,7 @@ def view(
     ],
     models: Annotated[
         Path | None,
-        typer.Option(help=f"CAD models to replace objects by: {MODELS_HELP}"),
+        typer.Option(help=f"CAD models to replace objects with: {MODELS_HELP}"),
     ] = None,
     host: Annotated[
         str, typer.Option(help="Address to serve on; 0.0.0.0 opens the page to your network.")
