@@ -1,5 +1,6 @@
 """The command view; it imports its dependencies when called."""
 
+import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -23,9 +24,31 @@ def view(
     cache: CacheOption = None,
 ) -> None:
     """View rooms in the browser, and explore the latent space of a run; Ctrl-C ends it."""
-    from sceneprior.apps.viewer.server import check_can_serve
+    from sceneprior.apps.viewer.server import check_can_serve, serving
 
     check_can_serve(host, port)  # before seconds are spent on loading
-    from sceneprior.apps.viewer.serve import serve
+    import torch
 
-    serve(where, host, port, models, cache, typer.echo)
+    from sceneprior.apps.api import load
+    from sceneprior.apps.retrieval.cad_models import open_models
+    from sceneprior.apps.viewer.explorer import Explorer, Folder
+    from sceneprior.apps.viewer.page import Page
+    from sceneprior.render.scene_files import load_scene_folder
+
+    # One room at a time is too little work for several threads.
+    torch.set_num_threads(1)
+    folder, stop = Path(where), threading.Event()
+    is_folder = folder.is_dir() and not (folder / "config.yaml").is_file()
+    try:
+        source = Folder(load_scene_folder(folder)) if is_folder else Explorer(load(where))
+        bank = None if models is None else open_models(models, source.label_set, cache)
+        with serving(host, port) as server:
+            Page(server, source, folder.name, bank)
+            typer.echo(f"Open http://localhost:{port} in a browser. Ctrl-C ends it.")
+            if isinstance(source, Explorer):
+                threading.Thread(target=source.find_meshes, args=(stop,)).start()
+            stop.wait()
+    except KeyboardInterrupt:
+        typer.echo("\nStopped: the page is closed.")
+    finally:
+        stop.set()
