@@ -128,8 +128,9 @@ def category_kl_of_counts(
 
 
 def _category_kl(rooms: RoomSet, comparison: Comparison) -> Estimate:
-    tables = (class_counts(each.scenes) for each in (rooms, comparison.test))
-    return category_kl_of_counts(*tables, rooms.counts, comparison.test.counts)
+    test = comparison.test
+    tables = class_counts(rooms.scenes), class_counts(test.scenes)
+    return category_kl_of_counts(*tables, rooms.counts, test.counts)
 
 
 METRICS = (
