@@ -39,7 +39,6 @@ def draw_reference(
 
     Args:
         rooms: Number of rooms in the two splits: `test` or `val`, and `train`.
-        train_rows: Indices of the requested training rooms, in this order.
         path: Reference file. An existing file is read. Otherwise all rooms of both splits are
             drawn, so that the file covers any later choice of training rooms, and it is written.
     """

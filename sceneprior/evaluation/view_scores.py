@@ -94,11 +94,8 @@ def score_views(
     """Scores of single-view reconstructions; every true object has the same weight.
 
     `summary` covers all objects of all images, `intervals` holds bootstrap intervals of its
-    metrics, and `classes` holds one summary per true class.
-
-    Args:
-        rooms: The room of each view. Views of one room are not independent, so intervals resample
-            rooms.
+    metrics, and `classes` holds one summary per true class. Views of one room (`rooms` has that of
+    each view) are not independent, so intervals resample rooms.
     """
     scores = [
         score_pair(pair, points, seed + row)

@@ -59,16 +59,11 @@ class Compared:
 def compare(
     comparison: Comparison, part: Comparison, out: Path, options: CompareOptions
 ) -> Compared:
-    """Train and evaluate every run that is not done yet, then write `table.*` and the pictures.
+    """Train and evaluate the runs of a part that are not done yet, then write `table.*` and the
+    pictures of all that is done.
 
-    Args:
-        comparison: The tables show all of it that is done.
-        part: What to do now: from `part_of`, or the same.
-        out: `<rooms>/<method>/seed<k>/` in it holds a run; the tables lie beside them.
-
-    Raises:
-        InputError: of shards, renderer or weights, or another `compare` is writing to `out`.
-        KeyboardInterrupt: stopped by Ctrl-C, SIGTERM or SIGHUP; the same call goes on.
+    A run lies in `<rooms>/<method>/seed<k>/` of `out`, and the tables beside. Ctrl-C, SIGTERM and
+    SIGHUP raise KeyboardInterrupt; the same call goes on.
     """
     if options.inception is not None:
         check_inception(options.inception)

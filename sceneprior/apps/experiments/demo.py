@@ -16,10 +16,7 @@ from sceneprior.core.files import write_json
 def run_demo(out: Path, config: str, rooms: int, count: int, renderer: str) -> None:
     """Run every step that is not done yet, then put time and memory beside the scores.
 
-    Raises:
-        InputError: a step failed (its own sentence stands above), or something else writes to
-            `out`.
-        KeyboardInterrupt: stopped by Ctrl-C, SIGTERM or SIGHUP; the same call goes on.
+    Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; the same call goes on.
     """
     steps = demo_steps(out, config, rooms, count, renderer)
     with open_runner(out) as runner:

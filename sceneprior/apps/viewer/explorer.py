@@ -141,9 +141,8 @@ class Explorer:
     def draw_path(self, shown: Shown, start: str, end: str) -> Float[Tensor, "steps dimension"]:
         """Set the path of `step`, and return its latents from start to end.
 
-        Args:
-            start, end: A training room's id, `seed:7` or `HERE`. Files are not accepted, since the
-                text comes from a browser, which may run on another machine.
+        An end is a training room's id, `seed:7` or `HERE`. Files are not accepted, since the text
+        comes from a browser, which may run on another machine.
         """
         ends = [
             self.prior.latent(shown.scene)

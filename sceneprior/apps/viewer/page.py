@@ -54,7 +54,7 @@ class Page:
         self._room = RoomNodes(server, "/room", 0.0, floor_m, self._clicked)
         self._beside_m = floor_m * (1 + GAP)
         self._beside = RoomNodes(server, "/nearest", self._beside_m, floor_m)
-        self._beside.visible = False
+        self._beside.frame.visible = False
         self.board: Board | None = None
         """The map's board; None if the source has no map."""
         self._left_m, self._right_m = -floor_m / 2, floor_m / 2
@@ -90,8 +90,8 @@ class Page:
 
     def _show_nearest(self, scene: Scene | None) -> None:
         assert self.explorer is not None
-        if self._beside.visible != (scene is not None):
-            self._beside.visible = scene is not None
+        if self._beside.frame.visible != (scene is not None):
+            self._beside.frame.visible = scene is not None
             eye, target = self._view(self._right_m + (self._beside_m if scene else 0.0))
             for client in self.server.get_clients().values():
                 client.camera.position, client.camera.look_at = eye, target

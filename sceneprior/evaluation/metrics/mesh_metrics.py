@@ -75,7 +75,7 @@ def oriented_box(mesh: Mesh) -> OrientedBox:
 def oriented_box_iou_3d(a: OrientedBox, b: OrientedBox) -> float:
     """Intersection over union of two upright boxes: shared footprint x shared height.
 
-    Two boxes without volume have IoU 0. At yaw 0 it equals `box_iou_3d` of decoded_rooms.
+    Two boxes without volume have IoU 0. At yaw 0 it equals `box_iou_3d`.
 
     Example: a cube and the same cube turned by 45 degrees share a regular octagon.
 
