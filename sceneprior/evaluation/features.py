@@ -3,7 +3,7 @@
 import hashlib
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,11 +40,6 @@ network; `small`: (rooms, 224, 224, 3) uint8 pictures, if AlexNet needs them; `p
 (rooms, 32) uint8, digest of the bytes of each (height, width, 3) uint8 picture. The full pictures
 are not kept: 1,000 rooms would take 0.8 GB.
 """
-
-
-def rows_of(features: Features, rows: Sequence[int]) -> Features:
-    """The features of some of the rooms."""
-    return {name: array[np.asarray(rows, dtype=np.int64)] for name, array in features.items()}
 
 
 @dataclass(frozen=True)

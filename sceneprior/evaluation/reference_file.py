@@ -17,7 +17,7 @@ import numpy as np
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
 from sceneprior.core.ground_truth import split_fingerprint, stream_scenes
-from sceneprior.evaluation.features import Drawing, Features, rows_of
+from sceneprior.evaluation.features import Drawing, Features
 
 FORMAT = "sceneprior-reference"
 VERSION = 1
@@ -54,7 +54,8 @@ def draw_reference(
         if path is not None:
             _write_reference(path, _key(shards, drawing, rooms), drawn)
     if path is not None:
-        drawn["train"] = rows_of(drawn["train"], train_rows)
+        chosen = np.asarray(train_rows, dtype=np.int64)
+        drawn["train"] = {name: array[chosen] for name, array in drawn["train"].items()}
     return drawn
 
 

@@ -223,15 +223,15 @@ def runs_of(comparison: Comparison, out: Path) -> list[Run]:
         for (key, rooms), (name, method) in product(
             comparison.rooms.items(), comparison.methods.items()
         ):
-            folder, changes = out / key / name, method.set
+            folder = out / key / name
             if seed is None and key in method.scenes:
                 scenes = Path(method.scenes[key])
                 runs.append(Run(key, name, None, rooms.config, (), folder, scenes))
             elif seed is not None and not method.scenes:
-                own = (*changes.get(EVERY, ()), *changes.get(key, ()), f"seed={seed}")
-                settings, config = (*_taken_over(rooms, method), *own), method.config
-                folder /= f"seed{seed}"
-                runs.append(Run(key, name, seed, config or rooms.config, settings, folder))
+                changes = (*method.set.get(EVERY, ()), *method.set.get(key, ()))
+                settings = (*_taken_over(rooms, method), *changes, f"seed={seed}")
+                config = method.config or rooms.config
+                runs.append(Run(key, name, seed, config, settings, folder / f"seed{seed}"))
     return runs
 
 
