@@ -38,12 +38,7 @@ WITH_BASELINE_DECODERS = {
 
 
 def load_config(name: str, overrides: tuple[str, ...] = ()) -> RunConfig:
-    """Read a config and apply `section.key=value` overrides.
-
-    Raises:
-        ConfigError: not found, not YAML, an unknown key or a wrong value; the message names the
-            file, the key and, for a typo, the nearest key.
-    """
+    """Read a config and apply `section.key=value` overrides."""
     path, data = read_settings(name, overrides)
     return check_config(data, str(path))
 
@@ -80,16 +75,7 @@ def check_config(data: dict[str, Any], source: str) -> RunConfig:
 
 
 def load_any_run(run: Path | str) -> Trained:
-    """Load the networks of a run of any method, in evaluation mode.
-
-    For tasks that do with less than a latent space: they ask what kind of `Trained` it is.
-
-    Args:
-        run: As `find_prior` finds it: a run's folder, a packed prior, its name, or one on the Hub.
-
-    Raises:
-        InputError: there is nothing of the kind, or its checkpoint is missing or damaged.
-    """
+    """Load the networks of a run of any method, which `find_prior` finds, in evaluation mode."""
     path = find_prior(run)
     if is_packed(path):
         packed = read_packed(path)
@@ -99,17 +85,12 @@ def load_any_run(run: Path | str) -> Trained:
 
 
 def load_run(run: Path | str) -> TrainedPrior:
-    """The trained prior of a run, in evaluation mode: for tasks that need its latent space.
-
-    Raises:
-        InputError: the folder is no run, its checkpoint is missing or damaged, or it is the run of
-            a baseline without a latent space.
-    """
+    """The trained prior of a run, in evaluation mode: for tasks that need its latent space."""
     return with_latents(load_any_run(run), run)
 
 
 def with_latents(trained: Trained, run: Path | str) -> TrainedPrior:
-    """The same; an InputError where it is a baseline's, which has no latent space."""
+    """The run, if it is a prior; else an InputError: baselines have no latent space."""
     if not isinstance(trained, TrainedPrior):
         works = "synthesize`, `eval-fid` and `report"
         if isinstance(trained, TrainedReconstructor):

@@ -29,23 +29,13 @@ def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> No
     """Write `<name>.glb`, `<name>.png` and `<name>.json`; see `save_scene`.
 
     The JSON is written last, so that a JSON implies that the other two files exist.
-
-    Raises:
-        InputError: `name` is empty or holds a path separator.
     """
-    if not name or Path(name).name != name:
-        raise InputError(f"'{name}' cannot name a scene's files; use a plain name such as room_0.")
     for ending in (".glb", ".png", ".json"):
         save_scene(scene, Path(folder) / f"{name}{ending}", renderer)
 
 
 def check_free(folder: Path, overwrite: bool = False) -> None:
-    """Check that a folder can be written, and is empty unless `overwrite` is true.
-
-    Raises:
-        InputError: the path is a file, or the folder is not empty and `overwrite` is false.
-        OSError: the folder cannot be written; `filename` is set.
-    """
+    """Check that a folder can be written, and is empty unless `overwrite` is true."""
     folder = Path(folder)
     if folder.is_file():
         raise InputError(f"{folder} is a file; name a folder.")
@@ -70,22 +60,12 @@ def clear_scenes(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def write_scenes(
-    scenes: Sequence[Scene],
-    folder: Path,
-    renderer: Renderer,
-    overwrite: bool = False,
-) -> None:
-    """Write scenes to a folder (see `check_free`).
+def write_scenes(scenes: Sequence[Scene], folder: Path, renderer: Renderer) -> None:
+    """Write scenes under their own names, in place of the scenes of a folder.
 
-    Each scene is written under its own name. `overview.png` shows the first few, and `latents.npz`
-    is written if all scenes are decoded from latents.
-
-    Raises:
-        InputError: the folder is not empty and `overwrite` is false, or scene names are not unique
-            or no file names.
+    `overview.png` shows the first few, and `latents.npz` is written if all scenes are decoded from
+    latents.
     """
-    check_free(folder, overwrite)
     check_names(scenes)
     clear_scenes(folder)
     with ThreadPoolExecutor(os.cpu_count()) as pool, Progress(console=Console(stderr=True)) as bar:

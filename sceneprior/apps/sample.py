@@ -19,14 +19,9 @@ from sceneprior.training.method import Trained, TrainedReconstructor
 def sample_rooms(
     trained: Trained, count: int, seed: int, distribution: str | None = None
 ) -> list[Scene]:
-    """Sample new rooms from a run of any method; the same seed gives the same rooms.
+    """Sample new rooms from a run of any method, by its sampler or a distribution of latents.
 
-    Args:
-        distribution: `sampler`, or a distribution of latents; None takes the run's default.
-
-    Raises:
-        InputError: the method generates no rooms, or has neither a sampler nor latents but a
-            distribution is given.
+    The same seed gives the same rooms; without a distribution, the run's own is taken.
     """
     if isinstance(trained, TrainedReconstructor):
         raise InputError(

@@ -43,12 +43,7 @@ def classify_pictures(
     """Fine-tune AlexNet on labelled pictures and classify others, on a GPU if there is one.
 
     Weights differ between processors in their last digits, so a picture near the decision boundary
-    may be classified differently on another machine.
-
-    Args:
-        path: `alexnet-owt-*.pth`, the state dict of torchvision's AlexNet.
-        labels: 1 generated, 0 real.
-        seed: Seed of the new layer and of the order of the pictures.
+    may be classified differently on another machine. Labels are 1 for generated, 0 for real.
 
     Source:
         ATISS (Paschalidou et al., NeurIPS 2021), whose classifier the paper uses.

@@ -63,6 +63,13 @@ class Estimate:
         ours, theirs = _paired(self, other)
         return Estimate(self.value - other.value, ours - theirs)
 
+    def mean_with(self, other: "Estimate") -> "Estimate":
+        """The mean of two shares, from 0 to 1; undefined if either is."""
+        if self.value is None or other.value is None:
+            return Estimate(None, np.zeros(0))
+        ours, theirs = _paired(self, other)
+        return Estimate((self.value + other.value) / 2, (ours + theirs) / 2, 0.0, 1.0)
+
 
 def _paired(a: Estimate, b: Estimate) -> tuple[np.ndarray, np.ndarray]:
     """The resamples of both, cut to the shorter list."""
@@ -76,12 +83,9 @@ def ratio(
     counts: Int[np.ndarray, "resamples rooms"],
     high: float = np.inf,
 ) -> Estimate:
-    """The ratio of two sums over rooms, such as a mean over rooms or over their objects.
+    """The ratio of two sums over rooms, from 0 to `high`, such as a mean over rooms or objects.
 
-    Args:
-        denominators: Weight of each room; 0 leaves a room out. If all are 0, the value is None.
-        counts: From `resample_counts`.
-        high: Upper bound of the ratio; the lower bound is 0.
+    A denominator of 0 leaves its room out. If all are 0, the value is None.
     """
     total = denominators.sum()
     value = float(numerators.sum() / total) if total > 0 else None

@@ -3,7 +3,7 @@
 import hashlib
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -42,11 +42,6 @@ are not kept: 1,000 rooms would take 0.8 GB.
 """
 
 
-def rows_of(features: Features, rows: Sequence[int]) -> Features:
-    """The features of some of the rooms."""
-    return {name: array[np.asarray(rows, dtype=np.int64)] for name, array in features.items()}
-
-
 @dataclass(frozen=True)
 class Drawing:
     """Settings for drawing and reading pictures, the same for every set of rooms."""
@@ -80,11 +75,7 @@ class Drawing:
         """Draw scenes from above, a few at a time, and compute the networks' features.
 
         The calling thread draws, and one thread per processor runs the networks; the bits do not
-        depend on their number.
-
-        Args:
-            scenes: At least one scene; a stream is consumed batch by batch.
-            on_progress: Called with the number of scenes just done.
+        depend on their number. `on_progress` is called with the number of scenes just done.
         """
         protocol, stream = topdown_protocol(self.label_set), iter(scenes)
         parts: list[Features] = []

@@ -74,16 +74,12 @@ def nearest_distances(
     """Layout distance of each scene to the nearest training room, minimised over all of `TURNS`.
 
     The search is exact. A lower bound, in which every object takes its cheapest partner, rules out
-    most training rooms without an assignment.
+    most training rooms without an assignment. A scene without a room to compare with is at inf.
 
     Args:
-        training: Training rooms, true or decoded.
         pass_over_own: Skip the training room of the scene's own name, for training rooms.
         as_copies: Compare only with rooms of the same furniture, up to one object more or fewer,
             and average over the pairs alone: the unpaired object costs nothing.
-
-    Returns:
-        Distances in metres; inf for a scene without a room to compare with.
     """
     rooms = _Rooms(training)
     names = np.array([room.name for room in training])

@@ -93,9 +93,6 @@ def inception_features(
         torchscript_path: NVIDIA's `inception-2015-12-05.pt`, a TorchScript of the 2015 network.
             It takes uint8 images (n, 3, height, width), resizes them itself, and answers
             `return_features=True` with 2,048 numbers per image.
-
-    Raises:
-        InputError: the file is missing, is not a TorchScript, or returns another shape.
     """
     network = _torchscript(Path(torchscript_path))
 

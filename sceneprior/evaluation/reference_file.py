@@ -17,7 +17,7 @@ import numpy as np
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
 from sceneprior.core.ground_truth import split_fingerprint, stream_scenes
-from sceneprior.evaluation.features import Drawing, Features, rows_of
+from sceneprior.evaluation.features import Drawing, Features
 
 FORMAT = "sceneprior-reference"
 VERSION = 1
@@ -39,12 +39,8 @@ def draw_reference(
 
     Args:
         rooms: Number of rooms in the two splits: `test` or `val`, and `train`.
-        train_rows: Indices of the requested training rooms, in this order.
         path: Reference file. An existing file is read. Otherwise all rooms of both splits are
             drawn, so that the file covers any later choice of training rooms, and it is written.
-
-    Raises:
-        InputError: the file is not a reference, or was made from other rooms or settings.
     """
     drawn: dict[str, Features] = {}
     if path is not None and path.is_file():
@@ -58,7 +54,8 @@ def draw_reference(
         if path is not None:
             _write_reference(path, _key(shards, drawing, rooms), drawn)
     if path is not None:
-        drawn["train"] = rows_of(drawn["train"], train_rows)
+        chosen = np.asarray(train_rows, dtype=np.int64)
+        drawn["train"] = {name: array[chosen] for name, array in drawn["train"].items()}
     return drawn
 
 

@@ -56,9 +56,9 @@ def definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
 def as_markdown() -> str:
     """The lists of metrics in docs/evaluation.md; a test compares the page with this text."""
     parts: dict[str, Sequence[Metric]] = {
-        "Against test rooms": [metric for metric in METRICS if "test" not in metric.sets],
-        "Of a set by itself": [metric for metric in METRICS if "test" in metric.sets],
-        "Of decoded training rooms": DECODED,
+        "Comparison with the test rooms": [m for m in METRICS if "test" not in m.sets],
+        "Properties of one set of rooms": [m for m in METRICS if "test" in m.sets],
+        "Accuracy of decoded training rooms": DECODED,
     }
     return "\n\n".join(f"### {title}\n\n{_table(some)}" for title, some in parts.items()) + "\n"
 

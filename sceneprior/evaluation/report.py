@@ -38,14 +38,14 @@ def write_report(
     source: str,
     made_by: str,
     shards: Path,
-    views: bool,
     generated: Sequence[Scene],
     scores: dict[str, Any],
     commands: Sequence[str],
-    curves: dict[str, list[tuple[int, float]]],
-    decoded: Sequence[tuple[Scene, Scene]],
-    unfolding: Sequence[Scene],
     renderer: Renderer,
+    views: bool = False,
+    curves: dict[str, list[tuple[int, float]]] | None = None,
+    decoded: Sequence[tuple[Scene, Scene]] = (),
+    unfolding: Sequence[Scene] = (),
 ) -> None:
     """Write one self-contained HTML file; the mouse rotates its rooms.
 
@@ -56,13 +56,11 @@ def write_report(
         source: Origin of the rooms, such as `run bedrooms`.
         made_by: Description of the method that made the rooms and of its random inputs.
         shards: Input views come from `train`, real rooms from `test` if known in 3D.
-        views: Show the input views of training. False for a method that learns from true boxes,
-            and if the method is unknown.
-        generated: Generated rooms; the first 8 are shown.
         scores: From `evaluate_synthesis`; class_accuracy, box_iou_3d, seconds and
             peak_memory_gib are shown too if present.
+        views: Show the input views of training, for a method that learns from them.
         curves: Points (epoch, value) by name; one panel each.
-        decoded: (decoded, true) training rooms; the first 5 are shown.
+        decoded: (decoded, true) training rooms.
         unfolding: Rooms along a geodesic of the hypersphere, from one room to another.
     """
     generated = list(generated)[:ROOMS_SHOWN]

@@ -21,13 +21,8 @@ def write_rooms_page(
     subtitle: str,
     pictures: Sequence[tuple[str, str]] = (),
 ) -> None:
-    """Write one self-contained HTML file of a few MB.
-
-    Args:
-        scenes: Rooms; the first 24 are shown.
-        subtitle: Origin of the rooms.
-        pictures: (caption, data URI) of pictures shown above the rooms.
-    """
+    """Write one self-contained HTML file of a few MB, with `pictures` (caption, data URI) above the
+    first rooms."""
     shown = scenes[:ROOMS_SHOWN]
     most_faces = faces_per_object(shown)
     page = render(

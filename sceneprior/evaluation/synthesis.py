@@ -93,10 +93,6 @@ def evaluate_synthesis(
         baselines' metrics are under `train_rooms`, `independent`, `independent_meshes` (pictures
         with real meshes), `shuffled` and `decoded_rooms`. `intervals` is by set of rooms, and
         `protocol` lists all that the values depend on. docs/evaluation.md defines each metric.
-
-    Raises:
-        InputError: a set has fewer than two rooms, the label sets differ, or a file of weights or
-            a reference file cannot be used.
     """
     # The weights are checked first, before hours of drawing.
     if options.inception is not None:
@@ -144,7 +140,7 @@ def evaluate_synthesis(
         "packages": _package_versions(),
     }
     notes = (emptiness(rooms.groups["generated"]), _uncertainty(columns, len(sets["test"].scenes)))
-    return _result(columns) | {
+    return result_of(columns) | {
         "relations": furthest_pairs(sets["generated"], sets["train"], comparison),
         "note": " ".join([*filter(None, notes), NOTE]),
         "protocol": protocol,
@@ -195,7 +191,8 @@ def _left_out(measured: Container[str], options: EvalOptions) -> dict[str, str]:
     }
 
 
-def _result(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
+def result_of(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
+    """Values and intervals of a result file, from the estimates by set of rooms and key."""
     values = {
         name: {key: estimate.value for key, estimate in estimates.items()}
         for name, estimates in columns.items()

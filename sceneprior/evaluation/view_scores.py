@@ -14,7 +14,7 @@ from sceneprior.evaluation.bootstrap import COVERAGE, ratio, resample_counts
 from sceneprior.evaluation.metrics.mesh_metrics import (
     F_THRESHOLD_M,
     POINTS,
-    f_score_of,
+    f_score,
     oriented_box,
     oriented_box_iou_3d,
     sample_surface,
@@ -81,7 +81,7 @@ def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairSco
         oriented_box_iou_3d=oriented_box_iou_3d(*map(oriented_box, surfaces)),
         chamfer_l2_m=distance.l2_m,
         chamfer_squared_m2=distance.squared_m2,
-        f_score=f_score_of(*apart_m, F_THRESHOLD_M),
+        f_score=f_score(*apart_m),
     )
 
 
@@ -94,14 +94,8 @@ def score_views(
     """Scores of single-view reconstructions; every true object has the same weight.
 
     `summary` covers all objects of all images, `intervals` holds bootstrap intervals of its
-    metrics, and `classes` holds one summary per true class.
-
-    Args:
-        rooms: The room of each view. Views of one room are not independent, so intervals resample
-            rooms.
-
-    Raises:
-        InputError: no image shows an object.
+    metrics, and `classes` holds one summary per true class. Views of one room (`rooms` has that of
+    each view) are not independent, so intervals resample rooms.
     """
     scores = [
         score_pair(pair, points, seed + row)
@@ -140,11 +134,8 @@ def intervals(
 ) -> dict[str, list[float] | None]:
     """[lower, upper] end for each metric of a summary; None for a metric without a value.
 
-    Rooms are resampled with all objects of all their views. The resamples depend only on the rooms
-    and the seed, so that several methods share them.
-
-    Args:
-        rooms: The room of each score.
+    Rooms (`rooms` has that of each score) are resampled with all objects of all their views. The
+    resamples depend only on the rooms and the seed, so that several methods share them.
     """
     names, number = np.unique(rooms, return_inverse=True)
     counts = resample_counts(len(names), RESAMPLES, seed)

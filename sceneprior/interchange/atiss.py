@@ -24,9 +24,6 @@ def write_atiss(scenes: Sequence[Scene], folder: Path) -> None:
     Sizes are half extents in each box's own frame: of the turned box if the object has one, else of
     the axis-aligned box, with angle 0. Meshes are not written. The columns of `class_labels` are
     the label set without void, then start and end.
-
-    Raises:
-        InputError: a floor has no area.
     """
     for scene in scenes:
         columns = [name for name in label_set(scene.label_set) if name not in NOT_FURNITURE]

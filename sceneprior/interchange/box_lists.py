@@ -41,13 +41,9 @@ def read_box_lists(
 
     Args:
         boxes: A `.npz` or `.json`, or a folder that is searched for them.
-        label_set_name: Label set of the rooms; it must contain every class.
         classes: Comma-separated names of the columns (or indices) of `class_labels`; None takes
             the label set without void, followed by `start` and `end` if there are two more columns.
         sizes: `half` or `full` extents.
-
-    Raises:
-        InputError: a file is not a box list, or has a class that the label set lacks.
     """
     if sizes not in SIZES:
         raise InputError(f"No sizes '{sizes}'; they are half (extents, as ATISS has them) or full.")
@@ -84,7 +80,6 @@ def read_boxes(
     Args:
         path: `.npz` with one room (arrays over objects) or several (one more axis in front), or
             `.json` with one such object, or a list of them.
-        columns: Names of the columns of `class_labels`.
         size_factor: Factor from `sizes` to full extents.
     """
     rooms = [room for record in _records(path) for room in _one_by_one(path, record)]

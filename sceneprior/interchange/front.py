@@ -35,9 +35,6 @@ def write_front(scenes: Sequence[Scene], folder: Path) -> None:
 
     Each object's mesh, or its box, becomes a separate model, with a 3D-FUTURE category that maps to
     the object's class. An unknown floor is written as the rectangle around the furniture.
-
-    Raises:
-        InputError: no category of 3D-FUTURE maps to a class, or a floor has no area.
     """
     models: list[dict[str, Any]] = []
     for scene in scenes:

@@ -48,7 +48,7 @@ def test_new_scenes_leave_none_of_the_old_ones_behind_and_everything_else_alone(
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "c.glb.0123abcd.part").write_bytes(b"of a process that was killed")
     (tmp_path / "film.part").write_bytes(b"mine, too")
-    write_scenes(rooms[1:2], tmp_path, renderer, overwrite=True)
+    write_scenes(rooms[1:2], tmp_path, renderer)
     assert {path.name for path in tmp_path.iterdir()} == {
         "b.json", "b.glb", "b.png", "overview.png", "scores.json", "notes.txt", "film.part",
     }  # fmt: skip

@@ -9,52 +9,49 @@ from sceneprior.apps.cli.options import (
     DistributionOption,
     InceptionOption,
     RendererOption,
+    ScenesOption,
+    SeedOption,
     checked_target,
     result_file,
 )
 from sceneprior.core.errors import InputError
-from sceneprior.core.seeds import LARGEST_SEED
 
 GENERATED = 1000
 
 
 def eval_fid(
     run: Annotated[
-        str | None, typer.Option(help="A run or prior, as `synthesize` takes; it makes the rooms.")
+        str | None, typer.Option(help="The run or prior that makes the rooms, as in `synthesize`.")
     ] = None,
-    scenes: Annotated[
-        Path | None, typer.Option(help="Instead of a run: a folder of scene JSONs, of any method.")
-    ] = None,
+    scenes: ScenesOption = None,
     count: Annotated[
         int | None,
         typer.Option(
             "-n", "--count", min=2, help=f"Rooms (default: {GENERATED} of a run, or all scenes)."
         ),
     ] = None,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the rooms, folds and resamples.")
-    ] = 0,
+    seed: SeedOption = 0,
     inception: InceptionOption = None,
     alexnet: Annotated[
-        Path | None, typer.Option(help="alexnet-owt-7be5be79.pth, for the paper's SCA.")
+        Path | None, typer.Option(help="The file alexnet-owt-7be5be79.pth, for the paper's SCA.")
     ] = None,
     shards: Annotated[
-        Path | None, typer.Option(help="Shards to compare with (default: those of the run).")
+        Path | None, typer.Option(help="Shards with the test rooms (default: those of the run).")
     ] = None,
     reference: Annotated[
         Path | None,
         typer.Option(
-            help="Keep features of real rooms' pictures in this .npz, or take them from there."
+            help="File (.npz) that keeps the features of real rooms' pictures; read if it exists."
         ),
     ] = None,
     split: Annotated[
-        str, typer.Option(help="Rooms to compare with: test to report, val to choose settings by.")
+        str, typer.Option(help="Rooms to compare with: test to report, val to choose settings.")
     ] = "test",
     boxes: Annotated[
-        bool, typer.Option("--boxes", help="Also compare all rooms as boxes: layouts alone.")
+        bool, typer.Option("--boxes", help="Compare layouts alone, too: all rooms as boxes.")
     ] = False,
     resamples: Annotated[
-        int, typer.Option(min=0, help="Of the bootstrap intervals; 0 leaves them out.")
+        int, typer.Option(min=0, help="Number of bootstrap resamples; 0 leaves intervals out.")
     ] = 200,
     out: Annotated[
         Path | None, typer.Option(help="JSON file (default: scores.json in RUN or SCENES).")
@@ -79,9 +76,8 @@ def eval_fid(
         )
     options = EvalOptions(seed, inception, alexnet, reference, split, boxes, resamples, renderer)
     if run is not None:
-        target = checked_target(result_file(run, out, "scores.json"))
-        rooms = count or GENERATED
-        found = evaluate_run(run, rooms, options, target, shards, distribution)
+        target = result_file(run, out, "scores.json")
+        found = evaluate_run(run, count or GENERATED, options, target, shards, distribution)
     elif scenes is not None:
         if shards is None:
             raise InputError("--scenes needs --shards: the folder with the test rooms.")

@@ -23,14 +23,14 @@ def _stopped_by_ctrl_c() -> Iterator[None]:
 def compare(
     config: Annotated[
         str,
-        typer.Option(help="compare/new_rooms_small.yaml, compare/single_view.yaml or your own."),
+        typer.Option(help="Comparison: your YAML, or a shipped one (compare/single_view.yaml)."),
     ] = "compare/new_rooms_small.yaml",
     out: Annotated[Path, typer.Option(help="Folder for runs, tables and pictures.")] = Path(
         "out/compare"
     ),
-    methods: Annotated[str | None, typer.Option(help="Only these methods: lifted,lstm.")] = None,
-    rooms: Annotated[str | None, typer.Option(help="Only these kinds of rooms: bedroom.")] = None,
-    seeds: Annotated[str | None, typer.Option(help="Only these seeds: 0,1.")] = None,
+    methods: Annotated[str | None, typer.Option(help="Methods, such as lifted,lstm.")] = None,
+    rooms: Annotated[str | None, typer.Option(help="Kinds of rooms, such as bedroom.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Seeds, such as 0,1 (default: all).")] = None,
     inception: InceptionOption = None,
     accelerator: AcceleratorOption = "auto",
     renderer: RendererOption = "auto",
@@ -64,12 +64,12 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for everything the demo makes.")] = Path(
         "out/demo"
     ),
-    config: Annotated[str, typer.Option(help="What to train.")] = "demo.yaml",
-    rooms: Annotated[int, typer.Option(min=20, help="Homes to make.")] = 240,
-    count: Annotated[int, typer.Option(min=2, help="Rooms to generate and evaluate.")] = 200,
+    config: Annotated[str, typer.Option(help="Config of the training run.")] = "demo.yaml",
+    rooms: Annotated[int, typer.Option(min=20, help="Number of homes to make.")] = 240,
+    count: Annotated[int, typer.Option(min=2, help="Number of rooms to generate.")] = 200,
     renderer: RendererOption = "auto",
 ) -> None:
-    """Run the whole pipeline on procedural homes: shards, fit, new rooms, scores, report page."""
+    """Run the whole pipeline on procedural homes: shards, training, new rooms, scores, a page."""
     from sceneprior.apps.experiments.demo import run_demo
 
     with _stopped_by_ctrl_c():

@@ -9,22 +9,25 @@ from typing import Annotated
 import typer
 
 from sceneprior.apps.cli.options import (
+    MODELS_HELP,
+    CacheOption,
+    CountOption,
     DistributionOption,
     OverwriteOption,
     RendererOption,
     RunOption,
+    SeedOption,
 )
-from sceneprior.core.seeds import LARGEST_SEED
 
 
 def synthesize(
     run: RunOption,
     out: Annotated[Path, typer.Option(help="Folder for the scenes.")],
-    count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many rooms.")] = 16,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same rooms.")] = 0,
+    count: CountOption = 16,
+    seed: SeedOption = 0,
     distribution: DistributionOption = None,
     html: Annotated[
-        bool, typer.Option("--html", help="Also rooms.html, one file whose rooms turn.")
+        bool, typer.Option("--html", help="Write rooms.html, too: one page of 3D models.")
     ] = False,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
@@ -40,7 +43,7 @@ def synthesize(
     prior = load(run)
     artist = open_renderer(renderer)
     scenes = prior.sample(count, seed, distribution)
-    write_scenes(scenes, out, artist, overwrite)
+    write_scenes(scenes, out, artist)
     origin = distribution or prior.distribution
     if html:
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
@@ -50,13 +53,13 @@ def synthesize(
         typer.echo(f"Warning: {warning}", err=True)
 
 
-_END_HELP = "a training room's id, seed:7, or a file of latents: scenes/latents.npz:seed0_0003."
+_END_HELP = "a training room's id, seed:7, or a latent in a file: scenes/latents.npz:seed0_0003."
 
 
 def interpolate(
     run: RunOption,
-    start: Annotated[str, typer.Option("--from", help=f"Where to begin: {_END_HELP}")],
-    end: Annotated[str, typer.Option("--to", help="Where to end: named like the beginning.")],
+    start: Annotated[str, typer.Option("--from", help=f"First room: {_END_HELP}")],
+    end: Annotated[str, typer.Option("--to", help="Last room, named like the first one.")],
     out: Annotated[Path, typer.Option(help="Folder for the rooms and pictures.")],
     steps: Annotated[int, typer.Option(min=2, max=1000, help="Rooms, both ends included.")] = 9,
     overwrite: OverwriteOption = False,
@@ -72,22 +75,20 @@ def interpolate(
     prior = load(run)
     scenes = prior.interpolate(start, end, steps)
     artist = open_renderer(renderer)
-    write_scenes(scenes, out, artist, overwrite)
+    write_scenes(scenes, out, artist)
     write_pictures(prior.with_latents, scenes, out, artist)
     typer.echo(f"Wrote {steps} rooms, strip.png and animation.gif to {out}")
 
 
 def complete(
     run: RunOption,
-    given: Annotated[Path, typer.Option(help="Scene JSON of the objects that are there.")],
+    given: Annotated[Path, typer.Option(help="Scene JSON of the given objects.")],
     out: Annotated[Path, typer.Option(help="Folder for the completed rooms.")],
-    count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many answers.")] = 4,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same answers.")
-    ] = 0,
+    count: CountOption = 4,
+    seed: SeedOption = 0,
     classes: Annotated[
         str | None,
-        typer.Option(help="What to add, and nothing else: double_bed,nightstand (samplers only)."),
+        typer.Option(help="Classes of the objects to add: double_bed,nightstand (samplers only)."),
     ] = None,
     distribution: DistributionOption = None,
     overwrite: OverwriteOption = False,
@@ -104,7 +105,7 @@ def complete(
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
     prior = load(run)
     scenes = prior.complete(scene, count, seed, distribution, wanted)
-    write_scenes(scenes, out, open_renderer(renderer), overwrite)
+    write_scenes(scenes, out, open_renderer(renderer))
     how = "drawn by the sampler" if scenes[0].latent is None else "of fitted latents"
     typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects, {how}, to {out}")
     for room in scenes:
@@ -114,12 +115,9 @@ def complete(
 
 def retrieve(
     scenes: Annotated[Path, typer.Option(help="Folder of scene JSONs, with their GLBs.")],
-    models: Annotated[Path, typer.Option(help="3D-FUTURE-model, a folder like it, or shards.")],
+    models: Annotated[Path, typer.Option(help=f"CAD models: {MODELS_HELP}")],
     out: Annotated[Path, typer.Option(help="Folder for the scenes with CAD models.")],
-    cache: Annotated[
-        Path | None,
-        typer.Option(help="Folder for the models' points (default: ~/.cache/sceneprior)."),
-    ] = None,
+    cache: CacheOption = None,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
 ) -> None:
@@ -127,7 +125,7 @@ def retrieve(
     from rich.console import Console
     from rich.progress import track
 
-    from sceneprior.apps.retrieval.cad_models import default_cache, open_models
+    from sceneprior.apps.retrieval.cad_models import open_models
     from sceneprior.apps.retrieval.retrieve import retrieval_report, retrieve_all
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.core.files import write_json
@@ -139,13 +137,13 @@ def retrieve(
     console = Console(stderr=True)
     rooms = load_scene_folder(scenes)
     cad_models = open_models(
-        models, common_label_set(rooms), cache or default_cache(),
+        models, common_label_set(rooms), cache,
         track=lambda ids: track(ids, "Reading models", console=console, transient=True),
     )  # fmt: skip
     chosen = retrieve_all(rooms, cad_models)
     made = list(track(chosen, "Choosing models", total=len(rooms), console=console))
     report = retrieval_report(made, cad_models)
-    write_scenes(made, out, open_renderer(renderer), overwrite)
+    write_scenes(made, out, open_renderer(renderer))
     write_json(out / "retrieval.json", report)
     typer.echo(f"Gave {report['objects_with_a_model']} of {report['objects']} objects a model")
     if report["classes_without_models"]:

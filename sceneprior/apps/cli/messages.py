@@ -4,7 +4,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TextIO
+from typing import Any
 
 from sceneprior.core.errors import InputWarning
 
@@ -15,18 +15,11 @@ def warnings_as_sentences() -> Iterator[None]:
     with warnings.catch_warnings():
         show = warnings.showwarning
 
-        def say(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
+        def say(message: Warning | str, category: type[Warning], *where: Any, **to: Any) -> None:
             if issubclass(category, InputWarning):
                 print(f"Warning: {message}", file=sys.stderr)
             else:
-                show(message, category, filename, lineno, file, line)
+                show(message, category, *where, **to)
 
         warnings.showwarning = say
         yield

@@ -6,54 +6,63 @@ from typing import Annotated
 import typer
 
 from sceneprior.core.errors import InputError
+from sceneprior.core.seeds import LARGEST_SEED
 
 RendererOption = Annotated[
-    str, typer.Option(help="auto, pyrender or software (needs no GL library).")
+    str, typer.Option(help="Renderer of the pictures: auto, pyrender or software (without GL).")
 ]
 RunOption = Annotated[
     str,
     typer.Option(
-        help="Folder of a run that `fit` made, a packed prior, the name of one (see `priors`), or "
-        "hf://OWNER/NAME."
+        help="The trained prior: the folder of a run that `fit` made, a packed prior, the name of "
+        "a shipped one (see `priors`), or hf://OWNER/NAME."
     ),
 ]
 DistributionOption = Annotated[
     str | None,
     typer.Option(
-        help="sampler, paper, or kernel, whose rooms are near copies of training rooms (default: "
-        "the config's)."
+        help="Distribution that new rooms are drawn from: sampler, paper, or kernel, which gives "
+        "near copies of training rooms (default: the config's)."
     ),
 ]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
-InceptionOption = Annotated[
-    Path | None, typer.Option(help="inception-2015-12-05.pt (TorchScript), for FID proper.")
+CountOption = Annotated[int, typer.Option("-n", "--count", min=1, help="Number of rooms to make.")]
+SeedOption = Annotated[
+    int,
+    typer.Option(
+        min=0, max=LARGEST_SEED, help="Seed of all random choices: the same seed, the same result."
+    ),
 ]
-AcceleratorOption = Annotated[str, typer.Option(help="cpu, gpu or auto; Lightning's option.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+InceptionOption = Annotated[
+    Path | None, typer.Option(help="The file inception-2015-12-05.pt (TorchScript), for FID.")
+]
+AcceleratorOption = Annotated[
+    str, typer.Option(help="Device to train on: cpu, gpu or auto (Lightning).")
+]
+ScenesOption = Annotated[
+    Path | None, typer.Option(help="A folder of scene JSONs of any method, in place of --run.")
+]
+MODELS_HELP = "a 3D-FUTURE-model folder, a folder like it, or shards."
+CacheOption = Annotated[
+    Path | None,
+    typer.Option(help="Folder that keeps the CAD models' points (default: ~/.cache/sceneprior)."),
+]
 
 
 def result_file(run: str, out: Path | None, name: str) -> Path:
-    """The file of a run's results: `out` if given, else `name` in the run's folder.
-
-    Raises:
-        InputError: `out` is not given, and the run is not a folder.
-    """
+    """The file of a run's results: `out` if given, else `name` in the run's folder."""
     from sceneprior.apps.priors.where import find_prior
 
     if out is not None:
-        return out
+        return checked_target(out)
     folder = find_prior(run)
     if folder != Path(run) or not folder.is_dir():
         raise InputError(f"{run} is no folder to keep {name} in; name a file with --out.")
-    return folder / name
+    return checked_target(folder / name)
 
 
 def checked_target(target: Path) -> Path:
-    """Check, before the work begins, that a file can be written; returns it.
-
-    Raises:
-        InputError: the path is a folder.
-        OSError: the file cannot be written.
-    """
+    """Check, before the work begins, that a file can be written; returns it."""
     from sceneprior.core.files import check_writable
 
     if target.is_dir():

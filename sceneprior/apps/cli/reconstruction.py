@@ -6,51 +6,55 @@ from typing import Annotated
 import typer
 
 from sceneprior.apps.cli.options import (
+    MODELS_HELP,
     OverwriteOption,
     RendererOption,
     RunOption,
+    SeedOption,
     checked_target,
     result_file,
 )
-from sceneprior.core.seeds import LARGEST_SEED
 
 FitOption = Annotated[
-    str, typer.Option(help="objects (one by one), or paper: one latent an image, in 1,000 steps.")
+    str, typer.Option(help="Fit: objects (one by one), or paper (one latent, in 1,000 steps).")
 ]
-RestartsOption = Annotated[int, typer.Option(min=1, help="Latents fitted; the best is kept.")]
+LimitOption = Annotated[int | None, typer.Option(min=1, help="Number of rooms (default: all).")]
+RestartsOption = Annotated[
+    int, typer.Option(min=1, help="Latents to fit to each image; the best is kept.")
+]
 
 
 def reconstruct(
     run: RunOption,
     out: Annotated[Path, typer.Option(help="Folder for the rooms.")],
-    shards: Annotated[Path | None, typer.Option(help="Folder of shards with the images.")] = None,
-    room: Annotated[str | None, typer.Option(help="A room of the shards.")] = None,
-    view: Annotated[int, typer.Option(min=0, help="Which of its views.")] = 0,
+    shards: Annotated[Path | None, typer.Option(help="Shards with the images.")] = None,
+    room: Annotated[str | None, typer.Option(help="Id of a room of the shards.")] = None,
+    view: Annotated[int, typer.Option(min=0, help="Number of the room's view.")] = 0,
     split: Annotated[
-        str | None, typer.Option(help="One view of each room of train or test.")
+        str | None, typer.Option(help="One view of each room of this split: train or test.")
     ] = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="Only the first rooms.")] = None,
+    limit: LimitOption = None,
     mask: Annotated[
-        Path | None, typer.Option(help="Your own image: a PNG of ids, or COCO's JSON.")
+        Path | None, typer.Option(help="Masks of your own image: a PNG of ids, or COCO's JSON.")
     ] = None,
     classes: Annotated[
-        Path | None, typer.Option(help="Of a PNG: CSV or JSON, id and class.")
+        Path | None, typer.Option(help="Classes of the PNG's ids, as CSV or JSON.")
     ] = None,
     intrinsics: Annotated[
-        str | None, typer.Option(help="Its camera's: fov=73, 35mm=26, fx,fy,cx,cy or a JSON file.")
+        str | None, typer.Option(help="Intrinsics: fov=73, 35mm=26, fx,fy,cx,cy or a JSON file.")
     ] = None,
-    pose: Annotated[Path | None, typer.Option(help="Its camera in the room frame, JSON.")] = None,
+    pose: Annotated[Path | None, typer.Option(help="JSON of your camera's pose.")] = None,
     camera_height: Annotated[
         float | None,
-        typer.Option(min=0.1, help="Metres above the floor, without --pose (several are tried)."),
+        typer.Option(min=0.1, help="Height of your camera in m, without --pose (tries several)."),
     ] = None,
     gravity: Annotated[
         str | None,
-        typer.Option(help="Where things fall in its camera's axes, without --pose: x,y,z."),
+        typer.Option(help="Direction of gravity in your camera's axes, without --pose: x,y,z."),
     ] = None,
     fit: FitOption = "objects",
     restarts: RestartsOption = 1,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of drawn views.")] = 0,
+    seed: SeedOption = 0,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "auto",
 ) -> None:
@@ -116,13 +120,13 @@ def reconstruct(
 
 def eval_svr(
     shards: Annotated[Path, typer.Option(help="Shards with 3D ground truth.")],
-    run: Annotated[str | None, typer.Option(help="A run: its fits are evaluated.")] = None,
+    run: Annotated[str | None, typer.Option(help="Run whose fits to evaluate.")] = None,
     scenes: Annotated[
-        Path | None, typer.Option(help="Instead: what reconstruct, or retrieve after it, wrote.")
+        Path | None, typer.Option(help="Scenes of `reconstruct` or `retrieve`, in place of --run.")
     ] = None,
-    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
-    views: Annotated[int, typer.Option(min=1, help="Drawn from each room, if it has them.")] = 1,
-    limit: Annotated[int | None, typer.Option(min=1, help="Only the first rooms.")] = None,
+    split: Annotated[str, typer.Option(help="Split: train, val or test.")] = "test",
+    views: Annotated[int, typer.Option(min=1, help="Views of each room, at the most.")] = 1,
+    limit: LimitOption = None,
     out: Annotated[
         Path | None, typer.Option(help="JSON file (default: svr.json in RUN or SCENES).")
     ] = None,
@@ -130,11 +134,9 @@ def eval_svr(
     restarts: RestartsOption = 1,
     models: Annotated[
         Path | None,
-        typer.Option(help="Also with CAD models: 3D-FUTURE-model, a folder like it, or shards."),
+        typer.Option(help=f"CAD models to evaluate the fits with, too: {MODELS_HELP}"),
     ] = None,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the views and random rooms.")
-    ] = 0,
+    seed: SeedOption = 0,
     renderer: RendererOption = "auto",
 ) -> None:
     """Evaluate single-view reconstruction, with training rooms as baselines."""
@@ -151,7 +153,7 @@ def eval_svr(
     protocol = SvrProtocol(shards, split, seed, views, renderer)
     if run is not None and scenes is None:
         options = FitOptions(fit, restarts)
-        target = checked_target(result_file(run, out, "svr.json"))
+        target = result_file(run, out, "svr.json")
         found = evaluate_run(run, protocol, options, limit, models)
     elif scenes is not None and run is None:
         given = (views, limit, fit, restarts, models)

@@ -14,16 +14,16 @@ def pack(
     out: Annotated[Path, typer.Option(help="The file to write, such as bedroom.prior.")],
     about: Annotated[
         Path | None,
-        typer.Option(help="Markdown for the card: the data, their authors and licence."),
+        typer.Option(help="Markdown file on the data, their authors and licence, for the card."),
     ] = None,
     scores: Annotated[
-        Path | None, typer.Option(help="From eval-fid, for the card (RUN/scores.json).")
+        Path | None, typer.Option(help="Scores for the card (default: RUN/scores.json).")
     ] = None,
     latents: Annotated[
         bool, typer.Option("--latents", help="Keep the latents and ids of the training rooms.")
     ] = False,
     half: Annotated[
-        bool, typer.Option("--half", help="Large tensors in half precision: a smaller file.")
+        bool, typer.Option("--half", help="Store large tensors in half precision.")
     ] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -75,10 +75,10 @@ def _text_of(path: Path) -> str:
 
 def priors(
     name: Annotated[
-        str | None, typer.Argument(help="Print the card of one: a name, a file, hf://OWNER/NAME.")
+        str | None, typer.Argument(help="Prior whose card to print, as in `synthesize`.")
     ] = None,
 ) -> None:
-    """List the priors that the package ships, or print the card of one."""
+    """List the priors that the package ships, or print the card of one prior."""
     from sceneprior.apps.priors.packed import is_packed, read_packed
     from sceneprior.apps.priors.where import find_prior, shipped_priors
 
@@ -98,24 +98,24 @@ def priors(
 
 def export(
     source: Annotated[
-        Path, typer.Argument(help="A folder of scenes; for `--to scenes`, box lists as ATISS has.")
+        Path, typer.Argument(help="Folder of scenes, or of box lists for `--to scenes`.")
     ],
-    to: Annotated[str, typer.Option(help="atiss, threed-front, obj or usd; or scenes, back.")],
+    to: Annotated[str, typer.Option(help="Format: atiss, threed-front, obj or usd; or scenes.")],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
     label_set: Annotated[
-        str | None, typer.Option(help="Of box lists, such as front3d_bedroom.")
+        str | None, typer.Option(help="Label set of box lists, such as front3d_bedroom.")
     ] = None,
     classes: Annotated[
         str | None,
-        typer.Option(help="Of box lists: names of the columns (default: the label set's)."),
+        typer.Option(help="Names of the columns of box lists (default: the label set's)."),
     ] = None,
     sizes: Annotated[
         str | None,
-        typer.Option(help="Of box lists: half (extents, as ATISS writes them; default) or full."),
+        typer.Option(help="Extents in box lists: half, as ATISS writes them (default), or full."),
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Export scenes to another format, or convert box lists (such as ATISS's) to scenes."""
+    """Export scenes to another format, or convert box lists, such as ATISS's, to scenes."""
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.interchange.box_lists import read_box_lists
     from sceneprior.interchange.export import export_scenes
@@ -127,7 +127,7 @@ def export(
         if label_set is None:
             raise InputError("--to scenes needs --label-set: that of the box lists' classes.")
         rooms = read_box_lists(source, label_set, classes, sizes or "half")
-        write_scenes(rooms, out, SoftwareRenderer(), overwrite)
+        write_scenes(rooms, out, SoftwareRenderer())
     else:
         if (label_set, classes, sizes) != (None, None, None):
             raise InputError("--label-set, --classes and --sizes are of box lists: --to scenes.")

@@ -8,29 +8,28 @@ import typer
 from sceneprior.apps.cli.options import (
     AcceleratorOption,
     RendererOption,
+    ScenesOption,
+    SeedOption,
     checked_target,
 )
 from sceneprior.core.errors import InputError
-from sceneprior.core.seeds import LARGEST_SEED
 
 
 def fit(
-    config: Annotated[str, typer.Option(help="A YAML file, or a shipped one such as demo.yaml.")],
+    config: Annotated[str, typer.Option(help="Config: a YAML file, or a shipped one (demo.yaml).")],
     run: Annotated[
         Path | None, typer.Option(help="Folder for checkpoints and logs (default: runs/<config>).")
     ] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Override: model.width=256. Repeatable.")
+        list[str] | None, typer.Option("--set", help="Changed key: model.width=256; repeatable.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue a stopped run.")] = False,
     logger: Annotated[
-        list[str] | None, typer.Option(help="csv, tensorboard, wandb. Repeatable.")
+        list[str] | None, typer.Option(help="Logger: csv, tensorboard or wandb; repeatable.")
     ] = None,
-    devices: Annotated[str, typer.Option(help="How many, or which; Lightning's option.")] = "auto",
+    devices: Annotated[str, typer.Option(help="Number or list of devices (Lightning).")] = "auto",
     accelerator: AcceleratorOption = "auto",
-    precision: Annotated[str, typer.Option(help="32-true, bf16-mixed; Lightning's option.")] = (
-        "32-true"
-    ),
+    precision: Annotated[str, typer.Option(help="32-true or bf16-mixed (Lightning).")] = "32-true",
 ) -> None:
     """Train the stages of a run, one after the other."""
     from sceneprior.apps.config import load_config
@@ -55,27 +54,23 @@ def fit(
 
 def report(
     run: Annotated[Path | None, typer.Option(help="Folder of a run that `fit` made.")] = None,
-    scenes: Annotated[
-        Path | None, typer.Option(help="Instead of a run: a folder of scene JSONs, of any method.")
-    ] = None,
+    scenes: ScenesOption = None,
     shards: Annotated[
-        Path | None, typer.Option(help="Of --scenes: the shards they were evaluated on.")
+        Path | None, typer.Option(help="Shards that --scenes were evaluated on.")
     ] = None,
     scores: Annotated[
-        Path | None, typer.Option(help="From eval-fid (default: scores.json in RUN or SCENES).")
+        Path | None, typer.Option(help="Scores file (default: scores.json in RUN or SCENES).")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="HTML file (default: report.html in RUN or SCENES).")
     ] = None,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the generated rooms shown.")
-    ] = 0,
+    seed: SeedOption = 0,
     command: Annotated[
-        list[str] | None, typer.Option(help="A command to list on the page. Repeatable.")
+        list[str] | None, typer.Option(help="Command to list on the page; repeatable.")
     ] = None,
     renderer: RendererOption = "auto",
 ) -> None:
-    """Write one self-contained page: inputs, curves, rooms, scores."""
+    """Write one self-contained HTML page of a run or of scenes: inputs, curves, rooms, scores."""
     from sceneprior.apps.experiments.evaluate import report_folder, report_run
 
     commands = tuple(command or ())

@@ -1,9 +1,12 @@
 """The command view; it imports its dependencies when called."""
 
+import threading
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from sceneprior.apps.cli.options import MODELS_HELP, CacheOption
 
 
 def view(
@@ -12,21 +15,40 @@ def view(
     ],
     models: Annotated[
         Path | None,
-        typer.Option(help="CAD models to swap in: 3D-FUTURE-model, a folder like it, or shards."),
+        typer.Option(help=f"CAD models to replace objects with: {MODELS_HELP}"),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Who may open the page: 0.0.0.0 is anyone in your network.")
+        str, typer.Option(help="Address to serve on; 0.0.0.0 opens the page to your network.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535)] = 8080,
-    cache: Annotated[
-        Path | None,
-        typer.Option(help="Folder for the models' points (default: ~/.cache/sceneprior)."),
-    ] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
+    cache: CacheOption = None,
 ) -> None:
     """View rooms in the browser, and explore the latent space of a run; Ctrl-C ends it."""
-    from sceneprior.apps.viewer.server import check_can_serve
+    from sceneprior.apps.viewer.server import check_can_serve, serving
 
     check_can_serve(host, port)  # before seconds are spent on loading
-    from sceneprior.apps.viewer.serve import serve
+    import torch
 
-    serve(where, host, port, models, cache, typer.echo)
+    from sceneprior.apps.api import load
+    from sceneprior.apps.retrieval.cad_models import open_models
+    from sceneprior.apps.viewer.explorer import Explorer, Folder
+    from sceneprior.apps.viewer.page import Page
+    from sceneprior.render.scene_files import load_scene_folder
+
+    # One room at a time is too little work for several threads.
+    torch.set_num_threads(1)
+    folder, stop = Path(where), threading.Event()
+    is_folder = folder.is_dir() and not (folder / "config.yaml").is_file()
+    try:
+        source = Folder(load_scene_folder(folder)) if is_folder else Explorer(load(where))
+        bank = None if models is None else open_models(models, source.label_set, cache)
+        with serving(host, port) as server:
+            Page(server, source, folder.name, bank)
+            typer.echo(f"Open http://localhost:{port} in a browser. Ctrl-C ends it.")
+            if isinstance(source, Explorer):
+                threading.Thread(target=source.find_meshes, args=(stop,)).start()
+            stop.wait()
+    except KeyboardInterrupt:
+        typer.echo("\nStopped: the page is closed.")
+    finally:
+        stop.set()

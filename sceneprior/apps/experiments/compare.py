@@ -59,16 +59,11 @@ class Compared:
 def compare(
     comparison: Comparison, part: Comparison, out: Path, options: CompareOptions
 ) -> Compared:
-    """Train and evaluate every run that is not done yet, then write `table.*` and the pictures.
+    """Train and evaluate the runs of a part that are not done yet, then write `table.*` and the
+    pictures of all that is done.
 
-    Args:
-        comparison: The tables show all of it that is done.
-        part: What to do now: from `part_of`, or the same.
-        out: `<rooms>/<method>/seed<k>/` in it holds a run; the tables lie beside them.
-
-    Raises:
-        InputError: of shards, renderer or weights, or another `compare` is writing to `out`.
-        KeyboardInterrupt: stopped by Ctrl-C, SIGTERM or SIGHUP; the same call goes on.
+    A run lies in `<rooms>/<method>/seed<k>/` of `out`, and the tables beside. Ctrl-C, SIGTERM and
+    SIGHUP raise KeyboardInterrupt; the same call goes on.
     """
     if options.inception is not None:
         check_inception(options.inception)
@@ -76,20 +71,17 @@ def compare(
     count = cache(partial(count_of, comparison))
     for rooms in part.rooms:
         count(rooms)  # refuses shards before anything is trained
-    failures: dict[Run, str] = {}
-    done, left_out = [], []
+    asked, done, failures, left_out = runs_of(part, out), [], [], []
     with open_runner(out) as runner:
-        for run in runs_of(part, out):
-            steps = steps_of(comparison, run, count(run.rooms), options)
-            if failure := _do(runner, run, steps):
-                failures[run] = f"{run.title}: {failure}"
         for run in runs_of(comparison, out):
-            if run in failures or not (run.folder / "scores.json").is_file():
+            if run not in asked and not (run.folder / "scores.json").is_file():
                 continue
             steps = steps_of(comparison, run, count(run.rooms), options)
-            if keeps_settings(run) and all(is_done(step, run.folder) for step in steps):
+            if run in asked and (failure := _do(runner, run, steps)):
+                failures.append(f"{run.title}: {failure}")
+            elif keeps_settings(run) and all(is_done(step, run.folder) for step in steps):
                 done.append(run)
-            else:
+            elif (run.folder / "scores.json").is_file():
                 left_out.append(run.title)
         if done:
             form = VIEWS if isinstance(comparison, ViewComparison) else NEW_ROOMS
@@ -98,7 +90,7 @@ def compare(
             first = {run.method: run for run in reversed(done) if run.rooms == rooms}
             if shown := [first[method] for method in comparison.methods if method in first]:
                 write_figure(comparison, shown, count(rooms), out / f"{rooms}.png", renderer)
-    return Compared(out / "table.md" if done else None, [*failures.values()], left_out)
+    return Compared(out / "table.md" if done else None, failures, left_out)
 
 
 def _do(runner: StepRunner, run: Run, steps: list[Step]) -> str | None:
@@ -120,11 +112,7 @@ def _do(runner: StepRunner, run: Run, steps: list[Step]) -> str | None:
 
 
 def count_of(comparison: Comparison, rooms: str) -> int | None:
-    """Number of rooms that each run generates, or of test rooms whose views it answers; None: all.
-
-    Raises:
-        InputError: the shards are missing, or runs cannot be scored on them.
-    """
+    """Rooms that each run generates, or test rooms whose views it answers; None: all."""
     shards = shards_of(comparison, rooms)
     if isinstance(comparison, ViewComparison):
         if not known_in_3d(shards, "test"):

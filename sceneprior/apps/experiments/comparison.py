@@ -2,8 +2,9 @@
 
 import json
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from pydantic import Field, field_validator, model_validator
 
@@ -16,6 +17,7 @@ from sceneprior.core.settings import Section, check_settings, read_settings
 from sceneprior.lifted.trained import SAMPLER
 from sceneprior.training.method import RunConfig
 
+_T = TypeVar("_T")
 EVERY = "every"
 """In `Method.set`: settings for every kind of room."""
 
@@ -163,11 +165,7 @@ class Run:
 
 
 def load_comparison(name: str) -> Comparison:
-    """Read a comparison and check the settings of each of its runs.
-
-    Raises:
-        ConfigError: not found, not YAML, an unknown key or a wrong value, in it or in a run.
-    """
+    """Read a comparison and check the settings of each of its runs."""
     path, data = read_settings(name)
     task = data.get("task", "new_rooms")
     if not isinstance(task, str) or task not in TASKS:
@@ -193,68 +191,48 @@ def load_comparison(name: str) -> Comparison:
 def part_of(
     comparison: Comparison, methods: str | None, rooms: str | None, seeds: str | None
 ) -> Comparison:
-    """Some methods, kinds of rooms and seeds of a comparison, each given as `a,b`; None is all.
-
-    Raises:
-        InputError: the comparison has no such entry.
-    """
-    kept_methods = _chosen("method", methods, tuple(comparison.methods))
-    kept_rooms = _chosen("kind of rooms", rooms, tuple(comparison.rooms))
-    kept_seeds = _chosen("seed", seeds, tuple(str(seed) for seed in comparison.seeds))
+    """Some methods, kinds of rooms and seeds of a comparison, each given as `a,b`; None is all."""
+    by_seed = {str(seed): seed for seed in comparison.seeds}
     return comparison.model_copy(
         update={
-            "methods": {key: comparison.methods[key] for key in kept_methods},
-            "rooms": {key: comparison.rooms[key] for key in kept_rooms},
-            "seeds": tuple(int(seed) for seed in kept_seeds),
+            "methods": _chosen("method", methods, comparison.methods),
+            "rooms": _chosen("kind of rooms", rooms, comparison.rooms),
+            "seeds": tuple(_chosen("seed", seeds, by_seed).values()),
         }
     )
 
 
-def _chosen(what: str, given: str | None, known: tuple[str, ...]) -> tuple[str, ...]:
+def _chosen(what: str, given: str | None, known: dict[str, _T]) -> dict[str, _T]:
     if given is None:
         return known
-    names = tuple(name.strip() for name in given.split(",") if name.strip())
+    names = [name.strip() for name in given.split(",") if name.strip()]
     for name in names:
         if name not in known:
             raise InputError(f"No {what} '{name}' in this comparison; it has {', '.join(known)}.")
     if not names:
         raise InputError(f"No {what} was named; the comparison has {', '.join(known)}.")
-    return tuple(name for name in known if name in names)
+    return {name: entry for name, entry in known.items() if name in names}
 
 
 def runs_of(comparison: Comparison, out: Path) -> list[Run]:
     """Every run, scenes first, then seed by seed, so that a comparison that is stopped early is a
     whole one of fewer seeds.
-
-    Raises:
-        ConfigError: the config of rooms or of a method is not found, or not YAML.
     """
-    given = [
-        Run(key, name, None, rooms.config, (), out / key / name, Path(method.scenes[key]))
-        for key, rooms in comparison.rooms.items()
-        for name, method in comparison.methods.items()
-        if key in method.scenes
-    ]
-    trained = [
-        Run(
-            rooms=key,
-            method=name,
-            seed=seed,
-            config=method.config or rooms.config,
-            settings=(
-                *_taken_over(rooms, method),
-                *method.set.get(EVERY, ()),
-                *method.set.get(key, ()),
-                f"seed={seed}",
-            ),
-            folder=out / key / name / f"seed{seed}",
-        )
-        for seed in comparison.seeds
-        for key, rooms in comparison.rooms.items()
-        for name, method in comparison.methods.items()
-        if not method.scenes
-    ]
-    return given + trained
+    runs = []
+    for seed in (None, *comparison.seeds):
+        for (key, rooms), (name, method) in product(
+            comparison.rooms.items(), comparison.methods.items()
+        ):
+            folder = out / key / name
+            if seed is None and key in method.scenes:
+                scenes = Path(method.scenes[key])
+                runs.append(Run(key, name, None, rooms.config, (), folder, scenes))
+            elif seed is not None and not method.scenes:
+                changes = (*method.set.get(EVERY, ()), *method.set.get(key, ()))
+                settings = (*_taken_over(rooms, method), *changes, f"seed={seed}")
+                config = method.config or rooms.config
+                runs.append(Run(key, name, seed, config, settings, folder / f"seed{seed}"))
+    return runs
 
 
 def _taken_over(rooms: Rooms, method: Method) -> list[str]:

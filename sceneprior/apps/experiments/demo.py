@@ -8,14 +8,7 @@ import sys
 from pathlib import Path
 
 from sceneprior.apps.config import load_config
-from sceneprior.apps.experiments.steps import (
-    Step,
-    StepRunner,
-    is_done,
-    open_runner,
-    read_journal,
-    read_result,
-)
+from sceneprior.apps.experiments.steps import Step, is_done, open_runner, read_journal, read_result
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json
 
@@ -23,14 +16,28 @@ from sceneprior.core.files import write_json
 def run_demo(out: Path, config: str, rooms: int, count: int, renderer: str) -> None:
     """Run every step that is not done yet, then put time and memory beside the scores.
 
-    Raises:
-        InputError: a step failed (its own sentence stands above), or something else writes to
-            `out`.
-        KeyboardInterrupt: stopped by Ctrl-C, SIGTERM or SIGHUP; the same call goes on.
+    Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; the same call goes on.
     """
     steps = demo_steps(out, config, rooms, count, renderer)
     with open_runner(out) as runner:
-        _run(steps, runner, out)
+        for step in steps:
+            if is_done(step, out):
+                took = read_journal(out)[step.name]["wall_s"]
+                seconds = "" if took is None else f", {took:.0f} s"
+                print(f"{step.name}: done before{seconds}", file=sys.stderr)
+                continue
+            told: list[str] = []
+            if step.name == "report":
+                _add_costs(out)
+                for earlier in steps[:-1]:
+                    told += ["--command", f"sceneprior {shlex.join(earlier.arguments)}"]
+            try:
+                runner.do(step, out, unshown=told)
+            except InputError:
+                raise InputError(
+                    f"The demo stopped at '{step.name}'; mend that and run it again."
+                ) from None
+        _add_costs(out)
 
 
 def demo_steps(out: Path, config: str, rooms: int, count: int, renderer: str) -> list[Step]:
@@ -59,36 +66,12 @@ def demo_steps(out: Path, config: str, rooms: int, count: int, renderer: str) ->
         "homes": "homes", "shards": "shards/index.json", "fit": f"run/{last}/final.ckpt",
         "scenes": "scenes/overview.png", "scores": "scores.json", "report": "report.html",
     }  # fmt: skip
-    continues = {"shards": "shards", "fit": "run"}
-    holds = {"fit": [settings.model_dump_json()]}
+    continues = {"shards": out / "shards", "fit": out / "run"}
+    depends_on = commands | {"fit": [*commands["fit"], settings.model_dump_json()]}
     return [
-        Step(
-            name, arguments, out / results[name], depends_on=arguments + holds.get(name, []),
-            continues=out / continues[name] if name in continues else None,
-        )
-        for name, arguments in commands.items()
-    ]  # fmt: skip
-
-
-def _run(steps: list[Step], runner: StepRunner, out: Path) -> None:
-    for step in steps:
-        if is_done(step, out):
-            took = read_journal(out)[step.name]["wall_s"]
-            seconds = "" if took is None else f", {took:.0f} s"
-            print(f"{step.name}: done before{seconds}", file=sys.stderr)
-            continue
-        told: list[str] = []
-        if step.name == "report":
-            _add_costs(out)
-            for earlier in steps[:-1]:
-                told += ["--command", f"sceneprior {shlex.join(earlier.arguments)}"]
-        try:
-            runner.do(step, out, unshown=told)
-        except InputError:
-            raise InputError(
-                f"The demo stopped at '{step.name}'; mend that and run it again."
-            ) from None
-    _add_costs(out)
+        Step(name, words, out / results[name], depends_on[name], continues.get(name))
+        for name, words in commands.items()
+    ]
 
 
 def _add_costs(out: Path) -> None:

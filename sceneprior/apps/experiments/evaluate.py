@@ -13,7 +13,7 @@ from sceneprior.apps.experiments.evaluate_views import (
     known_from_views_alone,
     mask_scores,
 )
-from sceneprior.apps.experiments.makers import maker_of_rooms
+from sceneprior.apps.experiments.makers import GIVEN, maker_of_rooms
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json
@@ -51,9 +51,6 @@ def evaluate_run(
     against masks, where rooms are known from views alone.
 
     The options' seed draws the latents, too; `shards` and `distribution` are by default the run's.
-
-    Raises:
-        InputError: the run, the shards or a file of weights cannot be used.
     """
     trained = load_any_run(run)
     folder = shards or Path(trained.config.data.shards)
@@ -86,15 +83,8 @@ def evaluate_run(
 def evaluate_folder(
     folder: Path, count: int | None, options: EvalOptions, out: Path, shards: Path
 ) -> dict[str, Any]:
-    """Score the user's scenes, of any method, against test rooms, and write the scores.
-
-    Args:
-        folder: Scene JSONs (docs/conventions.md), perhaps with the GLBs of their meshes.
-        count: So many of them, drawn by the options' seed; None takes all.
-
-    Raises:
-        InputError: there are fewer scenes, or they, the shards or a file of weights cannot be used.
-    """
+    """Score `count` of the user's scenes (None: all), of any method, against test rooms, and write
+    the scores."""
     scenes = load_scene_folder(folder)
     if count is not None and count > len(scenes):
         raise InputError(
@@ -138,14 +128,7 @@ def report_run(
     commands: tuple[str, ...],
     renderer: str,
 ) -> None:
-    """Write the page of a run; of rooms not known in 3D, without what compares with true rooms.
-
-    Args:
-        scores: None takes the run's `scores.json`.
-
-    Raises:
-        InputError: the run or its scores cannot be read.
-    """
+    """Write the page of a run; of rooms not known in 3D, without what compares with true rooms."""
     trained = load_any_run(run)
     config, shards = trained.config, Path(trained.config.data.shards)
     found = read_scores(scores, run, shards, f"--run {run}")
@@ -184,29 +167,17 @@ def report_folder(
     commands: tuple[str, ...],
     renderer: str,
 ) -> None:
-    """Write the page of the user's scenes, of any method: that of a run without the parts that a
-    run alone has.
-
-    Args:
-        scores: None takes the folder's `scores.json`.
-
-    Raises:
-        InputError: the scenes, the shards or the scores cannot be read.
-    """
+    """Write the page of the user's scenes, of any method, without the parts that only a run has."""
     scenes = load_scene_folder(folder)
     write_report(
         out,
         title="Rooms beside real ones",
         source=f"scenes {folder.resolve().name}",
-        made_by="scenes as given, which were made elsewhere",
+        made_by=GIVEN.said,
         shards=shards,
-        views=False,
         generated=scenes[:ROOMS_SHOWN],
         scores=read_scores(scores, folder, shards, f"--scenes {folder} --shards {shards}"),
         commands=commands,
-        curves={},
-        decoded=[],
-        unfolding=[],
         renderer=open_renderer(renderer),
     )
 
@@ -214,9 +185,6 @@ def report_folder(
 def read_scores(path: Path | None, folder: Path, shards: Path, evaluated: str) -> dict[str, Any]:
     """Read the scores that `eval-fid` wrote to a file. None reads the folder's `scores.json`, which
     may be missing where rooms have no 3D ground truth; `evaluated` is the command that writes it.
-
-    Raises:
-        InputError: the file is missing, or holds no scores.
     """
     if path is None:
         path = folder / "scores.json"

@@ -19,14 +19,14 @@ from sceneprior.core.views import SceneViews
 from sceneprior.evaluation.bootstrap import METHOD, Estimate, mean_of_rooms, resample_counts
 from sceneprior.evaluation.metrics.contents import (
     TYPE_CLASSES,
+    category_kl_of_counts,
     class_counts,
     common_label_set,
     emptiness,
-    frequency_kl,
 )
 from sceneprior.evaluation.metrics.overlaps import room_overlaps
 from sceneprior.evaluation.registry import METRICS
-from sceneprior.evaluation.synthesis import FORMAT, VERSION, EvalOptions
+from sceneprior.evaluation.synthesis import EvalOptions, result_of
 from sceneprior.paper.config import PaperConfig
 from sceneprior.paper.losses.matching import match_objects
 from sceneprior.paper.shape_decoder import ShapeDecoder
@@ -53,9 +53,6 @@ def evaluate_from_views(
 ) -> dict[str, Any]:
     """Scores by key of `METRICS`, of those that need no room in 3D, as `evaluate_synthesis` has
     them: of generated rooms, of real training rooms, and of the rooms compared with (`_test`).
-
-    Raises:
-        InputError: no rooms, or other classes than the shards'.
     """
     names = common_label_set(generated)
     rooms = {split: _counted(shards, split, names) for split in ("train", options.split)}
@@ -74,23 +71,14 @@ def evaluate_from_views(
             held = table[:, [label_set(names).index(label) for label in wanted]].any(axis=1)
             found["type_share"] = mean_of_rooms(held.astype(float), draws[name], 1.0)
         if name != "test":
-            pairs = (table, counts["test"], draws[name], draws["test"])
-            found["category_kl"] = _category_kl(*pairs)
+            found["category_kl"] = category_kl_of_counts(
+                table, counts["test"], draws[name], draws["test"]
+            )
         columns[name] = found
     volumes = [room_overlaps(scene).volumes_m3.sum() for scene in generated]
     columns["generated"]["overlap_volume_m3"] = mean_of_rooms(volumes, draws["generated"])
-    values = {name: {k: v.value for k, v in found.items()} for name, found in columns.items()}
     measured = columns["generated"]
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        **values["generated"],
-        **{f"{key}_test": value for key, value in values["test"].items()},
-        "train_rooms": values["train_rooms"],
-        "intervals": {
-            name: {key: estimate.interval() for key, estimate in found.items()}
-            for name, found in columns.items()
-        },
+    return result_of(columns) | {
         "note": " ".join(filter(None, (emptiness(generated), _NOTE))),
         "protocol": {
             "label_set": names,
@@ -109,9 +97,6 @@ def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
     """Mean IoU of decoded training rooms' masks with observed ones, in views that training never
     saw (`mask_iou_held_out`, where `data.view_fraction` left some out of every room), or else in
     some that it did (`mask_iou_training_views`). Nothing where shapes are no meshes.
-
-    Raises:
-        InputError: the shards are not those of the run.
     """
     config = trained.config
     if not isinstance(config, PaperConfig):
@@ -143,9 +128,7 @@ def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
 def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
     """Mean IoU of hard masks of decoded training rooms with the observed ones; void is left out.
 
-    Args:
-        trained: A prior of meshes; before the shape stage each box has the plain template in it.
-        views: Of training rooms, with instance ids.
+    The prior decodes meshes; before the shape stage each box has the plain template in it.
     """
     config, prior = trained.config, trained.prior
     assert isinstance(config, PaperConfig), "a run that remembers rooms has a view loss"
@@ -187,14 +170,3 @@ def _counted(shards: Path, split: str, names: str) -> Int[np.ndarray, "rooms cla
     table = np.stack(tables).astype(np.int64)
     table[:, VOID] = 0
     return table
-
-
-def _category_kl(
-    table: np.ndarray, test: np.ndarray, draws: np.ndarray, test_draws: np.ndarray
-) -> Estimate:
-    def shares(counts: np.ndarray) -> np.ndarray:
-        return np.asarray(counts / np.maximum(counts.sum(axis=-1, keepdims=True), 1))
-
-    resamples = zip(shares(test_draws @ test), shares(draws @ table), strict=True)
-    value = frequency_kl(shares(test.sum(axis=0)), shares(table.sum(axis=0)))
-    return Estimate(value, np.array([frequency_kl(p, q) for p, q in resamples]), 0.0)

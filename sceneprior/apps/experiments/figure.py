@@ -45,8 +45,7 @@ def write_figure(
 ) -> None:
     """Draw what runs on the same rooms make, one run a method, under the truth.
 
-    Args:
-        count: Rooms that each run is evaluated by; None is as `Comparison.count` says.
+    `count` rooms of each run are evaluated (`count_of`).
     """
     of = _answers if isinstance(comparison, ViewComparison) else _rooms
     write_whole(path, png_bytes(sheet(of(comparison, runs, count, renderer)), optimize=True))
@@ -80,23 +79,19 @@ def _rooms(
     lines = {"Real training rooms": real, "Independent objects": independent}
     for run in runs:
         variant = variants_of(comparison, run)[0]
-        lines[title_of(comparison, run, variant)] = _rooms_of(comparison, run, variant, count)
+        if run.scenes is not None:
+            made = load_scene_folder(run.scenes)
+        else:
+            assert count is not None, "comparisons of new rooms count them"
+            trained = load_any_run(run.folder / "run")
+            made = sample_rooms(trained, count, comparison.sampling_seed, variant)
+        lines[title_of(comparison, run, variant)] = made
     return {
         title: [
             topdown(without_void(room), renderer, outlines=True) for room in rooms[:ROOMS_SHOWN]
         ]
         for title, rooms in lines.items()
     }
-
-
-def _rooms_of(
-    comparison: Comparison, run: Run, variant: str | None, count: int | None
-) -> list[Scene]:
-    if run.scenes is not None:
-        return load_scene_folder(run.scenes)
-    assert count is not None, "comparisons of new rooms count them"
-    trained = load_any_run(run.folder / "run")
-    return sample_rooms(trained, count, comparison.sampling_seed, variant)
 
 
 def _answers(

@@ -84,15 +84,14 @@ def _rows_of_rooms(comparison: Comparison, run: Run) -> list[Row]:
     first = next(iter(found.values()))
     if decoded := first.get("decoded_rooms"):
         found[DECODED] = {**decoded, "protocol": first["protocol"]}
+    learns_from, ranks = run.run_config.learns_from, list(GROUPS)
     return [
-        replace(
-            _row(comparison, run, drawn, GROUPS[drawn].format(run.run_config.learns_from)),
-            variant=marked(drawn),
-            scores=scores,
-            rank=list(GROUPS).index(drawn),
+        _row(
+            comparison, run, drawn, GROUPS[drawn].format(learns_from), marked(drawn), scores,
+            ranks.index(drawn),
         )
         for drawn, scores in found.items()
-    ]
+    ]  # fmt: skip
 
 
 def _rows_of_views(comparison: Comparison, run: Run) -> list[Row]:
@@ -110,20 +109,20 @@ def _rows_of_views(comparison: Comparison, run: Run) -> list[Row]:
         for name, shapes in SHAPES.items():
             if name in of:
                 scores = {**of[name], **beside, "protocol": found["protocol"]}
-                row = _row(comparison, run, variant, group)
-                rows.append(replace(row, variant=shapes, scores=scores))
+                rows.append(_row(comparison, run, variant, group, shapes, scores))
     return rows
 
 
-def _row(comparison: Comparison, run: Run, variant: str | None, group: str) -> Row:
-    """A row of a run, without scores and costs."""
-    return Row(
-        rooms=comparison.rooms[run.rooms].title,
-        group=group,
-        title=title_of(comparison, run, variant),
-        variant="",
-        seed=run.seed,
-        scores={},
-        costs={},
-        made_by=maker_of(comparison, run, variant).said,
-    )
+def _row(
+    comparison: Comparison,
+    run: Run,
+    variant: str | None,
+    group: str,
+    shown: str,
+    scores: dict[str, Any],
+    rank: int = 0,
+) -> Row:
+    """A row without costs; `shown` is how the table calls its variant."""
+    rooms, title = comparison.rooms[run.rooms].title, title_of(comparison, run, variant)
+    made_by = maker_of(comparison, run, variant).said
+    return Row(rooms, group, title, shown, run.seed, scores, {}, made_by, rank)

@@ -121,9 +121,6 @@ def open_runner(out: Path) -> Iterator[StepRunner]:
 
     While it is open, Ctrl-C, SIGTERM and SIGHUP let its command save what it has, and raise
     KeyboardInterrupt.
-
-    Raises:
-        InputError: another runner is writing to `out`, or it cannot be written.
     """
     runner = StepRunner()
     with contextlib.ExitStack() as until_done:
@@ -158,11 +155,7 @@ def _answering_signals(runner: StepRunner) -> Iterator[None]:
 
 
 def is_done(step: Step, folder: Path) -> bool:
-    """Test whether a step has finished for its present inputs, and its result is there.
-
-    Raises:
-        InputError: the journal is damaged.
-    """
+    """Test whether a step has finished for its present inputs, and its result is there."""
     noted = read_journal(folder).get(step.name, {})
     same = noted.get("depends_on") == step.depends_on
     return same and bool(noted.get("finished")) and step.result.exists()
@@ -175,11 +168,7 @@ def read_journal(folder: Path) -> dict[str, Any]:
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """A JSON file that a step left.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """A JSON file that a step left."""
     try:
         return dict(read_json(path))
     except (InputError, TypeError, ValueError):

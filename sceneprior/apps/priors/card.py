@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from sceneprior import __version__
+from sceneprior.apps.priors.packed import shared_settings
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.files import read_json
-from sceneprior.core.settings import Section
 from sceneprior.core.shards import INDEX_NAME
 from sceneprior.evaluation.score_table import headings, score_rows
 from sceneprior.lifted.trained import TrainedLifted
@@ -31,14 +31,7 @@ def model_card(
     latents: bool = False,
     half: bool = False,
 ) -> str:
-    """The card as Markdown.
-
-    Args:
-        name: Name of the prior, the card's heading.
-        about: Markdown on the data, their authors and licence, and the making of the run.
-        scores: Result of `eval-fid`, on rooms that were held out of training.
-        latents, half: The options of `pack`.
-    """
+    """The card as Markdown, from the user's text `about` the data and the scores of `eval-fid`."""
     config = trained.config
     packed = trained
     if isinstance(trained, TrainedPrior) and not latents:
@@ -62,7 +55,7 @@ def model_card(
         "## Limits",
         *_limits(trained, latents, half),
         "## Settings",
-        f"```json\n{json.dumps(_settings(config), indent=1)}\n```",
+        f"```json\n{json.dumps(shared_settings(config), indent=1)}\n```",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -78,12 +71,6 @@ def _classes(trained: Trained) -> str:
     if lacking:
         said += f" It makes none of the label set's other classes: {', '.join(lacking)}."
     return said
-
-
-def _settings(config: Section) -> dict[str, Any]:
-    data = config.model_dump(mode="json", by_alias=True)
-    data["data"]["shards"] = Path(data["data"]["shards"]).name
-    return data
 
 
 def _splits(shards: Path) -> list[str]:

@@ -85,19 +85,21 @@ def pack(trained: Trained, card: str, latents: bool = False, half: bool = False)
         if network is not None
         for key, value in network.state_dict().items()
     }
-    settings = trained.config.model_dump(mode="json", by_alias=True)
-    # Only the name of the data is kept, not the path on the user's machine.
-    settings["data"]["shards"] = Path(settings["data"]["shards"]).name
-    classes = list(label_set(trained.config.label_set))
-    count = len(trained.room_ids)
     said = Description(
         stage=trained.stage,
-        classes=classes,
-        training_rooms=count,
+        classes=list(label_set(trained.config.label_set)),
+        training_rooms=len(trained.room_ids),
         room_ids=rooms,
-        settings=settings,
+        settings=shared_settings(trained.config),
     )
     return PackedPrior(said, tensors, card)
+
+
+def shared_settings(config: RunConfig) -> dict[str, Any]:
+    """A run's settings with the name of its data alone, not the path on the user's machine."""
+    settings = config.model_dump(mode="json", by_alias=True)
+    settings["data"]["shards"] = Path(settings["data"]["shards"]).name
+    return settings
 
 
 def _is_large(tensor: Tensor) -> bool:
@@ -105,11 +107,7 @@ def _is_large(tensor: Tensor) -> bool:
 
 
 def unpack(packed: PackedPrior, config: RunConfig, source: str) -> Trained:
-    """Restore the trained method of a file; `config` is the validated `packed.said.settings`.
-
-    Raises:
-        InputError: the weights do not fit these settings.
-    """
+    """Restore the trained method of a file; `config` is the validated `packed.said.settings`."""
     try:
         if packed.said.stage not in config.stage_names:
             raise ValueError(f"no stage of its method is called '{packed.said.stage}'")
@@ -164,11 +162,7 @@ def _check(name: str, tensor: Tensor, classes: int) -> None:
 
 
 def write_packed(packed: PackedPrior, path: Path) -> None:
-    """Write a prior to one file, atomically; the same prior gives the same bytes.
-
-    Raises:
-        InputError: a part of it is larger than `read_packed` accepts.
-    """
+    """Write a prior to one file, atomically; the same prior gives the same bytes."""
     described = packed.said.model_dump(mode="json")
     tensors = {name: tensor.contiguous() for name, tensor in packed.tensors.items()}
     contents = (packed.card.encode(), json_text(described).encode(), tensors_to_bytes(tensors))
@@ -182,14 +176,9 @@ def write_packed(packed: PackedPrior, path: Path) -> None:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for name, content in zip(FILES, contents, strict=True):
-            archive.writestr(_entry(name), content)
+            # An entry has the default date, 1980, so that the bytes are reproducible.
+            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
     write_whole(Path(path), buffer.getvalue())
-
-
-def _entry(name: str) -> zipfile.ZipInfo:
-    entry = zipfile.ZipInfo(name)  # with its default date, 1980, for reproducible bytes
-    entry.compress_type = zipfile.ZIP_DEFLATED
-    return entry
 
 
 def is_packed(path: Path) -> bool:
@@ -198,11 +187,7 @@ def is_packed(path: Path) -> bool:
 
 
 def read_packed(path: Path) -> PackedPrior:
-    """Read a packed prior. Nothing in it is executed, and nothing is written.
-
-    Raises:
-        InputError: the path is not a packed prior, or is damaged.
-    """
+    """Read a packed prior. Nothing in it is executed, and nothing is written."""
     try:
         card, described, weights = (_contents(path, name) for name in FILES)
         data = json.loads(described)

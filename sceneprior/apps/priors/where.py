@@ -5,7 +5,6 @@ from pathlib import Path
 from sceneprior.apps.priors.packed import FILES
 from sceneprior.core.errors import InputError
 
-ENDING = ".prior"
 HUB = "hf://"
 
 
@@ -15,19 +14,12 @@ def shipped_priors() -> dict[str, Path]:
     >>> "procthor-bedroom" in shipped_priors()
     True
     """
-    return {path.stem: path for path in sorted(Path(__file__).parent.glob(f"*{ENDING}"))}
+    return {path.stem: path for path in sorted(Path(__file__).parent.glob("*.prior"))}
 
 
 def find_prior(where: str | Path) -> Path:
-    """The file or folder of a prior.
-
-    Args:
-        where: A path, which takes precedence; a name of `shipped_priors`; or `hf://OWNER/NAME`,
-            which is downloaded once and kept in the Hub's cache.
-
-    Raises:
-        InputError: no such prior exists, or the download fails.
-    """
+    """The file or folder of a prior: a path, which takes precedence; a name of `shipped_priors`; or
+    `hf://OWNER/NAME`, which is downloaded once and kept in the Hub's cache."""
     text = str(where)
     if text.startswith(HUB):
         return _fetch(text)

@@ -75,17 +75,9 @@ def read_own_image(
     Classes outside the run's label set become those of `SAME_CLASS`, or void.
 
     Args:
-        mask: A PNG of ids (`read_mask`), or COCO's JSON (`read_coco`), which has the classes too.
-        classes: Table of a PNG's classes (`read_class_table`).
-        intrinsics: See `read_intrinsics`.
-        label_set_name: The run's label set.
-        pose: File for `read_pose`. None assumes a `level_camera`.
-        camera_height_m: Height of an assumed camera; None tries all `CAMERA_HEIGHTS_M`.
-        sides: Number of sides of the room from which an assumed camera may look.
-        gravity: Direction of gravity for an assumed camera (`read_gravity`); None is level.
-
-    Raises:
-        InputError: a file is missing or cannot be used, the sizes differ, or no object is visible.
+        mask: A PNG of ids, or COCO's JSON, which has the classes too.
+        pose: File for `read_pose`. None assumes a camera at one of `sides` of the room, at the
+            given height or at all `CAMERA_HEIGHTS_M`, tilted by `gravity`; None is level.
     """
     if mask.suffix.lower() == ".json":
         if classes is not None:
@@ -101,9 +93,8 @@ def read_own_image(
     camera = read_intrinsics(intrinsics, values.shape)
     step = -(-max(values.shape) // LARGEST_PX)
     seen = observe(table.ids(values[thinned(step)])[None], table.classes)
-    # Intrinsics are scaled to the subsampled image.
-    small = seen.instance_ids.shape[1:]
-    camera = np.diag([small[1] / values.shape[1], small[0] / values.shape[0], 1]) @ camera
+    height, width = seen.instance_ids.shape[1:]
+    camera = np.diag([width / values.shape[1], height / values.shape[0], 1]) @ camera
     if not len(seen.tracked):
         raise InputError(
             f"{mask} shows no object: none of its masks is of a class of the run and wider than "
@@ -185,14 +176,8 @@ def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
 
 
 def read_gravity(text: str) -> np.ndarray:
-    """Unit vector of gravity in camera axes (x right, y down, z forward).
-
-    Args:
-        text: `x,y,z`, of any length, from a phone's accelerometer or a horizon detector.
-
-    Raises:
-        InputError: the text is not three finite numbers, or the camera is upside down.
-    """
+    """Unit vector of gravity in camera axes (x right, y down, z forward), from `x,y,z` of any
+    length."""
     try:
         down = np.array([float(part) for part in text.split(",")])
     except ValueError:
@@ -235,32 +220,29 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
     `fov` is the horizontal field of view in degrees, `35mm` the 35 mm equivalent focal length in
     millimetres, by the diagonal; for both the principal point is the image centre. A file may state
     the size of its image (`width`, `height`), which is checked.
-
-    Raises:
-        InputError: the text is none of these, is not finite, or is for an image of another size.
     """
     expected = (
         "fx,fy,cx,cy in pixels, fov=DEGREES, 35mm=MILLIMETRES, or a JSON file: "
         '{"fx": 240, "fy": 240, "cx": 240, "cy": 180}'
     )
-    path = Path(text)
+    path, (height, width) = Path(text), image_size
     in_file = path.suffix.lower() == ".json"
+    data: Any
     try:
-        if text.startswith(("fov=", "35mm=")):
-            focal = _focal_px(text, image_size)
-            data: Any = {"fx": focal, "fy": focal, "cx": image_size[1] / 2, "cy": image_size[0] / 2}
-        elif not in_file:
-            values = (float(part) for part in text.split(","))
-            data = dict(zip(("fx", "fy", "cx", "cy"), values, strict=True))
-        else:
+        if in_file:
             data = read_json(path)
             data = data if isinstance(data, dict) else {"K": data}
-            said = (data.get("height", image_size[0]), data.get("width", image_size[1]))
+            said = (data.get("height", height), data.get("width", width))
             if said != image_size:
                 raise InputError(
                     f"{path} is of an image of {said[1]} x {said[0]} pixels, but the mask has "
-                    f"{image_size[1]} x {image_size[0]}; scale fx, fy, cx and cy, or the mask."
+                    f"{width} x {height}; scale fx, fy, cx and cy, or the mask."
                 )
+        elif text.startswith(("fov=", "35mm=")):
+            focal = _focal_px(text, image_size)
+            data = {"fx": focal, "fy": focal, "cx": width / 2, "cy": height / 2}
+        else:
+            data = dict(zip(("fx", "fy", "cx", "cy"), map(float, text.split(",")), strict=True))
         if "K" not in data:
             fx, fy, cx, cy = (data[key] for key in ("fx", "fy", "cx", "cy"))
             data = {"K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]}
@@ -285,7 +267,6 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
     for focal in (matrix[0, 0], matrix[1, 1]):
         if odd := odd_field_of_view(focal, image_size):
             raise InputError(f"--intrinsics {text}: {odd}.")
-    width, height = image_size[::-1]
     if not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
         raise InputError(
             f"The middle of the camera's image, cx = {matrix[0, 2]:g} and cy = {matrix[1, 2]:g}, "
@@ -311,16 +292,9 @@ def _focal_px(text: str, image_size: tuple[int, int]) -> float:
 
 
 def read_pose(path: Path) -> np.ndarray:
-    """Read a 4 x 4 pose from the JSON key `world_to_camera` or `camera_to_world`, OpenCV axes.
+    """The 4 x 4 `world_to_camera` of a JSON's key `world_to_camera` or `camera_to_world`.
 
-    The world is the room frame: metres, y up, the origin in the middle of the floor (y = 0).
-
-    Returns:
-        `world_to_camera`.
-
-    Raises:
-        InputError: there is no such matrix, it is not a rigid transform, or the camera is upside
-            down or below the floor.
+    Axes are OpenCV's; the world is the room frame, whose origin is the middle of the floor.
     """
     data = read_json(path)
     try:

@@ -68,10 +68,6 @@ def reconstruct(
 
     Scenes have no meshes if the run's shape stage has not been trained. A baseline that predicts
     objects from images directly is used without a fit.
-
-    Raises:
-        InputError: unknown options, a run that cannot reconstruct images, another label set, or,
-            for latent fits, more objects than the prior generates.
     """
     if options.fit not in (OBJECTS, *SCHEDULES):
         raise InputError(
@@ -81,14 +77,13 @@ def reconstruct(
         raise InputError(f"restarts is {options.restarts}; an image needs at least one.")
     if options.restarts > 1 and options.fit == OBJECTS:
         raise InputError("restarts are of latents, which the fit `paper` finds; name that one.")
-    direct = isinstance(trained, TrainedReconstructor)
-    if direct and options.fit != OBJECTS:
+    if not isinstance(trained, TrainedReconstructor):
+        with_training_latents(trained, "Reconstruction")
+    elif options.fit != OBJECTS:
         raise InputError(
             f"A run of `method: {trained.config.method}` has no latents to fit; leave out the fit "
             f"{options.fit}."
         )
-    if not direct:
-        with_training_latents(trained, "Reconstruction")
     for image in images:
         if image.label_set != trained.config.label_set:
             raise InputError(
@@ -97,20 +92,20 @@ def reconstruct(
             )
     if not images:
         return []
-    found: dict[int, Reconstruction] = {}
-    if isinstance(trained, TrainedReconstructor):
-        for rows in _batches(images, BATCH):
-            found |= zip(rows, _found_directly(trained, [images[row] for row in rows]), strict=True)
-        return [found[row] for row in range(len(images))]
-    assert isinstance(trained, TrainedPrior), "checked above: it remembers rooms"
-    if options.fit == OBJECTS:
+    if isinstance(trained, TrainedPrior) and options.fit == OBJECTS:
         return [
             Reconstruction(image, answer.scene, answer.energy, taken_for=answer.taken_for)
             for image, answer in zip(images, answer_images(trained, images), strict=True)
         ]
+    found: dict[int, Reconstruction] = {}
     for rows in _batches(images, max(BATCH // options.restarts, 1)):
         part = [images[row] for row in rows]
-        found |= zip(rows, _reconstruct_batch(trained, part, options), strict=True)
+        if isinstance(trained, TrainedReconstructor):
+            answers = _found_directly(trained, part)
+        else:
+            assert isinstance(trained, TrainedPrior), "checked above: it remembers rooms"
+            answers = _reconstruct_batch(trained, part, options)
+        found |= zip(rows, answers, strict=True)
     return [found[row] for row in range(len(images))]
 
 
@@ -176,11 +171,7 @@ def _reconstruct_batch(
 def starting_latents(
     trained: TrainedPrior, views: SceneViews, count: int
 ) -> Float[Tensor, "images count width"]:
-    """For each image, the latents of the training rooms with the lowest layout loss on it.
-
-    Raises:
-        InputError: more starts than training rooms.
-    """
+    """For each image, the latents of the training rooms with the lowest layout loss on it."""
     if count > len(trained.logits):
         raise InputError(
             f"{count} nearest training rooms were asked for, but the run has "

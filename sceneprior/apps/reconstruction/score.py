@@ -12,7 +12,7 @@ from rich.table import Table
 
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
-from sceneprior.apps.retrieval.cad_models import default_cache, open_models
+from sceneprior.apps.retrieval.cad_models import open_models
 from sceneprior.apps.retrieval.retrieve import retrieve_all
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import models_of, reference_scenes
@@ -86,9 +86,6 @@ def evaluate_run(
 
     With CAD `models`, the reconstructions are also scored with the objects replaced by retrieved
     models (apps/retrieval).
-
-    Raises:
-        InputError: the run or the shards cannot be used.
     """
     trained = load_any_run(run)
     shards, split = protocol.shards, protocol.split
@@ -102,7 +99,7 @@ def evaluate_run(
         "fit_boxes": [one.scene.without_meshes().objects for one in fitted],
     }
     if models is not None:
-        cad_models = open_models(models, trained.config.label_set, default_cache())
+        cad_models = open_models(models, trained.config.label_set)
         retrieved = retrieve_all([one.scene for one in fitted], cad_models)
         answers["fit_cad"] = [scene.objects for scene in retrieved]
     overlaps = [one.mask_iou for one in fitted if one.mask_iou is not None]
@@ -132,10 +129,6 @@ def evaluate_scenes(folder: Path, protocol: SvrProtocol) -> dict[str, Any]:
 
     Each scene's `extra` holds its `room_id` and `view`; its objects correspond to the masks of that
     view, in their order.
-
-    Raises:
-        InputError: a scene does not name its view, or has another number of objects.
-        ShardError: a shard is missing or damaged.
     """
     images, scenes = scenes_with_images(folder, protocol.shards, protocol.split)
     answers: dict[str, Answers] = {

@@ -63,34 +63,35 @@ def default_cache() -> Path:
 
 
 def open_models(
-    folder: Path, label_set_name: str, cache: Path, points: int = POINTS, track: Track = iter
+    folder: Path,
+    label_set_name: str,
+    cache: Path | None = None,
+    points: int = POINTS,
+    track: Track = iter,
 ) -> CadModels:
     """Open the models of a label set's classes, with points on their surfaces.
 
     Args:
         folder: The models of 3D-FUTURE, or shards of `prep-front` with this label set.
-        cache: Folder for the cache file of points, which may be deleted at any time.
-
-    Raises:
-        InputError: the folder is neither, has shards of another label set, or has no model of
-            these classes.
+        cache: Folder for the cache file of points, by default `default_cache()`.
     """
     folder = Path(folder)
-    names = label_set(label_set_name)
     of_shards = (folder / INDEX_NAME).is_file()
-    labels_of = _labels_of_shards if of_shards else _labels_of_3d_future
-    labels = labels_of(folder, label_set_name)
+    if of_shards:
+        labels = _labels_of_shards(folder, label_set_name)
+    else:
+        categories = model_categories(folder, "--models")
+        labels = {m: class_of_category(name, label_set_name) for m, name in categories.items()}
     read: Callable[[Path], Mesh] = read_model if of_shards else read_obj
     files = {
         model_id: model_path(folder, model_id) if of_shards else folder / model_id / MODEL_FILE
         for model_id, label in sorted(labels.items())
         if label != "void"
     }
-    wanted = list(files)
-    drawn, broken = _points_of_models(folder, files, read, Path(cache), points, track)
+    drawn, broken = _points_of_models(folder, files, read, cache or default_cache(), points, track)
     by_class = {}
-    for label in names:
-        if of_class := [m for m in wanted if labels[m] == label and m not in broken]:
+    for label in label_set(label_set_name):
+        if of_class := [m for m in files if labels[m] == label and m not in broken]:
             stack = np.stack([drawn[m] for m in of_class])
             by_class[label] = ClassModels(tuple(of_class), stack)
     if not by_class:
@@ -103,14 +104,6 @@ def open_models(
         return unit_mesh(read(files[model_id]))
 
     return CadModels(by_class, lru_cache(_MESHES_KEPT)(load), broken)
-
-
-def _labels_of_3d_future(folder: Path, label_set_name: str) -> dict[str, str]:
-    categories = model_categories(folder, "--models")
-    return {
-        model_id: class_of_category(category, label_set_name)
-        for model_id, category in categories.items()
-    }
 
 
 def _labels_of_shards(folder: Path, label_set_name: str) -> dict[str, str]:
@@ -160,8 +153,7 @@ def _points_of_models(
     settings = f"{folder.resolve()}|{count}|{SEED}|{FORMAT}"
     kept = cache / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
     points, stamps = _read_points(kept, count)
-    todo: dict[str, tuple[int, int]] = {}
-    broken: dict[str, str] = {}
+    before, todo, broken = dict(stamps), dict[str, tuple[int, int]](), dict[str, str]()
     for model_id, path in files.items():
         try:
             if not is_name(model_id):
@@ -171,7 +163,6 @@ def _points_of_models(
                 todo[model_id] = stamp
         except InputError as error:
             broken[model_id] = str(error)
-    before = dict(stamps)
     try:
         for model_id in track(list(todo)):
             try:

@@ -21,7 +21,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels
-from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.surfaces import chamfer_mean, surface_points
 from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject
@@ -54,11 +53,7 @@ def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
     `extra["retrieval"]` holds {"model_id", "turn_deg", "distance_m"} for each object, in their
     order. It is None for a class without models; such an object keeps its mesh, extruded with its
     box.
-
-    Raises:
-        InputError: a box is not finite or has a negative side.
     """
-    _check(scene)
     objects: list[SceneObject] = []
     found: list[dict[str, object] | None] = []
     for item in scene.objects:
@@ -197,13 +192,3 @@ def _rough_distances(
 
 def _squares(points: Tensor) -> Tensor:
     return points.square().sum(dim=-1, keepdim=True)
-
-
-def _check(scene: Scene) -> None:
-    for row, item in enumerate(scene.objects):
-        numbers = np.asarray([*item.center_m, *item.size_m], dtype=np.float64)
-        if not np.isfinite(numbers).all() or (numbers[3:] < 0).any():
-            raise InputError(
-                f"{scene.name}: the box of object {row} ({item.label}) is {numbers.tolist()}; "
-                "expected a finite centre and sides that are not negative."
-            )

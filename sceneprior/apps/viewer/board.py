@@ -68,9 +68,7 @@ class BoardPlane:
 class Board:
     """The scene nodes of the board.
 
-    Args:
-        pointed: Called with the map point and the kind of event: `click`, `drag` (during a drag) or
-            `end` (of a drag).
+    `pointed` is called with a map point and the kind of event: `click`, `drag`, or `end` of a drag.
     """
 
     def __init__(

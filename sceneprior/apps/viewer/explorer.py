@@ -141,12 +141,8 @@ class Explorer:
     def draw_path(self, shown: Shown, start: str, end: str) -> Float[Tensor, "steps dimension"]:
         """Set the path of `step`, and return its latents from start to end.
 
-        Args:
-            start, end: A training room's id, `seed:7` or `HERE`. Files are not accepted, since the
-                text comes from a browser, which may run on another machine.
-
-        Raises:
-            InputError: an end is unknown, or is `HERE` and the shown room has no latent.
+        An end is a training room's id, `seed:7` or `HERE`. Files are not accepted, since the text
+        comes from a browser, which may run on another machine.
         """
         ends = [
             self.prior.latent(shown.scene)

@@ -67,9 +67,6 @@ class LatentMap:
 def make_map(space: LatentSpace, z: Float[Tensor, "rooms dimension"]) -> LatentMap:
     """Make the map of a latent space from the training rooms' latents z.
 
-    Raises:
-        InputError: there are fewer than three training rooms, which span no plane.
-
     Example: on the sphere in three dimensions, rooms differ most along x, then along y.
 
         >>> space = LatentSphere(4, 3)
@@ -86,16 +83,12 @@ def make_map(space: LatentSpace, z: Float[Tensor, "rooms dimension"]) -> LatentM
             f"{len(z)}; sample rooms instead."
         )
     _, scale, directions = torch.linalg.svd(z - z.mean(dim=0), full_matrices=False)
-    axes = _upright(directions[:2])
+    # The signs of singular vectors are arbitrary: the largest entry becomes positive.
+    largest: Int[Tensor, "2 1"] = directions[:2].abs().argmax(dim=1, keepdim=True)
+    axes = directions[:2] * directions.gather(1, largest).sign()
     rooms = z @ axes.T
     low, high = rooms.amin(dim=0), rooms.amax(dim=0)
     side = max(float((high - low).max()), 1e-3) * (1 + 2 * MARGIN)
     share = float(scale[:2].square().sum() / scale.square().sum().clamp(min=1e-12))
     x, y = ((low + high) / 2).tolist()
     return LatentMap(space, axes, rooms, share, (x, y), side)
-
-
-def _upright(directions: Float[Tensor, "2 dimension"]) -> Float[Tensor, "2 dimension"]:
-    """Fix the arbitrary signs of singular vectors, so that the largest entry is positive."""
-    largest: Int[Tensor, "2 1"] = directions.abs().argmax(dim=1, keepdim=True)
-    return directions * directions.gather(1, largest).sign()

@@ -40,11 +40,7 @@ class _Node:
 class RoomNodes:
     """The nodes of one room, updated in place: only changes are sent to browsers.
 
-    Args:
-        root: Prefix of the nodes' names.
-        x_m: x of the room's origin in the scene.
-        floor_m: Side of the floor's grid.
-        clicked: Called with the index of an object that is clicked.
+    Their names begin with `root`; `clicked` is called with the index of an object that is clicked.
     """
 
     def __init__(
@@ -59,21 +55,12 @@ class RoomNodes:
         self._nodes: list[_Node] = []
         self._labels: list[Any] = []
         self._lines: Any = None
-        self._frame = self._scene.add_frame(root, show_axes=False, position=(x_m, 0.0, 0.0))
+        self.frame = self._scene.add_frame(root, show_axes=False, position=(x_m, 0.0, 0.0))
         self._scene.add_grid(
             f"{root}/floor", floor_m, floor_m, plane="xz", position=(0.0, -0.005, 0.0),
             plane_color=(236, 233, 226), plane_opacity=1.0, cell_color=(222, 218, 208),
             section_color=(196, 190, 178),
         )  # fmt: skip
-
-    @property
-    def visible(self) -> bool:
-        """Visibility of the room."""
-        return bool(self._frame.visible)
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        self._frame.visible = visible
 
     def show(
         self, scene: Scene, kept: Collection[int] = (), names: bool = False, boxes: bool = False

@@ -31,10 +31,7 @@ _TEXT = Markup('<div style="padding: 0 0.8em 0.8em; font-size: 0.875em">{}</div>
 class Page:
     """The page, whose single room is shared by all connected browsers.
 
-    Args:
-        source: Source of the rooms.
-        title: Title of the panel.
-        models: Models for the checkbox `CAD models`; None hides it.
+    The checkbox `CAD models` is hidden without `models`.
     """
 
     def __init__(
@@ -57,7 +54,7 @@ class Page:
         self._room = RoomNodes(server, "/room", 0.0, floor_m, self._clicked)
         self._beside_m = floor_m * (1 + GAP)
         self._beside = RoomNodes(server, "/nearest", self._beside_m, floor_m)
-        self._beside.visible = False
+        self._beside.frame.visible = False
         self.board: Board | None = None
         """The map's board; None if the source has no map."""
         self._left_m, self._right_m = -floor_m / 2, floor_m / 2
@@ -93,8 +90,8 @@ class Page:
 
     def _show_nearest(self, scene: Scene | None) -> None:
         assert self.explorer is not None
-        if self._beside.visible != (scene is not None):
-            self._beside.visible = scene is not None
+        if self._beside.frame.visible != (scene is not None):
+            self._beside.frame.visible = scene is not None
             eye, target = self._view(self._right_m + (self._beside_m if scene else 0.0))
             for client in self.server.get_clients().values():
                 client.camera.position, client.camera.look_at = eye, target
@@ -104,9 +101,6 @@ class Page:
             self._beside.show(room.scene, names=self._names.value, boxes=self._boxes.value)
             said = f"Right: {room.origin}; {distance_m:.2f} m away in layout."
             self._nearest_said.content = _html(said)
-
-    def _again(self) -> None:
-        self.show(self.shown)
 
     def _clicked(self, item: int) -> None:
         def keep() -> None:
@@ -185,7 +179,7 @@ class Page:
 
     def _box(self, name: str, value: bool, visible: bool = True) -> Any:
         box = self.server.gui.add_checkbox(name, value, visible=visible)
-        box.on_update(lambda _: self._safely(self._again))
+        box.on_update(lambda _: self._safely(lambda: self.show(self.shown)))
         return box
 
     def _buttons(self, tasks: dict[str, Callable[[], None]]) -> None:

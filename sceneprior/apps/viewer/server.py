@@ -17,11 +17,7 @@ if TYPE_CHECKING:
 
 
 def check_can_serve(host: str, port: int) -> None:
-    """Check, before anything is loaded, that the server can start.
-
-    Raises:
-        InputError: the extra `view` is not installed, or the port is taken.
-    """
+    """Check, before anything is loaded, that the server can start."""
     try:
         import viser  # noqa: F401
     except ImportError:
@@ -46,13 +42,11 @@ def serving(host: str, port: int) -> Iterator["viser.ViserServer"]:
     """Run a server with an empty page; port 0 takes any free port.
 
     Other web sites open in the same browser can neither read the page nor use its controls.
-
-    Raises:
-        InputError: in this version of viser, requests cannot be checked.
     """
     import viser
 
-    with _quiet(), _checking_requests(host) as checked:
+    quiet = contextlib.redirect_stdout(io.StringIO())
+    with quiet, _checking_requests(host) as checked:
         server = viser.ViserServer(host, port, verbose=False)
     try:
         if not checked:
@@ -62,7 +56,7 @@ def serving(host: str, port: int) -> Iterator["viser.ViserServer"]:
             )
         yield server
     finally:
-        with _quiet():
+        with quiet:
             server.stop()
 
 
@@ -145,9 +139,3 @@ def _checking_requests(host: str) -> Iterator[list[bool]]:
         yield checked
     finally:
         server.serve = serve  # type: ignore[misc]
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield

@@ -41,12 +41,7 @@ class CrossValidated:
     def accuracy(self, counts_generated: np.ndarray, counts_real: np.ndarray) -> Estimate:
         """Share of correct predictions; both sets have the same weight."""
         generated = ratio(self.right_generated, self.asked_generated, counts_generated)
-        real = ratio(self.right_real, self.asked_real, counts_real)
-        if generated.value is None or real.value is None:
-            return Estimate(None, np.zeros(0))
-        both = min(len(generated.resamples), len(real.resamples))
-        resamples = (generated.resamples[:both] + real.resamples[:both]) / 2
-        return Estimate((generated.value + real.value) / 2, resamples, 0.0, 1.0)
+        return generated.mean_with(ratio(self.right_real, self.asked_real, counts_real))
 
 
 def linear(
@@ -70,13 +65,8 @@ def cross_validated_predictions(
 ) -> CrossValidated:
     """Classify each room by a classifier trained on the other folds.
 
-    Both sets contribute the same number of rooms to every training, so that a constant prediction
-    has accuracy 0.5.
-
-    Args:
-        generated: Features or small pictures of the generated rooms; at least two rows, as in
-            `real`.
-        seed: Seed of the choice of rooms and of the folds.
+    The sets are features or small pictures, at least two rows each. Both contribute the same number
+    of rooms to every training, so that a constant prediction has accuracy 0.5.
     """
     n, smaller = len(generated), min(len(generated), len(real))
     inputs = np.concatenate([generated, real])

@@ -29,11 +29,7 @@ TYPE_CLASSES: dict[str, tuple[str, ...]] = {
 
 
 def common_label_set(*groups: Sequence[Scene]) -> str:
-    """The label set that all these scenes share.
-
-    Raises:
-        InputError: there are no scenes, or more than one label set.
-    """
+    """The label set that all these scenes share."""
     names = sorted({scene.label_set for scenes in groups for scene in scenes})
     if len(names) != 1:
         came = f"label sets {', '.join(names)}" if names else "no scenes"
@@ -119,12 +115,22 @@ def _holds_its_type(scene: Scene) -> bool | None:
     return None if wanted is None else any(item.label in wanted for item in scene.objects)
 
 
+def category_kl_of_counts(
+    rooms: Int[np.ndarray, "rooms classes"],
+    test: Int[np.ndarray, "test classes"],
+    counts: Int[np.ndarray, "resamples rooms"],
+    test_counts: Int[np.ndarray, "resamples test"],
+) -> Estimate:
+    """`category_kl` from the objects of each class, with its value on every resample."""
+    pairs = zip(_shares(test_counts @ test), _shares(counts @ rooms), strict=True)
+    value = frequency_kl(_shares(test.sum(0)), _shares(rooms.sum(0)))
+    return Estimate(value, np.array([frequency_kl(p, q) for p, q in pairs]), 0.0)
+
+
 def _category_kl(rooms: RoomSet, comparison: Comparison) -> Estimate:
     test = comparison.test
-    p = _shares(test.counts @ class_counts(test.scenes))
-    q = _shares(rooms.counts @ class_counts(rooms.scenes))
-    resamples = np.array([frequency_kl(*pair) for pair in zip(p, q, strict=True)])
-    return Estimate(category_kl(rooms.scenes, test.scenes), resamples, 0.0)
+    tables = class_counts(rooms.scenes), class_counts(test.scenes)
+    return category_kl_of_counts(*tables, rooms.counts, test.counts)
 
 
 METRICS = (

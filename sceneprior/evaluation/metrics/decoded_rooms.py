@@ -1,23 +1,18 @@
 """Decoded training rooms against their ground truth: matched objects, their IoU and classes."""
 
 from collections.abc import Sequence
+from functools import partial
 
 from sceneprior.core.overlaps import SceneMatch, match_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metric import Metric, TableColumn
 
 
-def _class_accuracy(matches: Sequence[SceneMatch]) -> float | None:
-    return _over_objects([float(match.correct.sum()) for match in matches], matches)
-
-
-def _mean_iou(matches: Sequence[SceneMatch]) -> float | None:
-    return _over_objects([float(match.iou.sum()) for match in matches], matches)
-
-
-def _over_objects(of_rooms: Sequence[float], matches: Sequence[SceneMatch]) -> float | None:
+def _mean_over_objects(value: str, matches: Sequence[SceneMatch]) -> float | None:
+    """The mean of an attribute of `SceneMatch` over true objects, 0 for those without a match."""
     objects = sum(match.truth_count for match in matches)
-    return sum(of_rooms) / objects if objects else None
+    total = sum(float(getattr(match, value).sum()) for match in matches)
+    return total / objects if objects else None
 
 
 def _count_accuracy(matches: Sequence[SceneMatch]) -> float | None:
@@ -41,12 +36,12 @@ METRICS = (
         "class_accuracy", "Classes of decoded training rooms", "share of objects", "higher",
         "Share of true objects whose matched object has the right class; an unmatched object "
         "counts as wrong.",
-        _class_accuracy, (),
+        partial(_mean_over_objects, "correct"), (),
     ),
     Metric(
         "box_iou_3d", "Box IoU of decoded training rooms", "IoU", "higher",
         "Mean IoU of axis-aligned 3D boxes over true objects; an unmatched object counts as 0.",
-        _mean_iou, (),
+        partial(_mean_over_objects, "iou"), (),
         column=TableColumn(
             "train box IoU", 2, "train box IoU: decoded training rooms against the truth"
         ),

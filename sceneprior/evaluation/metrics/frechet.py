@@ -45,9 +45,6 @@ def frechet_distance(
         The squared distance, as FID reports it, never below 0. It falls with n even for samples of
         one distribution: compare only values computed with equal n.
 
-    Raises:
-        InputError: a set holds fewer than two rows, or numbers that are not finite.
-
     Source:
         Dowson and Landau, 1982; Heusel et al., "TTUR", NeurIPS 2017, for its use.
 

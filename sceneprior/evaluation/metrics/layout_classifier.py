@@ -14,7 +14,7 @@ from sklearn.model_selection import KFold
 from sceneprior.core.classes import label_set
 from sceneprior.core.overlaps import intersection_volumes
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.bootstrap import Estimate, ratio, resample_counts
+from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms, ratio, resample_counts
 from sceneprior.evaluation.metric import AGAINST_TEST, Comparison, Metric, RoomSet, TableColumn
 from sceneprior.evaluation.metrics.classifier import FOLDS
 
@@ -129,11 +129,8 @@ def _accuracy(rooms: RoomSet, comparison: Comparison) -> Estimate:
         answers = boosted_trees(features, labels, others, FOLDS * seed + number)
         right_test += answers[: len(judged)] == 0
         right[fresh] = answers[len(judged) :] == 1
-    of_set = ratio(right, np.ones(len(right)), counts)
     of_test = ratio(right_test, np.full(len(judged), folds.n_splits), test.counts)
-    resamples = [each.resamples[: min(len(counts), len(test.counts))] for each in (of_set, of_test)]
-    assert of_set.value is not None and of_test.value is not None
-    return Estimate((of_set.value + of_test.value) / 2, (resamples[0] + resamples[1]) / 2, 0.0, 1.0)
+    return mean_of_rooms(right, counts).mean_with(of_test)
 
 
 METRICS = (

@@ -8,7 +8,6 @@ import trimesh
 from jaxtyping import Float
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.surfaces import nearest_distances
 from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.scene import Mesh
 
@@ -23,9 +22,6 @@ def sample_surface(mesh: Mesh, count: int, seed: int) -> Float[np.ndarray, "coun
     """Draw points uniformly by area from a mesh's surface, inner faces included.
 
     If no face has an area, all points lie on the first face.
-
-    Raises:
-        InputError: the mesh has no faces.
     """
     if not len(mesh.faces):
         raise InputError(
@@ -38,22 +34,12 @@ def sample_surface(mesh: Mesh, count: int, seed: int) -> Float[np.ndarray, "coun
 
 
 def f_score(
-    a_points_m: Float[np.ndarray, "n 3"],
-    b_points_m: Float[np.ndarray, "m 3"],
+    there_m: Float[np.ndarray, " n"],
+    back_m: Float[np.ndarray, " m"],
     threshold_m: float = F_THRESHOLD_M,
 ) -> float:
-    """Harmonic mean of precision (share of a near b) and recall (share of b near a), in [0, 1].
-
-    Raises:
-        InputError: a set is empty.
-    """
-    return f_score_of(*nearest_distances(a_points_m, b_points_m), threshold_m)
-
-
-def f_score_of(
-    there_m: Float[np.ndarray, " n"], back_m: Float[np.ndarray, " m"], threshold_m: float
-) -> float:
-    """`f_score` from the results of `nearest_distances`."""
+    """Harmonic mean of precision (share of a near b) and recall (share of b near a), in [0, 1],
+    from the `nearest_distances` of points on both surfaces."""
     precision, recall = (float((way <= threshold_m).mean()) for way in (there_m, back_m))
     return 2 * precision * recall / max(precision + recall, 1e-12)
 
@@ -89,7 +75,7 @@ def oriented_box(mesh: Mesh) -> OrientedBox:
 def oriented_box_iou_3d(a: OrientedBox, b: OrientedBox) -> float:
     """Intersection over union of two upright boxes: shared footprint x shared height.
 
-    Two boxes without volume have IoU 0. At yaw 0 it equals `box_iou_3d` of decoded_rooms.
+    Two boxes without volume have IoU 0. At yaw 0 it equals `box_iou_3d`.
 
     Example: a cube and the same cube turned by 45 degrees share a regular octagon.
 
@@ -97,16 +83,11 @@ def oriented_box_iou_3d(a: OrientedBox, b: OrientedBox) -> float:
         >>> round(oriented_box_iou_3d(cube, cube._replace(yaw_rad=np.pi / 4)), 6)
         0.707107
     """
-    low, high = zip(*(_heights(box) for box in (a, b)), strict=True)
+    low, high = ([box.center_m[1] + side * box.size_m[1] / 2 for box in (a, b)] for side in (-1, 1))
     height = max(min(high) - max(low), 0.0)
     shared = shapely.intersection(_footprint(a), _footprint(b)).area * height
     union = a.size_m.prod() + b.size_m.prod() - shared
     return float(shared / union) if union > 0 else 0.0
-
-
-def _heights(box: OrientedBox) -> tuple[float, float]:
-    middle, half = box.center_m[1], box.size_m[1] / 2
-    return middle - half, middle + half
 
 
 def _footprint(box: OrientedBox) -> shapely.Polygon:

@@ -7,7 +7,6 @@ copies are a fault.
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool
 
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms
@@ -35,14 +34,6 @@ def near_copy_threshold(training: Sequence[Scene]) -> float:
     return threshold if np.isfinite(threshold) else 0.0
 
 
-def near_copies(rooms: RoomSet, comparison: Comparison) -> Bool[np.ndarray, " rooms"]:
-    """True for rooms with the furniture of one training room, true or decoded, in its places.
-
-    One object may be added or missing.
-    """
-    return np.asarray(rooms.nearest.as_copies_m < comparison.near_copy_m)
-
-
 def _nearest(rooms: RoomSet, comparison: Comparison) -> Estimate:
     return mean_of_rooms(rooms.nearest.training_m, rooms.counts)
 
@@ -53,7 +44,8 @@ def _nearest_decoded(rooms: RoomSet, comparison: Comparison) -> Estimate | None:
 
 
 def _near_copy_share(rooms: RoomSet, comparison: Comparison) -> Estimate:
-    return mean_of_rooms(near_copies(rooms, comparison), rooms.counts, 1.0)
+    copies = rooms.nearest.as_copies_m < comparison.near_copy_m
+    return mean_of_rooms(copies, rooms.counts, 1.0)
 
 
 def _near_copy_excess(rooms: RoomSet, comparison: Comparison) -> Estimate:

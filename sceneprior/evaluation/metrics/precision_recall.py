@@ -26,19 +26,18 @@ of 3 rows or fewer, the farthest row."""
 def in_manifold(
     features: Float[np.ndarray, "n dimensions"],
     others: Float[np.ndarray, "m dimensions"],
-    neighbour: int = NEIGHBOUR,
 ) -> Bool[np.ndarray, " n"]:
     """True for rows of `features` that lie in the manifold of `others`, computed in float64.
 
     A set's manifold is the union of balls around its rows, each with the distance to the row's
-    `neighbour`-th nearest other row as its radius. The balls are closed, so that equal pictures lie
+    `NEIGHBOUR`-th nearest other row as its radius. The balls are closed, so that equal pictures lie
     in each other's balls of radius 0. The mean over generated rows, with real `others`, is
     precision; the mean over real rows, with generated `others`, is recall.
     """
     check_features(features, others)
     features, others = features.astype(np.float64), others.astype(np.float64)
     # Column 0 of the sorted distances is the row itself.
-    rank = min(neighbour, len(others) - 1)
+    rank = min(NEIGHBOUR, len(others) - 1)
     radii = np.partition(cdist(others, others), rank, axis=1)[:, rank]
     return np.asarray((cdist(features, others) <= radii).any(1))
 

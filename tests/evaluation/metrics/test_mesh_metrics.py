@@ -73,7 +73,7 @@ def test_chamfer_and_f_score_are_the_definition(rng):
     assert found.squared_m2 == pytest.approx((there**2).mean() + (back**2).mean(), rel=1e-12)
     precision, recall = (there <= 0.4).mean(), (back <= 0.4).mean()
     expected = 2 * precision * recall / (precision + recall)
-    assert f_score(a, b, 0.4) == pytest.approx(expected, rel=1e-12)
+    assert f_score(*nearest_distances(a, b), 0.4) == pytest.approx(expected, rel=1e-12)
 
 
 def test_chamfer_of_spheres_within_each_other_is_the_gap():
@@ -83,15 +83,16 @@ def test_chamfer_of_spheres_within_each_other_is_the_gap():
     # which lengthens a distance of 0.5 m by less than a millimetre. Level-5 spheres are 0.4 mm off.
     assert found.l2_m == pytest.approx(2 * 0.5, abs=2e-3)
     assert found.squared_m2 == pytest.approx(2 * 0.25, abs=2e-3)
-    assert f_score(inner, outer) == 0
+    assert f_score(*nearest_distances(inner, outer)) == 0
 
 
 def test_a_surface_beside_itself():
     points = sample_surface(sphere(1), 500, 0)
     assert chamfer_of(*nearest_distances(points, points)) == (0, 0)
-    assert f_score(points, points) == 1
+    assert f_score(*nearest_distances(points, points)) == 1
     moved = points + np.array([0, 0.04, 0])
-    assert f_score(points, moved) == 1  # every point finds its own copy 4 cm away, at the furthest
+    # Every point finds its own copy 4 cm away, at the furthest.
+    assert f_score(*nearest_distances(points, moved)) == 1
 
 
 def test_empty_surfaces_are_refused():
