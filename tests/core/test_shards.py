@@ -77,14 +77,6 @@ def test_round_trip(tmp_path):
     assert {room_id for _, room_id in iterate_rooms(tmp_path, "train")} == {"h/1", "h_2"}
 
 
-def test_small_images_are_every_nth_pixel_from_the_middle_of_a_block(tmp_path):
-    room = make_room(views=4)
-    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, None)])
-    with Shard(tmp_path / "a.h5") as shard:
-        small = shard.read_instance_ids("house_A", [2, 0], step=4)
-    np.testing.assert_array_equal(small, room.instance_ids[[2, 0], 2::4, 2::4])
-
-
 @pytest.mark.parametrize(
     "stored",
     [
@@ -123,20 +115,6 @@ def test_shards_of_version_1_are_read_and_those_of_the_future_are_not(tmp_path):
                 assert_same(shard.read_room("house_A", images=True), make_room())
     with pytest.raises(ShardError, match=r"version 3, expected .* Prepare the data again"):
         Shard(tmp_path / "a.h5")
-
-
-def test_void_is_the_id_after_the_last_objects(tmp_path):
-    room = make_room()
-    room.instance_ids[0, :2] = 3
-    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, None)])
-    with Shard(tmp_path / "a.h5") as shard:
-        assert_same(shard.read_room("house_A", images=True), room)
-
-
-def test_same_rooms_same_bytes(tmp_path):
-    for name in ("a.h5", "b.h5"):
-        write_shard(tmp_path / name, "front3d_bedroom", [(make_room(), make_truth())])
-    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -107,14 +107,6 @@ def test_only_in_a_whole_folder_says_what_is_still_to_make(front, tmp_path, prep
     assert "1 shards made, 0 already there, 3 still to make: run without --only" in said
 
 
-def test_a_rule_that_filters_is_in_the_table(front, prep):
-    front.house("house", bedroom("Bedroom-1"), bedroom("Bedroom-2"))
-    front.house("large", bedroom("Bedroom-3", bounds=(-4.0, -4.0, 4.0, 4.0)))
-    made = prep()
-    assert made.exit_code == 0, made.output
-    assert "filtered by max_floor_m" in made.stdout and "objects a room" not in made.stderr
-
-
 def test_pictures_and_wrong_words(front, tmp_path, prep, cli):
     three_houses(front)
     odd = bedroom("Bedroom-9")

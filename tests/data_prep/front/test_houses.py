@@ -50,12 +50,6 @@ def test_entries_that_are_not_valid_are_skipped(front, valid):
     assert len(only_room(front, front.house("house", room("A", pieces))).furniture) == 1
 
 
-def test_entries_without_valid_are_skipped(front):
-    written = bedroom("A")
-    del written["_furniture"][1]["valid"]
-    assert len(only_room(front, front.house("house", written)).furniture) == 3
-
-
 def test_duplicate_uids_and_duplicate_placements(front):
     written = bedroom("A")
     written["_furniture"].append(dict(written["_furniture"][0]))  # the same uid again

@@ -123,13 +123,6 @@ def test_rooms_of_another_size_are_left_out_with_the_reason(source, rooms):
     assert alone.room_id == "room_2"
 
 
-def test_only(source):
-    one = PosedSource(source.folder, SET, only="room_3")
-    assert [room.room_id for room in survey(one).rooms] == ["room_3"]
-    with pytest.raises(InputError, match=r"has no room 'attic' .--only takes a room's folder.\."):
-        source.settings("attic")
-
-
 def test_settings_follow_the_files(source, rooms):
     before = source.settings(None)
     assert json.loads(json.dumps(before)) == before
@@ -214,3 +207,10 @@ def test_the_command(rooms, tmp_path, cli):
         "--max-side", 64, "--workers", 1, "--test-share", 0.25,
     )  # fmt: skip
     assert "was begun with other settings (rooms differ)" in str(again.exception)
+
+
+def test_only(source):
+    one = PosedSource(source.folder, SET, only="room_3")
+    assert [room.room_id for room in survey(one).rooms] == ["room_3"]
+    with pytest.raises(InputError, match=r"has no room 'attic' .--only takes a room's folder.\."):
+        source.settings("attic")

@@ -9,7 +9,6 @@ from scan_files import BOX_FACES, write_ply
 from data_prep.scannet.annotations import (
     Group,
     axis_alignment,
-    object_parts,
     read_groups,
     read_mesh,
     read_properties,
@@ -130,11 +129,6 @@ def test_json_that_is_missing_or_cut(write, read, tmp_path):
         read(tmp_path / "none.json")
 
 
-def test_a_scan_without_annotations_says_so(tmp_path):
-    with pytest.raises(InputError, match=r"a scan without annotations .* cannot be prepared"):
-        read_groups(tmp_path / "a.json")
-
-
 def test_properties_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"a\.txt cannot be read .No such file"):
         read_properties(tmp_path / "a.txt")
@@ -186,19 +180,6 @@ def test_triangles_of_vertices_that_are_not_there(tmp_path, rng):
     faces = np.array([(0, 1, 2), (0, 1, 8)])
     with pytest.raises(InputError, match=r"a\.ply has triangles of vertices it lacks"):
         read_mesh(write_ply(tmp_path / "a.ply", rng.normal(size=(8, 3)), faces))
-
-
-def test_parts_are_those_of_each_objects_segments():
-    segments = np.array([7] * 4 + [9] * 4 + [3] * 8 + [1])
-    groups = [
-        Group(0, "chair", frozenset({9, 7, 1000})),
-        Group(1, "bed", frozenset({1000})),
-        Group(2, "bed", frozenset({3, 9})),
-        Group(3, "bed", frozenset()),
-    ]
-    whole, none, joined, empty = object_parts(groups, segments)
-    assert sorted(whole) == [*range(8)] and not len(none) and not len(empty)
-    assert sorted(joined) == [*range(4, 16)]
 
 
 def test_a_parts_surface_is_its_whole_triangles(rng):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from data_prep.scannet.splits import find_scans, space_of, split_scans
+from data_prep.scannet.splits import find_scans, split_scans
 from sceneprior.core.errors import InputError
 
 
@@ -39,10 +39,6 @@ def test_the_lists_decide_and_the_rest_is_named(scans, tmp_path):
     assert found.skipped == ("mine", "scene0002_00")
     assert found.missing == ("scene0700_00",)
     assert split_scans(find_scans(scans), None, val).split_of == {"scene0001_00": "test"}
-
-
-def test_a_space_is_scanned_more_than_once():
-    assert [space_of(name) for name in NAMES[:3]] == ["mine", "scene0000", "scene0000"]
 
 
 def test_lists_that_are_none(scans, tmp_path):

@@ -7,14 +7,13 @@ import sys
 import numpy as np
 import pytest
 import torch
-from silhouette_scenes import COMPOSITING, MODES, SIZE, cast, random_scene, sphere_scene
+from silhouette_scenes import MODES, SIZE, cast, random_scene, sphere_scene
 from torch.testing import assert_close
 from toy_rooms import look_at
 
 from sceneprior.core.geometry.meshes import icosphere
 from sceneprior.render.offscreen.zbuffer import rasterize
 from sceneprior.render.silhouettes.render import (
-    RenderedScene,
     render_scene,
     render_silhouettes,
     sigma_from_ndc,
@@ -80,18 +79,6 @@ def test_a_pixel_centre_on_a_shared_edge_reads_three_quarters_in_the_exact_mode_
         diagonal = exact.masks[0, 0, 0, range(24), range(4, 28)]
         assert_close(diagonal, torch.full_like(diagonal, 0.75), rtol=0, atol=1e-12)
         assert (fast.masks == 1).all() and (fast.front == 0).all() and (fast.depth_m == 1).all()
-
-
-def test_masks_are_render_silhouettes_own():
-    scene = random_scene(17, views=2)
-    for mode in MODES:
-        for compositing in COMPOSITING:
-            options = {"mode": mode, "compositing": compositing}
-            drawn = render_scene(**scene, **options)
-            assert isinstance(drawn, RenderedScene)
-            assert torch.equal(drawn.masks, render_silhouettes(**scene, **options))
-            if compositing == "layered" and mode == "exact":  # these are the defaults
-                assert torch.equal(drawn.masks, render_silhouettes(**scene, backend="cpu"))
 
 
 @pytest.mark.parametrize("mode", MODES)
