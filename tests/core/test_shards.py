@@ -262,21 +262,16 @@ def _put(name, value):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (_replace("boxes"), "boxes"),
         (_replace("boxes", data=np.zeros((3, 1, 4), "f4")), "boxes has shape (3, 1, 4), expected"),
         (_replace("boxes", data=np.zeros((3, 2, 4))), "boxes holds float64, expected float32"),
-        (_replace("boxes", shape=(2**40, 2, 4), dtype="f4", chunks=(1, 2, 4)), "boxes has shape"),
-        (_replace("object_class", data="text"), "object_class has shape ()"),
         (
             _replace("instance_ids", shape=(3, 2**20, 2**21), dtype="u1", chunks=(1, 9, 9)),
             "instance_ids claims 6597069766656 bytes, more than are stored",
         ),
         (_replace("instance_ids", data=np.zeros((3, 12, 16))), "instance_ids is float64 (3, 12,"),
-        (_replace("instance_ids", data=np.zeros((2, 12, 16), "u1")), "instance_ids has shape (2,"),
         (_put("instance_ids", 9), "an instance id is 9, but it has 2 objects"),
         (_put("world_to_camera", np.nan), "world_to_camera holds numbers that are not finite"),
         (_put("object_class", 99), "object_class is not below 22, the size of its label set"),
-        (_put("object_class", -1), "object_class is not below 22"),
         (_set("image_size", "big"), "invalid literal for int()"),
         (_set("image_size", (16, 12)), "instance_ids has shape (3, 12, 16), expected (3, 16, 12)"),
         (_put("ground_truth/centers_m", np.inf), "centers_m holds numbers that are not finite"),

@@ -1,19 +1,8 @@
 """The commands as a user meets them: what they print, and their exit status."""
 
 import pytest
-import typer
 from front_files import bedroom
 from front_jobs import SMALL, three_houses
-from typer.testing import CliRunner
-
-from data_prep.cli import add_commands
-
-
-@pytest.fixture
-def cli():
-    app = typer.Typer()
-    add_commands(app)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
 
 
 def test_commands(front, tmp_path, cli):

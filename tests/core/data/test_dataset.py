@@ -221,11 +221,7 @@ def test_a_data_set_moved_to_a_device_makes_its_batches_there(toy_shards):
         assert found.device.type == "meta" and found.shape == getattr(before, name).shape
 
 
-def test_folders_that_cannot_be_used_say_so(tmp_path, toy_shards):
-    with pytest.raises(ShardError, match="No folder of shards at"):
-        dataset(tmp_path / "none")
-    with pytest.raises(ShardError, match=r"The 'val' split of .* holds no shards"):
-        ViewDataset(toy_shards, "val", 5)
+def test_folders_that_cannot_be_used_say_so(tmp_path):
     write_shard(tmp_path / "train" / "a.h5", "front3d_bedroom", [])
     with pytest.raises(ShardError, match=r"/train hold no rooms; prepare them again"):
         dataset(tmp_path)
@@ -235,7 +231,4 @@ def test_folders_that_cannot_be_used_say_so(tmp_path, toy_shards):
     with pytest.raises(
         ShardError, match="is labelled 'scannet' but its neighbours 'front3d_bedroo"
     ):
-        dataset(tmp_path)
-    (tmp_path / "train" / "b.h5").write_bytes(b"nonsense")
-    with pytest.raises(ShardError, match=r"b\.h5 cannot be read .*damaged\. Delete it and run"):
         dataset(tmp_path)

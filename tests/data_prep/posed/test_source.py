@@ -6,15 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from PIL import Image
 from posed_files import PosedRoom, furniture
 from tiny_runs import tiny_config
-from typer.testing import CliRunner
 
-from data_prep.cli import add_commands
 from data_prep.engine.build import Job, build_shards
-from data_prep.engine.selection import seeded_split
 from data_prep.engine.source import RoomTask
 from data_prep.engine.workers import pool
 from data_prep.posed.source import PosedSource, find_rooms
@@ -42,13 +38,6 @@ def source(rooms, tmp_path):
     return PosedSource(tmp_path / "rooms", SET)
 
 
-@pytest.fixture
-def cli():
-    app = typer.Typer()
-    add_commands(app)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
-
-
 def survey(source):
     with pool(1) as run:
         return source.survey(run)
@@ -68,12 +57,6 @@ def test_shards_of_ones_own_classes_can_be_trained_on(source, tmp_path):
 
 
 def test_splits_are_seeded_shares_of_rooms(source):
-    names = [f"r{k}" for k in range(20)]
-    for share, tests in ((0.1, 2), (0.5, 10), (0.01, 1), (0.99, 19), (0.0, 0)):
-        split = seeded_split(names, 0, share)
-        assert sum(value == "test" for value in split.values()) == tests
-    assert seeded_split(names, 0, 0.5) != seeded_split(names, 1, 0.5)
-    assert seeded_split(["one"], 0, 0.5) == {"one": "train"}
     everything = survey(PosedSource(source.folder, SET, test_share=0.0)).rooms
     assert {room.split for room in everything} == {"train"} and len(everything) == 4
     for share in (-0.1, 1.0, float("nan")):

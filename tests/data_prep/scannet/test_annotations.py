@@ -49,12 +49,8 @@ def test_alignment_is_row_major_and_may_be_absent(tmp_path):
     ("numbers", "words"),
     [
         ("1 0 0", "axisAlignment is 3 words, expected 16 numbers"),
-        ("x " * 16, "axisAlignment is 16 words, expected 16 numbers"),
         ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 nan", "it distorts it; the file is damaged"),
-        ("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", "it distorts it"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1", "axisAlignment mirrors the scan"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0 1 0 0 1", "it distorts it"),
-        ("inf 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "it distorts it"),
     ],
 )
 def test_alignments_that_are_none(tmp_path, numbers, words):
@@ -80,16 +76,10 @@ def test_an_object_listed_twice_is_joined_and_told(write):
     ("data", "words"),
     [
         ({}, "KeyError: 'segGroups'"),
-        ([1], "TypeError"),
-        (None, "TypeError"),
-        ({"segGroups": None}, "TypeError"),
         ({"segGroups": [{"objectId": 1}]}, "KeyError: 'label'"),
         ({"segGroups": [group(-1)]}, "objectId -1 with label 'chair'"),
-        ({"segGroups": [group(1.5)]}, "objectId 1.5 with"),
-        ({"segGroups": [group(True)]}, "objectId True with"),
         ({"segGroups": [group(1, None)]}, "objectId 1 with label None"),
         ({"segGroups": [group(1, segments=["x"])]}, "segments of object 1 are not all whole"),
-        ({"segGroups": [group(1, segments=[[3]])]}, "TypeError"),
     ],
 )
 def test_aggregations_that_are_none(write, data, words):
@@ -101,11 +91,7 @@ def test_aggregations_that_are_none(write, data, words):
     ("data", "words"),
     [
         ({}, "KeyError: 'segIndices'"),
-        ([], "TypeError"),
         ({"segIndices": [1.5, 2]}, "segIndices is not a list of whole numbers"),
-        ({"segIndices": [10**30]}, "segIndices is not a list of whole numbers"),
-        ({"segIndices": [[1], [2, 3]]}, "ValueError"),
-        ({"segIndices": 4}, "segIndices is not a list"),
         ({"segIndices": []}, "segIndices is not a list of whole numbers"),
     ],
 )

@@ -166,7 +166,6 @@ def test_masks_of_another_shape_than_the_colour_frames(scan, labels):
     [
         ({"masks": "best"}, "masks is 'best'; choose filt or raw"),
         ({"frame_step": 0}, "frame_step is 0; it counts from 1"),
-        ({"max_views": -1}, "max_views is -1"),
         ({"image_size": (0, 324)}, "image_size is 324 x 0 pixels"),
     ],
 )

@@ -86,9 +86,7 @@ def test_flipped_bytes_never_surprise(write, rng):
         ({"version": 3}, "header, byte 0: version 3, expected 4"),
         ({"kind": 7}, "compressions 7 .colour. and 1 .depth., expected 0, 1 or 2"),
         ({"size": (0, 32)}, "colour pictures of 32 x 0 .* cannot be"),
-        ({"size": (24, 1 << 31)}, "colour pictures of 2147483648 x 24 .* cannot be"),
         ({"K": np.full((4, 4), np.nan)}, "focal lengths are nan and nan"),
-        ({"K": np.diag([0.0, 5, 1, 1])}, "focal lengths are 0 and 5"),
     ],
 )
 def test_impossible_headers(write, change, words):

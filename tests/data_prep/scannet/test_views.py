@@ -18,6 +18,7 @@ from scan_files import (
 )
 from toy_rooms import write_shard
 
+from data_prep.inspection.projection import box_iou_2d
 from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings, read_scan
 from data_prep.scannet.views import labelled_views, prepare_scan
 from sceneprior.core.classes import label_set
@@ -59,14 +60,6 @@ def drawn(views, truth, view):
     return (index + len(BOX_FACES)) // len(BOX_FACES)
 
 
-def iou(a, b):
-    overlap = np.clip(
-        np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None
-    ).prod(axis=-1)
-    areas = [(box[..., 2:] - box[..., :2]).prod(axis=-1) for box in (a, b)]
-    return overlap / (sum(areas) - overlap)
-
-
 @pytest.fixture(scope="module")
 def seen_around(tmp_path_factory):
     """A bed and two chairs far apart, seen whole by 24 cameras of 1296 x 968 all around."""
@@ -103,7 +96,7 @@ def test_ground_truth_projects_onto_the_masks(seen_around, labels, mask_size, im
     assert views.visible.shape == (24, 3) and views.visible.all() and views.sides_clear.all()
     again = np.stack([drawn(views, truth, view) for view in range(24)])
     wrong = (again != views.instance_ids).sum(axis=(1, 2)) / (again > 0).sum(axis=(1, 2))
-    assert iou(projected_boxes(views, truth), views.boxes).min() > 0.95
+    assert box_iou_2d(projected_boxes(views, truth), views.boxes).min() > 0.95
     if mask_size == FULL_SIZE:
         # The very same rays, but for float32 in poses and mesh: no pixel differs as measured.
         # Half a full-size pixel in the lens would move 8e-3 of them, at either size.
