@@ -56,15 +56,6 @@ def test_failed_rooms_give_status_3_and_filtered_ones_do_not(front, tmp_path, pr
     assert '"broken"' in (tmp_path / "shards" / "report.json").read_text()
 
 
-def test_furniture_without_a_floor_is_no_failure(front, tmp_path, prep):
-    bare = bedroom("OtherRoom-1", kind="OtherRoom")
-    bare["children"] = bare["children"][1:]
-    front.house("house", bare, bedroom("Bedroom-1"), bedroom("Bedroom-2"))
-    made = prep("--recipe", "all")
-    assert made.exit_code == 0, made.output
-    assert "filtered by no_floor" in made.stdout
-
-
 def test_one_room_is_enough_to_train_on(front, tmp_path, prep):
     front.house("house", bedroom("Bedroom-1"))
     made = prep()

@@ -158,9 +158,10 @@ def fuzz_models(folder: Path) -> None:
 
     rng = begun(folder)
     (folder / "given" / "a").mkdir()
-    (folder / "given" / "a" / "raw_model.obj").write_text(OBJ)
     record = [{"model_id": "a", "category": "Wardrobe"}]
-    (folder / "given" / "model_info.json").write_text(damaged_json(record, rng))
+    listed = damaged_json(record, rng) if rng.random() < 0.5 else json.dumps(record)
+    (folder / "given" / "a" / "raw_model.obj").write_bytes(damaged_words(OBJ, rng))
+    (folder / "given" / "model_info.json").write_text(listed)
     open_models(folder / "given", "front3d_bedroom", folder / "cache", 16)
 
 

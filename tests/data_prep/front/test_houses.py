@@ -133,13 +133,6 @@ def test_rooms_without_furniture_are_filtered_not_failed(front):
     ]
 
 
-def test_of_duplicate_uids_a_valid_one_counts(front):
-    written = bedroom("A")
-    rejected = dict(written["_furniture"][0], valid=False)
-    written["_furniture"].insert(0, rejected)
-    assert len(only_room(front, front.house("house", written)).furniture) == 4
-
-
 def test_ids_that_are_no_names(front):
     """Ids become parts of paths and lines of reports, so they cannot be just anything."""
     rooms = [bedroom(name) for name in ("../../up", "a\nb", "x" * 300, "\ud800", "good")]

@@ -46,6 +46,7 @@ def test_required_classes_are_switched_off_by_null_as_by_an_empty_list():
             "required_classes=[bed]",
             r"bedroom\.yaml: 'bed' is no class of its label set, which has void, armchair,",
         ),
+        ("categories=[crib]", r"'categories': input should be a valid dictionary"),
         ("label_set=attic", "No label set is called 'attic'; there are front3d_bedroom,"),
         (
             "label_set=[bed, bed]",

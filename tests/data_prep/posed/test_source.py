@@ -1,7 +1,6 @@
 """Posed rooms through the engine and the command: splits, sizes, failures, assumptions."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -77,18 +76,6 @@ def test_one_room_is_a_folder_of_rooms(source, rooms, tmp_path, monkeypatch):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"holds no transforms\.json and no model of COLMAP"):
         find_rooms(tmp_path / "empty")
-
-
-def test_files_by_split_make_a_room_a_room(rooms):
-    folder = rooms[0].folder
-    (folder / "transforms.json").rename(folder / "transforms_train.json")
-    assert len(survey(PosedSource(folder, SET)).rooms) == 1
-    assert len(survey(PosedSource(folder.parent, SET)).rooms) == 4
-    shutil.rmtree(folder / "instances")
-    with pytest.raises(InputError, match="none of its 5 frames has a PNG of instance ids"):
-        survey(PosedSource(folder, SET))
-    (lost,) = survey(PosedSource(folder.parent, SET)).left_out
-    assert lost.room_id == "room_0" and "transforms_train.json: none of" in lost.reason
 
 
 def test_rooms_of_another_size_are_left_out_with_the_reason(source, rooms):

@@ -13,10 +13,8 @@ from data_prep.scannet.annotations import (
     read_mesh,
     read_properties,
     read_segments,
-    surface_of,
 )
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Mesh
 
 
 @pytest.fixture
@@ -123,16 +121,6 @@ def test_properties_that_cannot_be_read(tmp_path):
         read_properties(tmp_path / "a.txt")
 
 
-def test_vertices_keep_their_number_and_order(tmp_path, rng):
-    """Also those that lie on each other, and those of no triangle."""
-    vertices = rng.normal(size=(20, 3)).astype(np.float32)
-    vertices[7] = vertices[3]
-    faces = np.array([(3, 4, 5), (7, 8, 9)])
-    mesh = read_mesh(write_ply(tmp_path / "a.ply", vertices, faces))
-    np.testing.assert_array_equal(mesh.vertices_m, vertices)
-    np.testing.assert_array_equal(mesh.faces, faces)
-
-
 def test_a_mesh_that_is_missing_damaged_or_cut(tmp_path, rng):
     path = write_ply(tmp_path / "a.ply", rng.normal(size=(8, 3)), BOX_FACES)
     data = path.read_bytes()
@@ -166,12 +154,3 @@ def test_triangles_of_vertices_that_are_not_there(tmp_path, rng):
     faces = np.array([(0, 1, 2), (0, 1, 8)])
     with pytest.raises(InputError, match=r"a\.ply has triangles of vertices it lacks"):
         read_mesh(write_ply(tmp_path / "a.ply", rng.normal(size=(8, 3)), faces))
-
-
-def test_a_parts_surface_is_its_whole_triangles(rng):
-    vertices = rng.normal(size=(16, 3))
-    faces = np.concatenate([BOX_FACES, BOX_FACES + 8, [(7, 8, 9)]])
-    mesh = surface_of(Mesh(vertices, faces), np.arange(8, 16))
-    np.testing.assert_array_equal(mesh.vertices_m[mesh.faces], vertices[BOX_FACES + 8])
-    assert len(mesh.vertices_m) == 8
-    assert surface_of(Mesh(vertices, faces), np.array([0, 7])) is None

@@ -103,13 +103,6 @@ def scan_mask(scan, frame):
     return png(scan.mask(frame, (242, 324)))
 
 
-def test_where_no_object_has_a_class_the_mesh_is_the_room(scan, labels):
-    for box in scan.boxes:
-        box.category = "backpack"
-    read = read_scan(scan.write().folder, labels, EVERY)
-    np.testing.assert_allclose(read.instances[0].lower_m, (-2, 0, -2.5), atol=2e-6)
-
-
 @pytest.mark.parametrize(
     ("ending", "words"),
     [

@@ -22,13 +22,6 @@ def lists(tmp_path, train, val):
     return tmp_path / "train.txt", tmp_path / "val.txt"
 
 
-NAMES = ["mine", "scene0000_00", "scene0000_01", "scene0001_00", "scene0002_00"]
-
-
-def test_scans_are_found_in_order_also_without_their_recording(scans):
-    assert [path.name for path in find_scans(scans)] == NAMES
-
-
 def test_the_lists_decide_and_the_rest_is_named(scans, tmp_path):
     train, val = lists(tmp_path, "scene0000_01\nscene0000_00\nscene0700_00\n\n", "scene0001_00\r\n")
     found = split_scans(find_scans(scans), train, val)

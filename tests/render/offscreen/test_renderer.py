@@ -53,15 +53,6 @@ def test_a_unit_box_covers_exactly_its_projection(renderer):
     assert (ids[37:59, 58:81] == 1).all()
 
 
-def test_near_hides_far_and_order_does_not_matter(renderer):
-    near, far = box((0, 0, 3), (0.5, 0.5, 0.1)), box((0, 0, 5), (2, 2, 0.1))
-    camera = Pinhole(np.eye(4), INTRINSICS)
-    one = renderer.instance_ids([near, far], camera, SIZE)
-    other = renderer.instance_ids([far, near], camera, SIZE)
-    assert one[48, 64] == 1 and one[48, 64 + 15] == 2
-    np.testing.assert_array_equal(one, np.array([0, 2, 1])[other])
-
-
 def test_equally_near_faces_go_to_the_first_mesh(renderer):
     wall = box((0, 0, 3), (9, 9, 0.1))
     ids = renderer.instance_ids([wall, wall], Pinhole(np.eye(4), INTRINSICS), SIZE)
@@ -75,14 +66,6 @@ def test_many_ids_and_empty_meshes(renderer):
     assert set(np.unique(ids)) == {0, 700}
     nothing = renderer.instance_ids_of_views([], [Pinhole(np.eye(4), INTRINSICS)] * 2, SIZE)
     assert nothing.shape == (2, *SIZE) and not nothing.any()
-
-
-def test_orthographic_top_down(renderer):
-    # Camera 3 m up, looking along -y: image right is +x, image down is +z.
-    down = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 3], [0, 0, 0, 1]])
-    piece = box((0.5, 0.5, 1.0), (1.0, 1.0, 0.4))
-    ids = renderer.instance_ids([piece], Orthographic(down, 0.05), (64, 64))
-    assert bounds(ids == 1) == (32, 32 + 16, 32 + 20, 32 + 24)
 
 
 def test_several_sizes_one_after_the_other(renderer):
