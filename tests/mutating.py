@@ -5,8 +5,9 @@ import os
 import resource
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,15 @@ MOST_BYTES = 6 * 2**30
 """Address space of a reader; torch alone reserves some of it."""
 MOST_RESIDENT = 2 * 2**30
 MOST_S = 300
+
+DEEP = "@deep@"
+JUNK: list[Any] = [
+    None, True, False, 0, -1, 0.5, 10**400, 1e300, -1e300, 1e9, 1e5, 1e-300, float("nan"),
+    float("inf"), "", "x", "1", "1e999", "nan", "\ud800", "\0", "[bold]", "x" * 5000, "../../up",
+    [], {}, [None], [[]], {"a": 1}, ["1", "x"], [1e300] * 3, [float("nan")] * 4, 20_000, 2**31,
+    2**63, 180.0, ["desk"] * 3, "Floor", DEEP, [DEEP], {"id": DEEP},
+]  # fmt: skip
+"""What may stand where something else should."""
 
 _READER = """
 import importlib.util, json, resource, sys
@@ -56,6 +66,39 @@ def damaged_bytes(data: bytes, rng: np.random.Generator) -> bytes:
             for at in rng.integers(0, len(data), int(rng.integers(1, 8))):
                 changed[at] = rng.integers(256)
     return bytes(changed)
+
+
+def places(data: Any) -> Iterator[tuple[Any, Any]]:
+    """Every (container, key) of a JSON document."""
+    for key in list(data) if isinstance(data, dict) else range(len(data)):
+        yield data, key
+        if isinstance(data[key], dict | list):
+            yield from places(data[key])
+
+
+def damaged_json(data: Any, rng: np.random.Generator) -> str:
+    """Up to three places: something else there, gone or doubled; at times all of it, or cut off."""
+    data = json.loads(json.dumps(data))
+    for _ in range(rng.integers(1, 4)):
+        if not data:
+            break
+        found = list(places(data))
+        # Long lists of numbers would take all the damage: choose among kinds of places first.
+        kinds = sorted({str(key) if isinstance(key, str) else "#" for _, key in found})
+        kind = kinds[rng.integers(len(kinds))]
+        same = [item for item in found if (item[1] if isinstance(item[1], str) else "#") == kind]
+        container, key = same[rng.integers(len(same))]
+        action = rng.random()
+        if action < 0.2:
+            del container[key]
+        elif action < 0.25 and isinstance(container, list):
+            container += [container[key]] * int(rng.choice([1, 3, 2_000]))
+        else:
+            container[key] = JUNK[rng.integers(len(JUNK))]
+    if rng.random() < 0.05:
+        data = JUNK[rng.integers(len(JUNK))]
+    text = json.dumps(data).replace(json.dumps(DEEP), "[" * 3000 + "]" * 3000)
+    return text[: rng.integers(len(text))] if rng.random() < 0.05 else text
 
 
 def assert_one_sentence(script: str, function: str, paths: Sequence[Path]) -> list[str]:

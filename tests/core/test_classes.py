@@ -30,12 +30,8 @@ def test_a_list_of_ones_own_is_its_own_name():
         ("attic", "No label set is called 'attic'; there are front3d_bedroom, front3d_living, "
          "scannet, front3d_dining, front3d_library, front3d_kitchen, front3d_all, or write your "
          "own as void,bed,chair."),
-        ("bed,chair", "No label set is called 'bed,chair'; there are"),
         ("void,bed,bed", "The class 'bed' is twice in the label set; once is enough."),
-        ("void,void", "The class 'void' is twice in the label set; once is enough."),
         ("void,", "'' is no class name: 1 to 60 printable characters, no space at either end."),
-        ("void, bed", "' bed' is no class name"),
-        ("void,b\ned", "is no class name"),
         ("void," + "x" * 61, "is no class name: 1 to 60 printable characters"),
     ],
 )  # fmt: skip

@@ -77,14 +77,6 @@ def test_round_trip(tmp_path):
     assert {room_id for _, room_id in iterate_rooms(tmp_path, "train")} == {"h/1", "h_2"}
 
 
-def test_small_images_are_every_nth_pixel_from_the_middle_of_a_block(tmp_path):
-    room = make_room(views=4)
-    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, None)])
-    with Shard(tmp_path / "a.h5") as shard:
-        small = shard.read_instance_ids("house_A", [2, 0], step=4)
-    np.testing.assert_array_equal(small, room.instance_ids[[2, 0], 2::4, 2::4])
-
-
 @pytest.mark.parametrize(
     "stored",
     [
@@ -123,20 +115,6 @@ def test_shards_of_version_1_are_read_and_those_of_the_future_are_not(tmp_path):
                 assert_same(shard.read_room("house_A", images=True), make_room())
     with pytest.raises(ShardError, match=r"version 3, expected .* Prepare the data again"):
         Shard(tmp_path / "a.h5")
-
-
-def test_void_is_the_id_after_the_last_objects(tmp_path):
-    room = make_room()
-    room.instance_ids[0, :2] = 3
-    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, None)])
-    with Shard(tmp_path / "a.h5") as shard:
-        assert_same(shard.read_room("house_A", images=True), room)
-
-
-def test_same_rooms_same_bytes(tmp_path):
-    for name in ("a.h5", "b.h5"):
-        write_shard(tmp_path / name, "front3d_bedroom", [(make_room(), make_truth())])
-    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -284,21 +262,16 @@ def _put(name, value):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (_replace("boxes"), "boxes"),
         (_replace("boxes", data=np.zeros((3, 1, 4), "f4")), "boxes has shape (3, 1, 4), expected"),
         (_replace("boxes", data=np.zeros((3, 2, 4))), "boxes holds float64, expected float32"),
-        (_replace("boxes", shape=(2**40, 2, 4), dtype="f4", chunks=(1, 2, 4)), "boxes has shape"),
-        (_replace("object_class", data="text"), "object_class has shape ()"),
         (
             _replace("instance_ids", shape=(3, 2**20, 2**21), dtype="u1", chunks=(1, 9, 9)),
             "instance_ids claims 6597069766656 bytes, more than are stored",
         ),
         (_replace("instance_ids", data=np.zeros((3, 12, 16))), "instance_ids is float64 (3, 12,"),
-        (_replace("instance_ids", data=np.zeros((2, 12, 16), "u1")), "instance_ids has shape (2,"),
         (_put("instance_ids", 9), "an instance id is 9, but it has 2 objects"),
         (_put("world_to_camera", np.nan), "world_to_camera holds numbers that are not finite"),
         (_put("object_class", 99), "object_class is not below 22, the size of its label set"),
-        (_put("object_class", -1), "object_class is not below 22"),
         (_set("image_size", "big"), "invalid literal for int()"),
         (_set("image_size", (16, 12)), "instance_ids has shape (3, 12, 16), expected (3, 16, 12)"),
         (_put("ground_truth/centers_m", np.inf), "centers_m holds numbers that are not finite"),

@@ -4,7 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from front_files import FrontFolder
+from typer.testing import CliRunner
+
+from data_prep.cli import add_commands
 
 
 @pytest.fixture
@@ -16,6 +20,14 @@ def front(tmp_path: Path) -> FrontFolder:
     folder.model("lamp", "Floor Lamp", (0.3, 1.5, 0.3))
     folder.model("pendant", "Pendant Lamp", (0.4, 0.5, 0.4))
     return folder
+
+
+@pytest.fixture
+def cli():
+    """Runs a command of data_prep."""
+    app = typer.Typer()
+    add_commands(app)
+    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
 
 
 @pytest.fixture

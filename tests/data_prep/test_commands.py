@@ -1,19 +1,8 @@
 """The commands as a user meets them: what they print, and their exit status."""
 
 import pytest
-import typer
 from front_files import bedroom
 from front_jobs import SMALL, three_houses
-from typer.testing import CliRunner
-
-from data_prep.cli import add_commands
-
-
-@pytest.fixture
-def cli():
-    app = typer.Typer()
-    add_commands(app)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
 
 
 def test_commands(front, tmp_path, cli):
@@ -67,15 +56,6 @@ def test_failed_rooms_give_status_3_and_filtered_ones_do_not(front, tmp_path, pr
     assert '"broken"' in (tmp_path / "shards" / "report.json").read_text()
 
 
-def test_furniture_without_a_floor_is_no_failure(front, tmp_path, prep):
-    bare = bedroom("OtherRoom-1", kind="OtherRoom")
-    bare["children"] = bare["children"][1:]
-    front.house("house", bare, bedroom("Bedroom-1"), bedroom("Bedroom-2"))
-    made = prep("--recipe", "all")
-    assert made.exit_code == 0, made.output
-    assert "filtered by no_floor" in made.stdout
-
-
 def test_one_room_is_enough_to_train_on(front, tmp_path, prep):
     front.house("house", bedroom("Bedroom-1"))
     made = prep()
@@ -105,14 +85,6 @@ def test_only_in_a_whole_folder_says_what_is_still_to_make(front, tmp_path, prep
     assert made.exit_code == 0, made.output
     said = " ".join(made.stdout.split())
     assert "1 shards made, 0 already there, 3 still to make: run without --only" in said
-
-
-def test_a_rule_that_filters_is_in_the_table(front, prep):
-    front.house("house", bedroom("Bedroom-1"), bedroom("Bedroom-2"))
-    front.house("large", bedroom("Bedroom-3", bounds=(-4.0, -4.0, 4.0, 4.0)))
-    made = prep()
-    assert made.exit_code == 0, made.output
-    assert "filtered by max_floor_m" in made.stdout and "objects a room" not in made.stderr
 
 
 def test_pictures_and_wrong_words(front, tmp_path, prep, cli):

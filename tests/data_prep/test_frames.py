@@ -1,12 +1,9 @@
 """Which frames are views, their poses and their lens."""
 
-import doctest
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data_prep import frames
 from data_prep.frames import (
     choose_frames,
     is_pose,
@@ -141,7 +138,3 @@ def test_lines_are_sampled_as_shards_sample_them():
     np.testing.assert_array_equal(sampled_lines(968, 242), np.arange(968)[2::4])
     np.testing.assert_array_equal(sampled_lines(7, 7), np.arange(7))
     assert sampled_lines(3, 6).tolist() == [0, 0, 1, 1, 2, 2]
-
-
-def test_docstring_examples():
-    assert doctest.testmod(frames) == (0, 8)

@@ -145,12 +145,6 @@ def test_usd_holds_meshes_in_metres_with_y_up(scenes, tmp_path):
     assert usd.Stage.Open(str(tmp_path / "second.usda")).GetDefaultPrim().GetName() == "room"
 
 
-def test_obj_is_one_file_a_room(scenes, tmp_path):
-    export_scenes(scenes, "obj", tmp_path)
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"first.obj", "first.mtl", "second.obj", "second.mtl"}
-
-
 def test_what_cannot_be_exported_is_a_sentence(scenes, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="No format 'max'; choose from atiss, threed-front, obj"):
         export_scenes(scenes, "max", tmp_path)

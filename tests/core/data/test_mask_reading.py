@@ -3,12 +3,10 @@
 import pickle
 
 import numpy as np
-import pytest
 from references.batches import rooms_with_images
 
 from sceneprior.core.data import masks
 from sceneprior.core.data.masks import MaskStore
-from sceneprior.core.errors import ShardError
 from sceneprior.core.shards import Shard, list_shards
 
 
@@ -51,10 +49,3 @@ def test_few_files_stay_open_and_none_travels_to_a_worker(toy_shards, monkeypatc
     assert not again._shards
     np.testing.assert_array_equal(again.read(0, np.arange(8)), first)
     np.testing.assert_array_equal(again.read(5, np.arange(8)), store.read(5, np.arange(8)))
-
-
-def test_a_shard_that_went_away_is_one_sentence(tmp_path, toy_shards):
-    (_, room_id), *_ = places(toy_shards)
-    store = MaskStore([(tmp_path / "gone.h5", room_id)], 4)
-    with pytest.raises(ShardError, match=r"No shard at .*gone\.h5"):
-        store.read(0, np.array([0]))

@@ -35,7 +35,6 @@ def coco(segmentations, names=("bed", "chair"), **changes) -> dict:
 
 
 BOX = [[1, 1, 9, 1, 9, 9]]
-ROW = {"id": 7, "image_id": 1, "category_id": 1, "segmentation": BOX}
 
 
 def image(height, width) -> dict:
@@ -112,13 +111,8 @@ def test_what_is_small_is_in_front_and_crowds_are_no_object(read):
         (coco([], images=[]), "describes 0 images; keep one"),
         (coco([]), "has 0 annotations; expected 1 to 65534"),
         (coco([[[1, 1, 2, 2]]]), "annotation 70: its segmentation is neither polygons nor run"),
-        (coco([[[1, 1, 2, 2, "x", 3]]]), "neither polygons nor run lengths (not all are numbers)"),
         (coco([[[1, 1, 2, 2, float("nan"), 3]]]), "a corner is not a finite number"),
-        (coco([3]), "neither polygons nor run lengths"),
         (coco([{"size": [60, 80], "counts": [4800]}]), "is of an image of 80 x 60 pixels, but the"),
-        (coco([{"size": [30, 40], "counts": [1199]}]), "its runs are of 1199 pixels, not of 1200"),
-        (coco([{"size": [30, 40], "counts": [1201, -1]}]), "its runs are of 1200 pixels"),
-        (coco([{"size": [30, 40], "counts": ""}]), "its runs are of 0 pixels"),
         (coco([{"size": [30, 40], "counts": "\u00ff"}]), "is no digit of packed runs"),
         (coco([{"size": [30, 40], "counts": "P"}]), "its packed runs end within a number"),
         (coco([[[1, 1, 2, 2, 1, 3]]], categories=[]), "category 1 is not among its categories"),
@@ -126,26 +120,15 @@ def test_what_is_small_is_in_front_and_crowds_are_no_object(read):
             coco([BOX], categories={"1": "bed"}),
             "categories is {'1': 'bed'}; input should be a valid",
         ),
-        (coco([BOX], categories=[{"id": [1], "name": "bed"}]), "categories.0.id.int is [1]; input"),
-        (
-            coco([BOX], annotations=[ROW | {"category_id": [1]}]),
-            "annotations.0.category_id.int is [",
-        ),
-        (coco([BOX], annotations=[[]]), "annotations.0 is []; input should be a valid dict"),
-        (image(float("inf"), 40), "images.0.height is inf; input should be a finite number."),
         (image(0, 40), "images.0.height is 0; input should be greater than or equal to 1."),
         (image(10**400, 40), "pixels, more than 67 million; write the masks of a smaller image"),
-        (image(20_000, 20_000), "20000 x 20000 pixels, more than 67 million; write the masks of a"),
         (coco([{"counts": [1200]}]), "annotation 70: its segmentation has no 'size'."),
-        (coco([{"size": 3, "counts": [1200]}]), "neither polygons nor run lengths ('int' object"),
         (
             coco([{"size": [30], "counts": [30]}]),
             "is of an image of [30] pixels, but the image has",
         ),
         (coco([{"size": [30, 40], "counts": [10**30]}]), "its runs are of too many pixels, not of"),
-        (coco([{"size": [30, 40], "counts": [float("inf")]}]), "neither polygons nor run lengths"),
         (coco([{"size": [30, 40], "counts": "o" * 9_999}]), "a number of its packed runs is too l"),
-        (coco([[["1", "2", "3", "4", "5", "6"]]]), "run lengths (not all are numbers)"),
     ],
 )
 def test_what_is_no_image_of_masks(read, data, said):

@@ -58,24 +58,11 @@ def test_void_is_no_object_and_hides_what_is_behind_it():
     np.testing.assert_array_equal(seen.boxes[0, 0], np.float32([0, 0, 0.25, 1]))
 
 
-def test_a_mask_in_two_parts_has_one_box():
-    seen = observe(paint(20, 40, (1, 0, 0, 6, 6), (1, 30, 10, 40, 20))[None], [True])
-    np.testing.assert_array_equal(seen.boxes[0, 0], np.float32([0, 0, 1, 1]))
-    assert seen.mask_pixels[0, 0] == 136
-
-
 def test_nothing_seen_at_all():
     seen = observe(np.zeros((3, 20, 40), np.uint16), [True, False])
     assert seen.instance_ids.dtype == np.uint8
     assert len(seen.tracked) == 0 and seen.boxes.shape == (3, 0, 4)
     assert not seen.instance_ids.any()
-
-
-def test_more_than_255_objects_need_two_bytes():
-    image = np.repeat(np.arange(1, 301, dtype=np.uint16), 5)[None, None].repeat(6, axis=1)
-    seen = observe(image, [True] * 300)
-    assert seen.instance_ids.dtype == np.uint16
-    np.testing.assert_array_equal(seen.instance_ids, image)
 
 
 def test_void_after_255_objects_needs_two_bytes_and_only_where_it_is_seen():

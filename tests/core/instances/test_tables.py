@@ -13,15 +13,11 @@ from sceneprior.core.instances.tables import IdTable, read_class_table
         ("classes.json", "{", "classes.json cannot be read (Expecting property name"),
         ("classes.json", "{}", "classes.json is empty; expected a class for each instance id."),
         ("classes.json", "[[1]]", 'is not an object of ids and class names, as {"1": "bed", "2"'),
-        ("classes.json", '{"1": 2}', 'is not an object of ids and class names, as {"1": "bed", "'),
         ("classes.json", '"bed"', "is not an object of ids and class names"),
         ("classes.json", '{"0": "bed"}', "'0' is no instance id; expected a number from 1 to 655"),
-        ("classes.json", '{"70000": "bed"}', "'70000' is no instance id"),
-        ("classes.json", '{"1e3": "bed"}', "'1e3' is no instance id"),
         ("classes.json", '{"1": "bed", "1": "sofa"}', "instance id 1 is there twice."),
         ("classes.csv", "1,bed\n1,sofa", "instance id 1 is there twice."),
         ("classes.csv", "1\n", "classes.csv cannot be read (a row '1' has no class)."),
-        ("classes.csv", "", "classes.csv is empty; expected a class"),
     ],
 )  # fmt: skip
 def test_bad_tables(tmp_path, name, text, said):

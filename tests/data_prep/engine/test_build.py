@@ -12,10 +12,9 @@ from front_jobs import digests, front_job, rooms_of, three_houses
 from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
-from data_prep.inspection.contents import count_shards, draw_sheet
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.shards import iterate_rooms, list_shards, read_index
+from sceneprior.core.shards import list_shards, read_index
 
 
 def projected(corners, turn, K):
@@ -165,23 +164,6 @@ def test_a_second_run_makes_only_what_is_missing(front, tmp_path):
     third = build_shards(front_job(front, out))
     assert (third.shards_made, third.shards_kept) == (1, 3)
     assert digests(out) == before
-
-
-def test_inspection(front, tmp_path):
-    three_houses(front)
-    out = tmp_path / "shards"
-    build_shards(front_job(front, out))
-    counts = count_shards(out)
-    assert counts["train"]["rooms"] == 4 and counts["test"]["objects"] == 3
-    assert counts["val"]["objects"] == 3
-    assert counts["train"]["classes"] == {"nightstand": 8, "double_bed": 4}
-    assert counts["train"]["seen"] == pytest.approx(
-        np.mean([r.visible.sum(axis=1).mean() for r in
-                 (shard.read_room(name) for shard, name in iterate_rooms(out, "train"))])
-    )  # fmt: skip
-    assert draw_sheet(out, pictures=4).size == draw_sheet(out, pictures=4, boxes_3d=True).size
-    with pytest.raises(InputError, match="has no room 'attic'"):
-        draw_sheet(out, "attic")
 
 
 def shared_front() -> Path:

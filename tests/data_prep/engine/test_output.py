@@ -87,42 +87,6 @@ def test_the_kernel_refuses_large_files(front, tmp_path, workers):
     assert done.returncode == 0, done.stderr
 
 
-def test_a_folder_without_write_permission(front, tmp_path):
-    if os.geteuid() == 0:
-        pytest.skip("root may write everywhere")
-    three_houses(front)
-    closed = tmp_path / "closed"
-    closed.mkdir(mode=0o555)
-    with pytest.raises(InputError, match=r"cannot be written \(Permission denied\)"):
-        build_shards(front_job(front, closed / "shards"))
-
-
-def test_two_runs_do_not_share_a_folder(tmp_path):
-    out = tmp_path / "deep" / "shards"
-    with (
-        claimed(out),
-        pytest.raises(InputError, match=r"Another run is writing to .*shards; wait for it"),
-        claimed(out),
-    ):
-        raise AssertionError
-    assert not (tmp_path / "deep").exists()  # nothing came to lie there
-    with claimed(out):
-        (out / "file").touch()
-    with claimed(out):
-        pass
-    assert (out / "file").exists()
-
-
-def test_leftovers_of_killed_runs_are_cleared_away(tmp_path):
-    out = tmp_path / "shards"
-    build_shards(Job(ToySource(), out))
-    expected = digests(out)
-    for name in ("plan.json.1a2b.part", "models/x.ply.ffff.part", "train/toys_0001.h5.0000.part"):
-        (out / name).write_bytes(b"half")
-    build_shards(Job(ToySource(), out))
-    assert digests(out) == expected
-
-
 def test_what_a_worker_left_that_died_on_the_way_is_cleared_away_at_the_end(tmp_path):
     out = tmp_path / "shards"
     with claimed(out):

@@ -78,12 +78,6 @@ def test_failed_rooms_are_tried_again_when_asked(tmp_path):
     assert again.statuses == {"prepared": 9, "filtered": 2}
 
 
-def test_debugging_lets_the_unforeseen_through(tmp_path, monkeypatch):
-    monkeypatch.setenv("SCENEPRIOR_DEBUG", "1")
-    with pytest.raises(KeyError, match="surprise"):
-        build_shards(Job(ToySource(trouble={2: "unforeseen"}), tmp_path / "shards"))
-
-
 def test_a_worker_elsewhere_says_that_it_sees_no_plan(tmp_path):
     shard = ShardPlan("train/toys_0000.h5", (RoomTask("box_0", "box", "train"),))
     with pytest.raises(InputError, match=r"A worker finds no plan\.json in .*under the same paths"):
@@ -135,3 +129,9 @@ def test_a_house_that_is_cut_off_meanwhile_costs_its_own_rooms_only(front, tmp_p
     report = json.loads((job.out / "report.json").read_text())
     assert {item["room_id"] for item in report["failed"]} == {"cut_Bedroom-1", "cut_Bedroom-2"}
     assert all("cut.json is not JSON" in item["reason"] for item in report["failed"])
+
+
+def test_debugging_lets_the_unforeseen_through(tmp_path, monkeypatch):
+    monkeypatch.setenv("SCENEPRIOR_DEBUG", "1")
+    with pytest.raises(KeyError, match="surprise"):
+        build_shards(Job(ToySource(trouble={2: "unforeseen"}), tmp_path / "shards"))

@@ -69,9 +69,3 @@ def test_the_room_and_the_seed_decide(room):
     eyes = -np.einsum("nji,nj->ni", one.world_to_camera[:, :3, :3], one.world_to_camera[:, :3, 3])
     assert eyes[:, 1].min() >= 1.4 - 1e-5 and eyes[:, 1].max() <= 1.8 + 1e-5
     assert one.image_size == (60, 80)
-
-
-def test_the_papers_pictures():
-    views = load_recipe("bedroom").views
-    assert views.image_size == (360, 480) and views.fov_deg == 90
-    assert views.eye_height_m == (1.4, 1.8) and views.per_house_at_most == 100

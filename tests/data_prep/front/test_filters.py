@@ -14,7 +14,6 @@ OUTSIDE = {"jid": "stand", "pos": (3.4, 0.0, 0.0)}
 HIGH = {"jid": "stand", "pos": (0.0, 3.6, 1.0)}
 SUNK = {"jid": "stand", "pos": (0.0, -0.01, 1.0)}
 GONE = [{"jid": f"gone{k}", "pos": (0.3 * k, 0.0, 1.0)} for k in range(3)]
-LAMP = {"jid": "lamp", "pos": (1.7, 0.0, 1.7)}
 
 
 def prepared(front, tmp_path, pieces, *rules, out="shards"):

@@ -5,13 +5,13 @@ case is named by its number.
 """
 
 import json
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 from front_files import FrontFolder, bedroom, surface
 from front_jobs import front_job, rooms_of
+from mutating import damaged_json
 
 from data_prep.engine.build import build_shards
 from data_prep.front.models import ModelBank
@@ -20,16 +20,6 @@ from data_prep.front.rooms import read_house
 from sceneprior.core.errors import InputError
 
 CASES = 400
-DEEP: Any = 0
-for _ in range(400):
-    DEEP = [DEEP]
-
-JUNK = [
-    None, True, False, 0, -1, 10**400, 1e300, -1e300, 1e5, 1e-300, float("nan"), float("inf"),
-    "", "x", "1e999", "nan", "\ud800", "\0", "[bold]", "x" * 5000, "../../up", [], {}, [None],
-    [[]], {"a": 1}, ["1", "2", "x"], [1e300] * 3, [float("nan")] * 4, DEEP, {"uid": {}}, "Floor",
-]  # fmt: skip
-"""What may stand where something else should."""
 
 
 def written_house(front: FrontFolder) -> bytes:
@@ -41,32 +31,6 @@ def written_house(front: FrontFolder) -> bytes:
     first["_furniture"][0] |= {"bbox": [1.8, 1.0, 2.0], "category": "King-size Bed"}
     first["_furniture"][1] |= {"size": ["0.5", "0.6", "0.4"], "sourceCategoryId": "a", "title": "b"}
     return front.house("house", first, second).read_bytes()
-
-
-def places(data: Any) -> Iterator[tuple[Any, Any]]:
-    """Every (container, key) of a JSON document."""
-    for key in list(data) if isinstance(data, dict) else range(len(data)):
-        yield data, key
-        if isinstance(data[key], dict | list):
-            yield from places(data[key])
-
-
-def damage(data: Any, rng: np.random.Generator) -> None:
-    """One to three places: something else there, or gone, or there twice."""
-    for _ in range(rng.integers(1, 4)):
-        found = list(places(data))
-        # Long lists of numbers would take all the damage: choose among kinds of places first.
-        kinds = sorted({str(key) if isinstance(key, str) else "#" for _, key in found})
-        kind = kinds[rng.integers(len(kinds))]
-        same = [item for item in found if (item[1] if isinstance(item[1], str) else "#") == kind]
-        container, key = same[rng.integers(len(same))]
-        action = rng.random()
-        if action < 0.2:
-            del container[key]
-        elif action < 0.25 and isinstance(container, list):
-            container.append(container[key])
-        else:
-            container[key] = JUNK[rng.integers(len(JUNK))]
 
 
 def check(front: FrontFolder, path: Any, bank: ModelBank, rules: tuple[str, ...]) -> str:
@@ -98,9 +62,7 @@ def test_mutilated_houses_never_raise_a_traceback(front, rules):
     path = front.front / "house.json"
     outcomes = []
     for case in range(CASES):
-        data = json.loads(text)
-        damage(data, np.random.default_rng(case))
-        path.write_text(json.dumps(data))
+        path.write_text(damaged_json(json.loads(text), np.random.default_rng(case)))
         try:
             outcomes.append(check(front, path, bank, rules))
         except Exception:
@@ -133,9 +95,8 @@ def test_a_job_on_damaged_houses_names_every_room(front, tmp_path):
     """The whole way to shards and reports: what can be used is there, the rest has a sentence."""
     text = written_house(front)
     for case in range(40):
-        data = json.loads(text)
-        damage(data, np.random.default_rng(10_000 + case))
-        (front.front / f"house{case:02d}.json").write_text(json.dumps(data))
+        damaged = damaged_json(json.loads(text), np.random.default_rng(10_000 + case))
+        (front.front / f"house{case:02d}.json").write_text(damaged)
     (front.front / "house98.json").write_bytes(text[:1000])
     (front.front / "house99.json").write_bytes(b"\xff" * 100)
     rules = ("max_floor_m=null", "max_height_m=null", "scale_range=null", "min_objects=null",

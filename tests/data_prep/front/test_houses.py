@@ -50,12 +50,6 @@ def test_entries_that_are_not_valid_are_skipped(front, valid):
     assert len(only_room(front, front.house("house", room("A", pieces))).furniture) == 1
 
 
-def test_entries_without_valid_are_skipped(front):
-    written = bedroom("A")
-    del written["_furniture"][1]["valid"]
-    assert len(only_room(front, front.house("house", written)).furniture) == 3
-
-
 def test_duplicate_uids_and_duplicate_placements(front):
     written = bedroom("A")
     written["_furniture"].append(dict(written["_furniture"][0]))  # the same uid again
@@ -82,14 +76,10 @@ def test_a_room_without_floor_is_left_out_and_with_a_damaged_one_fails(front):
     [
         ("pos", [0, float("nan"), 0], "no places"),
         ("rot", [0, 0, 0, 0], "incomplete"),
-        ("rot", [0, 1], "incomplete"),
         ("scale", [1, 1], "incomplete"),
         ("scale", {}, "list of numbers is none"),
         ("pos", "here", "holds something else"),
-        ("pos", [0, None, 0], "holds something else"),
-        ("pos", [0, 10**400, 0], "holds something else"),
         ("pos", None, "its placement has no pos"),
-        ("rot", None, "its placement has no rot"),
     ],
 )
 def test_placements_that_are_no_numbers_are_named(front, key, value, note):
@@ -143,13 +133,6 @@ def test_rooms_without_furniture_are_filtered_not_failed(front):
     ]
 
 
-def test_of_duplicate_uids_a_valid_one_counts(front):
-    written = bedroom("A")
-    rejected = dict(written["_furniture"][0], valid=False)
-    written["_furniture"].insert(0, rejected)
-    assert len(only_room(front, front.house("house", written)).furniture) == 4
-
-
 def test_ids_that_are_no_names(front):
     """Ids become parts of paths and lines of reports, so they cannot be just anything."""
     rooms = [bedroom(name) for name in ("../../up", "a\nb", "x" * 300, "\ud800", "good")]
@@ -191,13 +174,10 @@ def test_two_rooms_of_one_name(front):
     ("content", "said"),
     [
         (b'{"scene": {"room"', "is not JSON .*; it may be truncated"),
-        (b"", "is not JSON"),
         (b"[" * 100_000, "is not JSON"),
         (b'{"mesh": "\xff\xfe"}', "is not JSON .*utf-8"),
         (b"[]", "is not a 3D-FRONT house: it has no list 'furniture'"),
-        (b'{"furniture": [], "mesh": {}}', "is not a 3D-FRONT house: it has no list 'mesh'"),
         (b'{"furniture": [], "mesh": [], "scene": 1}', ".* has no list 'scene.room'"),
-        (b'{"furniture": [], "mesh": [], "scene": {}}', ".* has no list 'scene.room'"),
     ],
 )
 def test_files_that_are_no_houses(front, content, said):

@@ -137,15 +137,6 @@ def test_faces_that_are_none(tmp_path, face):
         read_obj(path)
 
 
-def test_vertices_that_are_no_places(tmp_path):
-    path = tmp_path / "model" / "raw_model.obj"
-    path.parent.mkdir()
-    for bad in ("nan 0 0", "1e999 0 0", "1 2", ""):
-        path.write_text(f"v 0 0 0\nv 1 0 0\nv {bad}\nf 1 2 3\n")
-        with pytest.raises(InputError, match=r"cannot be read|holds no usable triangles"):
-            read_obj(path)
-
-
 def test_a_models_colour(front):
     bank = ModelBank(front.future)
     folder = front.future / "bed"

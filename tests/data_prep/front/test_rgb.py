@@ -16,7 +16,6 @@ from data_prep.front.furnished import Room
 from data_prep.front.rgb import shell_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh
-from sceneprior.render.offscreen import Pinhole, open_renderer
 
 
 def areas(mesh: Mesh) -> np.ndarray:
@@ -37,20 +36,6 @@ def test_the_shell_of_a_room_with_a_corner_and_a_pillar():
     two = shapely.MultiPolygon([shapely.box(0, 0, 1, 1), shapely.box(3, 0, 4, 1)])
     parts = shell_of(dataclasses.replace(empty, floor=two))
     assert [areas(part).sum() for part in parts] == pytest.approx([2, 8 * 2.5, 2])
-
-
-def test_a_picture_may_lie_behind_the_meshes():
-    triangle = Mesh(np.array([[-9.0, -9, 2], [0, -9, 2], [0, 9, 2]]), np.array([[0, 1, 2]]))
-    camera = Pinhole(np.eye(4), np.array([[4.0, 0, 4], [0, 4, 4], [0, 0, 1]]))
-    behind = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
-    renderer = open_renderer("software")
-    colors = np.array([[200, 0, 0]], np.uint8)
-    drawn = renderer.shaded([triangle], colors, camera, (8, 8), behind)
-    ids = renderer.instance_ids([triangle], camera, (8, 8))
-    np.testing.assert_array_equal(drawn[:, 4:], behind[:, 4:])
-    assert (ids[:, :3] == 1).all() and (drawn[:, :3, 1:] == 0).all()
-    whole = renderer.shaded([], colors[:0], camera, (8, 8), behind)
-    np.testing.assert_array_equal(whole, behind)
 
 
 def test_pictures_show_what_the_masks_show(front, tmp_path):

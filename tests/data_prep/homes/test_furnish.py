@@ -8,7 +8,7 @@ import pytest
 from data_prep.homes.bedroom import BEDROOM
 from data_prep.homes.bedroom import COUNTS as BEDROOM_COUNTS
 from data_prep.homes.catalog import make_catalog
-from data_prep.homes.furnish import count_at, draw_basics, draw_extras, furnish
+from data_prep.homes.furnish import furnish
 from data_prep.homes.living import COUNTS as LIVING_COUNTS
 
 
@@ -23,32 +23,6 @@ def test_object_counts_follow_the_histogram(rooms, room_type, histogram):
     np.testing.assert_allclose(ours, cumulative, atol=0.012)
     mean = sum(k * v for k, v in histogram.items()) / sum(histogram.values())
     assert counts.mean() == pytest.approx(mean, abs=0.1)
-
-
-def test_count_at_walks_up_the_histogram():
-    shares = (0, 0.24, 0.25, 0.74, 0.75, 0.999)
-    counts = [count_at({2: 1, 5: 2, 6: 1}, share) for share in shares]
-    assert counts == [2, 2, 5, 5, 6, 6]
-
-
-def test_basics_are_drawn_while_pieces_are_left():
-    rng = np.random.default_rng(0)
-    basics = [("bed", 1, 1.0), ("dining 4", 5, 1.0), ("none", 0, 1.0), ("never", 1, 0.0)]
-    for _ in range(20):
-        groups, left = draw_basics(rng, basics, 6)
-        assert (sorted(groups), left) == (["bed", "dining 4"], 0)
-        assert draw_basics(rng, basics, 3) == (["bed"], 2)
-
-
-def test_extras_use_up_all_pieces_and_repeat_only_what_may():
-    offers = {"desk": (1, 1.0), "desk and chair": (2, 1.0), "lamp": (1, 9.0), "sofa": (1, 1e-9)}
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        groups = draw_extras(rng, ["bed"], 5, offers, {"shelf": (1, 1.0)}, twice=("lamp",))
-        assert groups[0] == "bed"
-        assert sum({"desk and chair": 2}.get(group, 1) for group in groups[1:]) == 5
-        assert sum(group.startswith("desk") for group in groups) == 1
-        assert groups.count("lamp") == 2 and groups.count("sofa") <= 1
 
 
 def test_a_room_for_which_no_place_is_found_is_an_error():

@@ -6,22 +6,6 @@ import pytest
 from data_prep.homes import solids
 
 
-def test_solids_have_the_volume_of_their_shape():
-    ring = 20 / 2 * np.sin(2 * np.pi / 20)  # area of a polygon of 20 corners in the unit circle
-    assert solids.box(1, 2, 3).volume == pytest.approx(6)
-    assert solids.cylinder(2, 3).volume == pytest.approx(ring * 4 * 3)
-    assert solids.lathe([(1, 0), (0.5, 3)]).volume == pytest.approx(ring * (1 + 0.5 + 0.25))
-    assert solids.slab(solids.oval(2, 1, 20), 3).volume == pytest.approx(ring * 0.5 * 3)
-    assert solids.panel([[0, 0], [2, 0], [0, 2]], 0.1).volume == pytest.approx(0.2)
-    assert solids.ribbon([[0, 0], [1, 0], [3, 0]], 0.5, 2.5, 0.1).volume == pytest.approx(0.6)
-    bar = 6 / 2 * np.sin(2 * np.pi / 6)
-    assert solids.rod([0, 0, 0], [0, 3, 4], 0.1).volume == pytest.approx(bar * 0.01 * 5)
-    assert solids.tube([[0, 0, 0], [1, 0, 0], [3, 0, 0]], 0.1, 6).volume == pytest.approx(
-        bar * 0.03
-    )
-    assert solids.sphere(1, rows=40).volume == pytest.approx(4 / 3 * np.pi, rel=0.01)
-
-
 @pytest.mark.parametrize(
     ("solid", "low", "high"),
     [

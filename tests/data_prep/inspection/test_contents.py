@@ -3,14 +3,11 @@
 import h5py
 import numpy as np
 import pytest
-import typer
 from front_jobs import front_job, three_houses
 from PIL import Image
-from typer.testing import CliRunner
 
-from data_prep.cli import add_commands
 from data_prep.engine.build import build_shards
-from data_prep.inspection.contents import count_shards, describe_room, draw_sheet
+from data_prep.inspection.contents import describe_room, draw_sheet
 from sceneprior.core.errors import InputError
 
 
@@ -19,21 +16,6 @@ def shards(front, tmp_path):
     three_houses(front)
     build_shards(front_job(front, tmp_path / "shards"))
     return tmp_path / "shards"
-
-
-@pytest.fixture
-def cli():
-    app = typer.Typer()
-    add_commands(app)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
-
-
-def test_counts_say_what_is_known(shards):
-    counts = count_shards(shards)
-    assert {split: found["with_truth"] for split, found in counts.items()} == {
-        "train": 4, "val": 1, "test": 1
-    }  # fmt: skip
-    assert counts["train"]["image_sizes"] == {"120 x 90": 4}
 
 
 def test_a_sheet_of_a_folder_and_of_a_room(shards):

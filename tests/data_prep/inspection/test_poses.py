@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import typer
 from front_jobs import SMALL
 from front_reading import shared_front
 from mutations import (
@@ -16,9 +15,7 @@ from mutations import (
     swapped,
     transposed,
 )
-from typer.testing import CliRunner
 
-from data_prep.cli import add_commands
 from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
@@ -174,12 +171,3 @@ def test_one_room_with_wrong_cameras_is_named_among_right_ones(shards, tmp_path)
         folder = mutated(shards(kind), tmp_path / kind, poses=np.linalg.inv, rooms=1)
         first, *_ = verify(folder).problems
         assert ", room " in first and INVERTED in first, kind
-
-
-def test_the_command_ends_with_the_cause(shards, tmp_path):
-    folder = mutated(shards("homes"), tmp_path / "wrong", poses=lambda poses: OPENGL @ poses)
-    app = typer.Typer()
-    add_commands(app)
-    ended = CliRunner().invoke(app, ["inspect", str(folder), "--verify"])
-    assert ended.exit_code == 3 and "all is well" not in ended.stdout
-    assert FLIPPED in ended.stderr.strip().splitlines()[-1]

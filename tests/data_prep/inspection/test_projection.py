@@ -1,7 +1,5 @@
 """Wires and boxes on the image, against corners projected by hand."""
 
-import doctest
-
 import numpy as np
 import pytest
 
@@ -17,10 +15,6 @@ from data_prep.inspection.projection import (
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 
 K = np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]])
-
-
-def test_examples():
-    assert doctest.testmod(projection).failed == 0
 
 
 def test_wires_join_projected_points(numbers):

@@ -8,13 +8,17 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from scan_files import BOX_FACES
 
+from data_prep.engine.source import PreparedRoom
+from data_prep.inspection.projection import box_iou_2d, boxes_around, hull_of
+from data_prep.posed.transforms import read_recording
+from data_prep.posed.views import PosedSettings, prepare_posed
+from data_prep.upright import own_sides
+from sceneprior.core.shards import RoomViews
 from sceneprior.render.offscreen.zbuffer import rasterize
 
-FACES = np.array(
-    [(0, 1, 3), (0, 3, 2), (4, 7, 5), (4, 6, 7), (0, 5, 1), (0, 4, 5),
-     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
-)  # fmt: skip
+SET = "void,bed,chair"
 EYES = [(-2.0, -2, 1.6), (2.2, -2, 1.5), (2.4, 2.2, 1.7), (-2.2, 2, 1.5), (0.2, -2.6, 1.9)]
 
 
@@ -74,13 +78,13 @@ class PosedRoom:
         height, width = self.size
         index, _ = rasterize(
             np.concatenate([thing.corners for thing in self.things]),
-            np.concatenate([FACES + 8 * k for k in range(len(self.things))]),
+            np.concatenate([BOX_FACES + 8 * k for k in range(len(self.things))]),
             np.linalg.inv(self.poses[view] @ np.diag([1.0, -1, -1, 1])),
             (self.focal_px, self.focal_px, width / 2, height / 2),
             self.size,
         )
         values = np.array([0, *(thing.id for thing in self.things)], dtype=np.uint16)
-        return values[(index + len(FACES)) // len(FACES)]
+        return values[(index + len(BOX_FACES)) // len(BOX_FACES)]
 
     @property
     def data(self) -> dict[str, Any]:
@@ -112,3 +116,27 @@ class PosedRoom:
 
     def png(self, view: int) -> Path:
         return self.folder / "instances" / f"frame_{view:05d}.png"
+
+
+def prepared(room: PosedRoom, label_set: str = SET, **settings: Any) -> PreparedRoom | None:
+    """The room on disk as views."""
+    return prepare_posed(read_recording(room.folder), label_set, PosedSettings(**settings))
+
+
+def in_room(room: PosedRoom, center: tuple[float, float] = (0.1, -0.2)) -> list[np.ndarray]:
+    """Corners of bed and chair in the room frame: (x, y, z) with z up -> (x, z, -y)."""
+    return [
+        np.stack([c[:, 0] - center[0], c[:, 2], -(c[:, 1] - center[1])], axis=1)
+        for c in (thing.corners for thing in room.things[:2])
+    ]
+
+
+def overlaps(views: RoomViews, corners: Sequence[np.ndarray]) -> np.ndarray:
+    """IoU of the boxes round projected corners (in the room frame) with those of whole masks."""
+    height, width = views.image_size
+    found = []
+    for k, points in enumerate(corners):
+        boxes = boxes_around(hull_of(points), views.world_to_camera, views.intrinsics)
+        iou = box_iou_2d(boxes, views.boxes[:, k] * np.array([width, height, width, height]))
+        found += iou[own_sides(views, views.image_size).all(axis=-1)[:, k]].tolist()
+    return np.array(found)

@@ -1,20 +1,15 @@
 """Posed rooms through the engine and the command: splits, sizes, failures, assumptions."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from PIL import Image
 from posed_files import PosedRoom, furniture
 from tiny_runs import tiny_config
-from typer.testing import CliRunner
 
-from data_prep.cli import add_commands
 from data_prep.engine.build import Job, build_shards
-from data_prep.engine.selection import seeded_split
 from data_prep.engine.source import RoomTask
 from data_prep.engine.workers import pool
 from data_prep.posed.source import PosedSource, find_rooms
@@ -42,13 +37,6 @@ def source(rooms, tmp_path):
     return PosedSource(tmp_path / "rooms", SET)
 
 
-@pytest.fixture
-def cli():
-    app = typer.Typer()
-    add_commands(app)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
-
-
 def survey(source):
     with pool(1) as run:
         return source.survey(run)
@@ -68,12 +56,6 @@ def test_shards_of_ones_own_classes_can_be_trained_on(source, tmp_path):
 
 
 def test_splits_are_seeded_shares_of_rooms(source):
-    names = [f"r{k}" for k in range(20)]
-    for share, tests in ((0.1, 2), (0.5, 10), (0.01, 1), (0.99, 19), (0.0, 0)):
-        split = seeded_split(names, 0, share)
-        assert sum(value == "test" for value in split.values()) == tests
-    assert seeded_split(names, 0, 0.5) != seeded_split(names, 1, 0.5)
-    assert seeded_split(["one"], 0, 0.5) == {"one": "train"}
     everything = survey(PosedSource(source.folder, SET, test_share=0.0)).rooms
     assert {room.split for room in everything} == {"train"} and len(everything) == 4
     for share in (-0.1, 1.0, float("nan")):
@@ -96,18 +78,6 @@ def test_one_room_is_a_folder_of_rooms(source, rooms, tmp_path, monkeypatch):
         find_rooms(tmp_path / "empty")
 
 
-def test_files_by_split_make_a_room_a_room(rooms):
-    folder = rooms[0].folder
-    (folder / "transforms.json").rename(folder / "transforms_train.json")
-    assert len(survey(PosedSource(folder, SET)).rooms) == 1
-    assert len(survey(PosedSource(folder.parent, SET)).rooms) == 4
-    shutil.rmtree(folder / "instances")
-    with pytest.raises(InputError, match="none of its 5 frames has a PNG of instance ids"):
-        survey(PosedSource(folder, SET))
-    (lost,) = survey(PosedSource(folder.parent, SET)).left_out
-    assert lost.room_id == "room_0" and "transforms_train.json: none of" in lost.reason
-
-
 def test_rooms_of_another_size_are_left_out_with_the_reason(source, rooms):
     PosedRoom(rooms[2].folder, size=(128, 96)).write()
     found = survey(source)
@@ -121,13 +91,6 @@ def test_rooms_of_another_size_are_left_out_with_the_reason(source, rooms):
         survey(PosedSource(source.folder, SET, only="room_2"))
     (alone,) = survey(PosedSource(rooms[2].folder, SET)).rooms
     assert alone.room_id == "room_2"
-
-
-def test_only(source):
-    one = PosedSource(source.folder, SET, only="room_3")
-    assert [room.room_id for room in survey(one).rooms] == ["room_3"]
-    with pytest.raises(InputError, match=r"has no room 'attic' .--only takes a room's folder.\."):
-        source.settings("attic")
 
 
 def test_settings_follow_the_files(source, rooms):
@@ -214,3 +177,10 @@ def test_the_command(rooms, tmp_path, cli):
         "--max-side", 64, "--workers", 1, "--test-share", 0.25,
     )  # fmt: skip
     assert "was begun with other settings (rooms differ)" in str(again.exception)
+
+
+def test_only(source):
+    one = PosedSource(source.folder, SET, only="room_3")
+    assert [room.room_id for room in survey(one).rooms] == ["room_3"]
+    with pytest.raises(InputError, match=r"has no room 'attic' .--only takes a room's folder.\."):
+        source.settings("attic")

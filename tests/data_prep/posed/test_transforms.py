@@ -55,15 +55,10 @@ def test_room_names(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"frames": None}, "has no list `frames` with a frame in it."),
         ({"frames": []}, "has no list `frames` with a frame in it."),
-        ({"frames": [3]}, "frame 0: it has no `file_path`."),
         ({"frames": [{"file_path": 3}]}, "frame 0: it has no `file_path`."),
         ({"frames": [{"file_path": "a"}]}, "frame 'a': `transform_matrix` is not a list of 4 rows"),
         ({"fl_x": "wide"}, "fl_x is 'wide'; input should be a valid number."),
-        ({"fl_x": 10**400}, "fl_x is a number of many digits; input should be "),
-        ({"cx": True}, "cx is True; input should be a valid number."),
-        ({"cy": float("nan")}, "cy is nan; input should be "),
         ({"w": 12.5}, "frame 'images/frame_00000.jpg': w, h are 12.5, 96.0; expected pixel counts"),
         ({"fl_x": None}, "has no fl_x and no camera_angle_x, here or for the whole file"),
         ({"fl_x": -1}, "fl_x, fl_y are -1.0, 80.0; expected above 0"),
@@ -71,24 +66,17 @@ def test_room_names(tmp_path, monkeypatch):
             {"fl_x": None, "camera_angle_x": 62.0},
             "camera_angle_x is 62, expected radians between 0 and pi; degrees? Give radians: 1.08",
         ),
-        ({"fl_x": None, "camera_angle_x": -1}, "camera_angle_x is -1, expected radians between"),
         ({"fl_y": None, "camera_angle_y": 180}, "camera_angle_y is 180, expected radians between"),
-        ({"fl_x": None, "camera_angle_x": 3.1}, "fl_x: a focal length of 1.33"),
-        ({"fl_x": 0.6}, "in an image of 128 x 96 sees 179 degrees, expected 5 to 160; give pixels"),
         (
             {"fl_y": 2600},
             "fl_y: a focal length of 2600 pixels in an image of 128 x 96 sees 2.82 deg",
         ),
+        ({"fl_x": 0.6}, "in an image of 128 x 96 sees 179 degrees, expected 5 to 160; give pixels"),
         ({"k4": 0.03}, "its k4 is 0.03, which OPENCV does not have."),
         ({"camera_model": "FULL_OPENCV"}, "its camera_model is FULL_OPENCV; expected a pinhole,"),
         ({"is_fisheye": True, "p2": 0.1}, "its p2 is 0.1, which OPENCV_FISHEYE does not have."),
         ({"metres_per_unit": 0}, "metres_per_unit is 0; input should be greater than 0."),
         ({"floor_center_m": [1]}, "floor_center_m.1 is [1]; field required."),
-        (
-            {"floor_center_m": [1, None]},
-            "floor_center_m.1 is None; input should be a valid number.",
-        ),
-        ({"floor_center_m": [1, "x"]}, "floor_center_m.1 is 'x'; input should be a valid number."),
     ],
 )
 def test_a_wrong_key_is_a_sentence(room, changes, said):
@@ -102,16 +90,10 @@ def test_a_wrong_key_is_a_sentence(room, changes, said):
     ("changes", "said"),
     [
         ({"transform_matrix": [[1, 2], [3, 4]]}, "`transform_matrix` is not a list of 4 rows of 4"),
-        ({"transform_matrix": [[1, 2], [3]]}, "`transform_matrix` is not a list of 4 rows of 4"),
-        ({"transform_matrix": [["1", 0, 0, 0]] * 4}, "`transform_matrix` is not a list of 4 rows"),
-        ({"transform_matrix": [[10**400] * 4] * 4}, "`transform_matrix` is not a list of 4 rows"),
-        ({"transform_matrix": "eye"}, "`transform_matrix` is not a list of 4 rows of 4 numbers."),
         ({"instance_path": 3}, "instance_path is 3; input should be a valid string."),
         ({"instance_path": "a\0b"}, "'a\\x00b' can be no file's name."),
         ({"instance_path": "x" * 300}, "xxx...' can be no file's name."),
-        ({"mask_path": ""}, "'' can be no file's name."),
         ({"file_path": "other/frame_00000.png"}, "would share the ids in "),
-        ({"k4": 1e-3}, "its k4 is 0.001, which OPENCV does not have."),
     ],
 )
 def test_a_wrong_frame_is_named(room, changes, said):

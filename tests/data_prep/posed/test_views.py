@@ -5,46 +5,19 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
-from posed_files import PosedRoom, furniture
+from posed_files import SET, PosedRoom, furniture, in_room, overlaps, prepared
 
 from data_prep.inspection.checks import array_problems, mask_problems
-from data_prep.inspection.projection import box_iou_2d, boxes_around, hull_of
 from data_prep.posed.cameras import cameras_in_room, seems_up, upright_cameras
 from data_prep.posed.transforms import read_recording
-from data_prep.posed.views import PosedSettings, prepare_posed
-from data_prep.upright import own_sides
+from data_prep.posed.views import PosedSettings
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-
-SET = "void,bed,chair"
 
 
 @pytest.fixture
 def room(tmp_path):
     return PosedRoom(tmp_path / "room")
-
-
-def prepared(room, **settings):
-    return prepare_posed(read_recording(room.folder), SET, PosedSettings(**settings))
-
-
-def overlaps(views, corners):
-    """IoU of the boxes round projected corners (in the room frame) with those of whole masks."""
-    height, width = views.image_size
-    found = []
-    for k, points in enumerate(corners):
-        boxes = boxes_around(hull_of(points), views.world_to_camera, views.intrinsics)
-        iou = box_iou_2d(boxes, views.boxes[:, k] * np.array([width, height, width, height]))
-        found += iou[own_sides(views, views.image_size).all(axis=-1)[:, k]].tolist()
-    return np.array(found)
-
-
-def in_room(room, center=(0.1, -0.2), floor=0.0, scale=1.0):
-    """Corners of bed and chair in the room frame: (x, y, z) with z up -> (x, z, -y)."""
-    return [
-        np.stack([c[:, 0] - center[0], c[:, 2] - floor, -(c[:, 1] - center[1])], axis=1) * scale
-        for c in (thing.corners for thing in room.things[:2])
-    ]
 
 
 def check(views):
@@ -258,7 +231,6 @@ def test_all_frames_of_a_room_have_one_size(room):
     [
         ({"up": "x"}, "up is 'x'; choose from auto, z, y, cameras."),
         ({"max_side": 0}, "max_side is 0; it counts from 1."),
-        ({"max_views": 0}, "max_views is 0; it counts from 1."),
         ({"camera_height_m": 0.0}, "camera_height_m is 0.0; it must be above 0."),
         ({"metres_per_unit": float("inf")}, "metres_per_unit is inf; it must be above 0."),
         ({"floor_m": float("nan")}, "floor_m is nan; expected a height in metres."),

@@ -9,15 +9,12 @@ from scan_files import BOX_FACES, write_ply
 from data_prep.scannet.annotations import (
     Group,
     axis_alignment,
-    object_parts,
     read_groups,
     read_mesh,
     read_properties,
     read_segments,
-    surface_of,
 )
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Mesh
 
 
 @pytest.fixture
@@ -50,12 +47,10 @@ def test_alignment_is_row_major_and_may_be_absent(tmp_path):
     ("numbers", "words"),
     [
         ("1 0 0", "axisAlignment is 3 words, expected 16 numbers"),
-        ("x " * 16, "axisAlignment is 16 words, expected 16 numbers"),
         ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 nan", "it holds NaN or infinity; the file is damaged"),
         ("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", "its axes have the length 2, expected 1"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1", "it is left-handed, a mirror"),
         ("1 0 0 0 0 1 0 0 0 0 1 0 1 0 0 1", "it is transposed: its translation is in the last row"),
-        ("inf 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "it holds NaN or infinity"),
     ],
 )
 def test_alignments_that_are_none(tmp_path, numbers, words):
@@ -81,16 +76,10 @@ def test_an_object_listed_twice_is_joined_and_told(write):
     ("data", "words"),
     [
         ({}, "KeyError: 'segGroups'"),
-        ([1], "TypeError"),
-        (None, "TypeError"),
-        ({"segGroups": None}, "TypeError"),
         ({"segGroups": [{"objectId": 1}]}, "KeyError: 'label'"),
         ({"segGroups": [group(-1)]}, "objectId -1 with label 'chair'"),
-        ({"segGroups": [group(1.5)]}, "objectId 1.5 with"),
-        ({"segGroups": [group(True)]}, "objectId True with"),
         ({"segGroups": [group(1, None)]}, "objectId 1 with label None"),
         ({"segGroups": [group(1, segments=["x"])]}, "segments of object 1 are not all whole"),
-        ({"segGroups": [group(1, segments=[[3]])]}, "TypeError"),
     ],
 )
 def test_aggregations_that_are_none(write, data, words):
@@ -102,11 +91,7 @@ def test_aggregations_that_are_none(write, data, words):
     ("data", "words"),
     [
         ({}, "KeyError: 'segIndices'"),
-        ([], "TypeError"),
         ({"segIndices": [1.5, 2]}, "segIndices is not a list of whole numbers"),
-        ({"segIndices": [10**30]}, "segIndices is not a list of whole numbers"),
-        ({"segIndices": [[1], [2, 3]]}, "ValueError"),
-        ({"segIndices": 4}, "segIndices is not a list"),
         ({"segIndices": []}, "segIndices is not a list of whole numbers"),
     ],
 )
@@ -130,27 +115,12 @@ def test_json_that_is_missing_or_cut(write, read, tmp_path):
         read(tmp_path / "none.json")
 
 
-def test_a_scan_without_annotations_says_so(tmp_path):
-    with pytest.raises(InputError, match=r"a scan without annotations .* cannot be prepared"):
-        read_groups(tmp_path / "a.json")
-
-
 def test_properties_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"a\.txt cannot be read .No such file"):
         read_properties(tmp_path / "a.txt")
     (tmp_path / "a.txt").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match=r"a\.txt cannot be read .*utf-8"):
         read_properties(tmp_path / "a.txt")
-
-
-def test_vertices_keep_their_number_and_order(tmp_path, rng):
-    """Also those that lie on each other, and those of no triangle."""
-    vertices = rng.normal(size=(20, 3)).astype(np.float32)
-    vertices[7] = vertices[3]
-    faces = np.array([(3, 4, 5), (7, 8, 9)])
-    mesh = read_mesh(write_ply(tmp_path / "a.ply", vertices, faces))
-    np.testing.assert_array_equal(mesh.vertices_m, vertices)
-    np.testing.assert_array_equal(mesh.faces, faces)
 
 
 def test_a_mesh_that_is_missing_damaged_or_cut(tmp_path, rng):
@@ -186,25 +156,3 @@ def test_triangles_of_vertices_that_are_not_there(tmp_path, rng):
     faces = np.array([(0, 1, 2), (0, 1, 8)])
     with pytest.raises(InputError, match=r"a\.ply has triangles of vertices it lacks"):
         read_mesh(write_ply(tmp_path / "a.ply", rng.normal(size=(8, 3)), faces))
-
-
-def test_parts_are_those_of_each_objects_segments():
-    segments = np.array([7] * 4 + [9] * 4 + [3] * 8 + [1])
-    groups = [
-        Group(0, "chair", frozenset({9, 7, 1000})),
-        Group(1, "bed", frozenset({1000})),
-        Group(2, "bed", frozenset({3, 9})),
-        Group(3, "bed", frozenset()),
-    ]
-    whole, none, joined, empty = object_parts(groups, segments)
-    assert sorted(whole) == [*range(8)] and not len(none) and not len(empty)
-    assert sorted(joined) == [*range(4, 16)]
-
-
-def test_a_parts_surface_is_its_whole_triangles(rng):
-    vertices = rng.normal(size=(16, 3))
-    faces = np.concatenate([BOX_FACES, BOX_FACES + 8, [(7, 8, 9)]])
-    mesh = surface_of(Mesh(vertices, faces), np.arange(8, 16))
-    np.testing.assert_array_equal(mesh.vertices_m[mesh.faces], vertices[BOX_FACES + 8])
-    assert len(mesh.vertices_m) == 8
-    assert surface_of(Mesh(vertices, faces), np.array([0, 7])) is None

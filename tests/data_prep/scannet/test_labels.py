@@ -3,8 +3,7 @@
 import pytest
 from scan_files import TABLE, write_table
 
-from data_prep.scannet.labels import SHELL, read_labels
-from sceneprior.core.classes import label_set
+from data_prep.scannet.labels import read_labels
 from sceneprior.core.errors import InputError
 
 
@@ -35,10 +34,6 @@ def test_columns_are_found_by_name(tmp_path):
     rows = [("nyu40class", "x", "raw_category"), ("bed", "1", 'a 12" bed'), ("sofa",)]
     labels = read_labels(write_table(tmp_path / "a.tsv", rows))
     assert labels.nyu40 == {'a 12" bed': "bed"} and labels.source == "a.tsv"
-
-
-def test_the_shell_has_no_class():
-    assert not SHELL & set(label_set("scannet"))
 
 
 @pytest.mark.parametrize(

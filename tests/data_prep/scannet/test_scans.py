@@ -97,13 +97,6 @@ def scan_mask(scan, frame):
     return png(scan.mask(frame, (242, 324)))
 
 
-def test_where_no_object_has_a_class_the_mesh_is_the_room(scan, labels):
-    for box in scan.boxes:
-        box.category = "backpack"
-    read = read_scan(scan.write().folder, labels, EVERY)
-    np.testing.assert_allclose(read.instances[0].lower_m, (-2, 0, -2.5), atol=2e-6)
-
-
 @pytest.mark.parametrize(
     ("ending", "words"),
     [
@@ -160,7 +153,6 @@ def test_masks_of_another_shape_than_the_colour_frames(scan, labels):
     [
         ({"masks": "best"}, "masks is 'best'; choose filt or raw"),
         ({"frame_step": 0}, "frame_step is 0; it counts from 1"),
-        ({"max_views": -1}, "max_views is -1"),
     ],
 )
 def test_settings_that_mean_nothing(change, words):

@@ -1,6 +1,5 @@
 """Recordings written to ScanNet's layout, whole, damaged and truncated."""
 
-import io
 import tracemalloc
 import zlib
 
@@ -45,13 +44,6 @@ def test_a_recording_comes_back_pose_by_pose(write, kind, encode):
     np.testing.assert_array_equal(sens.intrinsic_color, SCANNET_K)  # whole quarters in float32
 
 
-def test_lost_poses_stay_as_recorded(write):
-    lost = poses(2)
-    lost[1] = -np.inf
-    sens = read_recording(write(sens_bytes(lost, [b"", b""], SIZE)))
-    assert np.isneginf(sens.camera_to_world[1]).all()
-
-
 def test_a_recording_cut_anywhere_is_refused_by_name(write):
     data = sens_bytes(poses(3), [b"colour"] * 3, SIZE)
     whole = len(data) - 8  # the count of IMU records, of which we use none
@@ -94,9 +86,7 @@ def test_flipped_bytes_never_surprise(write, rng):
         ({"version": 3}, "header, byte 0: version 3, expected 4"),
         ({"kind": 7}, "compressions 7 .colour. and 1 .depth., expected 0, 1 or 2"),
         ({"size": (0, 32)}, "colour pictures of 32 x 0 .* cannot be"),
-        ({"size": (24, 1 << 31)}, "colour pictures of 2147483648 x 24 .* cannot be"),
         ({"K": np.full((4, 4), np.nan)}, "focal lengths are nan and nan"),
-        ({"K": np.diag([0.0, 5, 1, 1])}, "focal lengths are 0 and 5"),
     ],
 )
 def test_impossible_headers(write, change, words):
@@ -145,19 +135,3 @@ def test_a_file_that_changes_while_open(write):
 def test_a_missing_recording(tmp_path):
     with pytest.raises(InputError, match=r"a\.sens cannot be opened .No such file.*<scene>\.sens"):
         read_recording(tmp_path / "a.sens")
-
-
-def test_a_thousand_frames_stay_on_disk(tmp_path):
-    """Payloads of a megabyte are holes in the file: 1 GB that takes no room."""
-    path, payload = tmp_path / "big.sens", 1 << 20
-    with path.open("wb") as file:
-        file.write(sens_header(1000, SIZE))
-        for frame in range(1000):
-            file.write(frame_header(np.eye(4), frame, payload, 1000))
-            file.seek(payload + 1000, io.SEEK_CUR)
-        file.write(bytes(8))
-    tracemalloc.start()
-    assert len(read_recording(path).camera_to_world) == 1000
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert most < 400_000  # about 100 bytes a frame, and the Python around them

@@ -54,14 +54,6 @@ def test_lists_become_splits_and_the_rest_is_counted(source):
     assert source.expected is None
 
 
-def test_without_lists_a_space_is_in_one_half(source):
-    for seed in range(6):
-        rooms = survey(ScanNetSource(source.scans, source.labels, seed=seed)).rooms
-        assert [room.room_id for room in rooms] == IDS
-        assert rooms[0].split == rooms[1].split
-        assert {room.split for room in rooms} == {"train", "test"}
-
-
 def test_settings_follow_what_the_bytes_depend_on(source):
     before = source.settings(None)
     assert json.loads(json.dumps(before)) == source.settings(None) | {
@@ -117,3 +109,11 @@ def test_a_damaged_scan_fails_by_name_and_the_rest_goes_on(source, tmp_path):
     summary = build_shards(Job(official, tmp_path / "out", retry_failed=True))
     assert summary.statuses == {"prepared": 4}
     assert summary.report["counts"]["train"] == {"rooms": 3, "views": 15, "objects": 6}
+
+
+def test_without_lists_a_space_is_in_one_half(source):
+    for seed in range(6):
+        rooms = survey(ScanNetSource(source.scans, source.labels, seed=seed)).rooms
+        assert [room.room_id for room in rooms] == IDS
+        assert rooms[0].split == rooms[1].split
+        assert {room.split for room in rooms} == {"train", "test"}

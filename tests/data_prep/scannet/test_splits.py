@@ -2,7 +2,7 @@
 
 import pytest
 
-from data_prep.scannet.splits import find_scans, space_of, split_scans
+from data_prep.scannet.splits import find_scans, split_scans
 from sceneprior.core.errors import InputError
 
 
@@ -22,13 +22,6 @@ def lists(tmp_path, train, val):
     return tmp_path / "train.txt", tmp_path / "val.txt"
 
 
-NAMES = ["mine", "scene0000_00", "scene0000_01", "scene0001_00", "scene0002_00"]
-
-
-def test_scans_are_found_in_order_also_without_their_recording(scans):
-    assert [path.name for path in find_scans(scans)] == NAMES
-
-
 def test_the_lists_decide_and_the_rest_is_named(scans, tmp_path):
     train, val = lists(tmp_path, "scene0000_01\nscene0000_00\nscene0700_00\n\n", "scene0001_00\r\n")
     split_of, missing = split_scans(find_scans(scans), train, val)
@@ -37,10 +30,6 @@ def test_the_lists_decide_and_the_rest_is_named(scans, tmp_path):
     }  # fmt: skip
     assert list(split_of) == sorted(split_of) and missing == ["scene0700_00"]
     assert split_scans(find_scans(scans), None, val)[0] == {"scene0001_00": "test"}
-
-
-def test_a_space_is_scanned_more_than_once():
-    assert [space_of(name) for name in NAMES[:3]] == ["mine", "scene0000", "scene0000"]
 
 
 def test_lists_that_are_none(scans, tmp_path):

@@ -53,38 +53,6 @@ def test_a_unit_box_covers_exactly_its_projection(renderer):
     assert (ids[37:59, 58:81] == 1).all()
 
 
-def test_up_is_up_and_right_is_right(renderer):
-    right, below = box((1, 0, 5), (0.2, 0.2, 0.2)), box((0, 1, 5), (0.2, 0.2, 0.2))
-    ids = renderer.instance_ids([right, below], Pinhole(np.eye(4), INTRINSICS), SIZE)
-    assert ids[48, 64 + 20] == 1 and ids[48 + 20, 64] == 2
-    assert set(np.unique(ids)) == {0, 1, 2}
-
-
-def test_an_off_centre_principal_point_is_honoured(renderer):
-    K = np.array([[90.0, 0, 40], [0, 110, 60], [0, 0, 1]])
-    ids = renderer.instance_ids([box((1, -1, 5), (0.1, 0.1, 0.1))], Pinhole(np.eye(4), K), SIZE)
-    x1, y1, x2, y2 = bounds(ids == 1)
-    assert abs((x1 + x2) / 2 - (40 + 90 / 5)) <= 1 and abs((y1 + y2) / 2 - (60 - 110 / 5)) <= 1
-
-
-def test_near_hides_far_and_order_does_not_matter(renderer):
-    near, far = box((0, 0, 3), (0.5, 0.5, 0.1)), box((0, 0, 5), (2, 2, 0.1))
-    camera = Pinhole(np.eye(4), INTRINSICS)
-    one = renderer.instance_ids([near, far], camera, SIZE)
-    other = renderer.instance_ids([far, near], camera, SIZE)
-    assert one[48, 64] == 1 and one[48, 64 + 15] == 2
-    np.testing.assert_array_equal(one, np.array([0, 2, 1])[other])
-
-
-def test_inside_out_meshes_are_seen(renderer):
-    camera = Pinhole(np.eye(4), INTRINSICS)
-    one = renderer.instance_ids([box((0, 0, 3), (1, 1, 1))], camera, SIZE)
-    other = renderer.instance_ids([box((0, 0, 3), (1, 1, 1), inside_out=True)], camera, SIZE)
-    np.testing.assert_array_equal(one, other)
-    # From inside a box, every pixel sees it.
-    assert (renderer.instance_ids([box((0, 0, 0), (4, 4, 4))], camera, SIZE) == 1).all()
-
-
 def test_equally_near_faces_go_to_the_first_mesh(renderer):
     wall = box((0, 0, 3), (9, 9, 0.1))
     ids = renderer.instance_ids([wall, wall], Pinhole(np.eye(4), INTRINSICS), SIZE)
@@ -98,14 +66,6 @@ def test_many_ids_and_empty_meshes(renderer):
     assert set(np.unique(ids)) == {0, 700}
     nothing = renderer.instance_ids_of_views([], [Pinhole(np.eye(4), INTRINSICS)] * 2, SIZE)
     assert nothing.shape == (2, *SIZE) and not nothing.any()
-
-
-def test_orthographic_top_down(renderer):
-    # Camera 3 m up, looking along -y: image right is +x, image down is +z.
-    down = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 3], [0, 0, 0, 1]])
-    piece = box((0.5, 0.5, 1.0), (1.0, 1.0, 0.4))
-    ids = renderer.instance_ids([piece], Orthographic(down, 0.05), (64, 64))
-    assert bounds(ids == 1) == (32, 32 + 16, 32 + 20, 32 + 24)
 
 
 def test_several_sizes_one_after_the_other(renderer):
@@ -230,18 +190,6 @@ def test_one_pyrender_a_process_and_none_after_a_fork():
         "raise SystemExit(os.waitstatus_to_exitcode(os.wait()[1]))\n"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-def test_who_draws_nothing_does_not_pay_for_numba():
-    code = (
-        "import sys, data_prep.engine.build, sceneprior.render.offscreen as o\n"
-        "o.open_renderer('software')\n"
-        "print('numba' in sys.modules)"
-    )
-    answer = subprocess.run(
-        [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=os.environ
-    )
-    assert answer.stdout.strip() == "False"
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")

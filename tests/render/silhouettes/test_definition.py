@@ -8,7 +8,6 @@ import torch
 from references.silhouettes import composite_loop, exact_loop
 from silhouette_scenes import (
     COMPOSITING,
-    FRONT,
     MODES,
     SIZE,
     random_scene,
@@ -70,22 +69,6 @@ def test_half_covered_on_the_edge_and_27_percent_at_root_sigma(backend):
         np.testing.assert_allclose(middle[11:22].numpy(), expected, rtol=1e-12)
         assert middle[9] == 0  # 7 px out; the blur radius is 6.07 px
         assert math.isclose(middle[14], 1 / (1 + math.e), rel_tol=1e-12)
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_faces_that_reach_behind_the_near_plane_are_left_out_alone(mode, backend):
-    scene = random_scene(11, rooms=1, objects=1, views=1, corners=30, faces=10, spread=0)
-    scene["world_to_camera"] = FRONT
-    scene["faces"] = torch.arange(30).reshape(10, 3)
-    kept = (scene["vertices_m"][0, 0, :, 2].reshape(10, 3) > NEAR_FACE_M).all(dim=1)
-    assert 0 < kept.sum() < 10
-    options = {"sigma_px2": 0.5, "mode": mode, "backend": backend}
-    whole = render_scene(**scene, **options)
-    part = render_scene(**scene | {"faces": scene["faces"][kept]}, **options)
-    assert whole.masks.max() > 0.5
-    for one, other in zip(whole, part, strict=True):
-        assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -3,82 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from references.silhouettes import composite_loop
 from silhouette_scenes import COMPOSITING, MODES, one_triangle_over_another, triangles
 from torch.testing import assert_close
 
-from sceneprior.render.silhouettes import reference
-from sceneprior.render.silhouettes.cpu import compositing
-from sceneprior.render.silhouettes.cpu.windows import Windows
 from sceneprior.render.silhouettes.render import render_scene, render_silhouettes
 
 IMAGES, OBJECTS, HEIGHT, WIDTH = 2, 4, 3, 11
-STRIPS = 2
-
-
-def random_layers(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Coverage, depth and whether a face contains the pixel; a third of the pixels untouched,
-    and some depths equal."""
-    rng = np.random.default_rng(seed)
-    shape = (IMAGES, OBJECTS, HEIGHT, WIDTH)
-    z = np.where(rng.random(shape) < 0.3, 2.0, rng.uniform(1, 4, shape))
-    z[rng.random(shape) < 0.3] = np.inf
-    inside = (rng.random(shape) < 0.5) & np.isfinite(z)
-    coverage = np.where(np.isfinite(z), rng.uniform(0.05, 0.95, shape), 0.0)
-    return coverage, z, inside
-
-
-def pack(dense: np.ndarray, fill: float) -> np.ndarray:
-    """Images as windows that are the whole image: strips of eight columns, row by row."""
-    wide = np.full((*dense.shape[:-1], STRIPS * 8), fill)
-    wide[..., :WIDTH] = dense
-    return wide.reshape(-1, HEIGHT, STRIPS, 8).transpose(0, 2, 1, 3).ravel()
-
-
-def whole_windows() -> Windows:
-    meshes = IMAGES * OBJECTS
-    bounds = np.tile(np.array([0, HEIGHT, 0, STRIPS], dtype=np.int32), (meshes, 1))
-    return Windows(bounds, np.arange(meshes + 1) * (HEIGHT * STRIPS * 8))
-
-
-@pytest.mark.parametrize("way", COMPOSITING)
-def test_compositing_and_its_gradient_are_the_definitions(way):
-    coverage, z, inside = random_layers(0)
-    odds = pack(1 / (1 - coverage), 1.0)
-    # Larger is nearer: 1 / z inside, -z in the halo, -inf untouched.
-    order = pack(np.where(inside, 1 / z, -z), -np.inf)
-    drawn = compositing.compose(odds, order, whole_windows(), way, coverage.shape)
-    visible, front, front_depth = drawn
-    assert front.dtype == np.int32
-
-    wanted = composite_loop(coverage, z, way)
-    np.testing.assert_allclose(visible, wanted, rtol=0, atol=1e-14)
-    alpha = torch.from_numpy(coverage).requires_grad_()
-    masks = reference.composite(alpha, torch.from_numpy(z), way)
-    np.testing.assert_allclose(masks.detach().numpy(), wanted, rtol=0, atol=1e-14)
-    contained = np.where(inside, z, np.inf)
-    nearest = contained.min(axis=1)
-    np.testing.assert_allclose(front_depth, nearest, rtol=1e-15)
-    ids = np.where(np.isfinite(nearest), contained.argmin(axis=1), -1)
-    first, second = np.sort(contained, axis=1)[:, :2].swapaxes(0, 1)
-    assert ((first == second) & np.isfinite(first)).any()  # some are equal
-    np.testing.assert_array_equal(front, ids)  # of equals, the first
-
-    upstream = np.random.default_rng(1).normal(size=coverage.shape)
-    masks.backward(torch.from_numpy(upstream))
-    packed = compositing.compose_backward(odds, order, whole_windows(), way, upstream)
-    # `packed` has the chance to miss in it: d coverage / d x = missed * sigmoid(x).
-    wanted = pack(np.where(np.isfinite(z), alpha.grad.numpy() * (1 - coverage), 0), 0.0)
-    touched = order > -np.inf
-    np.testing.assert_allclose(packed[touched], wanted[touched], rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("way", COMPOSITING)
-def test_the_references_compositing_passes_gradcheck(way):
-    coverage, z, _ = random_layers(2)
-    alpha = torch.from_numpy(coverage[:1, :, :2, :5]).clamp(min=1e-3).requires_grad_()
-    depth = torch.from_numpy(z[:1, :, :2, :5])
-    assert torch.autograd.gradcheck(lambda a: reference.composite(a, depth, way), (alpha,))
 
 
 @pytest.mark.parametrize("mode", MODES)

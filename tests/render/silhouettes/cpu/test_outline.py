@@ -134,18 +134,6 @@ def test_where_contours_cross_only_the_pieces_around_the_crossing_differ(
     assert difference.max() < 0.5
 
 
-def test_a_hole_is_seen_through_and_its_rim_is_soft():
-    points, faces = torus(0.3)
-    scene = seen_ahead((points + AHEAD)[None], faces, SIZE, FOCAL_PX)
-    shape, _ = shape_seen(scene)
-    (hole,) = shape.interiors
-    u, v = (int(x) for x in shapely.Polygon(hole).centroid.coords[0])
-    mask = render_silhouettes(**scene, mode="fast", sigma_px2=0.5)[0, 0, 0]
-    assert mask[v, u] == 0 and shapely.Polygon(hole).area > 100
-    across = mask[v, u : u + 15]
-    assert across.max() > 0.99 and ((across > 0.01) & (across < 0.99)).sum() >= 2
-
-
 def test_one_large_triangle_is_the_exact_modes():
     # One face has no inner edges. Beyond the blur radius inside, exact is within 1e-4 of 1.
     scene = triangles([[-0.9, -0.6, 1.5], [0.95, -0.3, 1.1], [-0.1, 0.8, 1.9]])
@@ -160,23 +148,6 @@ def test_one_large_triangle_is_the_exact_modes():
         wide = {"sigma_px2": 0.8, "blur_ndc": 9.0, "backend": backend}  # 1296 px2: no end
         exact, fast = (render_silhouettes(**scene, mode=m, **wide) for m in ("exact", "fast"))
         torch.testing.assert_close(fast, exact, rtol=0, atol=1e-12)
-
-
-def test_a_finer_mesh_fattens_the_exact_mask_and_not_the_fast_one():
-    areas = {"exact": [], "fast": []}
-    for level in (1, 2, 3, 4):
-        sphere, faces = icosphere(level)
-        scene = seen_ahead((sphere + AHEAD)[None], faces, SIZE, FOCAL_PX)
-        shape, _ = shape_seen(scene)
-        for mode, ratios in areas.items():
-            masks = render_silhouettes(**scene, mode=mode, sigma_px2=1.0)
-            ratios.append(float(masks.sum()) / shape.area)
-    # A rim of sigmoid(+-d2) around a disc of radius r: the ring outside is longer than inside,
-    # pi * sigma * log(2) * 2 px2 of 628. Seen 1.0068 to 1.0076; exact 1.17, 1.21, 1.25, 1.29.
-    assert all(1 < ratio < 1.01 for ratio in areas["fast"])
-    assert max(areas["fast"]) - min(areas["fast"]) < 1e-3
-    assert areas["exact"] == sorted(areas["exact"])
-    assert areas["exact"][0] > 1.15 and areas["exact"][-1] > areas["exact"][0] + 0.08
 
 
 @pytest.mark.parametrize(

@@ -1,31 +1,10 @@
 """The compiled projection against `geometry.cameras.project`, and cameras that move."""
 
 import pytest
-import torch
-from silhouette_scenes import MODES, cast, random_scene
+from silhouette_scenes import MODES, random_scene
 from torch.testing import assert_close
 
-from sceneprior.core.geometry.cameras import MIN_DEPTH_M, project
-from sceneprior.render.silhouettes.cpu.projection import project_in_threads
 from sceneprior.render.silhouettes.render import render_silhouettes
-
-
-@pytest.mark.parametrize(("dtype", "to"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
-def test_pixels_depths_and_gradients_are_the_plain_projections(dtype, to):
-    scene = cast(random_scene(48, rooms=2, objects=3, views=3), dtype)
-    cameras = (scene["world_to_camera"], scene["intrinsics"])
-    mine, plain = (scene["vertices_m"].clone().requires_grad_() for _ in range(2))
-    pixels, depths = project_in_threads(mine, *cameras)
-    wanted = project(plain, *cameras).flatten(0, 1)
-    assert (depths < MIN_DEPTH_M).any() and (depths > MIN_DEPTH_M).any()
-    assert not depths.requires_grad
-    scale = wanted.detach().abs().max()
-    assert_close(pixels, wanted[..., :2], rtol=to, atol=to * float(scale))
-    assert_close(depths, wanted[..., 2], rtol=to, atol=to)
-    upstream = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0)).to(dtype)
-    (pixels * upstream).sum().backward()
-    (wanted[..., :2] * upstream).sum().backward()
-    assert_close(mine.grad, plain.grad, rtol=to, atol=to * float(plain.grad.abs().max()))
 
 
 @pytest.mark.parametrize("mode", MODES)
