@@ -1,7 +1,5 @@
 """The baselines with 3D supervision: what they learn, and what they refuse."""
 
-import shutil
-
 import pytest
 import torch
 from tiny_runs import tiny_baseline
@@ -138,22 +136,3 @@ def test_what_does_not_fit_is_a_sentence(baseline_config, method, tmp_path):
         baseline_config("atiss", model__heads=3)
     with pytest.raises(ConfigError, match="'model': width 36 is not a multiple of 8"):
         baseline_config("sync2gen", model__width=36)
-
-
-def test_refinement_acts_on_sampling_alone(toy_shards, tmp_path):
-    """One training serves both of the paper's rows, Sync2Gen and Sync2Gen*."""
-    fit(
-        tiny_baseline(toy_shards, "sync2gen", model__refine_steps=40),
-        tmp_path / "run",
-        trainer_options=CPU,
-    )
-    plain = shutil.copytree(tmp_path / "run", tmp_path / "plain")
-    text = (plain / "config.yaml").read_text()
-    assert "refine_steps: 40" in text
-    (plain / "config.yaml").write_text(text.replace("refine_steps: 40", "refine_steps: 0"))
-    refined, decoded = (
-        load_any_run(tmp_path / name).prior.sample(20, 0) for name in ("run", "plain")
-    )
-    assert torch.equal(refined.object_class, decoded.object_class)
-    assert torch.equal(refined.boxes_m[..., 3:], decoded.boxes_m[..., 3:])
-    assert not torch.equal(refined.boxes_m, decoded.boxes_m)

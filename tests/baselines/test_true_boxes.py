@@ -1,9 +1,6 @@
 """True boxes as batches: what they say, how rooms turn, and who may read them."""
 
-import ast
 import shutil
-from collections import defaultdict
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -14,11 +11,8 @@ from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.core.data.dataset import BLANK, ViewDataset
 from sceneprior.core.errors import ShardError
 from sceneprior.core.geometry.corners import box_corners
-from sceneprior.core.geometry.turns import turn_boxes
 from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.training.fit import fit
-
-PACKAGE = Path(__file__).parents[2] / "sceneprior"
 
 
 def test_a_batch_says_what_the_shards_say(toy_shards):
@@ -81,17 +75,6 @@ def test_fronts_turn_with_their_pieces(toy_shards, torch_rng):
         np.testing.assert_allclose(fronts[turn, there], wanted[there], atol=1e-6)
 
 
-def test_four_quarters_are_none(torch_rng):
-    boxes_m = torch.rand(5, 3, 6, generator=torch_rng)
-    again = boxes_m
-    for _ in range(4):
-        again = turn_boxes(again, torch.ones(5, dtype=torch.long))
-    assert torch.equal(again, boxes_m)
-    assert torch.equal(turn_boxes(boxes_m, torch.full((5,), 3)), turn_boxes(
-        turn_boxes(boxes_m, torch.full((5,), 2)), torch.full((5,), 1)
-    ))  # fmt: skip
-
-
 def test_a_process_without_a_room_of_its_own_gets_nothing_in_no_room(toy_shards):
     batch = TruthDataset(toy_shards, "train").__getitems__([(3, BLANK)])
     assert batch.room_ids == () and not batch.is_object.any() and not batch.object_class.any()
@@ -117,27 +100,3 @@ def test_methods_under_2d_supervision_never_read_it(baseline_config, tmp_path, m
     changes = {"layout": None} if "one stage" in method else {}
     config = baseline_config(method.split()[0], **changes)
     fit(config, tmp_path / "run", trainer_options={"accelerator": "cpu"})
-
-
-def test_only_baselines_with_3d_supervision_read_the_ground_truth():
-    """By the imports of the whole package: evaluation reads it; retrieval reads the classes of CAD
-    models; of what trains, one module reads boxes, and one reads views with true meshes."""
-    importers = defaultdict(set)
-    for path in PACKAGE.rglob("*.py"):
-        name = path.relative_to(PACKAGE).as_posix()
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Attribute) and node.attr == "read_ground_truth":
-                importers[node.attr].add(name)
-            if isinstance(node, ast.ImportFrom):
-                importers[node.module].add(name)
-                for alias in node.names:
-                    importers[alias.name].add(name)
-    assert importers["read_ground_truth"] == {
-        "baselines/true_boxes.py", "core/ground_truth.py", "apps/retrieval/cad_models.py"
-    }  # fmt: skip
-    trains = ("paper/", "lifted/", "training/", "baselines/")
-    readers = {n for n in importers["sceneprior.core.ground_truth"] if n.startswith(trains)}
-    views = "baselines/single_view"
-    assert readers == {f"{views}/truth.py", "lifted/reconstruction/known_rooms.py"}
-    assert importers["TruthDataset"] == {"baselines/box_training.py"}
-    assert importers["TrueViewDataset"] == {f"{views}/total3d.py"}

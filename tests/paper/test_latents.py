@@ -25,17 +25,6 @@ def test_latents_are_positive_mixtures_of_unit_anchors_on_the_unit_sphere(torch_
         assert_close(z[room].double(), mixed / mixed.norm(), rtol=0, atol=1e-6)
 
 
-def test_one_overwhelming_logit_is_its_anchor():
-    sphere = LatentSphere(7, 12)
-    assert_close(sphere(50 * torch.eye(7)), sphere.anchors, rtol=0, atol=1e-6)
-
-
-def test_a_constant_added_to_all_logits_changes_nothing(torch_rng):
-    sphere = LatentSphere(7, 12).double()
-    logits = torch.randn(5, 7, generator=torch_rng, dtype=torch.float64)
-    assert_close(sphere(logits + 3.5), sphere(logits), rtol=0, atol=1e-14)
-
-
 def test_anchors_come_from_the_seed_and_travel_with_the_model():
     assert torch.equal(LatentSphere(7, 12, 3).anchors, LatentSphere(7, 12, 3).anchors)
     assert not torch.equal(LatentSphere(7, 12, 3).anchors, LatentSphere(7, 12, 4).anchors)

@@ -239,16 +239,6 @@ def test_a_loss_that_is_no_number_names_its_rooms(toy_shards, tmp_path, monkeypa
     assert not list((tmp_path / "run").rglob("*.ckpt"))  # after an error, nothing is saved
 
 
-def test_a_shape_stage_that_is_no_number_names_its_rooms(toy_run, toy_shards, tmp_path):
-    run = shutil.copytree(toy_run, tmp_path / "run")
-    shutil.rmtree(run / "shape")
-    saved = read_checkpoint(run / "layout" / "final.ckpt")
-    saved["state_dict"]["latents.weight"][4] = torch.nan
-    torch.save(saved, run / "layout" / "final.ckpt")
-    with pytest.raises(FloatingPointError, match=r"The loss is nan on rooms .*toy/train_04"):
-        fit(tiny_config(toy_shards, layout__epochs=20), run, resume=True, trainer_options=CPU)
-
-
 def test_settings_and_shards_that_do_not_fit_are_sentences(toy_run, toy_shards, tmp_path):
     config = tiny_config(toy_shards, layout__epochs=20)
     with pytest.raises(InputError) as error:
@@ -280,14 +270,6 @@ def test_the_label_set_of_the_shards_is_the_runs(toy_shards, tmp_path):
     fit(config, tmp_path / "run", resume=True, trainer_options=CPU)  # no other settings
     with pytest.raises(InputError, match="No folder of shards at"):
         tiny_config(tmp_path / "none", label_set="shards").with_label_set()
-
-
-def test_a_run_refused_can_be_started_again_without_resume(toy_shards, tmp_path):
-    """Nothing half-written: a refused run leaves no folder that the next try trips over."""
-    for changes in ({"data__shards": str(tmp_path / "none")}, {"model__max_objects": 3}):
-        with pytest.raises(InputError):
-            fit(tiny_config(toy_shards, **changes), tmp_path / "run")
-        assert not (tmp_path / "run").exists()
 
 
 def test_damaged_or_foreign_checkpoints_are_sentences(toy_run, tmp_path):

@@ -12,7 +12,6 @@ from tiny_runs import tiny_config, write_tiny_config
 from torch.testing import assert_close
 from toy_rooms import write_toy_shards
 
-from sceneprior.paper.losses.averages import share_of_batch
 from sceneprior.training.checkpoints import read_checkpoint
 
 ROOT = Path(__file__).parents[2]
@@ -107,7 +106,3 @@ def test_a_loss_that_is_no_number_in_one_process_stops_both(runs):
     assert f"toy/train_{POISON:02d}" in said[0] and said[0].count("toy/train_") <= 3
     assert (folder / "poisoned" / "layout" / "final.ckpt").is_file()
     assert not list(folder.glob("poisoned/shape/*.ckpt"))
-
-
-def test_alone_a_mean_is_taken_as_it_is():
-    assert share_of_batch(torch.tensor(0)) == share_of_batch(torch.tensor(5)) == 1

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 from tiny_runs import tiny_config, tiny_lifted
-from torch.testing import assert_close
 
 from sceneprior.apps.config import load_run
 from sceneprior.apps.decoders import AnyPaperModel
@@ -18,13 +17,11 @@ from sceneprior.apps.experiments.evaluate import (
     unfold,
 )
 from sceneprior.apps.sample import sample_rooms
-from sceneprior.baselines.lstm import SceneLstm
 from sceneprior.core.overlaps import match_scenes
 from sceneprior.evaluation.synthesis import EvalOptions
 from sceneprior.lifted.lifting import dataset as lifted
 from sceneprior.lifted.prototypes import Prototypes
 from sceneprior.paper.decode import decode_training_rooms
-from sceneprior.paper.latents import LatentCube
 from sceneprior.paper.sampling import DISTRIBUTIONS
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import RollingCheckpoint
@@ -162,35 +159,6 @@ def test_a_variant_is_judged(toy_shards, tmp_path, name):
     matches = [match_scenes(*pair) for pair in decoded_and_true(load_run(run), toy_shards)]
     overlap = sum(match.iou.sum() for match in matches) / sum(m.truth_count for m in matches)
     assert scores["box_iou_3d"] == pytest.approx(overlap, abs=1e-9) and 0 < overlap < 1
-
-
-def test_one_stage_begins_with_fresh_weights_and_leaves_no_layout_folder(toy_shards, tmp_path):
-    config = tiny_config(toy_shards, layout=None, shape__epochs=1, shape__learning_rate=1e-12,
-                         shape__latent_learning_rate=1e-12)  # fmt: skip
-    fit(config, tmp_path / "run", trainer_options=CPU)
-    assert not (tmp_path / "run" / "layout").exists()
-    trained = load_run(tmp_path / "run")
-    for mine, fresh in zip(
-        trained.prior.parameters(), config.build_prior().parameters(), strict=True
-    ):
-        assert_close(mine, fresh, rtol=0, atol=1e-9)
-
-
-def test_the_ablations_change_their_module_and_no_other_module(toy_shards):
-    plain = tiny_config(toy_shards).build_prior()
-    cube = tiny_config(toy_shards, model__latent_space={"name": "cube"}).build_prior()
-    lstm = tiny_config(toy_shards, model__decoder={"name": "lstm"}).build_prior()
-    assert isinstance(cube.latent_space, LatentCube) and isinstance(lstm.decoder, SceneLstm)
-
-    def shapes(prior, without):
-        return {
-            name: value.shape
-            for name, value in prior.state_dict().items()
-            if not name.startswith(without)
-        }
-
-    assert shapes(cube, "latent_space.") == shapes(plain, "latent_space.")
-    assert shapes(lstm, "decoder.") == shapes(plain, "decoder.")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 from PIL import Image
-from tiny_runs import tiny_baseline_settings, tiny_sampler_config, write_tiny_config
+from tiny_runs import tiny_baseline_settings, write_tiny_config
 
 from sceneprior.apps.config import load_any_run, load_config
 from sceneprior.apps.experiments.compare import (
@@ -104,12 +104,6 @@ def test_a_method_with_a_config_of_its_own_learns_from_the_same_rooms(written, t
     own.unlink()
     with pytest.raises(InputError, match=r"No config '.*gan\.yaml'"):
         load_comparison(str(tmp_path / "compare.yaml"))
-
-
-def test_the_shipped_comparison_has_every_method_of_the_paper():
-    comparison = load_comparison("compare/new_rooms_small.yaml")
-    wanted = {"paper", "lstm", "atiss2d", "gan", "atiss", "sync2gen", "c1", "c3", "views25"}
-    assert wanted < set(comparison.methods) and set(comparison.rooms) == {"bedroom", "living"}
 
 
 def test_a_part_keeps_the_order_and_names_what_there_is(written):
@@ -304,29 +298,6 @@ def test_a_truncated_file_is_a_sentence(begun, toy_shards, calls):
     assert "seed0/steps.json is damaged; delete it and run the same command" in failure
 
 
-def test_costs_of_a_run_add_up_and_are_unknown_after_a_kill(begun, toy_shards, calls):
-    folder = begun / "out" / "toy" / "ours" / "seed0"
-    (folder / "run" / "shape" / "final.ckpt").unlink()
-
-    def cpu_s():
-        return json.loads((folder / "steps.json").read_text())["fit"].get("cpu_s")
-
-    before = cpu_s()
-    again(begun, toy_shards)
-    assert cpu_s() == before + 2.5
-
-    def killed(arguments):
-        raise MemoryError
-
-    calls.before = killed
-    with pytest.raises(MemoryError):
-        again(begun, toy_shards)
-    assert cpu_s() is None
-    calls.before = lambda arguments: None
-    again(begun, toy_shards)
-    assert cpu_s() is None
-
-
 @pytest.mark.parametrize(
     ("name", "background"),
     [
@@ -393,19 +364,6 @@ def test_methods_without_latents_of_rooms_are_evaluated_once_by_their_own(writte
     assert step.name == "scores" and "--distribution" not in step.arguments
     with pytest.raises(InputError, match="distributions"):
         load_comparison(written(distributions=["anywhere"]))
-
-
-def test_a_run_with_a_sampler_is_first_evaluated_by_it(written, tmp_path):
-    own = tmp_path / "sampled.yaml"
-    settings = tiny_sampler_config(Path("elsewhere")).model_dump(mode="json", by_alias=True)
-    own.write_text(yaml.safe_dump(settings))
-    ours = {"config": str(own)}
-    comparison = load_comparison(written(methods={"ours": ours}))
-    (run,) = runs_of(comparison, Path())
-    steps = scoring_steps(comparison, run, 4, SOFTWARE)
-    assert [step.name for step in steps] == ["scores", "scores_paper", "scores_kernel"]
-    assert "--distribution" not in steps[0].arguments
-    assert steps[1].arguments[-1] == "paper"
 
 
 def test_the_large_comparison_loads_and_says_where_rooms_come_from():

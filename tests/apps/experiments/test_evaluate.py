@@ -130,19 +130,6 @@ def test_other_json_among_scenes_is_said(command, scenes, toy_shards, tmp_path):
     )
 
 
-def test_copies_are_warned_of_once_a_command(command, toy_run):
-    draw = ["--run", toy_run, "-n", 3, "--renderer", "software"]
-    for words in (
-        ["synthesize", *draw, "--out", "copies"],
-        ["eval-fid", *draw, "--resamples", 0, "--out", "s.json"],
-    ):
-        status, _, errors = command(*words, "--distribution", "kernel")
-        assert status == 0 and errors.count(f"Warning: {COPIES}\n") == 1, errors
-        assert "sample.py" not in errors
-    status, _, errors = command("synthesize", *draw, "--out", "new")
-    assert status == 0 and "Warning" not in errors
-
-
 def test_a_run_whose_rooms_are_copies_is_warned_of_wherever_it_draws(command, toy_run, tmp_path):
     shutil.copytree(toy_run, tmp_path / "run")
     config = tmp_path / "run" / "config.yaml"
@@ -209,30 +196,6 @@ def test_files_of_weights_and_references_are_checked_before_drawing(
     (tmp_path / "kept.npz").write_text("no")
     status, _, errors = command(*call, "--reference", "kept.npz")
     assert status == 2 and "kept.npz is no reference" in errors
-
-
-def test_boxes_are_converted_and_then_evaluated(command, toy_shards, tmp_path):
-    rng = np.random.default_rng(0)
-    for row in range(3):
-        np.savez(
-            tmp_path / f"{row}.npz",
-            class_labels=np.eye(23)[[8, 12]], translations=rng.uniform(0.5, 1, (2, 3)),
-            sizes=np.full((2, 3), 0.4), angles=rng.uniform(-3, 3, (2, 1)),
-        )  # fmt: skip
-    (tmp_path / "theirs").mkdir()
-    for path in tmp_path.glob("*.npz"):
-        path.rename(tmp_path / "theirs" / path.name)
-    call = ["export", "theirs", "--to", "scenes", "--out", "ours", "--label-set", "front3d_bedroom"]
-    assert command(*call)[:2] == (0, "Wrote 3 rooms to ours\n")
-    status, _, errors = command(*call)
-    assert status == 2 and "ours is not empty; add --overwrite" in errors
-    status, _, errors = command(
-        "eval-fid", "--scenes", "ours", "--shards", toy_shards, "--resamples", 0,
-        "--renderer", "software",
-    )  # fmt: skip
-    assert status == 0, errors
-    scores = json.loads((tmp_path / "ours" / "scores.json").read_text())
-    assert scores["mean_objects"] == 2 and scores["out_of_bounds_share"] is None
 
 
 def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from sceneprior.apps.experiments.makers import LIFTED, PAPER
-from sceneprior.apps.experiments.table import NEW_ROOMS, Row, as_csv, markdown, write_tables
+from sceneprior.apps.experiments.table import NEW_ROOMS, Row, as_csv, markdown
 
 PROTOCOL = {"n_generated": 200, "n_test": 38, "n_train_rooms": 149, "shards": "front"}
 
@@ -115,11 +115,6 @@ def test_what_nobody_knows_is_left_open(rows):
     assert lines[1]["cpu_s"] == "" and lines[1]["steps"] == "4500"
 
 
-def test_two_files_are_written(rows, tmp_path):
-    write_tables(rows, tmp_path / "new", NEW_ROOMS)
-    assert {p.name for p in (tmp_path / "new").iterdir()} == {"table.md", "table.csv"}
-
-
 def test_a_table_first_says_which_rows_are_the_papers_method_and_which_ours(rows):
     sampled = row("Lifted method: sampler", 0, 40.0, made_by=LIFTED)
     said = markdown([*rows, sampled], NEW_ROOMS).removeprefix("### Bedrooms\n\n")
@@ -132,17 +127,3 @@ def test_a_table_first_says_which_rows_are_the_papers_method_and_which_ours(rows
         line["made by"] for line in csv.DictReader(io.StringIO(as_csv([sampled], NEW_ROOMS)))
     ]
     assert made_by == ["the lifted method"]
-
-
-def test_groups_stand_in_the_order_of_their_ranks(rows):
-    last = [replace(one, group="copies", rank=9) for one in rows[:2]]
-    text = markdown([*last, *rows], NEW_ROOMS)
-    assert (
-        text.index("*from masks in 2D*") < text.index("*from boxes in 3D*") < text.index("*copies*")
-    )
-
-
-def test_scenes_have_no_seed(rows):
-    given = replace(rows[1], seed=None, title="Theirs")
-    assert "seeds 0, 1." in markdown([given, *rows], NEW_ROOMS)
-    assert next(csv.DictReader(io.StringIO(as_csv([given], NEW_ROOMS))))["seed"] == ""

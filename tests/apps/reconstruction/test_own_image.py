@@ -295,14 +295,3 @@ def test_classes_under_another_name_are_taken_for_the_label_sets(own):
     assert found[:2] == ["sofa", "double_bed"]
     known = {tidy(name) for each in (LABELS, "scannet") for name in label_set(each)}
     assert set(SAME_CLASS.values()) <= known
-
-
-def test_one_object_at_the_border(own, tmp_path):
-    """Its side there is not clear: it may go on beyond."""
-    mask, classes, pose = own
-    ids = np.zeros((72, 96), np.uint8)
-    ids[30:50, 80:] = 10
-    Image.fromarray(ids).save(mask)
-    (image,) = read_own_image(mask, classes, INTRINSICS, LABELS, pose).images
-    assert len(image.object_class) == 1
-    np.testing.assert_allclose(image.boxes[0], [80 / 96, 30 / 72, 1, 50 / 72])

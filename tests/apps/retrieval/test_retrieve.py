@@ -141,12 +141,6 @@ def test_the_fast_search_finds_the_winner_of_the_slow_one(rng):
         assert most_similar(item, models.by_class["sofa"]) == slow
 
 
-def test_without_a_mesh_the_box_is_compared(models):
-    made = retrieve(room(SceneObject("sofa", (0.0, 0.9, 0.0), (1.0, 0.6, 1.0))), models)
-    assert made.extra["retrieval"][0]["model_id"] == "plain"
-    assert made.objects[0].size_m == pytest.approx((1.0, 1.2, 1.0))
-
-
 def test_classes_without_models_keep_their_objects_and_the_report_says_so(models):
     own = Mesh(np.eye(3), np.array([[0, 1, 2]]))
     lamp = SceneObject("pendant_lamp", (0.0, 2.2, 0.0), (0.5, 0.5, 0.5), own)

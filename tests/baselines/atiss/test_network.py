@@ -113,16 +113,6 @@ def test_angles_that_look_alike_are_near_each_other(network):
     assert turn[1, 0] == turn[1, 4] and len(turn[1].unique()) == 4
 
 
-def test_rooms_are_sampled_by_their_seed(network):
-    network = network.float()
-    rooms = network.sample(40, 3)
-    again = network.sample(40, 3)
-    assert torch.equal(rooms.boxes_m, again.boxes_m)
-    assert torch.equal(rooms.object_class, again.object_class)
-    assert torch.equal(rooms.yaw_rad, again.yaw_rad) and len(rooms.yaw_rad.unique()) > 40
-    assert not torch.equal(rooms.is_object, network.sample(40, 4).is_object)
-
-
 def test_the_first_of_many_rooms_are_those_of_few(network):
     """In float64, where the last bits of another batch size are below 1e-10 on every processor; in
     float32 each object inherits the rounding of those before it."""

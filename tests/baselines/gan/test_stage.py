@@ -9,7 +9,7 @@ from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.baselines.gan.losses import adversarial_loss
 from sceneprior.baselines.gan.semantic_maps import observed_maps
-from sceneprior.baselines.gan.stage import MEMORY, GanStage
+from sceneprior.baselines.gan.stage import GanStage
 from sceneprior.core.data.dataset import ViewDataset
 from sceneprior.core.errors import InputError
 from sceneprior.paper.decode import decode_training_rooms
@@ -118,47 +118,3 @@ def test_a_discriminator_told_to_tell_apart_does_and_its_views_have_no_order(fre
     patches, room = judge(real.flip(1))
     assert_close(room, room_real, rtol=0, atol=1e-5)
     assert_close(patches.flip(1), judge(real)[0], rtol=0, atol=1e-5)
-
-
-def test_the_excess_is_a_running_mean_that_pushes_down(baseline_config, tmp_path, monkeypatch):
-    """Always two more objects of class 9 than real rooms have, and one less of class 4."""
-    more, less = torch.eye(22)[9] * 2, torch.eye(22)[4]
-    said = []
-
-    def draw(self, scenes, views):
-        maps, _ = drawn(self, scenes, views)
-        said.append(more + 0 * scenes.completeness_logits.sum(dim=1, keepdim=True))
-        said[-1].retain_grad()
-        return maps, said[-1]
-
-    def observed(views, _):
-        return less.expand(len(views.room_index), -1)
-
-    drawn = GanStage._draw
-    monkeypatch.setattr(GanStage, "_draw", draw)
-    monkeypatch.setattr("sceneprior.baselines.gan.stage.observed_counts", observed)
-    # Beside it the discriminator does not matter.
-    big = baseline_config("gan", training__counts=1e3, training__epochs=2)
-    fit(big, tmp_path / "run", trainer_options=CPU)
-    excess = read_checkpoint(tmp_path / "run" / "gan" / "final.ckpt")["state_dict"]["excess"]
-    assert_close(excess[:22], (1 - MEMORY ** len(said)) * (more - less), rtol=1e-4, atol=1e-5)
-    assert excess[22:].any()  # of pixels
-    assert (said[-1].grad[:, 9] > 0).all() and (said[-1].grad[:, 4] < 0).all()
-
-
-def test_rates_fall_evenly_to_nothing(baseline_config, tmp_path, monkeypatch):
-    seen = []
-
-    def note(self, optimizer, loss):
-        seen.append(optimizer.param_groups[0]["lr"])
-        step(self, optimizer, loss)
-
-    step = GanStage._update
-    monkeypatch.setattr(GanStage, "_update", note)
-    config = baseline_config("gan")
-    fit(config, tmp_path / "run", trainer_options=CPU)
-    rates = [config.training.discriminator_learning_rate, config.training.learning_rate]
-    for epoch, kept in enumerate((1, 0.75, 0.5, 0.25)):
-        batches = len(seen) // 4
-        here = seen[epoch * batches : (epoch + 1) * batches]
-        assert here[:2] == pytest.approx([rate * kept for rate in rates])

@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from tiny_runs import tiny_baseline
-from torch.testing import assert_close
 
 from sceneprior.baselines.single_view.detections import detections_of, some_views
 from sceneprior.baselines.single_view.usl import other_view_losses, silhouette_loss
@@ -61,19 +60,6 @@ def test_an_object_that_no_other_view_shows_teaches_nothing(views, stage):
     stage.zero_grad()
     losses = other_view_losses(found, *stage.prior(found), faces, nobody, stage.settings)
     assert {name: loss.item() for name, loss in losses.items()} == dict.fromkeys(losses, 0.0)
-
-
-def test_before_training_boxes_are_seen_as_large_as_their_masks(views, stage):
-    found = detections_of(some_views(views, slice(1)))
-    with torch.no_grad():
-        for layer in (stage.prior.box,):
-            layer.weight.zero_()
-        placed, vertices_m = stage.prior(found)
-    away = (placed.centers_m - found.eye_m).norm(dim=-1)
-    assert_close(away, torch.full_like(away, 3.0), rtol=0, atol=1e-4)
-    low, high = vertices_m.amin(dim=1), vertices_m.amax(dim=1)
-    assert_close((low + high) / 2, placed.centers_m, rtol=0, atol=1e-4)
-    assert_close(high - low, placed.sizes_m, rtol=0, atol=1e-4)
 
 
 def test_a_few_rooms_can_be_learnt_from_their_masks_alone(views, stage, toy_shards):

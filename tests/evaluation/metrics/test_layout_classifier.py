@@ -141,16 +141,6 @@ def test_both_sides_weigh_alike_and_no_judged_room_is_learnt_from(accuracy, rng,
     assert len(np.unique(fresh, axis=0)) == 200, "each judged once"
 
 
-def test_an_unbalanced_set_does_not_tip_the_classifier(rng):
-    """Without weights, 10 rooms among 120 that look the same would all be given to the 120."""
-    features = rng.normal(size=(130, 6))
-    labels = np.repeat([0, 1], [120, 10])
-    others = rng.normal(size=(400, 6))
-    share = boosted_trees(features, labels, others, 0).mean()
-    same = boosted_trees(features, labels, features, 0)
-    assert (same == labels).all() and share > 0.02
-
-
 def test_millimetres_do_not_show(accuracy, rng):
     """A method that is off by two centimetres makes as good layouts."""
     rooms = [

@@ -11,7 +11,6 @@ from sceneprior.apps.config import load_run
 from sceneprior.apps.reconstruction.own_image import level_camera
 from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.meshes import icosphere
-from sceneprior.core.geometry.turns import quarter_rotation, turn_vectors
 from sceneprior.core.observed_image import ObservedImage, images_of_split
 from sceneprior.lifted.reconstruction import candidates
 from sceneprior.lifted.reconstruction.candidates import candidates_of, with_shapes
@@ -162,13 +161,6 @@ def test_candidates_of_looks_reach_as_far_as_their_meshes(sampler_run):
     wanted = (mesh.vertices_m @ directions.numpy().T).max(axis=0)
     reach = (shaped.points[2] * directions).sum(dim=1)
     assert_close(reach, torch.from_numpy(wanted).float(), rtol=1e-4, atol=1e-5)
-
-
-def test_a_turned_point_is_where_its_turned_mesh_is():
-    point = torch.tensor([[[0.1, 0.2, 0.5]]])
-    for quarter in range(4):
-        turned = turn_vectors(point, torch.tensor([quarter]))[0, 0].numpy()
-        np.testing.assert_allclose(turned, quarter_rotation(quarter) @ point[0, 0].numpy())
 
 
 def test_answers_have_one_object_a_mask_of_its_class_with_its_mesh_in_its_box(trained, images):
