@@ -53,7 +53,6 @@ def test_shipped_configs_load_and_survive_being_saved(path, tmp_path):
 @pytest.mark.parametrize("path", SHIPPED, ids=name_of)
 def test_shipped_configs_are_complete(path):
     """No setting is left to a default, so that a diff of two files shows how two runs differ."""
-    import yaml
 
     def keys(data, prefix=""):
         for key, value in data.items():
@@ -89,13 +88,9 @@ def test_the_papers_numbers(name, objects, classes, mask_step):
 
 
 @pytest.mark.parametrize("path", PRIORS, ids=name_of)
-def test_no_shipped_config_draws_near_copies_of_training_rooms(path):
-    assert load_config(str(path)).distribution in ("paper", "sampler")
-
-
-@pytest.mark.parametrize("path", PRIORS, ids=name_of)
-def test_no_shipped_config_is_a_variant_or_an_ablation(path):
+def test_no_shipped_config_is_a_variant_an_ablation_or_draws_near_copies(path):
     config = load_config(str(path))
+    assert config.distribution in ("paper", "sampler")
     model = config.model
     assert config.stage_names[:2] in (("layout", "shape"), ("shape",), ("shape", "sampler"))
     assert config.method == "lifted" or config.layout is not None, "one stage is ablation c3"
@@ -124,13 +119,10 @@ def test_the_released_codes_settings_are_one_command_away():
     assert config.sampling.distribution == "paper"
 
 
-@pytest.mark.parametrize("part", ["final_norm", "query_self_attention", "step_mlps"])
-def test_a_part_of_the_transformer_without_a_transformer_is_a_sentence(config, part):
-    message = refusal(config, f"model.decoder={{name: lstm, {part}: true}}")
-    assert (
-        message == f"{config}: unknown key 'model.decoder.{part}'; the nearest valid key is 'name'."
+def test_a_part_of_the_transformer_without_a_transformer_is_a_sentence(config):
+    assert refusal(config, "model.decoder={name: lstm, step_mlps: true}") == (
+        f"{config}: unknown key 'model.decoder.step_mlps'; the nearest valid key is 'name'."
     )
-    load_config(str(config), ("model.decoder={name: lstm}",))
 
 
 def test_a_variant_that_does_not_exist_lists_those_that_do(config):
@@ -146,9 +138,6 @@ def test_a_variant_without_its_section_is_a_sentence(config):
     wanted = "write {name: ...} with one of transformer, lstm, atiss2d."
     said = refusal(config, "model.decoder=lstm")
     assert said == f"{config}: 'model.decoder' is a section; {wanted}"
-    assert "unknown key 'layout.epoch'; the nearest valid key is 'epochs'" in refusal(
-        config, "layout.epoch=3"
-    )
 
 
 def test_a_method_that_does_not_exist_and_a_config_of_before_are_sentences(config):
@@ -210,10 +199,8 @@ def test_no_such_config_lists_the_shipped_ones(tmp_path, monkeypatch):
     ("old", "new", "key", "near"),
     [
         ("  width: 16", "  widht: 16", "model.widht", "width"),
-        ("  batch_size: 5", "  batchsize: 5", "layout.batchsize", "batch_size"),
         ("loss: {}", "loss: {clas: 1.0}", "loss.clas", "class"),
         ("label_set:", "labelset: x\nlabel_set:", "labelset", "label_set"),
-        ("  compositing: layered", "  composting: layered", "shape.composting", "compositing"),
     ],
 )
 def test_a_typo_names_the_key_the_file_and_the_nearest_key(config, old, new, key, near):
@@ -227,14 +214,10 @@ def test_a_typo_names_the_key_the_file_and_the_nearest_key(config, old, new, key
     [
         ("  width: 16", "  width: wide",
          "'model.width': input should be a valid integer (got 'wide')."),
-        ("  width: 16", "  width: 16.5",
-         "'model.width': input should be a valid integer (got 16.5)."),
         ("    fit_box: true", "    fit_box: 1",
          "'model.shape.fit_box': input should be a valid boolean (got 1)."),
         ("  epochs: 6", "  epochs: 0",
          "'layout.epochs': input should be greater than or equal to 1 (got 0)."),
-        ("    template: box", "    template: cone",
-         "'model.shape.template': input should be 'sphere' or 'box' (got 'cone')."),
         ("    heads: 2", "    heads: 3", "'model': width 16 is not a multiple of heads 3."),
         ("  epochs: 6\n", "", "'layout.epochs' is missing and has no default; add it."),
         ("label_set: front3d_bedroom", "label_set: attic",
@@ -275,9 +258,6 @@ def test_set_overrides_what_the_file_says(config):
     [
         ("model.width", "--set takes section.key=value, got 'model.width'."),
         ("model.width.deep=3", "--set model.width.deep=3: 'width' is a value, not a section."),
-        ("model.widht=3", "unknown key 'model.widht'; the nearest valid key is 'width'."),
-        ("modle.width=3", "unknown key 'modle'; the nearest valid key is 'model'."),
-        ("model.width=wide", "'model.width': input should be a valid integer (got 'wide')."),
         ("model.width=[", "--set model.width=[: '[' is not a YAML value."),
     ],
 )

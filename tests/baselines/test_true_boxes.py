@@ -94,9 +94,7 @@ def test_methods_under_3d_supervision_refuse_shards_without_it(
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("method", ("atiss2d", "atiss2d in one stage", "gan", "usl"))
+@pytest.mark.parametrize("method", ("atiss2d", "gan", "usl"))
 def test_methods_under_2d_supervision_never_read_it(baseline_config, tmp_path, monkeypatch, method):
     monkeypatch.setattr(Shard, "read_ground_truth", None)
-    changes = {"layout": None} if "one stage" in method else {}
-    config = baseline_config(method.split()[0], **changes)
-    fit(config, tmp_path / "run", trainer_options={"accelerator": "cpu"})
+    fit(baseline_config(method), tmp_path / "run", trainer_options={"accelerator": "cpu"})

@@ -6,7 +6,6 @@ import torch
 import trimesh
 from tiny_runs import tiny_lifted
 
-from sceneprior.core.errors import ConfigError
 from sceneprior.core.geometry.isosurface import surface_of
 from sceneprior.core.geometry.turns import turn_grids
 from sceneprior.lifted.occupancy import OccupancyConfig, OccupancyDecoder
@@ -91,19 +90,3 @@ def test_the_prior_decodes_looks_in_place_of_meshes(prior, torch_rng):
     assert scenes.shape_codes.shape == (3, 6, 4)
     assert bare.looks is None and torch.equal(bare.shape_codes, scenes.shape_codes)
     assert torch.equal(bare.centers_m, scenes.centers_m)
-
-
-@pytest.mark.parametrize(
-    ("shape", "sentence"),
-    [
-        ({"name": "cloud"}, "unknown key 'model.shape.name'; the nearest valid key is 'codes'."),
-        ("occupancy", "'model.shape': input should be a valid dictionary"),
-        ({"level": 2}, "unknown key 'model.shape.level'; the nearest valid"),
-        ({"cells": 4}, "'model.shape.cells': input should be greater than or"),
-        ({"margin": 0.9}, "'model.shape.margin': input should be greater"),
-    ],
-)  # fmt: skip
-def test_wrong_shapes_are_sentences(tmp_path, shape, sentence):
-    with pytest.raises(ConfigError) as error:
-        tiny_lifted(tmp_path, model__shape=shape)
-    assert sentence in str(error.value)

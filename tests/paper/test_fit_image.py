@@ -8,7 +8,6 @@ import torch
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.apps.config import load_run
 from sceneprior.core.errors import InputError
 from sceneprior.core.observed_image import as_views, images_of_split, rows_of
 from sceneprior.paper import fit_image as fitting
@@ -20,11 +19,6 @@ from sceneprior.paper.fit_image import (
 )
 
 SHORT = FitSchedule(steps=12, drop_at=8, patience=0)
-
-
-@pytest.fixture(scope="module")
-def trained(toy_run):
-    return load_run(toy_run)
 
 
 @pytest.fixture(scope="module")

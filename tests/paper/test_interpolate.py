@@ -9,7 +9,6 @@ import torch
 from PIL import Image
 from torch import nn
 
-from sceneprior.apps.config import load_run
 from sceneprior.core.classes import class_colors
 from sceneprior.core.errors import InputError
 from sceneprior.core.views import DecodedScenes
@@ -26,18 +25,7 @@ from sceneprior.paper.interpolate import (
 from sceneprior.paper.latents import LatentCube
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.paper.shape_decoder import ShapeDecoder, ShapeDecoderConfig
-from sceneprior.render.offscreen import open_renderer
 from sceneprior.render.topdown import corner_view, perspective
-
-
-@pytest.fixture(scope="module")
-def trained(toy_run):
-    return load_run(toy_run)
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return open_renderer("software")
 
 
 def test_steps_are_even_and_end_where_they_should(trained):

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import sys
 from dataclasses import replace
 
 import h5py
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from sceneprior.apps import cli
 from sceneprior.apps.config import load_run
 from sceneprior.apps.experiments.evaluate_views import mask_iou_of_rooms, mask_scores
 from sceneprior.apps.rooms import write_scenes
@@ -27,32 +25,6 @@ from sceneprior.evaluation.metrics.contents import class_frequencies, frequency_
 from sceneprior.paper.sampling import COPIES
 from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.topdown import box_mesh
-
-
-@pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Run `sceneprior <arguments>` in this process: (exit status, stdout, stderr)."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["sceneprior", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        output = capsys.readouterr()
-        return int(end.value.code or 0), output.out, output.err
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def scenes(toy_shards, tmp_path_factory):
-    """Four training rooms as boxes, as another method might write them."""
-    folder = tmp_path_factory.mktemp("theirs") / "scenes"
-    rooms = reference_scenes(toy_shards, "train", limit=4)
-    plain = [replace(room.without_meshes(), name=f"room_{k}") for k, room in enumerate(rooms)]
-    write_scenes(plain, folder, SoftwareRenderer())
-    return folder
 
 
 def test_the_users_scenes_are_evaluated_and_again_with_the_reference(

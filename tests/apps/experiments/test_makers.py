@@ -9,7 +9,6 @@ from sceneprior.apps.experiments.makers import LIFTED, PAPER, maker_of_answers, 
 @pytest.mark.parametrize(
     ("name", "distribution", "title", "said"),
     [
-        ("bedroom", "paper", "Paper's method", PAPER.said),
         ("bedroom", None, "Paper's method", PAPER.said),
         ("paper/bedroom_small", "kernel", "Paper's method", PAPER.said),
         (
@@ -18,7 +17,6 @@ from sceneprior.apps.experiments.makers import LIFTED, PAPER, maker_of_answers, 
             "Paper's sphere, taught by lifted boxes",
             "the paper's network and latents taught by lifted boxes",
         ),
-        ("lifted/bedroom", None, "Lifted method: sampler", LIFTED),
         ("lifted/living", "sampler", "Lifted method: sampler", LIFTED),
         ("baselines/gan", None, "", "baselines"),
     ],

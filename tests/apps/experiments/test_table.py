@@ -73,26 +73,6 @@ def test_methods_stand_under_their_group_in_the_order_they_came(rows):
     ]  # fmt: skip
 
 
-def test_every_distribution_of_latents_has_a_row_that_names_it(rows):
-    near = replace(rows[0], variant="kernel, copies: near training rooms", costs={})
-    near = replace(near, scores=near.scores | {"fd_effnet_lite0": 45.0})
-    table = markdown([rows[0], near, *rows[1:]], NEW_ROOMS)
-    lines = [line for line in table.splitlines() if line.startswith("| Ours ")]
-    assert [line.split(" | ")[1] for line in lines] == [
-        "paper",
-        "kernel, copies: near training rooms",
-    ]
-    # Both seeds of the first are one row; what training took stands there alone.
-    assert "48.0 ± 1.0" in lines[0] and "5.5" in lines[0]
-    assert "45.0" in lines[1] and lines[1].endswith("| – | – | – |")
-    assert cells(table, "Real training rooms")["latents"] == "–"
-    assert {len(line.split(" |")) for line in table.splitlines() if line.startswith("|")} == {
-        len(lines[0].split(" |"))
-    }
-    found = list(csv.DictReader(io.StringIO(as_csv([rows[0], near], NEW_ROOMS))))
-    assert [line["latents"] for line in found] == ["paper", "kernel, copies: near training rooms"]
-
-
 def test_each_kind_of_rooms_has_a_table_that_says_what_it_is_of(rows):
     both = markdown([*rows, row("Ours", 0, 40.0, rooms="Living rooms")], NEW_ROOMS)
     assert both.index("### Bedrooms") < both.index("### Living rooms")

@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.apps.config import load_run
 from sceneprior.apps.reconstruction import reconstruct as reconstruct_module
 from sceneprior.apps.reconstruction.reconstruct import (
     FitOptions,
@@ -24,16 +23,6 @@ from sceneprior.paper.fit_image import (
     decode_images,
     view_loss,
 )
-
-
-@pytest.fixture(scope="module")
-def trained(toy_run):
-    return load_run(toy_run)
-
-
-@pytest.fixture(scope="module")
-def images(toy_shards):
-    return images_of_split(toy_shards, "test", 0)[0]
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ from PIL import Image
 
 import sceneprior
 from sceneprior.apps.viewer.explorer import Explorer
-from sceneprior.apps.viewer.nodes import name_and_size
 
 PATIENCE_S = 120
 """WebGL in software, on a machine that does other things as well."""
@@ -137,22 +136,6 @@ def test_objects_are_kept_by_a_click_and_the_rest_is_completed(browser, page):
     click(browser, "Complete the rest")
     wait_for(lambda: "completed round 1 kept objects" in words(browser), "it was not completed")
     assert page.shown.scene.objects[0].center_m == kept.center_m
-
-
-def test_every_object_can_have_its_name_and_size(browser, page, monkeypatch):
-    said = []
-    add = page.server.scene.add_label
-    monkeypatch.setattr(
-        page.server.scene,
-        "add_label",
-        lambda name, text, **more: said.append(text) or add(name, text, **more),
-    )
-    before = canvas(browser)
-    click(browser, "Names and sizes")
-    wait_for(lambda: len(said) == len(page.shown.scene.objects) - len(page.shown.kept), "no labels")
-    assert set(said) <= {name_and_size(item) for item in page.shown.scene.objects}
-    wait_for(lambda: (np.abs(canvas(browser) - before).max(axis=-1) > 40).any(), "none is drawn")
-    click(browser, "Names and sizes")
 
 
 def test_what_does_not_work_is_said(browser, page):

@@ -104,21 +104,6 @@ def whole(scenes: DecodedScenes, views) -> torch.Tensor:
     return ((ahead > 0.1) | ~there).flatten(2).all(dim=-1)
 
 
-def test_what_is_not_kept_hides_nothing(views, toy_shards):
-    scenes = true_scenes(toy_shards, 4)
-    plain = drawn_maps(scenes, views)
-    # In the middle of the room and large.
-    centers, sizes = scenes.centers_m.clone(), scenes.sizes_m.clone()
-    centers[:, 5], sizes[:, 5] = torch.tensor([0.0, 1.0, 0.0]), 2.0
-    meshes = place(CORNERS.expand(4, 6, -1, -1), centers, sizes)
-    label = scenes.class_logits.clone()
-    label[:, 5, 9] = 3 * SURE
-    ghost = replace(scenes, class_logits=label, centers_m=centers, sizes_m=sizes, vertices_m=meshes)
-    assert torch.equal(drawn_maps(ghost, views), plain)
-    bed = replace(ghost, completeness_logits=ghost.completeness_logits.abs())
-    assert (drawn_maps(bed, views)[:, :, 9] > plain[:, :, 9]).any()
-
-
 def test_laying_over_is_the_product_of_what_nearer_objects_leave(torch_rng):
     rooms, views, objects, classes = 2, 2, 4, 5
     double = {"generator": torch_rng, "dtype": torch.float64}

@@ -37,17 +37,6 @@ def test_what_stands_behind_another_object_costs_nothing(views):
     assert float(silhouette_loss(perfect + background, views, seen)) > 0.3
 
 
-def test_silhouettes_have_gradients_where_masks_are_missed(views):
-    silhouettes = torch.full(
-        (*views.visible.shape, *views.observed_ids.shape[-2:]), 0.3, dtype=torch.float64
-    ).requires_grad_()
-    silhouette_loss(silhouettes, views, views.visible).backward()
-    room, view, item = views.visible.nonzero()[0].tolist()
-    slope, ids = silhouettes.grad[room, view, item], views.observed_ids[room, view]
-    assert (slope[ids == item + 1] < 0).all() and (slope[ids == 0] > 0).all()
-    assert not slope[(ids != 0) & (ids != item + 1)].any()
-
-
 def test_an_object_that_no_other_view_shows_teaches_nothing(views, stage):
     found, others = detections_of(some_views(views, slice(1))), some_views(views, slice(1, None))
     faces = stage.prior.shape.faces

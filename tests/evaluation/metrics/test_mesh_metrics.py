@@ -48,11 +48,6 @@ def test_a_mesh_without_faces_has_no_points():
         sample_surface(Mesh(np.zeros((3, 3)), np.zeros((0, 3), int)), 10, 0)
 
 
-def test_a_mesh_without_area_still_has_points():
-    flat = Mesh(np.ones((3, 3)), np.array([[0, 1, 2]]))
-    assert (sample_surface(flat, 5, 0) == 1).all()
-
-
 def test_chamfer_and_f_score_are_the_definition(rng):
     a, b = rng.normal(size=(70, 3)), rng.normal(size=(50, 3))
     apart = cdist(a, b)

@@ -11,7 +11,7 @@ from sceneprior.apps.config import load_run
 from sceneprior.apps.reconstruction.own_image import level_camera
 from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.meshes import icosphere
-from sceneprior.core.observed_image import ObservedImage, images_of_split
+from sceneprior.core.observed_image import ObservedImage
 from sceneprior.lifted.reconstruction import candidates
 from sceneprior.lifted.reconstruction.candidates import candidates_of, with_shapes
 from sceneprior.lifted.reconstruction.objects import answer_images, likeliest_box
@@ -20,16 +20,6 @@ from sceneprior.lifted.reconstruction.placing import Placed, place_objects
 
 CUBE = torch.tensor([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 CAMERA = np.array([[48.0, 0, 48], [0, 48, 36], [0, 0, 1]])
-
-
-@pytest.fixture(scope="module")
-def trained(toy_run):
-    return load_run(toy_run)
-
-
-@pytest.fixture(scope="module")
-def images(toy_shards):
-    return images_of_split(toy_shards, "test", 0)[0]
 
 
 def painted(*rectangles, clear=True) -> ObservedImage:
