@@ -4,6 +4,7 @@ import csv
 
 import pytest
 import torch
+from interrupting import CPU, interrupted
 from typer.testing import CliRunner
 
 from sceneprior.apps.cli.commands import app
@@ -13,12 +14,9 @@ from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.settings import dump_settings
 from sceneprior.evaluation.room_sets import without_void
 from sceneprior.evaluation.synthesis import EvalOptions
-from sceneprior.training import fit as train
-from sceneprior.training.callbacks import RollingCheckpoint
 from sceneprior.training.checkpoints import find_checkpoint, read_checkpoint
 from sceneprior.training.fit import fit
 
-CPU = {"accelerator": "cpu", "devices": 1}
 LOGGED = {
     "atiss2d": {"mask"},
     "gan": {"discriminator", "objects", "real_score", "fake_score"},
@@ -48,23 +46,12 @@ def test_a_run_leaves_its_checkpoints_and_curves(baseline_run, method):
     assert not load_any_run(run).prior.training
 
 
-class Stop(RollingCheckpoint):
-    """Presses Ctrl-C in the middle of the second epoch of the last stage."""
-
-    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
-        if (trainer.current_epoch, batch_idx) == (1, 1) and self.folder.name != "layout":
-            raise KeyboardInterrupt
-
-
 @pytest.mark.parametrize("method", LOGGED)
 def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
-    baseline_config, baseline_run, method, tmp_path, monkeypatch
+    baseline_config, baseline_run, method, tmp_path
 ):
     config, run, last = baseline_config(method), tmp_path / "run", STAGES[method][-1]
-    with monkeypatch.context() as patch:
-        patch.setattr(train, "RollingCheckpoint", Stop)
-        with pytest.raises(KeyboardInterrupt):
-            fit(config, run, trainer_options=CPU)
+    interrupted(config, run, last, 1)
     assert read_checkpoint(run / last / "last.ckpt")["epoch"] == 0
     fit(config, run, resume=True, trainer_options=CPU)
     wanted, reached = (

@@ -13,7 +13,7 @@ from sceneprior.core.scene import Scene
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototypes import POSES, Prototypes
 from sceneprior.paper import decode
-from sceneprior.paper.decode import decode_latents, decode_training_rooms, to_rooms
+from sceneprior.paper.decode import decode_training_rooms, to_rooms
 from sceneprior.paper.prior import ScenePrior
 
 
@@ -102,8 +102,7 @@ def test_looks_become_meshes_in_the_boxes_of_objects_that_are_kept(decoded, tmp_
         np.testing.assert_allclose(high - low, np.multiply(item.size_m, share), atol=1e-6)
 
 
-def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(toy_run, monkeypatch):
-    trained = load_run(toy_run)
+def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(trained, monkeypatch):
     scenes = sample_rooms(trained, 5, 7)
     assert [scene.name for scene in scenes] == [f"seed7_000{k}" for k in range(5)]
     monkeypatch.setattr(decode, "BATCH", 2)
@@ -116,15 +115,6 @@ def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(toy_run, monk
             # Stage 2 has run: meshes, which fill their boxes (fit_box).
             low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
             np.testing.assert_allclose(high - low, item.size_m, rtol=1e-4)
-
-
-def test_training_rooms_are_decoded_under_their_own_names(toy_run):
-    trained = load_run(toy_run)
-    decoded = decode_training_rooms(trained)
-    assert [scene.name for scene in decoded] == list(trained.room_ids)
-    z = trained.prior.latent_space(trained.logits)
-    for one, other in zip(decoded, decode_latents(trained, z, ["x"] * len(z)), strict=True):
-        np.testing.assert_array_equal(one.centers_m, other.centers_m)
 
 
 def test_a_run_that_stopped_before_the_shape_stage_gives_boxes(toy_run):

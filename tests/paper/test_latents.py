@@ -25,13 +25,6 @@ def test_latents_are_positive_mixtures_of_unit_anchors_on_the_unit_sphere(torch_
         assert_close(z[room].double(), mixed / mixed.norm(), rtol=0, atol=1e-6)
 
 
-def test_anchors_come_from_the_seed_and_travel_with_the_model():
-    assert torch.equal(LatentSphere(7, 12, 3).anchors, LatentSphere(7, 12, 3).anchors)
-    assert not torch.equal(LatentSphere(7, 12, 3).anchors, LatentSphere(7, 12, 4).anchors)
-    assert "anchors" in LatentSphere(7, 12).state_dict()
-    assert not list(LatentSphere(7, 12).parameters())
-
-
 @pytest.mark.parametrize("angle", [1e-8, 1e-4, 0.3, 2.0, 3.1])
 def test_slerp_walks_at_equal_angles_on_the_unit_sphere(torch_rng, angle):
     start, other = F.normalize(

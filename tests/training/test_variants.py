@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from interrupting import CPU, interrupted
 from tiny_runs import tiny_config, tiny_lifted
 
 from sceneprior.apps.config import load_run
@@ -20,12 +21,9 @@ from sceneprior.lifted.lifting import dataset as lifted
 from sceneprior.lifted.prototypes import Prototypes
 from sceneprior.paper.decode import decode_training_rooms
 from sceneprior.paper.sampling import DISTRIBUTIONS
-from sceneprior.training import fit as train
-from sceneprior.training.callbacks import RollingCheckpoint
 from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit
 
-CPU = {"accelerator": "cpu", "devices": 1}
 FAST = {"layout__epochs": 6, "shape__epochs": 2}
 RELEASED = {
     "model__decoder__hidden": 16,
@@ -55,14 +53,6 @@ VARIANTS = {
         "shape__epochs": 12,
     },
 }
-
-
-class Stop(RollingCheckpoint):
-    """Presses Ctrl-C in the middle of the second epoch of the shape stage."""
-
-    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
-        if (self.folder.name, trainer.current_epoch, batch_idx) == ("shape", 1, 1):
-            raise KeyboardInterrupt
 
 
 @pytest.fixture(scope="module", params=VARIANTS)
@@ -127,10 +117,7 @@ def test_a_stopped_variant_resumes_to_the_same_weights(variant, tmp_path, monkey
     found = lifted.choose_prototypes
     run = shutil.copytree(whole, tmp_path / "run")
     shutil.rmtree(run / "shape")
-    with monkeypatch.context() as patch:
-        patch.setattr(train, "RollingCheckpoint", Stop)
-        with pytest.raises(KeyboardInterrupt):
-            fit(config, run, resume=True, trainer_options=CPU)
+    interrupted(config, run, "shape", 1, resume=True)
     assert not (run / "shape" / "final.ckpt").exists()
     # Another processor finds prototypes in another order; the checkpoint's are taken.
     monkeypatch.setattr(

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -89,19 +88,6 @@ def test_unforeseen_errors_are_one_line_and_status_1(command, monkeypatch):
     status, _, errors = command("fit", "--config", "demo.yaml")
     assert status == 1 and errors.startswith("Error: KeyError: 'surprise'\n")
     assert "SCENEPRIOR_DEBUG=1" in errors and "Traceback" not in errors
-
-
-def test_the_module_is_the_command(tmp_path):
-    """In a process of its own, as a user meets it."""
-    call = [sys.executable, "-m", "sceneprior"]
-    answer = subprocess.run([*call, "--version"], capture_output=True, text=True, cwd=tmp_path)
-    assert answer.returncode == 0 and answer.stdout.startswith("sceneprior 0.")
-    answer = subprocess.run(
-        [*call, "prep-front", "--front", "none", "--future", "none", "--out", "made"],
-        capture_output=True, text=True, cwd=tmp_path,
-    )  # fmt: skip
-    one_sentence((answer.returncode, answer.stdout, answer.stderr))
-    assert not list(tmp_path.iterdir())
 
 
 def test_options_that_lightning_refuses_are_a_sentence_and_leave_nothing(

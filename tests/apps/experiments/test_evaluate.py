@@ -144,8 +144,6 @@ def test_a_run_is_evaluated_with_its_own_shards(command, toy_run, tmp_path):
             ["--scenes", "b", "--shards", "c", "--distribution", "paper"],
             "--distribution belongs to --run; scenes are evaluated as they are.",
         ),
-        (["--scenes", "b", "--shards", "c"], "No folder of scenes at b;"),
-        (["--run", "a"], "No prior at a;"),
         (
             ["--run", "a", "--split", "train"],
             "Generated rooms are compared with the split test, or",
@@ -156,18 +154,6 @@ def test_what_cannot_be_evaluated_is_one_sentence(command, tmp_path, arguments, 
     status, _, errors = command("eval-fid", *arguments, "--renderer", "software")
     assert status == 2 and errors.startswith(f"Error: {sentence}"), errors
     assert len(errors.strip().splitlines()) == 1 and list(tmp_path.iterdir()) == []
-
-
-def test_files_of_weights_and_references_are_checked_before_drawing(
-    command, scenes, toy_shards, tmp_path
-):
-    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
-    for option in ("--inception", "--alexnet"):
-        status, _, errors = command(*call, option, "absent.pt")
-        assert status == 2 and "at absent.pt" in errors and errors.count("\n") == 1
-    (tmp_path / "kept.npz").write_text("no")
-    status, _, errors = command(*call, "--reference", "kept.npz")
-    assert status == 2 and "kept.npz is no reference" in errors
 
 
 def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(

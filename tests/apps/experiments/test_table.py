@@ -64,15 +64,6 @@ def test_a_cell_is_the_mean_of_seeds_and_half_their_range(rows):
     assert "FID ↓" not in table.splitlines()[4]  # nobody has it
 
 
-def test_methods_stand_under_their_group_in_the_order_they_came(rows):
-    order = [line.strip("| ").split(" |")[0] for line in markdown(rows, NEW_ROOMS).splitlines()[6:]]
-    assert order[:10] == [
-        "*reference*", "Independent objects, as boxes", "Independent objects, with meshes",
-        "Shuffled furniture, as boxes", "Real training rooms", "*from masks in 2D*", "Ours",
-        "GAN_x", "*from boxes in 3D*", "ATISS",
-    ]  # fmt: skip
-
-
 def test_each_kind_of_rooms_has_a_table_that_says_what_it_is_of(rows):
     both = markdown([*rows, row("Ours", 0, 40.0, rooms="Living rooms")], NEW_ROOMS)
     assert both.index("### Bedrooms") < both.index("### Living rooms")

@@ -6,7 +6,7 @@ import trimesh
 from model_folder import blocks, corner_sofa, write_model, write_models
 
 from sceneprior.apps.retrieval import cad_models
-from sceneprior.apps.retrieval.cad_models import default_cache, open_models
+from sceneprior.apps.retrieval.cad_models import open_models
 from sceneprior.core.errors import InputError
 
 
@@ -130,8 +130,3 @@ def test_ids_that_leave_the_folder_are_broken_models(tmp_path):
     info.write_text(info.read_text()[:-1] + ', {"model_id": "../x", "category": "Dining Table"}]')
     models = open_models(tmp_path / "models", "front3d_bedroom", tmp_path / "cache", 16)
     assert "cannot be a folder's name" in models.broken["../x"]
-
-
-def test_the_cache_goes_where_caches_go(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert default_cache() == tmp_path / "sceneprior"

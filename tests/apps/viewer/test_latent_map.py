@@ -50,13 +50,6 @@ def test_moving_goes_where_the_pointer_is_and_keeps_the_rest(space, z):
     torch.testing.assert_close(back, z[3], rtol=0, atol=1e-5)
 
 
-def test_beyond_the_rim_a_point_is_drawn_in(space, z):
-    moved = make_map(space, z).moved(z[0], (30.0, 40.0))
-    place = make_map(space, z).place(moved[None])[0]
-    np.testing.assert_allclose(place, [0.5994, 0.7992], atol=1e-5)
-    assert moved.isfinite().all()
-
-
 def test_in_a_cube_the_rest_stays_to_the_bit_and_walls_hold(torch_rng):
     cube = LatentCube(6)
     z = cube(torch.randn(20, 6, generator=torch_rng))

@@ -132,17 +132,6 @@ def test_a_sampled_room_ends_once(network):
     assert (boxes_m >= network.low_m - 1e-5).all() and (boxes_m <= network.high_m + 1e-5).all()
 
 
-def test_the_first_class_comes_as_often_as_the_network_says(network):
-    network = network.float()
-    nothing = torch.zeros(1, 0, 7), torch.zeros(1, 0, dtype=torch.bool)
-    context = network.context(torch.zeros(1, 0, dtype=torch.long), *nothing)
-    wanted = network.class_head(context).softmax(dim=-1)[0]
-    first = network.sample(4000, 0).object_class[:, 0]
-    share = torch.bincount(first, minlength=6) / 4000
-    # Four standard deviations of a share of 4,000.
-    assert (share - wanted).abs().max() < 4 * (0.25 / 4000) ** 0.5
-
-
 def test_fourier_features_are_octaves():
     x = torch.tensor([[0.25, -0.5]], dtype=torch.float64)
     found = fourier_features(x)

@@ -7,7 +7,6 @@ from torch.testing import assert_close
 from sceneprior.apps.config import load_run
 from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
 from sceneprior.apps.sample import sample_rooms
-from sceneprior.baselines.gan.losses import adversarial_loss
 from sceneprior.baselines.gan.semantic_maps import observed_maps
 from sceneprior.baselines.gan.stage import GanStage
 from sceneprior.core.data.dataset import ViewDataset
@@ -75,24 +74,11 @@ def test_each_opponent_learns_from_the_maps_and_the_average_follows(baseline_run
     )
 
 
-def test_a_discriminator_told_to_tell_apart_does_and_its_views_have_no_order(fresh, toy_shards):
-    stage = fresh()
+def test_the_order_of_views_means_nothing_to_the_discriminator(fresh, toy_shards):
     views = ViewDataset(toy_shards, "train", views_per_room=3, mask_step=4).__getitems__(
         [(row, 0) for row in range(6)]
     )
-    real = observed_maps(views, 22)
-    with torch.no_grad():
-        fake, _ = stage._draw(stage.generator(torch.randn(6, 10)), views)
-    judge = stage.discriminator
-    optimizer = torch.optim.Adam(judge.parameters(), 2e-3, (0.0, 0.99))
-    for _ in range(60):
-        optimizer.zero_grad()
-        loss = adversarial_loss(judge(real), True) + adversarial_loss(judge(fake), False)
-        loss.backward()
-        optimizer.step()
-    judge.eval()
-    (_, room_real), (_, room_fake) = judge(real), judge(fake)
-    assert (room_real > room_fake.max()).all()
-    patches, room = judge(real.flip(1))
-    assert_close(room, room_real, rtol=0, atol=1e-5)
-    assert_close(patches.flip(1), judge(real)[0], rtol=0, atol=1e-5)
+    maps, judge = observed_maps(views, 22), fresh().discriminator.eval()
+    (patches, room), (patches_turned, room_turned) = judge(maps), judge(maps.flip(1))
+    assert_close(room_turned, room, rtol=0, atol=1e-5)
+    assert_close(patches_turned.flip(1), patches, rtol=0, atol=1e-5)

@@ -10,8 +10,6 @@ from sceneprior.evaluation.metrics import layout_classifier
 from sceneprior.evaluation.metrics.layout_classifier import (
     ABSENT,
     METRICS,
-    boosted_trees,
-    jittered_features,
     layout_features,
 )
 
@@ -139,12 +137,3 @@ def test_both_sides_weigh_alike_and_no_judged_room_is_learnt_from(accuracy, rng,
         assert not (others[:, None] == features).all(axis=2).any()
     fresh = np.concatenate([others[60:] for *_, others in asked])
     assert len(np.unique(fresh, axis=0)) == 200, "each judged once"
-
-
-def test_noise_is_seeded_and_rooms_that_cannot_be_told_are_answered(rng):
-    scenes = random_rooms(rng, 3)
-    once = jittered_features(scenes, (0, 1))
-    np.testing.assert_array_equal(once, jittered_features(scenes, (0, 1)))
-    assert (once != jittered_features(scenes, (0, 2))).any()
-    same = np.zeros((4, 5))
-    assert boosted_trees(same, np.array([0, 1, 0, 1]), same, 0).tolist() == [0] * 4
