@@ -39,15 +39,3 @@ def test_what_the_sphere_does_not_see_counts_for_nothing():
 
     assert_close(loss(logits + shift, True), loss(logits, True))
     assert loss(logits + shift, False) > 1.5 * loss(logits, False)
-
-
-def test_it_spreads_crowded_latents_as_drawn_ones():
-    logits = (0.05 * points(256, 6, 0)).requires_grad_()
-    optimizer = torch.optim.Adam([logits], lr=0.05)
-    generator = torch.Generator().manual_seed(1)
-    for _ in range(300):
-        optimizer.zero_grad()
-        latent_loss(logits, False, generator).backward()
-        optimizer.step()
-    assert_close(logits.mean(dim=0), torch.zeros(6).double(), atol=0.1, rtol=0)
-    assert_close(logits.T.cov(), torch.eye(6).double(), atol=0.15, rtol=0)

@@ -26,17 +26,6 @@ def test_a_config_and_a_distribution_say_what_makes_rooms(name, distribution, ti
     assert (maker.title, maker.said) == (title, said)
 
 
-def test_a_variation_is_called_by_its_own_title_and_by_what_it_learns_from():
-    small, large = (
-        load_config(f"{name}.yaml") for name in ("paper/bedroom_small", "lifted/bedroom")
-    )
-    assert maker_of_rooms(small, "paper").named("LSTM (c2)") == "LSTM (c2)"
-    assert maker_of_rooms(large, "paper").named("LSTM (c2)") == "LSTM (c2), taught by lifted boxes"
-    assert maker_of_rooms(large, "paper").title == "Paper's sphere, taught by lifted boxes"
-    assert large.learns_from == "boxes lifted from masks in 2D"
-    assert small.learns_from == "masks in 2D"
-
-
 @pytest.mark.parametrize(
     ("name", "fit", "title", "said"),
     [
