@@ -25,6 +25,9 @@ from threadpoolctl import threadpool_limits
 from tiny_runs import tiny_config, tiny_lifted, tiny_sampler_config
 from toy_rooms import write_toy_shards
 
+from sceneprior.core.observed_image import images_of_split
+from sceneprior.render.offscreen import Renderer, open_renderer
+
 # Toy tensors gain nothing from a second thread, and wait for it where cores are shared: thirty
 # times as long.
 torch.set_num_threads(1)
@@ -105,6 +108,26 @@ def toy_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
 
 
 @pytest.fixture(scope="session")
+def trained(toy_run: Path):
+    """The toy run, ready for use. Tests change nothing of it."""
+    from sceneprior.apps.config import load_run
+
+    return load_run(toy_run)
+
+
+@pytest.fixture(scope="session")
+def images(toy_shards: Path):
+    """A view of each test room of the toy shards."""
+    return images_of_split(toy_shards, "test", 0)[0]
+
+
+@pytest.fixture(scope="session")
+def renderer() -> Renderer:
+    """The renderer that every machine has."""
+    return open_renderer("software")
+
+
+@pytest.fixture(scope="session")
 def sampler_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
     """A prior of occupancy grids and its sampler, hardly trained. Tests read it only."""
     from sceneprior.training.fit import fit
@@ -116,12 +139,10 @@ def sampler_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
 
 
 @pytest.fixture
-def grid_prior(toy_run: Path):
+def grid_prior(trained):
     """The toy run's prior with occupancy grids for shapes, which are untrained."""
-    from sceneprior.apps.config import load_run
     from sceneprior.lifted.trained import TrainedLifted
 
-    trained = load_run(toy_run)
     shards = Path(trained.config.data.shards)
     config = tiny_lifted(shards)
     prior = config.build_prior()

@@ -22,7 +22,6 @@ from data_prep.front.recipe import load_recipe
 from sceneprior.apps.cli.commands import app
 from sceneprior.apps.config import load_config
 from sceneprior.apps.experiments.comparison import load_comparison
-from sceneprior.core.errors import ConfigError
 from sceneprior.core.scene import read_scene
 
 LONGEST_LINE = 110
@@ -186,26 +185,6 @@ def test_the_site_builds_without_a_warning(tmp_path: Path):
         name for name in get_command(app).commands if f"sceneprior {name}" not in commands
     ] == []
     assert "Prior" in (tmp_path / "api.html").read_text()
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        "sceneprior fit --config no_such.yaml",
-        "sceneprior fit --config demo.yaml --set layout.epoch=3",
-        "sceneprior fit --config demo.yaml --no-such-option",
-        "sceneprior no-such-command",
-        "sceneprior synthesize --run RUN",
-        "python benchmarks/no_such.py",
-        "python benchmarks/bench_shards.py --no-such-option",
-        "make no-such-target",
-        "rm -rf out",
-    ],
-)
-def test_a_wrong_command_is_noticed(command: str, tmp_path: Path):
-    block = Block(PAGES[0], 1, "bash", f"{command}\n", "")
-    with pytest.raises((AssertionError, ConfigError, pytest.fail.Exception)):
-        check_shell(block, tmp_path)
 
 
 # -- Names -----------------------------------------------------------------------------------------

@@ -39,14 +39,6 @@ def test_steps_run_as_printed(tmp_path):
     assert (made / "views.png").stat().st_size > 10_000
 
 
-def test_two_commands_are_targets_of_the_makefile():
-    makefile = (ROOT / "Makefile").read_text()
-    commands = commands_under("README.md", "Two commands")
-    assert commands == ["make demo", "make test"]
-    for command in commands:
-        assert f"\n{command.split()[1]}: setup\n" in makefile
-
-
 def test_every_command_is_in_the_reference():
     """The page that the site makes from the commands' help has each, with what it does."""
     pytest.importorskip("mkdocs", reason="no mkdocs here: pip install -e '.[docs]'")

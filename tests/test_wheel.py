@@ -71,10 +71,3 @@ def test_a_prior_of_the_package_makes_rooms(installed, tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout == "Wrote 2 rooms to rooms (from: sampler)\n"
     assert len(list((tmp_path / "rooms").glob("*.glb"))) == 2
-
-
-def test_a_wrong_name_lists_the_shipped_configs(installed, tmp_path):
-    done = run(installed, "-m", "sceneprior", "fit", "--config", "bedrom.yaml", cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith("Error: No config 'bedrom.yaml'")
-    assert "bedroom.yaml" in done.stderr and "Traceback" not in done.stderr

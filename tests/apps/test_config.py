@@ -9,7 +9,7 @@ from tiny_runs import write_tiny_config
 
 from sceneprior.apps.config import METHODS, load_config
 from sceneprior.core.classes import LABEL_SETS, label_set
-from sceneprior.core.errors import ConfigError, InputError
+from sceneprior.core.errors import ConfigError
 from sceneprior.core.settings import check_settings, dump_settings, find_config
 from sceneprior.paper.config import PaperConfig
 from sceneprior.paper.settings import Steps
@@ -43,11 +43,6 @@ def replaced(path: Path, old: str, new: str) -> Path:
     return path
 
 
-def test_the_demo_and_the_papers_settings_are_there():
-    wanted = {"demo.yaml", "paper/bedroom.yaml", "paper/living.yaml", "paper/scannet.yaml"}
-    assert wanted <= {name_of(path) for path in SHIPPED}
-
-
 @pytest.mark.parametrize("path", SHIPPED, ids=name_of)
 def test_shipped_configs_load_and_survive_being_saved(path, tmp_path):
     config = load_config(str(path))
@@ -58,7 +53,6 @@ def test_shipped_configs_load_and_survive_being_saved(path, tmp_path):
 @pytest.mark.parametrize("path", SHIPPED, ids=name_of)
 def test_shipped_configs_are_complete(path):
     """No setting is left to a default, so that a diff of two files shows how two runs differ."""
-    import yaml
 
     def keys(data, prefix=""):
         for key, value in data.items():
@@ -94,17 +88,9 @@ def test_the_papers_numbers(name, objects, classes, mask_step):
 
 
 @pytest.mark.parametrize("path", PRIORS, ids=name_of)
-def test_no_shipped_config_draws_near_copies_of_training_rooms(path):
-    assert load_config(str(path)).distribution in ("paper", "sampler")
-
-
-def test_rooms_are_drawn_as_the_paper_does_unless_a_config_says_otherwise(config):
-    assert load_config(str(config)).distribution == "paper"
-
-
-@pytest.mark.parametrize("path", PRIORS, ids=name_of)
-def test_no_shipped_config_is_a_variant_or_an_ablation(path):
+def test_no_shipped_config_is_a_variant_an_ablation_or_draws_near_copies(path):
     config = load_config(str(path))
+    assert config.distribution in ("paper", "sampler")
     model = config.model
     assert config.stage_names[:2] in (("layout", "shape"), ("shape",), ("shape", "sampler"))
     assert config.method == "lifted" or config.layout is not None, "one stage is ablation c3"
@@ -133,20 +119,10 @@ def test_the_released_codes_settings_are_one_command_away():
     assert config.sampling.distribution == "paper"
 
 
-@pytest.mark.parametrize("part", ["final_norm", "query_self_attention", "step_mlps"])
-def test_a_part_of_the_transformer_without_a_transformer_is_a_sentence(config, part):
-    message = refusal(config, f"model.decoder={{name: lstm, {part}: true}}")
-    assert (
-        message == f"{config}: unknown key 'model.decoder.{part}'; the nearest valid key is 'name'."
+def test_a_part_of_the_transformer_without_a_transformer_is_a_sentence(config):
+    assert refusal(config, "model.decoder={name: lstm, step_mlps: true}") == (
+        f"{config}: unknown key 'model.decoder.step_mlps'; the nearest valid key is 'name'."
     )
-    load_config(str(config), ("model.decoder={name: lstm}",))
-
-
-def test_a_part_of_atiss_without_atiss_is_a_sentence(config):
-    assert refusal(config, "model.decoder.norm_first=true").startswith(
-        f"{config}: unknown key 'model.decoder.norm_first'; the nearest valid key is '"
-    )
-    load_config(str(config), ("model.decoder={name: atiss2d, heads: 2, norm_first: true}",))
 
 
 def test_a_variant_that_does_not_exist_lists_those_that_do(config):
@@ -162,9 +138,6 @@ def test_a_variant_without_its_section_is_a_sentence(config):
     wanted = "write {name: ...} with one of transformer, lstm, atiss2d."
     said = refusal(config, "model.decoder=lstm")
     assert said == f"{config}: 'model.decoder' is a section; {wanted}"
-    assert "unknown key 'layout.epoch'; the nearest valid key is 'epochs'" in refusal(
-        config, "layout.epoch=3"
-    )
 
 
 def test_a_method_that_does_not_exist_and_a_config_of_before_are_sentences(config):
@@ -201,13 +174,6 @@ def test_keys_of_another_method_are_refused(config):
     assert refusal(config, "training.epochs=3").startswith(f"{config}: unknown key 'training'; the")
 
 
-def test_a_room_has_as_many_logits_as_its_latent_space_asks_for(config):
-    assert load_config(str(config)).model.logits_per_room == 10
-    assert (
-        load_config(str(config), ("model.latent_space={name: cube}",)).model.logits_per_room == 16
-    )
-
-
 def test_a_shipped_config_is_found_by_name_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert find_config("demo.yaml").samefile(FOLDER / "demo.yaml")
@@ -233,10 +199,8 @@ def test_no_such_config_lists_the_shipped_ones(tmp_path, monkeypatch):
     ("old", "new", "key", "near"),
     [
         ("  width: 16", "  widht: 16", "model.widht", "width"),
-        ("  batch_size: 5", "  batchsize: 5", "layout.batchsize", "batch_size"),
         ("loss: {}", "loss: {clas: 1.0}", "loss.clas", "class"),
         ("label_set:", "labelset: x\nlabel_set:", "labelset", "label_set"),
-        ("  compositing: layered", "  composting: layered", "shape.composting", "compositing"),
     ],
 )
 def test_a_typo_names_the_key_the_file_and_the_nearest_key(config, old, new, key, near):
@@ -250,14 +214,10 @@ def test_a_typo_names_the_key_the_file_and_the_nearest_key(config, old, new, key
     [
         ("  width: 16", "  width: wide",
          "'model.width': input should be a valid integer (got 'wide')."),
-        ("  width: 16", "  width: 16.5",
-         "'model.width': input should be a valid integer (got 16.5)."),
         ("    fit_box: true", "    fit_box: 1",
          "'model.shape.fit_box': input should be a valid boolean (got 1)."),
         ("  epochs: 6", "  epochs: 0",
          "'layout.epochs': input should be greater than or equal to 1 (got 0)."),
-        ("    template: box", "    template: cone",
-         "'model.shape.template': input should be 'sphere' or 'box' (got 'cone')."),
         ("    heads: 2", "    heads: 3", "'model': width 16 is not a multiple of heads 3."),
         ("  epochs: 6\n", "", "'layout.epochs' is missing and has no default; add it."),
         ("label_set: front3d_bedroom", "label_set: attic",
@@ -298,9 +258,6 @@ def test_set_overrides_what_the_file_says(config):
     [
         ("model.width", "--set takes section.key=value, got 'model.width'."),
         ("model.width.deep=3", "--set model.width.deep=3: 'width' is a value, not a section."),
-        ("model.widht=3", "unknown key 'model.widht'; the nearest valid key is 'width'."),
-        ("modle.width=3", "unknown key 'modle'; the nearest valid key is 'model'."),
-        ("model.width=wide", "'model.width': input should be a valid integer (got 'wide')."),
         ("model.width=[", "--set model.width=[: '[' is not a YAML value."),
     ],
 )
@@ -317,13 +274,6 @@ def test_a_file_that_is_no_config_is_a_sentence(tmp_path, text):
     assert "holds no settings; expected" in message or "is not a YAML file: " in message
     path.write_bytes(b"\xff\xfe\x00")
     assert "is not a YAML file" in refusal(path)
-
-
-def test_a_config_cannot_be_changed_and_is_an_input_error(config):
-    loaded = load_config(str(config))
-    with pytest.raises(Exception, match="frozen"):
-        loaded.model.width = 3
-    assert issubclass(ConfigError, InputError)
 
 
 def _laughs(levels: int) -> str:
@@ -353,12 +303,6 @@ def test_yaml_that_would_fill_the_memory_or_the_stack_is_refused(config, text, s
     assert refusal(config).startswith(f"{config} is not a YAML file: {said}")
     if len(text) < 2000:
         assert "is not a YAML value." in refusal(FOLDER / "demo.yaml", f"seed={{{text}}}")
-
-
-def test_aliases_are_what_they_stand_for(config):
-    text = config.read_text().replace("seed: 3", "seed: &number 3")
-    config.write_text(text.replace("epochs: 6", "epochs: *number"))
-    assert load_config(str(config)).layout.epochs == 3
 
 
 def test_long_values_are_abbreviated(config):

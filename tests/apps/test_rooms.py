@@ -13,12 +13,6 @@ from sceneprior.apps.rooms import (
     write_scenes,
 )
 from sceneprior.core.scene import Mesh, Scene, SceneObject
-from sceneprior.render.offscreen import open_renderer
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return open_renderer("software")
 
 
 @pytest.fixture

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from sceneprior.evaluation.metric import EACH_SET, PICTURED
-from sceneprior.evaluation.registry import DECODED, METRICS, as_markdown
+from sceneprior.evaluation.registry import as_markdown
 
 DOCS = Path(__file__).parents[2] / "docs" / "evaluation.md"
 
@@ -15,26 +14,3 @@ def test_the_docs_list_every_metric_as_it_is():
         "docs/evaluation.md is out of date; put there what `python -c 'from "
         "sceneprior.evaluation.registry import as_markdown; print(as_markdown())'` prints."
     )
-
-
-def test_keys_and_titles_are_each_ones_own_and_definitions_are_sentences():
-    every = [*METRICS, *DECODED]
-    assert len({metric.key for metric in every}) == len({m.title for m in every}) == len(every)
-    for metric in every:
-        assert metric.definition.endswith(".") and metric.definition.count("\n") == 0
-        assert "|" not in metric.definition + metric.unit  # would end a cell
-        assert metric.boxes == metric.key.endswith("_boxes")
-        assert set(metric.sets) <= {*EACH_SET, *PICTURED}
-
-
-def test_metrics_of_one_network_stand_together_and_apply_where_it_is_given():
-    networks = [metric.network for metric in METRICS]
-    blocks = [n for row, n in enumerate(networks) if row == 0 or networks[row - 1] != n]
-    assert blocks == ["inception", "alexnet", "effnet_lite0", None]
-    lacking = {metric.key: metric.lacks(["effnet_lite0"], boxes=False) for metric in METRICS}
-    plain = {key for key, want in lacking.items() if want is None}
-    assert (lacking["fid"], lacking["sca"], lacking["gap_closed_boxes"]) == (
-        "--inception", "--alexnet", "--boxes"
-    )  # fmt: skip
-    assert "fd_effnet_lite0" in plain and "mean_objects" in plain
-    assert not plain & {"fid", "kid", "sca", "fd_effnet_lite0_boxes", "fid_boxes"}

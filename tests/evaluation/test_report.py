@@ -13,8 +13,8 @@ from PIL import Image
 from sceneprior.core.classes import class_colors
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.evaluation.report import UNFOLDING_SHOWN, _spread, _tiles, write_report
-from sceneprior.evaluation.report_pictures import curves_svg, input_views, legend, room_pictures
+from sceneprior.evaluation.report import _tiles, write_report
+from sceneprior.evaluation.report_pictures import input_views, legend, room_pictures
 from sceneprior.evaluation.rooms_page import write_rooms_page
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 
@@ -148,18 +148,6 @@ def test_room_pictures_count_in_words(renderer):
     assert room_pictures(replace(room, objects=()), renderer).contents == "nothing"
     assert [name for name, _ in legend([room])] == ["double bed", "stool"]
     assert legend([room])[0][1] == "#" + bytes(class_colors(22)[9].tolist()).hex()
-
-
-def test_curves_survive_nan_one_point_and_repeat_exactly():
-    curves = {"a": [(0, 1.0), (1, float("nan")), (2, 100.0)], "b": [(5, 0.0)], "c": []}
-    assert curves_svg(curves) == curves_svg(curves)
-    assert curves_svg(curves).startswith("data:image/svg+xml;base64,")
-
-
-def test_long_walks_are_thinned_with_both_ends_kept():
-    assert _spread(list(range(17)), UNFOLDING_SHOWN) == [0, 2, 4, 6, 8, 10, 12, 14, 16]
-    assert _spread([1, 2], UNFOLDING_SHOWN) == [1, 2]
-    assert _spread([], UNFOLDING_SHOWN) == []
 
 
 def test_tiles_do_not_round_to_all_or_nothing():

@@ -104,23 +104,6 @@ def test_the_protocol_says_all_that_the_metrics_depend_on(result, shards, render
     assert str(shards.parent) not in out.read_text()  # the file can be passed on
 
 
-def test_the_same_rooms_score_the_same(result, generated, shards, renderer):
-    again = evaluate_synthesis(generated, shards, EvalOptions(seed=1, renderer=renderer))
-    assert again == result[0]
-
-
-def test_test_rooms_against_themselves_are_at_distance_zero(shards, renderer, no_classifier):
-    scores = evaluate_synthesis(
-        reference_scenes(shards, "test"), shards, EvalOptions(renderer=renderer)
-    )
-    assert scores["fd_effnet_lite0"] < 1e-8
-    assert scores["category_kl"] == 0
-    assert (
-        scores["protocol"]["renders_sha256"]["test"]
-        == (scores["protocol"]["renders_sha256"]["generated"])
-    )
-
-
 def shrunk(scene: Scene) -> Scene:
     """Every mesh at half its size round its box's centre."""
     return replace(
@@ -290,22 +273,6 @@ def test_odd_sets_of_rooms_have_metrics_or_none_but_never_nan(shards, renderer, 
         ]
         == 0
     )
-
-
-def test_copies_of_training_rooms_are_told(shards, renderer, no_classifier):
-    copies = [replace(scene, floor_m=None) for scene in reference_scenes(shards, "train")]
-    scores = evaluate_synthesis(copies, shards, EvalOptions(renderer=renderer, resamples=0))
-    assert scores["nearest_training_m"] == pytest.approx(0, abs=1e-6)
-    assert scores["near_copy_share"] == 1 and scores["train_rooms"]["near_copy_share"] == 0
-    # The toy's test rooms are much like its training rooms, which takes from the excess.
-    assert scores["near_copy_excess"] == 1 - scores["near_copy_share_test"]
-    # Real rooms pass themselves over.
-    assert scores["train_rooms"]["nearest_training_m"] > 0.05
-    same = ("fd_effnet_lite0", "precision_effnet_lite0", "walkable_share")
-    for key in same:
-        assert scores[key] == scores["train_rooms"][key]
-    assert scores["walkable_share_floor"] is None
-    assert set(scores["intervals"]["generated"].values()) == {None}
 
 
 def test_the_papers_classifier_appears_with_its_weights(

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import nn
 
-from sceneprior.apps.config import load_run
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
@@ -32,11 +31,6 @@ BED = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
 FEW = 20
 """Steps, where it does not matter how far they lead."""
 DESK = SceneObject("desk", (1.5, 0.4, 1.3), (1.0, 0.8, 0.6))
-
-
-@pytest.fixture(scope="module")
-def trained(toy_run):
-    return load_run(toy_run)
 
 
 def scene(*objects: SceneObject) -> Scene:

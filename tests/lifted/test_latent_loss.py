@@ -24,11 +24,6 @@ def test_the_distance_on_each_line_is_that_of_the_cheapest_assignment():
     assert_close(sliced_wasserstein(some, others, directions), expected.double())
 
 
-def test_neither_order_nor_equal_points_cost_anything():
-    some, directions = points(12, 6, 0), points(6, 8, 1)
-    assert sliced_wasserstein(some, some.flip(0), directions).item() == 0
-
-
 def test_gradients_are_right():
     some, others, directions = points(6, 3, 0), points(6, 3, 1), points(3, 4, 2)
     assert torch.autograd.gradcheck(
@@ -44,15 +39,3 @@ def test_what_the_sphere_does_not_see_counts_for_nothing():
 
     assert_close(loss(logits + shift, True), loss(logits, True))
     assert loss(logits + shift, False) > 1.5 * loss(logits, False)
-
-
-def test_it_spreads_crowded_latents_as_drawn_ones():
-    logits = (0.05 * points(256, 6, 0)).requires_grad_()
-    optimizer = torch.optim.Adam([logits], lr=0.05)
-    generator = torch.Generator().manual_seed(1)
-    for _ in range(300):
-        optimizer.zero_grad()
-        latent_loss(logits, False, generator).backward()
-        optimizer.step()
-    assert_close(logits.mean(dim=0), torch.zeros(6).double(), atol=0.1, rtol=0)
-    assert_close(logits.T.cov(), torch.eye(6).double(), atol=0.15, rtol=0)

@@ -81,26 +81,13 @@ def test_the_terms_are_their_definitions(scenes, rooms):
     assert set(losses) == {"box", "class", "completeness"}
 
 
-def test_a_right_scene_has_no_box_loss_and_one_without_objects_no_nan(scenes, rooms):
+def test_rooms_without_objects_have_no_loss_and_no_nan(scenes, rooms):
     none = LiftedRooms(
         rooms.room_index, rooms.object_class * 0, rooms.is_object & False,
         rooms.is_lifted & False, rooms.boxes_m,
     )  # fmt: skip
     losses = lifted_losses(scenes, none, match_lifted(scenes, none), "first_n")
     assert losses["box"] == 0 and losses["class"] == 0 and losses["completeness"] == 0
-    centers_m, sizes_m = rooms.boxes_m.split(3, dim=-1)
-    right = DecodedScenes(
-        scenes.class_logits[:, :3], centers_m.flip(1), sizes_m.flip(1),
-        scenes.completeness_logits[:, :3],
-    )  # fmt: skip
-    first = LiftedRooms(*(getattr(rooms, name)[:1] for name in (
-        "room_index", "object_class", "is_object", "is_lifted", "boxes_m",
-    )))  # fmt: skip
-    right = DecodedScenes(*(part[:1] for part in (
-        right.class_logits, right.centers_m, right.sizes_m, right.completeness_logits,
-    )))  # fmt: skip
-    matches = match_lifted(right, first, 50.0)
-    assert lifted_losses(right, first, matches, "first_n")["box"] == 0
 
 
 def test_the_distance_of_codes_is_a_filled_cell_s(scenes, rooms, torch_rng):

@@ -6,7 +6,6 @@ import torch
 import trimesh
 from tiny_runs import tiny_lifted
 
-from sceneprior.core.errors import ConfigError
 from sceneprior.core.geometry.isosurface import surface_of
 from sceneprior.core.geometry.turns import turn_grids
 from sceneprior.lifted.occupancy import OccupancyConfig, OccupancyDecoder
@@ -60,11 +59,6 @@ def test_prototypes_are_kept_in_checkpoints_and_are_no_weights(decoder, prototyp
     assert all(name.startswith("mlp.") for name, _ in fresh.named_parameters())
 
 
-def test_every_weight_learns_from_every_object(decoder, torch_rng):
-    decoder(torch.randn(1, 4, 6, generator=torch_rng)).square().sum().backward()
-    assert all(parameter.grad.any() for parameter in decoder.parameters())
-
-
 def test_meshes_turn_and_fill_boxes_as_grids_do():
     """A look's mesh against the surface of its turned grid, on a shape without symmetry."""
     rng = np.random.default_rng(0)
@@ -96,19 +90,3 @@ def test_the_prior_decodes_looks_in_place_of_meshes(prior, torch_rng):
     assert scenes.shape_codes.shape == (3, 6, 4)
     assert bare.looks is None and torch.equal(bare.shape_codes, scenes.shape_codes)
     assert torch.equal(bare.centers_m, scenes.centers_m)
-
-
-@pytest.mark.parametrize(
-    ("shape", "sentence"),
-    [
-        ({"name": "cloud"}, "unknown key 'model.shape.name'; the nearest valid key is 'codes'."),
-        ("occupancy", "'model.shape': input should be a valid dictionary"),
-        ({"level": 2}, "unknown key 'model.shape.level'; the nearest valid"),
-        ({"cells": 4}, "'model.shape.cells': input should be greater than or"),
-        ({"margin": 0.9}, "'model.shape.margin': input should be greater"),
-    ],
-)  # fmt: skip
-def test_wrong_shapes_are_sentences(tmp_path, shape, sentence):
-    with pytest.raises(ConfigError) as error:
-        tiny_lifted(tmp_path, model__shape=shape)
-    assert sentence in str(error.value)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from rooms_of_boxes import CELLS, lifted_rooms
+from rooms_of_boxes import CELLS
 
 from sceneprior.core.geometry.turns import turn_grids
 from sceneprior.lifted.prototypes import (
@@ -65,14 +65,6 @@ def test_an_odd_shape_is_a_prototype_but_no_common_one():
     # But a class has at least one.
     alone = choose_prototypes(grids[:1], sizes[:1], labels[:1], np.ones(1, dtype=bool), most=99)
     assert alone.common.tolist() == [True]
-
-
-def test_what_is_not_usable_is_no_prototype():
-    lifted = lifted_rooms()
-    sizes = np.concatenate([room.sizes_m for room in lifted.boxes])
-    usable = lifted.object_classes != 3
-    found = choose_prototypes(lifted.grids(), sizes, lifted.object_classes, usable, most=99)
-    assert set(found.object_class.tolist()) == {1, 2}
 
 
 def test_distances_are_those_of_a_loop():

@@ -8,17 +8,13 @@ import torch
 from tiny_runs import tiny_config, tiny_lifted
 
 from sceneprior.apps.config import load_run
-from sceneprior.apps.experiments.evaluate import UNFOLDING_STEPS, read_curves, unfold
 from sceneprior.apps.sample import sample_rooms
-from sceneprior.core.classes import label_set
 from sceneprior.core.scene import Scene
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototypes import POSES, Prototypes
 from sceneprior.paper import decode
-from sceneprior.paper.decode import decode_latents, decode_training_rooms, to_rooms
+from sceneprior.paper.decode import decode_training_rooms, to_rooms
 from sceneprior.paper.prior import ScenePrior
-
-NAMES = label_set("front3d_bedroom")
 
 
 @pytest.fixture
@@ -106,8 +102,7 @@ def test_looks_become_meshes_in_the_boxes_of_objects_that_are_kept(decoded, tmp_
         np.testing.assert_allclose(high - low, np.multiply(item.size_m, share), atol=1e-6)
 
 
-def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(toy_run, monkeypatch):
-    trained = load_run(toy_run)
+def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(trained, monkeypatch):
     scenes = sample_rooms(trained, 5, 7)
     assert [scene.name for scene in scenes] == [f"seed7_000{k}" for k in range(5)]
     monkeypatch.setattr(decode, "BATCH", 2)
@@ -122,35 +117,7 @@ def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(toy_run, monk
             np.testing.assert_allclose(high - low, item.size_m, rtol=1e-4)
 
 
-def test_training_rooms_are_decoded_under_their_own_names(toy_run):
-    trained = load_run(toy_run)
-    decoded = decode_training_rooms(trained)
-    assert [scene.name for scene in decoded] == list(trained.room_ids)
-    z = trained.prior.latent_space(trained.logits)
-    for one, other in zip(decoded, decode_latents(trained, z, ["x"] * len(z)), strict=True):
-        np.testing.assert_array_equal(one.centers_m, other.centers_m)
-
-
 def test_a_run_that_stopped_before_the_shape_stage_gives_boxes(toy_run):
     trained = replace(load_run(toy_run), stage="layout")
     scenes = decode_training_rooms(trained)
     assert all(item.mesh is None for scene in scenes for item in scene.objects)
-
-
-def test_unfolding_walks_from_one_training_room_to_another(toy_run):
-    trained = load_run(toy_run)
-    steps = unfold(trained)
-    assert [scene.name for scene in steps] == [f"step_{k}" for k in range(UNFOLDING_STEPS)]
-    z = trained.prior.latent_space(trained.logits)
-    far = int((z @ z[0]).argmin())
-    rooms = decode_training_rooms(trained)
-    for step, room in ((steps[0], rooms[0]), (steps[-1], rooms[far])):
-        assert labels(step) == labels(room)
-        np.testing.assert_allclose(step.centers_m, room.centers_m, atol=1e-4)
-
-
-def test_curves_are_read_back_by_stage_and_term(toy_run):
-    curves = read_curves(toy_run)
-    assert [epoch for epoch, _ in curves["layout/loss"]] == list(range(20))
-    assert [epoch for epoch, _ in curves["shape/mask_iou"]] == [0, 1, 2]
-    assert "layout/mask" not in curves

@@ -79,63 +79,6 @@ def test_the_slow_twin_says_the_same(torch_rng):
         assert_close(model(z, 1)[:, 0], first, rtol=0, atol=1e-12)
 
 
-def test_the_encoder_is_torchs_own_layer(torch_rng):
-    """Independent of our loop: torch.nn.TransformerEncoderLayer with the same weights."""
-    model = decoder().eval()
-    layer = torch.nn.TransformerEncoderLayer(
-        24, 3, 40, 0.0, "gelu", batch_first=True, dtype=torch.float64
-    ).eval()
-    same = {
-        layer.self_attn.in_proj_weight: model.encoder_qkv.weight,
-        layer.self_attn.in_proj_bias: model.encoder_qkv.bias,
-        layer.self_attn.out_proj.weight: model.encoder_out.weight,
-        layer.self_attn.out_proj.bias: model.encoder_out.bias,
-        layer.linear1.weight: model.encoder_ff.expand.weight,
-        layer.linear1.bias: model.encoder_ff.expand.bias,
-        layer.linear2.weight: model.encoder_ff.contract.weight,
-        layer.linear2.bias: model.encoder_ff.contract.bias,
-        layer.norm1.weight: model.encoder_norm.weight,
-        layer.norm1.bias: model.encoder_norm.bias,
-        layer.norm2.weight: model.encoder_ff.norm.weight,
-        layer.norm2.bias: model.encoder_ff.norm.bias,
-    }
-    cross = torch.nn.MultiheadAttention(24, 3, batch_first=True, dtype=torch.float64)
-    with torch.no_grad():
-        for theirs, ours in same.items():
-            theirs.copy_(ours)
-        cross.in_proj_weight.copy_(
-            torch.cat([model.decoder_query.weight, model.decoder_key, model.decoder_value.weight])
-        )
-        cross.in_proj_bias.copy_(
-            torch.cat(
-                [model.decoder_query.bias, model.start.new_ones(24), model.decoder_value.bias]
-            )
-        )
-        cross.out_proj.weight.copy_(model.decoder_out.weight)
-        cross.out_proj.bias.copy_(model.decoder_out.bias)
-        z, previous = inputs(torch_rng)
-        context = layer(torch.cat([model.start.expand(3, 1, -1), previous], dim=1))
-        wish = z * 24**0.5
-        answer = wish + cross(wish.unsqueeze(1), context, context)[0][:, 0]
-        wanted = model.decoder_ff(model.decoder_norm(answer))
-        assert_close(next_object(model, z, previous), wanted, rtol=0, atol=1e-12)
-
-
-def test_each_room_is_decoded_by_itself(torch_rng):
-    model = decoder().eval()
-    z, _ = inputs(torch_rng)
-    alone = torch.cat([model(z[k : k + 1], 5) for k in range(3)])
-    assert_close(model(z, 5), alone, rtol=0, atol=1e-12)
-
-
-def test_dropout_acts_in_training_alone(torch_rng):
-    model = decoder(dropout=0.5)
-    z, _ = inputs(torch_rng)
-    assert not torch.equal(model(z, 2), model(z, 2))
-    model.eval()
-    assert torch.equal(model(z, 2), model(z, 2))
-
-
 def test_every_weight_has_a_gradient_that_gradcheck_confirms(torch_rng):
     model = decoder(width=8, heads=2).eval()
     z = F.normalize(torch.randn(1, 8, generator=torch_rng, dtype=torch.float64), dim=-1)

@@ -11,7 +11,7 @@ from toy_rooms import look_at
 
 from sceneprior.core.geometry.cameras import boxes_of_points
 from sceneprior.core.views import DecodedScenes, SceneViews
-from sceneprior.paper.settings import ShapeConfig, StageConfig
+from sceneprior.paper.settings import ShapeConfig
 from sceneprior.paper.view_loss import proxy_boxes, seen_boxes
 
 
@@ -49,19 +49,6 @@ def test_a_beveled_box_holds_the_ellipsoid(seen):
     assert box.in_frustum.all() and smooth.in_frustum.all()
     outward = torch.tensor([-1.0, -1, 1, 1])
     assert ((box.boxes - smooth.boxes) * outward).min() > 0
-
-
-def test_every_proxy_of_the_config_has_boxes_of_its_own(seen):
-    proxies = StageConfig.model_fields["proxy"].annotation.__args__
-    boxes = [proxy_boxes(*seen, proxy).boxes for proxy in proxies]
-    assert len(proxies) == 2
-    for i, one in enumerate(boxes):
-        assert all(not torch.equal(one, other) for other in boxes[:i])
-
-
-def test_the_papers_proxy_is_the_smooth_ellipsoid():
-    assert StageConfig.model_fields["proxy"].default == "ellipsoid"
-    assert ShapeConfig.model_fields["proxy"].default == "ellipsoid"
 
 
 @pytest.mark.parametrize("box_from", ["mesh", "proxy"])

@@ -5,33 +5,25 @@ from pathlib import Path
 
 import pytest
 import torch
+from interrupting import CPU, interrupted
 from tiny_runs import tiny_config, tiny_lifted
-from torch.testing import assert_close
 
 from sceneprior.apps.config import load_run
 from sceneprior.apps.decoders import AnyPaperModel
 from sceneprior.apps.experiments.evaluate import (
     UNFOLDING_STEPS,
     decoded_and_true,
-    evaluate_run,
     read_curves,
     unfold,
 )
 from sceneprior.apps.sample import sample_rooms
-from sceneprior.baselines.lstm import SceneLstm
-from sceneprior.core.overlaps import match_scenes
-from sceneprior.evaluation.synthesis import EvalOptions
 from sceneprior.lifted.lifting import dataset as lifted
 from sceneprior.lifted.prototypes import Prototypes
 from sceneprior.paper.decode import decode_training_rooms
-from sceneprior.paper.latents import LatentCube
 from sceneprior.paper.sampling import DISTRIBUTIONS
-from sceneprior.training import fit as train
-from sceneprior.training.callbacks import RollingCheckpoint
 from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit
 
-CPU = {"accelerator": "cpu", "devices": 1}
 FAST = {"layout__epochs": 6, "shape__epochs": 2}
 RELEASED = {
     "model__decoder__hidden": 16,
@@ -61,14 +53,6 @@ VARIANTS = {
         "shape__epochs": 12,
     },
 }
-
-
-class Stop(RollingCheckpoint):
-    """Presses Ctrl-C in the middle of the second epoch of the shape stage."""
-
-    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
-        if (self.folder.name, trainer.current_epoch, batch_idx) == ("shape", 1, 1):
-            raise KeyboardInterrupt
 
 
 @pytest.fixture(scope="module", params=VARIANTS)
@@ -133,10 +117,7 @@ def test_a_stopped_variant_resumes_to_the_same_weights(variant, tmp_path, monkey
     found = lifted.choose_prototypes
     run = shutil.copytree(whole, tmp_path / "run")
     shutil.rmtree(run / "shape")
-    with monkeypatch.context() as patch:
-        patch.setattr(train, "RollingCheckpoint", Stop)
-        with pytest.raises(KeyboardInterrupt):
-            fit(config, run, resume=True, trainer_options=CPU)
+    interrupted(config, run, "shape", 1, resume=True)
     assert not (run / "shape" / "final.ckpt").exists()
     # Another processor finds prototypes in another order; the checkpoint's are taken.
     monkeypatch.setattr(
@@ -150,47 +131,6 @@ def test_a_stopped_variant_resumes_to_the_same_weights(variant, tmp_path, monkey
     assert wanted.keys() == reached.keys()
     for name, value in wanted.items():
         assert torch.equal(reached[name], value), name
-
-
-@pytest.mark.parametrize("name", ["c1_uniform", "c3_one_stage"])
-def test_a_variant_is_judged(toy_shards, tmp_path, name):
-    changes = {**FAST, **VARIANTS[name], "layout__epochs": 1, "shape__epochs": 1}
-    run = tmp_path / "run"
-    fit(tiny_config(toy_shards, **changes), run, trainer_options=CPU)
-    scores = evaluate_run(run, 4, EvalOptions(renderer="software"), run / "scores.json")
-    assert scores["protocol"]["stage"] == "shape"
-    matches = [match_scenes(*pair) for pair in decoded_and_true(load_run(run), toy_shards)]
-    overlap = sum(match.iou.sum() for match in matches) / sum(m.truth_count for m in matches)
-    assert scores["box_iou_3d"] == pytest.approx(overlap, abs=1e-9) and 0 < overlap < 1
-
-
-def test_one_stage_begins_with_fresh_weights_and_leaves_no_layout_folder(toy_shards, tmp_path):
-    config = tiny_config(toy_shards, layout=None, shape__epochs=1, shape__learning_rate=1e-12,
-                         shape__latent_learning_rate=1e-12)  # fmt: skip
-    fit(config, tmp_path / "run", trainer_options=CPU)
-    assert not (tmp_path / "run" / "layout").exists()
-    trained = load_run(tmp_path / "run")
-    for mine, fresh in zip(
-        trained.prior.parameters(), config.build_prior().parameters(), strict=True
-    ):
-        assert_close(mine, fresh, rtol=0, atol=1e-9)
-
-
-def test_the_ablations_change_their_module_and_no_other_module(toy_shards):
-    plain = tiny_config(toy_shards).build_prior()
-    cube = tiny_config(toy_shards, model__latent_space={"name": "cube"}).build_prior()
-    lstm = tiny_config(toy_shards, model__decoder={"name": "lstm"}).build_prior()
-    assert isinstance(cube.latent_space, LatentCube) and isinstance(lstm.decoder, SceneLstm)
-
-    def shapes(prior, without):
-        return {
-            name: value.shape
-            for name, value in prior.state_dict().items()
-            if not name.startswith(without)
-        }
-
-    assert shapes(cube, "latent_space.") == shapes(plain, "latent_space.")
-    assert shapes(lstm, "decoder.") == shapes(plain, "decoder.")
 
 
 @pytest.mark.parametrize(

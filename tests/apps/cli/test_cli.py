@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -42,58 +41,6 @@ def test_bad_shards_are_sentences_and_leave_no_run(command, toy_shards, tmp_path
     assert "the file is damaged" in fit(corrupt)
 
     assert "model.max_objects is 2; raise it." in fit(toy_shards, "--set", "model.max_objects=2")
-    assert "No logger 'paper'; choose from " in fit(toy_shards, "--logger", "paper")
-    assert "input should be" in fit(toy_shards, "--set", "layout.epochs=0")
-    assert "the nearest valid key is 'epochs'" in fit(toy_shards, "--set", "layout.epoch=3")
-
-
-def test_a_config_typo_names_key_file_and_nearest_key(command, toy_shards, tmp_path):
-    config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards)
-    config.write_text(config.read_text().replace("  dropout:", "  droput:"))
-    said = one_sentence(command("fit", "--config", config, "--run", "run"))
-    assert said == (
-        f"Error: {config}: unknown key 'model.decoder.droput'; the nearest valid key is 'dropout'."
-    )
-    said = one_sentence(command("fit", "--config", "dmeo.yaml", "--run", "run"))
-    assert "No config 'dmeo.yaml'" in said and "demo.yaml" in said
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    "words",
-    [("synthesize", "--out", "made"), ("eval-fid", "-n", "4"), ("report",)],
-    ids=lambda words: words[0],
-)
-def test_folders_that_are_no_run_or_hold_no_checkpoint(command, toy_run, tmp_path, words):
-    name, *rest = words
-    call = [name, "--run", "run", *rest, "--renderer", "software"]
-    said = one_sentence(command(*call))
-    assert "No prior at run; give a run's folder (`sceneprior fit`)" in said
-    (tmp_path / "run").mkdir()
-    shutil.copy(toy_run / "config.yaml", tmp_path / "run")
-    before = everything_in(tmp_path)
-    said = one_sentence(command(*call))
-    assert "run holds no checkpoint yet; let `sceneprior fit --config run/config.yaml" in said
-    assert "--run run --resume` get further" in said
-    (tmp_path / "run" / "layout").mkdir()
-    (tmp_path / "run" / "layout" / "final.ckpt").write_bytes(b"PK nonsense")
-    assert "it is damaged. Delete it and run `sceneprior fit`" in one_sentence(command(*call))
-    shutil.rmtree(tmp_path / "run" / "layout")
-    assert everything_in(tmp_path) == before
-
-
-def test_an_existing_run_wants_resume_and_the_same_settings(command, toy_run, toy_shards, tmp_path):
-    config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards, layout__epochs=20)
-    before = everything_in(toy_run)
-    said = one_sentence(command("fit", "--config", config, "--run", toy_run))
-    assert "already holds a run; add --resume to continue it, or name another folder." in said
-    said = one_sentence(
-        command("fit", "--config", config, "--run", toy_run, "--resume", "--set", "seed=9")
-    )
-    assert "config.yaml differs from the settings given now; resume with" in said
-    status, out, _ = command("fit", "--config", config, "--run", toy_run, "--resume")
-    assert (status, out) == (0, f"Trained: {toy_run}\n")
-    assert everything_in(toy_run) == before
 
 
 def test_without_gl_pyrender_is_a_sentence_with_the_apt_line(
@@ -106,18 +53,6 @@ def test_without_gl_pyrender_is_a_sentence_with_the_apt_line(
     )
     assert offscreen.APT_LINE in said and "--renderer software" in said
     assert not (tmp_path / "made").exists()
-    said = one_sentence(
-        command("synthesize", "--run", toy_run, "--out", "made", "--renderer", "vulkan")
-    )
-    assert "No renderer is called 'vulkan'; there are auto, pyrender, software." in said
-
-
-def test_data_commands_refuse_in_sentences(command, tmp_path):
-    said = one_sentence(
-        command("prep-front", "--front", "no", "--future", "neither", "--out", "shards")
-    )
-    assert "No folder at " in said and not (tmp_path / "shards").exists()
-    assert "nowhere" in one_sentence(command("inspect", "nowhere"))
 
 
 def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
@@ -144,49 +79,6 @@ def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
     assert everything_in(tmp_path) == before
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        ("synthesize", "--out", "made"), ("complete", "--given", "a.json", "--out", "made"),
-        ("report",), ("eval-fid",), ("eval-svr", "--shards", "shards"),
-        ("reconstruct", "--shards", "shards", "--split", "test", "--out", "made"),
-    ],
-    ids=lambda call: call[0],
-)  # fmt: skip
-def test_a_seed_of_20_digits_is_refused_at_once(command, call):
-    status, _, errors = command(*call, "--run", "run", "--seed", 10**20 - 1)
-    assert status == 2 and "Invalid value for '--seed'" in errors and "4294967295" in errors
-
-
-def test_scores_that_are_named_must_be_there(command, toy_run):
-    said = one_sentence(command("report", "--run", toy_run, "--scores", "missing.json"))
-    assert "missing.json holds no scores" in said and "`sceneprior eval-fid --run" in said
-
-
-def test_eval_fid_scores_a_tiny_run(command, toy_run, tmp_path):
-    call = ["eval-fid", "--run", toy_run, "-n", 4, "--out", "scores.json", "--renderer", "software"]
-    call += ["--resamples", 5]
-    status, out, _ = command(*call)
-    assert status == 0 and out.endswith("Wrote scores.json\n")
-    scores = json.loads((tmp_path / "scores.json").read_text())
-    for name in (
-        "class_accuracy", "box_iou_3d", "category_kl", "type_share", "mean_objects",
-        "mean_objects_test", "implausible_pairs", "implausible_pairs_test", "fd_effnet_lite0",
-    ):  # fmt: skip
-        assert isinstance(scores[name], int | float), name
-    assert 0 <= scores["class_accuracy"] <= 1 and 0 <= scores["box_iou_3d"] <= 1
-    assert scores["protocol"]["stage"] == "shape"
-    before = (tmp_path / "scores.json").read_bytes()
-    status, out, errors = command(*call, "--inception", "none.pt")
-    # A progress bar may stand before it.
-    assert "No Inception network at none.pt." in one_sentence(
-        (status, out, errors[errors.index("Err") :])
-    )
-    assert (tmp_path / "scores.json").read_bytes() == before
-    said = one_sentence(command(*call, "--shards", "nowhere"))
-    assert "No folder of shards at nowhere" in said
-
-
 def test_unforeseen_errors_are_one_line_and_status_1(command, monkeypatch):
     def broken(*_):
         raise KeyError("surprise")
@@ -197,19 +89,6 @@ def test_unforeseen_errors_are_one_line_and_status_1(command, monkeypatch):
     assert "SCENEPRIOR_DEBUG=1" in errors and "Traceback" not in errors
 
 
-def test_the_module_is_the_command(tmp_path):
-    """In a process of its own, as a user meets it."""
-    call = [sys.executable, "-m", "sceneprior"]
-    answer = subprocess.run([*call, "--version"], capture_output=True, text=True, cwd=tmp_path)
-    assert answer.returncode == 0 and answer.stdout.startswith("sceneprior 0.")
-    answer = subprocess.run(
-        [*call, "prep-front", "--front", "none", "--future", "none", "--out", "made"],
-        capture_output=True, text=True, cwd=tmp_path,
-    )  # fmt: skip
-    one_sentence((answer.returncode, answer.stdout, answer.stderr))
-    assert not list(tmp_path.iterdir())
-
-
 def test_options_that_lightning_refuses_are_a_sentence_and_leave_nothing(
     command, toy_shards, tmp_path
 ):
@@ -218,15 +97,6 @@ def test_options_that_lightning_refuses_are_a_sentence_and_leave_nothing(
     said = one_sentence(command(*call, "--accelerator", "quantum"))
     assert "Lightning cannot train with --devices auto, --accelerator quantum" in said
     assert not (tmp_path / "new").exists()
-
-
-def test_ctrl_c_is_a_sentence(command, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("sceneprior.apps.api.load", interrupted)
-    status, _, errors = command("synthesize", "--run", "run", "--out", "rooms")
-    assert (status, errors) == (130, "Stopped by Ctrl-C. Every file that was written is whole.\n")
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,8 @@
 """Ctrl-C ends a command with one sentence and status 130, whatever it falls into."""
 
-import signal
 import subprocess
 import sys
-import time
 
-import numpy as np
 import pytest
 
 SENTENCE = "Stopped by Ctrl-C. Every file that was written is whole.\n"
@@ -58,28 +55,3 @@ def test_in_the_background_ctrl_c_stays_ignored(start):
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.communicate(timeout=400) == ("on\n", "") and process.returncode == 0
-
-
-@pytest.mark.slow
-def test_homes_end_whole_or_not_at_all_whenever_ctrl_c_comes(start, tmp_path):
-    """At random moments: one sentence and status 130, or a finished folder and status 0."""
-    rng = np.random.default_rng(0)
-    command = [sys.executable, "-m", "sceneprior", "make-homes", "homes", "--rooms", "6"]
-    began = time.monotonic()
-    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
-    took = time.monotonic() - began
-    for number in range(10):
-        folder = tmp_path / f"{number}"
-        folder.mkdir()
-        process = start(
-            command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        time.sleep(float(rng.uniform(0.3, took)))  # before, Python itself is not ready
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=400)
-        assert "Traceback" not in errors
-        if process.returncode == 0:
-            assert (folder / "homes" / "splits" / "bedroom.csv").is_file()
-        else:
-            assert process.returncode == 130 and errors.endswith(SENTENCE), errors
-            assert not list(folder.iterdir())

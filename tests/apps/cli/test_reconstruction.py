@@ -103,11 +103,6 @@ def test_one_object_at_the_border_is_answered(command, toy_run, own, tmp_path):
     label = (tmp_path / "classes.csv").read_text().splitlines()[1].split(",")[1]
     (item,) = json.loads((tmp_path / "one" / "mine.json").read_text())["objects"]
     assert item["class"] == label
-    upside_down = json.loads((tmp_path / "pose.json").read_text())["world_to_camera"]
-    flipped = (np.diag([1, -1, -1, 1]) @ np.array(upside_down)).tolist()
-    (tmp_path / "pose.json").write_text(json.dumps({"world_to_camera": flipped}))
-    said = one_sentence(command(*call, "--overwrite"))
-    assert "The camera of pose.json is upside down" in said
 
 
 def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_path):
@@ -121,7 +116,6 @@ def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_pat
         ([*shards, "--room", "toy/test_00", "--split", "test"], way),
         ([*shards, *own], way),
         (own[:2], "--mask needs --intrinsics beside it, and a PNG --classes, too."),
-        ([*own[:2], *own[4:]], "mine.png needs --classes: a table of the class"),
         ([*shards, "--room", "attic"], "holds no room 'attic'"),
         ([*shards, "--room", "toy/test_00", "--view", 8], "has no view 8; its 8 views are 0 to 7."),
         ([*shards, "--split", "test", "--fit", "slow"], "No fit is called 'slow'"),
@@ -129,14 +123,6 @@ def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_pat
     ):
         assert said in one_sentence(command(*call, *arguments)), arguments
     assert everything_in(tmp_path) == before
-    (tmp_path / "camera.json").write_text(
-        '{"fx": 48, "fy": 48, "cx": 48, "cy": 36, "width": 97, "height": 72}'
-    )
-    said = one_sentence(command(*call, *own[:-1], "camera.json"))
-    assert "is of an image of 97 x 72 pixels, but the mask has 96 x 72" in said
-    (tmp_path / "classes.csv").write_text("1,grand piano\n")
-    assert "none of its classes (grand piano)" in one_sentence(command(*call, *own))
-    assert not (tmp_path / "none").exists()
 
 
 def test_eval_svr_of_a_run_and_of_its_scenes(command, toy_run, toy_shards, tmp_path):

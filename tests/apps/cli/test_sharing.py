@@ -53,7 +53,6 @@ def test_scores_of_a_packed_prior_need_a_file_and_shards(command, packed, toy_sh
     status, _, errors = command(*call, "--shards", toy_shards)
     assert status == 0, errors
     assert json.loads((tmp_path / "s.json").read_text())["protocol"]["run"] == "mine.prior"
-    assert "is not a run folder" in one_sentence(command("report", "--run", "mine.prior"))
     said = one_sentence(
         command("eval-svr", "--run", "mine.prior", "--shards", toy_shards, "--out", "svr.json")
     )
@@ -98,7 +97,6 @@ def test_priors_are_listed_and_their_cards_printed(command, packed, sampler_run)
     status, out, _ = command("priors", "mine.prior")
     assert status == 0 and "# mine\n" in out and "Toys, made by hand; CC0." in out
     assert "is a run, which has no card" in one_sentence(command("priors", sampler_run))
-    assert "No prior at nothing" in one_sentence(command("priors", "nothing"))
 
 
 def test_export_goes_both_ways(command, tmp_path):

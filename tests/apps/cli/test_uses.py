@@ -47,9 +47,6 @@ def test_interpolate(command, toy_run, rooms, tmp_path):
     extra = json.loads((tmp_path / "way" / "step_03.json").read_text())["extra"]
     assert extra["along"] == 1 and extra["to"] == end and extra["slots"]
     before = everything_in(tmp_path)
-    assert "is neither a training room of this run" in one_sentence(
-        command(*call, "--to", "nowhere", "--out", "other")
-    )
     assert "way is not empty" in one_sentence(command(*call, "--to", "seed:1", "--out", "way"))
     assert everything_in(tmp_path) == before
 
@@ -78,8 +75,6 @@ def test_retrieve(command, rooms, tmp_path):
     again = command(*call, "--out", "again")
     assert again[0] == 0
     assert everything_in(tmp_path / "cad") == everything_in(tmp_path / "again")
-    said = one_sentence(command(*call[:3], "--models", "none", *SOFT, "--out", "new"))
-    assert "No folder at none; --models names" in said
     said = one_sentence(command("retrieve", "--scenes", "cache", *call[3:], "--out", "new"))
     assert "cache holds no scene JSON" in said and not (tmp_path / "new").exists()
 
@@ -102,16 +97,6 @@ def test_complete(command, toy_run, rooms, tmp_path):
     ends = ["--from", "whole/latents.npz:complete_00", "--to", "whole/latents.npz:complete_01"]
     walk = ["interpolate", "--run", toy_run, *ends, "--steps", 2, "--out", "walk", *SOFT]
     assert command(*walk)[0] == 0
-    scene["objects"] *= 7
-    given.write_text(json.dumps(scene))
-    said = one_sentence(command(*call, "--out", "many"))
-    assert "gives 7 objects, but rooms of this run hold at most 6" in said
-    given.write_text("[]")
-    assert "is not a scene JSON: expected an object" in one_sentence(
-        command(*call, "--out", "many")
-    )
-    given.write_text(json.dumps({**scene, "floor_m": [1, 2, 3]}))
-    assert "(floor_m.0: Input should be a valid list)" in command(*call, "--out", "many")[2]
     said = one_sentence(command(*call[:3], "--given", "gone.json", *SOFT, "--out", "many"))
     assert "gone.json cannot be read (No such file or directory)" in said
     assert not (tmp_path / "many").exists()
@@ -126,7 +111,7 @@ def test_a_sampler_s_rooms_have_no_latents(command, sampler_run, tmp_path):
     assert (tmp_path / "drawn" / "seed0_0001.json").exists()
 
 
-def test_complete_adds_what_is_asked_for(command, sampler_run, toy_run, tmp_path):
+def test_complete_adds_what_is_asked_for(command, sampler_run, tmp_path):
     empty = {
         "format": "sceneprior-scene", "version": 1, "name": "mine", "objects": [],
         "label_set": "front3d_bedroom", "floor_m": [[-2, -2], [2, -2], [2, 2], [-2, 2]],
@@ -147,10 +132,3 @@ def test_complete_adds_what_is_asked_for(command, sampler_run, toy_run, tmp_path
     assert "Note: complete_00 has no place for double_bed." in errors
     room = json.loads((tmp_path / "full" / "complete_00.json").read_text())
     assert len(room["objects"]) == 1 and room["extra"]["no_place"] == ["double_bed"]
-    assert "asked of a sampler alone" in one_sentence(
-        command(*call, "--run", toy_run, "--out", "other", *SOFT)
-    )
-    assert "has no sampler" in one_sentence(
-        command("synthesize", "--run", toy_run, "--distribution", "sampler", "--out", "other")
-    )
-    assert not (tmp_path / "other").exists()

@@ -37,13 +37,8 @@ def test_what_cannot_be_shown_is_said(command, tmp_path, port):
         assert f"--port {port + 1}" in said
     call = ["--port", port]
     assert "No prior at nowhere;" in one_sentence(command("view", "nowhere", *call))
-    (tmp_path / "empty").mkdir()
-    said = one_sentence(command("view", "empty", *call))
-    assert "empty holds no scene JSON" in said
     bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
     save_scene(Scene("room", "front3d_bedroom", (bed,)), tmp_path / "rooms" / "room.json")
-    said = one_sentence(command("view", "rooms", "--models", "none", *call))
-    assert "No folder at none; --models names" in said
     said = one_sentence(command("view", "rooms", "--host", "no.such.host.invalid", *call))
     assert "of no.such.host.invalid cannot be had" in said
 

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -14,7 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 from PIL import Image
-from tiny_runs import tiny_baseline_settings, tiny_sampler_config, write_tiny_config
+from tiny_runs import tiny_baseline_settings, write_tiny_config
 
 from sceneprior.apps.config import load_any_run, load_config
 from sceneprior.apps.experiments.compare import (
@@ -31,14 +30,10 @@ from sceneprior.apps.experiments.comparison import (
 )
 from sceneprior.apps.experiments.rows import costs_of
 from sceneprior.apps.experiments.steps import StepRunner
-from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import only_writer
-from sceneprior.core.ground_truth import reference_scenes
-from sceneprior.render.offscreen import SoftwareRenderer
 
 SOFTWARE = CompareOptions("software")
-OTHER_WAYS_TO_STOP = (("SIGINT", False), ("SIGHUP", False), ("SIGTERM", True))
 METHODS = {
     "ours": {},
     "lstm": {
@@ -106,12 +101,6 @@ def test_a_method_with_a_config_of_its_own_learns_from_the_same_rooms(written, t
         load_comparison(str(tmp_path / "compare.yaml"))
 
 
-def test_the_shipped_comparison_has_every_method_of_the_paper():
-    comparison = load_comparison("compare/new_rooms_small.yaml")
-    wanted = {"paper", "lstm", "atiss2d", "gan", "atiss", "sync2gen", "c1", "c3", "views25"}
-    assert wanted < set(comparison.methods) and set(comparison.rooms) == {"bedroom", "living"}
-
-
 def test_a_part_keeps_the_order_and_names_what_there_is(written):
     comparison = load_comparison(written(seeds=[0, 1]))
     part = part_of(comparison, "lstm, ours", "toy", "1")
@@ -128,15 +117,7 @@ def test_a_part_keeps_the_order_and_names_what_there_is(written):
     ("changes", "message"),
     [
         ({"seed": [0]}, "unknown key 'seed'; the nearest valid key is 'seeds'"),
-        (
-            {"methods": {name: {"title": "A"} for name in "ab"}},
-            "the title 'A' is given twice; a title names a row",
-        ),
         ({"seeds": [1, 1]}, "seeds are numbers from 0 on, each once"),
-        (
-            {"methods": {"a": {"title": "A", "tile": "B"}}},
-            "unknown key 'methods.a.tile'; the nearest valid key is 'title'",
-        ),
         (
             {"methods": {"a": {}, "b": {}}},
             "the title 'Paper's method' is given twice; a title names a row, so give methods.a",
@@ -281,19 +262,6 @@ def test_where_rooms_are_drawn_from_by_default_is_no_other_training(begun, toy_s
     assert again(begun, toy_shards).failures == [] and calls.names == []
 
 
-def test_what_was_deleted_is_made_again(begun, toy_shards, calls):
-    folder = begun / "out" / "toy" / "ours" / "seed0"
-    (folder / "scores.json").unlink()
-    again(begun, toy_shards)
-    assert calls.names == ["eval-fid", "eval-fid"]  # the second is forgotten with the first
-    shutil.rmtree(folder / "run")
-    done = again(begun, toy_shards)
-    assert (
-        calls.names[2:] == ["fit", "eval-fid", "eval-fid"] and done.table is None
-    )  # they made nothing
-    assert json.loads((folder / "steps.json").read_text())["fit"]["cpu_s"] == 2.5
-
-
 def test_a_truncated_file_is_a_sentence(begun, toy_shards, calls):
     folder = begun / "out" / "toy" / "ours" / "seed0"
     (folder / "scores.json").write_bytes((folder / "scores.json").read_bytes()[:40])
@@ -304,39 +272,8 @@ def test_a_truncated_file_is_a_sentence(begun, toy_shards, calls):
     assert "seed0/steps.json is damaged; delete it and run the same command" in failure
 
 
-def test_costs_of_a_run_add_up_and_are_unknown_after_a_kill(begun, toy_shards, calls):
-    folder = begun / "out" / "toy" / "ours" / "seed0"
-    (folder / "run" / "shape" / "final.ckpt").unlink()
-
-    def cpu_s():
-        return json.loads((folder / "steps.json").read_text())["fit"].get("cpu_s")
-
-    before = cpu_s()
-    again(begun, toy_shards)
-    assert cpu_s() == before + 2.5
-
-    def killed(arguments):
-        raise MemoryError
-
-    calls.before = killed
-    with pytest.raises(MemoryError):
-        again(begun, toy_shards)
-    assert cpu_s() is None
-    calls.before = lambda arguments: None
-    again(begun, toy_shards)
-    assert cpu_s() is None
-
-
-@pytest.mark.parametrize(
-    ("name", "background"),
-    [
-        ("SIGTERM", False),
-        # The runner's own tests hold these, without training.
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in OTHER_WAYS_TO_STOP),
-    ],
-)
 def test_a_signal_to_compare_alone_stops_its_commands_which_save_what_they_have(
-    written, tmp_path, start, name, background
+    written, tmp_path, start
 ):
     path = written(rooms={"toy": {"title": "Toys", "config": str(tmp_path / "tiny.yaml")}})
     text = (tmp_path / "tiny.yaml").read_text().replace("epochs: 1\n", "epochs: 100000\n")
@@ -344,13 +281,13 @@ def test_a_signal_to_compare_alone_stops_its_commands_which_save_what_they_have(
     words = ["--config", path, "--methods", "ours", "--out", str(tmp_path / "out")]
     process = start(
         [sys.executable, "-m", "sceneprior", "compare", *words, "--renderer", "software"],
-        background, stderr=subprocess.PIPE, text=True,
+        stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     folder = tmp_path / "out/toy/ours/seed0"
     deadline = time.monotonic() + 400
     while not (folder / "run/layout/last.ckpt").is_file() and time.monotonic() < deadline:
         time.sleep(0.1)
-    process.send_signal(signal.Signals[name])
+    process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=400)
     assert process.returncode == 130 and "The same command goes on from here" in said
     assert "Stopped and saved" in (folder / "fit.log").read_text()
@@ -395,19 +332,6 @@ def test_methods_without_latents_of_rooms_are_evaluated_once_by_their_own(writte
         load_comparison(written(distributions=["anywhere"]))
 
 
-def test_a_run_with_a_sampler_is_first_evaluated_by_it(written, tmp_path):
-    own = tmp_path / "sampled.yaml"
-    settings = tiny_sampler_config(Path("elsewhere")).model_dump(mode="json", by_alias=True)
-    own.write_text(yaml.safe_dump(settings))
-    ours = {"config": str(own)}
-    comparison = load_comparison(written(methods={"ours": ours}))
-    (run,) = runs_of(comparison, Path())
-    steps = scoring_steps(comparison, run, 4, SOFTWARE)
-    assert [step.name for step in steps] == ["scores", "scores_paper", "scores_kernel"]
-    assert "--distribution" not in steps[0].arguments
-    assert steps[1].arguments[-1] == "paper"
-
-
 def test_the_large_comparison_loads_and_says_where_rooms_come_from():
     comparison = load_comparison("compare/new_rooms.yaml")
     origins = {run.method: variants_of(comparison, run) for run in runs_of(comparison, Path())}
@@ -416,18 +340,8 @@ def test_the_large_comparison_loads_and_says_where_rooms_come_from():
     assert origins["atiss"] == (None,)
 
 
-@pytest.fixture(scope="module")
-def theirs(toy_shards, tmp_path_factory) -> Path:
-    """Four training rooms as boxes, as another method might write them."""
-    folder = tmp_path_factory.mktemp("theirs") / "scenes"
-    rooms = reference_scenes(toy_shards, "train", limit=4)
-    plain = [replace(room.without_meshes(), name=f"room_{k}") for k, room in enumerate(rooms)]
-    write_scenes(plain, folder, SoftwareRenderer())
-    return folder
-
-
-def test_scenes_that_are_there_are_a_row_beside_ours(begun, toy_shards, theirs):
-    scenes = shutil.copytree(theirs, begun / "given")
+def test_scenes_that_are_there_are_a_row_beside_ours(begun, toy_shards, scenes):
+    scenes = shutil.copytree(scenes, begun / "given", ignore=shutil.ignore_patterns("scores.json"))
     given = {"title": "Theirs", "scenes": {"toy": str(scenes)}}
     methods = {"ours": {}, "theirs": given}
     done = again(begun, toy_shards, "theirs", methods=methods)
@@ -451,9 +365,9 @@ def test_scenes_that_are_there_are_a_row_beside_ours(begun, toy_shards, theirs):
 
 
 def test_scenes_are_evaluated_again_when_they_change_and_need_as_many_as_others(
-    begun, toy_shards, theirs, calls
+    begun, toy_shards, scenes, calls
 ):
-    scenes = shutil.copytree(theirs, begun / "given")
+    scenes = shutil.copytree(scenes, begun / "given")
     methods = {"ours": {}, "theirs": {"title": "Theirs", "scenes": {"toy": str(scenes)}}}
 
     def states() -> str:

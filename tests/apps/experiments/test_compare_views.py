@@ -13,7 +13,6 @@ from tiny_runs import tiny_baseline_settings, write_tiny_config
 from typer.testing import CliRunner
 
 from sceneprior.apps.cli.commands import app
-from sceneprior.apps.config import load_config
 from sceneprior.apps.experiments.compare import CompareOptions, compare, scoring_steps
 from sceneprior.apps.experiments.comparison import load_comparison, runs_of
 from sceneprior.apps.experiments.rows import rows_of
@@ -148,9 +147,6 @@ def test_rooms_without_a_truth_are_refused_before_anything_is_trained(toy_shards
     [
         ({"task": "nowhere"}, "no task is called 'nowhere'; choose from new_rooms, single_views"),
         ({"task": ["a"]}, r"no task is called '\['a'\]'"),
-        ({"distributions": ["paper"]}, "unknown key 'distributions'"),
-        ({"count": 0}, "'count': input should be greater than or equal to 1"),
-        ({"views": 0}, "'views': input should be greater than or equal to 1"),
         ({"fits": ["guess"]}, "'fits.0': input should be 'objects' or 'paper'"),
         ({"task": "new_rooms"}, "unknown key 'views'"),
         (
@@ -162,15 +158,6 @@ def test_rooms_without_a_truth_are_refused_before_anything_is_trained(toy_shards
 def test_what_is_wrong_with_a_comparison_of_views_is_said(toy_shards, tmp_path, changes, said):
     with pytest.raises(ConfigError, match=said):
         load_comparison(write_comparison(tmp_path, toy_shards, **changes))
-
-
-def test_the_shipped_comparison_has_every_row_of_table_2():
-    comparison = load_comparison("compare/single_view.yaml")
-    assert list(comparison.methods) == ["total3d", "im3d", "usl", "paper", "lifted"]
-    methods = [load_config(run.config, run.settings).method for run in runs_of(comparison, Path())]
-    assert methods == ["total3d", "im3d", "usl", "paper", "lifted"]
-    assert comparison.cad_models == "shards"
-    assert comparison.views == 10 and comparison.fits == ("paper", "objects")
 
 
 def test_surfaces_that_are_unknown_are_counted():

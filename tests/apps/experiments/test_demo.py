@@ -97,17 +97,6 @@ def test_costs_add_up_over_a_stop_and_are_unknown_after_a_kill(ran, tmp_path):
     assert wall_s() == 6.0 and scores["seconds"] == 16.0
 
 
-def test_a_step_that_was_killed_is_done_again_and_its_costs_are_not_guessed(ran, tmp_path):
-    called, _ = ran
-    run(tmp_path, called)
-    noted = json.loads((tmp_path / "steps.json").read_text())
-    entry = noted["report"]
-    noted["report"] = {key: entry[key] for key in ("arguments", "depends_on")}  # as if killed
-    (tmp_path / "steps.json").write_text(json.dumps(noted))
-    assert run(tmp_path, called) == ["report"]
-    assert json.loads((tmp_path / "scores.json").read_text())["seconds"] == 12.0
-
-
 def test_other_settings_in_the_same_file_are_trained_anew(ran, tmp_path):
     called, _ = ran
     config = tmp_path / "mine.yaml"

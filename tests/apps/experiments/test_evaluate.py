@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import sys
 from dataclasses import replace
 
 import h5py
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from sceneprior.apps import cli
 from sceneprior.apps.config import load_run
 from sceneprior.apps.experiments.evaluate_views import mask_iou_of_rooms, mask_scores
 from sceneprior.apps.rooms import write_scenes
@@ -27,32 +25,6 @@ from sceneprior.evaluation.metrics.contents import class_frequencies, frequency_
 from sceneprior.paper.sampling import COPIES
 from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.topdown import box_mesh
-
-
-@pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Run `sceneprior <arguments>` in this process: (exit status, stdout, stderr)."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["sceneprior", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        output = capsys.readouterr()
-        return int(end.value.code or 0), output.out, output.err
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def scenes(toy_shards, tmp_path_factory):
-    """Four training rooms as boxes, as another method might write them."""
-    folder = tmp_path_factory.mktemp("theirs") / "scenes"
-    rooms = reference_scenes(toy_shards, "train", limit=4)
-    plain = [replace(room.without_meshes(), name=f"room_{k}") for k, room in enumerate(rooms)]
-    write_scenes(plain, folder, SoftwareRenderer())
-    return folder
 
 
 def test_the_users_scenes_are_evaluated_and_again_with_the_reference(
@@ -130,19 +102,6 @@ def test_other_json_among_scenes_is_said(command, scenes, toy_shards, tmp_path):
     )
 
 
-def test_copies_are_warned_of_once_a_command(command, toy_run):
-    draw = ["--run", toy_run, "-n", 3, "--renderer", "software"]
-    for words in (
-        ["synthesize", *draw, "--out", "copies"],
-        ["eval-fid", *draw, "--resamples", 0, "--out", "s.json"],
-    ):
-        status, _, errors = command(*words, "--distribution", "kernel")
-        assert status == 0 and errors.count(f"Warning: {COPIES}\n") == 1, errors
-        assert "sample.py" not in errors
-    status, _, errors = command("synthesize", *draw, "--out", "new")
-    assert status == 0 and "Warning" not in errors
-
-
 def test_a_run_whose_rooms_are_copies_is_warned_of_wherever_it_draws(command, toy_run, tmp_path):
     shutil.copytree(toy_run, tmp_path / "run")
     config = tmp_path / "run" / "config.yaml"
@@ -185,8 +144,6 @@ def test_a_run_is_evaluated_with_its_own_shards(command, toy_run, tmp_path):
             ["--scenes", "b", "--shards", "c", "--distribution", "paper"],
             "--distribution belongs to --run; scenes are evaluated as they are.",
         ),
-        (["--scenes", "b", "--shards", "c"], "No folder of scenes at b;"),
-        (["--run", "a"], "No prior at a;"),
         (
             ["--run", "a", "--split", "train"],
             "Generated rooms are compared with the split test, or",
@@ -197,42 +154,6 @@ def test_what_cannot_be_evaluated_is_one_sentence(command, tmp_path, arguments, 
     status, _, errors = command("eval-fid", *arguments, "--renderer", "software")
     assert status == 2 and errors.startswith(f"Error: {sentence}"), errors
     assert len(errors.strip().splitlines()) == 1 and list(tmp_path.iterdir()) == []
-
-
-def test_files_of_weights_and_references_are_checked_before_drawing(
-    command, scenes, toy_shards, tmp_path
-):
-    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
-    for option in ("--inception", "--alexnet"):
-        status, _, errors = command(*call, option, "absent.pt")
-        assert status == 2 and "at absent.pt" in errors and errors.count("\n") == 1
-    (tmp_path / "kept.npz").write_text("no")
-    status, _, errors = command(*call, "--reference", "kept.npz")
-    assert status == 2 and "kept.npz is no reference" in errors
-
-
-def test_boxes_are_converted_and_then_evaluated(command, toy_shards, tmp_path):
-    rng = np.random.default_rng(0)
-    for row in range(3):
-        np.savez(
-            tmp_path / f"{row}.npz",
-            class_labels=np.eye(23)[[8, 12]], translations=rng.uniform(0.5, 1, (2, 3)),
-            sizes=np.full((2, 3), 0.4), angles=rng.uniform(-3, 3, (2, 1)),
-        )  # fmt: skip
-    (tmp_path / "theirs").mkdir()
-    for path in tmp_path.glob("*.npz"):
-        path.rename(tmp_path / "theirs" / path.name)
-    call = ["export", "theirs", "--to", "scenes", "--out", "ours", "--label-set", "front3d_bedroom"]
-    assert command(*call)[:2] == (0, "Wrote 3 rooms to ours\n")
-    status, _, errors = command(*call)
-    assert status == 2 and "ours is not empty; add --overwrite" in errors
-    status, _, errors = command(
-        "eval-fid", "--scenes", "ours", "--shards", toy_shards, "--resamples", 0,
-        "--renderer", "software",
-    )  # fmt: skip
-    assert status == 0, errors
-    scores = json.loads((tmp_path / "ours" / "scores.json").read_text())
-    assert scores["mean_objects"] == 2 and scores["out_of_bounds_share"] is None
 
 
 def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(

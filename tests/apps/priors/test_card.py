@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -78,9 +77,3 @@ def test_what_is_not_known_is_said(trained):
     card = model_card(trained, "tiny", latents=True)
     assert UNSTATED in card and "Not measured when this was packed" in card
     assert "training rooms can be decoded from it" in card and "half precision" not in card
-
-
-def test_no_path_of_the_machine_is_in_it(trained):
-    folder = Path(trained.config.data.shards)
-    card = model_card(trained, "tiny")
-    assert f'"shards": "{folder.name}"' in card and str(folder.parent) not in card

@@ -175,46 +175,6 @@ def tensors_of(path: Path) -> dict[str, torch.Tensor]:
         return load(archive.read(WEIGHTS))
 
 
-def test_flipped_and_missing_bytes_are_sentences(sampler_file, tmp_path, rng):
-    """Any byte: a zip's checksums cover its files, and its directory must agree with them."""
-    whole, path = sampler_file.read_bytes(), tmp_path / "a.prior"
-    unharmed = sample_rooms(load_any_run(sampler_file), 1, 0)
-    for cut in (0, 1, 100, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:cut])
-        assert "is no packed prior, or is damaged" in refused(path)
-    places = [
-        *range(0, 60),
-        *range(len(whole) - 200, len(whole)),
-        *rng.integers(len(whole), size=60),
-    ]
-    for place in places:
-        damaged = bytearray(whole)
-        damaged[place] ^= 1 << int(rng.integers(8))
-        path.write_bytes(bytes(damaged))
-        try:
-            back = load_any_run(path)
-        except InputError as error:
-            assert "is no packed prior, or is damaged" in str(error)
-        else:  # a date, say, of which nothing depends
-            assert_same(sample_rooms(back, 1, 0), unharmed)
-
-
-def test_wrong_bytes_with_right_checksums_are_sentences_or_load(sampler_file, tmp_path, rng):
-    with zipfile.ZipFile(sampler_file) as archive:
-        parts = {"config": archive.read(CONFIG), "weights": archive.read(WEIGHTS)}
-    for _ in range(60):
-        for key, content in parts.items():
-            damaged = bytearray(content)
-            # The head of the weights is what is parsed.
-            for place in rng.integers(min(len(damaged), 3000), size=3):
-                damaged[place] = int(rng.integers(256))
-            path = rewritten(sampler_file, tmp_path / "a.prior", **{key: bytes(damaged)})
-            try:
-                load_any_run(path)
-            except InputError as error:
-                assert "\n" not in str(error)
-
-
 def test_pickles_and_checkpoints_are_refused_unopened(sampler_run, sampler_file, tmp_path):
     class Bomb:
         def __reduce__(self):

@@ -13,10 +13,6 @@ from sceneprior.apps.sample import sample_rooms
 SHIPPED = shipped_priors()
 
 
-def test_there_are_some():
-    assert "procthor-bedroom" in SHIPPED
-
-
 @pytest.fixture(params=SHIPPED)
 def name(request) -> str:
     return request.param

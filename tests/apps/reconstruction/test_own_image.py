@@ -115,7 +115,6 @@ def test_intrinsics(tmp_path):
     ("text", "said"),
     [
         ("40,40,48", "--intrinsics 40,40,48 is no intrinsics; expected fx,fy,cx,cy in pixels"),
-        ("a,b,c,d", "is no intrinsics"),
         ("fov=wide", "--intrinsics fov=wide is no intrinsics"),
         (
             "fov=1.08",
@@ -125,26 +124,19 @@ def test_intrinsics(tmp_path):
             "fov=3.5",
             "sees 3.5 degrees, expected 5 to 160; give that of this image, not of a larger",
         ),
-        ("fov=175", "sees 175 degrees, expected 5 to 160"),
-        ("0.7,0.7,48,36", "a focal length of 0.7 pixels in an image of 96 x 72 sees 178 degrees"),
         ("0.7,0.7,48,36", "give pixels, not a share of the width or millimetres."),
-        ("35mm=4000", "pixels in an image of 96 x 72 sees"),
         ('{"fx": "40", "fy": 40, "cx": 48, "cy": 36}', "holds no intrinsics"),
         ('{"K": [[1e400, 0, 48], [0, 40, 36], [0, 0, 1]]}', "is no pinhole camera"),
         (f"[[1{'0' * 400}, 0, 48], [0, 40, 36], [0, 0, 1]]", "holds no intrinsics"),
         ("[" * 3000 + "]" * 3000, "camera.json is not JSON"),
-        ("fov=180", "--intrinsics fov=180 is no intrinsics; expected fx,fy,cx,cy in pixels, fov="),
-        ("0,40,48,36", "is no pinhole camera"),
         ("40,nan,48,36", "is no pinhole camera"),
         ('{"fx": 40}', "holds no intrinsics"),
-        ("3", "is no pinhole camera"),
         ("[[40, 1, 48], [0, 40, 36], [0, 0, 1]]", "no skew"),
-        ("[[40, 0, 48], [0, 40, 36], [0, 0, 2]]", "is no pinhole camera"),
         ("{", "camera.json is not JSON"),
     ],
 )
 def test_intrinsics_that_are_none(tmp_path, text, said):
-    if text[0] in "{[" or text == "3":
+    if text[0] in "{[":
         (tmp_path / "camera.json").write_text(text)
         text = str(tmp_path / "camera.json")
     with pytest.raises(InputError) as error:
@@ -295,14 +287,3 @@ def test_classes_under_another_name_are_taken_for_the_label_sets(own):
     assert found[:2] == ["sofa", "double_bed"]
     known = {tidy(name) for each in (LABELS, "scannet") for name in label_set(each)}
     assert set(SAME_CLASS.values()) <= known
-
-
-def test_one_object_at_the_border(own, tmp_path):
-    """Its side there is not clear: it may go on beyond."""
-    mask, classes, pose = own
-    ids = np.zeros((72, 96), np.uint8)
-    ids[30:50, 80:] = 10
-    Image.fromarray(ids).save(mask)
-    (image,) = read_own_image(mask, classes, INTRINSICS, LABELS, pose).images
-    assert len(image.object_class) == 1
-    np.testing.assert_allclose(image.boxes[0], [80 / 96, 30 / 72, 1, 50 / 72])

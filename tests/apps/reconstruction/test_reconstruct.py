@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.apps.config import load_run
 from sceneprior.apps.reconstruction import reconstruct as reconstruct_module
 from sceneprior.apps.reconstruction.reconstruct import (
     FitOptions,
@@ -18,24 +17,12 @@ from sceneprior.apps.reconstruction.reconstruct import (
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.observed_image import as_views, images_of_split, rows_of
-from sceneprior.paper import fit_image as fitting
 from sceneprior.paper.fit_image import (
     SCHEDULES,
     FitSchedule,
     decode_images,
     view_loss,
 )
-from sceneprior.paper.view_loss import seen_masks
-
-
-@pytest.fixture(scope="module")
-def trained(toy_run):
-    return load_run(toy_run)
-
-
-@pytest.fixture(scope="module")
-def images(toy_shards):
-    return images_of_split(toy_shards, "test", 0)[0]
 
 
 @pytest.fixture(scope="module")
@@ -127,20 +114,6 @@ def test_an_object_of_a_class_that_the_run_never_generates(trained, images):
     assert [item.label for item in one.scene.objects] == [names[index] for index in classes]
     assert set(one.taken_for) - set(plain.taken_for) == {"sofa"}
     assert one.taken_for["sofa"] in generated
-
-
-def test_masks_are_fitted_at_the_runs_size(trained, images, monkeypatch):
-    """A quarter of 96 x 72 pixels in this run, whatever the size of an image."""
-    assert trained.config.data.mask_step == 4
-    sizes = []
-
-    def drawn(vertices_m, faces, views, settings):
-        sizes.append(views.observed_ids.shape[-2:])
-        return seen_masks(vertices_m, faces, views, settings)
-
-    monkeypatch.setattr(fitting, "seen_masks", drawn)
-    reconstruct(trained, images[:1], FitOptions("short"))
-    assert set(sizes) == {(18, 24)}
 
 
 def test_nearest_starts_are_the_rooms_of_least_layout_loss(trained, toy_shards):

@@ -6,9 +6,8 @@ import trimesh
 from model_folder import blocks, corner_sofa, write_model, write_models
 
 from sceneprior.apps.retrieval import cad_models
-from sceneprior.apps.retrieval.cad_models import default_cache, open_models, unit_mesh
+from sceneprior.apps.retrieval.cad_models import open_models
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Mesh
 
 
 @pytest.fixture
@@ -68,12 +67,6 @@ def test_models_by_class_and_broken_models(folder):
     np.testing.assert_allclose(beds[0], beds[1], atol=1e-6)
     assert (models.by_class["table"].points[..., 1] == 0).all()  # flat stays flat
     np.testing.assert_allclose(np.ptp(models.load("huge").vertices_m, axis=0), 1)
-
-
-def test_a_unit_mesh_fills_its_box():
-    mesh = corner_sofa()
-    unit = unit_mesh(Mesh(mesh.vertices, mesh.faces)).vertices_m
-    np.testing.assert_allclose([unit.min(0), unit.max(0)], [[-0.5] * 3, [0.5] * 3], atol=1e-12)
 
 
 def test_points_are_drawn_once_and_again_where_a_file_changed(folder, drawn):
@@ -137,8 +130,3 @@ def test_ids_that_leave_the_folder_are_broken_models(tmp_path):
     info.write_text(info.read_text()[:-1] + ', {"model_id": "../x", "category": "Dining Table"}]')
     models = open_models(tmp_path / "models", "front3d_bedroom", tmp_path / "cache", 16)
     assert "cannot be a folder's name" in models.broken["../x"]
-
-
-def test_the_cache_goes_where_caches_go(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert default_cache() == tmp_path / "sceneprior"

@@ -8,8 +8,6 @@ from model_folder import blocks, corner_sofa
 
 from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels, unit_mesh
 from sceneprior.apps.retrieval.retrieve import (
-    _rough_distances,
-    _turned_views,
     extruded,
     most_similar,
     placed,
@@ -18,7 +16,6 @@ from sceneprior.apps.retrieval.retrieve import (
     retrieve_all,
 )
 from sceneprior.core.geometry.surfaces import surface_points
-from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m
 
 POINTS = 256
@@ -53,28 +50,8 @@ def models():
     return cad_models(sofa={"plain": plain, "corner": corner_sofa(), "table": table})
 
 
-def brute_chamfer(a: np.ndarray, b: np.ndarray) -> float:
-    apart = np.linalg.norm(a[:, None] - b[None], axis=2)
-    return float(apart.min(axis=1).mean() + apart.min(axis=0).mean()) / 2
-
-
 def room(*objects: SceneObject) -> Scene:
     return Scene("room", "front3d_living", objects)
-
-
-@pytest.mark.parametrize("step", [1, 4])
-def test_rough_distances_are_chamfer_distances_of_every_nth_point(rng, step):
-    of_class = rng.uniform(-0.5, 0.5, (7, 64, 3)).astype(np.float32)
-    points, size = rng.normal(size=(64, 3)), np.array([2.0, 0.7, 0.4])
-    choices = rng.permutation(7 * QUARTERS)[:19]
-    rough = _rough_distances(_turned_views(points, tuple(size)), of_class, choices, step)
-    for choice, got in zip(choices, rough, strict=True):
-        model, turn = divmod(int(choice), QUARTERS)
-        unit = Mesh(of_class[model].astype(np.float64), np.zeros((0, 3), np.int64))
-        item = SceneObject("sofa", (0.0, 0.0, 0.0), tuple(size))
-        in_room = placed(unit, item, 90 * turn).vertices_m
-        # Squared distances in float32, as a difference of squares of a few metres.
-        assert got == pytest.approx(brute_chamfer(points[::step], in_room[::step]), abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -138,12 +115,6 @@ def test_the_fast_search_finds_the_winner_of_the_slow_one(rng):
         item = replace(item, mesh=placed(unit, item, 0))
         slow = most_similar(item, models.by_class["sofa"], keep=None)
         assert most_similar(item, models.by_class["sofa"]) == slow
-
-
-def test_without_a_mesh_the_box_is_compared(models):
-    made = retrieve(room(SceneObject("sofa", (0.0, 0.9, 0.0), (1.0, 0.6, 1.0))), models)
-    assert made.extra["retrieval"][0]["model_id"] == "plain"
-    assert made.objects[0].size_m == pytest.approx((1.0, 1.2, 1.0))
 
 
 def test_classes_without_models_keep_their_objects_and_the_report_says_so(models):

@@ -78,11 +78,3 @@ def test_fewer_objects_leave_no_node_behind(room, fake):
     assert fake.nodes["/room/name_0"].text == "pendant lamp 0.40 x 0.60 x 0.40 m"
     room.show(scene())
     assert set(fake.nodes) == {"/room", "/room/floor"}
-
-
-def test_a_kept_object_has_its_box_and_name(room, fake):
-    room.show(scene(BED, LAMP), kept={1})
-    assert fake.nodes["/room/name_0"].values == ("pendant lamp 0.40 x 0.60 x 0.40 m",)
-    points = fake.nodes["/room/boxes"].values[0]
-    assert len(points) == 12
-    np.testing.assert_allclose(points.reshape(-1, 3).max(axis=0), [1.2, 2.3, 0.2])

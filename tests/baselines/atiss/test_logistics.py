@@ -38,21 +38,6 @@ def test_a_step_is_a_difference_of_scipys_distribution_functions(mixture):
     np.testing.assert_allclose(ours.numpy(), wanted, rtol=1e-9)
 
 
-def test_the_density_integrates_to_what_lies_inside(mixture):
-    """Away from the ends, the probability of a step is the density's mean over it times its width:
-    integrated over values and divided by that width, it is what the mixture has inside."""
-    grid = torch.linspace(-0.9, 0.9, 400_001, dtype=torch.float64)
-    one = LogisticMixture(mixture.weight_logits[0], mixture.means[0], mixture.log_scales[0])
-    wide = LogisticMixture(*(part.expand(len(grid), -1) for part in (
-        one.weight_logits, one.means, one.log_scales)))  # fmt: skip
-    inside = torch.trapezoid(wide.log_prob(grid).exp(), grid) / (2 * HALF_STEP)
-    distribution = stats.logistic(one.means.numpy(), one.log_scales.exp().numpy())
-    shifts = np.linspace(-HALF_STEP, HALF_STEP, 2001)[:, None]
-    smooth = np.mean(distribution.cdf(0.9 + shifts) - distribution.cdf(-0.9 + shifts), axis=0)
-    wanted = (one.weight_logits.softmax(dim=-1).numpy() * smooth).sum()
-    assert float(inside) == pytest.approx(wanted, rel=1e-5)  # the trapezoid's and the mean's error
-
-
 def test_far_away_and_in_float32_it_stays_a_number():
     mixture = LogisticMixture(torch.zeros(1, 1), torch.full((1, 1), 0.9), torch.full((1, 1), -7.0))
     far = mixture.log_prob(torch.tensor([-0.9]))

@@ -22,7 +22,6 @@ from sceneprior.core.geometry.meshes import place
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.losses.completeness import kept_objects
-from sceneprior.render.silhouettes.render import render_silhouettes
 
 CLASSES = 22
 BOX = trimesh.creation.box()
@@ -105,41 +104,6 @@ def whole(scenes: DecodedScenes, views) -> torch.Tensor:
     return ((ahead > 0.1) | ~there).flatten(2).all(dim=-1)
 
 
-def test_what_is_not_kept_hides_nothing(views, toy_shards):
-    scenes = true_scenes(toy_shards, 4)
-    plain = drawn_maps(scenes, views)
-    # In the middle of the room and large.
-    centers, sizes = scenes.centers_m.clone(), scenes.sizes_m.clone()
-    centers[:, 5], sizes[:, 5] = torch.tensor([0.0, 1.0, 0.0]), 2.0
-    meshes = place(CORNERS.expand(4, 6, -1, -1), centers, sizes)
-    label = scenes.class_logits.clone()
-    label[:, 5, 9] = 3 * SURE
-    ghost = replace(scenes, class_logits=label, centers_m=centers, sizes_m=sizes, vertices_m=meshes)
-    assert torch.equal(drawn_maps(ghost, views), plain)
-    bed = replace(ghost, completeness_logits=ghost.completeness_logits.abs())
-    assert (drawn_maps(bed, views)[:, :, 9] > plain[:, :, 9]).any()
-
-
-def test_the_maps_are_the_renderers_layers(views, toy_shards):
-    """Independent of our own laying over: `compositing='layered'`, where no edge is soft."""
-    scenes = true_scenes(toy_shards, 4)
-    size = (views.instance_ids.shape[-2] // POOLING, views.instance_ids.shape[-1] // POOLING)
-    scale = torch.tensor([size[1] / views.image_size[1], size[0] / views.image_size[0], 1])
-    layers = render_silhouettes(
-        scenes.vertices_m, FACES, views.world_to_camera, views.intrinsics * scale[:, None],
-        size, sigma_px2=0.25, mode="fast", drawn=scenes.completeness_logits > 0,
-    )  # fmt: skip
-    maps = drawn_maps(scenes, views)
-    assert_close(maps[:, :, VOID], 1 - layers.sum(dim=2), rtol=0, atol=1e-5)
-    _, one_hot = choices(scenes)
-    wanted = torch.einsum("rvkhw,rkc->rvchw", layers, one_hot)
-    hard = (layers.amax(dim=2) > 0.999) & whole(scenes, views)[..., None, None]
-    assert_close(
-        maps.movedim(2, -1)[hard][:, 1:], wanted.movedim(2, -1)[hard][:, 1:], rtol=0, atol=2e-3
-    )
-    assert hard.sum() > 100
-
-
 def test_laying_over_is_the_product_of_what_nearer_objects_leave(torch_rng):
     rooms, views, objects, classes = 2, 2, 4, 5
     double = {"generator": torch_rng, "dtype": torch.float64}
@@ -194,29 +158,3 @@ def test_counts_are_those_of_the_objects_that_exist(views, toy_shards):
         for label in shard.read_room(room_id).object_class:
             wanted[int(label)] += 1
         assert torch.equal(observed_counts(views, CLASSES)[room], wanted)
-
-
-def test_counts_pull_on_existence_and_classes(toy_shards):
-    scenes = true_scenes(toy_shards, 4, objects=2)
-    complete = torch.tensor([[0.5, -0.5]] * 4, requires_grad=True)
-    labels = (scenes.class_logits / SURE).requires_grad_()
-    counts = counts_of(replace(scenes, completeness_logits=complete, class_logits=labels))
-    assert_close(counts.detach().sum(dim=1), torch.ones(4))
-    counts[:, 9].sum().backward()
-    assert (labels.grad[:, 0, 9] > 0).all()  # of the object that exists
-    assert (labels.grad[:, 1] == 0).all()
-    counts = counts_of(replace(scenes, completeness_logits=complete))
-    (more,) = torch.autograd.grad(counts.sum(), complete)
-    assert (more > 0).all()
-
-
-def test_what_is_not_there_learns_what_its_appearance_would_change(views, toy_shards):
-    """A bed that is not kept, where the camera would see it: asked for beds, it comes."""
-    scenes = true_scenes(toy_shards, 4, objects=1)
-    complete = torch.full((4, 1), -0.5, requires_grad=True)
-    label = torch.zeros(4, 1, CLASSES, requires_grad=True) + scenes.class_logits / 9
-    maps = drawn_maps(replace(scenes, completeness_logits=complete, class_logits=label), views)
-    assert (maps[:, :, VOID] == 1).all()
-    beds = int(scenes.class_logits[0, 0].argmax())
-    maps[:, :, beds].sum().backward()
-    assert (complete.grad > 0).any() and (complete.grad >= 0).all()

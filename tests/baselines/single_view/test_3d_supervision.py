@@ -67,18 +67,6 @@ def test_true_numbers_give_the_true_boxes_and_no_loss(batch):
     assert float(wrong["size"]) == pytest.approx(0.3**2 / 2, rel=1e-3)
 
 
-def test_the_truth_of_a_mask_is_that_of_its_object(batch, toy_shards):
-    found = detections_of(batch.views)
-    true = true_objects(found, batch)
-    rows = (found.room, found.item)
-    assert torch.equal(torch.cat(true.placed, dim=-1), batch.boxes_m[rows])
-    # Toy furniture is boxes: every point is on a side, and nearly every cell is filled.
-    assert_close(
-        true.points.abs().amax(dim=-1), torch.ones(true.points.shape[:2]), rtol=0, atol=1e-3
-    )
-    assert true.occupied.float().mean() > 0.98
-
-
 @pytest.mark.parametrize("stage", METHODS, indirect=True)
 def test_masks_hear_of_their_own_image_alone(batch, stage):
     prior = stage.prior.eval()

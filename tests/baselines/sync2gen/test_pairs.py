@@ -101,14 +101,6 @@ def test_a_nightstand_goes_back_beside_its_bed(prior):
     assert float(prior.energy(refined, start_m)) < float(prior.energy(rooms, start_m))
 
 
-def test_a_certain_decoder_is_believed(prior):
-    prior.error_m2.fill_(1e-4)
-    rooms = room((BED, 0, 0), (STAND, 0.9, 0.35))
-    moved = (prior.refine(rooms, 200).boxes_m - rooms.boxes_m).abs().max()
-    prior.error_m2.fill_(0.04)
-    assert 5 * moved < (prior.refine(rooms, 200).boxes_m - rooms.boxes_m).abs().max()
-
-
 def test_strangers_and_lone_objects_stay_where_they_are(prior):
     for rooms in (room((BED, 0.3, 0)), room((BED, 0, 0), (LAMP, 0.1, 0.1))):
         assert torch.equal(prior.refine(rooms, 20).boxes_m, rooms.boxes_m)

@@ -18,7 +18,6 @@ from data_prep.scannet.occlusion import unoccluded
 from data_prep.scannet.scans import ScanSettings, read_scan
 from data_prep.scannet.source import ScanNetSource
 from data_prep.scannet.views import prepare_scan
-from sceneprior.core.errors import InputError
 from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import Shard
 from sceneprior.render.offscreen.zbuffer import rasterize

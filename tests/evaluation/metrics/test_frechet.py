@@ -21,26 +21,6 @@ def with_moments(count: int, mean: np.ndarray, covariance: np.ndarray, seed: int
     return mean + white @ np.linalg.cholesky(covariance).T
 
 
-def test_two_gaussians_with_diagonal_covariances_have_a_closed_form():
-    mean_a, mean_b = np.array([0.0, 1.0, 2.0]), np.array([1.0, -1.0, 2.0])
-    var_a, var_b = np.array([1.0, 4.0, 9.0]), np.array([4.0, 4.0, 0.25])
-    a = with_moments(40, mean_a, np.diag(var_a), 0)
-    b = with_moments(70, mean_b, np.diag(var_b), 1)
-    expected = ((mean_a - mean_b) ** 2).sum() + ((np.sqrt(var_a) - np.sqrt(var_b)) ** 2).sum()
-    assert frechet_distance(a, b) == pytest.approx(expected, abs=1e-10)
-    assert frechet_distance(b, a) == pytest.approx(expected, abs=1e-10)
-
-
-def test_correlated_gaussians_agree_with_scipys_square_root():
-    rng = np.random.default_rng(2)
-    a = rng.normal(size=(60, 8)) @ rng.normal(size=(8, 8))
-    b = rng.normal(size=(50, 8)) @ rng.normal(size=(8, 8)) + 0.3
-    cov_a, cov_b = np.cov(a.T), np.cov(b.T)
-    root = np.real(scipy.linalg.sqrtm(cov_a @ cov_b))
-    by_hand = ((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(cov_a + cov_b - 2 * root)
-    assert frechet_distance(a, b) == pytest.approx(by_hand, rel=1e-9)
-
-
 def test_fewer_images_than_dimensions_is_exact_too():
     # In 300 dimensions, but living in the first 3: the closed form of those 3 holds.
     var_a, var_b = np.array([1.0, 4.0, 9.0]), np.array([4.0, 4.0, 0.25])
@@ -51,13 +31,6 @@ def test_fewer_images_than_dimensions_is_exact_too():
     turn = scipy.linalg.qr(np.random.default_rng(5).normal(size=(300, 300)))[0]
     assert frechet_distance(a, b) == pytest.approx(expected, abs=1e-10)
     assert frechet_distance(a @ turn, b @ turn) == pytest.approx(expected, abs=1e-9)
-
-
-def test_a_set_is_at_distance_zero_from_itself_in_any_order():
-    a = np.random.default_rng(6).normal(size=(12, 40)).astype(np.float32)
-    assert frechet_distance(a, a[::-1]) < 1e-10
-    same = np.tile(a[0], (5, 1))
-    assert frechet_distance(same, same) == 0
 
 
 def test_distances_refuse_too_few_images_and_broken_numbers():

@@ -11,7 +11,6 @@ from sceneprior.evaluation.metrics.layout_classifier import (
     ABSENT,
     METRICS,
     boosted_trees,
-    jittered_features,
     layout_features,
 )
 
@@ -116,12 +115,6 @@ def test_other_real_rooms_are_not_told_and_rooms_without_relations_are(accuracy,
     assert accuracy(incoherent(random_rooms(rng, 60), rng)) > 0.8
 
 
-def test_real_training_rooms_are_told_from_the_other_half(accuracy):
-    """Were they told from themselves, all would be called real: 0.5 by one side alone."""
-    assert accuracy(accuracy.real[:60]) == pytest.approx(0.5, abs=0.15)
-    assert accuracy(accuracy.real) == accuracy(accuracy.real[:60]), "which half, the seed says"
-
-
 def test_both_sides_weigh_alike_and_no_judged_room_is_learnt_from(accuracy, rng, monkeypatch):
     asked: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
@@ -141,29 +134,6 @@ def test_both_sides_weigh_alike_and_no_judged_room_is_learnt_from(accuracy, rng,
     assert len(np.unique(fresh, axis=0)) == 200, "each judged once"
 
 
-def test_an_unbalanced_set_does_not_tip_the_classifier(rng):
-    """Without weights, 10 rooms among 120 that look the same would all be given to the 120."""
-    features = rng.normal(size=(130, 6))
-    labels = np.repeat([0, 1], [120, 10])
-    others = rng.normal(size=(400, 6))
-    share = boosted_trees(features, labels, others, 0).mean()
-    same = boosted_trees(features, labels, features, 0)
-    assert (same == labels).all() and share > 0.02
-
-
-def test_millimetres_do_not_show(accuracy, rng):
-    """A method that is off by two centimetres makes as good layouts."""
-    rooms = [
-        room(*((o.label, np.add(o.center_m, rng.normal(0, 0.02, 3))) for o in scene.objects))
-        for scene in random_rooms(rng, 60)
-    ]
-    assert accuracy(rooms) == pytest.approx(0.5, abs=0.15)
-
-
-def test_noise_is_seeded_and_rooms_that_cannot_be_told_are_answered(rng):
-    scenes = random_rooms(rng, 3)
-    once = jittered_features(scenes, (0, 1))
-    np.testing.assert_array_equal(once, jittered_features(scenes, (0, 1)))
-    assert (once != jittered_features(scenes, (0, 2))).any()
+def test_rooms_that_cannot_be_told_are_answered():
     same = np.zeros((4, 5))
     assert boosted_trees(same, np.array([0, 1, 0, 1]), same, 0).tolist() == [0] * 4

@@ -77,13 +77,3 @@ def test_the_threshold_is_what_one_real_room_in_a_hundred_falls_below(training):
     assert near_copy_threshold(training[:1]) == 0  # nothing is nearer than that
     # Where no two rooms hold the same furniture, nothing can be a copy of another.
     assert near_copy_threshold([training[0], of_classes("sofa", "stool", "wardrobe")]) == 0
-
-
-def test_distances_of_incoherent_rooms_are_not_called_better(training):
-    """Furniture at random is as far from training rooms as new rooms are: no direction."""
-    directions = {metric.key: metric.direction for metric in METRICS}
-    assert directions["nearest_training_m"] == directions["nearest_decoded_m"] == "none"
-    comparison = compared(training, training[:2])
-    assert values(room_set(training, training), comparison).keys() == {
-        "nearest_training_m", "near_copy_share", "near_copy_excess"
-    }  # fmt: skip

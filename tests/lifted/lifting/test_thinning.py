@@ -54,12 +54,6 @@ def test_the_slope_of_variation_and_volume_is_autograds():
     np.testing.assert_allclose(slope, wanted.numpy(), rtol=0, atol=1e-12)
 
 
-def test_rays_without_spans_alone_have_no_slope(rays):
-    slope = np.zeros((5, 5, 5))
-    ray_slope(slope.copy(), rays.starts, 0 * rays.spans, rays.hits, np.zeros(30), 7, slope)
-    assert not slope.any()
-
-
 def chair() -> np.ndarray:
     """A seat, a back on the side of low z, and one arm at high x."""
     grid = np.zeros((CELLS, CELLS, CELLS), bool)

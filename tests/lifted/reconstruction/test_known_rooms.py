@@ -16,17 +16,11 @@ from sceneprior.lifted.reconstruction.known_rooms import (
     random_answers,
     turn_scene,
 )
-from sceneprior.render.offscreen import open_renderer
 
 
 @pytest.fixture(scope="module")
 def rooms(toy_shards):
     return known_rooms(toy_shards)
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return open_renderer("software")
 
 
 def test_every_room_is_there_in_four_turns(rooms):

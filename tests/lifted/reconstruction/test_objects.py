@@ -11,8 +11,7 @@ from sceneprior.apps.config import load_run
 from sceneprior.apps.reconstruction.own_image import level_camera
 from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.meshes import icosphere
-from sceneprior.core.geometry.turns import quarter_rotation, turn_vectors
-from sceneprior.core.observed_image import ObservedImage, images_of_split
+from sceneprior.core.observed_image import ObservedImage
 from sceneprior.lifted.reconstruction import candidates
 from sceneprior.lifted.reconstruction.candidates import candidates_of, with_shapes
 from sceneprior.lifted.reconstruction.objects import answer_images, likeliest_box
@@ -21,16 +20,6 @@ from sceneprior.lifted.reconstruction.placing import Placed, place_objects
 
 CUBE = torch.tensor([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 CAMERA = np.array([[48.0, 0, 48], [0, 48, 36], [0, 0, 1]])
-
-
-@pytest.fixture(scope="module")
-def trained(toy_run):
-    return load_run(toy_run)
-
-
-@pytest.fixture(scope="module")
-def images(toy_shards):
-    return images_of_split(toy_shards, "test", 0)[0]
 
 
 def painted(*rectangles, clear=True) -> ObservedImage:
@@ -162,13 +151,6 @@ def test_candidates_of_looks_reach_as_far_as_their_meshes(sampler_run):
     wanted = (mesh.vertices_m @ directions.numpy().T).max(axis=0)
     reach = (shaped.points[2] * directions).sum(dim=1)
     assert_close(reach, torch.from_numpy(wanted).float(), rtol=1e-4, atol=1e-5)
-
-
-def test_a_turned_point_is_where_its_turned_mesh_is():
-    point = torch.tensor([[[0.1, 0.2, 0.5]]])
-    for quarter in range(4):
-        turned = turn_vectors(point, torch.tensor([quarter]))[0, 0].numpy()
-        np.testing.assert_allclose(turned, quarter_rotation(quarter) @ point[0, 0].numpy())
 
 
 def test_answers_have_one_object_a_mask_of_its_class_with_its_mesh_in_its_box(trained, images):

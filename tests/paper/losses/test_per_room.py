@@ -60,16 +60,6 @@ def test_mask_term(batch, torch_rng):
             assert_close(overlap[name][room], value, rtol=1e-6, atol=1e-9)
 
 
-def test_a_gate_below_zero_lets_every_mask_count(batch, torch_rng):
-    ids = torch.randint(0, 4, (*batch.views.visible.shape[:2], 6, 8), generator=torch_rng)
-    views = replace(batch.views, instance_ids=ids)
-    matches = match_objects(batch.scenes, batch.boxes, views)
-    empty = torch.zeros(*views.visible.shape[:2], batch.scenes.centers_m.shape[1], 6, 8)
-    assert mask_loss(empty, views, matches, 0.5)[0] == 0
-    loss, overlap = mask_loss(empty, views, matches, -1.0)
-    assert loss > 0 and overlap["mask_used"] == 1
-
-
 def test_a_room_without_anything_that_counts_is_zero():
     values = torch.tensor([[1.0, 3.0], [5.0, 7.0]])
     counted = torch.tensor([[True, True], [False, False]])
