@@ -44,8 +44,8 @@ def negative_log_likelihood(
         reading = sampler.read(before, still[row, step], frame.rows(row), tokens[row, :step])
         going = (counts[row] > step).nonzero()[:, 0]
         row = row[going]
-        coming = rooms.changed(lambda part, row=row, step=step: part[row, step : step + 1])
-        for name, log_prob in sampler.log_prob(reading.rows(going), coming).items():
+        following = _first(rooms, row, step + 1).take(torch.full((len(row), 1), step).to(row))
+        for name, log_prob in sampler.log_prob(reading.rows(going), following).items():
             found[name] = found[name].index_add(0, row, -log_prob)
     listing = sampler.contents.negative_log_likelihood(
         listed.object_class, listed.is_object, frame.rectangle_m[:, 2:]

@@ -123,10 +123,11 @@ class SamplerStage(lightning.LightningModule):
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         rate = self.stage.learning_rate
         decay = self.stage.weight_decay
-        contents, tables, rest = [], [], []
-        for name, value in self.learner.named_parameters():
-            table = name.startswith("placement.") and name.endswith("_table")
-            (contents if name.startswith("contents.") else tables if table else rest).append(value)
+        named = list(self.learner.named_parameters())
+        contents = [value for name, value in named if name.startswith("contents.")]
+        tables = [value for name, value in named if name.endswith("_table")]
+        known = {id(value) for value in contents + tables}
+        rest = [value for _, value in named if id(value) not in known]
         optimizer = torch.optim.AdamW(
             [
                 {"params": rest, "lr": rate},
