@@ -17,11 +17,11 @@ from sceneprior.lifted.sampler.plan import (
     plan_rooms,
     uniform_numbers,
 )
-from sceneprior.lifted.sampler.rooms import FRAME_M, gaps_m, shared_extents
+from sceneprior.lifted.sampler.rooms import FRAME_M, GRAZE_M, gaps_m, shared_extents
 
 PLACES = 16
 """Places sampled for an object in the last attempt, in which it takes the best one."""
-TRIES = 2
+TRIES = 4
 """Places sampled for an object in each attempt before; it takes the first without a violation. Few,
 since an object whose likely places are taken would end at an unlikely one; the room is furnished
 again instead."""
@@ -36,7 +36,7 @@ SIZE_RANGE = 0.5
 """Largest difference between the log extents of an object and of its look."""
 SIZE_DOUBT = 0.1
 """Standard deviation of that difference for given objects."""
-ROUNDS = 32
+ROUNDS = 16
 """Maximum number of attempts to furnish a room before it is planned anew."""
 PLANS = 3
 """Maximum number of plans of a room."""
@@ -173,7 +173,10 @@ def _placed(
             break
         tried_m = boxes_m[rows]
         tried_m[:, [0, 2]] = places.rows(rows).draw(x[rows, number], numbers[rows, number, 2:])
-        found = _wrong(tried_m, label[rows], reading.rows(rows), sampler.may_meet)
+        some = reading.rows(rows)
+        apart = ~sampler.may_meet[label[rows, None], some.before.object_class]
+        tried_m = _settled(tried_m, some, apart)
+        found = _wrong(tried_m, some, apart)
         better = rows[found < wrong[rows]]
         boxes_m[better] = tried_m[found < wrong[rows]]
         wrong[rows] = torch.minimum(found, wrong[rows])
@@ -218,22 +221,39 @@ def _recognised(
     return rooms
 
 
+def _settled(
+    boxes_m: Float[Tensor, "rooms 6"], reading: Reading, apart: Bool[Tensor, "rooms objects"]
+) -> Float[Tensor, "rooms 6"]:
+    """Move boxes out of objects that they should stand `apart` from, and into the rectangle, along
+    each axis by at most `GRAZE_M`: sampled places are not accurate to the centimetre."""
+    others_m = reading.before.boxes_m
+    shared = shared_extents(boxes_m.unsqueeze(1), others_m)
+    grazes = apart & reading.before.is_object & (shared > 0).all(dim=-1)
+    x_and_z, away = shared[..., ::2], (boxes_m.unsqueeze(1) - others_m)[..., [0, 2]]
+    least = x_and_z == x_and_z.amin(dim=-1, keepdim=True)
+    moves = x_and_z * away.sign() * (least & (x_and_z <= GRAZE_M) & grazes.unsqueeze(-1))
+    centre = boxes_m[:, [0, 2]] + moves.sum(dim=1)
+    middle, extents = reading.frame.rectangle_m.split(2, dim=-1)
+    free = ((extents - boxes_m[:, [3, 5]]) / 2).clamp(min=0)
+    inside = centre.clamp(middle - free, middle + free)
+    centre = inside.where((inside - centre).abs() <= GRAZE_M, centre)
+    settled = boxes_m.clone()
+    settled[:, [0, 2]] = centre
+    return settled
+
+
 def _wrong(
-    boxes_m: Float[Tensor, "rooms 6"],
-    label: Int[Tensor, " rooms"],
-    reading: Reading,
-    may_meet: Bool[Tensor, "classes classes"],
+    boxes_m: Float[Tensor, "rooms 6"], reading: Reading, apart: Bool[Tensor, "rooms objects"]
 ) -> Float[Tensor, " rooms"]:
     """Violation of a box, 0 if there is none: the intersected shares of the smaller boxes, summed
-    over objects that it should not meet, plus the metres by which it extends beyond the
+    over objects that it should stand `apart` from, plus the metres by which it extends beyond the
     rectangle."""
     others = reading.before
     here, theirs = boxes_m.unsqueeze(1), others.boxes_m
     shared = shared_extents(here, theirs).prod(dim=-1)
     least = torch.minimum(here[..., 3:].prod(dim=-1), theirs[..., 3:].prod(dim=-1))
     share = shared / least.clamp(min=1e-9)
-    counts = others.is_object & ~may_meet[label[:, None], others.object_class]
-    share = share.where((share > INTERSECTING) & counts, 0.0)
+    share = share.where((share > INTERSECTING) & others.is_object & apart, 0.0)
     middle, extents = reading.frame.rectangle_m.split(2, dim=-1)
     beyond = (boxes_m[:, [0, 2]] - middle).abs() + (boxes_m[:, [3, 5]] - extents) / 2
     return share.sum(dim=-1) + (beyond.amax(dim=-1) - BEYOND_M).clamp(min=0)
