@@ -117,9 +117,10 @@ def path_text(name: str) -> str:
 
 
 def ids_path(folder: Path, name: str) -> Path:
-    """Path of the PNG of ids that belongs to a frame with `file_path` `name`.
+    """Path of a frame's instance-id PNG; `name` is the frame's `file_path`.
 
-    It is `instances/<the same path>.png` if that exists (for frames in several folders), else
+    It is `instances/<name without its extension>.png` if that exists (for frames in several
+    folders), else
     `instances/<stem>.png`.
     """
     path = Path(_as_png(path_text(name)))
@@ -135,7 +136,7 @@ def _as_png(name: str) -> str:
 
 
 def check_one_png_a_frame(path: Path, frames: tuple[PosedFrame, ...]) -> None:
-    """Raise an `InputError` if two frames would share a PNG of ids."""
+    """Raise an `InputError` if two frames would share an instance-id PNG."""
     first: dict[Path, str] = {}
     for frame in frames:
         other = first.setdefault(frame.instances, frame.name)

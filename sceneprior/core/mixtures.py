@@ -31,7 +31,8 @@ class LogisticMixture(NamedTuple):
 
     @classmethod
     def of(cls, features: Float[Tensor, "*batch features"], numbers: int) -> "LogisticMixture":
-        """Build a mixture from a network's output, 1 + 2 D features per component."""
+        """Build a mixture of D-dimensional components from a network's output: for each component a
+        logit of its weight, D means and D log-scales."""
         weight_logits, means, scales = features.unflatten(-1, (-1, 1 + 2 * numbers)).split(
             [1, numbers, numbers], dim=-1
         )

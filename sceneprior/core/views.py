@@ -126,9 +126,10 @@ class LiftedRooms(Batch):
 
 @dataclass(frozen=True)
 class RoomBoxes(Batch):
-    """A batch of rooms as labelled 3D boxes: 3D supervision, and the output of methods using it.
+    """A batch of rooms as labelled 3D boxes: the supervision and the output of methods that learn
+    from boxes.
 
-    Objects are padded to the largest room's count; their order has no meaning.
+    Each room is padded to the batch's highest number of objects, whose order has no meaning.
     """
 
     object_class: Int[Tensor, "rooms objects"]

@@ -170,8 +170,8 @@ def repeated(rooms: RoomBoxes, times: int) -> RoomBoxes:
 def _starts(
     trained: TrainedPrior, given: RoomBoxes, each: int, seed: int, distribution: str | None
 ) -> Float[Tensor, "starts dimension"]:
-    """For every room, the `each` sampled latents whose rooms come nearest to the given objects,
-    best first."""
+    """Starting latents for every room, a number of `each`: the sampled latents whose decoded rooms
+    have the lowest `given_loss`, best first."""
     z, _ = draw_latents(trained, max(DRAWN, each), seed, distribution)
     decoded = trained.prior.decode(z, with_shape=False)
     target = trained.config.model.completeness_target

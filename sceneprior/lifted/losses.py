@@ -86,8 +86,9 @@ def shape_code_loss(
 
         L_S = mean over objects of |a_k - a_j|_2^2 / cells_j
 
-    Squared distances of the codes a count differing grid cells, and cells_j is the number of cells
-    that the lifted shape fills. Without the division, a lamp on a cord, which fills a hundredth of
+    a_k is the code that the network predicts for an object, and a_j that of its lifted shape. The
+    squared distance of two codes is about the number of grid cells in which their shapes differ,
+    and cells_j is the number of cells that the lifted shape fills. Without the division, a lamp on a cord, which fills a hundredth of
     its box, would hardly be learnt. `codes` and `cells` are those of the objects' looks
     (`OccupancyDecoder.targets`).
     """

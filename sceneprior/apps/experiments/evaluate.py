@@ -213,7 +213,7 @@ def unfold(trained: TrainedPrior) -> list[Scene]:
 
 
 def read_curves(run: Path) -> dict[str, list[tuple[int, float]]]:
-    """Loss curves of every stage from its metrics.csv, as `stage/term` -> (epoch, value)."""
+    """Loss curves of every stage from its metrics.csv, as `stage/term` -> (epochs, values)."""
     curves: dict[str, list[tuple[int, float]]] = {}
     for stage in run_config(run).stage_names:
         path = run / stage / "metrics.csv"

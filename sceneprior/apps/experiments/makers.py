@@ -12,7 +12,7 @@ from sceneprior.training.method import RunConfig
 
 @dataclass(frozen=True)
 class Maker:
-    """Method that made rooms or reconstructions, in the words of a table."""
+    """The method that made rooms or reconstructions, as result tables name it."""
 
     title: str
     """Title of a row whose method has none of its own."""

@@ -65,7 +65,8 @@ class RoomNodes:
     def show(
         self, scene: Scene, kept: Collection[int] = (), names: bool = False, boxes: bool = False
     ) -> None:
-        """Show a scene in place of the previous one; kept objects get an orange box and a name."""
+        """Show a scene in place of the previous one; objects that the user keeps get an orange box
+        and a name."""
         for row, (item, color) in enumerate(
             zip(scene.objects, object_colors(scene).tolist(), strict=True)
         ):

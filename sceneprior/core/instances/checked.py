@@ -15,7 +15,7 @@ _REPR.maxstring = _LONGEST
 
 
 def checked(model: type[_M], data: dict[str, Any], where: str) -> _M:
-    """Validate plain data as a model."""
+    """Validate parsed JSON against a Pydantic model."""
     try:
         return model.model_validate(data)
     except ValidationError as error:

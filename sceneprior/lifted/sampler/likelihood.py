@@ -54,5 +54,5 @@ def negative_log_likelihood(
 
 
 def _first(rooms: RoomBoxes, row: Int[Tensor, " some"], step: int) -> RoomBoxes:
-    """The first `step` objects of the rooms in `row`."""
+    """The rooms with indices `row`, cut to their first `step` objects."""
     return rooms.changed(lambda part: part[row, :step])

@@ -195,7 +195,7 @@ def _fill(points, a, b, c, label, height, width, image, nearness):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _near_at(x, row_b, row_c, triangle, wanted):
-    """Nearness of a triangle at a pixel centre; -inf outside it or if not `wanted`."""
+    """Inverse depth of a triangle at a pixel centre; -inf outside it or if `wanted` is false."""
     dx_b, dx_c, a_near, slope_b, slope_c = triangle
     weight_b = dx_b * x + row_b
     weight_c = dx_c * x + row_c

@@ -127,7 +127,8 @@ def _faces(grid: Tensor, corners: Tensor, z: Tensor, settings: Settings) -> tupl
 def _outline(
     grid: Tensor, pixels: Tensor, depths: Tensor, faces: Tensor, keep: Tensor, settings: Settings
 ) -> tuple[Tensor, ...]:
-    """The fast mode: coverage by the mesh's outline, order depth, and depth."""
+    """The fast mode: coverage by the mesh's outline, the depth that decides which object is in
+    front, and the depth itself."""
     corners, z = pixels[faces[keep]], depths[faces[keep]].detach()
     weights = _weights(grid, corners.detach())
     contained = (weights > -SLACK).all(dim=-1)
