@@ -130,7 +130,7 @@ def _one_by_one(path: Path, record: dict[str, Any]) -> list[dict[str, Any]]:
     if centers.size == 0:
         centers, sizes, angles = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
         labels = np.zeros(0, dtype=int)
-    if angles.ndim == centers.ndim:
+    if angles.ndim == centers.ndim and angles.shape[-1] == 1:
         angles = angles[..., 0]
     objects = centers.shape[:-1]
     if (

@@ -88,9 +88,9 @@ def shape_code_loss(
 
     a_k is the code that the network predicts for an object, and a_j that of its lifted shape. The
     squared distance of two codes is about the number of grid cells in which their shapes differ,
-    and cells_j is the number of cells that the lifted shape fills. Without the division, a lamp on a cord, which fills a hundredth of
-    its box, would hardly be learnt. `codes` and `cells` are those of the objects' looks
-    (`OccupancyDecoder.targets`).
+    and cells_j is the number of cells that the lifted shape fills. Without the division, a lamp on
+    a cord, which fills a hundredth of its box, would hardly be learnt. `codes` and `cells` are
+    those of the objects' looks (`OccupancyDecoder.targets`).
     """
     assert scenes.shape_codes is not None, "the prior decodes looks"
     apart = take(scenes.shape_codes, matches.prediction, dim=1) - codes

@@ -8,17 +8,24 @@ import contextlib
 import json
 import resource
 import signal
+import struct
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
 import pytest
-from mutating import damaged_json
+from front_files import FrontFolder, bedroom
 from posed_files import PosedRoom
 from pycocotools.mask import encode
 from scan_files import make_scan, write_table
 from scipy.spatial.transform import Rotation
 
+from data_prep.front.filters import broken_rule
+from data_prep.front.models import ModelBank
+from data_prep.front.recipe import load_recipe
+from data_prep.front.rooms import read_house
 from data_prep.posed.source import PosedSource
 from data_prep.posed.transforms import read_recording
 from data_prep.posed.views import PosedSettings, prepare_posed
@@ -34,9 +41,44 @@ CASES = 300
 SECONDS = 60
 """A case takes milliseconds; machines that tests share may be slow."""
 MEMORY = 2 << 30
+DEEP = "@deep@"
 LABELS = "void,bed,chair"
 
+JUNK = [
+    None, True, 0, -1, 0.5, 10**400, 1e300, -1e300, 1e9, 1e-300, float("nan"), float("inf"), "",
+    "x", "1", "nan", "\ud800", "\0", "x" * 5000, "../../up", [], {}, [None], [[]], {"a": 1},
+    ["1", "x"], [1e300] * 3, 20_000, 2**31, 2**63, DEEP, [DEEP], {"id": DEEP},
+]  # fmt: skip
 WORDS = ["", "x", "nan", "inf", "-1", "0", "1e999", "9" * 400, "1.5", "\ufffd", "#", "= =", "\0"]
+
+
+def places(data: Any) -> Iterator[tuple[Any, Any]]:
+    """Every (container, key) of a JSON document."""
+    for key in list(data) if isinstance(data, dict) else range(len(data)):
+        yield data, key
+        if isinstance(data[key], dict | list):
+            yield from places(data[key])
+
+
+def damaged_json(data: Any, rng: np.random.Generator) -> str:
+    """Up to three places: something else there, or gone; sometimes all of it, or half a text."""
+    data = json.loads(json.dumps(data))
+    for _ in range(rng.integers(1, 4)):
+        found = list(places(data))
+        kinds = sorted({str(key) if isinstance(key, str) else "#" for _, key in found})
+        kind = kinds[rng.integers(len(kinds))]
+        same = [item for item in found if (item[1] if isinstance(item[1], str) else "#") == kind]
+        container, key = same[rng.integers(len(same))]
+        if rng.random() < 0.2:
+            del container[key]
+        else:
+            container[key] = JUNK[rng.integers(len(JUNK))]
+        if not data:
+            break
+    if rng.random() < 0.05:
+        data = JUNK[rng.integers(len(JUNK))]
+    text = json.dumps(data).replace(json.dumps(DEEP), "[" * 3000 + "]" * 3000)
+    return text[: rng.integers(len(text))] if rng.random() < 0.05 else text
 
 
 def damaged_text(text: str, rng: np.random.Generator) -> str:
@@ -57,6 +99,17 @@ def damaged_text(text: str, rng: np.random.Generator) -> str:
             del lines[at]
             lines = lines or [""]
     return "\n".join(lines)
+
+
+def damaged_bytes(data: bytes, rng: np.random.Generator, first: int) -> bytes:
+    """Up to four numbers among the first bytes are others, or the end is gone."""
+    changed = bytearray(data)
+    for _ in range(rng.integers(1, 5)):
+        at = int(rng.integers(first - 8))
+        value = [b"\xff", b"\0\0\0\0", b"\xff" * 8, struct.pack("<f", np.nan), rng.bytes(4),
+                 struct.pack("<f", 1e30), struct.pack("<Q", 1 << 40)][rng.integers(7)]  # fmt: skip
+        changed[at : at + len(value)] = value
+    return bytes(changed[: rng.integers(len(changed))] if rng.random() < 0.2 else changed)
 
 
 @contextlib.contextmanager
@@ -126,6 +179,13 @@ def test_classes_json(room):
     path = made.folder / "classes.json"
     data = json.loads(path.read_text())
     check_all(lambda rng: path.write_text(damaged_json(data, rng)), read)
+
+
+def test_instance_pngs(room):
+    made, read = room
+    path = made.png(1)
+    data = path.read_bytes()
+    check_all(lambda rng: path.write_bytes(damaged_bytes(data, rng, len(data))), read)
 
 
 def test_colmap_text(room):
@@ -200,3 +260,46 @@ def test_scannet_text(scan):
     path = made.path(".txt")
     text = path.read_text()
     check_all(lambda rng: path.write_text(damaged_text(text, rng)), read)
+
+
+def test_scannet_sens(scan):
+    made, read = scan
+    path = made.path(".sens")
+    data = path.read_bytes()
+    check_all(lambda rng: path.write_bytes(damaged_bytes(data, rng, 450)), read)
+
+
+def test_scannet_masks_and_mesh(scan):
+    made, read = scan
+    paths = [made.path("_2d-instance-filt.zip"), made.path("_vh_clean_2.ply")]
+    texts = [path.read_bytes() for path in paths]
+
+    def damage(rng):
+        chosen = rng.integers(2)
+        for k, (path, data) in enumerate(zip(paths, texts, strict=True)):
+            path.write_bytes(damaged_bytes(data, rng, len(data)) if k == chosen else data)
+
+    check_all(damage, read)
+
+
+def test_front_house_json(tmp_path):
+    front = FrontFolder(tmp_path)
+    for jid, category in (("bed", "King-size Bed"), ("stand", "Nightstand"), ("lamp", None)):
+        front.model(jid, category, (0.5, 0.6, 0.4))
+    path = front.house("house", bedroom("A"), bedroom("B", bounds=(3.0, -2.0, 7.0, 2.0)))
+    data = json.loads(path.read_text())
+    data["furniture"][0] |= {"bbox": [1.8, 1.0, 2.0], "category": "King-size Bed"}
+    data["furniture"][1] |= {"jid": "gone", "category": "Nightstand"}
+    bank, recipe = ModelBank(front.future), load_recipe("bedroom")
+    atiss = load_recipe("atiss_bedroom")
+
+    def read():
+        found = read_house(path, bank, recipe)
+        reasons = [why for *_, why in [*found.failures, *found.filtered]]
+        for one in found.rooms:
+            for rules in (recipe, atiss):
+                reasons += [broken[1]] if (broken := broken_rule(one, rules)) else []
+        assert all(why.isprintable() and len(why) < 500 for why in reasons), reasons
+
+    damage = lambda rng: Path(path).write_text(damaged_json(data, rng))  # noqa: E731
+    check_all(damage, read)

@@ -165,12 +165,8 @@ def fuzz_models(folder: Path) -> None:
     open_models(folder / "given", "front3d_bedroom", folder / "cache", 16)
 
 
-# Angles of shape (n, 0) end in a raw IndexError in interchange/box_lists.py.
-NPZ = pytest.param("npz", marks=pytest.mark.xfail(strict=True, raises=AssertionError))
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["json", "glb", NPZ, "obj", "ply", "models"])
+@pytest.mark.parametrize("name", ["json", "glb", "npz", "obj", "ply", "models"])
 def test_damaged_files_are_refused_in_a_sentence(name, tmp_path):
     paths = [tmp_path / str(seed) for seed in range(MUTATIONS)]
     for path in paths:

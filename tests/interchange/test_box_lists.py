@@ -125,6 +125,7 @@ def test_a_folder_becomes_scenes_that_are_read_back(tmp_path):
     ("changes", "sentence"),
     [
         ({"sizes": np.ones((3, 3))}, "do not describe the same objects"),
+        ({"angles": np.zeros((2, 0))}, r"angles \(2, 0\) do not describe the same objects"),
         ({"angles": np.full((2, 1), np.nan)}, "not finite"),
         ({"sizes": np.zeros((2, 3))}, "sizes above 0"),
         ({"sizes": np.full((2, 3), 90)}, r"a desk .* Are these centimetres\? Give metres"),

@@ -10,7 +10,9 @@ import torch
 from PIL import Image
 
 import sceneprior
-from sceneprior.apps.viewer.explorer import Explorer
+from sceneprior.apps.viewer.explorer import Explorer, Folder
+from sceneprior.apps.viewer.nodes import name_and_size
+from sceneprior.core.scene import Scene, SceneObject
 
 PATIENCE_S = 120
 """WebGL in software, on a machine that does other things as well."""
@@ -138,8 +140,48 @@ def test_objects_are_kept_by_a_click_and_the_rest_is_completed(browser, page):
     assert page.shown.scene.objects[0].center_m == kept.center_m
 
 
+def test_every_object_can_have_its_name_and_size(browser, page, monkeypatch):
+    said = []
+    add = page.server.scene.add_label
+    monkeypatch.setattr(
+        page.server.scene,
+        "add_label",
+        lambda name, text, **more: said.append(text) or add(name, text, **more),
+    )
+    before = canvas(browser)
+    click(browser, "Names and sizes")
+    wait_for(lambda: len(said) == len(page.shown.scene.objects) - len(page.shown.kept), "no labels")
+    assert set(said) <= {name_and_size(item) for item in page.shown.scene.objects}
+    wait_for(lambda: (np.abs(canvas(browser) - before).max(axis=-1) > 40).any(), "none is drawn")
+    click(browser, "Names and sizes")
+
+
 def test_what_does_not_work_is_said(browser, page):
     end = browser.find_element("css selector", "input[value='seed:2']")
     end.send_keys("000x")
     click(browser, "Draw path")
     wait_for(lambda: "'seed:2000x' is neither" in words(browser), "no sentence came")
+
+
+def test_a_room_of_a_stranger_runs_nothing(browser):
+    pytest.importorskip("viser", reason="the extra `view` is not installed")
+    from sceneprior.apps.viewer.page import Page
+    from sceneprior.apps.viewer.server import serving
+
+    name, label = (
+        "<iframe srcdoc='<script>parent.hacked=1</script>'>",
+        "<img src=x onerror=hacked=1>",
+    )
+    item = SceneObject(label, (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
+    with serving("127.0.0.1", 0) as server:
+        page = Page(server, Folder([Scene(name, f"void,{label}", (item,))]), label)
+        browser.get(f"http://127.0.0.1:{server.get_port()}")
+        wait_for(lambda: name in words(browser), "the room's name is not shown as it is")
+        page._names.value = True
+        wait_for(lambda: words(browser).count(label) >= 2, "class and title are not shown")
+        assert browser.execute_script("return window.hacked") is None
+        own = (
+            "[...document.querySelectorAll('img, iframe')].filter(x => !x.src.startsWith('data:'))"
+        )
+        assert browser.execute_script(f"return {own}.length") == 0
+        browser.get("about:blank")
