@@ -132,9 +132,7 @@ def prep_scannet(
     train_list: Annotated[Path | None, typer.Option(help="scannetv2_train.txt.")] = None,
     val_list: Annotated[
         Path | None,
-        typer.Option(
-            help="scannetv2_val.txt: the test split. Without lists, scans are split 9:1 by the seed."
-        ),
+        typer.Option(help="scannetv2_val.txt: the test split. Without lists, a seeded 9:1 split."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the 9:1 split.")] = 0,
     workers: WorkersOption = None,
