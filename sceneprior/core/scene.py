@@ -310,13 +310,15 @@ def check_box(path: Path, label: str, center_m: Sequence[float], size_m: Sequenc
 
 
 def check_floor(path: Path, outline_m: np.ndarray) -> None:
-    """Reject an implausibly large floor outline."""
+    """Reject a floor outline that is implausibly large, or has no area."""
     far = np.abs(outline_m).max(initial=0)
     if not far <= FARTHEST_M:
         raise InputError(
             f"{path}: the floor reaches {far:g} m from its centre; expected finite metres, at most "
             f"{FARTHEST_M:g}. {_unit_guess(far)}"
         )
+    if np.linalg.matrix_rank(outline_m - outline_m[0]) < 2:
+        raise InputError(f"{path}: all corners of the floor lie on one line, so it has no area.")
 
 
 def _unit_guess(numbers: Any) -> str:

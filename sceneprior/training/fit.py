@@ -20,7 +20,7 @@ from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.files import only_writer, remove_parts
 from sceneprior.core.settings import check_settings, dump_settings, read_settings
 from sceneprior.training.callbacks import RollingCheckpoint, RunProgress, StepSeed
-from sceneprior.training.checkpoints import check_resumable, write_checkpoint
+from sceneprior.training.checkpoints import check_resumable, read_checkpoint, write_checkpoint
 from sceneprior.training.method import RunConfig, Stage
 from sceneprior.training.settings import without_samples
 from sceneprior.training.slurm import first_process, requeue_on_signal, slurm_plugins
@@ -52,7 +52,9 @@ def fit(
             _check_run(config, run, resume)
         for stage in config.stages():
             final = run / stage.name / "final.ckpt"
-            if not final.is_file():
+            if final.is_file():
+                read_checkpoint(final)  # a damaged one is named, not counted as trained
+            else:
                 options = trainer_options or {}
                 _train(stage, config, final.parent, previous, resume, loggers, options)
             previous = final

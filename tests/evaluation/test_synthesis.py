@@ -178,6 +178,13 @@ def test_fid_appears_with_the_users_inception_file(
     assert entry["file"] == path.name
 
 
+def test_few_test_rooms_are_said_with_the_interval_of_the_layout_classifier(result):
+    scores, _ = result
+    low, high = scores["intervals"]["generated"]["layout_classifier_accuracy"]
+    said = f"the accuracy of the layout classifier is uncertain: {low:.2f} to {high:.2f}."
+    assert scores["protocol"]["n_test"] < 150 and said in scores["note"]
+
+
 def test_the_printed_table_holds_a_column_a_set(result):
     scores, _ = result
     page = Console(file=io.StringIO(), width=140)

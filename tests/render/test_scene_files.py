@@ -274,6 +274,14 @@ def test_floors_that_are_no_outline_are_refused(tmp_path, floor):
         load_scene(tmp_path / "a.json")
 
 
+def test_floors_without_area_are_refused_when_read(tmp_path):
+    for floor in ([[0, 0], [1, 1], [3, 3]], [[1, 2]] * 3):
+        data = scene_to_json(Scene("a", "front3d_bedroom")) | {"floor_m": floor}
+        (tmp_path / "a.json").write_text(json.dumps(data))
+        with pytest.raises(InputError, match=r"a\.json: all corners of the floor lie on one line"):
+            load_scene(tmp_path / "a.json")
+
+
 def test_an_obj_has_a_named_object_each_in_metres_and_its_class_colour(scene, tmp_path):
     save_scene(replace(scene, objects=(*scene.objects, scene.objects[1])), tmp_path / "a.obj")
     vertices, faces, materials = [], {}, {}

@@ -242,6 +242,8 @@ def test_damaged_or_foreign_checkpoints_are_sentences(toy_run, tmp_path):
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(InputError, match=r"final.ckpt cannot be read .*; it is damaged. Delete it"):
         load_run(run)
+    with pytest.raises(InputError, match=r"final.ckpt cannot be read .*; it is damaged. Delete it"):
+        fit(load_config(str(run / "config.yaml")), run, resume=True, trainer_options=CPU)
     text = (run / "config.yaml").read_text()
     path.unlink()
     (run / "config.yaml").write_text(text.replace("width: 16", "width: 32"))

@@ -7,7 +7,7 @@ from sceneprior.core.scene import Scene, SceneObject
 
 pytest.importorskip("viser", reason="the extra `view` is not installed")
 
-from sceneprior.apps.viewer.page import Page
+from sceneprior.apps.viewer.page import Page, _html
 from sceneprior.apps.viewer.server import serving
 
 CLASS = "<img src=x onerror='hacked=1'>"
@@ -30,3 +30,8 @@ def test_names_are_escaped_and_read_no_file(recwarn):
     for content in (said, kept):
         assert "&lt;img src=x onerror=&#39;hacked=1&#39;&gt; 1.00 x 1.00 x 1.00 m" in content
         assert "<img" not in content and "<iframe" not in content and "![]" in content
+
+
+def test_other_texts_of_the_panel_are_escaped_too():
+    """The nearest training room's id, for example, is a text out of the run's files."""
+    assert CLASS not in _html(CLASS) and "&lt;img" in _html(CLASS)
