@@ -19,23 +19,13 @@ _KEPT = "Finished shards are kept: run the same command again to go on."
 def cluster(address: str) -> Iterator[Run]:
     """Open a cluster as `run(function, argument_lists, title)`, which yields results in order.
 
-    `run` connects when it is first called. Start the cluster with `dask scheduler` and, on each
+    Start the cluster with `dask scheduler` and, on each
     machine, `dask worker tcp://... --nworkers auto --nthreads 1`. Every machine needs this package,
     and the folders of data and shards under the same paths. If a worker dies, another takes over
     its task.
     """
-    with contextlib.ExitStack() as stack:
-        clients: list[Any] = []
-
-        def in_cluster(
-            function: Callable[..., Any], arguments: list[Any], title: str | None
-        ) -> Iterator[Any]:
-            if not clients:
-                clients.append(stack.enter_context(_connect(address)))
-            with progress(title, len(arguments)) as advance:
-                yield from _run(clients[0], address, function, arguments, advance)
-
-        yield in_cluster
+    with _connect(address) as client:
+        yield lambda *work: _run(client, address, *work)
 
 
 def _run(
@@ -43,7 +33,7 @@ def _run(
     address: str,
     function: Callable[..., Any],
     arguments: list[Any],
-    advance: Callable[[], None],
+    title: str | None,
 ) -> Iterator[Any]:
     from distributed import CancelledError, KilledWorker
     from distributed.comm import CommClosedError
@@ -53,12 +43,13 @@ def _run(
         client.submit(_in_one_thread, function, *item, pure=False, priority=-index)
         for index, item in enumerate(arguments)
     ]
-    for future in futures:
-        future.add_done_callback(lambda _: advance())
     try:
-        for future in futures:
-            yield future.result()
-            future.release()
+        with progress(title, len(futures)) as advance:
+            for future in futures:
+                future.add_done_callback(lambda _: advance())
+            for future in futures:
+                yield future.result()
+                future.release()
     except KilledWorker:
         raise InputError(
             f"A task of the cluster at {address} killed every worker it was given to (for lack of "

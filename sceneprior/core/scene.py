@@ -32,9 +32,8 @@ _LEAST_M = 10.0**-_DECIMALS
 class Mesh:
     """A triangle mesh in the room frame: vertices (V, 3) in metres, faces (F, 3) as indices.
 
-    Raises:
-        InputError: the arrays have other shapes, a vertex is not finite, or a face has an index out
-            of range, at which the z-buffer would read beyond the array.
+    Other shapes, vertices that are not finite, and faces with an index out of range, at which the
+    z-buffer would read beyond the array, raise an `InputError`.
     """
 
     vertices_m: np.ndarray
@@ -171,11 +170,7 @@ class Scene:
         return perspective(self, open_renderer())
 
     def show(self) -> None:
-        """Display the scene in a notebook, from any line of a cell.
-
-        Raises:
-            InputError: the code does not run in a notebook.
-        """
+        """Display the scene from any line of a notebook's cell; elsewhere an `InputError`."""
         notebook = sys.modules.get("IPython")
         if notebook is None or notebook.get_ipython() is None:
             raise InputError(
@@ -203,6 +198,15 @@ class Scene:
 
 def scene_to_json(scene: Scene) -> dict[str, Any]:
     """Convert a scene to its JSON format (docs/conventions.md): classes and boxes, no meshes."""
+    objects = []
+    for item in scene.objects:
+        entry: dict[str, Any] = {"class": item.label}
+        entry["center_m"] = [round(value, _DECIMALS) for value in item.center_m]
+        entry["size_m"] = _rounded_size(item.size_m)
+        if item.turned is not None:
+            entry["yaw_rad"] = round(item.turned.yaw_rad, 7)
+            entry["own_size_m"] = _rounded_size(item.turned.size_m)
+        objects.append(entry)
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -210,15 +214,7 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
         "label_set": scene.label_set,
         "units": "metres",
         "axes": "x right, y up, z towards the viewer; floor at y = 0, its centre at the origin",
-        "objects": [
-            {
-                "class": item.label,
-                "center_m": [round(value, _DECIMALS) for value in item.center_m],
-                "size_m": _rounded_size(item.size_m),
-                **({} if item.turned is None else _turned_to_json(item.turned)),
-            }
-            for item in scene.objects
-        ],
+        "objects": objects,
         **({} if scene.floor_m is None else {"floor_m": scene.floor_m.tolist()}),
         **({"extra": scene.extra} if scene.extra else {}),
     }
@@ -227,10 +223,6 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
 def _rounded_size(size_m: Sequence[float]) -> list[float]:
     # A flat side stays above 0, because `read_scene` rejects sizes of 0.
     return [max(round(value, _DECIMALS), _LEAST_M) for value in size_m]
-
-
-def _turned_to_json(turned: Turned) -> dict[str, Any]:
-    return {"yaw_rad": round(turned.yaw_rad, 7), "own_size_m": _rounded_size(turned.size_m)}
 
 
 _Triple = Annotated[list[float], Field(min_length=3, max_length=3)]

@@ -130,25 +130,25 @@ def test_a_cluster_that_is_not_there(dask, monkeypatch):
     address, _ = scheduler()
     with (
         pytest.raises(InputError, match=rf"{address} has no workers; start some with `dask worker"),
-        cluster(address) as run,
+        cluster(address),
     ):
-        next(run(len, [("abc",)], None))
+        pass
     with (
         pytest.raises(InputError, match=r"No Dask scheduler answers at tcp://127.0.0.1:9"),
-        cluster("tcp://127.0.0.1:9") as run,
+        cluster("tcp://127.0.0.1:9"),
     ):
-        next(run(len, [("abc",)], None))
+        pass
     with (
         pytest.raises(InputError, match=r"No Dask scheduler answers at nonsense://x"),
-        cluster("nonsense://x") as run,
+        cluster("nonsense://x"),
     ):
-        next(run(len, [("abc",)], None))
+        pass
 
 
 def test_without_dask_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
         pytest.raises(InputError, match=r"needs dask\.distributed; install it with .*\[cluster\]"),
-        cluster("tcp://127.0.0.1:9") as run,
+        cluster("tcp://127.0.0.1:9"),
     ):
-        next(run(len, [("abc",)], None))
+        pass

@@ -94,7 +94,7 @@ def test_members_that_are_no_picture(tmp_path):
     for data, words in (
         (b"GIF89a" + bytes(30), "it is not a PNG"),
         (png(mask())[:20], "it is not a PNG"),
-        (bytes(huge), "60000 x 60000 pixels"),
+        (bytes(huge), "its header is damaged"),
         (bytes((64 << 20) + 1), "67108865 bytes unpacked"),
     ):
         path = write_zip(tmp_path / "a.zip", {"0.png": data})
