@@ -134,15 +134,6 @@ def test_a_mesh_that_is_missing_damaged_or_cut(tmp_path, rng):
         else:
             # Half the vertices would be noticed beside segs.json; lost triangles are not.
             assert len(mesh.vertices_m) == 8 and cut >= begin + 8 * 16
-    for _ in range(200):
-        damaged = bytearray(data)
-        for at in rng.integers(0, len(data), 4):
-            damaged[at] = rng.integers(256)
-        path.write_bytes(damaged)
-        try:
-            read_mesh(path)
-        except InputError as error:
-            assert "a.ply" in str(error)
     with pytest.raises(InputError, match=r"none\.ply cannot be read .no such file"):
         read_mesh(tmp_path / "none.ply")
     broken = np.full((8, 3), np.nan)
