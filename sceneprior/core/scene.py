@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, read_json
+from sceneprior.core.instances.checked import checked
 
 FORMAT = "sceneprior-scene"
 VERSION = 1
@@ -225,11 +226,15 @@ def _rounded_size(size_m: Sequence[float]) -> list[float]:
     return [max(round(value, _DECIMALS), _LEAST_M) for value in size_m]
 
 
-_Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
-_Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
+# Strict, because "1.8" and true are not valid lengths; JSON has lists for our tuples.
+_STRICT = ConfigDict(strict=True)
+_Triple = Annotated[tuple[float, float, float], Field(strict=False)]
+_Pair = Annotated[tuple[float, float], Field(strict=False)]
 
 
 class _ObjectEntry(BaseModel):
+    model_config = _STRICT
+
     label: str = Field(alias="class")
     center_m: _Triple
     size_m: _Triple
@@ -238,6 +243,8 @@ class _ObjectEntry(BaseModel):
 
 
 class _SceneEntry(BaseModel):
+    model_config = _STRICT
+
     name: str | None = None
     label_set: str
     objects: Annotated[list[_ObjectEntry], Field(max_length=MOST_OBJECTS)]
@@ -249,28 +256,19 @@ def read_scene(path: Path) -> Scene:
     """Read a scene's JSON."""
     path = Path(path)
     data = read_json(path)
-    try:
-        if isinstance(data, dict) and (data["format"], data["version"]) != (FORMAT, VERSION):
-            raise InputError(
-                f"{path} says format '{_short(data['format'])}' version "
-                f"{_short(data['version'])}; expected '{FORMAT}' version {VERSION}. Write it "
-                "again with `sceneprior synthesize`."
-            )
-        # Strict, because "1.8" and true are not valid lengths.
-        entry = _SceneEntry.model_validate(data, strict=True)
-        # `extra` is written again with the scene, so it must be valid JSON without NaN.
-        json_text(entry.extra)
-    except InputError:
-        raise
-    except (ValueError, KeyError, RecursionError) as error:
-        reason = f"{type(error).__name__}: {error}"
-        if isinstance(error, ValidationError):
-            first = error.errors(include_url=False)[0]
-            reason = ": ".join([".".join(map(_short, first["loc"])), first["msg"]]).lstrip(": ")
+    where = f"{path} is not a scene JSON, which docs/conventions.md describes"
+    if not isinstance(data, dict) or not {"format", "version"} <= data.keys():
+        raise InputError(f"{where}: expected an object with 'format', 'version' and 'objects'.")
+    if (data["format"], data["version"]) != (FORMAT, VERSION):
         raise InputError(
-            f"{path} is not a scene JSON: expected an object with 'format' and 'objects' "
-            f"({reason}); docs/conventions.md describes the format."
-        ) from None
+            f"{path} says format '{_short(data['format'])}' version {_short(data['version'])}; "
+            f"expected '{FORMAT}' version {VERSION}. Write it again with `sceneprior synthesize`."
+        )
+    entry = checked(_SceneEntry, data, where)
+    try:
+        json_text(entry.extra)  # it is written again with the scene
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{where}: extra cannot be written as JSON ({error}).") from None
     names = label_set(entry.label_set)
     objects = []
     for item in entry.objects:
@@ -280,8 +278,8 @@ def read_scene(path: Path) -> Scene:
                 f"'{_short(entry.label_set)}'; use one of {', '.join(names)}."
             )
         check_box(path, item.label, item.center_m, item.size_m)
-        center, size = _triple(item.center_m), _triple(item.size_m)
-        objects.append(SceneObject(item.label, center, size, turned=_turned_of(path, item)))
+        turned = _turned_of(path, item)
+        objects.append(SceneObject(item.label, item.center_m, item.size_m, turned=turned))
     floor = None if entry.floor_m is None else np.array(entry.floor_m, dtype=np.float64)
     if floor is not None:
         check_floor(path, floor)
@@ -322,7 +320,7 @@ def _turned_of(path: Path, item: _ObjectEntry) -> Turned | None:
         return None
     if item.yaw_rad is not None and item.own_size_m is not None:
         check_box(path, item.label, item.center_m, item.own_size_m)
-        turned = Turned(item.yaw_rad, _triple(item.own_size_m))
+        turned = Turned(item.yaw_rad, item.own_size_m)
         if np.allclose(bound_m(turned), item.size_m, rtol=0, atol=1e-3):
             return turned
     raise InputError(

@@ -159,7 +159,7 @@ def test_bad_folders_and_files_say_what_to_do(scene, tmp_path, renderer):
         ),
         ({"size_m": [1800, 500, 2000]}, r"Are these millimetres\? Give metres\."),
         ({"center_m": [150.0, 25, 60]}, r"100 m from the floor's centre\. Are these centimetres"),
-        ({"center_m": ["0", "1", "2"]}, r"objects\.0\.center_m\.0: Input should be a valid number"),
+        ({"center_m": ["0", "1", "2"]}, r"objects\.0\.center_m\.0 is .0.; input should be a valid"),
         ({"yaw_rad": 0.3}, "expected both"),
         ({"yaw_rad": 0.3, "own_size_m": [1.0, 0.8, 0.5]}, "the box turned by yaw_rad fills size_m"),
     ],
