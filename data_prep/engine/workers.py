@@ -30,23 +30,16 @@ def pool(workers: int) -> Iterator[Run]:
     context = multiprocessing.get_context("spawn")
     executor = ProcessPoolExecutor(workers, context, initializer=_start_worker)
 
-    def in_pool(
-        function: Callable[..., Any], arguments: list[Any], title: str | None
-    ) -> Iterator[Any]:
-        with progress(title, len(arguments)) as advance:
-            # Only this process handles Ctrl-C; workers inherit the blocked signal.
-            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
-                futures = [executor.submit(function, *item) for item in arguments]
-            finally:
-                signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-            for future in futures:
-                future.add_done_callback(lambda _: advance())
-            for future in futures:
-                yield future.result()
+    def submit(function: Callable[..., Any], *item: Any) -> Any:
+        # Only this process handles Ctrl-C; workers inherit the blocked signal.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return executor.submit(function, *item)
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     try:
-        yield in_pool
+        yield lambda *work: in_order(submit, *work)
     except BrokenProcessPool:
         raise InputError(
             "A worker process died (was it killed for lack of memory?). Finished shards are kept: "
@@ -59,6 +52,21 @@ def pool(workers: int) -> Iterator[Run]:
         raise
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
+
+
+def in_order(
+    submit: Callable[..., Any],
+    function: Callable[..., Any],
+    arguments: list[Any],
+    title: str | None,
+) -> Iterator[Any]:
+    """Submit all calls, which return futures, and yield their results in order."""
+    with progress(title, len(arguments)) as advance:
+        futures = [submit(function, *item) for item in arguments]
+        for future in futures:
+            future.add_done_callback(lambda _: advance())
+        for future in futures:
+            yield future.result()
 
 
 def _in_process(
