@@ -16,12 +16,8 @@ if TYPE_CHECKING:
 
 def add_commands(app: typer.Typer) -> None:
     """Mount the prep-* commands, inspect and make-homes."""
-    app.command("make-homes")(make_homes)
-    app.command("prep-front")(prep_front)
-    app.command("recipe")(recipe)
-    app.command("prep-scannet")(prep_scannet)
-    app.command("prep-posed")(prep_posed)
-    app.command("inspect")(inspect)
+    for command in (make_homes, prep_front, recipe, prep_scannet, prep_posed, inspect):
+        app.command()(command)
 
 
 _SHEET = "inspect.png"
@@ -32,10 +28,10 @@ WorkersOption = Annotated[
     int | None, typer.Option(min=1, help="Processes on this machine (default: all cores).")
 ]
 SchedulerOption = Annotated[
-    str | None, typer.Option(help="Work on a Dask cluster instead: tcp://HOST:8786.")
+    str | None, typer.Option(help="Run on a Dask cluster instead: tcp://HOST:8786.")
 ]
-OnlyOption = Annotated[
-    str | None, typer.Option(help="One house or room: HOUSE, HOUSE/ROOM or a room id.")
+SeedOption = Annotated[
+    int, typer.Option(min=0, max=LARGEST_SEED, help="The same seed writes the same bytes.")
 ]
 StrictOption = Annotated[bool, typer.Option("--strict", help="Stop at the first failed room.")]
 RetryOption = Annotated[
@@ -46,12 +42,10 @@ RetryOption = Annotated[
 def make_homes(
     out: Annotated[Path, typer.Argument(help="A new folder for the homes.")],
     rooms: Annotated[
-        int, typer.Option(help="How many rooms; seven in ten are train, one val, two test.")
+        int, typer.Option(help="Number of rooms: 70% train, 10% val, 20% test.")
     ] = 400,
     room_type: Annotated[str, typer.Option(help="bedroom or living.")] = "bedroom",
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="The same seed writes the same bytes.")
-    ] = 0,
+    seed: SeedOption = 0,
 ) -> None:
     """Make furnished homes in 3D-FRONT's on-disk format."""
     from data_prep.homes import make
@@ -72,27 +66,31 @@ def prep_front(
         ),
     ] = "bedroom",
     splits: Annotated[
-        Path | None, typer.Option(help="CSV of `room id,split`; without it, a seeded 8:1:1.")
+        Path | None,
+        typer.Option(help="CSV with rows `room id,split` (default: a random 8:1:1 split)."),
     ] = None,
     views_per_m2: Annotated[
         float | None,
         typer.Option(help="Views per square metre of floor (default: the recipe's: 2)."),
     ] = None,
     rule: Annotated[
-        list[str] | None, typer.Option(help="Change a rule of the recipe: max_floor_m=8, or null.")
+        list[str] | None,
+        typer.Option(help="Change a rule of the recipe: max_floor_m=8; null turns it off."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same bytes.")] = 0,
+    seed: SeedOption = 0,
     rgb: Annotated[
-        bool, typer.Option("--rgb", help="Also draw shaded pictures: OUT/rgb/ROOM/VIEW.png.")
+        bool, typer.Option("--rgb", help="Also write shaded pictures, OUT/rgb/ROOM/VIEW.png.")
     ] = False,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
     renderer: Annotated[str, typer.Option(help="auto, pyrender or software.")] = "auto",
-    only: OnlyOption = None,
+    only: Annotated[
+        str | None, typer.Option(help="One house or room only: HOUSE, HOUSE/ROOM or a room id.")
+    ] = None,
     strict: StrictOption = False,
     retry_failed: RetryOption = False,
 ) -> None:
-    """Turn houses in 3D-FRONT's format into view shards. Run again to go on after a stop.
+    """Turn houses in 3D-FRONT's format into view shards. The same command resumes a stopped run.
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
@@ -122,22 +120,26 @@ def prep_scannet(
     labels: Annotated[Path, typer.Option(help="scannetv2-labels.combined.tsv.")],
     out: OutOption,
     masks: Annotated[
-        str, typer.Option(help="filt (cleaned) or raw (the projected mesh).")
+        str, typer.Option(help="ScanNet's masks: filt (cleaned) or raw (the mesh, projected).")
     ] = "filt",
     full_size: Annotated[
-        bool, typer.Option("--full-size", help="1296 x 968 rather than a quarter of it.")
+        bool, typer.Option("--full-size", help="Images of 1296 x 968 pixels, not 324 x 242.")
     ] = False,
-    frame_step: Annotated[int, typer.Option(help="Every so many frames is a candidate.")] = 15,
-    max_views: Annotated[int, typer.Option(help="Candidates are thinned to this many.")] = 100,
-    train_list: Annotated[Path | None, typer.Option(help="scannetv2_train.txt.")] = None,
+    frame_step: Annotated[int, typer.Option(help="Every n-th frame is a candidate.")] = 15,
+    max_views: Annotated[
+        int, typer.Option(help="Most views of a scan; more candidates are thinned.")
+    ] = 100,
+    train_list: Annotated[
+        Path | None, typer.Option(help="List of training scans, scannetv2_train.txt.")
+    ] = None,
     val_list: Annotated[
         Path | None,
-        typer.Option(help="scannetv2_val.txt: the test split. Without lists, a seeded 9:1 split."),
+        typer.Option(help="List of test scans, scannetv2_val.txt (default: a random 9:1 split)."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the 9:1 split.")] = 0,
+    seed: SeedOption = 0,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    only: Annotated[str | None, typer.Option(help="One scan, or the beginning of names.")] = None,
+    only: Annotated[str | None, typer.Option(help="One scan, or all whose names begin so.")] = None,
     strict: StrictOption = False,
     retry_failed: RetryOption = False,
 ) -> None:
@@ -165,33 +167,38 @@ def prep_posed(
     out: OutOption,
     label_set: Annotated[
         str,
-        typer.Option(help="A file with a class a line, void,bed,chair or a known set's name."),
+        typer.Option(
+            help="Classes: a file with one a line, a list such as void,bed,chair, or a set's name."
+        ),
     ],
     up: Annotated[
         str,
         typer.Option(
-            help="The poses' axis that points up: z or y; cameras: as upright cameras were held; "
-            "auto: z, or cameras for COLMAP's models."
+            help="Axis of the poses that points up: z or y. `cameras` finds it from upright "
+            "cameras; `auto` is z, or `cameras` for COLMAP's models."
         ),
     ] = "auto",
     floor_m: Annotated[
-        float | None, typer.Option(help="Height of the floor where a file gives no floor_m.")
+        float | None, typer.Option(help="Height of the floor in rooms whose file has no floor_m.")
     ] = None,
     camera_height_m: Annotated[
-        float, typer.Option(help="Of the lowest camera, where nothing shows the floor.")
+        float, typer.Option(help="Height of the lowest camera, where no furniture shows the floor.")
     ] = 1.2,
     metres_per_unit: Annotated[
-        float, typer.Option(help="Of the poses, where a file does not say.")
+        float, typer.Option(help="Metres a unit of the poses, in rooms whose file does not say.")
     ] = 1.0,
     max_side: Annotated[
-        int | None, typer.Option(help="Sample larger masks down to this (default: as they are).")
+        int | None,
+        typer.Option(help="Longest side of stored masks in pixels (default: as they are)."),
     ] = None,
-    max_views: Annotated[int, typer.Option(help="Frames are thinned to this many.")] = 100,
+    max_views: Annotated[
+        int, typer.Option(help="Most views of a room; more frames are thinned.")
+    ] = 100,
     test_share: Annotated[float, typer.Option(help="Share of rooms in the test split.")] = 0.1,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the split.")] = 0,
+    seed: SeedOption = 0,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    only: Annotated[str | None, typer.Option(help="One room, or the beginning of names.")] = None,
+    only: Annotated[str | None, typer.Option(help="One room, or all whose names begin so.")] = None,
     strict: StrictOption = False,
 ) -> None:
     """Turn posed pictures with tracked instance masks into view shards (docs/posed_data.md).
@@ -213,26 +220,26 @@ def prep_posed(
 
 def inspect(
     shards: Annotated[Path, typer.Argument(help="Folder of shards.")],
-    room: Annotated[str | None, typer.Option(help="This room only, and its plan.")] = None,
+    room: Annotated[str | None, typer.Option(help="This room only, with its floor plan.")] = None,
     png: Annotated[
-        Path | None, typer.Option(help=f"The sheet of pictures (default: SHARDS/{_SHEET}).")
+        Path | None, typer.Option(help=f"File for the pictures (default: SHARDS/{_SHEET}).")
     ] = None,
-    pictures: Annotated[int, typer.Option(min=1, help="Views on the sheet.")] = 24,
+    pictures: Annotated[int, typer.Option(min=1, help="Number of views to draw.")] = 24,
     boxes_3d: Annotated[
-        bool, typer.Option("--boxes-3d/--no-boxes-3d", help="Draw the ground truth's 3D boxes.")
+        bool, typer.Option("--boxes-3d/--no-boxes-3d", help="Draw 3D boxes of the ground truth.")
     ] = True,
     verify: Annotated[
         bool, typer.Option("--verify", help="Check everything instead of drawing.")
     ] = False,
     workers: Annotated[int, typer.Option(min=1, help="Processes for --verify.")] = 1,
 ) -> None:
-    """Say what a folder of shards holds and draw a sheet of it, or check it with --verify.
+    """Print what a folder of shards holds and draw some views, or check it with --verify.
 
     Exit status: 0, or 3 if --verify finds something wrong.
     """
     from rich.console import Console
 
-    from data_prep.inspection.contents import draw_sheet
+    from data_prep.inspection.pictures import draw_sheet
     from data_prep.inspection.tables import count_tables, room_table
     from sceneprior.core.errors import InputError
     from sceneprior.core.files import write_whole

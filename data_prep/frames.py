@@ -27,6 +27,15 @@ class FrameChoice:
     bad_poses: int
     without_mask: int
     """Candidates with a pose but no mask."""
+    step: int
+
+    def notes(self, mask: str) -> list[str]:
+        """Say how many candidates were rejected; `mask` is what those without a mask lack."""
+        of = f"of {self.candidates} frames" + (f" (every {self.step})" if self.step > 1 else "")
+        rejected = {"usable pose": self.bad_poses, mask: self.without_mask}
+        return [
+            f"{count} {of} have no {what}; skipped" for what, count in rejected.items() if count
+        ]
 
 
 def choose_frames(
@@ -43,7 +52,7 @@ def choose_frames(
         >>> poses = np.repeat(np.eye(4)[None], 61, axis=0)
         >>> poses[10] = -np.inf
         >>> choose_frames(poses, range(61), step=10, at_most=3)
-        FrameChoice(frames=(0, 40, 60), candidates=7, bad_poses=1, without_mask=0)
+        FrameChoice(frames=(0, 40, 60), candidates=7, bad_poses=1, without_mask=0, step=10)
     """
     candidates = np.arange(0, len(camera_to_world), step)
     posed = candidates[is_pose(camera_to_world[candidates])].tolist()
@@ -55,7 +64,7 @@ def choose_frames(
         places = np.floor(np.linspace(0, len(usable) - 1, at_most) + 0.5).astype(int)
         frames = [usable[place] for place in places]
     return FrameChoice(
-        tuple(frames), len(candidates), len(candidates) - len(posed), len(posed) - len(usable)
+        tuple(frames), len(candidates), len(candidates) - len(posed), len(posed) - len(usable), step
     )
 
 
@@ -70,6 +79,12 @@ def is_pose(camera_to_world: np.ndarray) -> np.ndarray:
     bottom = np.abs(safe[:, 3] - (0, 0, 0, 1)).max(axis=1)
     right_handed = np.linalg.det(turn) > 0
     return finite & (off < _ROTATION_SLACK) & (bottom < _ROTATION_SLACK) & right_handed
+
+
+def first_fault(camera_to_world: np.ndarray, step: int = 1) -> tuple[int, str] | None:
+    """Number and fault of the first of every `step`-th pose that `is_pose` rejects."""
+    bad = np.flatnonzero(~is_pose(camera_to_world[::step])) * step
+    return (int(bad[0]), pose_fault(camera_to_world[bad[0]])) if len(bad) else None
 
 
 def pose_fault(camera_to_world: np.ndarray) -> str:
@@ -122,7 +137,7 @@ def sampled_lines(source: int, target: int) -> np.ndarray:
 
 
 def mask_intrinsics(
-    intrinsic_color: np.ndarray,
+    intrinsics: np.ndarray,
     color_size: tuple[int, int],
     mask_size: tuple[int, int],
     image_size: tuple[int, int],
@@ -130,22 +145,20 @@ def mask_intrinsics(
     """Intrinsics of a mask that was downsampled to `image_size` with `sampled_lines`.
 
     Colour frames, masks and stored images may all differ in size; only this function converts
-    between them. Three steps, each exact:
+    between them. Two steps, each exact:
 
-    - ScanNet puts pixel centres at integers, docs/conventions.md at i + 0.5, so half a pixel is
-      added to the principal point.
     - Masks and colour frames show the same picture: u scales with the widths, v with the heights.
     - A downsampled pixel copies one mask pixel, whose centre may be off its own: keeping every
       fourth row from the third on shifts the image by 0.5 full-size pixels. The principal point
       moves by the mean offset, so that points project onto the pixels that show them.
 
-    `intrinsic_color` is the (4, 4) matrix of the `.sens` file, in pixels of the colour frame; sizes
-    are (height, width). Masks and colour frames must have the same aspect ratio.
+    `intrinsics`, (3, 3), are in pixels of the colour frame; sizes are (height, width). Masks and
+    colour frames must have the same aspect ratio.
 
     Example: half size; the second pixel of each pair stays, 0.25 small pixels right of the centre.
 
-        >>> K = np.diag([8.0, 8, 1, 1])
-        >>> K[:2, 2] = 3.5  # the middle of 8 pixels that are counted from centre to centre
+        >>> K = np.diag([8.0, 8, 1])
+        >>> K[:2, 2] = 4
         >>> mask_intrinsics(K, (8, 8), (8, 8), (4, 4))[0].tolist()
         [4.0, 0.0, 1.75]
     """
@@ -156,9 +169,7 @@ def mask_intrinsics(
             f"{color_size[1]} x {color_size[0]}, another shape: they do not show the same "
             "picture. Use the masks that belong to this recording."
         )
-    intrinsics = np.array(intrinsic_color[:3, :3], dtype=np.float64)
-    intrinsics[2] = 0, 0, 1
-    intrinsics[:2, 2] += 0.5
+    intrinsics = np.array(intrinsics, dtype=np.float64)
     # Axis 0 is u (width), axis 1 is v (height).
     for axis, line in enumerate((1, 0)):
         intrinsics[axis] *= mask_size[line] / color_size[line]

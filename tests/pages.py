@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,3 +49,21 @@ def commands_of(text: str) -> list[list[str]]:
     lines = text.replace("\\\n", " ").replace("&&", "\n").splitlines()
     words = [shlex.split(line, comments=True) for line in lines]
     return [line[1:] if line[0] == "srun" else line for line in words if line]
+
+
+def first_block(page: Path, language: str) -> str:
+    return next(block.text for block in blocks_of(page) if block.language == language)
+
+
+def run_first_commands(page: Path) -> list[str]:
+    """Run the commands of a page's first bash block here; what each printed."""
+    said = []
+    for command, *words in commands_of(first_block(page, "bash")):
+        assert command == "sceneprior"
+        done = subprocess.run(
+            [sys.executable, "-m", "sceneprior", *words],
+            capture_output=True, text=True, timeout=600,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{words}\n{done.stderr[-2000:]}"
+        said.append(done.stdout)
+    return said

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from data_prep.engine.cluster import cluster
-from data_prep.engine.finish import REPORT_FILES, Summary, finish
 from data_prep.engine.output import claimed, writing
 from data_prep.engine.plan import PLAN_NAME, Plan, ShardPlan, job_settings, read_plan
+from data_prep.engine.report import REPORT_FILES, Summary, finish
 from data_prep.engine.selection import is_asked_for
 from data_prep.engine.shard_job import RoomFailedError, ShardReport, make_shard, read_finished
 from data_prep.engine.source import Line, Source

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from data_prep.engine.workers import Run, progress
+from data_prep.engine.workers import Run, in_order
 from sceneprior import __version__
 from sceneprior.core.errors import InputError
 
@@ -19,58 +19,29 @@ _KEPT = "Finished shards are kept: run the same command again to go on."
 def cluster(address: str) -> Iterator[Run]:
     """Open a cluster as `run(function, argument_lists, title)`, which yields results in order.
 
-    `run` connects when it is first called. Start the cluster with `dask scheduler` and, on each
-    machine, `dask worker tcp://... --nworkers auto --nthreads 1`. Every machine needs this package,
-    and the folders of data and shards under the same paths. If a worker dies, another takes over
-    its task.
+    Start the cluster with `dask scheduler` and, on each machine, `dask worker tcp://... --nworkers
+    auto --nthreads 1`. Every machine needs this package, and the folders of data and shards under
+    the same paths. If a worker dies, another takes over its task.
     """
-    with contextlib.ExitStack() as stack:
-        clients: list[Any] = []
+    with _connect(address) as client:
+        from distributed import CancelledError, KilledWorker
+        from distributed.comm import CommClosedError
 
-        def in_cluster(
-            function: Callable[..., Any], arguments: list[Any], title: str | None
-        ) -> Iterator[Any]:
-            if not clients:
-                clients.append(stack.enter_context(_connect(address)))
-            with progress(title, len(arguments)) as advance:
-                yield from _run(clients[0], address, function, arguments, advance)
+        def submit(function: Callable[..., Any], *item: Any) -> Any:
+            # pure=False: the scheduler must not return cached results of an earlier job.
+            return client.submit(_in_one_thread, function, *item, pure=False)
 
-        yield in_cluster
-
-
-def _run(
-    client: Any,
-    address: str,
-    function: Callable[..., Any],
-    arguments: list[Any],
-    advance: Callable[[], None],
-) -> Iterator[Any]:
-    from distributed import CancelledError, KilledWorker
-    from distributed.comm import CommClosedError
-
-    # pure=False: the scheduler must not return cached results of an earlier job.
-    futures = [
-        client.submit(_in_one_thread, function, *item, pure=False, priority=-index)
-        for index, item in enumerate(arguments)
-    ]
-    for future in futures:
-        future.add_done_callback(lambda _: advance())
-    try:
-        for future in futures:
-            yield future.result()
-            future.release()
-    except KilledWorker:
-        raise InputError(
-            f"A task of the cluster at {address} killed every worker it was given to (for lack of "
-            f"memory?). {_KEPT}"
-        ) from None
-    except (CancelledError, CommClosedError, TimeoutError) as error:
-        raise InputError(
-            f"The cluster at {address} was lost ({type(error).__name__}). {_KEPT}"
-        ) from None
-    finally:
-        with contextlib.suppress(Exception):
-            client.cancel([future for future in futures if not future.done()])
+        try:
+            yield lambda *work: in_order(submit, *work)
+        except KilledWorker:
+            raise InputError(
+                f"A task of the cluster at {address} killed every worker it was given to (for lack "
+                f"of memory?). {_KEPT}"
+            ) from None
+        except (CancelledError, CommClosedError, TimeoutError) as error:
+            raise InputError(
+                f"The cluster at {address} was lost ({type(error).__name__}). {_KEPT}"
+            ) from None
 
 
 @contextlib.contextmanager

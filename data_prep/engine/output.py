@@ -18,9 +18,11 @@ def claimed(out: Path) -> Iterator[None]:
         with writing(out):
             until_done.enter_context(only_writer(out))
             remove_parts(out)
-        yield
-        with writing(out):
-            remove_parts(out)  # partial files of workers that died
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                remove_parts(out)  # partial files of workers that died
 
 
 @contextlib.contextmanager

@@ -7,18 +7,14 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
-from multiprocessing.synchronize import Event
 from typing import Any
 
 from sceneprior.core.errors import InputError
 
 Run = Callable[..., Iterator[Any]]
-
-# Spawned, never forked: a GL context does not survive a fork.
-_START_METHOD = "spawn"
 
 
 @contextlib.contextmanager
@@ -28,63 +24,62 @@ def pool(workers: int) -> Iterator[Run]:
     A single worker is this process itself. A progress bar goes to stderr if there is a title.
     """
     if workers <= 1:
-
-        def in_process(
-            function: Callable[..., Any], arguments: list[Any], title: str | None
-        ) -> Iterator[Any]:
-            with progress(title, len(arguments)) as advance:
-                for item in arguments:
-                    result = function(*item)
-                    advance()
-                    yield result
-
-        yield in_process
+        yield _in_process
         return
-    context = multiprocessing.get_context(_START_METHOD)
-    stop = context.Event()
-    executor = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(stop,))
+    # Spawned, never forked: a GL context does not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    executor = ProcessPoolExecutor(workers, context, initializer=_start_worker)
 
-    def in_pool(
-        function: Callable[..., Any], arguments: list[Any], title: str | None
-    ) -> Iterator[Any]:
-        with progress(title, len(arguments)) as advance:
-            # Only this process handles Ctrl-C; workers inherit the blocked signal.
-            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
-                futures: list[Future[Any]] = [
-                    executor.submit(_unless_stopped, function, *item) for item in arguments
-                ]
-            finally:
-                signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-            for future in futures:
-                future.add_done_callback(lambda _: advance())
-            for future in futures:
-                yield future.result()
+    def submit(function: Callable[..., Any], *item: Any) -> Any:
+        # Only this process handles Ctrl-C; workers inherit the blocked signal.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return executor.submit(function, *item)
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     try:
-        yield in_pool
+        yield lambda *work: in_order(submit, *work)
     except BrokenProcessPool:
         raise InputError(
             "A worker process died (was it killed for lack of memory?). Finished shards are kept: "
             "run the same command again, perhaps with fewer --workers."
         ) from None
     except BaseException:
-        stop.set()  # lets workers skip the queued tasks that can no longer be cancelled
+        # What they were about to write is not missed: files appear whole or not at all.
+        for worker in multiprocessing.active_children():
+            worker.kill()
         raise
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
 
 
-_stop: Event | None = None  # in a worker: set when the job is abandoned
+def in_order(
+    submit: Callable[..., Any],
+    function: Callable[..., Any],
+    arguments: list[Any],
+    title: str | None,
+) -> Iterator[Any]:
+    """Submit all calls, which return futures, and yield their results in order."""
+    with progress(title, len(arguments)) as advance:
+        futures = [submit(function, *item) for item in arguments]
+        for future in futures:
+            future.add_done_callback(lambda _: advance())
+        for future in futures:
+            yield future.result()
 
 
-def _unless_stopped(function: Callable[..., Any], *arguments: Any) -> Any:
-    return None if _stop is not None and _stop.is_set() else function(*arguments)
+def _in_process(
+    function: Callable[..., Any], arguments: list[Any], title: str | None
+) -> Iterator[Any]:
+    with progress(title, len(arguments)) as advance:
+        for item in arguments:
+            result = function(*item)
+            advance()
+            yield result
 
 
-def _start_worker(stop: Event) -> None:
-    global _stop
-    _stop = stop
+def _start_worker() -> None:
     # llvmpipe's own threads would compete with the other workers for the same cores.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     parent = multiprocessing.parent_process()

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import is_name, read_json
+from sceneprior.core.files import read_json
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,6 @@ def house_files(folder: Path) -> list[Path]:
         hint = f"; did you mean {inside}?" if inside.is_dir() else "."
         raise InputError(f"{folder} holds no house JSONs (<uid>.json){hint}")
     return files
-
-
-def shown(text: Any) -> str:
-    """Make a text from a house file printable and short, for reports."""
-    if is_name(text):
-        return str(text)
-    try:
-        return ascii(text)[:60]
-    except RecursionError:
-        return "something deeply nested"
 
 
 def parse_house(path: Path) -> House:

@@ -1,16 +1,16 @@
 """3D representation of each object of a room: its mesh, its 3D box, or a box found from masks."""
 
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import trimesh
-from cachetools import cachedmethod
 
 from data_prep.inspection.projection import Hull, hull_of
 from data_prep.upright import fit_upright
 from sceneprior.core.errors import ShardError
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
+from sceneprior.core.ground_truth import load_model, model_path
 from sceneprior.core.shards import RoomGroundTruth, RoomViews
 
 KINDS = {"mesh": "meshes", "box": "3D boxes", "found": "boxes found from the masks"}
@@ -29,30 +29,14 @@ class Body(NamedTuple):
     """(T,) bool, as in `RoomGroundTruth`; None if only tracked objects can occlude it."""
 
 
-class ModelHulls:
-    """Convex hulls of `models/<id>.ply` in a folder of shards; each is read once."""
-
-    def __init__(self, folder: Path):
-        self.folder = Path(folder)
-        self._hulls: dict[str, Hull] = {}
-
-    @cachedmethod(lambda self: self._hulls, key=lambda self, model_id: model_id)
-    def get(self, model_id: str) -> Hull:
-        """Hull of all vertices in the model's frame; the ground truth's boxes use all, too."""
-        path = self.folder / f"{model_id}.ply"
-        try:
-            mesh = trimesh.load_mesh(path, process=False)
-            points = np.asarray(mesh.vertices, dtype=np.float64)
-        except Exception as error:  # the type that trimesh raises depends on the damage
-            why = "is missing" if not path.is_file() else f"is damaged ({type(error).__name__})"
-            raise ShardError(f"{path} {why}, but ground truth stands on it.") from None
-        if not len(mesh.faces) or not np.isfinite(points).all():
-            raise ShardError(f"{path} holds no usable faces, but ground truth stands on it.")
-        return hull_of(points)
+@lru_cache(maxsize=4096)
+def hull_of_model(path: Path) -> Hull:
+    """Convex hull of a model (`model_path`) in its own frame; the file is read once."""
+    return hull_of(load_model(path).vertices_m)
 
 
 def true_bodies(
-    views: RoomViews, truth: RoomGroundTruth, models: ModelHulls
+    views: RoomViews, truth: RoomGroundTruth, shards: Path
 ) -> tuple[list[Body | None], list[str]]:
     """Tracked objects according to the ground truth, and faults of the ground truth as sentences.
 
@@ -65,7 +49,8 @@ def true_bodies(
         body: Body | None = Body("box", Hull(corners, np.array(BOX_EDGES)))
         if model_id:
             try:
-                body = Body("mesh", _placed(models.get(model_id), truth.model_to_room[k]))
+                hull = hull_of_model(model_path(shards, model_id))
+                body = Body("mesh", _placed(hull, truth.model_to_room[k]))
                 problems += _box_problem(k, body.hull.points_m, truth)
             except ShardError as error:
                 body = None

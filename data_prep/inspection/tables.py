@@ -1,50 +1,71 @@
 """The tables and sentences that `sceneprior inspect` prints."""
 
+from collections import Counter
 from pathlib import Path
 
 from rich.table import Column, Table
 
 from data_prep.engine.report_tables import make_table
+from data_prep.engine.source import SPLITS
 from data_prep.inspection.agreement import Agreement
 from data_prep.inspection.bodies import KINDS
-from data_prep.inspection.contents import count_shards, describe_room
+from data_prep.inspection.pictures import choose_views
 from data_prep.inspection.verify import FolderCheck
+from sceneprior.core.classes import label_set
+from sceneprior.core.shards import Shard, iterate_rooms, read_index
 
 _WORST_SHOWN = 5
 _JUDGED = ("in 3D", "masks within", "mean 2D IoU")
 
 
-def count_tables(shards: Path) -> list[Table]:
+def count_tables(folder: Path) -> list[Table]:
     """Counts of each split, and its objects of each class."""
-    counts = count_shards(shards)
-    totals = []
-    for split, row in counts.items():
-        sizes = row["image_sizes"]
-        several = ", ".join(f"{rooms} rooms: {size}" for size, rooms in sizes.items())
-        image_size = next(iter(sizes)) if len(sizes) == 1 else several
-        known = f"{row['with_truth']} rooms" if row["with_truth"] else "no room"
-        means = f"{row['objects'] / max(row['rooms'], 1):.2f}", f"{row['seen']:.2f}"
-        whole = row["rooms"], row["views"], row["objects"]
-        totals.append((split, *whole, *means, known, image_size))
+    names = label_set(read_index(folder)["label_set"])
+    totals, classes = [], {}
+    for split in SPLITS:
+        if not any((folder / split).glob("*.h5")):
+            continue  # the folder was made with --only
+        rooms, known = [], 0
+        for shard, room_id in iterate_rooms(folder, split):
+            rooms.append(shard.read_room(room_id))
+            known += shard.has_ground_truth(room_id)
+        views, objects = (sum(room.visible.shape[axis] for room in rooms) for axis in (0, 1))
+        seen = sum(int(room.visible.sum()) for room in rooms)
+        sizes = Counter("{1} x {0}".format(*room.image_size) for room in rooms).most_common()
+        several = ", ".join(f"{count} rooms: {size}" for size, count in sizes)
+        means = f"{objects / max(len(rooms), 1):.2f}", f"{seen / max(views, 1):.2f}"
+        in_3d = f"{known} rooms" if known else "no room"
+        image_size = sizes[0][0] if len(sizes) == 1 else several
+        totals.append((split, len(rooms), views, objects, *means, in_3d, image_size))
+        classes[split] = Counter(names[index] for room in rooms for index in room.object_class)
     columns = (
         "split", "rooms", "views", "objects", "objects a room", "objects a view", "known in 3D",
         "image size",
     )  # fmt: skip
-    names = sorted({name for row in counts.values() for name in row["classes"]})
-    classes = [(name, *(row["classes"].get(name, 0) for row in counts.values())) for name in names]
-    return [make_table(columns, totals), make_table(("class", *counts), classes)]
+    every = sorted({name for counts in classes.values() for name in counts})
+    rows = [(name, *(counts[name] for counts in classes.values())) for name in every]
+    return [make_table(columns, totals), make_table(("class", *classes), rows)]
 
 
-def room_table(shards: Path, room: str) -> Table:
-    """The objects of one room."""
-    table = Table("object", "class", "views", "share of image", "centre, m", "size, m", title=room)
-    for k, row in enumerate(describe_room(shards, room)):
-        place = [
-            "unknown" if row[key] is None else " ".join(f"{value:.2f}" for value in row[key])
-            for key in ("center_m", "size_m")
-        ]
-        share = f"{row['share']:.1%}" if row["views"] else "-"
-        table.add_row(str(k), row["class"], str(row["views"]), share, *place)
+def room_table(folder: Path, room_id: str) -> Table:
+    """The objects of one room; share is the mean area of an object's 2D boxes."""
+    ((path, _, _),) = choose_views(folder, room_id, 1)
+    with Shard(path) as shard:
+        views = shard.read_room(room_id)
+        truth = shard.read_ground_truth(room_id) if shard.has_ground_truth(room_id) else None
+        names = label_set(shard.label_set)
+    rows = []
+    for k, index in enumerate((views if truth is None else truth).object_class):
+        tracked = k < len(views.object_class)
+        boxes = views.boxes[views.visible[:, k], k] if tracked else views.boxes[:0, 0]
+        share = f"{(boxes[:, 2:] - boxes[:, :2]).prod(axis=1).mean():.1%}" if len(boxes) else "-"
+        place = ["unknown"] * 2
+        if truth is not None:
+            place = [" ".join(f"{m:.2f}" for m in of[k]) for of in (truth.centers_m, truth.sizes_m)]
+        rows.append((k, names[index], len(boxes), share, *place))
+    columns = ("object", "class", "views", "share of image", "centre, m", "size, m")
+    table = make_table(columns, rows)
+    table.title = room_id
     return table
 
 

@@ -8,14 +8,14 @@ from typing import Any
 from data_prep.engine.source import SPLITS
 from data_prep.engine.workers import pool
 from data_prep.inspection.agreement import Agreement, compare
-from data_prep.inspection.bodies import ModelHulls, found_bodies, true_bodies
+from data_prep.inspection.bodies import found_bodies, true_bodies
 from data_prep.inspection.causes import Trial, try_repairs
 from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
 from data_prep.inspection.verdicts import disagreement, room_problems
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError, ShardError
 from sceneprior.core.shard_writing import room_checksum
-from sceneprior.core.shards import MODELS_FOLDER, Shard, list_shards, read_index
+from sceneprior.core.shards import Shard, list_shards, read_index
 
 _TRIED_ROOMS = 2
 """Rooms per shard in which camera repairs are tried; the others likely have the same fault."""
@@ -125,7 +125,6 @@ def _check_shard(
 ) -> list[RoomCheck]:
     """Check every room of a shard, or only `only`; an unreadable shard is one problem."""
     name = str(path.relative_to(folder))
-    models = ModelHulls(folder / MODELS_FOLDER)
     checks: list[RoomCheck] = []
     try:
         with Shard(path) as shard:
@@ -135,15 +134,13 @@ def _check_shard(
             for room_id in shard.room_ids:
                 if only is None or room_id == only:
                     left = _TRIED_ROOMS - sum(bool(check.trials) for check in checks)
-                    checks.append(_check_room(shard, name, room_id, models, left > 0))
+                    checks.append(_check_room(shard, folder, name, room_id, left > 0))
     except ShardError as error:
         checks.append(RoomCheck(name, "", problems=(str(error).removesuffix("."),)))
     return checks
 
 
-def _check_room(
-    shard: Shard, name: str, room_id: str, models: ModelHulls, try_causes: bool
-) -> RoomCheck:
+def _check_room(shard: Shard, folder: Path, name: str, room_id: str, try_causes: bool) -> RoomCheck:
     truth = None
     try:
         views = shard.read_room(room_id, images=True)
@@ -169,7 +166,7 @@ def _check_room(
     if truth is None:
         bodies = found_bodies(views)
     else:
-        bodies, found = true_bodies(views, truth, models)
+        bodies, found = true_bodies(views, truth, folder)
         problems += found
     seen = compare(bodies, views)
     trials = {}

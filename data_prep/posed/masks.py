@@ -56,8 +56,7 @@ class RoomMasks:
         """Read a frame's uint32 ids for `observe`, at the stored size, and their intrinsics."""
         values = self._values(frame)
         K, picture = frame_intrinsics(frame, self._size)
-        # `mask_intrinsics` expects pixel centres at integers, as in ScanNet.
-        K = mask_intrinsics(_counted_from_0(K), picture, self._size, self._size)
+        K = mask_intrinsics(K, picture, self._size, self._size)
         if not (lens := frame.camera.lens).is_straight:
             key = lens, K.tobytes()
             if key not in self._views:
@@ -68,7 +67,7 @@ class RoomMasks:
             view = self._views[key]
             K, values = view.intrinsics, values[view.rows, view.columns]
         lines = [sampled_lines(*sides) for sides in zip(self._size, self._stored, strict=True)]
-        sampled = mask_intrinsics(_counted_from_0(K), self._size, self._size, self._stored)
+        sampled = mask_intrinsics(K, self._size, self._size, self._stored)
         return self.table.ids(values[np.ix_(*lines)]), sampled
 
     def _values(self, frame: PosedFrame) -> np.ndarray:
@@ -89,9 +88,3 @@ class RoomMasks:
                 )
             ids[known == 0] = -1
         return ids
-
-
-def _counted_from_0(K: np.ndarray) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    return matrix

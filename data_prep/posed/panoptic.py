@@ -76,8 +76,7 @@ class PanopticIds:
 
 def read_panoptic(path: Path, label_set_name: str) -> PanopticIds:
     """Read a room's annotations. Stuff is background, unless the label set has its class."""
-    data = read_json(path)
-    room = checked(_Panoptic, data if isinstance(data, dict) else {}, str(path))
+    room = checked(_Panoptic, read_json(path), str(path))
     names = {
         item.id: item.name
         if item.isthing or tidy(item.name) in map(tidy, label_set(label_set_name))

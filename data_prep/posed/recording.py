@@ -120,8 +120,7 @@ def ids_path(folder: Path, name: str) -> Path:
     """Path of a frame's instance-id PNG; `name` is the frame's `file_path`.
 
     It is `instances/<name without its extension>.png` if that exists (for frames in several
-    folders), else
-    `instances/<stem>.png`.
+    folders), else `instances/<stem>.png`.
     """
     path = Path(_as_png(path_text(name)))
     whole = folder / INSTANCES / path

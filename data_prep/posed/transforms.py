@@ -69,10 +69,7 @@ def read_recording(folder: Path) -> Recording:
     """Read the frames of one room (`room_files`); errors name the file, the frame and the key."""
     files = room_files(Path(folder)) or [Path(folder) / FILE_NAME]
     jsons = [(path, read_json(path)) for path in files if path.suffix == ".json"]
-    rooms = [
-        (path, checked(_RoomEntry, data if isinstance(data, dict) else {}, str(path)))
-        for path, data in jsons
-    ]
+    rooms = [(path, checked(_RoomEntry, data, str(path))) for path, data in jsons]
     model = [path for path in files if path.suffix != ".json"]
     frames: list[PosedFrame] = []
     if model:
@@ -110,8 +107,8 @@ def _one(key: str, rooms: list[tuple[Path, _RoomEntry]]) -> Any:
     return said[0][1] if said else None
 
 
-def _frames(path: Path, data: Any) -> list[PosedFrame]:
-    if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
+def _frames(path: Path, data: dict[str, Any]) -> list[PosedFrame]:
+    if not isinstance(data.get("frames"), list) or not data["frames"]:
         raise InputError(f"{path} has no list `frames` with a frame in it.")
     return [_frame(path, data, number) for number in range(len(data["frames"]))]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_prep.engine.source import PreparedRoom
-from data_prep.frames import choose_frames, is_pose, pose_fault, room_cameras
+from data_prep.frames import choose_frames, first_fault, room_cameras
 from data_prep.posed.cameras import UP, cameras_in_room, upright_cameras
 from data_prep.posed.floor import find_floor
 from data_prep.posed.masks import RoomMasks, png_size
@@ -75,16 +75,14 @@ def prepare_posed(
     with_mask = [i for i, frame in enumerate(recording.frames) if frame.instances.is_file()]
     choice = choose_frames(poses, with_mask, 1, settings.max_views)
     if not choice.frames:
+        bad = first_fault(poses)
+        fault = f"; frame {shown(recording.frames[bad[0]].name)}: {bad[1]}" if bad else ""
         raise InputError(
             f"{recording.path} has no usable frame: {choice.bad_poses} of {choice.candidates} have "
             f"no usable pose (a rotation with a translation), {choice.without_mask} no PNG of ids"
-            f"{_first_fault(recording)}."
+            f"{fault}."
         )
-    notes = [
-        f"{count} of {choice.candidates} frames have {what}; skipped"
-        for count, what in ((choice.bad_poses, "no usable pose"), (choice.without_mask, "no PNG"))
-        if count
-    ]
+    notes = choice.notes("PNG")
     masks = RoomMasks(recording.folder, label_set_name, size, stored_size(recording, settings))
     try:
         read = [masks.read(recording.frames[i]) for i in choice.frames]
@@ -104,13 +102,6 @@ def prepare_posed(
     world_to_camera = cameras_in_room(recording, upright, turn, floor)
     views = seen.room_views(room_name(recording.folder), world_to_camera, intrinsics)
     return PreparedRoom(views, notes=tuple(notes))
-
-
-def _first_fault(recording: Recording) -> str:
-    for frame in recording.frames:
-        if not is_pose(frame.camera_to_world[None])[0]:
-            return f"; frame {shown(frame.name)}: {pose_fault(frame.camera_to_world)}"
-    return ""
 
 
 def _unsaid_floor(

@@ -1,16 +1,34 @@
 """Reads a scan's alignment, objects and mesh from its `.txt`, JSON and PLY files."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, TypeVar
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from data_prep.frames import is_pose, pose_fault
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import shown
+from sceneprior.core.files import read_json
+from sceneprior.core.instances.checked import checked
 from sceneprior.core.scene import Mesh
+
+_M = TypeVar("_M", bound=BaseModel)
+_Index = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
+
+
+class _Object(BaseModel):
+    objectId: _Index  # noqa: N815
+    label: str
+    segments: frozenset[_Index]
+
+
+class _Aggregation(BaseModel):
+    segGroups: list[_Object]  # noqa: N815
+
+
+class _Segmentation(BaseModel):
+    segIndices: list[_Index]  # noqa: N815
 
 
 @dataclass(frozen=True)
@@ -57,42 +75,22 @@ def axis_alignment(path: Path, properties: dict[str, str]) -> np.ndarray:
 
 def read_groups(path: Path) -> tuple[list[Group], list[str]]:
     """Read the objects of `<scene>.aggregation.json`, sorted by id, with notes on oddities."""
-    data = _read_json(path, "a scan without annotations (ScanNet's test scans) cannot be prepared")
+    why = "a scan without annotations (ScanNet's test scans) cannot be prepared"
     found: dict[int, Group] = {}
     notes = []
-    try:
-        for entry in data["segGroups"]:
-            number, category = entry["objectId"], entry["label"]
-            if not _is_index(number) or not isinstance(category, str):
-                raise TypeError(f"objectId {shown(number)} with label {shown(category)}")
-            segments = frozenset(entry["segments"])
-            if not all(_is_index(segment) for segment in segments):
-                raise TypeError(f"the segments of object {number} are not all whole numbers")
-            if number in found:
-                notes.append(f"object {number} is listed twice; its parts were joined")
-                category, segments = found[number].category, segments | found[number].segments
-            found[number] = Group(number, category, segments)
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"{path} is not an aggregation of objects ({type(error).__name__}: {error}); "
-            "expected segGroups with objectId, label and segments. Download the scan again."
-        ) from None
+    for entry in _read_json(_Aggregation, path, why).segGroups:
+        number, category, segments = entry.objectId, entry.label, entry.segments
+        if number in found:
+            notes.append(f"object {number} is listed twice; its parts were joined")
+            category, segments = found[number].category, segments | found[number].segments
+        found[number] = Group(number, category, segments)
     return [found[number] for number in sorted(found)], notes
 
 
 def read_segments(path: Path) -> np.ndarray:
     """Read the segment of each mesh vertex from `<scene>_vh_clean_2...segs.json`: (V,) int64."""
-    data = _read_json(path, "it tells which part of the mesh is which object")
-    try:
-        segments = np.asarray(data["segIndices"])
-        if segments.ndim != 1 or segments.dtype.kind != "i":
-            raise TypeError("segIndices is not a list of whole numbers")
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path} is not a segmentation ({type(error).__name__}: {error}); "
-            "expected segIndices, one whole number per vertex. Download the scan again."
-        ) from None
-    return segments.astype(np.int64)
+    why = "it tells which part of the mesh is which object"
+    return np.array(_read_json(_Segmentation, path, why).segIndices, dtype=np.int64)
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -145,20 +143,13 @@ def surface_of(mesh: Mesh, part: np.ndarray) -> Mesh | None:
     return Mesh(mesh.vertices_m[part], faces) if len(faces) else None
 
 
-def _is_index(value: Any) -> bool:
-    # bool is a subclass of int; a float is no index, even if it is a whole number.
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
-
-
-def _read_json(path: Path, why: str) -> Any:
+def _read_json(model: type[_M], path: Path, why: str) -> _M:
+    if not path.is_file():
+        raise _unreadable(path, FileNotFoundError("no such file"), why)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise _unreadable(path, error, why) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path} is not JSON ({error}); it is truncated or damaged. Download the scan again."
-        ) from None
+        return checked(model, read_json(path), str(path))
+    except InputError as error:
+        raise InputError(f"{error} Download the scan again.") from None
 
 
 def _unreadable(path: Path, error: Exception, why: str = "") -> InputError:

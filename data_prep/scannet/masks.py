@@ -11,13 +11,12 @@ from PIL import Image
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import plain, shown
+from sceneprior.core.instances.pngs import png_kind
 
 MASK_FILES = {"filt": "_2d-instance-filt.zip", "raw": "_2d-instance.zip"}
 """Suffix of the archive's name, after the scan's, for each value of `--masks`."""
 _LARGEST_MEMBER_BYTES = 64 << 20
 """Size limit of a mask; one of 1296 x 968 has some 10 KB, or 1.2 MB uncompressed."""
-_PNG_START = b"\x89PNG\r\n\x1a\n"
-_HEADER_BYTES = 26
 
 
 class MaskArchive:
@@ -38,7 +37,8 @@ class MaskArchive:
         try:
             self._members = self._list()
             self.frames = tuple(sorted(self._members))
-            self.image_size = self._size(self.frames[0])
+            width, height = self._open(self.frames[0]).size
+            self.image_size = height, width
         except BaseException:
             self._zip.close()
             raise
@@ -51,16 +51,16 @@ class MaskArchive:
 
     def read(self, frame: int) -> np.ndarray:
         """Read the mask of one frame, (height, width) uint8: objectId + 1, or 0 for no object."""
-        size = self._size(frame)
-        if size != self.image_size:
+        picture = self._open(frame)
+        width, height = picture.size
+        if (height, width) != self.image_size:
             raise InputError(
-                f"{self._where(frame)} is {size[1]} x {size[0]} pixels, but the masks before it "
+                f"{self._where(frame)} is {width} x {height} pixels, but the masks before it "
                 f"{self.image_size[1]} x {self.image_size[0]}; an archive has one size."
             )
         try:
             # Pillow rejects truncated pictures; cv2 would pad them.
-            with Image.open(io.BytesIO(self._bytes(frame))) as picture:
-                return np.asarray(picture).copy()
+            return np.asarray(picture).copy()
         except (OSError, ValueError, SyntaxError, EOFError, zlib.error) as error:
             raise self._damaged(frame, error) from None
 
@@ -89,31 +89,31 @@ class MaskArchive:
             )
         return members
 
-    def _size(self, frame: int) -> tuple[int, int]:
-        """Read the height and width of a mask from its PNG header."""
-        head = self._bytes(frame, _HEADER_BYTES)
-        if len(head) < _HEADER_BYTES or not head.startswith(_PNG_START):
+    def _open(self, frame: int) -> Image.Image:
+        data = self._bytes(frame)
+        kind = png_kind(data)
+        if kind is None:
             raise self._damaged(frame, "it is not a PNG")
-        width, height = (int.from_bytes(head[i : i + 4], "big") for i in (16, 20))
-        depth, kind = head[24:26]
-        if (depth, kind) != (8, 0):
-            colors = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGBA"}
-            hint = "; 16-bit ones are the label archives (_2d-label)" if depth == 16 else ""
+        if kind != (8, "grey"):
+            hint = "; 16-bit ones are the label archives (_2d-label)" if kind[0] == 16 else ""
             raise InputError(
-                f"{self._where(frame)} has {depth} bits, {colors.get(kind, 'unknown colours')}; "
-                f"an instance mask has 8 bits, grey{hint}."
+                f"{self._where(frame)} has {kind[0]} bits, {kind[1]}; an instance mask has 8 bits, "
+                f"grey{hint}."
             )
-        if not 0 < width * height <= _LARGEST_MEMBER_BYTES:
-            raise self._damaged(frame, f"{width} x {height} pixels")
-        return height, width
+        try:
+            picture = Image.open(io.BytesIO(data), formats=("PNG",))
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+            raise self._damaged(frame, "its header is damaged") from None
+        if not 0 < picture.width * picture.height <= _LARGEST_MEMBER_BYTES:
+            raise self._damaged(frame, f"{picture.width} x {picture.height} pixels")
+        return picture
 
-    def _bytes(self, frame: int, count: int = -1) -> bytes:
+    def _bytes(self, frame: int) -> bytes:
         item = self._members[frame]
         if item.file_size > _LARGEST_MEMBER_BYTES:
             raise self._damaged(frame, f"{item.file_size} bytes unpacked")
         try:
-            with self._zip.open(item) as file:
-                return file.read(count)
+            return self._zip.read(item)
         except (
             OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error,
         ) as error:  # fmt: skip

@@ -8,9 +8,8 @@ import numpy as np
 from data_prep.frames import (
     FrameChoice,
     choose_frames,
-    is_pose,
+    first_fault,
     mask_intrinsics,
-    pose_fault,
     room_cameras,
 )
 from data_prep.scannet.annotations import (
@@ -24,7 +23,7 @@ from data_prep.scannet.annotations import (
 )
 from data_prep.scannet.labels import Labels
 from data_prep.scannet.masks import MASK_FILES, MaskArchive
-from data_prep.scannet.sens import Recording, read_recording
+from data_prep.scannet.sens import read_recording
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import plain, shown
 from sceneprior.core.scene import Mesh
@@ -173,12 +172,7 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
         instances.append(Instance(group.object_id, kind, is_shell, *corners, part, surface))
     half = (upper - lower)[[0, 2]] / 2
     choice, world_to_camera, intrinsics, masks = _read_cameras(folder, room_from_scan, settings)
-    every = f"of {choice.candidates} frames (every {settings.frame_step})"
-    for count, why in (
-        (choice.bad_poses, "have no usable pose"),
-        (choice.without_mask, "have no mask"),
-    ):
-        notes += [f"{count} {every} {why}; skipped"] * bool(count)
+    notes += choice.notes("mask")
     return Scan(
         folder=folder,
         instances=tuple(instances),
@@ -205,28 +199,22 @@ def _read_cameras(
         frames, mask_size = masks.frames, masks.image_size
     choice = choose_frames(sens.camera_to_world, frames, settings.frame_step, settings.max_views)
     if not choice.frames:
+        bad = first_fault(sens.camera_to_world, settings.frame_step)
+        fault = f" (the pose of frame {bad[0]}: {bad[1]})" if bad else ""
         raise InputError(
             f"{sens_path} gives no view: of {choice.candidates} frames (every "
             f"{settings.frame_step}), {choice.bad_poses} have no usable pose and "
-            f"{choice.without_mask} no mask in {mask_path.name}{_first_fault(sens, settings)}. "
+            f"{choice.without_mask} no mask in {mask_path.name}{fault}. "
             "Download the scan again, or leave it out."
         )
     try:
         intrinsics = mask_intrinsics(
-            sens.intrinsic_color, sens.color_size, mask_size, settings.image_size
+            sens.intrinsics, sens.color_size, mask_size, settings.image_size
         )
     except InputError as error:
         raise InputError(f"{mask_path}: {error}") from None
     poses = sens.camera_to_world[list(choice.frames)]
     return choice, room_cameras(poses, room_from_scan), intrinsics, mask_path
-
-
-def _first_fault(sens: Recording, settings: ScanSettings) -> str:
-    for frame in range(0, len(sens.camera_to_world), settings.frame_step):
-        pose = sens.camera_to_world[frame]
-        if not is_pose(pose[None])[0]:
-            return f" (the pose of frame {frame}: {pose_fault(pose)})"
-    return ""
 
 
 def _mask_path(folder: Path, kind: str) -> Path:

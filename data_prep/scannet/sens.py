@@ -27,10 +27,8 @@ class Recording:
     Depth and colour of the release are already aligned, so the header's extrinsics are not used.
     """
 
-    intrinsic_color: np.ndarray
-    """(4, 4) float64, intrinsics of the colour camera in pixels of a frame of `color_size`. ScanNet
-    puts pixel centres at integers (its tools unproject pixel x, y by K^-1 (x, y, 1));
-    `data_prep.frames.mask_intrinsics` converts them to our convention."""
+    intrinsics: np.ndarray
+    """(3, 3) float64, of the colour camera in pixels of a frame of `color_size`."""
     color_size: tuple[int, int]
     """(height, width) of the colour frames."""
     camera_to_world: np.ndarray
@@ -74,13 +72,16 @@ class _Reader:
         self._check_end("header", 12, length, "the sensor's name")
         at = 12 + length
         matrices = self._read(at, 4 * 64, "header", "the calibration")
-        intrinsics = np.frombuffer(matrices, dtype="<f4", count=16).reshape(4, 4).astype(np.float64)
+        intrinsics = np.eye(3)
+        intrinsics[:2] = np.frombuffer(matrices, dtype="<f4", count=16).reshape(4, 4)[:2, :3]
         focal = intrinsics[(0, 1), (0, 1)]
         if not np.isfinite(intrinsics[:2]).all() or not (focal > 0).all():
             raise InputError(
                 f"{self._where('header', at)}: the colour camera's focal lengths are "
                 f"{focal[0]:g} and {focal[1]:g} pixels; the file is damaged. Download it again."
             )
+        # ScanNet puts pixel centres at integers: its tools unproject pixel x, y by K^-1 (x, y, 1).
+        intrinsics[:2, 2] += 0.5
         at += len(matrices)
         rest = self._read(at, _AFTER_CALIBRATION.size, "header", "the sizes")
         color_kind, depth_kind, width, height, *depth, _, frames = _AFTER_CALIBRATION.unpack(rest)
@@ -120,19 +121,15 @@ class _Reader:
         self._check_end(frame, start, size, what)
         try:
             self.file.seek(start)
-            data = self.file.read(size)
+            return self.file.read(size)
         except OSError as error:
             raise InputError(
                 f"{self._where(frame, start)}: {what} cannot be read ({error.strerror})."
             ) from None
-        self._check_end(frame, start, size, what, start + len(data))  # truncated while open
-        return data
 
-    def _check_end(
-        self, frame: str, start: int, size: int, what: str, end: int | None = None
-    ) -> None:
+    def _check_end(self, frame: str, start: int, size: int, what: str) -> None:
         """Check that bytes `start` to `start + size` lie inside the file."""
-        left = max((self.size if end is None else end) - start, 0)
+        left = max(self.size - start, 0)
         if size > left:
             # A negative size, read as unsigned, is a very large one and ends here, too.
             raise InputError(

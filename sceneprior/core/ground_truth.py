@@ -116,7 +116,7 @@ def split_fingerprint(shards: Path, split: str) -> str:
             digest.update(np.ascontiguousarray(array).tobytes())
         models.update(model_id for model_id in truth.model_ids if model_id)
     for model_id in sorted(models):
-        path = Path(shards) / MODELS_FOLDER / f"{model_id}.ply"
+        path = model_path(Path(shards), model_id)
         digest.update(hashlib.sha256(path.read_bytes() if path.is_file() else b"").digest())
     return digest.hexdigest()
 
@@ -157,8 +157,7 @@ def model_path(shards: Path, model_id: str) -> Path:
     return shards / MODELS_FOLDER / f"{model_id}.ply"
 
 
-@lru_cache(maxsize=4096)
-def read_model(path: Path) -> Mesh:
+def load_model(path: Path) -> Mesh:
     """Read a model of a folder of shards (`model_path`) in its own frame."""
     if not path.is_file():
         raise ShardError(
@@ -175,3 +174,6 @@ def read_model(path: Path) -> Mesh:
             f"{path} is not a triangle mesh ({type(error).__name__}: {error}). Delete it and run "
             "`sceneprior prep-front` again."
         ) from None
+
+
+read_model = lru_cache(maxsize=4096)(load_model)

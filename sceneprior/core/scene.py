@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, read_json
+from sceneprior.core.instances.checked import checked
 
 FORMAT = "sceneprior-scene"
 VERSION = 1
@@ -32,9 +33,8 @@ _LEAST_M = 10.0**-_DECIMALS
 class Mesh:
     """A triangle mesh in the room frame: vertices (V, 3) in metres, faces (F, 3) as indices.
 
-    Raises:
-        InputError: the arrays have other shapes, a vertex is not finite, or a face has an index out
-            of range, at which the z-buffer would read beyond the array.
+    Other shapes, vertices that are not finite, and faces with an index out of range, at which the
+    z-buffer would read beyond the array, raise an `InputError`.
     """
 
     vertices_m: np.ndarray
@@ -171,11 +171,7 @@ class Scene:
         return perspective(self, open_renderer())
 
     def show(self) -> None:
-        """Display the scene in a notebook, from any line of a cell.
-
-        Raises:
-            InputError: the code does not run in a notebook.
-        """
+        """Display the scene from any line of a notebook's cell; elsewhere an `InputError`."""
         notebook = sys.modules.get("IPython")
         if notebook is None or notebook.get_ipython() is None:
             raise InputError(
@@ -203,6 +199,15 @@ class Scene:
 
 def scene_to_json(scene: Scene) -> dict[str, Any]:
     """Convert a scene to its JSON format (docs/conventions.md): classes and boxes, no meshes."""
+    objects = []
+    for item in scene.objects:
+        entry: dict[str, Any] = {"class": item.label}
+        entry["center_m"] = [round(value, _DECIMALS) for value in item.center_m]
+        entry["size_m"] = _rounded_size(item.size_m)
+        if item.turned is not None:
+            entry["yaw_rad"] = round(item.turned.yaw_rad, 7)
+            entry["own_size_m"] = _rounded_size(item.turned.size_m)
+        objects.append(entry)
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -210,15 +215,7 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
         "label_set": scene.label_set,
         "units": "metres",
         "axes": "x right, y up, z towards the viewer; floor at y = 0, its centre at the origin",
-        "objects": [
-            {
-                "class": item.label,
-                "center_m": [round(value, _DECIMALS) for value in item.center_m],
-                "size_m": _rounded_size(item.size_m),
-                **({} if item.turned is None else _turned_to_json(item.turned)),
-            }
-            for item in scene.objects
-        ],
+        "objects": objects,
         **({} if scene.floor_m is None else {"floor_m": scene.floor_m.tolist()}),
         **({"extra": scene.extra} if scene.extra else {}),
     }
@@ -229,15 +226,15 @@ def _rounded_size(size_m: Sequence[float]) -> list[float]:
     return [max(round(value, _DECIMALS), _LEAST_M) for value in size_m]
 
 
-def _turned_to_json(turned: Turned) -> dict[str, Any]:
-    return {"yaw_rad": round(turned.yaw_rad, 7), "own_size_m": _rounded_size(turned.size_m)}
-
-
-_Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
-_Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
+# Strict, because "1.8" and true are not valid lengths; JSON has lists for our tuples.
+_STRICT = ConfigDict(strict=True)
+_Triple = Annotated[tuple[float, float, float], Field(strict=False)]
+_Pair = Annotated[tuple[float, float], Field(strict=False)]
 
 
 class _ObjectEntry(BaseModel):
+    model_config = _STRICT
+
     label: str = Field(alias="class")
     center_m: _Triple
     size_m: _Triple
@@ -246,6 +243,8 @@ class _ObjectEntry(BaseModel):
 
 
 class _SceneEntry(BaseModel):
+    model_config = _STRICT
+
     name: str | None = None
     label_set: str
     objects: Annotated[list[_ObjectEntry], Field(max_length=MOST_OBJECTS)]
@@ -257,28 +256,19 @@ def read_scene(path: Path) -> Scene:
     """Read a scene's JSON."""
     path = Path(path)
     data = read_json(path)
-    try:
-        if isinstance(data, dict) and (data["format"], data["version"]) != (FORMAT, VERSION):
-            raise InputError(
-                f"{path} says format '{_short(data['format'])}' version "
-                f"{_short(data['version'])}; expected '{FORMAT}' version {VERSION}. Write it "
-                "again with `sceneprior synthesize`."
-            )
-        # Strict, because "1.8" and true are not valid lengths.
-        entry = _SceneEntry.model_validate(data, strict=True)
-        # `extra` is written again with the scene, so it must be valid JSON without NaN.
-        json_text(entry.extra)
-    except InputError:
-        raise
-    except (ValueError, KeyError, RecursionError) as error:
-        reason = f"{type(error).__name__}: {error}"
-        if isinstance(error, ValidationError):
-            first = error.errors(include_url=False)[0]
-            reason = ": ".join([".".join(map(_short, first["loc"])), first["msg"]]).lstrip(": ")
+    where = f"{path} is not a scene JSON, which docs/conventions.md describes"
+    if not isinstance(data, dict) or not {"format", "version"} <= data.keys():
+        raise InputError(f"{where}: expected an object with 'format', 'version' and 'objects'.")
+    if (data["format"], data["version"]) != (FORMAT, VERSION):
         raise InputError(
-            f"{path} is not a scene JSON: expected an object with 'format' and 'objects' "
-            f"({reason}); docs/conventions.md describes the format."
-        ) from None
+            f"{path} says format '{_short(data['format'])}' version {_short(data['version'])}; "
+            f"expected '{FORMAT}' version {VERSION}. Write it again with `sceneprior synthesize`."
+        )
+    entry = checked(_SceneEntry, data, where)
+    try:
+        json_text(entry.extra)  # it is written again with the scene
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{where}: extra cannot be written as JSON ({error}).") from None
     names = label_set(entry.label_set)
     objects = []
     for item in entry.objects:
@@ -288,8 +278,8 @@ def read_scene(path: Path) -> Scene:
                 f"'{_short(entry.label_set)}'; use one of {', '.join(names)}."
             )
         check_box(path, item.label, item.center_m, item.size_m)
-        center, size = _triple(item.center_m), _triple(item.size_m)
-        objects.append(SceneObject(item.label, center, size, turned=_turned_of(path, item)))
+        turned = _turned_of(path, item)
+        objects.append(SceneObject(item.label, item.center_m, item.size_m, turned=turned))
     floor = None if entry.floor_m is None else np.array(entry.floor_m, dtype=np.float64)
     if floor is not None:
         check_floor(path, floor)
@@ -332,7 +322,7 @@ def _turned_of(path: Path, item: _ObjectEntry) -> Turned | None:
         return None
     if item.yaw_rad is not None and item.own_size_m is not None:
         check_box(path, item.label, item.center_m, item.own_size_m)
-        turned = Turned(item.yaw_rad, _triple(item.own_size_m))
+        turned = Turned(item.yaw_rad, item.own_size_m)
         if np.allclose(bound_m(turned), item.size_m, rtol=0, atol=1e-3):
             return turned
     raise InputError(

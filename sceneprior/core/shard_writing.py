@@ -32,7 +32,6 @@ def shard_bytes(
         _write_text(file, "label_set", label_set_name)
         _write_text(file, "classes", json.dumps(label_set(label_set_name)))
         for views, truth in rooms:
-            check_views(name, views)
             # HDF5 treats "/" as a group separator, and ids such as <house>/<room> contain it.
             key = views.room_id.replace("/", "|")
             _write_room(file.create_group(f"rooms/{key}"), views, truth)

@@ -5,26 +5,6 @@ from front_files import bedroom
 from front_jobs import SMALL, three_houses
 
 
-def test_commands(front, tmp_path, cli):
-    three_houses(front)
-    out, png = tmp_path / "shards", tmp_path / "pictures" / "sheet.png"
-    rules = [word for rule in SMALL for word in ("--rule", rule)]
-    made = cli(
-        "prep-front", "--front", front.front, "--future", front.future, "--out", out,
-        "--workers", 1, "--renderer", "software", "--views-per-m2", 0.7, *rules[:2], *rules[4:],
-    )  # fmt: skip
-    assert made.exit_code == 0, made.output
-    told = (
-        "train 4 rooms, 44 views, 12 objects; val 1 rooms, 11 views, 3 objects; test 1 rooms, 11 "
-        "views, 3 objects"
-    )
-    assert told in made.stdout
-    looked = cli("inspect", out, "--png", png, "--boxes-3d", "--pictures", 6)
-    assert looked.exit_code == 0, looked.output
-    assert "nightstand" in looked.stdout and "train" in looked.stdout
-    assert png.read_bytes().startswith(b"\x89PNG")
-
-
 @pytest.fixture
 def prep(front, tmp_path, cli):
     def run(*words):

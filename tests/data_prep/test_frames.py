@@ -90,7 +90,7 @@ def test_a_room_camera_undoes_pose_and_frame(rng):
     )
 
 
-K = np.array([[1170.0, 0.5, 640.25, 0], [0, 1165, 490.75, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+K = np.array([[1170.0, 0.5, 640.75], [0, 1165, 491.25], [0, 0, 1]])
 
 
 @pytest.mark.parametrize("image_size", [QUARTER_SIZE, FULL_SIZE, (484, 648), (88, 432)])
@@ -100,8 +100,7 @@ def test_a_sampled_pixel_is_where_the_lens_says(image_size):
     rows, columns = (sampled_lines(*pair) for pair in zip(FULL_SIZE, image_size, strict=True))
     assert len(np.unique(rows)) == image_size[0] and rows[-1] < 968 and columns[-1] < 1296
     for i, j in ((0, 0), (7, 50), (image_size[0] - 1, image_size[1] - 1)):
-        # ScanNet's pixel centres are whole numbers.
-        ray = np.linalg.inv(K[:3, :3]) @ (columns[j], rows[i], 1)
+        ray = np.linalg.inv(K) @ (columns[j] + 0.5, rows[i] + 0.5, 1)
         # Only rounding: numbers of the size of a pixel coordinate.
         np.testing.assert_allclose(lens @ ray, (j + 0.5, i + 0.5, 1), atol=1e-10)
 
@@ -111,10 +110,10 @@ def test_masks_of_another_size_show_the_same_picture():
     for image_size in ((480, 640), QUARTER_SIZE, FULL_SIZE):
         lens = mask_intrinsics(K, FULL_SIZE, (480, 640), image_size)
         rows, columns = (sampled_lines(*pair) for pair in zip((480, 640), image_size, strict=True))
-        rays = np.linalg.inv(K[:3, :3]) @ np.stack(
+        rays = np.linalg.inv(K) @ np.stack(
             [
-                (columns[: len(rows)] + 0.5) / 640 * 1296 - 0.5,
-                (rows[: len(columns)] + 0.5) / 480 * 968 - 0.5,
+                (columns[: len(rows)] + 0.5) / 640 * 1296,
+                (rows[: len(columns)] + 0.5) / 480 * 968,
                 np.ones(len(rows)),
             ]
         )

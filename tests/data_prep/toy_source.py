@@ -55,10 +55,6 @@ class ToySource:
                 return open("/nowhere/at/all")  # noqa: PTH123
             case "shapes":
                 return replace(made, views=replace(views, boxes=views.boxes[:1]))
-            case "path":
-                return replace(made, files={"../evil": b""})
-            case "model path":
-                return replace(made, models={"/elsewhere/evil": TRIANGLE})
         raise AssertionError
 
 

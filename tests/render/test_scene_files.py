@@ -159,7 +159,7 @@ def test_bad_folders_and_files_say_what_to_do(scene, tmp_path, renderer):
         ),
         ({"size_m": [1800, 500, 2000]}, r"Are these millimetres\? Give metres\."),
         ({"center_m": [150.0, 25, 60]}, r"100 m from the floor's centre\. Are these centimetres"),
-        ({"center_m": ["0", "1", "2"]}, r"objects\.0\.center_m\.0: Input should be a valid number"),
+        ({"center_m": ["0", "1", "2"]}, r"objects\.0\.center_m\.0 is .0.; input should be a valid"),
         ({"yaw_rad": 0.3}, "expected both"),
         ({"yaw_rad": 0.3, "own_size_m": [1.0, 0.8, 0.5]}, "the box turned by yaw_rad fills size_m"),
     ],
@@ -180,6 +180,8 @@ def test_what_room_files_cannot_hold_is_refused(tmp_path):
         ({"objects": data["objects"] * 20_000}, "at most 1000 items"),
         ({"extra": {"a": float("nan")}}, "is not a scene JSON"),
         ({"floor_m": [[0, 0], [400, 0], [400, 300]]}, "the floor reaches 400 m.* centimetres"),
+        ({"floor_m": [[0, 0], [1, 0]]}, r"a\.json is not a scene JSON.*floor_m"),
+        ({"floor_m": [[0, 0], [1], [2, 2]]}, r"a\.json is not a scene JSON.*floor_m"),
         ({"version": "x" * 9999}, "x{60}; expected 'sceneprior-scene' version 1"),
     ):
         (tmp_path / "a.json").write_text(json.dumps(data | change))
@@ -264,14 +266,6 @@ def test_box_lists_in_place_of_scenes_are_sent_to_their_command(tmp_path):
     (tmp_path / "b" / "rooms.json").write_text("[]")
     with pytest.raises(InputError, match="holds no scene JSON"):
         load_scene_folder(tmp_path / "b")
-
-
-@pytest.mark.parametrize("floor", [[[0, 0], [1, 0]], [1, 2, 3], "here", [[0, 0], [1], [2, 2]]])
-def test_floors_that_are_no_outline_are_refused(tmp_path, floor):
-    data = scene_to_json(Scene("a", "front3d_bedroom")) | {"floor_m": floor}
-    (tmp_path / "a.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match=r"a\.json is not a scene JSON.*floor_m"):
-        load_scene(tmp_path / "a.json")
 
 
 def test_floors_without_area_are_refused_when_read(tmp_path):

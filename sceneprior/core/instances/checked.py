@@ -14,7 +14,7 @@ _REPR = reprlib.Repr()
 _REPR.maxstring = _LONGEST
 
 
-def checked(model: type[_M], data: dict[str, Any], where: str) -> _M:
+def checked(model: type[_M], data: Any, where: str) -> _M:
     """Validate parsed JSON against a Pydantic model."""
     try:
         return model.model_validate(data)
@@ -22,7 +22,9 @@ def checked(model: type[_M], data: dict[str, Any], where: str) -> _M:
         first = error.errors(include_url=False)[0]
         if first["type"] == "value_error":
             raise InputError(f"{where}: {first['ctx']['error']}") from None
-        key, reason = ".".join(map(str, first["loc"])), first["msg"]
+        key, reason = ".".join(map(str, first["loc"])) or "it", first["msg"]
+        if first["type"] == "model_type":  # the sentence of Pydantic names our class
+            reason = "expected a JSON object"
         raise InputError(
             f"{where}: {key} is {shown(first['input'])}; {reason[:1].lower()}{reason[1:]}."
         ) from None

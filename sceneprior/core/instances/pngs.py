@@ -10,8 +10,14 @@ from sceneprior.core.errors import InputError
 
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _HEADER_BYTES = 26
-_GREY, _RGB, _PALETTE = 0, 2, 3
-_KINDS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
+_COLORS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
+
+
+def png_kind(data: bytes) -> tuple[int, str] | None:
+    """Bits a channel and colours of the PNG that begins with these bytes; None if it is none."""
+    if len(data) < _HEADER_BYTES or not data.startswith(_PNG_START):
+        return None
+    return data[24], _COLORS.get(data[25], "unknown colours")
 
 
 def mask_size(path: Path, rgb: bool = False) -> tuple[int, int]:
@@ -43,22 +49,18 @@ def _pixels(path: Path, rgb: bool) -> np.ndarray:
 def _open(path: Path, rgb: bool) -> Image.Image:
     try:
         with path.open("rb") as file:
-            head = file.read(_HEADER_BYTES)
-        if len(head) < _HEADER_BYTES or not head.startswith(_PNG_START):
+            kind = png_kind(file.read(_HEADER_BYTES))
+        if kind is None:
             raise InputError(f"{path} is no PNG; ids are kept in PNGs, which lose nothing.")
-        depth, kind = head[24:26]
         # The indices of a palette are the ids, as in DAVIS and the output of most segmenters.
         # Pillow rescales grey values of fewer than 8 bits, so those are rejected.
-        if rgb and (kind, depth) != (_RGB, 8):
-            raise InputError(
-                f"{path} is {depth}-bit {_KINDS.get(kind, 'of unknown colours')}; expected 8-bit "
-                "RGB, whose colours are segment ids."
-            )
-        if not rgb and kind != _PALETTE and (kind != _GREY or depth not in (8, 16)):
-            raise InputError(
-                f"{path} is {depth}-bit {_KINDS.get(kind, 'of unknown colours')}; expected one "
-                "channel of 8 or 16 bits, or a palette, whose values are instance ids."
-            )
+        wanted = "8-bit RGB, whose colours are segment ids"
+        known = kind == (8, "RGB")
+        if not rgb:
+            wanted = "one channel of 8 or 16 bits, or a palette, whose values are instance ids"
+            known = kind in ((8, "grey"), (16, "grey")) or kind[1] == "palette"
+        if not known:
+            raise InputError(f"{path} is {kind[0]}-bit {kind[1]}; expected {wanted}.")
         return Image.open(path, formats=("PNG",))
     except FileNotFoundError:
         raise InputError(f"{path} is missing.") from None

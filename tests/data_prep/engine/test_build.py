@@ -1,17 +1,16 @@
 """Houses to shards: right boxes, the same bytes whatever the workers, resumed, reported."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
-import trimesh
 from front_files import bedroom, room
 from front_jobs import digests, front_job, rooms_of, three_houses
+from front_reading import shared_front
 
 from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
+from data_prep.inspection.bodies import true_bodies
+from data_prep.inspection.verify import verify
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import list_shards, read_index
@@ -107,13 +106,8 @@ def test_models_fit_the_ground_truth(front, tmp_path):
     front.house("house", *(room(f"Bedroom-{k}", pieces) for k in range(2)))
     out = tmp_path / "shards"
     build_shards(front_job(front, out))
-    for _, truth in rooms_of(out).values():
-        for k, model in enumerate(truth.model_ids):
-            mesh = trimesh.load(out / "models" / f"{model}.ply", process=False)
-            here = trimesh.transform_points(mesh.vertices, truth.model_to_room[k].astype(float))
-            center = (here.min(axis=0) + here.max(axis=0)) / 2
-            np.testing.assert_allclose(center, truth.centers_m[k], atol=1e-5)
-            np.testing.assert_allclose(np.ptp(here, axis=0), truth.sizes_m[k], atol=1e-5)
+    for views, truth in rooms_of(out).values():
+        assert true_bodies(views, truth, out)[1] == []
     header = (out / "models" / "bed.ply").read_bytes()[:400].split(b"end_header")[0].decode()
     assert "format binary_little_endian" in header
     assert [line.split()[-1] for line in header.splitlines() if line.startswith("property")] == [
@@ -166,35 +160,16 @@ def test_a_second_run_makes_only_what_is_missing(front, tmp_path):
     assert digests(out) == before
 
 
-def shared_front() -> Path:
-    folder = Path(os.environ.get("SCENEPRIOR_SHARED", Path(__file__).parents[3] / "shared"))
-    folder = folder / "data" / "front"
-    if not folder.is_dir():
-        pytest.skip("no shared data beside the repository")
-    return folder
-
-
 def test_houses_made_by_others(tmp_path):
-    """Ground-truth boxes, projected, agree with the boxes of masks that nothing hides."""
+    """What is stored agrees with itself: the masks with the projected meshes of the furniture."""
     folder = shared_front()
     recipe = load_recipe("bedroom", ("views.per_m2=0.5",))
     source = FrontSource(folder / "3D-FRONT", folder / "3D-FUTURE-model", recipe, only="0022c821")
     build_shards(Job(source, tmp_path / "a", renderer="software"))
-    ((views, truth),) = rooms_of(tmp_path / "a").values()
+    ((views, _),) = rooms_of(tmp_path / "a").values()
     assert views.room_id == "0022c821-c1f2-516e-8552-8f01efccfc26_MasterBedroom-8629"
     names = [label_set("front3d_bedroom")[c] for c in views.object_class]
     assert names.count("double_bed") == 1 and "armchair" in names and "void" not in names
-    overlaps = []
-    for k in range(len(names)):
-        mesh = trimesh.load(tmp_path / "a" / "models" / f"{truth.model_ids[k]}.ply", process=False)
-        here = trimesh.transform_points(mesh.vertices, truth.model_to_room[k].astype(float))
-        for view in np.flatnonzero(views.visible[:, k]):
-            pixels, nearest = projected(here, views.world_to_camera[view], views.intrinsics[view])
-            low, high = pixels.min(axis=0), pixels.max(axis=0)
-            x1, y1, x2, y2 = views.boxes[view, k] * (480, 360, 480, 360)
-            if nearest < 0.1 or min(low) < 0 or high[0] > 480 or high[1] > 360:
-                continue
-            sides = np.minimum((x2, y2), high) - np.maximum((x1, y1), low)
-            both = np.prod(np.maximum(sides, 0))
-            overlaps.append(both / ((x2 - x1) * (y2 - y1) + np.prod(high - low) - both))
-    assert len(overlaps) > 3 and np.median(overlaps) > 0.95, overlaps
+    found = verify(tmp_path / "a")
+    tally = found.agreement.of("mesh")
+    assert found.problems == () and tally.whole > 3 and tally.mean_iou > 0.95

@@ -45,11 +45,11 @@ def test_every_room_left_out_is_named_with_the_reason(front, tmp_path):
         "many": "15 objects, max_objects is 13",
         "bedless": "none of double_bed, single_bed, kids_bed, which required_classes asks for",
         "large": "floor 6.00 x 8.00 m, max_floor_m is 6",
-        "scaled": "stand is scaled by 1, 9, 1, beyond scale_range",
+        "scaled": "'stand' is scaled by 1, 9, 1, beyond scale_range",
         "broken": rows["broken"]["reason"],
     }  # fmt: skip
     assert rows["broken"]["status"] == "failed" and "not JSON" in rows["broken"]["reason"]
-    assert "ghost is left out" in rows["house_Bedroom-ghost"]["notes"]
+    assert "'ghost' is left out" in rows["house_Bedroom-ghost"]["notes"]
     assert summary.statuses == {"prepared": 3, "filtered": 5, "failed": 1}
     assert str(summary).endswith("; 5 filtered, 1 failed (report.csv says why)")
     report = json.loads((out / "report.json").read_text())

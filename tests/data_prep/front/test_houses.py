@@ -58,7 +58,7 @@ def test_duplicate_uids_and_duplicate_placements(front):
     twice["children"].append(dict(twice["children"][2]))  # the same piece at the same place
     room_ = only_room(front, front.house("twice", twice))
     assert len(room_.furniture) == 4
-    assert room_.notes == ("bed stands twice at the same place; one is kept",)
+    assert room_.notes == ("'bed' stands twice at the same place; one is kept",)
 
 
 def test_a_room_without_floor_is_left_out_and_with_a_damaged_one_fails(front):
@@ -87,7 +87,7 @@ def test_placements_that_are_no_numbers_are_named(front, key, value, note):
     written["children"][2][key] = value
     room_ = only_room(front, front.house("house", written))
     assert len(room_.furniture) == 3
-    assert "bed is left out" in room_.notes[0] and note in room_.notes[0]
+    assert "'bed' is left out" in room_.notes[0] and note in room_.notes[0]
 
 
 def test_wild_scales_leave_the_room_out(front):
@@ -95,7 +95,7 @@ def test_wild_scales_leave_the_room_out(front):
     path = front.house("house", written)
     result = read(front, path)
     assert not result.rooms
-    why = "bed is scaled by 1, 6, 1, beyond scale_range"
+    why = "'bed' is scaled by 1, 6, 1, beyond scale_range"
     assert result.filtered == [("house_A", "scale_range", why)]
     assert len(read(front, path, rules=("scale_range=null",)).rooms) == 1
 
@@ -109,7 +109,7 @@ def test_a_scale_of_zero_is_never_drawn(front):
     assert read(front, path).filtered[0][1] == "scale_range"
     room_ = only_room(front, path, rules=("scale_range=null",))
     assert [piece.model_id for piece in room_.furniture] == ["bed"]
-    assert room_.notes == ("stand is left out: it is scaled by 1, 0, 1, to nothing",)
+    assert room_.notes == ("'stand' is left out: it is scaled by 1, 0, 1, to nothing",)
 
 
 def test_mirrored_pieces_can_be_ruled_out(front):
@@ -117,7 +117,7 @@ def test_mirrored_pieces_can_be_ruled_out(front):
     path = front.house("house", room("A", pieces))
     assert len(read(front, path).rooms) == 1
     filtered = read(front, path, rules=("allow_mirrored=false",)).filtered
-    assert filtered == [("house_A", "allow_mirrored", "bed is mirrored, scaled by -1, 1, 1")]
+    assert filtered == [("house_A", "allow_mirrored", "'bed' is mirrored, scaled by -1, 1, 1")]
 
 
 def test_rooms_without_furniture_are_filtered_not_failed(front):

@@ -71,7 +71,7 @@ def test_missing_and_broken_models_are_named(front):
     pieces = [{"jid": jid, "pos": (0, 0, 0)} for jid in ("bed", "ghost", "empty", "cut", "")]
     found = only_room(front, front.house("house", room("A", pieces)))
     assert [piece.model_id for piece in found.furniture] == ["bed"]
-    assert "ghost is left out: the models folder has no raw_model.obj for it" in found.notes[0]
+    assert "'ghost' is left out: the models folder has no raw_model.obj for it" in found.notes[0]
     assert "empty/raw_model.obj holds no usable triangles" in found.notes[1]
     assert "cut/raw_model.obj cannot be read" in found.notes[2]
     assert found.notes[3].startswith("'' is left out")

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from posed_files import SET, PosedRoom, Thing, furniture, in_room, overlaps, prepared
+from posed_files import SET, PosedRoom, Thing, in_room, overlaps, prepared
 from scipy.spatial.transform import Rotation
 
 from data_prep.posed.source import PosedSource
@@ -270,25 +270,6 @@ def test_frames_of_one_name_have_ids_where_the_frames_lie(room):
         path.parent.mkdir(exist_ok=True)
         room.png(k).rename(path)
     assert len(prepared(room).views.visible) == 5
-
-
-PALETTE = [value for k in range(256) for value in (k, 255 - k, 7 * k % 256)]
-
-
-def test_palettes_of_sam_2_are_tracks(room):
-    """SAM 2 writes one PNG a frame, whose palette's indices are the objects' ids."""
-    room.things = [Thing(1, "bed", *_box(0)), Thing(2, "chair", *_box(1))]
-    room.write(floor_m=0.0)
-    plain = prepared(room).views
-    for view in range(5):
-        picture = Image.fromarray(room.ids(view).astype(np.uint8), mode="P")
-        picture.putpalette(PALETTE)
-        picture.save(room.png(view))
-    np.testing.assert_array_equal(prepared(room).views.instance_ids, plain.instance_ids)
-
-
-def _box(k):
-    return furniture()[k].low, furniture()[k].high
 
 
 SEGMENTS = {3: 70_001, 300: 5, 7: 1_000_000, 11: 256}

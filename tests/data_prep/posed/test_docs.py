@@ -2,41 +2,28 @@
 
 import json
 import re
-import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pages import ROOT, first_block, run_first_commands
 from PIL import Image
 from posed_files import PosedRoom, furniture
 
-DOCUMENT = Path(__file__).parents[3] / "docs" / "posed_data.md"
-
-
-def block(language):
-    return re.search(rf"```{language}\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)[1]
+DOCUMENT = ROOT / "docs" / "posed_data.md"
 
 
 @pytest.mark.slow
 def test_the_example_runs_as_printed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    lines = block("python")
+    lines = first_block(DOCUMENT, "python")
     assert len(lines.splitlines()) == 10
     for k, name in enumerate(("attic", "cellar", "hall")):
         made = PosedRoom(Path(), furniture(0.1 * k))
         views = [(pose, made.ids(view)) for view, pose in enumerate(made.poses)]
         code = lines.replace("attic", name)
         exec(code, {"Path": Path, "Image": Image, "np": np, "json": json, "views": views})
-    for command in block("bash").replace("\\\n", "").splitlines():
-        verb, *arguments = shlex.split(command)
-        assert verb == "sceneprior"
-        done = subprocess.run(
-            [sys.executable, "-m", "sceneprior", *arguments],
-            capture_output=True, text=True, timeout=600,
-        )  # fmt: skip
-        assert done.returncode == 0, f"{command}\n{done.stderr[-2000:]}"
+    run_first_commands(DOCUMENT)
     assert len(list(Path("scenes").glob("*.glb"))) == 2
     with Image.open("shards/inspect.png") as sheet:
         assert sheet.width > 1000

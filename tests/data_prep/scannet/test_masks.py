@@ -1,8 +1,6 @@
 """Zips of masks: names, bits, sizes and damage."""
 
 import io
-import random
-import zipfile
 
 import numpy as np
 import pytest
@@ -94,7 +92,7 @@ def test_members_that_are_no_picture(tmp_path):
     for data, words in (
         (b"GIF89a" + bytes(30), "it is not a PNG"),
         (png(mask())[:20], "it is not a PNG"),
-        (bytes(huge), "60000 x 60000 pixels"),
+        (bytes(huge), "its header is damaged"),
         (bytes((64 << 20) + 1), "67108865 bytes unpacked"),
     ):
         path = write_zip(tmp_path / "a.zip", {"0.png": data})
@@ -143,25 +141,3 @@ def test_an_archive_cut_anywhere_is_refused(tmp_path):
         path.write_bytes(data[:cut])
         with pytest.raises(InputError, match=r"cut\.zip cannot be opened as a zip"):
             read_all(path)
-
-
-@pytest.mark.parametrize("repack", [False, True])
-def test_flipped_bytes_never_surprise(tmp_path, repack):
-    """In the archive, where sums catch them, and in a picture that was packed damaged."""
-    chance = random.Random(0)
-    picture = png(mask())
-    whole = write_zip(tmp_path / "a.zip", {"x/0.png": picture, "x/1.png": picture}).read_bytes()
-    for _ in range(800):
-        damaged = bytearray(picture if repack else whole)
-        for _ in range(3):
-            damaged[chance.randrange(len(damaged))] = chance.randrange(256)
-        path = tmp_path / "b.zip"
-        if repack:
-            with zipfile.ZipFile(path, "w") as archive:
-                archive.writestr("0.png", bytes(damaged))
-        else:
-            path.write_bytes(damaged)
-        try:
-            read_all(path)
-        except InputError as error:
-            assert "b.zip" in str(error)

@@ -11,7 +11,7 @@ from room_scans import ROOM_TABLE, make_room_scan
 from scan_files import png, write_table, write_zip
 
 from data_prep.engine.build import Job, build_shards
-from data_prep.inspection.bodies import ModelHulls, true_bodies
+from data_prep.inspection.bodies import true_bodies
 from data_prep.inspection.verify import verify
 from data_prep.scannet.labels import read_labels
 from data_prep.scannet.occlusion import unoccluded
@@ -84,7 +84,7 @@ def test_box_and_surface_end_at_the_same_places(right, tmp_path):
     for name, mesh in made.models.items():
         bare = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
         bare.export(folder / f"{name}.ply")
-    assert true_bodies(made.views, made.truth, ModelHulls(folder))[1] == []
+    assert true_bodies(made.views, made.truth, tmp_path)[1] == []
 
 
 def test_whole_objects_are_those_drawn_the_same_alone(right):

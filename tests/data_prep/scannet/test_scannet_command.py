@@ -3,7 +3,6 @@
 import pytest
 from scan_files import ScanFolder, write_table
 
-from sceneprior.core.errors import InputError
 from sceneprior.core.shards import Shard
 
 
@@ -42,20 +41,3 @@ def test_options(prep, tmp_path):
     with Shard(path) as shard:
         room = shard.read_room("scene0001_00")
     assert room.image_size == (968, 1296) and len(room.visible) == 2
-    other = prep("--masks", "soft")
-    assert isinstance(other.exception, InputError)
-    assert str(other.exception) == "masks is 'soft'; choose filt or raw."
-
-
-def test_a_damaged_scan_gives_status_3(prep, tmp_path):
-    path = tmp_path / "scans/scene0001_00/scene0001_00.sens"
-    path.write_bytes(path.read_bytes()[:-60])
-    lists = []
-    for name, scans in (("train", (0, 1)), ("val", (2,))):
-        path = tmp_path / f"{name}.txt"
-        path.write_text("".join(f"scene000{k}_00\n" for k in scans))
-        lists += [f"--{name}-list", path]
-    stopped = prep("--strict", *lists)
-    assert stopped.exit_code == 3 and "Error: Room scene0001_00 failed" in stopped.stderr
-    made = prep(*lists)
-    assert made.exit_code == 3 and "1 failed (report.csv says why)" in made.stdout

@@ -36,7 +36,7 @@ def test_y_is_up_and_the_floors_centre_is_the_origin(scan, labels):
 def test_cameras_stand_where_they_stood(scan, labels):
     read = read_scan(scan.write().folder, labels, EVERY)
     assert read.frames == (0, 1, 3, 4, 5)  # 2 lost its pose
-    assert "1 of 6 frames (every 1) have no usable pose; skipped" in read.notes
+    assert "1 of 6 frames have no usable pose; skipped" in read.notes
     eyes = np.array([(-2.5, -2, 2.5), (5, -2.5, 1.8), (6, 4, 2.2), (0.5, 5.5, 2.0), (-2, 4, 1.6)])
     expected = eyes[:, [1, 2, 0]] - (1.25, 0.05, 1.75)
     turn, shift = read.world_to_camera[:, :3, :3], read.world_to_camera[:, :3, 3:]
@@ -85,8 +85,8 @@ def test_notes_tell_what_was_left_out(scan, labels):
     assert read.notes == (
         "object 3: 'never heard of' is not in scannetv2-labels.combined.tsv, so void",
         "object 40 (bed) has no vertices; left out",
-        "1 of 6 frames (every 1) have no usable pose; skipped",
-        "2 of 6 frames (every 1) have no mask; skipped",
+        "1 of 6 frames have no usable pose; skipped",
+        "2 of 6 frames have no mask; skipped",
     )
     assert [item.object_id for item in read.instances] == [0, 1, 2, 3]
 

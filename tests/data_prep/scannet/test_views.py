@@ -16,14 +16,11 @@ from scan_files import (
     write_ply,
     write_zip,
 )
-from toy_rooms import write_shard
 
 from data_prep.inspection.projection import box_iou_2d
 from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings, read_scan
 from data_prep.scannet.views import instance_images, prepare_scan
 from sceneprior.core.classes import label_set
-from sceneprior.core.errors import InputError
-from sceneprior.core.shards import Shard
 from sceneprior.render.offscreen.zbuffer import rasterize
 
 BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
@@ -105,29 +102,6 @@ def test_ground_truth_projects_onto_the_masks(seen_around, labels, mask_size, im
         # 640 columns and 324 or 1296 do not go by whole steps: outlines are off by up to half a
         # mask pixel (8e-3 and 9e-3 as measured; with half a pixel more in the lens, 1.1e-2).
         assert wrong.mean() < 1e-2
-
-
-def test_a_room_fits_a_shard_and_comes_back(scan, labels, tmp_path):
-    room = prepare_scan(read_scan(scan.write().folder, labels, ScanSettings(1)))
-    path = tmp_path / "room.h5"
-    write_shard(path, "scannet", [(room.views, room.truth)])
-    with Shard(path) as shard:
-        assert shard.room_ids == ("scene0000_00",)
-        back = shard.read_room("scene0000_00", images=True)
-        for name in (
-            "world_to_camera",
-            "intrinsics",
-            "boxes",
-            "visible",
-            "mask_pixels",
-            "sides_clear",
-            "instance_ids",
-        ):
-            array = getattr(back, name)
-            np.testing.assert_array_equal(array, getattr(room.views, name))
-        truth = shard.read_ground_truth("scene0000_00")
-    assert back.image_size == QUARTER_SIZE and back.instance_ids.dtype == np.uint8
-    assert truth.floor_m.shape == (4, 2)
 
 
 def test_what_the_scan_saw_of_an_object_is_its_model(scan, labels):
@@ -213,13 +187,6 @@ def test_objects_no_view_shows_are_truth_alone(scan, labels):
     assert room.truth.centers_m.shape == room.truth.sizes_m.shape == (2, 3)
 
 
-def test_a_scan_that_shows_nothing_is_none(scan, labels):
-    assert (
-        prepare_scan(painted(scan, labels, {0: picture((1, 0, 0, 80, 60), (3, 0, 0, 4, 4))}))
-        is None
-    )
-
-
 def test_objects_past_what_a_mask_can_say(scan, labels):
     scan.write()
     data = json.loads(scan.path(".aggregation.json").read_text())
@@ -228,12 +195,6 @@ def test_objects_past_what_a_mask_can_say(scan, labels):
     scan.path(".aggregation.json").write_text(json.dumps(data))
     room = prepare_scan(read_scan(scan.folder, labels, ScanSettings(1, image_size=(60, 80))))
     assert [NAMES[k] for k in room.truth.object_class] == ["chair", "bed"]
-
-
-def test_a_mask_of_another_size_fails_by_name(scan, labels):
-    made = painted(scan, labels, {0: picture(), 1: np.zeros((61, 80), np.uint8)})
-    with pytest.raises(InputError, match=r"scene0000_00_2d.*zip, 1\.png is 80 x 61 pixels"):
-        prepare_scan(made)
 
 
 def test_a_long_recording_takes_little_memory(scan, labels):

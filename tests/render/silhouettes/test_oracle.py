@@ -147,29 +147,6 @@ def test_ids_and_depths_are_pytorch3ds_hard_rasters(source, tag, dtype, mode):
             np.testing.assert_array_equal(alone.front[0, 0].numpy() >= 0, inside)
 
 
-@CASES
-def test_the_joined_scene_is_pytorch3ds(source, tag):
-    """One mesh of all three objects; B alone, for in A many pixels fill the 50 faces it keeps."""
-    data = oracle(source)
-    for view in range(len(data["R"])):
-        if around_the_camera(data, 2, view):
-            continue
-        vertices = torch.from_numpy(data["verts"]).double().requires_grad_()
-        faces = [seen_by_pytorch3d(data, view, item, tag) + item * 642 for item in range(3)]
-        mask = render_scene(
-            vertices.reshape(1, 1, -1, 3),
-            torch.cat(faces),
-            **camera_of(data, view, tag, torch.float64),
-            sigma_ndc=float(data["sigma"]),
-            blur_ndc=float(data["blur_radius_B"]),
-        ).masks[0, 0, 0]
-        weights = torch.from_numpy(data[f"weights_int8_{tag}"][0, view]) / 64
-        (mask * weights).sum().backward()
-        alpha = data[f"scene_alpha_B_{tag}"][view]
-        np.testing.assert_allclose(mask.detach().numpy(), alpha, rtol=0, atol=1e-4)
-        gradients_agree(vertices.grad, data[f"scene_grad_B_{tag}"][view], "B")
-
-
 @pytest.mark.parametrize("mode", ["exact", "fast"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_object_around_the_camera_has_a_mask_and_a_gradient_without_a_nan(mode, dtype):

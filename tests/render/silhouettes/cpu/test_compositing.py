@@ -39,31 +39,24 @@ def test_a_face_that_contains_the_pixel_centre_decides_the_depth_before_a_nearer
     assert (masks[1, 12, 16:] > 1 - 1e-9).all() and (masks[0, 12, 16:] < 1e-9).all()
 
 
-def gradients_of(way: str, item: int, **options) -> torch.Tensor:
-    """What it takes for more to be seen of an object."""
+def gradients_of(way: str, **options) -> torch.Tensor:
+    """What it takes for more to be seen of the front object."""
     scene = one_triangle_over_another()
     vertices = scene["vertices_m"].clone().requires_grad_()
     scene["vertices_m"] = vertices
     masks = render_silhouettes(**scene, compositing=way, sigma_px2=0.2, **options)
-    masks[0, 0, item].sum().backward()
+    masks[0, 0, 0].sum().backward()
     return vertices.grad[0]
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_only_layered_lets_a_boundary_between_two_objects_push_the_front_one(mode):
-    gradients = {way: gradients_of(way, 0, mode=mode) for way in COMPOSITING}
+    gradients = {way: gradients_of(way, mode=mode) for way in COMPOSITING}
     assert gradients["alone"][0].abs().max() > 1
     # Nothing is nearer than the front object: seen as if alone, and the one behind has no say.
     assert_close(gradients["layered"][0], gradients["alone"][0], rtol=1e-12, atol=1e-12)
     assert gradients["layered"][1].abs().max() < 1e-12
     assert gradients["paper"].abs().max() < 1e-12
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_layered_reveals_the_object_behind_as_the_front_one_shrinks(mode):
-    front, back = (gradients_of("layered", item, mode=mode)[0] for item in (0, 1))
-    # The back one fills the image: what the front one gains there, it loses.
-    assert_close(back, -front, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("mode", MODES)

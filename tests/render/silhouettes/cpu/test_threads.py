@@ -3,31 +3,10 @@
 import os
 import subprocess
 import sys
-import threading
 
-import numba
-import numpy as np
 import pytest
 
 from sceneprior.render.silhouettes.cpu.threads import in_threads
-
-
-@pytest.mark.parametrize("items", [0, 1, 2, 5, 6, 7, 100])
-def test_every_item_is_done_once(items):
-    times = np.zeros(items, dtype=int)
-
-    def count(first: int, last: int, times: np.ndarray, by: int) -> None:
-        times[first:last] += by
-
-    in_threads(count, items, times, 2)
-    assert (times == 2).all()
-
-
-def test_one_thread_stays_in_the_callers(monkeypatch):
-    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
-    names = []
-    in_threads(lambda first, last: names.append(threading.current_thread().name), 9)
-    assert names == [threading.current_thread().name]
 
 
 def test_torch_keeps_its_number_of_threads():
