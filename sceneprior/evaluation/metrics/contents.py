@@ -63,7 +63,7 @@ def _shares(counts: np.ndarray) -> np.ndarray:
 def category_kl(generated: Sequence[Scene], test: Sequence[Scene]) -> float:
     """KL divergence of the generated rooms' class frequencies from the test rooms', in nats.
 
-        KL = sum_c p_c * (log(p_c + 1e-6) - log(q_c + 1e-6))
+        KL = sum_c p_c * (log(p_c + 1e-6) - log(q_c + 1e-6))  (Paschalidou et al., NeurIPS 2021)
 
     p are the test rooms' frequencies, q the generated rooms', both without void. Training rooms
     in place of test rooms would give values that are too good. Raises like `common_label_set`.
@@ -135,23 +135,18 @@ def _category_kl(rooms: RoomSet, comparison: Comparison) -> Estimate:
 
 METRICS = (
     Metric(
-        "category_kl", "Category KL to test rooms", "nats", "closer",
-        "KL divergence `sum_c p_c (log(p_c + 1e-6) - log(q_c + 1e-6))`, p the class frequencies of "
-        "the test rooms, q those of the set.",
-        _category_kl, AGAINST_TEST, "Paschalidou et al., NeurIPS 2021",
+        "category_kl", "Category KL to test rooms", "nats", "closer", _category_kl, AGAINST_TEST,
         protocol={
             "category_kl": f"KL(test || generated) in nats, epsilon {KL_EPSILON}, without void"
         },
         column=TableColumn("category KL", 3),
     ),
     Metric(
-        "mean_objects", "Objects in a room", "mean", "none", "Mean number of objects in a room.",
-        mean_over_rooms(_count), column=TableColumn("objects", 2),
+        "mean_objects", "Objects in a room", "mean", "none", mean_over_rooms(_count),
+        column=TableColumn("objects", 2),
     ),
     Metric(
         "type_share", "Rooms that hold their type's furniture", "share", "higher",
-        "Share of bedrooms with a double, single or kids' bed, or of living rooms with a sofa or "
-        "an armchair; null for every other label set.",
         mean_over_rooms(_holds_its_type, 1.0),
         column=TableColumn("type", 2, "type: rooms that hold the furniture their type needs"),
     ),
