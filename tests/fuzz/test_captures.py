@@ -11,12 +11,12 @@ import signal
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
 import pytest
 from front_files import FrontFolder, bedroom
+from mutating import MUTATIONS, damaged_json
 from posed_files import PosedRoom
 from pycocotools.mask import encode
 from scan_files import make_scan, write_table
@@ -37,48 +37,12 @@ from sceneprior.core.instances.coco import read_coco
 
 pytestmark = pytest.mark.slow
 
-CASES = 300
 SECONDS = 60
 """A case takes milliseconds; machines that tests share may be slow."""
 MEMORY = 2 << 30
-DEEP = "@deep@"
 LABELS = "void,bed,chair"
 
-JUNK = [
-    None, True, 0, -1, 0.5, 10**400, 1e300, -1e300, 1e9, 1e-300, float("nan"), float("inf"), "",
-    "x", "1", "nan", "\ud800", "\0", "x" * 5000, "../../up", [], {}, [None], [[]], {"a": 1},
-    ["1", "x"], [1e300] * 3, 20_000, 2**31, 2**63, DEEP, [DEEP], {"id": DEEP},
-]  # fmt: skip
 WORDS = ["", "x", "nan", "inf", "-1", "0", "1e999", "9" * 400, "1.5", "\ufffd", "#", "= =", "\0"]
-
-
-def places(data: Any) -> Iterator[tuple[Any, Any]]:
-    """Every (container, key) of a JSON document."""
-    for key in list(data) if isinstance(data, dict) else range(len(data)):
-        yield data, key
-        if isinstance(data[key], dict | list):
-            yield from places(data[key])
-
-
-def damaged_json(data: Any, rng: np.random.Generator) -> str:
-    """Up to three places: something else there, or gone; sometimes all of it, or half a text."""
-    data = json.loads(json.dumps(data))
-    for _ in range(rng.integers(1, 4)):
-        found = list(places(data))
-        kinds = sorted({str(key) if isinstance(key, str) else "#" for _, key in found})
-        kind = kinds[rng.integers(len(kinds))]
-        same = [item for item in found if (item[1] if isinstance(item[1], str) else "#") == kind]
-        container, key = same[rng.integers(len(same))]
-        if rng.random() < 0.2:
-            del container[key]
-        else:
-            container[key] = JUNK[rng.integers(len(JUNK))]
-        if not data:
-            break
-    if rng.random() < 0.05:
-        data = JUNK[rng.integers(len(JUNK))]
-    text = json.dumps(data).replace(json.dumps(DEEP), "[" * 3000 + "]" * 3000)
-    return text[: rng.integers(len(text))] if rng.random() < 0.05 else text
 
 
 def damaged_text(text: str, rng: np.random.Generator) -> str:
@@ -132,9 +96,9 @@ def limits() -> Iterator[None]:
 
 
 def check_all(damage: Callable[[np.random.Generator], None], read: Callable[[], object]) -> None:
-    """Damage and read `CASES` times; an error is the package's own, in one sentence or two."""
+    """Damage and read `MUTATIONS` times; an error is the package's own, in one sentence or two."""
     refused = 0
-    for case in range(CASES):
+    for case in range(MUTATIONS):
         damage(np.random.default_rng(case))
         try:
             with limits():
@@ -147,7 +111,7 @@ def check_all(damage: Callable[[np.random.Generator], None], read: Callable[[], 
             print("case", case)
             raise
     # Mutations that all fail, or all pass, test nothing.
-    assert 0.1 * CASES < refused < CASES
+    assert 0.1 * MUTATIONS < refused < MUTATIONS
 
 
 @pytest.fixture
