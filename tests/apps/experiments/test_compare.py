@@ -2,10 +2,6 @@
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -271,27 +267,13 @@ def test_a_truncated_file_is_a_sentence(begun, toy_shards, calls):
     assert "seed0/steps.json is damaged; delete it and run the same command" in failure
 
 
-def test_a_signal_to_compare_alone_stops_its_commands_which_save_what_they_have(
-    written, tmp_path, start
-):
-    path = written(rooms={"toy": {"title": "Toys", "config": str(tmp_path / "tiny.yaml")}})
-    text = (tmp_path / "tiny.yaml").read_text().replace("epochs: 1\n", "epochs: 100000\n")
-    (tmp_path / "tiny.yaml").write_text(text)
-    words = ["--config", path, "--methods", "ours", "--out", str(tmp_path / "out")]
-    process = start(
-        [sys.executable, "-m", "sceneprior", "compare", *words, "--renderer", "software"],
-        stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    folder = tmp_path / "out/toy/ours/seed0"
-    deadline = time.monotonic() + 400
-    while not (folder / "run/layout/last.ckpt").is_file() and time.monotonic() < deadline:
-        time.sleep(0.1)
-    process.send_signal(signal.SIGTERM)
-    _, said = process.communicate(timeout=400)
-    assert process.returncode == 130 and "The same command goes on from here" in said
-    assert "Stopped and saved" in (folder / "fit.log").read_text()
-    noted = json.loads((folder / "steps.json").read_text())
-    assert noted["fit"]["cpu_s"] > 0 and not noted["fit"]["finished"]
+def test_a_stopped_comparison_says_how_it_goes_on(command, written, calls, tmp_path):
+    def stop(arguments):
+        raise KeyboardInterrupt
+
+    calls.before = stop
+    status, _, errors = command("compare", "--config", written(), "--out", tmp_path / "out")
+    assert status == 130 and errors.endswith("Stopped. The same command goes on from here.\n")
     assert not (tmp_path / "out" / "table.md").exists()
 
 
