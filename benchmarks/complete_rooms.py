@@ -34,7 +34,12 @@ from sceneprior.apps.config import load_run
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.overlaps import match_scenes
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.metrics.contents import category_kl, object_counts, type_share
+from sceneprior.evaluation.metrics.contents import (
+    category_kl,
+    class_frequencies,
+    object_counts,
+    type_share,
+)
 from sceneprior.evaluation.metrics.overlaps import room_overlaps
 from sceneprior.lifted.complete import STEPS, complete
 from sceneprior.lifted.insert import insert
@@ -125,7 +130,7 @@ def evaluate(
         for pair in combinations(scenes, 2)
     ]
     return {
-        "category_kl": round(category_kl(every, tests), 3),
+        "category_kl": round(category_kl(class_frequencies(tests), class_frequencies(every)), 3),
         "overlaps": round(float(np.mean([room_overlaps(s).intersect.sum() for s in every])), 2),
         "beds": round(type_share(every) or 0.0, 3),
         "objects": round(float(object_counts(every).mean()), 2),

@@ -3,10 +3,14 @@
 `tests/conftest.py` makes the fixture known. Tests skip where there is no chromium, and say so.
 """
 
+import contextlib
+import io
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 
 import pytest
+from PIL import Image
 
 FLAGS = (
     "--headless=new",
@@ -17,6 +21,24 @@ FLAGS = (
     "--enable-unsafe-swiftshader",
     "--window-size=1280,1000",
 )
+
+
+def wait_for(condition: Callable[[], object], said: str, seconds: float = 120) -> None:
+    """WebGL in software takes long, on a machine that does other things as well."""
+    limit = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < limit, said
+        time.sleep(0.1)
+
+
+def picture(take: Callable[[], bytes]) -> Image.Image:
+    """What a PNG of the browser shows; Chromium gives up on one after 10 s."""
+    from selenium.common.exceptions import TimeoutException
+
+    for _ in range(6):
+        with contextlib.suppress(TimeoutException):
+            return Image.open(io.BytesIO(take())).convert("RGB")
+    raise AssertionError("the browser gives no picture")
 
 
 @pytest.fixture(scope="session")

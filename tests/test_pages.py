@@ -9,7 +9,6 @@ the options of all.
 import contextlib
 import json
 import os
-import re
 import runpy
 import shlex
 import shutil
@@ -286,24 +285,12 @@ def assert_pictures_of_the_page(drawn: Path) -> None:
 
 
 def test_every_page_with_commands_runs_somewhere():
-    """Here, or whole in a test that names it; what is left out is printed, and its test exists."""
+    """Here, or whole in a test that names it."""
     pages = {name_of(page) for page in PAGES if any(map(is_shell, blocks_of(page)))}
     left = {page for page in pages - set(RUN_HERE) if not page.startswith(TABLES)}
     assert left == set(WHOLE_PAGES)
     for page, test in WHOLE_PAGES.items():
         assert Path(page).name in (ROOT / test).read_text()
-    printed = [
-        shlex.join(words)
-        for page in RUN_HERE
-        for block in blocks_of(ROOT / page)
-        if is_shell(block)
-        for words in commands_of(block.text)
-    ]
-    for part, reason in ELSEWHERE.items():
-        assert any(part in command for command in printed), part
-        assert all((ROOT / test).is_file() for test in re.findall(r"tests/[\w/]+\.py", reason))
-    run = [command for command in printed if not any(part in command for part in ELSEWHERE)]
-    assert len(run) > 40
 
 
 def is_shell(block: Block) -> bool:

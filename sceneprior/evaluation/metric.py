@@ -96,22 +96,19 @@ class TableColumn:
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric of a set of rooms, with all that tables and docs say about it."""
+    """A metric of a set of rooms, with what tables say about it; docs/evaluation.md defines it."""
 
     key: str
     """Its key in result files."""
     title: str
     unit: str
     direction: Direction
-    definition: str
-    """One sentence (Markdown), for docs/evaluation.md."""
     function: Callable[..., Any]
     """Computes an `Estimate` from a `RoomSet` and a `Comparison`; None if it needs decoded training
     rooms and there are none, and the result then leaves the metric out. (The metrics of
     metrics/decoded_rooms.py compute a number from a list of `SceneMatch` instead.)"""
     sets: tuple[str, ...] = EACH_SET
     """The sets of rooms that it is computed for; the value of test rooms is `<key>_test`."""
-    source: str = ""
     network: str | None = None
     """The network that reads the pictures (`inception`, `alexnet`, `effnet_lite0`), if any."""
     boxes: bool = False

@@ -1,6 +1,8 @@
-"""Every metric, in the order of tables. To add one, write a file in metrics/ and list it here."""
+"""Every metric, in the order of tables.
 
-from collections.abc import Sequence
+To add one, write a file in metrics/, list it here, and define it in docs/evaluation.md.
+"""
+
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +40,6 @@ METRICS: tuple[Metric, ...] = tuple(
 DECODED: tuple[Metric, ...] = decoded_rooms.METRICS
 """Metrics of decoded training rooms against their ground truth."""
 
-_BETTER = {"closer": "lower", "lower": "lower", "higher": "higher", "half": "0.5", "none": "–"}
-
 
 def definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
     """The protocol entries of all metrics, whether or not they could be computed."""
@@ -51,22 +51,3 @@ def definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
         "many rooms as real training rooms; drawn as boxes, _meshes: with the real meshes",
         "type_share": list(TYPE_CLASSES.get(names, ())),
     }
-
-
-def as_markdown() -> str:
-    """The lists of metrics in docs/evaluation.md; a test compares the page with this text."""
-    parts: dict[str, Sequence[Metric]] = {
-        "Comparison with the test rooms": [m for m in METRICS if "test" not in m.sets],
-        "Properties of one set of rooms": [m for m in METRICS if "test" in m.sets],
-        "Accuracy of decoded training rooms": DECODED,
-    }
-    return "\n\n".join(f"### {title}\n\n{_table(some)}" for title, some in parts.items()) + "\n"
-
-
-def _table(metrics: Sequence[Metric]) -> str:
-    lines = ["| key | unit | better | definition |", "| --- | --- | --- | --- |"]
-    for metric in metrics:
-        source = f" *{metric.source}.*" if metric.source else ""
-        better = _BETTER[metric.direction]
-        lines.append(f"| `{metric.key}` | {metric.unit} | {better} | {metric.definition}{source} |")
-    return "\n".join(lines)

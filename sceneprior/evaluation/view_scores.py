@@ -86,10 +86,7 @@ def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairSco
 
 
 def score_views(
-    views: Sequence[Sequence[ObjectPair]],
-    rooms: Sequence[str],
-    points: int = POINTS,
-    seed: int = 0,
+    views: Sequence[Sequence[ObjectPair]], rooms: Sequence[str], points: int = POINTS
 ) -> dict[str, Any]:
     """Scores of single-view reconstructions; every true object has the same weight.
 
@@ -98,7 +95,7 @@ def score_views(
     each view) are not independent, so intervals resample rooms.
     """
     scores = [
-        score_pair(pair, points, seed + row)
+        score_pair(pair, points, row)
         for row, pair in enumerate(pair for view in views for pair in view)
     ]
     if not scores:
@@ -108,7 +105,7 @@ def score_views(
     return {
         "summary": {"rooms": len(set(rooms)), "images": len(views), **summary(scores)},
         "intervals": intervals(
-            scores, [room for room, view in zip(rooms, views, strict=True) for _ in view], seed
+            scores, [room for room, view in zip(rooms, views, strict=True) for _ in view]
         ),
         "classes": {name: summary(some) for name, some in by_class.items()},
     }
@@ -129,16 +126,14 @@ def summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
     }
 
 
-def intervals(
-    scores: Sequence[PairScore], rooms: Sequence[str], seed: int = 0
-) -> dict[str, list[float] | None]:
+def intervals(scores: Sequence[PairScore], rooms: Sequence[str]) -> dict[str, list[float] | None]:
     """[lower, upper] end for each metric of a summary; None for a metric without a value.
 
     Rooms (`rooms` has that of each score) are resampled with all objects of all their views. The
-    resamples depend only on the rooms and the seed, so that several methods share them.
+    resamples depend only on the rooms, so that several methods share them.
     """
     names, number = np.unique(rooms, return_inverse=True)
-    counts = resample_counts(len(names), RESAMPLES, seed)
+    counts = resample_counts(len(names), RESAMPLES, 0)
     found = {}
     for name, attribute in FIELDS.items():
         values = [getattr(score, attribute) for score in scores]

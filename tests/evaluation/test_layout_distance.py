@@ -11,7 +11,6 @@ from sceneprior.evaluation.layout_distance import (
     layout_distance,
     nearest_distances,
     nearest_known,
-    nearest_room,
 )
 
 LABELS = ("desk", "chair", "sofa")
@@ -90,14 +89,6 @@ def test_the_nearest_room_is_found_among_all_turned_or_mirrored(rng):
     for scene, distance in zip(scenes, got, strict=True):
         expected = min(by_all_pairings(turn, other) for turn in eight(scene) for other in training)
         assert distance == pytest.approx(expected, abs=1e-9)
-
-
-def test_which_room_is_nearest(rng):
-    training = [random_room(rng) for _ in range(30)]
-    for scene in [random_room(rng) for _ in range(10)]:
-        apart = [nearest_distances([scene], [each])[0] for each in training]
-        row, distance = nearest_room(scene, training)
-        assert apart[row] == min(apart) == distance
 
 
 def named(scenes: list[Scene]) -> list[Scene]:

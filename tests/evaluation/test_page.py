@@ -1,7 +1,6 @@
 """Pages of turning rooms: opened from disk in a real browser, and without scripts or WebGL."""
 
 import base64
-import contextlib
 import hashlib
 import io
 import re
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import picture, wait_for
 from PIL import Image
 
 import sceneprior.evaluation
@@ -52,24 +52,9 @@ def page(renderer, tmp_path_factory) -> Path:
 
 
 def picture_of(browser) -> np.ndarray:
-    """What the browser shows of the first room.
-
-    Chromium gives up on a picture after 10 s, which WebGL in software may need on a busy machine.
-    """
-    from selenium.common.exceptions import TimeoutException
-
-    for _ in range(6):
-        with contextlib.suppress(TimeoutException):
-            shown = browser.find_element("css selector", "model-viewer").screenshot_as_png
-            break
-    return np.asarray(Image.open(io.BytesIO(shown)).convert("RGB")).astype(int)
-
-
-def wait_for(condition, seconds: float = 90) -> None:
-    limit = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < limit, "the browser did not do it in time"
-        time.sleep(0.2)
+    """What the browser shows of the first room."""
+    room = browser.find_element("css selector", "model-viewer")
+    return np.asarray(picture(lambda: room.screenshot_as_png)).astype(int)
 
 
 def settled(browser) -> np.ndarray:
@@ -91,7 +76,8 @@ def test_a_room_turns_under_the_mouse(browser, page, tmp_path):
     browser.get_log("browser")
     browser.get(page.as_uri())
     room = browser.find_element("css selector", "model-viewer")
-    wait_for(lambda: browser.execute_script("return arguments[0].loaded === true", room))
+    loaded = "return arguments[0].loaded === true"
+    wait_for(lambda: browser.execute_script(loaded, room), "the room was not loaded")
     before = settled(browser)
     assert colors_of(before) > 8  # a room, and no blank canvas
     turned = "return arguments[0].getCameraOrbit().theta"

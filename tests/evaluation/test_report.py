@@ -13,7 +13,7 @@ from PIL import Image
 from sceneprior.core.classes import class_colors
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.evaluation.report import _tiles, write_report
+from sceneprior.evaluation.report import write_report
 from sceneprior.evaluation.report_pictures import input_views, legend, room_pictures
 from sceneprior.evaluation.rooms_page import write_rooms_page
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
@@ -104,11 +104,6 @@ def test_every_part_is_there(page):
     assert "100% of 2 classes right, mean 3D box IoU 1.00" in page
 
 
-def test_text_is_escaped(page):
-    assert "Bedrooms &lt;new&gt; &amp; real" in page
-    assert "&#39;&lt;done&gt;&#39;" in page
-
-
 def test_parts_without_material_are_left_out(shards, renderer, tmp_path):
     write_report(
         tmp_path / "a.html", title="Bare", shards=shards, source="run", made_by="none",
@@ -148,17 +143,6 @@ def test_room_pictures_count_in_words(renderer):
     assert room_pictures(replace(room, objects=()), renderer).contents == "nothing"
     assert [name for name, _ in legend([room])] == ["double bed", "stool"]
     assert legend([room])[0][1] == "#" + bytes(class_colors(22)[9].tolist()).hex()
-
-
-def test_tiles_do_not_round_to_all_or_nothing():
-    scores = {
-        "type_share": 0.995, "type_share_test": 0.9996,
-        "near_copy_share": 0.004, "near_copy_share_test": 0.0,
-    }  # fmt: skip
-    assert _tiles(scores) == [
-        ("99.5%", "hold their type's furniture", "over 99.9% of real test rooms"),
-        ("0.4%", "near copies of a training room", "0% of real test rooms"),
-    ]
 
 
 def test_a_page_of_a_stranger_s_rooms_runs_nothing(renderer, tmp_path):

@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 import pytest
 from front_files import FrontFolder, bedroom
-from mutating import damaged_json
+from mutating import MUTATIONS, damaged_json
 from posed_files import PosedRoom
 from pycocotools.mask import encode
 from scan_files import make_scan, write_table
@@ -37,7 +37,6 @@ from sceneprior.core.instances.coco import read_coco
 
 pytestmark = pytest.mark.slow
 
-CASES = 300
 SECONDS = 60
 """A case takes milliseconds; machines that tests share may be slow."""
 MEMORY = 2 << 30
@@ -97,9 +96,9 @@ def limits() -> Iterator[None]:
 
 
 def check_all(damage: Callable[[np.random.Generator], None], read: Callable[[], object]) -> None:
-    """Damage and read `CASES` times; an error is the package's own, in one sentence or two."""
+    """Damage and read `MUTATIONS` times; an error is the package's own, in one sentence or two."""
     refused = 0
-    for case in range(CASES):
+    for case in range(MUTATIONS):
         damage(np.random.default_rng(case))
         try:
             with limits():
@@ -112,7 +111,7 @@ def check_all(damage: Callable[[np.random.Generator], None], read: Callable[[], 
             print("case", case)
             raise
     # Mutations that all fail, or all pass, test nothing.
-    assert 0.1 * CASES < refused < CASES
+    assert 0.1 * MUTATIONS < refused < MUTATIONS
 
 
 @pytest.fixture

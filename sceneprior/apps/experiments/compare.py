@@ -20,7 +20,7 @@ from sceneprior.apps.experiments.comparison import (
     variants_of,
 )
 from sceneprior.apps.experiments.figure import write_figure
-from sceneprior.apps.experiments.rows import result_of, rows_of
+from sceneprior.apps.experiments.rows import rows_of
 from sceneprior.apps.experiments.steps import Step, StepRunner, is_done, open_runner
 from sceneprior.apps.experiments.table import NEW_ROOMS, VIEWS, write_tables
 from sceneprior.core.errors import InputError
@@ -192,10 +192,9 @@ def scoring_steps(
             alike += ["--inception", str(options.inception)]
     steps = []
     for variant in variants_of(comparison, run):
-        result = result_of(comparison, run, variant)
-        asked = alike if variant is None else [*alike, option, variant]
-        words = [command, *source, "--out", str(result), *asked]
-        steps.append(Step(result.stem, words, result=result, depends_on=asked + state))
+        asked = alike if variant.name is None else [*alike, option, variant.name]
+        words = [command, *source, "--out", str(variant.result), *asked]
+        steps.append(Step(variant.result.stem, words, variant.result, depends_on=asked + state))
     return steps
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeVar
 from pydantic import Field, field_validator, model_validator
 
 from sceneprior.apps.config import load_config
-from sceneprior.apps.experiments.makers import GIVEN, Maker, maker_of_answers, maker_of_rooms
+from sceneprior.apps.experiments.makers import GIVEN, maker_of_answers, maker_of_rooms
 from sceneprior.apps.reconstruction.reconstruct import OBJECTS
 from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.seeds import LARGEST_SEED
@@ -164,6 +164,20 @@ class Run:
         return ", ".join((self.rooms, self.method, *seed))
 
 
+@dataclass(frozen=True)
+class Variant:
+    """A way in which a run makes rooms or answers: a command that scores it, and a row."""
+
+    name: str | None
+    """Value of `--distribution` or `--fit`; None is the run's own way."""
+    title: str
+    """Title of the row; empty where neither the comparison nor a config gives one."""
+    made_by: str
+    """Maker of its rooms or answers, as captions say it (`Maker.said`)."""
+    result: Path
+    """File of its scores."""
+
+
 def load_comparison(name: str) -> Comparison:
     """Read a comparison and check the settings of each of its runs."""
     path, data = read_settings(name)
@@ -174,8 +188,7 @@ def load_comparison(name: str) -> Comparison:
     rows: dict[tuple[str, str], str] = {}
     for run in runs_of(comparison, Path()):
         for variant in variants_of(comparison, run):
-            title = title_of(comparison, run, variant)
-            if not title:
+            if not (title := variant.title):
                 raise ConfigError(
                     f"{path}: methods.{run.method} has no title; only the paper's and the "
                     "lifted method are named by their configs."
@@ -254,34 +267,31 @@ def _value(data: Any, key: str) -> Any:
     return data
 
 
-def variants_of(comparison: Comparison, run: Run) -> tuple[str | None, ...]:
-    """Distributions that a run's rooms are drawn from, or fits of its answers; a row each.
+def variants_of(comparison: Comparison, run: Run) -> list[Variant]:
+    """The rows of a run: of one that remembers rooms, one for each distribution or fit.
 
-    None is the run's own way, which comes first where that is a sampler, and is all that scenes and
-    methods without latents of rooms have.
+    A sampler comes before the distributions; scenes and other methods have their own way alone.
     """
     config = run.run_config
-    if run.scenes is not None or not config.remembers_rooms:
-        return (None,)
-    if isinstance(comparison, ViewComparison):
-        return comparison.fits
-    assert isinstance(comparison, RoomComparison), "one of TASKS"
-    own = (None,) if getattr(config, "distribution", None) == SAMPLER else ()
-    return (*own, *comparison.distributions)
-
-
-def maker_of(comparison: Comparison, run: Run, variant: str | None) -> Maker:
-    """Maker of the rooms, or the answers, of one of a run's variants."""
-    if run.scenes is not None:
-        return GIVEN
-    if isinstance(comparison, ViewComparison):
-        return maker_of_answers(run.run_config, variant or OBJECTS)
-    return maker_of_rooms(run.run_config, variant)
-
-
-def title_of(comparison: Comparison, run: Run, variant: str | None) -> str:
-    """The title of a row of a run; empty where neither the comparison nor a config gives one."""
-    return maker_of(comparison, run, variant).named(comparison.methods[run.method].title)
+    names: tuple[str | None, ...] = (None,)
+    if run.scenes is None and config.remembers_rooms:
+        if isinstance(comparison, ViewComparison):
+            names = comparison.fits
+        elif isinstance(comparison, RoomComparison):
+            own = (None,) if getattr(config, "distribution", None) == SAMPLER else ()
+            names = (*own, *comparison.distributions)
+    found = []
+    for name in names:
+        if run.scenes is not None:
+            maker = GIVEN
+        elif isinstance(comparison, ViewComparison):
+            maker = maker_of_answers(config, name or OBJECTS)
+        else:
+            maker = maker_of_rooms(config, name)
+        title = maker.named(comparison.methods[run.method].title)
+        file = "scores.json" if name == names[0] else f"scores_{name}.json"
+        found.append(Variant(name, title, maker.said, run.folder / file))
+    return found
 
 
 def shards_of(comparison: Comparison, rooms: str) -> Path:

@@ -14,7 +14,6 @@ from sceneprior.apps.experiments.comparison import (
     Run,
     ViewComparison,
     shards_of,
-    title_of,
     variants_of,
 )
 from sceneprior.apps.reconstruction.export import from_above, from_camera, masks_of
@@ -78,14 +77,14 @@ def _rooms(
     independent = independent_rooms(real, ROOMS_SHOWN, comparison.sampling_seed, True)
     lines = {"Real training rooms": real, "Independent objects": independent}
     for run in runs:
-        variant = variants_of(comparison, run)[0]
+        first = variants_of(comparison, run)[0]
         if run.scenes is not None:
             made = load_scene_folder(run.scenes)
         else:
             assert count is not None, "comparisons of new rooms count them"
             trained = load_any_run(run.folder / "run")
-            made = sample_rooms(trained, count, comparison.sampling_seed, variant)
-        lines[title_of(comparison, run, variant)] = made
+            made = sample_rooms(trained, count, comparison.sampling_seed, first.name)
+        lines[first.title] = made
     return {
         title: [
             topdown(without_void(room), renderer, outlines=True) for room in rooms[:ROOMS_SHOWN]
@@ -110,8 +109,8 @@ def _answers(
     for run in runs:
         trained = load_any_run(run.folder / "run")
         for fit in variants_of(comparison, run):
-            found = reconstruct(trained, images, FitOptions(fit or OBJECTS))
-            answers[title_of(comparison, run, fit)] = [one.scene for one in found]
+            found = reconstruct(trained, images, FitOptions(fit.name or OBJECTS))
+            answers[fit.title] = [one.scene for one in found]
     lines: dict[str, list[np.ndarray]] = {"Masks": []}
     for image in images:
         masks = masks_of(image)

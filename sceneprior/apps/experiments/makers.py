@@ -1,7 +1,7 @@
 """Names what made rooms or reconstructions, from the settings of the run: the paper's method, its
 network taught by lifted boxes, the lifted method, a baseline, or somebody else's scenes."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from sceneprior.apps.reconstruction.reconstruct import OBJECTS
 from sceneprior.lifted.config import LiftedConfig
@@ -10,16 +10,15 @@ from sceneprior.paper.config import PaperConfig
 from sceneprior.training.method import RunConfig
 
 
-@dataclass(frozen=True)
-class Maker:
+class Maker(NamedTuple):
     """The method that made rooms or reconstructions, as result tables name it."""
 
     title: str
     """Title of a row whose method has none of its own."""
-    detail: str
-    """Text that follows a method's own title, such as that of another decoder."""
     said: str
     """Such rows, in a caption."""
+    detail: str = ""
+    """Text that follows a method's own title, such as that of another decoder."""
 
     def named(self, title: str | None) -> str:
         """The title of a row, from that of its method, if any."""
@@ -29,23 +28,23 @@ class Maker:
 
 
 LIFTED = "the lifted method"
-PAPER = Maker("Paper's method", "", "the paper's method and variations of it")
+PAPER = Maker("Paper's method", "the paper's method and variations of it")
 TAUGHT = Maker(
     "Paper's sphere, taught by lifted boxes",
-    "taught by lifted boxes",
     "the paper's network and latents taught by lifted boxes",
+    "taught by lifted boxes",
 )
-SAMPLED = Maker("Lifted method: sampler", "sampler of the lifted method", LIFTED)
-FITTED = Maker("Paper: fit of a latent", "fit of a latent", PAPER.said)
+SAMPLED = Maker("Lifted method: sampler", LIFTED, "sampler of the lifted method")
+FITTED = Maker("Paper: fit of a latent", PAPER.said, "fit of a latent")
 FITTED_TAUGHT = Maker(
     "Fit of a latent, taught by lifted boxes",
-    "fit of a latent, taught by lifted boxes",
     TAUGHT.said,
+    "fit of a latent, taught by lifted boxes",
 )
-ONE_BY_ONE = Maker("Object by object", "object by object", LIFTED)
-ONE_BY_ONE_PAPER = Maker("Object by object, by the paper's prior", "object by object", LIFTED)
-BASELINE = Maker("", "", "baselines")
-GIVEN = Maker("", "", "scenes as given, which were made elsewhere")
+ONE_BY_ONE = Maker("Object by object", LIFTED, "object by object")
+ONE_BY_ONE_PAPER = ONE_BY_ONE._replace(title="Object by object, by the paper's prior")
+BASELINE = Maker("", "baselines")
+GIVEN = Maker("", "scenes as given, which were made elsewhere")
 
 
 def maker_of_rooms(config: RunConfig, distribution: str | None) -> Maker:
@@ -61,6 +60,6 @@ def maker_of_answers(config: RunConfig, fit: str = OBJECTS) -> Maker:
     """Maker of a run's reconstructions, by a fit of `eval-svr`."""
     if not isinstance(config, PaperConfig | LiftedConfig):
         return BASELINE
-    if fit == OBJECTS:
-        return ONE_BY_ONE if isinstance(config, LiftedConfig) else ONE_BY_ONE_PAPER
-    return FITTED_TAUGHT if isinstance(config, LiftedConfig) else FITTED
+    if isinstance(config, LiftedConfig):
+        return ONE_BY_ONE if fit == OBJECTS else FITTED_TAUGHT
+    return ONE_BY_ONE_PAPER if fit == OBJECTS else FITTED

@@ -1,16 +1,13 @@
 """The rows of a comparison's table, from the results that its runs left."""
 
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.experiments.comparison import (
     Comparison,
     Run,
+    Variant,
     ViewComparison,
-    maker_of,
-    title_of,
     variants_of,
 )
 from sceneprior.apps.experiments.steps import read_journal, read_result
@@ -39,17 +36,11 @@ SHAPES = {"fit": "as found", "fit_cad": "CAD models"}
 
 def rows_of(comparison: Comparison, run: Run) -> list[Row]:
     """The rows of a run that is scored; what training took stands in the first."""
-    if isinstance(comparison, ViewComparison):
-        rows = _rows_of_views(comparison, run)
-    else:
-        rows = _rows_of_rooms(comparison, run)
-    return [replace(rows[0], costs=costs_of(run)), *rows[1:]]
-
-
-def result_of(comparison: Comparison, run: Run, variant: str | None) -> Path:
-    """The file that holds the scores of one of a run's variants."""
-    is_first = variant == variants_of(comparison, run)[0]
-    return run.folder / ("scores.json" if is_first else f"scores_{variant}.json")
+    found = {variant: read_result(variant.result) for variant in variants_of(comparison, run)}
+    of_task = _rows_of_views if isinstance(comparison, ViewComparison) else _rows_of_rooms
+    rows = of_task(run, comparison.rooms[run.rooms].title, found)
+    rows[0].scores.update(costs_of(run))
+    return rows
 
 
 def costs_of(run: Run) -> dict[str, int | float | None]:
@@ -72,57 +63,42 @@ def costs_of(run: Run) -> dict[str, int | float | None]:
     }
 
 
-def _rows_of_rooms(comparison: Comparison, run: Run) -> list[Row]:
+def _rows_of_rooms(run: Run, title: str, found: dict[Variant, dict[str, Any]]) -> list[Row]:
     """A row for each distribution of latents, and one of decoded training rooms where there are
     some."""
-    found = {}
-    for variant in variants_of(comparison, run):
-        scores = read_result(result_of(comparison, run, variant))
-        # The result says how its rooms were drawn, with the mark of the version that wrote it.
-        drawn = scores["protocol"].get("latents", AS_GIVEN).split(",")[0]
-        found[drawn] = scores
-    first = next(iter(found.values()))
+    # A result says how its rooms were drawn, with the mark of the version that wrote it.
+    drawn = [
+        (variant, scores["protocol"].get("latents", AS_GIVEN).split(",")[0], scores)
+        for variant, scores in found.items()
+    ]
+    first, last = drawn[0][2], drawn[-1][0]  # a sampler, which decodes no room, would come first
     if decoded := first.get("decoded_rooms"):
-        found[DECODED] = {**decoded, "protocol": first["protocol"]}
-    learns_from, ranks = run.run_config.learns_from, list(GROUPS)
+        drawn.append((last, DECODED, {**decoded, "protocol": first["protocol"]}))
+    learns_from, groups = run.run_config.learns_from, list(GROUPS)
     return [
-        _row(
-            comparison, run, drawn, GROUPS[drawn].format(learns_from), marked(drawn), scores,
-            ranks.index(drawn),
+        Row(
+            title, GROUPS[by].format(learns_from), variant.title, marked(by), run.seed, scores,
+            variant.made_by, groups.index(by),
         )
-        for drawn, scores in found.items()
+        for variant, by, scores in drawn
     ]  # fmt: skip
 
 
-def _rows_of_views(comparison: Comparison, run: Run) -> list[Row]:
+def _rows_of_views(run: Run, title: str, found: dict[Variant, dict[str, Any]]) -> list[Row]:
     """A row for each fit, and one more where CAD models stand in for what was found."""
     group = f"taught by {run.run_config.learns_from}"
     rows = []
-    for variant in variants_of(comparison, run):
-        found = read_result(result_of(comparison, run, variant))
+    for variant, result in found.items():
         of: dict[str, dict[str, Any]] = {
             name: {**row["summary"], "intervals": row["intervals"]}
-            for name, row in found["rows"].items()
+            for name, row in result["rows"].items()
         }
-        of["fit"]["seconds"] = found["cpu_seconds_an_image"]
+        of["fit"]["seconds"] = result["cpu_seconds_an_image"]
         beside = {name: of[name] for name in VIEWS.references.values()}
         for name, shapes in SHAPES.items():
             if name in of:
-                scores = {**of[name], **beside, "protocol": found["protocol"]}
-                rows.append(_row(comparison, run, variant, group, shapes, scores))
+                scores = {**of[name], **beside, "protocol": result["protocol"]}
+                rows.append(
+                    Row(title, group, variant.title, shapes, run.seed, scores, variant.made_by)
+                )
     return rows
-
-
-def _row(
-    comparison: Comparison,
-    run: Run,
-    variant: str | None,
-    group: str,
-    shown: str,
-    scores: dict[str, Any],
-    rank: int = 0,
-) -> Row:
-    """A row without costs; `shown` is how the table calls its variant."""
-    rooms, title = comparison.rooms[run.rooms].title, title_of(comparison, run, variant)
-    made_by = maker_of(comparison, run, variant).said
-    return Row(rooms, group, title, shown, run.seed, scores, {}, made_by, rank)

@@ -10,7 +10,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -128,30 +127,16 @@ def open_runner(out: Path) -> Iterator[StepRunner]:
             until_done.enter_context(only_writer(out))
         except OSError as error:
             raise InputError(f"{out} cannot be written ({error.strerror}).") from None
-        until_done.enter_context(_answering_signals(runner))
+        for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            handler = signal.getsignal(name)
+            until_done.callback(signal.signal, name, handler)
+            if handler is not signal.SIG_IGN:
+                signal.signal(name, runner.stop)
+            elif name == signal.SIGINT:
+                # In the background. Commands inherit what is ignored, but not an answer, and have
+                # to hear the SIGINT by which `StepRunner.stop` ends them.
+                signal.signal(name, lambda number, frame: None)
         yield runner
-
-
-@contextlib.contextmanager
-def _answering_signals(runner: StepRunner) -> Iterator[None]:
-    """Let a runner answer every signal that asks this process to end."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # where no signal can be answered
-        return
-    names = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {name: signal.getsignal(name) for name in names}
-    for name, handler in before.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(name, runner.stop)
-        elif name == signal.SIGINT:
-            # In the background. Commands inherit what is ignored, but not an answer, and have to
-            # hear the SIGINT by which `StepRunner.stop` ends them.
-            signal.signal(name, lambda number, frame: None)
-    try:
-        yield
-    finally:
-        for name, handler in before.items():
-            signal.signal(name, handler)
 
 
 def is_done(step: Step, folder: Path) -> bool:

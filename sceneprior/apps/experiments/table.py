@@ -26,7 +26,7 @@ FACTORS = {"cpu_s": 1 / 60, "parameters": 1e-6}
 
 @dataclass(frozen=True)
 class Row:
-    """Result of one run: rooms, method, scores and costs of training."""
+    """Result of one run."""
 
     rooms: str
     group: str
@@ -36,7 +36,7 @@ class Row:
     seed: int | None
     """None of scenes as given."""
     scores: dict[str, Any]
-    costs: dict[str, int | float | None]
+    """By key of a result, with its protocol and its rows of reference; and what training took."""
     made_by: str
     """Who its method is of, as a caption says it (`Maker.said`)."""
     rank: int = 0
@@ -53,8 +53,8 @@ class Form:
     """Rows that need no training: (title, where a result keeps their values)."""
     variant: str
     """Heading of the second column."""
-    say: Callable[[Sequence[Row]], str]
-    """Makes what stands above a table from its rows."""
+    say: Callable[[dict[str, Any]], str]
+    """Says in a caption how rooms were scored, from one of the results."""
 
 
 def write_tables(rows: Sequence[Row], out: Path, form: Form) -> None:
@@ -70,10 +70,10 @@ def markdown(rows: Sequence[Row], form: Form) -> str:
         columns = {
             key: column
             for key, column in (form.columns | COSTS).items()
-            if any(_value(row, key) is not None for row in own)
+            if any(row.scores.get(key) is not None for row in own)
         }
         titles = [column.title for column in columns.values()]
-        lines = [f"### {rooms}", "", form.say(own), ""]
+        lines = [f"### {rooms}", "", _caption(own, form), ""]
         lines.append(_line(["method", form.variant, *titles]))
         lines.append("| --- | --- |" + " ---: |" * len(columns))
         lines += [_line(cells) for cells in _body(own, columns, form)]
@@ -90,11 +90,8 @@ def as_csv(rows: Sequence[Row], form: Form) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["rooms", "group", "method", "made by", form.variant, "seed", *keys])
     for row in rows:
-        values = [_value(row, key) for key in keys]
-        told = ["" if value is None else repr(value) for value in values]
-        seed = "" if row.seed is None else row.seed
-        named = [row.rooms, row.group, row.title, row.made_by, row.variant, seed]
-        writer.writerow([*named, *told])
+        named = [row.rooms, row.group, row.title, row.made_by, row.variant, row.seed]
+        writer.writerow([*named, *(row.scores.get(key) for key in keys)])
     return text.getvalue()
 
 
@@ -119,15 +116,11 @@ def _body(rows: Sequence[Row], columns: dict[str, TableColumn], form: Form) -> l
         for runs in _by(members, lambda row: f"{row.title}: {row.variant}").values():
             values = runs[0].scores if len(runs) == 1 else {}
             cells = [
-                _cell([_value(row, key) for row in runs], key, of, values)
+                _cell([row.scores.get(key) for row in runs], key, of, values)
                 for key, of in columns.items()
             ]
             lines.append([runs[0].title, runs[0].variant, *cells])
     return lines
-
-
-def _value(row: Row, key: str) -> int | float | None:
-    return (row.costs if key in COSTS else row.scores).get(key)
 
 
 def _cell(
@@ -158,14 +151,8 @@ def _arrowed(column: TableColumn, direction: Direction) -> TableColumn:
     return replace(column, title=column.title + ARROWS[direction])
 
 
-def _seeds_of(rows: Sequence[Row]) -> str:
-    """The seeds of rows, in words; scenes as given have none."""
-    seeds = sorted({row.seed for row in rows if row.seed is not None})
-    return ", ".join(map(str, seeds)) or "none"
-
-
-def _makers_of(rows: Sequence[Row]) -> str:
-    """The sentence that says which rows are the paper's method and which the lifted one."""
+def _caption(rows: Sequence[Row], form: Form) -> str:
+    """The sentences above a table: which rows are whose method, how they were scored, the seeds."""
     titles: dict[str, list[str]] = {PAPER.said: [], LIFTED: []}
     for row in rows:
         named = titles.setdefault(row.made_by, [])
@@ -175,21 +162,20 @@ def _makers_of(rows: Sequence[Row]) -> str:
         f"of {said}: " + (", ".join(f"'{title}'" for title in named) or "none")
         for said, named in titles.items()
     )
-    return f"Rows {'; '.join(parts)}."
+    seeds = sorted({row.seed for row in rows if row.seed is not None})
+    told = ", ".join(map(str, seeds)) or "none"
+    return f"Rows {'; '.join(parts)}. {form.say(rows[0].scores)}; seeds {told}."
 
 
-def _of_new_rooms(rows: Sequence[Row]) -> str:
-    protocol = rows[0].scores["protocol"]
+def _of_new_rooms(scores: dict[str, Any]) -> str:
+    protocol = scores["protocol"]
     return (
-        f"{_makers_of(rows)} "
         f"{protocol['n_generated']} generated rooms a run against {protocol['n_test']} test rooms "
-        f"of {protocol['shards']}; {protocol['n_train_rooms']} real training rooms; "
-        f"seeds {_seeds_of(rows)}."
+        f"of {protocol['shards']}; {protocol['n_train_rooms']} real training rooms"
     )
 
 
-def _of_views(rows: Sequence[Row]) -> str:
-    scores = rows[0].scores
+def _of_views(scores: dict[str, Any]) -> str:
     protocol = scores["protocol"]
     surfaces, known = scores["with_surface"], protocol["known_model_share"]
     objects = f"{scores['objects']} objects"
@@ -200,11 +186,10 @@ def _of_views(rows: Sequence[Row]) -> str:
         f"{Path(protocol['shards']).name}, {objects}",
         "masks, classes, 2D boxes and cameras are given to every method",
         "boxes are upright and along the room's axes, in the truth and in every answer",
-        f"seeds {_seeds_of(rows)}",
     ]
     if known is not None:
         told.insert(1, f"{known:.0%} of the objects are models that training rooms hold, too")
-    return f"{_makers_of(rows)} {'; '.join(told)}."
+    return "; ".join(told)
 
 
 NEW_ROOMS = Form(

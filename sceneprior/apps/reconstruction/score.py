@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from sceneprior.apps.config import load_any_run
@@ -66,13 +65,11 @@ class SvrProtocol:
     views: int = 1
     """Views drawn from each room to evaluate a run; all if a room has fewer."""
     renderer: str = "auto"
-    points: int = POINTS
-    """Points sampled from each surface."""
 
     def as_dict(self) -> dict[str, Any]:
         """The protocol, for a result file."""
         told = {"shards": str(self.shards), "split": self.split, "seed": self.seed}
-        return {**told, "points": self.points, **PROTOCOL}
+        return {**told, "points": POINTS, **PROTOCOL}
 
 
 def evaluate_run(
@@ -201,7 +198,7 @@ def score_answers(
         for image, objects in zip(images, some, strict=True):
             shown = [truth[image.room_id][row] for row in image.rows]
             views.append([ObjectPair(*pair) for pair in zip(shown, objects, strict=True)])
-        rows[name] = score_views(views, [image.room_id for image in images], protocol.points)
+        rows[name] = score_views(views, [image.room_id for image in images])
     return rows
 
 
@@ -217,7 +214,7 @@ def known_model_share(images: Sequence[ObservedImage], shards: Path, split: str)
     return sum(named) / len(named) if named else None
 
 
-def print_view_scores(scores: dict[str, Any], console: Console | None = None) -> None:
+def print_view_scores(scores: dict[str, Any]) -> None:
     """Print both tables of a result: all objects by method, and the first method by class."""
     rows = {
         TITLES[name]: {**row["summary"], "intervals": row["intervals"]}
@@ -230,7 +227,7 @@ def print_view_scores(scores: dict[str, Any], console: Console | None = None) ->
         "rooms, with 95% intervals over rooms": rows,
         f"{next(iter(rows)).capitalize()}, by class": evaluated["classes"],
     }
-    console = console or wide_console()
+    console = wide_console()
     for title, lines in tables.items():
         table = Table("", "objects", "unmatched", "with a surface", title=title)
         for name, _ in COLUMNS.values():

@@ -47,7 +47,7 @@ class Retrieved(NamedTuple):
     """Chamfer distance of `chamfer_mean`."""
 
 
-def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
+def retrieve(scene: Scene, models: CadModels) -> Scene:
     """The scene with the mesh of the most similar CAD model in every box.
 
     `extra["retrieval"]` holds {"model_id", "turn_deg", "distance_m"} for each object, in their
@@ -59,7 +59,7 @@ def retrieve(scene: Scene, models: CadModels, keep: int | None = KEEP) -> Scene:
     for item in scene.objects:
         box, told = extruded(item), None
         if of_class := models.by_class.get(item.label):
-            best = most_similar(box, of_class, keep)
+            best = most_similar(box, of_class)
             mesh = placed(models.load(best.model_id), box, best.turn_deg)
             objects.append(replace(box, mesh=mesh, turned=None))
             told = best._asdict() | {"distance_m": round(best.distance_m, 5)}

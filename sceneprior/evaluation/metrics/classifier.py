@@ -110,19 +110,10 @@ def _alexnet(rooms: RoomSet, comparison: Comparison) -> Estimate:
 
 
 METRICS = (
+    Metric("sca", "SCA (AlexNet)", "", "half", _alexnet, PICTURED, "alexnet"),
     Metric(
-        "sca", "SCA (AlexNet)", "", "half",
-        "The paper's scene classification accuracy: AlexNet from the user's "
-        "`alexnet-owt-7be5be79.pth` (`--alexnet`) with one new linear layer, all fine-tuned for 10 "
-        "epochs at 1e-4 in batches of 256, on 224 x 224 pictures; 5 folds, drawn once.",
-        _alexnet, PICTURED, "Paschalidou et al., NeurIPS 2021", "alexnet",
-    ),
-    Metric(
-        "sca_effnet_lite0", "Classifier accuracy, EfficientNet-Lite0", "", "half",
-        "Accuracy of a linear classifier (scikit-learn's logistic regression, C = 0.01, on "
-        "standardized features) that separates the set from the test rooms: 5 folds, drawn 5 "
-        "times; the larger set is subsampled to the size of the smaller one.",
-        _linear, PICTURED, network="effnet_lite0",
+        "sca_effnet_lite0", "Classifier accuracy, EfficientNet-Lite0", "", "half", _linear,
+        PICTURED, "effnet_lite0",
         protocol={
             "sca_effnet_lite0": f"logistic regression (L2, C = {INVERSE_PENALTY}) on standardized "
             f"features, {FOLDS}-fold, {REPEATS} draws of folds and of as many rooms of the larger "

@@ -34,13 +34,10 @@ def reconstruction_scores(pairs: Sequence[tuple[Scene, Scene]]) -> dict[str, flo
 METRICS = (
     Metric(
         "class_accuracy", "Classes of decoded training rooms", "share of objects", "higher",
-        "Share of true objects whose matched object has the right class; an unmatched object "
-        "counts as wrong.",
         partial(_mean_over_objects, "correct"), (),
     ),
     Metric(
         "box_iou_3d", "Box IoU of decoded training rooms", "IoU", "higher",
-        "Mean IoU of axis-aligned 3D boxes over true objects; an unmatched object counts as 0.",
         partial(_mean_over_objects, "iou"), (),
         column=TableColumn(
             "train box IoU", 2, "train box IoU: decoded training rooms against the truth"
@@ -48,7 +45,7 @@ METRICS = (
     ),
     Metric(
         "count_accuracy", "Numbers of objects of decoded training rooms", "share of rooms",
-        "higher", "Share of rooms with the right number of objects.", _count_accuracy, (),
+        "higher", _count_accuracy, (),
     ),
 )  # fmt: skip
 """Metrics of decoded training rooms; their functions take the rooms' `SceneMatch`es."""

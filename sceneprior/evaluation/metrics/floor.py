@@ -56,7 +56,7 @@ def walkable_share(scene: Scene, within: str = "furniture") -> float | None:
 
     Free are the positions in which the agent, a cylinder of radius 0.2 m and height 1.5 m,
     intersects neither a wall nor an object. 1 means that the free area is connected, 0 that the
-    agent fits nowhere.
+    agent fits nowhere. Yang et al., CVPR 2024, in exact areas.
 
     Args:
         within: The walls. `furniture`: the rectangle around all furniture, which every scene has,
@@ -90,9 +90,6 @@ METRICS = (
     Metric(
         "out_of_bounds_share", "Pieces out of the floor's bounds", "share; known floors alone",
         "lower",
-        "Share of objects with more than 5% of their footprint outside the floor's outline. Only "
-        "rooms with `floor_m` count; null if no room has one, as for this package's priors, which "
-        "generate no floor.",
         _out_of_bounds,
         protocol={
             "out_of_bounds_share": f"pieces with more than {OUTSIDE_SHARE:.0%} of their box "
@@ -102,12 +99,7 @@ METRICS = (
     Metric(
         "walkable_share", "Walkable in one piece, between furniture", "share of free floor",
         "higher",
-        "Mean over rooms of the largest connected area in which a disc of radius 0.2 m can stand, "
-        "divided by all such area. The walls are the **rectangle around all furniture**, so that "
-        "rooms with and without a floor can be compared; objects whose lower face is at 1.5 m or "
-        "higher do not block. 0 if the disc fits nowhere; rooms with fewer than two objects are "
-        "left out.",
-        mean_over_rooms(walkable_share, 1.0), source="Yang et al., CVPR 2024, in exact areas",
+        mean_over_rooms(walkable_share, 1.0),
         protocol={
             "walkable_share": f"disc of {AGENT_RADIUS_M} m, {AGENT_HEIGHT_M} m high; exact areas; "
             "_floor: within floor_m, else the rectangle around all furniture"
@@ -116,8 +108,6 @@ METRICS = (
     Metric(
         "walkable_share_floor", "Walkable in one piece, within the floor",
         "share; known floors alone", "higher",
-        "`walkable_share` within `floor_m`; rooms without one are left out; null if no room has "
-        "one.",
         mean_over_rooms(partial(walkable_share, within="floor"), 1.0),
     ),
 )  # fmt: skip

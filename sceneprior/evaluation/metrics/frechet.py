@@ -134,26 +134,17 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
     """The four metrics of a network's features, in the order of tables."""
     lite = network == "effnet_lite0"
     key, gap = FRECHET[network], "gap_closed" if lite else f"gap_closed_{network}"
-    where = "EfficientNet-Lite0" if lite else "Inception"
     ends = "0: theirs, 1: as near as real"
     return [
         Metric(
             key, title, "", "closer",
-            f"Frechet distance in {where} features (below), in squared feature units; like all "
-            "metrics of pictures, computed on as many generated rooms as there are real training "
-            "rooms (`n_pictured`).",
             partial(_distance, network, False), PICTURED, network=network,
-            source="Heusel et al., NeurIPS 2017",
             column=TableColumn(
                 "FD", 1, "FD: Frechet distance of EfficientNet-Lite0 features, which is not FID"
             ) if lite else TableColumn("FID", 1),
         ),
         Metric(
             f"{gap}_furnished", f"Gap closed, from independent furniture, {short}", ends, "higher",
-            "Share of the gap between independent objects, drawn with their real meshes, and real "
-            "rooms that the generated rooms close: `(D_independent_meshes - D_generated) / "
-            f"(D_independent_meshes - D_real)`, D the Frechet distance `{key}` to the test rooms; "
-            "if `D_independent_meshes <= D_real`, it is 1 for `D_generated <= D_real`, else 0.",
             partial(_gap, network, False), GENERATED, network=network,
             protocol={
                 "gap_closed": "(independent - generated) / (independent - real training), Frechet "
@@ -168,8 +159,6 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
         ),
         Metric(
             f"{key}_boxes", boxes_title, "", "closer",
-            f"`{key}` with all rooms, the test rooms too, drawn as boxes (`--boxes`): compares "
-            "layouts alone, for methods with and without meshes.",
             partial(_distance, network, True), AGAINST_TEST, network=network, boxes=True,
             protocol={
                 "_boxes": "the same metric, all rooms drawn as boxes, real ones too (--boxes)"
@@ -182,8 +171,6 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
         Metric(
             f"{gap}_boxes", f"Gap closed, all rooms as boxes, {short}",
             "0: independent, 1: as near as real", "higher",
-            f"`{gap}_furnished` with all rooms drawn as boxes (`--boxes`), the independent objects "
-            "too.",
             partial(_gap, network, True), GENERATED, network=network, boxes=True,
             column=TableColumn("gap closed, boxes", 2) if lite else None,
         ),

@@ -1,4 +1,7 @@
-"""Kernel distance (KID in Inception features): maximum mean discrepancy of two sets of pictures."""
+"""Kernel distance (KID in Inception features): maximum mean discrepancy of two sets of pictures.
+
+Source: Binkowski et al., ICLR 2018.
+"""
 
 from functools import partial
 from typing import NamedTuple
@@ -61,18 +64,11 @@ def _estimate(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
 
 METRICS = tuple(
     Metric(
-        key, title, "", "closer", definition, partial(_estimate, network), PICTURED,
-        network=network, source="Binkowski et al., ICLR 2018",
+        key, title, "", "closer", partial(_estimate, network), PICTURED, network=network,
         protocol={"kid": "unbiased, kernel (x . y / dimensions + 1)^3, over the whole sets"},
     )
-    for network, key, title, definition in (
-        ("inception", "kid", "KID (Inception)", "`kid_effnet_lite0` in Inception features."),
-        (
-            "effnet_lite0", "kid_effnet_lite0", "Kernel distance, EfficientNet-Lite0 (not KID)",
-            "Unbiased squared maximum mean discrepancy with the kernel `(x . y / dimensions + "
-            "1)^3`: around 0, possibly negative, for two samples of one distribution of any sizes; "
-            "computed on the whole sets, which equals the mean over all subsets, and not "
-            "multiplied by 1,000.",
-        ),
+    for network, key, title in (
+        ("inception", "kid", "KID (Inception)"),
+        ("effnet_lite0", "kid_effnet_lite0", "Kernel distance, EfficientNet-Lite0 (not KID)"),
     )
 )  # fmt: skip

@@ -136,14 +136,6 @@ def _accuracy(rooms: RoomSet, comparison: Comparison) -> Estimate:
 METRICS = (
     Metric(
         "layout_classifier_accuracy", "Classifier accuracy, layouts", "", "half",
-        "Accuracy of a classifier of boxes (scikit-learn's gradient boosting, 300 trees, on the "
-        "features of `layout_features`: counts, heights and distances to the edge by class, gaps, "
-        "overlaps and misalignments by pair of classes; noise of 7 cm on all centres and sizes) "
-        "that separates the set from real rooms. 5-fold: it is trained on all real training and "
-        "val rooms and on four fifths of the set (at most as many rooms), and tested on the "
-        "held-out fifth and the test rooms. Both sides have the same weight. Copies of real rooms "
-        "pass as real (`near_copy_share`). For real training rooms, one half of the real rooms is "
-        "told from the other half.",
         _accuracy, AGAINST_TEST,
         protocol={
             "layout_classifier_accuracy": f"gradient boosting ({TREES} trees, depth 3, square root "

@@ -56,9 +56,6 @@ def _near_copy_excess(rooms: RoomSet, comparison: Comparison) -> Estimate:
 METRICS = (
     Metric(
         "nearest_training_m", "Distance to the nearest training room", "mean, metres", "none",
-        "Mean layout distance (below) to the nearest of all training rooms; a training room is not "
-        "compared with itself. Values near 0 mean that training rooms are repeated; values above "
-        "the test rooms' are no better, since incoherent rooms are far from all others.",
         _nearest,
         protocol={
             "nearest_training_m": f"boxes paired within classes, {MISSING_M} m for a missing one, "
@@ -73,16 +70,10 @@ METRICS = (
     Metric(
         "nearest_decoded_m", "Distance to the nearest decoded training room", "mean, metres",
         "none",
-        "Mean layout distance to the nearest training room as the prior decodes it; left out if "
-        "there are no decoded training rooms.",
         _nearest_decoded,
     ),
     Metric(
         "near_copy_share", "Near copies of a training room", "share of rooms", "lower",
-        "Share of rooms with the furniture of one training room, true or decoded (one object more "
-        "or fewer allowed), whose paired objects are at a mean distance below `near_copy_m` of the "
-        "protocol: the 1% quantile of the same distance from a real training room to the nearest "
-        "other one.",
         _near_copy_share,
         protocol={
             "near_copy_share": f"under near_copy_m, the {NEAR_COPY_QUANTILE:.0%} quantile of the "
@@ -97,7 +88,6 @@ METRICS = (
     ),
     Metric(
         "near_copy_excess", "Near copies beyond those among real rooms", "share of rooms", "lower",
-        "`near_copy_share` of generated rooms minus that of test rooms.",
         _near_copy_excess, GENERATED,
     ),
 )  # fmt: skip

@@ -103,9 +103,6 @@ def _mean_of_pairs(
 METRICS = (
     Metric(
         "implausible_pairs", "Implausible intersecting pairs in a room", "mean", "lower",
-        "Mean number per room of intersecting pairs (boxes that share more than 1% of the smaller "
-        "one's volume; lamps included) whose classes intersect in fewer than 5% of the real "
-        "training rooms that hold both.",
         _mean_of_pairs(lambda overlaps: overlaps.intersect, plausible=False),
         protocol={"implausible_pairs": f"boxes sharing more than {OVERLAP_SHARE:.0%} of the "
                   f"smaller one, classes that do so in under {PLAUSIBLE_SHARE:.0%} of the real "
@@ -118,22 +115,16 @@ METRICS = (
     ),
     Metric(
         "deep_pairs", "Implausible pairs deeper than 1 cm", "mean", "lower",
-        "Mean number per room of implausible pairs whose boxes penetrate each other by more than "
-        "1 cm, whatever volume they share. The `sampler` rejects the pairs of `implausible_pairs`, "
-        "not these.",
         _mean_of_pairs(lambda overlaps: overlaps.depths_m > DEEP_M, plausible=False),
         protocol={"deep_pairs": f"penetration over {DEEP_M} m, classes as in implausible_pairs"},
         column=TableColumn("deeper than 1 cm", 2, "deeper than 1 cm: such pairs by depth"),
     ),
     Metric(
         "implausible_litres", "Volume shared by implausible pairs", "mean, litres", "lower",
-        "Mean over rooms of the volume shared by all implausible pairs, however small.",
         _mean_of_pairs(lambda overlaps: 1000 * overlaps.volumes_m3, plausible=False),
     ),
     Metric(
         "plausible_pairs", "Plausible intersecting pairs in a room", "mean", "none",
-        "Mean number per room of all other intersecting pairs, such as a chair pushed under a "
-        "table; a value near that of real rooms is good.",
         _mean_of_pairs(lambda overlaps: overlaps.intersect, plausible=True),
         column=TableColumn(
             "plausible pairs", 2,
@@ -143,7 +134,6 @@ METRICS = (
     ),
     Metric(
         "overlap_volume_m3", "Volume shared by all pairs in a room", "mean, cubic metres", "none",
-        "Mean over rooms of the volume shared by all pairs, plausible ones too.",
         mean_over_rooms(lambda scene: float(room_overlaps(scene).volumes_m3.sum())),
     ),
 )  # fmt: skip

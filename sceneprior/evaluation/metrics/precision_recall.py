@@ -1,4 +1,7 @@
-"""Improved precision and recall: the shares of pictures inside the other set's manifold."""
+"""Improved precision and recall: the shares of pictures inside the other set's manifold.
+
+Source: Kynkaanniemi et al., NeurIPS 2019.
+"""
 
 from functools import partial
 
@@ -61,22 +64,15 @@ def _recall_ratio(network: str, rooms: RoomSet, comparison: Comparison) -> Estim
 
 
 def _metrics_of(network: str, title: str, column: TableColumn | None) -> tuple[Metric, Metric]:
-    source = "Kynkaanniemi et al., NeurIPS 2019"
     return (
         Metric(
             f"precision_{network}", f"Precision, {title}", "share of rooms", "higher",
-            f"Improved precision in {title} features: the share of rooms inside the test rooms' "
-            "manifold, the union of closed balls around its pictures that each reach to the 3rd "
-            "nearest other (in a set of 3 or fewer the farthest); null if more than half of the "
-            "rooms are empty, since blank pictures lie inside too.",
-            partial(_precision, network), PICTURED, source, network,
+            partial(_precision, network), PICTURED, network,
             protocol={"precision_recall_k": NEIGHBOUR},
         ),
         Metric(
             f"recall_{network}", f"Recall, {title}", "share of test rooms", "higher",
-            f"Improved recall in {title} features: the share of test rooms inside the set's "
-            "manifold; it grows with the size of the set.",
-            partial(_recall, network), PICTURED, source, network, column=column,
+            partial(_recall, network), PICTURED, network, column=column,
         ),
     )  # fmt: skip
 
@@ -91,8 +87,6 @@ METRICS = (
     ),
     Metric(
         "recall_ratio", "Recall over that of real training rooms", "1: as varied as real", "higher",
-        "`recall_effnet_lite0` of generated rooms divided by that of real training rooms, "
-        "`n_pictured` rooms each, since recall grows with their number; null if the latter is 0.",
         partial(_recall_ratio, "effnet_lite0"), GENERATED, network="effnet_lite0",
     ),
 )  # fmt: skip

@@ -184,12 +184,6 @@ METRICS = (
     Metric(
         "relation_distance_m", "Relations: gaps between classes", "mean over pairs, metres",
         "closer",
-        "Wasserstein-1 distance between the set's and the test rooms' gaps, averaged over the "
-        "ordered pairs of classes that at least 5% of the real training and val rooms hold, "
-        "weighted by their number in the test rooms. The gaps are the distances between footprints "
-        "(at most 3 m) from each object of the first class to the nearest object of the second; a "
-        "pair that the set lacks has a gap of 3 m. The value of real training rooms is the lower "
-        "limit to expect.",
         _distance, AGAINST_TEST,
         protocol={
             "relation_distance_m": f"ordered pairs that {PAIR_SHARE:.0%} of the real training and "
@@ -203,7 +197,6 @@ METRICS = (
     ),
     Metric(
         "relation_ratio", "The same, over that of real rooms", "1: as near as real", "lower",
-        "`relation_distance_m` of generated rooms divided by that of real training rooms.",
         _ratio, GENERATED,
     ),
 )  # fmt: skip

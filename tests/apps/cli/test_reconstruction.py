@@ -92,19 +92,6 @@ def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):
     assert (-pose[:3, :3].T @ pose[:3, 3])[1] == pytest.approx(1.4)
 
 
-def test_one_object_at_the_border_is_answered(command, toy_run, own, tmp_path):
-    """A defined answer: one object, of the mask's class, however much of it the border hides."""
-    ids = np.zeros((72, 96), np.uint8)
-    ids[30:50, 80:] = 1
-    Image.fromarray(ids).save(tmp_path / "mine.png")
-    call = ["reconstruct", "--run", toy_run, *own, "--pose", "pose.json", "--out", "one", *SOFT]
-    status, out, errors = command(*call)
-    assert (status, out) == (0, "Wrote 1 room to one\n"), errors
-    label = (tmp_path / "classes.csv").read_text().splitlines()[1].split(",")[1]
-    (item,) = json.loads((tmp_path / "one" / "mine.json").read_text())["objects"]
-    assert item["class"] == label
-
-
 def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_path):
     call = ["reconstruct", "--run", toy_run, "--out", "none"]
     shards = ["--shards", toy_shards]
@@ -145,23 +132,6 @@ def test_eval_svr_of_a_run_and_of_its_scenes(command, toy_run, toy_shards, tmp_p
         assert one == pytest.approx(two_, abs=1e-3)
     for row in ("nearest_room", "random_room"):
         assert again["rows"][row] == scores["rows"][row]
-
-
-def test_known_rooms_ignore_a_runs_weights(command, toy_run, toy_shards, tmp_path):
-    """They are the same rooms beside every method: a run's own matching has no say."""
-    other = shutil.copytree(toy_run, tmp_path / "other")
-    config = (other / "config.yaml").read_text()
-    for key in ("match_box", "occlusion_slack"):
-        config = re.sub(rf"{key}: [0-9.]+", f"{key}: 0.0", config)
-    (other / "config.yaml").write_text(config)
-    assert config.count(": 0.0\n") >= 2 and config != (toy_run / "config.yaml").read_text()
-    known = []
-    for run in (toy_run, other):
-        call = ["eval-svr", "--shards", toy_shards, "--run", run, "--limit", 2, *SOFT]
-        assert command(*call, "--out", "svr.json")[0] == 0
-        rows = json.loads((tmp_path / "svr.json").read_text())["rows"]
-        known.append((rows["nearest_room"], rows["random_room"]))
-    assert known[0] == known[1]
 
 
 def test_scenes_that_answer_no_image(command, toy_run, toy_shards, tmp_path):

@@ -113,7 +113,7 @@ def test_a_run_that_remembers_rooms_has_a_row_for_each_fit(toy_shards, toy_run, 
         "Paper: fit of a latent",
         "Object by object, by the paper's prior",
     ]
-    assert rows[0].costs["parameters"] and not rows[1].costs
+    assert rows[0].scores["parameters"] and "parameters" not in rows[1].scores
     assert rows[0].scores["box_iou_3d"] != rows[1].scores["box_iou_3d"]
 
 
@@ -166,7 +166,7 @@ def test_surfaces_that_are_unknown_are_counted():
         "seconds": 0.25, "nearest_room": {"box_iou_3d": 0.2}, "random_room": {},
         "protocol": {"shards": "data/rooms", "known_model_share": None},
     }  # fmt: skip
-    table = markdown([Row("Rooms", "2D", "A", "as found", 0, scores, {}, "baselines")], VIEWS)
+    table = markdown([Row("Rooms", "2D", "A", "as found", 0, scores, "baselines")], VIEWS)
     assert (
         "of the lifted method: none; of baselines: 'A'. 3 views of 3 test rooms of rooms" in table
     )

@@ -21,7 +21,7 @@ from sceneprior.core.geometry.meshes import place
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import DecodedScenes
-from sceneprior.evaluation.metrics.contents import class_frequencies, frequency_kl
+from sceneprior.evaluation.metrics.contents import category_kl, class_frequencies
 from sceneprior.paper.sampling import COPIES
 from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.topdown import box_mesh
@@ -184,7 +184,7 @@ def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
     assert scores["mean_objects_test"] == np.mean([len(labels) for labels in tracked])
     seen = np.bincount(np.concatenate(tracked), minlength=22) / sum(map(len, tracked))
     made = sample_rooms(load_run(tmp_path / "run"), 3, 1)
-    assert scores["category_kl"] == pytest.approx(frequency_kl(seen, class_frequencies(made)))
+    assert scores["category_kl"] == pytest.approx(category_kl(seen, class_frequencies(made)))
     assert scores["mean_objects"] == np.mean([len(scene.objects) for scene in made])
     assert scores["type_share_test"] == 1 and scores["train_rooms"]["category_kl"] >= 0
     low, high = scores["intervals"]["generated"]["mean_objects"]

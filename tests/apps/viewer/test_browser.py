@@ -1,28 +1,15 @@
 """The page in a real browser: it draws, the room follows the pointer, and buttons do their work."""
 
-import contextlib
-import io
 import time
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from browser import picture, wait_for
 
 import sceneprior
 from sceneprior.apps.viewer.explorer import Explorer, Folder
-from sceneprior.apps.viewer.nodes import name_and_size
 from sceneprior.core.scene import Scene, SceneObject
-
-PATIENCE_S = 120
-"""WebGL in software, on a machine that does other things as well."""
-
-
-def wait_for(condition, said: str) -> None:
-    limit = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < limit, said
-        time.sleep(0.1)
 
 
 def words(browser) -> str:
@@ -47,13 +34,7 @@ def on_screen(page, point_m) -> tuple[float, float]:
 
 def canvas(browser) -> np.ndarray:
     """What is drawn left of the panel."""
-    from selenium.common.exceptions import TimeoutException
-
-    for _ in range(6):  # chromium gives up on a picture after 10 s
-        with contextlib.suppress(TimeoutException):
-            picture = browser.get_screenshot_as_png()
-            break
-    shown = Image.open(io.BytesIO(picture)).convert("RGB")
+    shown = picture(browser.get_screenshot_as_png)
     return np.asarray(shown.crop((0, 0, int(0.65 * shown.width), shown.height))).astype(int)
 
 
@@ -138,22 +119,6 @@ def test_objects_are_kept_by_a_click_and_the_rest_is_completed(browser, page):
     click(browser, "Complete the rest")
     wait_for(lambda: "completed round 1 kept objects" in words(browser), "it was not completed")
     assert page.shown.scene.objects[0].center_m == kept.center_m
-
-
-def test_every_object_can_have_its_name_and_size(browser, page, monkeypatch):
-    said = []
-    add = page.server.scene.add_label
-    monkeypatch.setattr(
-        page.server.scene,
-        "add_label",
-        lambda name, text, **more: said.append(text) or add(name, text, **more),
-    )
-    before = canvas(browser)
-    click(browser, "Names and sizes")
-    wait_for(lambda: len(said) == len(page.shown.scene.objects) - len(page.shown.kept), "no labels")
-    assert set(said) <= {name_and_size(item) for item in page.shown.scene.objects}
-    wait_for(lambda: (np.abs(canvas(browser) - before).max(axis=-1) > 40).any(), "none is drawn")
-    click(browser, "Names and sizes")
 
 
 def test_what_does_not_work_is_said(browser, page):
