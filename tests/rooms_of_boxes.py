@@ -5,7 +5,7 @@ import torch
 
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.lifting.lifted import LiftedBoxes
-from sceneprior.lifted.occupancy import OccupancyConfig, OccupancyDecoder
+from sceneprior.lifted.looks import LookConfig, LookDecoder
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.rooms import SamplerRooms
 from sceneprior.lifted.sampler.settings import SamplerConfig
@@ -53,10 +53,10 @@ def sampler_rooms(count: int = 6, seed: int = 0) -> SamplerRooms:
     return SamplerRooms(lifted_rooms(count, seed)).see_looks(lifted_rooms().find_prototypes(99))
 
 
-def small_decoder() -> OccupancyDecoder:
+def small_decoder() -> LookDecoder:
     """A decoder that knows the shapes above."""
-    config = OccupancyConfig(prototypes=PROTOTYPES, codes=CODES, width=8, cells=CELLS, margin=1.0)
-    decoder = OccupancyDecoder(4, config)
+    config = LookConfig(prototypes=PROTOTYPES, codes=CODES, width=8, cells=CELLS, margin=1.0)
+    decoder = LookDecoder(4, config)
     decoder.learn_prototypes(lifted_rooms().find_prototypes(99))
     return decoder
 

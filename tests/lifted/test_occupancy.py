@@ -8,7 +8,7 @@ from tiny_runs import tiny_lifted
 
 from sceneprior.core.geometry.isosurface import surface_of
 from sceneprior.core.geometry.turns import turn_grids
-from sceneprior.lifted.occupancy import OccupancyConfig, OccupancyDecoder
+from sceneprior.lifted.looks import LookConfig, LookDecoder
 from sceneprior.lifted.prototypes import POSES, Prototypes, turn_of
 from sceneprior.paper.prior import ScenePrior
 
@@ -29,9 +29,9 @@ def prototypes() -> Prototypes:
 
 
 @pytest.fixture
-def decoder(prototypes) -> OccupancyDecoder:
+def decoder(prototypes) -> LookDecoder:
     torch.manual_seed(0)
-    decoder = OccupancyConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
+    decoder = LookConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
     decoder.learn_prototypes(prototypes)
     return decoder
 
@@ -50,7 +50,7 @@ def test_an_object_has_the_look_whose_code_is_nearest(decoder, torch_rng):
 
 
 def test_prototypes_are_kept_in_checkpoints_and_are_no_weights(decoder, prototypes):
-    fresh = OccupancyConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
+    fresh = LookConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
     assert len(fresh.prototypes.grids) == 0
     assert fresh.looks(torch.zeros(2, 30)).tolist() == [0, 0]
     fresh.load_state_dict(decoder.state_dict())
@@ -62,7 +62,7 @@ def test_prototypes_are_kept_in_checkpoints_and_are_no_weights(decoder, prototyp
 def test_meshes_turn_and_fill_boxes_as_grids_do():
     """A look's mesh against the surface of its turned grid, on a shape without symmetry."""
     rng = np.random.default_rng(0)
-    decoder = OccupancyConfig(prototypes=2, codes=8, cells=8).build(6)
+    decoder = LookConfig(prototypes=2, codes=8, cells=8).build(6)
     grids = np.zeros((1, 8, 8, 8), dtype=bool)
     grids[0, 1:, 1:4, 2:7] = True
     grids[0, 2:4, 1:7, 2:4] = True
