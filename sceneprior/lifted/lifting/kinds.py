@@ -1,7 +1,11 @@
 """Kinds of furniture: the parts of each prototype, and the look that each object's rays support."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from rich.console import Console
+from rich.progress import track
 
 from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.parts import Parts
@@ -16,12 +20,15 @@ from sceneprior.lifted.prototypes import (
     turn_of,
     turned_extents,
 )
-from sceneprior.render.silhouettes.cpu.threads import in_threads
+from sceneprior.render.silhouettes.cpu.threads import in_threads, thread_count
 
 RAYS = 4096
 """Rays to which the parts of a kind are fitted."""
 MOST = 16
 """Maximum number of objects, in one pose each, whose rays are taken."""
+SYMMETRIC = 0.05
+"""Distance by which an object may be further from a prototype in other poses than in its best, if
+its rays are to be taken in these, too."""
 ASKED = 128
 """Rays of an object by which its look is found."""
 SIZE_WEIGHT = 0.1
@@ -38,31 +45,34 @@ def fit_kinds(
     margin: float,
 ) -> tuple[Parts, ...]:
     """Parts of the prototypes, which are the objects `items`, each fitted to its own rays and those
-    of the objects of its class that look like it, in all poses in which they do."""
-    found: dict[int, Parts] = {}
+    of the objects of its class that look like it, each in its best pose and in those that are as good
+    since it is symmetric."""
 
-    def fit_some(first: int, last: int) -> None:
-        for item in items[first:last].tolist():
-            rows = np.flatnonzero((object_class == object_class[item]) & usable)
-            apart = pose_distances(
-                (hulls[rows], sizes_m[rows]), (hulls[item, None], sizes_m[item, None])
-            )[:, 0]
-            near = np.argsort(apart, axis=None, kind="stable")[:MOST]
-            near = near[apart.ravel()[near] <= ALIKE]
-            # A generator per prototype makes the result independent of the number of threads.
-            rng = np.random.default_rng([1, item])
-            count = min(-(-RAYS // len(near)), rays.hits.shape[1])
-            pools = []
-            for row, pose in zip(*np.unravel_index(near, apart.shape), strict=True):
-                some = rng.choice(rays.hits.shape[1], count, replace=False)
-                pool = RayPool(*(part[rows[row], some] for part in rays))
-                pools.append(as_prototype(pool, int(pose)))
-            order = rng.permutation(len(pools) * count)
-            pool = RayPool(*(np.concatenate(part)[order] for part in zip(*pools, strict=True)))
-            found[item] = fit_parts(pool, hulls[item], margin)
+    def fit_one(item: int) -> Parts:
+        rows = np.flatnonzero((object_class == object_class[item]) & usable)
+        apart = pose_distances(
+            (hulls[rows], sizes_m[rows]), (hulls[item, None], sizes_m[item, None])
+        )[:, 0]
+        other_poses = apart > apart.min(axis=1, keepdims=True) + SYMMETRIC
+        apart = np.where(other_poses | (apart > ALIKE), np.inf, apart)
+        near = np.argsort(apart, axis=None, kind="stable")[:MOST]
+        near = near[np.isfinite(apart.ravel()[near])]
+        # A generator per prototype makes the result independent of the number of threads.
+        rng = np.random.default_rng([1, item])
+        count = min(-(-RAYS // len(near)), rays.hits.shape[1])
+        pools = []
+        for row, pose in zip(*np.unravel_index(near, apart.shape), strict=True):
+            some = rng.choice(rays.hits.shape[1], count, replace=False)
+            pool = RayPool(*(part[rows[row], some] for part in rays))
+            pools.append(as_prototype(pool, int(pose)))
+        order = rng.permutation(len(pools) * count)
+        pool = RayPool(*(np.concatenate(part)[order] for part in zip(*pools, strict=True)))
+        return fit_parts(pool, hulls[item], margin)
 
-    in_threads(fit_some, len(items))
-    return tuple(found[item] for item in items.tolist())
+    with ThreadPoolExecutor(thread_count()) as pool:
+        found = pool.map(fit_one, items.tolist())
+        words, console = "finding parts from masks (kinds)", Console(stderr=True)
+        return tuple(track(found, words, total=len(items), console=console))
 
 
 def as_prototype(rays: RayPool, pose: int) -> RayPool:

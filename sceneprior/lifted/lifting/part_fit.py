@@ -2,15 +2,17 @@
 
 The loss counts rays and has no gradient:
 
-    wrong rays / (2 (hits or misses, the fewer of the two))
-      + 0.002 (number of parts) + 0.003 (volume of the parts, 1 for the box)
-      + 0.03 (gaps between the parts and the six sides of the box, 1 for the box's length)
+    half the share of hits that meet no part + half the share of misses that meet one
+      + 0.003 (number of parts) + 0.003 (number of planes in which faces lie)
+      + 0.002 (number of curved parts) + 0.0003 (volume of the parts, 1 for the box)
+      + 0.06 (gaps between the parts and the six sides of the box, 1 for the box's length)
       + 0.005 (connected pieces - 1)
 
 A ray is right if it meets a part exactly when its pixel is the object's. Few parts explain masks
 more cheaply than what a visual hull adds where no view sees past: a headboard and a mattress, not a
-dome. Parts and their mirror images count once. The other prices settle what rays leave open: solids
-are small, fill their box, and hold together.
+dome. Parts and their mirror images count once, and so do planes and theirs; sides of the box cost
+nothing. So edges line up. The other prices settle what rays leave open: solids are small, fill
+their box, and hold together.
 """
 
 import itertools
@@ -45,8 +47,10 @@ from sceneprior.lifted.lifting.part_rays import (
 
 PART_PRICE, VOLUME_PRICE, GAP_PRICE, PIECE_PRICE = 0.003, 0.0003, 0.06, 0.005
 PLANE_PRICE = 0.003
-LEAST_GAIN, CURVED_GAIN = 1e-4, 3e-3
-"""Loss by which one more part, or a curved part in place of a box, must be better."""
+CURVED = (CYLINDER, ELLIPSOID, DOME, BOWL)
+CURVED_PRICE = 0.002
+LEAST_GAIN = 1e-4
+"""Loss by which a change must be better."""
 PLACES = (0.25, 0.5, 0.75)
 """Where a part is split, as shares of its length."""
 SHORTEST = 4
@@ -104,6 +108,7 @@ class RayFit:
             self.hit_price * missed
             + self.miss_price * wrongly_met
             + PART_PRICE * len(guess.kinds)
+            + CURVED_PRICE * (guess.kinds != BOX).sum()
             + PLANE_PRICE * count_planes(guess.ends)
             + VOLUME_PRICE * volume
             + GAP_PRICE * gaps / LEVELS
@@ -172,7 +177,7 @@ def fit_parts(rays: RayPool, hull: Bool[np.ndarray, "x y z"], margin: float) -> 
     some = RayFit(RayPool(*(part[:SCREENED] for part in rays)), margin)
     while better := _one_more(every, some, guess, hull) or _one_more(every, every, guess, hull):
         guess = better
-    return _joined(every, _curved(every, _needed(every, guess))).parts()
+    return _joined(every, _needed(every, guess)).parts()
 
 
 def _one_more(
@@ -181,8 +186,11 @@ def _one_more(
     """The guess after its best change, which often adds a part; None if no change is better."""
     rough = some.guess(*guess[:3])
     tried = []
-    for change in _changes(guess, hull):
-        trial = some.settled(some.changed(rough, change), change, 1)
+    curved = len(guess.kinds) > 1 or some is every  # not at first: a chair is no bowl
+    for change in _changes(guess, hull, curved):
+        trial = some.changed(rough, change)
+        if all(kind == BOX for kind, _, _ in change.values()):  # curved parts take ten times as long
+            trial = some.settled(trial, change, 1)
         parts = zip(trial.kinds.tolist(), trial.mirrored.tolist(), trial.ends, strict=True)
         settled = {row: part for row, part in enumerate(parts) if row in change}
         tried.append((some.loss(trial), settled))
@@ -194,13 +202,16 @@ def _one_more(
     return best and every.settled(best, range(len(best.kinds)), 2)
 
 
-def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"]) -> Iterator[Change]:
-    """What may be better: parts made narrow and mirrored, parts split in two, with the hull's
-    extents in each half, and new parts around pieces of the hull that no part fills."""
+def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Iterator[Change]:
+    """What may be better: parts of another kind, parts made narrow and mirrored, parts split in two
+    with the hull's extents in each half, parts below others, and new parts around pieces of the
+    hull that no part fills."""
     new = len(guess.kinds)
     room = new < MOST_PARTS
     for row in range(new):
         across, ends = int(guess.mirrored[row]), guess.ends[row]
+        if curved:
+            yield from ({row: (kind, across, ends)} for kind in CURVED if kind != guess.kinds[row])
         for axis, bit in enumerate((ACROSS_X, 0, ACROSS_Z)):
             low, high = ends[axis]
             if high - low < SHORTEST:
@@ -279,45 +290,45 @@ def _needed(every: RayFit, guess: Guess) -> Guess:
     return guess
 
 
-def _curved(every: RayFit, guess: Guess) -> Guess:
-    """The guess with curved parts in place of boxes where these explain more."""
-    for row in range(len(guess.kinds)):
-        across, ends = int(guess.mirrored[row]), guess.ends[row]
-        trials = [
-            every.changed(guess, {row: (kind, across, ends)})
-            for kind in (CYLINDER, ELLIPSOID, DOME, BOWL)
-        ]
-        best = min(trials, key=every.loss)
-        if every.loss(best) < every.loss(guess) + 2 * CURVED_GAIN:
-            best = every.settled(best, [row], 1)
-            if every.loss(best) < every.loss(guess) - CURVED_GAIN:
-                guess = best
-    return guess
-
-
 def _joined(every: RayFit, guess: Guess) -> Guess:
-    """The guess with parts that join its pieces where that costs less than to leave them apart:
-    cords are often too thin for masks to show."""
+    """The guess with bars between its pieces, and from pieces to the top and the bottom of the box,
+    where that costs less than gaps: cords are often too thin for masks."""
     while len(guess.kinds) < MOST_PARTS:
         new = len(guess.kinds)
-        trials = []
-        for one, other in itertools.permutations(range(new), 2):
-            joint = np.sort([guess.ends[one].T, guess.ends[other].T], axis=0)
-            low, high = joint[0, 1], joint[1, 0]  # of the gap along an axis, or of the overlap
-            low, high = np.minimum(joint[1, 0], joint[0, 1]), np.maximum(joint[1, 0], joint[0, 1])
-            wide = np.stack([low, np.maximum(high, low + 1)], axis=1)
-            across = int(guess.mirrored[one] & guess.mirrored[other])
-            narrow = wide.copy()
-            overlaps = joint[1, 0] < joint[0, 1]
-            middle = (low + high) // 2
-            narrow[overlaps, 0], narrow[overlaps, 1] = middle[overlaps] - 1, middle[overlaps] + 1
-            trials += [(new, across, wide), (new, across, narrow)]
-        best = guess
-        for row, across, ends in trials:
-            trial = every.changed(guess, {row: (BOX, across, ends)})
-            if every.loss(trial) < every.loss(best):
-                best = trial
-        if best is guess:
-            return guess
+        trials = [
+            every.changed(guess, {new: (BOX, across, bar)}) for across, bar in _bars(guess)
+        ]
+        best = min(trials, key=every.loss)
+        if every.loss(best) >= every.loss(guess):
+            break
         guess = best
     return guess
+
+
+def _bars(guess: Guess) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
+    """Boxes from each part to each other, to the ceiling and to the floor, as wide as both together
+    allow and two levels wide; with their mirroring."""
+    ceiling, floor = np.array([[[0, LEVELS]] * 3] * 2)
+    ceiling[1], floor[1] = LEVELS, 0
+    both = ACROSS_X | ACROSS_Z
+    ends = list(zip(guess.mirrored.tolist(), guess.ends, strict=True))
+    for across, own in ends.copy():
+        whole = own.copy()  # with the mirror images
+        for bit, axis in ((ACROSS_X, 0), (ACROSS_Z, 2)):
+            if across & bit:
+                far = max(own[axis, 1], LEVELS - own[axis, 0])
+                whole[axis] = LEVELS - far, far
+        ends += [(0, whole)] if across else []
+    targets = [*ends, (both, ceiling), (both, floor)]
+    for (one, here), (other, there) in itertools.product(ends, targets):
+        last_low = np.maximum(here[:, 0], there[:, 0])
+        first_high = np.minimum(here[:, 1], there[:, 1])
+        between = np.sort([last_low, first_high], axis=0)  # the gap, or the overlap
+        narrow = between.copy()
+        overlaps = last_low <= first_high
+        middle = between.sum(axis=0)[overlaps] // 2
+        narrow[:, overlaps] = middle - 1, middle + 1
+        for low, high in (between, narrow):
+            bar = np.stack([low, np.maximum(high, low + 1)], axis=1).clip(0, LEVELS)
+            if (bar[:, 0] < bar[:, 1]).all():
+                yield one & other, bar
