@@ -21,7 +21,7 @@ CORNER = boxes((0, 64, 0, 24, 0, 64), (0, 16, 24, 64, 0, 64), (16, 64, 24, 40, 0
 
 def rays_of(parts: Parts, count: int, seed: int = 0, margin: float = 1.1) -> RayPool:
     """Random rays through the frame of an object of these parts; half of them hit it, as far as
-    there are enough."""
+    there are enough. Rays without information make up the number."""
     rng = np.random.default_rng(seed)
     starts = rng.normal(size=(6 * count, 3))
     starts *= 1.8 / np.linalg.norm(starts, axis=1, keepdims=True)
@@ -37,4 +37,6 @@ def rays_of(parts: Parts, count: int, seed: int = 0, margin: float = 1.1) -> Ray
     order = rng.permutation(
         np.concatenate([np.flatnonzero(hits)[: count // 2], np.flatnonzero(~hits)[: count // 2]])
     )
-    return RayPool(starts[order], spans[order], hits[order])
+    rest = count - len(order)
+    starts, spans = (np.pad(part[order], ((0, rest), (0, 0))) for part in (starts, spans))
+    return RayPool(starts, spans, np.pad(hits[order], (0, rest)))

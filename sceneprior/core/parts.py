@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-BOX, CYLINDER, ELLIPSOID, DOME, BOWL = range(5)
+KINDS = 5
+BOX, CYLINDER, ELLIPSOID, DOME, BOWL = range(KINDS)
 """Kinds of parts: each fills its own box as far as its kind can. A cylinder stands upright; a dome
 is the upper half of an ellipsoid, a bowl the lower half."""
 ACROSS_X, ACROSS_Z = 1, 2
@@ -59,12 +60,13 @@ def inside(
     low, high = ends[:, 0], ends[:, 1]
     within = ((points >= low) & (points <= high)).all(axis=-1)
     if kind == BOX:
-        return within
+        return np.asarray(within)
     center, radii = center_and_radii(kind, ends)
     squares = ((points - center) / radii) ** 2
     if kind == CYLINDER:
         squares = squares[..., ::2]
-    return within & (squares.sum(axis=-1) <= 1)
+    found: np.ndarray = within & (squares.sum(axis=-1) <= 1)
+    return found
 
 
 def center_and_radii(

@@ -41,7 +41,7 @@ def surface_of_parts(
 def _solid(kind: int, ends: Float[np.ndarray, "3 2"]) -> "Manifold":
     from manifold3d import Manifold
 
-    grown = ends + [-OVERLAP, OVERLAP]
+    grown = ends + np.array([-OVERLAP, OVERLAP])
     if kind == BOX:
         corners = CUBE_CORNERS / 2 * (grown[:, 1] - grown[:, 0]) + grown.mean(axis=1)
     else:
@@ -49,12 +49,12 @@ def _solid(kind: int, ends: Float[np.ndarray, "3 2"]) -> "Manifold":
         turns = np.arange(SIDES) * 2 * np.pi / SIDES
         circle = np.stack([np.cos(turns), np.zeros(SIDES), np.sin(turns)], axis=1)
         if kind == CYLINDER:
-            rings = [circle + [0, height, 0] for height in (-1, 1)]
+            rings = [circle + np.array([0, height, 0]) for height in (-1, 1)]
         else:
             low, high = {DOME: (0, 1), BOWL: (-1, 0)}.get(kind, (-1, 1))
             steps = SIDES // 4 * (high - low) + 1
             rises = np.linspace(low, high, steps) * np.pi / 2
-            rings = [np.cos(rise) * circle + [0, np.sin(rise), 0] for rise in rises]
+            rings = [np.cos(rise) * circle + np.array([0, np.sin(rise), 0]) for rise in rises]
         corners = np.concatenate(rings) * radii + center
     return Manifold.hull_points(corners)
 
@@ -86,5 +86,3 @@ def stretched(
         places = np.concatenate([[0], np.cumsum(lengths * scale)]) - 0.5
         moved[:, axis] = np.interp(points[:, axis], knots, places)
     return moved
-
-

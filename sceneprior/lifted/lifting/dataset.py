@@ -28,8 +28,7 @@ from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turned_l
 VERSION = 1
 """Version of the cached boxes."""
 SHAPES_VERSION = 5
-"""Version of the cached hulls and rays. Raise it, or `VERSION`, when they come out otherwise for the
-same views."""
+"""Version of the cached hulls and rays. Raise it, or `VERSION`, when the same views give others."""
 
 RAYS_KEPT = 1024
 """Rays per object from which shapes are found."""

@@ -44,9 +44,9 @@ def fit_kinds(
     usable: Bool[np.ndarray, " objects"],
     margin: float,
 ) -> tuple[Parts, ...]:
-    """Parts of the prototypes, which are the objects `items`, each fitted to its own rays and those
-    of the objects of its class that look like it, each in its best pose and in those that are as good
-    since it is symmetric."""
+    """Parts of the prototypes, which are the objects `items`: fitted to the rays of all objects of
+    their class that look like them, in the pose in which each does best and, for symmetric ones, in
+    those that are as good."""
 
     def fit_one(item: int) -> Parts:
         rows = np.flatnonzero((object_class == object_class[item]) & usable)

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from scipy import ndimage
 
 from sceneprior.core.parts import (
@@ -76,7 +76,7 @@ class Guess(NamedTuple):
     """On the levels of `part_rays.py`."""
     covered: Bool[np.ndarray, "parts rays"]
     """Which rays each part meets."""
-    count: Int[np.ndarray, " rays"]
+    met_by: Int[np.ndarray, " rays"]
     """Number of parts that each ray meets."""
 
     def parts(self) -> Parts:
@@ -101,7 +101,7 @@ class RayFit:
 
     def loss(self, guess: Guess) -> float:
         """See the module's docstring."""
-        missed, wrongly_met = wrong_rays(guess.count, self.hits)
+        missed, wrongly_met = wrong_rays(guess.met_by, self.hits)
         volume = sum(map(volume_of, guess.kinds, guess.mirrored, guess.ends))
         gaps, pieces = gaps_and_pieces(guess.mirrored, guess.ends)
         return float(
@@ -134,7 +134,7 @@ class RayFit:
             np.concatenate([part, np.zeros((more, *part.shape[1:]), part.dtype)])
             for part in guess[:4]
         )
-        count = guess.count.copy()
+        count = guess.met_by.copy()
         for row, (kind, across, own) in change.items():
             kinds[row], mirrored[row], ends[row] = kind, across, own
             count -= covered[row]
@@ -146,7 +146,7 @@ class RayFit:
         """A copy without one part."""
         others = np.arange(len(guess.kinds)) != row
         kinds, mirrored, ends, covered = (part[others] for part in guess[:4])
-        return Guess(kinds, mirrored, ends, covered, guess.count - guess.covered[row])
+        return Guess(kinds, mirrored, ends, covered, guess.met_by - guess.covered[row])
 
     def settled(self, guess: Guess, rows: Iterable[int], sweeps: int) -> Guess:
         """The guess after the faces of some parts have moved to where fewest rays are wrong, or as
@@ -154,7 +154,7 @@ class RayFit:
         moved = Guess(*(part.copy() for part in guess))
         descend(
             self.starts, self.spans, self.inverse, self.hits, moved.kinds, moved.mirrored,
-            moved.ends, moved.covered, moved.count, np.array(list(rows)), sweeps,
+            moved.ends, moved.covered, moved.met_by, np.array(list(rows)), sweeps,
             self.hit_price, self.miss_price, VOLUME_PRICE, PLANE_PRICE,
         )  # fmt: skip
         return min(guess, moved, key=self.loss)
@@ -189,7 +189,9 @@ def _one_more(
     curved = len(guess.kinds) > 1 or some is every  # not at first: a chair is no bowl
     for change in _changes(guess, hull, curved):
         trial = some.changed(rough, change)
-        if all(kind == BOX for kind, _, _ in change.values()):  # curved parts take ten times as long
+        if all(
+            kind == BOX for kind, _, _ in change.values()
+        ):  # curved parts take ten times as long
             trial = some.settled(trial, change, 1)
         parts = zip(trial.kinds.tolist(), trial.mirrored.tolist(), trial.ends, strict=True)
         settled = {row: part for row, part in enumerate(parts) if row in change}
@@ -295,9 +297,7 @@ def _joined(every: RayFit, guess: Guess) -> Guess:
     where that costs less than gaps: cords are often too thin for masks."""
     while len(guess.kinds) < MOST_PARTS:
         new = len(guess.kinds)
-        trials = [
-            every.changed(guess, {new: (BOX, across, bar)}) for across, bar in _bars(guess)
-        ]
+        trials = [every.changed(guess, {new: (BOX, across, bar)}) for across, bar in _bars(guess)]
         best = min(trials, key=every.loss)
         if every.loss(best) >= every.loss(guess):
             break

@@ -189,7 +189,11 @@ def count_planes(ends):
     """The number of planes in which faces lie; sides of the box do not count, and across x and z a
     plane and its mirror image count once."""
     used = planes_of(ends, -1)
-    return used[1, 1:LEVELS].sum() + used[0, 1 : LEVELS // 2 + 1].sum() + used[2, 1 : LEVELS // 2 + 1].sum()
+    return (
+        used[1, 1:LEVELS].sum()
+        + used[0, 1 : LEVELS // 2 + 1].sum()
+        + used[2, 1 : LEVELS // 2 + 1].sum()
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -201,9 +205,9 @@ def descend(
     """Move the faces of the chosen parts, one after another, each to its best level; in place.
 
     `covered` says which rays each part meets, and `count` how many parts each ray meets; both are
-    kept up to date. In rays, `price` is the cost of filling the whole box, and `plane_price` that of
-    a face in a plane of its own (`count_planes`). Boxes try all levels;
-    curved parts, whose faces hang together, try those nearby.
+    kept up to date. The prices are those of a hit that no part meets, of a miss that one meets, of
+    filling the whole box, and of a face in a plane of its own (`count_planes`). Boxes try all
+    levels; curved parts, whose faces hang together, try those nearby.
     """
     costs = np.empty(LEVELS + 1)
     others = np.empty(len(hits), np.int16)
@@ -268,9 +272,8 @@ def descend(
 @njit(cache=True, nogil=True)
 @no_type_check
 def gaps_and_pieces(mirrored, ends):
-    """How far the connected piece that comes nearest to them all stays away from the six sides of
-    the object's box, in levels added up, and the number of such pieces; parts within a level of each
-    other touch."""
+    """The sum of the gaps, in levels, between the six sides of the object's box and the connected
+    piece that comes nearest to them, and the number of pieces. Parts within a level touch."""
     solids = np.empty((4 * len(ends), 3, 2), np.int64)
     count = 0
     for part in range(len(ends)):

@@ -75,7 +75,7 @@ def test_the_loss_is_the_formula_of_the_docstring():
     # Three planes: below the top, and the inner sides of the legs along x and z.
     assert fit.loss(guess) == pytest.approx(0.003 * 2 + 0.003 * 3 + 0.0003 * volume)
     upper = fit.guess(TABLE.kind[:1], TABLE.mirrored[:1], ends[:1])
-    missed = (fit.hits & (upper.count == 0)).sum()
+    missed = (fit.hits & (upper.met_by == 0)).sum()
     assert fit.loss(upper) == pytest.approx(
         0.5 * missed / (fit.hits.sum() + 50) + 0.003 + 0.003 + 0.0003 / 8 + 0.06 * 56 / 64
     )

@@ -58,7 +58,7 @@ def test_a_face_goes_where_the_fewest_rays_are_wrong(mirrored):
             moved = ends.copy()
             moved[1, axis, side] = place
             trial = fit.guess(np.zeros(2, int), np.array([0, mirrored]), moved)
-            wrong = (trial.count > 0) != fit.hits
+            wrong = (trial.met_by > 0) != fit.hits
             cost = prices[0] * (wrong & fit.hits).sum() + prices[1] * (wrong & ~fit.hits).sum()
             cost += prices[2] * volume_of(BOX, mirrored, moved[1])
             cost += prices[3] * (not planes_of(moved, 1)[axis, place])
@@ -68,7 +68,7 @@ def test_a_face_goes_where_the_fewest_rays_are_wrong(mirrored):
             before = min(trials.values())
             descend(
                 fit.starts, fit.spans, fit.inverse, fit.hits, one_sweep.kinds, one_sweep.mirrored,
-                one_sweep.ends, one_sweep.covered, one_sweep.count, np.array([1]), 1, *prices,
+                one_sweep.ends, one_sweep.covered, one_sweep.met_by, np.array([1]), 1, *prices,
             )  # fmt: skip
             assert fit.loss(one_sweep) <= fit.loss(guess) + 1
             assert trials[int(one_sweep.ends[1, 0, 0])] == pytest.approx(before)
@@ -85,7 +85,7 @@ def test_moving_faces_never_makes_more_rays_wrong_and_keeps_the_counts():
         moved = fit.settled(guess, range(3), 2)
         assert fit.loss(moved) <= fit.loss(guess)
         again = fit.guess(*moved[:3])
-        assert (again.covered == moved.covered).all() and (again.count == moved.count).all()
+        assert (again.covered == moved.covered).all() and (again.met_by == moved.met_by).all()
         assert (moved.ends[..., 0] < moved.ends[..., 1]).all()
         assert moved.ends.min() >= 0 and moved.ends.max() <= LEVELS
 
@@ -126,4 +126,4 @@ def test_wrong_rays_of_several_objects_are_counted_at_once():
     assert wrong[0] == 0
     fit = RayFit(rays, MARGIN)
     box = fit.guess(np.array([BOX]), np.array([0]), np.array([[[0, LEVELS]] * 3]))
-    assert wrong[1] == ((box.count > 0) != fit.hits).sum() > 50
+    assert wrong[1] == ((box.met_by > 0) != fit.hits).sum() > 50
