@@ -9,7 +9,7 @@ Two fifths of the views of each room are fitted, the others are held out. A mesh
 in its object's true box, moved by about 15 cm and scaled by about a quarter, and its vertices and
 box are optimised by the mask loss alone (masks at 120 x 90, the paper's sigma). All variants take
 the same steps on the same views from the same start. `lifted` uses neither true boxes nor steps:
-boxes and occupancy grids are computed from full-size masks, as in `fit`. The scores are the IoU of
+boxes and parts are found from full-size masks, as in `fit`. The scores are the IoU of
 each object's visible hard mask in held-out views, and the IoU of the mesh's bounding box with the
 true one. With --image-step k every k-th pixel of the masks is used along each axis.
 """
@@ -25,7 +25,6 @@ import numpy as np
 import torch
 
 from sceneprior.core.data.dataset import ViewDataset
-from sceneprior.core.geometry.isosurface import surface_of
 from sceneprior.core.geometry.meshes import icosphere, place
 from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.core.scene import Mesh
@@ -33,6 +32,7 @@ from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import SceneViews
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.lifting.shapes import ShapeGrid
+from sceneprior.lifted.looks import LookConfig
 from sceneprior.paper.losses.matching import Matches
 from sceneprior.paper.losses.shape import mask_loss
 from sceneprior.render.offscreen.renderer import Pinhole, SoftwareRenderer
@@ -98,18 +98,21 @@ def lift_rooms(shards: Path, seed: int) -> list[list[Mesh]]:
             if not each.name.startswith("lifted_"):
                 (Path(name) / each.name).symlink_to(each.resolve())
         lifted = LiftedDataset(Path(name), "train", view_fraction=FITTED, shape=GRID, seed=seed)
-    grids = iter(lifted.grids())
+    prototypes = lifted.find_prototypes(1024)
+    shapes = LookConfig(prototypes=1024, cells=GRID.cells, margin=GRID.margin).build(1)
+    shapes.learn_prototypes(prototypes)
+    looks = iter(lifted.looks_of(prototypes).tolist())
     rooms = []
     for room in lifted.boxes:
         found = []
-        for center, size, grid in zip(room.centers_m, room.sizes_m, grids, strict=False):
-            surface = surface_of(grid - 0.5, center, size, GRID.margin) if grid.any() else NOTHING
-            found.append(Mesh(*surface))
+        for center, size, look in zip(room.centers_m, room.sizes_m, looks, strict=False):
+            box_m = np.concatenate([center, size])
+            found.append(shapes.mesh(look, box_m) if look >= 0 else NOTHING)
         rooms.append(found)
     return rooms
 
 
-NOTHING = (np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
 
 
 def fit_rooms(dataset, truths, rows, mode, compositing, arguments) -> list[list[Mesh]]:

@@ -2,40 +2,48 @@
 
 import numpy as np
 import torch
+from parts_of_rooms import boxes, rays_of
 
+from sceneprior.core.parts import Parts, filled_cells
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.lifting.lifted import LiftedBoxes
-from sceneprior.lifted.occupancy import OccupancyConfig, OccupancyDecoder
+from sceneprior.lifted.lifting.lifted import LiftedBoxes, RayPool, ShapeGrid
+from sceneprior.lifted.looks import LookConfig, LookDecoder
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.rooms import SamplerRooms
 from sceneprior.lifted.sampler.settings import SamplerConfig
 from sceneprior.lifted.sampler.stage import teach
 
 CLASSES, CODES, CELLS, PROTOTYPES = 5, 7, 8, 12
+RAYS = 400
 TINY = {"epochs": 2, "width": 16, "layers": 1, "heads": 2, "dropout": 0.0}
+
+
+SOFA = boxes((0, 32, 0, 64, 0, 64), (32, 64, 0, 64, 0, 32))
+"""L-shaped: one corner is empty."""
+PLAIN = boxes((0, 64, 0, 64, 0, 64))
 
 
 class Lifted(LiftedDataset):
     """Rooms without shards: what the sampler reads of lifted ones."""
 
-    def __init__(self, boxes: list[LiftedBoxes], classes: list[int], grids: list[np.ndarray]):
+    def __init__(self, boxes: list[LiftedBoxes], classes: list[int], shapes: list[Parts]):
         self.rotations, self.label_set, self.boxes = 1, "toy", boxes
         self.plain_ids = [f"room{row}" for row in range(len(boxes))]
         self.object_classes = np.array(classes, dtype=np.int64)
-        self._grids = np.array(grids)
+        self._shape = ShapeGrid(CELLS, 1.0)
+        pools = [rays_of(each, RAYS, row, margin=1.0) for row, each in enumerate(shapes)]
+        self.rays = RayPool(*(np.stack(part) for part in zip(*pools, strict=True)))
+        self._hulls = np.stack([filled_cells(each, CELLS, 1.0) for each in shapes])
 
-    def grids(self) -> np.ndarray:
-        return self._grids
+    def hulls(self) -> np.ndarray:
+        return self._hulls
 
 
 def lifted_rooms(count: int = 6, seed: int = 0) -> Lifted:
     """An L-shaped sofa (1), a box (2), and in every other room a thin box (3), far enough from each
     other."""
     rng = np.random.default_rng(seed)
-    corner = np.ones((CELLS,) * 3, dtype=bool)
-    corner[4:, :, 4:] = False
-    plain = np.ones((CELLS,) * 3, dtype=bool)
-    boxes, classes, grids = [], [], []
+    boxes, classes, shapes = [], [], []
     for room in range(count):
         labels = [1, 2, 3][: 2 + room % 2]
         sizes = np.array([[2.0, 0.8, 1.4], [0.5, 0.5, 0.5], [0.3, 1.5, 0.3]])[: len(labels)]
@@ -44,8 +52,8 @@ def lifted_rooms(count: int = 6, seed: int = 0) -> Lifted:
         centers = np.stack([x, sizes[:, 1] / 2, rng.uniform(-0.5, 0.5, len(labels))], axis=1)
         boxes.append(LiftedBoxes(centers, sizes, np.ones(len(labels))))
         classes += labels
-        grids += [corner, plain, plain][: len(labels)]
-    return Lifted(boxes, classes, grids)
+        shapes += [SOFA, PLAIN, PLAIN][: len(labels)]
+    return Lifted(boxes, classes, shapes)
 
 
 def sampler_rooms(count: int = 6, seed: int = 0) -> SamplerRooms:
@@ -53,10 +61,10 @@ def sampler_rooms(count: int = 6, seed: int = 0) -> SamplerRooms:
     return SamplerRooms(lifted_rooms(count, seed)).see_looks(lifted_rooms().find_prototypes(99))
 
 
-def small_decoder() -> OccupancyDecoder:
+def small_decoder() -> LookDecoder:
     """A decoder that knows the shapes above."""
-    config = OccupancyConfig(prototypes=PROTOTYPES, codes=CODES, width=8, cells=CELLS, margin=1.0)
-    decoder = OccupancyDecoder(4, config)
+    config = LookConfig(prototypes=PROTOTYPES, codes=CODES, width=8, cells=CELLS, margin=1.0)
+    decoder = LookDecoder(4, config)
     decoder.learn_prototypes(lifted_rooms().find_prototypes(99))
     return decoder
 

@@ -64,6 +64,7 @@ OWNERS = {
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
     "skimage": ["sceneprior/core/geometry/isosurface.py"],
+    "manifold3d": ["sceneprior/core/geometry/part_meshes.py"],
     "fast_simplification": ["sceneprior/core/geometry/isosurface.py"],
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/stage"],
     "scipy.optimize": [

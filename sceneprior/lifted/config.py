@@ -14,7 +14,7 @@ from sceneprior.core.settings import Section
 from sceneprior.core.shards import list_shards
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.lifting.lifted import ShapeGrid
-from sceneprior.lifted.occupancy import OccupancyConfig, OccupancyDecoder
+from sceneprior.lifted.looks import LookConfig, LookDecoder
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.rooms import SamplerRooms
 from sceneprior.lifted.sampler.settings import SamplerConfig
@@ -70,7 +70,7 @@ class LiftedModel(ModelConfig):
     """The paper's network, with looks in place of deformed templates."""
 
     decoder: TransformerConfig
-    shape: OccupancyConfig = OccupancyConfig()
+    shape: LookConfig = LookConfig()
 
 
 class LiftedConfig(PriorConfig):
@@ -151,7 +151,7 @@ class LiftedConfig(PriorConfig):
         from sceneprior.lifted.stages import LiftedStage
 
         prior, latents = self.build_prior(), self.build_latents(len(rooms))
-        assert isinstance(prior.shape, OccupancyDecoder)
+        assert isinstance(prior.shape, LookDecoder)
         prior.shape.learn_prototypes(rooms.find_prototypes(self.model.shape.prototypes))
         target = self.model.completeness_target
         return LiftedStage(prior, latents, rooms, self.shape, self.loss, target, self.seed)
@@ -163,7 +163,7 @@ class LiftedConfig(PriorConfig):
 
         assert previous is not None, "the shape stage comes before"
         before = self.before(previous, rooms.room_ids)
-        assert isinstance(before.prior.shape, OccupancyDecoder)
+        assert isinstance(before.prior.shape, LookDecoder)
         prototypes = before.prior.shape.prototypes
         sampler = self.build_sampler(stage)
         teach(sampler, rooms.see_looks(prototypes))

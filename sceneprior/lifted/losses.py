@@ -90,7 +90,7 @@ def shape_code_loss(
     squared distance of two codes is about the number of grid cells in which their shapes differ,
     and cells_j is the number of cells that the lifted shape fills. Without the division, a lamp on
     a cord, which fills a hundredth of its box, would hardly be learnt. `codes` and `cells` are
-    those of the objects' looks (`OccupancyDecoder.targets`).
+    those of the objects' looks (`LookDecoder.targets`).
     """
     assert scenes.shape_codes is not None, "the prior decodes looks"
     apart = take(scenes.shape_codes, matches.prediction, dim=1) - codes

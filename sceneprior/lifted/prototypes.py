@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.core.geometry.turns import QUARTERS, turn_grids
+from sceneprior.core.parts import Parts
 
 POSES = 2 * QUARTERS
 """Poses of a prototype: mirrored or not, times the quarter turns; numbered as in the module's
@@ -35,7 +36,9 @@ sampler's network reads (`PARTS`)."""
 class Prototypes(NamedTuple):
     """Objects whose shapes represent those of all objects of their classes."""
 
+    parts: tuple[Parts, ...]
     grids: Bool[np.ndarray, "prototypes x y z"]
+    """The cells that the parts fill, in the frame of the object's box."""
     sizes_m: Float[np.ndarray, "prototypes 3"]
     object_class: Int[np.ndarray, " prototypes"]
     """Class of each prototype; -1 if it is not used."""
@@ -58,25 +61,6 @@ class Prototypes(NamedTuple):
         ]  # fmt: skip
         return np.stack(rows, axis=1).reshape(len(self.grids) * POSES, -1).astype(np.float32)
 
-    def looks_of(
-        self,
-        grids: Bool[np.ndarray, "objects x y z"],
-        sizes_m: Float[np.ndarray, "objects 3"],
-        object_class: Int[np.ndarray, " objects"],
-    ) -> Int[np.ndarray, " objects"]:
-        """The nearest look of each object; -1 if its class has no prototype."""
-        looks = np.full(len(grids), -1, dtype=np.int64)
-        for label in np.unique(object_class):
-            rows, own = (
-                np.flatnonzero(all_ == label) for all_ in (object_class, self.object_class)
-            )
-            if len(own):
-                theirs = (self.grids[own], self.sizes_m[own])
-                apart, pose = distances((grids[rows], sizes_m[rows]), theirs)
-                nearest = apart.argmin(axis=1)
-                looks[rows] = own[nearest] * POSES + pose[np.arange(len(rows)), nearest]
-        return looks
-
 
 def choose_prototypes(
     grids: Bool[np.ndarray, "objects x y z"],
@@ -84,9 +68,10 @@ def choose_prototypes(
     object_class: Int[np.ndarray, " objects"],
     usable: Bool[np.ndarray, " objects"],
     most: int,
-) -> Prototypes:
-    """Prototypes of each class: greedily, the object that looks like most of those left, until
-    every usable object looks like a prototype.
+) -> tuple[Int[np.ndarray, " prototypes"], Bool[np.ndarray, " prototypes"]]:
+    """Objects that become prototypes, and whether each is common (`COMMON`): greedily for each
+    class, the object that looks like most of those left, until every usable object looks like a
+    prototype.
 
     The threshold `ALIKE` is raised by half until there are at most `most` prototypes, or one per
     class.
@@ -95,13 +80,13 @@ def choose_prototypes(
     for label in np.unique(object_class[usable]):
         rows = np.flatnonzero((object_class == label) & usable)
         own = (grids[rows], sizes_m[rows])
-        apart.append((rows, distances(own, own)[0]))
+        apart.append((rows, pose_distances(own, own).min(axis=2)))
     alike = ALIKE
     items, common = _covering(apart, alike)
     while len(items) > max(most, len(apart)):
         alike *= 1.5
         items, common = _covering(apart, alike)
-    return Prototypes(grids[items], sizes_m[items], object_class[items], common)
+    return items, common
 
 
 def _covering(
@@ -148,29 +133,26 @@ def looks_apart(
     return placed
 
 
-def distances(
+def pose_distances(
     objects: tuple[Bool[np.ndarray, "objects x y z"], Float[np.ndarray, "objects 3"]],
     offered: tuple[Bool[np.ndarray, "offered x y z"], Float[np.ndarray, "offered 3"]],
-) -> tuple[Float[np.ndarray, "objects offered"], Int[np.ndarray, "objects offered"]]:
-    """Distance of each object (grids, extents in metres) from each offered one in the latter's best
-    pose, and that pose; the first of equal ones."""
+) -> Float[np.ndarray, "objects offered poses"]:
+    """Distance (`ALIKE`) of each object (grids, extents in metres) from each offered one in each
+    pose of the latter."""
     (coarse, log_sizes), (offered_coarse, offered_sizes) = (
         (pooled(grids, COARSE), np.log(sizes_m)) for grids, sizes_m in (objects, offered)
     )
     own = coarse.reshape(len(coarse), -1).astype(np.float64)
     theirs = offered_coarse.reshape(len(offered_coarse), -1)
     filled = np.sqrt(np.outer(own.sum(axis=1), theirs.sum(axis=1))).clip(min=1e-9)
-    apart = np.full(filled.shape, np.inf)
-    best = np.zeros(filled.shape, dtype=np.int64)
+    apart = np.empty((*filled.shape, POSES))
     for pose in range(POSES):
         turned = turn_grids(offered_coarse, *turn_of(pose)).reshape(theirs.shape)
         squared = (own**2).sum(1)[:, None] + (turned**2).sum(1) - 2 * own @ turned.T
         sizes = turned_extents(offered_sizes, pose)
         differ = np.abs(log_sizes[:, None] - sizes).sum(2)
-        found = squared / filled + SIZE_WEIGHT * differ
-        better = found < apart - 1e-9
-        best[better], apart[better] = pose, found[better]
-    return apart, best
+        apart[..., pose] = squared / filled + SIZE_WEIGHT * differ
+    return apart
 
 
 def turn_of(pose: int) -> tuple[int, bool]:

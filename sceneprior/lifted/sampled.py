@@ -11,7 +11,7 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.threads import single_threaded
-from sceneprior.lifted.occupancy import OccupancyDecoder
+from sceneprior.lifted.looks import LookDecoder
 from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.lifted.sampler.plan import Given
 from sceneprior.lifted.trained import SAMPLER, TrainedLifted
@@ -38,7 +38,7 @@ def sample_scenes(
     """A new room with meshes for each name; see `draw_rooms`."""
     sampler, shapes = trained.sampler, trained.prior.shape
     assert sampler is not None, "callers ask trained.sampler first"
-    assert isinstance(shapes, OccupancyDecoder), "whose looks the sampler draws"
+    assert isinstance(shapes, LookDecoder), "whose looks the sampler draws"
     rooms = draw_rooms(sampler, len(names), seed, given)
     assert rooms.looks is not None
     classes = label_set(trained.config.label_set)

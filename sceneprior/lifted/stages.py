@@ -6,6 +6,7 @@ from torch import Tensor
 from sceneprior.core.views import LiftedRooms
 from sceneprior.lifted.config import LiftedLossConfig, LiftedStageConfig
 from sceneprior.lifted.lifting.dataset import LiftedDataset
+from sceneprior.lifted.looks import LookDecoder
 from sceneprior.lifted.losses import (
     latent_loss,
     lifted_losses,
@@ -13,7 +14,6 @@ from sceneprior.lifted.losses import (
     needed_predictions,
     shape_code_loss,
 )
-from sceneprior.lifted.occupancy import OccupancyDecoder
 from sceneprior.paper.stages import LatentStage
 from sceneprior.training.steps import batch_seed, full_precision
 
@@ -26,9 +26,9 @@ class LiftedStage(LatentStage):
     rooms: LiftedDataset
 
     @property
-    def looks(self) -> OccupancyDecoder:
+    def looks(self) -> LookDecoder:
         """The shape decoder."""
-        assert isinstance(self.prior.shape, OccupancyDecoder)
+        assert isinstance(self.prior.shape, LookDecoder)
         return self.prior.shape
 
     def on_fit_start(self) -> None:

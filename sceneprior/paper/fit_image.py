@@ -78,7 +78,7 @@ def decode_images(
     """Decode as many objects of each latent as the fullest image shows, with shapes after the shape
     stage.
 
-    Without `with_grids`, shapes are decoded only where they are meshes: occupancy grids are not
+    Without `with_grids`, shapes are decoded only where they are meshes: looks are not
     compared with masks, so the fit does not need them.
     """
     z = trained.prior.latent_space.onto(points)
@@ -96,7 +96,7 @@ def view_loss(
 
     The scenes have at least as many objects as the fullest image shows. `masks` compares masks as
     well, for which `views` needs instance ids; objects without meshes (before the shape stage, or
-    with occupancy grids) have none.
+    with looks) have none.
     """
     weights, drawing = trained.config.view_terms
     boxes = seen_boxes(scenes, views, drawing)
@@ -126,7 +126,7 @@ def fit_latents_to_images(
 ) -> Fit:
     """Fit one latent per image by RMSProp on its view loss; return the best latent on the way.
 
-    For shapes that are occupancy grids, only classes and 2D boxes are fitted: their masks are not
+    For shapes that are looks, only classes and 2D boxes are fitted: their masks are not
     rendered.
 
     The fit moves z itself and projects it onto the sphere before each decoding. Training moves the

@@ -3,15 +3,17 @@
 import numpy as np
 import pytest
 import torch
+from parts_of_rooms import boxes
 from rooms_of_boxes import CELLS
 
 from sceneprior.core.geometry.turns import turn_grids
 from sceneprior.lifted.prototypes import (
     POSES,
+    Prototypes,
     choose_prototypes,
-    distances,
     looks_apart,
     pooled,
+    pose_distances,
     turn_of,
     turned_extents,
     turned_looks,
@@ -31,46 +33,39 @@ def in_poses() -> tuple[np.ndarray, np.ndarray]:
 def test_one_object_in_all_its_poses_is_one_prototype():
     grids, sizes = in_poses()
     labels, usable = np.ones(POSES, dtype=np.int64), np.ones(POSES, dtype=bool)
-    found = choose_prototypes(grids, sizes, labels, usable, most=99)
-    assert len(found.grids) == 1
-    looks = found.looks_of(grids, sizes, labels)
-    shown = found.shown()
-    for row, look in enumerate(looks):
-        assert look // POSES == 0
-        assert np.array_equal(turn_grids(found.grids, *turn_of(int(look % POSES)))[0], grids[row])
-        assert np.allclose(shown[look][-3:], np.log(sizes[row]))
-        assert np.allclose(shown[look][:-3], pooled(grids[row : row + 1], 4).ravel())
+    items, common = choose_prototypes(grids, sizes, labels, usable, most=99)
+    assert items.tolist() == [0] and common.tolist() == [True]
+    nothing = boxes((0, 64, 0, 64, 0, 64))
+    shown = Prototypes((nothing,), grids[:1], sizes[:1], labels[:1], common).shown()
+    for pose in range(POSES):
+        assert np.allclose(shown[pose][-3:], np.log(sizes[pose]))
+        assert np.allclose(shown[pose][:-3], pooled(grids[pose : pose + 1], 4).ravel())
 
 
 def test_other_classes_and_other_sizes_are_other_prototypes():
     grids = np.stack([ODD] * 9)
     sizes = np.stack([SIZE] * 6 + [2 * SIZE] * 3)
     labels = np.array([1] * 3 + [2] * 6)
-    found = choose_prototypes(grids, sizes, labels, np.ones(9, dtype=bool), most=99)
-    assert sorted(found.object_class.tolist()) == [1, 2, 2]
-    assert found.looks_of(grids, sizes, np.full(9, 3)).tolist() == [-1] * 9  # no such class
-    fewer = choose_prototypes(grids, sizes, labels, np.ones(9, dtype=bool), most=1)
-    assert sorted(fewer.object_class.tolist()) == [1, 2]  # one a class stays
+    items, _ = choose_prototypes(grids, sizes, labels, np.ones(9, dtype=bool), most=99)
+    assert sorted(labels[items].tolist()) == [1, 2, 2]
+    fewer, _ = choose_prototypes(grids, sizes, labels, np.ones(9, dtype=bool), most=1)
+    assert sorted(labels[fewer].tolist()) == [1, 2]  # one a class stays
 
 
 def test_an_odd_shape_is_a_prototype_but_no_common_one():
     grids = np.stack([ODD] * 3 + [~ODD] * 2)
     sizes, labels = np.stack([SIZE] * 5), np.ones(5, dtype=np.int64)
-    found = choose_prototypes(grids, sizes, labels, np.ones(5, dtype=bool), most=99)
-    assert np.array_equal(found.grids, np.stack([ODD, ~ODD]))
-    assert found.common.tolist() == [True, False]
-    assert (found.looks_of(grids, sizes, labels) // POSES).tolist() == [0, 0, 0, 1, 1]
-    # Of common ones alone, it looks like the one that others share.
-    assert (found.common_alone().looks_of(grids, sizes, labels) // POSES == 0).all()
+    items, common = choose_prototypes(grids, sizes, labels, np.ones(5, dtype=bool), most=99)
+    assert (items < 3).tolist() == [True, False] and common.tolist() == [True, False]
     # But a class has at least one.
-    alone = choose_prototypes(grids[:1], sizes[:1], labels[:1], np.ones(1, dtype=bool), most=99)
-    assert alone.common.tolist() == [True]
+    _, alone = choose_prototypes(grids[:1], sizes[:1], labels[:1], np.ones(1, dtype=bool), most=99)
+    assert alone.tolist() == [True]
 
 
 def test_distances_are_those_of_a_loop():
     grids = RNG.random((3, CELLS, CELLS, CELLS)) < 0.5
     sizes = RNG.uniform(0.3, 2, (3, 3))
-    ours, pose = distances((grids, sizes), (grids[:2], sizes[:2]))
+    ours = pose_distances((grids, sizes), (grids[:2], sizes[:2]))
     for a in range(3):
         for b in range(2):
             each = []
@@ -80,8 +75,7 @@ def test_distances_are_those_of_a_loop():
                 here = pooled(grids[a : a + 1], 8)[0]
                 relative = ((here - there) ** 2).sum() / np.sqrt(here.sum() * there.sum())
                 each.append(relative + 0.3 * np.abs(differ).sum())
-            assert ours[a, b] == pytest.approx(min(each), abs=1e-6)
-            assert each[pose[a, b]] == pytest.approx(min(each), abs=1e-6)
+            assert ours[a, b] == pytest.approx(each, abs=1e-6)
 
 
 @pytest.mark.parametrize("layers", [CELLS // 8, CELLS // 2])
@@ -90,7 +84,7 @@ def test_thin_things_are_as_far_apart_as_full_ones(layers):
     both = np.zeros((2, CELLS, CELLS, CELLS), dtype=bool)
     both[0, :, :layers], both[1, :, -layers:] = True, True
     sizes = np.ones((2, 3))
-    apart, _ = distances((both, sizes), (both, sizes))
+    apart = pose_distances((both, sizes), (both, sizes)).min(axis=2)
     assert apart == pytest.approx(np.array([[0, 2], [2, 0]]))
 
 

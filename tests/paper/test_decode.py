@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from parts_of_rooms import boxes
 from tiny_runs import tiny_config, tiny_lifted
 
 from sceneprior.apps.config import load_run
 from sceneprior.apps.sample import sample_rooms
+from sceneprior.core.parts import filled_cells
 from sceneprior.core.scene import Scene
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototypes import POSES, Prototypes
@@ -85,12 +87,11 @@ def test_nothing_complete_is_an_empty_room_and_no_vertices_are_boxes(decoded, pr
 
 
 def test_looks_become_meshes_in_the_boxes_of_objects_that_are_kept(decoded, tmp_path):
-    grids = np.zeros((2, 8, 8, 8), dtype=bool)
-    grids[0, :, :4] = True  # the lower half of every frame
-    grids[1, :4] = True
+    halves = boxes((0, 64, 0, 32, 0, 64)), boxes((0, 32, 0, 64, 0, 64))
+    grids = np.stack([filled_cells(each, 8, 1.1) for each in halves])
     prior = tiny_lifted(tmp_path).build_prior()
     prior.shape.learn_prototypes(
-        Prototypes(grids, np.ones((2, 3)), np.array([9, 13]), np.ones(2, dtype=bool))
+        Prototypes(halves, grids, np.ones((2, 3)), np.array([9, 13]), np.ones(2, dtype=bool))
     )
     looks = torch.tensor([[0, POSES, 0, 0], [0, 0, 0, 0]])
     chosen = replace(decoded, vertices_m=None, looks=looks)
@@ -99,7 +100,7 @@ def test_looks_become_meshes_in_the_boxes_of_objects_that_are_kept(decoded, tmp_
         low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
         bottom = np.subtract(item.center_m, np.divide(item.size_m, 2))
         np.testing.assert_allclose(low, bottom, atol=1e-6)
-        np.testing.assert_allclose(high - low, np.multiply(item.size_m, share), atol=1e-6)
+        np.testing.assert_allclose(high - low, np.multiply(item.size_m, share), atol=2e-3)
 
 
 def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(trained, monkeypatch):

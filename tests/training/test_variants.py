@@ -18,7 +18,6 @@ from sceneprior.apps.experiments.evaluate import (
 )
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.lifted.lifting import dataset as lifted
-from sceneprior.lifted.prototypes import Prototypes
 from sceneprior.paper.decode import decode_training_rooms
 from sceneprior.paper.sampling import DISTRIBUTIONS
 from sceneprior.training.checkpoints import read_checkpoint
@@ -123,7 +122,7 @@ def test_a_stopped_variant_resumes_to_the_same_weights(variant, tmp_path, monkey
     monkeypatch.setattr(
         lifted,
         "choose_prototypes",
-        lambda *given: Prototypes(*(part[::-1].copy() for part in found(*given))),
+        lambda *given: tuple(part[::-1].copy() for part in found(*given)),
     )
     fit(config, run, resume=True, trainer_options=CPU)
     wanted = read_checkpoint(whole / "shape" / "final.ckpt")["state_dict"]

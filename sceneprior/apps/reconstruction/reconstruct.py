@@ -39,7 +39,7 @@ class FitOptions:
     """Latents fitted to each image, started at its nearest training rooms; the latent with the
     lowest score is kept."""
     masks: bool = True
-    """Fit latents to masks too. False uses only classes and 2D boxes, as with occupancy grids."""
+    """Fit latents to masks too. False uses only classes and 2D boxes, as with looks."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.layout_distance import nearest_room
 from sceneprior.evaluation.metrics.contents import common_label_set
-from sceneprior.lifted.occupancy import OccupancyDecoder
+from sceneprior.lifted.looks import LookDecoder
 from sceneprior.lifted.trained import SAMPLER, TrainedLifted
 from sceneprior.paper.decode import decode_latents, to_rooms
 from sceneprior.paper.interpolate import path_latents
@@ -194,7 +194,7 @@ class Explorer:
     def find_meshes(self, stop: threading.Event) -> None:
         """Extract the meshes of all shape prototypes in advance, so that no room has to wait."""
         trained = self.prior.trained
-        if isinstance(trained, TrainedPrior) and isinstance(trained.prior.shape, OccupancyDecoder):
+        if isinstance(trained, TrainedPrior) and isinstance(trained.prior.shape, LookDecoder):
             for prototype in trained.prior.shape.known:
                 if stop.is_set():
                     return

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from rich.console import Console
 from rich.progress import track
 from torch import Tensor
@@ -19,27 +19,27 @@ from sceneprior.core.data.dataset import BLANK, RoomDataset, allowed_views
 from sceneprior.core.errors import ShardError
 from sceneprior.core.files import write_whole
 from sceneprior.core.geometry.turns import turn_boxes
+from sceneprior.core.parts import filled_cells
 from sceneprior.core.shards import RoomViews, Shard, iterate_rooms
 from sceneprior.core.views import LiftedRooms
-from sceneprior.lifted.lifting.lifted import LiftedBoxes, ShapeGrid
+from sceneprior.lifted.lifting.lifted import LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turned_looks
 
 VERSION = 1
 """Version of the cached boxes."""
-SHAPES_VERSION = 4
-"""Version of the cached shapes. Raise it, or `VERSION`, when `lift_shapes` or `lift_boxes` give
-another result for the same views."""
+SHAPES_VERSION = 5
+"""Version of the cached hulls and rays. Raise it, or `VERSION`, when the same views give others."""
 
 RAYS_KEPT = 1024
-"""Rays per object from which shapes are thinned."""
+"""Rays per object from which shapes are found."""
 
 
 class LiftedDataset(RoomDataset):
     """Tracked objects of a split with the 3D boxes estimated from their masks; rows and turns are
     those of `ViewDataset`.
 
-    Boxes are computed once, at 0.2 CPU seconds per object, and cached as `lifted_<split>.npz`
-    beside the shards if that folder is writable; shapes likewise, if `shape` gives their grid.
+    Boxes are computed once and cached as `lifted_<split>.npz` beside the shards if that folder is
+    writable; visual hulls and rays likewise, if `shape` gives the hulls' grid.
     `view_fraction` and `seed` are those of `ViewDataset`. If no object is visible in two views, a
     `ShardError` says so.
     """
@@ -88,12 +88,14 @@ class LiftedDataset(RoomDataset):
                 f"and high, in at least two views of a room, and here are {views} views (at "
                 f"data.view_fraction {view_fraction:g}). Prepare more or larger views of each room."
             )
-        self._bits, self._cells = np.zeros((0, 0), dtype=np.uint8), 0
         self._looks: Tensor | None = None
         """Looks by room and quarter turn."""
+        self._shape = shape
         if shape is not None:
-            self._bits = _find_shapes(folder, split, key, rooms, self.boxes, chosen, shape)
-            self._cells = shape.cells
+            found = _find_shapes(folder, split, key, rooms, self.boxes, chosen, shape)
+            self._bits = found["bits"]
+            self.rays = RayPool(*(found[name] for name in RayPool._fields))
+            """Rays around the masks of all objects, room after room."""
 
     @property
     def usable(self) -> Bool[np.ndarray, " objects"]:
@@ -108,12 +110,25 @@ class LiftedDataset(RoomDataset):
         return np.where(self.usable[:, None], sizes_m, 1.0)
 
     def find_prototypes(self, most: int) -> Prototypes:
-        """At most `most` prototypes that represent the shapes of all usable objects."""
-        return choose_prototypes(self.grids(), self.sizes_m, self.object_classes, self.usable, most)
+        """At most `most` prototypes, in parts, that represent the shapes of all usable objects."""
+        # Imported only where something is lifted, here and below, since Numba is slow to import.
+        from sceneprior.lifted.lifting.kinds import fit_kinds
+
+        assert self._shape is not None, "opened with shapes"
+        hulls, sizes_m, labels = self.hulls(), self.sizes_m, self.object_classes
+        items, common = choose_prototypes(hulls, sizes_m, labels, self.usable, most)
+        margin = self._shape.margin
+        parts = fit_kinds(items, hulls, self.rays, sizes_m, labels, self.usable, margin)
+        grids = [filled_cells(each, self._shape.cells, margin) for each in parts]
+        return Prototypes(parts, np.stack(grids), sizes_m[items], labels[items], common)
 
     def looks_of(self, prototypes: Prototypes) -> Int[np.ndarray, " objects"]:
         """The look of each object; -1 if it is not usable or its class has no prototype."""
-        looks = prototypes.looks_of(self.grids(), self.sizes_m, self.object_classes)
+        from sceneprior.lifted.lifting.kinds import looks_of
+
+        assert self._shape is not None, "opened with shapes"
+        margin = self._shape.margin
+        looks = looks_of(prototypes, self.rays, self.sizes_m, self.object_classes, margin)
         return np.where(self.usable, looks, -1)
 
     def see_looks(self, prototypes: Prototypes) -> None:
@@ -132,11 +147,12 @@ class LiftedDataset(RoomDataset):
         padded = torch.nn.utils.rnn.pad_sequence(list(parts), batch_first=True, padding_value=-1)
         self._looks = padded.transpose(1, 2).to(self._counts.device)
 
-    def grids(self) -> Bool[np.ndarray, "objects x y z"]:
-        """The lifted shapes of all objects, room after room; see `lift_shapes` and
-        `thin_shapes`."""
-        flat = np.unpackbits(self._bits, axis=1, count=self._cells**3).view(bool)
-        return flat.reshape(-1, *(self._cells,) * 3)
+    def hulls(self) -> Bool[np.ndarray, "objects x y z"]:
+        """The visual hulls of all objects, room after room; see `lift_shapes`."""
+        assert self._shape is not None, "opened with shapes"
+        cells = self._shape.cells
+        flat = np.unpackbits(self._bits, axis=1, count=cells**3).view(bool)
+        return flat.reshape(-1, cells, cells, cells)
 
     def to(self, device: torch.device | str) -> "LiftedDataset":
         """Move all boxes and looks to `device`, on which batches are then assembled."""
@@ -175,7 +191,6 @@ def _find_boxes(
     folder: Path, split: str, key: str, counts: Sequence[int], chosen: Sequence[np.ndarray]
 ) -> list[LiftedBoxes]:
     def find() -> dict[str, np.ndarray]:
-        # Imported only where something is lifted, here and below, since Numba is slow to import.
         from sceneprior.lifted.lifting.boxes import lift_boxes
 
         progress = track(chosen, "lifting boxes from masks (rooms)", console=Console(stderr=True))
@@ -201,13 +216,12 @@ def _find_shapes(
     boxes: Sequence[LiftedBoxes],
     chosen: Sequence[np.ndarray],
     shape: ShapeGrid,
-) -> UInt8[np.ndarray, "objects bytes"]:
-    """Lifted shapes, packed to eight cells per byte."""
+) -> dict[str, np.ndarray]:
+    """Visual hulls (`bits`), packed to eight cells per byte, and the fields of a `RayPool`."""
 
     def find() -> dict[str, np.ndarray]:
-        from sceneprior.lifted.lifting.rays import RayPool, draw_rays
-        from sceneprior.lifted.lifting.shapes import lift_shapes, made_symmetric
-        from sceneprior.lifted.lifting.thinning import thin_shapes
+        from sceneprior.lifted.lifting.rays import draw_rays
+        from sceneprior.lifted.lifting.shapes import lift_shapes
 
         hulls, rays = [], []
         progress = track(boxes, "lifting shapes from masks (rooms)", console=Console(stderr=True))
@@ -217,17 +231,17 @@ def _find_shapes(
             room = shard.read_room(room_id, images=True)
             hulls.append(lift_shapes(room, its_boxes, shape, views))
             rays.append(draw_rays(room, its_boxes, RAYS_KEPT, shape.margin, views))
-        thin = thin_shapes(
-            np.concatenate(hulls),
-            RayPool(*(np.concatenate(part) for part in zip(*rays, strict=True))),
-            np.concatenate([each.sizes_m for each in boxes]),
-            np.concatenate([room.object_class for room in rooms]),
-        )
-        grids = made_symmetric(thin)
-        return {"bits": np.packbits(grids.reshape(len(grids), -1), axis=1)}
+        grids = np.concatenate(hulls)
+        starts, spans, hits = (np.concatenate(part) for part in zip(*rays, strict=True))
+        return {
+            "bits": np.packbits(grids.reshape(len(grids), -1), axis=1),
+            "starts": starts.astype(np.float16),
+            "spans": spans.astype(np.float16),
+            "hits": hits,
+        }
 
     key = f"{key} {SHAPES_VERSION} {shape.cells} {shape.margin}"
-    return _kept(folder / f"lifted_shapes_{split}.npz", key, find)["bits"]
+    return _kept(folder / f"lifted_shapes_{split}.npz", key, find)
 
 
 def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

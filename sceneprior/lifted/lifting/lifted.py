@@ -4,7 +4,7 @@ them."""
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 
 class LiftedBoxes(NamedTuple):
@@ -24,3 +24,16 @@ class ShapeGrid(NamedTuple):
     """Cells along each axis."""
     margin: float
     """Extent of the grid, relative to the object's box."""
+
+
+class RayPool(NamedTuple):
+    """Segments of rays in the frames of one or more objects, which span [-1, 1]; as many for each
+    object."""
+
+    starts: Float[np.ndarray, "*objects rays 3"]
+    """Points at which the rays enter the frame."""
+    spans: Float[np.ndarray, "*objects rays 3"]
+    """Vector from there to the point where the ray leaves the frame or its course becomes unknown;
+    0 for a ray without information."""
+    hits: Bool[np.ndarray, "*objects rays"]
+    """True if the object is met on the segment; otherwise the whole segment is empty."""

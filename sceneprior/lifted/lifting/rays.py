@@ -1,15 +1,15 @@
 """Rays around an object's masks: each either meets the object or passes through empty space."""
 
-from typing import NamedTuple, no_type_check
+from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 from numba import njit
 
 from sceneprior.core.shards import RoomViews
 from sceneprior.lifted.lifting.boxes import pixel_directions
 from sceneprior.lifted.lifting.hulls import own_in, pass_through, sightings_of
-from sceneprior.lifted.lifting.lifted import LiftedBoxes
+from sceneprior.lifted.lifting.lifted import LiftedBoxes, RayPool
 from sceneprior.render.silhouettes.cpu.threads import in_threads
 
 NEAR_OUTLINE_PX = 4
@@ -17,19 +17,6 @@ NEAR_OUTLINE_PX = 4
 often as all others together."""
 FAR_M = 100.0
 """Length of rays that no object stops."""
-
-
-class RayPool(NamedTuple):
-    """Segments of rays in the frames of one or more objects, which span [-1, 1]; as many for each
-    object."""
-
-    starts: Float[np.ndarray, "*objects rays 3"]
-    """Points at which the rays enter the frame."""
-    spans: Float[np.ndarray, "*objects rays 3"]
-    """Vector from there to the point where the ray leaves the frame or its course becomes unknown;
-    0 for a ray without information."""
-    hits: Bool[np.ndarray, "*objects rays"]
-    """True if the object is met on the segment; otherwise the whole segment is empty."""
 
 
 def draw_rays(

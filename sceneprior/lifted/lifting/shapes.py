@@ -1,8 +1,4 @@
-"""Visual hulls of tracked objects, on a grid in the frame of each object's box.
-
-Most furniture is symmetric, but only some sides of a piece are seen, and the hull is full on the
-others: `made_symmetric` empties a cell that is empty on the other side.
-"""
+"""Visual hulls of tracked objects, on a grid in the frame of each object's box."""
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -16,10 +12,6 @@ REACH = 0.4
 EMPTY = 0.05
 """Share of views seeing past a cell above which it is empty. It is lower than the limit in
 `boxes.py`, where one wrong cell can move a whole side of a box; here it is only one cell."""
-ALIKE = 0.75
-"""IoU of a shape with its mirror image from which it counts as symmetric."""
-SIDES = (0, 2)
-"""Axes along which furniture may be symmetric: x and z, not top to bottom."""
 
 
 def lift_shapes(
@@ -45,22 +37,3 @@ def lift_shapes(
         hull = carve(seen, low_m, high_m, cells, REACH, EMPTY)
         grids[item] = (hull.emptiness <= EMPTY) & inside & inside[:, None] & inside[:, None, None]
     return grids
-
-
-def made_symmetric(
-    grids: Bool[np.ndarray, "objects x y z"],
-) -> Bool[np.ndarray, "objects x y z"]:
-    """Shapes without the cells whose mirror images are empty, along each axis along which a shape
-    is nearly symmetric.
-
-    A vertical column that would become empty is left unchanged: boxes are not centred to the cell,
-    and hulls are accurate in the outline seen from above.
-    """
-    found = grids.copy()
-    for axis in SIDES:
-        mirrored = np.flip(found, axis + 1)
-        both, either = (part.sum(axis=(1, 2, 3)) for part in (found & mirrored, found | mirrored))
-        nearly = both >= ALIKE * either
-        found &= mirrored | ~nearly[:, None, None, None]
-    lost = grids.any(axis=2, keepdims=True) & ~found.any(axis=2, keepdims=True)
-    return found | (grids & lost)

@@ -12,7 +12,7 @@ from sceneprior.core.classes import VOID
 from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.meshes import beveled_cube, icosphere
 from sceneprior.core.views import DecodedScenes
-from sceneprior.lifted.occupancy import OccupancyDecoder
+from sceneprior.lifted.looks import LookDecoder
 from sceneprior.paper.losses.completeness import kept_objects
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.paper.trained import TrainedPrior
@@ -117,7 +117,7 @@ def _furthest(
         away = decoded.vertices_m[row, slot] - decoded.centers_m[row, slot].unsqueeze(1)
         surfaces = list(away / sizes_m.unsqueeze(1))
     else:
-        assert decoded.looks is not None and isinstance(prior.shape, OccupancyDecoder)
+        assert decoded.looks is not None and isinstance(prior.shape, LookDecoder)
         meshes = [prior.shape.mesh(look, UNIT_BOX) for look in decoded.looks[row, slot].tolist()]
         surfaces = [torch.from_numpy(mesh.vertices_m).to(directions) for mesh in meshes]
     return torch.stack([each[(each @ directions.T).argmax(dim=0)] for each in surfaces])

@@ -17,9 +17,10 @@ from sceneprior.core.shards import iterate_rooms
 from sceneprior.lifted.lifting import boxes, shapes
 from sceneprior.lifted.lifting import dataset as module
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.lifting.lifted import ShapeGrid
-from sceneprior.lifted.lifting.shapes import lift_shapes
-from sceneprior.lifted.prototypes import POSES, Prototypes, turn_of
+from sceneprior.lifted.lifting.kinds import looks_of
+from sceneprior.lifted.lifting.lifted import RayPool, ShapeGrid
+from sceneprior.lifted.lifting.rays import draw_rays
+from sceneprior.lifted.prototypes import POSES, turn_of
 
 GRID = ShapeGrid(cells=8, margin=1.2)
 
@@ -50,30 +51,21 @@ def test_rows_and_objects_are_those_of_the_views_and_truth_is_not_needed(shards)
     assert mine.looks is None
 
 
-def test_turned_rows_are_turned_rooms(shards, monkeypatch):
-    rng = np.random.default_rng(0)
-    monkeypatch.setattr(
-        shapes,
-        "lift_shapes",
-        lambda views, *_: rng.random((len(views.object_class), 8, 8, 8)) < 0.5,
-    )
-    monkeypatch.setattr(module, "write_whole", lambda *_: None)
-    data = LiftedDataset(shards, "train", rotations=4, shape=GRID._replace(margin=1.15))
-    common = np.ones(len(data.object_classes), dtype=bool)  # every one its own
-    prototypes = Prototypes(data.grids(), data.sizes_m, data.object_classes, common)
+def test_turned_rows_are_turned_rooms(shards):
+    data = LiftedDataset(shards, "train", rotations=4, shape=GRID)
+    prototypes = data.find_prototypes(99)
+    odd = np.random.default_rng(0).random((1, 8, 8, 8))  # another grid in every pose
     data.see_looks(prototypes)
     plain, turned = data.__getitems__([(4, 0)]), data.__getitems__([(7, 2)])
     assert torch.equal(turned.boxes_m, turn_boxes(plain.boxes_m, torch.tensor([3])))
     for item in range(int(plain.is_object.sum())):
-        before, after = (
-            turn_grids(prototypes.grids[look // POSES][None], *turn_of(look % POSES))[0]
-            for look in (int(batch.looks[0, item]) for batch in (plain, turned))
-        )
-        np.testing.assert_array_equal(np.rot90(before, 3, axes=(2, 0)), after)
-        assert (before != after).any()
+        before, after = (int(batch.looks[0, item]) for batch in (plain, turned))
+        assert before // POSES == after // POSES
+        here, there = (turn_grids(odd, *turn_of(look % POSES))[0] for look in (before, after))
+        np.testing.assert_array_equal(np.rot90(here, 3, axes=(2, 0)), there)
 
 
-def test_looks_are_those_of_the_lifted_shapes_in_the_order_of_objects(shards):
+def test_looks_are_those_of_the_rays_in_the_order_of_objects(shards):
     data = LiftedDataset(shards, "train", shape=GRID)
     assert data.__getitems__([(1, 0)]).looks is None, "not before there are prototypes"
     prototypes = data.find_prototypes(99)
@@ -82,11 +74,13 @@ def test_looks_are_those_of_the_lifted_shapes_in_the_order_of_objects(shards):
     for row, (shard, room_id) in enumerate(iterate_rooms(shards, "train")):
         if row in (1, 3):
             room = shard.read_room(room_id, images=True)
-            grids = lift_shapes(room, data.boxes[row], GRID)
-            sizes_m = np.where(data.boxes[row].sizes_m > 0, data.boxes[row].sizes_m, 1)
-            wanted = prototypes.looks_of(grids, sizes_m, room.object_class.astype(np.int64))
+            rays = draw_rays(room, data.boxes[row], 1024, GRID.margin)
+            rays = RayPool(*(part.astype(np.float16) for part in rays[:2]), rays.hits)
             known = (data.boxes[row].explained > 0) & (room.object_class != VOID)
-            found = batch.looks[(row - 1) // 2, : len(grids)].numpy()
+            sizes_m = np.where(known[:, None], data.boxes[row].sizes_m, 1)
+            labels = room.object_class.astype(np.int64)
+            wanted = looks_of(prototypes, rays, sizes_m, labels, GRID.margin)
+            found = batch.looks[(row - 1) // 2, : len(labels)].numpy()
             np.testing.assert_array_equal(found, np.where(known, wanted, -1))
             assert (found >= 0).any()
 

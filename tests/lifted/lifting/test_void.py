@@ -9,12 +9,13 @@ from toy_rooms import look_at
 
 from sceneprior.core.classes import VOID
 from sceneprior.core.instances.observations import observe
+from sceneprior.core.parts import filled_cells
 from sceneprior.core.scene import Mesh
 from sceneprior.lifted.lifting.boxes import lift_boxes
-from sceneprior.lifted.lifting.lifted import ShapeGrid
+from sceneprior.lifted.lifting.lifted import RayPool, ShapeGrid
+from sceneprior.lifted.lifting.part_fit import fit_parts
 from sceneprior.lifted.lifting.rays import draw_rays
 from sceneprior.lifted.lifting.shapes import lift_shapes
-from sceneprior.lifted.lifting.thinning import thin_shapes
 from sceneprior.render.offscreen import Pinhole, SoftwareRenderer
 
 GRID = ShapeGrid(cells=24, margin=1.15)
@@ -47,10 +48,10 @@ def lifted_bed(room):
     """Its box and its volume in m3."""
     boxes = lift_boxes(room)
     hulls = lift_shapes(room, boxes, GRID)
-    rays = draw_rays(room, boxes, 1024, GRID.margin)
-    thin = thin_shapes(hulls, rays, boxes.sizes_m, np.asarray(room.object_class, dtype=np.int64))
-    cell_m3 = (GRID.margin * boxes.sizes_m[0] / GRID.cells).prod()
-    return boxes.centers_m[0], boxes.sizes_m[0], thin[0].sum() * cell_m3
+    rays = RayPool(*(part[0] for part in draw_rays(room, boxes, 1024, GRID.margin)))
+    parts = fit_parts(rays, hulls[0], GRID.margin)
+    volume_m3 = filled_cells(parts, 64, 1.0).mean() * boxes.sizes_m[0].prod()
+    return boxes.centers_m[0], boxes.sizes_m[0], volume_m3
 
 
 def test_a_bed_behind_a_void_chest_keeps_its_height_and_volume():

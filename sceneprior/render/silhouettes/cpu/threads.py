@@ -21,11 +21,9 @@ CHUNKS = 3
 def in_threads(function: Callable[..., None], items: int, *arguments: Any) -> None:
     """Call function(first, last, *arguments) for parts that cover range(items).
 
-    It uses as many threads as Numba may (NUMBA_NUM_THREADS, or all cores).
+    It uses as many threads as Numba may (`thread_count`).
     """
-    # numba.get_num_threads() would start Numba's own pool, which with OpenMP overrides torch's
-    # number of threads.
-    threads: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    threads = thread_count()
     parts = min(items, threads * CHUNKS if threads > 1 else 1)
     if parts < 2:
         function(0, items, *arguments)
@@ -35,6 +33,14 @@ def in_threads(function: Callable[..., None], items: int, *arguments: Any) -> No
     jobs = [pool.submit(function, *part, *arguments) for part in itertools.pairwise(ends)]
     for job in jobs:
         job.result()
+
+
+def thread_count() -> int:
+    """Number of threads that Numba may use: NUMBA_NUM_THREADS, or all cores."""
+    # numba.get_num_threads() would start Numba's own pool, which with OpenMP overrides torch's
+    # number of threads.
+    count: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    return count
 
 
 @lru_cache(maxsize=4)

@@ -1,4 +1,4 @@
-"""The occupancy decoder: from an object's feature to a prototype shape in one of its poses.
+"""The look decoder: from an object's feature to a prototype, made of parts, in one of its poses.
 
 It replaces the paper's deformed template; such shapes may have legs, holes and thin tops.
 """
@@ -12,16 +12,23 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
-from sceneprior.core.geometry.isosurface import surface_of
+from sceneprior.core.geometry.part_meshes import stretched, surface_of_parts
 from sceneprior.core.geometry.turns import quarter_rotation
+from sceneprior.core.parts import MOST_PARTS, Parts, filled_cells
 from sceneprior.core.scene import Mesh
 from sceneprior.core.views import DecodedScenes
-from sceneprior.lifted.prototypes import POSES, Prototypes, looks_apart, turn_of
+from sceneprior.lifted.prototypes import (
+    POSES,
+    Prototypes,
+    looks_apart,
+    turn_of,
+    turned_extents,
+)
 from sceneprior.paper.layers import ShapeModule, ShapeModuleConfig
 
 
-class OccupancyConfig(ShapeModuleConfig):
-    """Shapes as occupancy grids, chosen among prototypes lifted from the training rooms' masks."""
+class LookConfig(ShapeModuleConfig):
+    """Shapes in parts, chosen among prototypes lifted from the training rooms' masks."""
 
     prototypes: int = Field(1024, ge=1)
     """Maximum number of prototype shapes, which represent the shapes of all objects."""
@@ -30,16 +37,16 @@ class OccupancyConfig(ShapeModuleConfig):
     width: int = Field(128, ge=8)
     """Hidden width of the MLP that predicts the code."""
     cells: int = Field(32, ge=8, le=64)
-    """Cells along each axis of the grid."""
+    """Cells along each axis of the grids on which visual hulls are carved and looks compared."""
     margin: float = Field(1.1, ge=1, le=2)
-    """Extent of the grid, relative to the object's box."""
+    """Extent of these grids, relative to the object's box."""
 
-    def build(self, features: int) -> "OccupancyDecoder":
+    def build(self, features: int) -> "LookDecoder":
         """The module for object features of this width, freshly initialised."""
-        return OccupancyDecoder(features, self)
+        return LookDecoder(features, self)
 
 
-class OccupancyDecoder(ShapeModule):
+class LookDecoder(ShapeModule):
     """An MLP on MLP1's output predicts a code; the object gets the look whose code is nearest.
 
     Looks are defined in `lifted/prototypes.py`: a prototype shape in one of its poses. Squared
@@ -53,26 +60,31 @@ class OccupancyDecoder(ShapeModule):
 
     faces = None
     unknown: ClassVar[int] = -1
-    """Class of unused prototype slots."""
+    """Class of unused prototypes, and kind of unused parts."""
 
-    def __init__(self, features: int, config: OccupancyConfig):
+    def __init__(self, features: int, config: LookConfig):
         super().__init__()
-        width, cells, most = config.width, config.cells, config.prototypes
-        self.cells, self.margin = cells, config.margin
+        width, most = config.width, config.prototypes
+        self.cells, self.margin = config.cells, config.margin
         self.mlp = nn.Sequential(
             nn.ReLU(),
             nn.Linear(features, width), nn.SiLU(),
             nn.Linear(width, width), nn.SiLU(),
             nn.Linear(width, config.codes),
         )  # fmt: skip
-        self.grid_bits: Tensor
+        self.part_kind: Tensor
+        self.part_mirrored: Tensor
+        self.part_ends: Tensor
         self.filled: Tensor
         self.sizes_m: Tensor
         self.object_class: Tensor
         self.common: Tensor
         self.look_codes: Tensor
         self.spread: Tensor
-        self.register_buffer("grid_bits", torch.zeros(most, -(-(cells**3) // 8), dtype=torch.uint8))
+        slots = (most, MOST_PARTS)
+        self.register_buffer("part_kind", torch.full(slots, self.unknown, dtype=torch.int8))
+        self.register_buffer("part_mirrored", torch.zeros(slots, dtype=torch.int8))
+        self.register_buffer("part_ends", torch.zeros(*slots, 3, 2))
         self.register_buffer("filled", torch.ones(most))
         self.register_buffer("sizes_m", torch.ones(most, 3))
         self.register_buffer("object_class", torch.full((most,), self.unknown))
@@ -83,10 +95,14 @@ class OccupancyDecoder(ShapeModule):
 
     def learn_prototypes(self, prototypes: Prototypes) -> None:
         """Set the prototypes whose looks are decoded."""
-        count = len(prototypes.grids)
-        flat = prototypes.grids.reshape(count, -1)
-        self.grid_bits[:count] = torch.from_numpy(np.packbits(flat, axis=1))
-        self.filled[:count] = torch.from_numpy(flat.sum(axis=1).clip(min=1).astype(np.float32))
+        count = len(prototypes.parts)
+        for row, parts in enumerate(prototypes.parts):
+            used = slice(len(parts.kind))
+            self.part_kind[row, used] = torch.from_numpy(parts.kind)
+            self.part_mirrored[row, used] = torch.from_numpy(parts.mirrored)
+            self.part_ends[row, used] = torch.from_numpy(parts.ends).float()
+        filled = prototypes.grids.sum(axis=(1, 2, 3)).clip(min=1)
+        self.filled[:count] = torch.from_numpy(filled.astype(np.float32))
         self.sizes_m[:count] = torch.from_numpy(prototypes.sizes_m)
         self.object_class[:count] = torch.from_numpy(prototypes.object_class)
         self.common[:count] = torch.from_numpy(prototypes.common)
@@ -97,14 +113,22 @@ class OccupancyDecoder(ShapeModule):
     @property
     def prototypes(self) -> Prototypes:
         """The prototypes set by `learn_prototypes`."""
-        known = self.object_class != self.unknown
-        bits, sizes_m, labels, common = (
-            part[known].cpu().numpy()
-            for part in (self.grid_bits, self.sizes_m, self.object_class, self.common)
+        rows = self.known
+        sizes_m, labels, common = (
+            part[rows].cpu().numpy() for part in (self.sizes_m, self.object_class, self.common)
         )
-        flat = np.unpackbits(bits, axis=1, count=self.cells**3).view(bool)
-        grids = flat.reshape(-1, *(self.cells,) * 3)
-        return Prototypes(grids, sizes_m.astype(np.float64), labels, common)
+        parts = tuple(map(self.parts, rows))
+        grids = np.stack([filled_cells(each, self.cells, self.margin) for each in parts])
+        return Prototypes(parts, grids, sizes_m.astype(np.float64), labels, common)
+
+    def parts(self, prototype: int) -> Parts:
+        """The parts of a prototype."""
+        used = self.part_kind[prototype] != self.unknown
+        kind, mirrored, ends = (
+            part[prototype, used].cpu().numpy()
+            for part in (self.part_kind, self.part_mirrored, self.part_ends)
+        )
+        return Parts(kind.astype(np.int64), mirrored.astype(np.int64), ends.astype(np.float64))
 
     def forward(
         self, features: Float[Tensor, "*objects features"]
@@ -153,7 +177,10 @@ class OccupancyDecoder(ShapeModule):
         """The mesh of a look, stretched into a box (centre, full extents)."""
         prototype, pose = divmod(look, POSES)
         surface = self.surface(prototype)
-        vertices, faces = surface.vertices_m, surface.faces
+        size_m = self.sizes_m[prototype].double().cpu().numpy()
+        own_m = turned_extents(box_m[None, 3:], pose)[0]
+        vertices = stretched(surface.vertices_m, self.parts(prototype), size_m, own_m)
+        faces = surface.faces
         quarters, mirrored = turn_of(pose)
         if mirrored:  # inverts the faces: reverse their corners
             vertices, faces = vertices * [-1, 1, 1], faces[:, ::-1].copy()
@@ -168,8 +195,5 @@ class OccupancyDecoder(ShapeModule):
     def surface(self, prototype: int) -> Mesh:
         """The surface of a prototype in [-0.5, 0.5]^3; computed once."""
         if prototype not in self._meshes:
-            bits = self.grid_bits[prototype].cpu().numpy()
-            filled = np.unpackbits(bits, count=self.cells**3).reshape((self.cells,) * 3)
-            surface = surface_of(filled - 0.5, np.zeros(3), np.ones(3), self.margin)
-            self._meshes[prototype] = Mesh(*surface)
+            self._meshes[prototype] = Mesh(*surface_of_parts(self.parts(prototype)))
         return self._meshes[prototype]

@@ -1,0 +1,88 @@
+"""Closed triangle meshes of furniture in parts."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sceneprior.core.geometry.corners import CUBE_CORNERS
+from sceneprior.core.parts import BOWL, BOX, CYLINDER, DOME, Parts, center_and_radii
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+
+SIDES = 16
+"""Corners of a circle; a multiple of four."""
+OVERLAP = 5e-4
+"""Length by which each part grows, as a share of the box, so that parts which touch become one
+solid."""
+THIN_M = 0.08
+"""Thickness up to which a part keeps its size in metres when its object is stretched."""
+MOST_THIN = 0.7
+"""Share of an axis that such parts may take; beyond it, they are stretched, too."""
+
+
+def surface_of_parts(
+    parts: Parts,
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    """Vertices, in the frame of the object's box, and outward triangles of the union of all parts.
+
+    The mesh is closed: every edge belongs to two triangles.
+    """
+    from manifold3d import Manifold, OpType  # imported here: reading a scene needs none
+
+    solids = [_solid(kind, ends) for kind, ends in parts.solids()]
+    united: Manifold = Manifold.batch_boolean(solids, OpType.Add)
+    mesh = united.simplify(OVERLAP).to_mesh64()
+    vertices = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
+    return vertices.clip(-0.5, 0.5), np.asarray(mesh.tri_verts, dtype=np.int64)
+
+
+def _solid(kind: int, ends: Float[np.ndarray, "3 2"]) -> "Manifold":
+    from manifold3d import Manifold
+
+    grown = ends + np.array([-OVERLAP, OVERLAP])
+    if kind == BOX:
+        corners = CUBE_CORNERS / 2 * (grown[:, 1] - grown[:, 0]) + grown.mean(axis=1)
+    else:
+        center, radii = center_and_radii(kind, grown)
+        turns = np.arange(SIDES) * 2 * np.pi / SIDES
+        circle = np.stack([np.cos(turns), np.zeros(SIDES), np.sin(turns)], axis=1)
+        if kind == CYLINDER:
+            rings = [circle + np.array([0, height, 0]) for height in (-1, 1)]
+        else:
+            low, high = {DOME: (0, 1), BOWL: (-1, 0)}.get(kind, (-1, 1))
+            steps = SIDES // 4 * (high - low) + 1
+            rises = np.linspace(low, high, steps) * np.pi / 2
+            rings = [np.cos(rise) * circle + np.array([0, np.sin(rise), 0]) for rise in rises]
+        corners = np.concatenate(rings) * radii + center
+    return Manifold.hull_points(corners)
+
+
+def stretched(
+    points: Float[np.ndarray, "points 3"],
+    parts: Parts,
+    size_m: Float[np.ndarray, "3"],
+    new_size_m: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "points 3"]:
+    """Points of an object, in the frame of its box, after the box gets other extents: what is thin
+    keeps its thickness in metres, and the rest is stretched. The result is in the frame of the new
+    box."""
+    moved = np.empty_like(points)
+    solids = np.stack([ends for _, ends in parts.solids()])
+    for axis in range(3):
+        ends = solids[:, axis]
+        knots = np.unique(np.concatenate([[-0.5, 0.5], ends.ravel()]))
+        middles = (knots[1:] + knots[:-1]) / 2
+        thin = ends[ends[:, 1] - ends[:, 0] <= THIN_M / size_m[axis]]
+        kept = ((middles[:, None] > thin[:, 0]) & (middles[:, None] < thin[:, 1])).any(axis=1)
+        lengths = np.diff(knots)
+        kept_length = (lengths * kept).sum() * size_m[axis] / new_size_m[axis]
+        if kept.all() or kept_length > MOST_THIN:
+            moved[:, axis] = points[:, axis]
+            continue
+        rest = (1 - kept_length) / (lengths * ~kept).sum()
+        scale = np.where(kept, size_m[axis] / new_size_m[axis], rest)
+        places = np.concatenate([[0], np.cumsum(lengths * scale)]) - 0.5
+        moved[:, axis] = np.interp(points[:, axis], knots, places)
+    return moved

@@ -1,0 +1,89 @@
+"""Furniture as a few solid parts: boxes, upright cylinders, ellipsoids and their halves.
+
+Parts lie in the frame of their object's box, which spans [-0.5, 0.5] along each axis. A part may be
+mirrored to the other side of the frame along x, along z, or along both, so one part can be all four
+legs of a table. Every part is convex; an object is the union of its parts.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+KINDS = 5
+BOX, CYLINDER, ELLIPSOID, DOME, BOWL = range(KINDS)
+"""Kinds of parts: each fills its own box as far as its kind can. A cylinder stands upright; a dome
+is the upper half of an ellipsoid, a bowl the lower half."""
+ACROSS_X, ACROSS_Z = 1, 2
+"""Bits of `Parts.mirrored`: the part also stands on the other side along this axis."""
+
+
+MOST_PARTS = 10
+"""Maximum number of parts of an object, mirror images not counted."""
+
+
+class Parts(NamedTuple):
+    """The parts of one object."""
+
+    kind: Int[np.ndarray, " parts"]
+    mirrored: Int[np.ndarray, " parts"]
+    """0, `ACROSS_X`, `ACROSS_Z`, or the sum of both."""
+    ends: Float[np.ndarray, "parts 3 2"]
+    """Lower and upper end of each part along x, y and z."""
+
+    def solids(self) -> Iterator[tuple[int, Float[np.ndarray, "3 2"]]]:
+        """Kind and ends of every part and its mirror images, which may touch or overlap."""
+        for kind, mirrored, ends in zip(self.kind, self.mirrored, self.ends, strict=True):
+            copies = [ends]
+            for bit, axis in ((ACROSS_X, 0), (ACROSS_Z, 2)):
+                if mirrored & bit:
+                    copies += [_across(each, axis) for each in copies]
+            yield from ((int(kind), each) for each in copies)
+
+
+def _across(ends: Float[np.ndarray, "3 2"], axis: int) -> Float[np.ndarray, "3 2"]:
+    other = ends.copy()
+    other[axis] = -ends[axis, ::-1]
+    return other
+
+
+def whole_box() -> Parts:
+    """The object's box as its only part."""
+    return Parts(np.array([BOX]), np.array([0]), np.array([[[-0.5, 0.5]] * 3]))
+
+
+def inside(
+    kind: int, ends: Float[np.ndarray, "3 2"], points: Float[np.ndarray, "*points 3"]
+) -> Bool[np.ndarray, "*points"]:
+    """True for points in a solid."""
+    low, high = ends[:, 0], ends[:, 1]
+    within = ((points >= low) & (points <= high)).all(axis=-1)
+    if kind == BOX:
+        return np.asarray(within)
+    center, radii = center_and_radii(kind, ends)
+    squares = ((points - center) / radii) ** 2
+    if kind == CYLINDER:
+        squares = squares[..., ::2]
+    found: np.ndarray = within & (squares.sum(axis=-1) <= 1)
+    return found
+
+
+def center_and_radii(
+    kind: int, ends: Float[np.ndarray, "3 2"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Centre and radii of the ellipsoid, or of the cylinder's ellipse, that a part is cut from."""
+    center, radii = ends.mean(axis=1), (ends[:, 1] - ends[:, 0]) / 2
+    if kind in (DOME, BOWL):
+        center[1], radii[1] = ends[1, 0 if kind == DOME else 1], 2 * radii[1]
+    return center, radii
+
+
+def filled_cells(parts: Parts, cells: int, margin: float) -> Bool[np.ndarray, "x y z"]:
+    """True for the cells of a grid whose centres lie in a part; the grid spans `margin` boxes."""
+    middles = ((np.arange(cells) + 0.5) / cells - 0.5) * margin
+    points = np.stack(np.meshgrid(middles, middles, middles, indexing="ij"), axis=-1)
+    found = np.zeros(points.shape[:3], bool)
+    for kind, ends in parts.solids():
+        found |= inside(kind, ends, points)
+    return found

@@ -1,0 +1,125 @@
+"""Kinds of furniture: the parts of each prototype, and the look that each object's rays support."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from rich.console import Console
+from rich.progress import track
+
+from sceneprior.core.geometry.turns import quarter_rotation
+from sceneprior.core.parts import Parts
+from sceneprior.lifted.lifting.lifted import RayPool
+from sceneprior.lifted.lifting.part_fit import fit_parts
+from sceneprior.lifted.lifting.part_rays import count_wrong
+from sceneprior.lifted.prototypes import (
+    ALIKE,
+    POSES,
+    Prototypes,
+    pose_distances,
+    turn_of,
+    turned_extents,
+)
+from sceneprior.render.silhouettes.cpu.threads import in_threads, thread_count
+
+RAYS = 4096
+"""Rays to which the parts of a kind are fitted."""
+MOST = 16
+"""Maximum number of objects, in one pose each, whose rays are taken."""
+SYMMETRIC = 0.05
+"""Distance by which an object may be further from a prototype in other poses than in its best, if
+its rays are to be taken in these, too."""
+ASKED = 128
+"""Rays of an object by which its look is found."""
+SIZE_WEIGHT = 0.1
+"""Weight of the difference in log extents; see `looks_of`."""
+
+
+def fit_kinds(
+    items: Int[np.ndarray, " prototypes"],
+    hulls: Bool[np.ndarray, "objects x y z"],
+    rays: RayPool,
+    sizes_m: Float[np.ndarray, "objects 3"],
+    object_class: Int[np.ndarray, " objects"],
+    usable: Bool[np.ndarray, " objects"],
+    margin: float,
+) -> tuple[Parts, ...]:
+    """Parts of the prototypes, which are the objects `items`: fitted to the rays of all objects of
+    their class that look like them, in the pose in which each does best and, for symmetric ones, in
+    those that are as good."""
+
+    def fit_one(item: int) -> Parts:
+        rows = np.flatnonzero((object_class == object_class[item]) & usable)
+        apart = pose_distances(
+            (hulls[rows], sizes_m[rows]), (hulls[item, None], sizes_m[item, None])
+        )[:, 0]
+        other_poses = apart > apart.min(axis=1, keepdims=True) + SYMMETRIC
+        apart = np.where(other_poses | (apart > ALIKE), np.inf, apart)
+        near = np.argsort(apart, axis=None, kind="stable")[:MOST]
+        near = near[np.isfinite(apart.ravel()[near])]
+        # A generator per prototype makes the result independent of the number of threads.
+        rng = np.random.default_rng([1, item])
+        count = min(-(-RAYS // len(near)), rays.hits.shape[1])
+        pools = []
+        for row, pose in zip(*np.unravel_index(near, apart.shape), strict=True):
+            some = rng.choice(rays.hits.shape[1], count, replace=False)
+            pool = RayPool(*(part[rows[row], some] for part in rays))
+            pools.append(as_prototype(pool, int(pose)))
+        order = rng.permutation(len(pools) * count)
+        pool = RayPool(*(np.concatenate(part)[order] for part in zip(*pools, strict=True)))
+        return fit_parts(pool, hulls[item], margin)
+
+    with ThreadPoolExecutor(thread_count()) as pool:
+        found = pool.map(fit_one, items.tolist())
+        words, console = "finding parts from masks (kinds)", Console(stderr=True)
+        return tuple(track(found, words, total=len(items), console=console))
+
+
+def as_prototype(rays: RayPool, pose: int) -> RayPool:
+    """Rays of an object that is a prototype in this pose, in the prototype's own frame."""
+    quarters, mirrored = turn_of(pose)
+    back = quarter_rotation(quarters) * [-1 if mirrored else 1, 1, 1]
+    starts, spans = (part.astype(np.float64) @ back for part in rays[:2])
+    return RayPool(starts, spans, rays.hits)
+
+
+def looks_of(
+    prototypes: Prototypes,
+    rays: RayPool,
+    sizes_m: Float[np.ndarray, "objects 3"],
+    object_class: Int[np.ndarray, " objects"],
+    margin: float,
+) -> Int[np.ndarray, " objects"]:
+    """The look of each object: the prototype of its class, in the pose, for which
+
+        share of the object's rays explained wrongly + `SIZE_WEIGHT` (L1 distance of log extents)
+
+    is least, the first of equal ones; -1 if its class has no prototype."""
+    looks = np.full(len(object_class), -1, dtype=np.int64)
+    offered = {}
+    for label in np.unique(prototypes.object_class):
+        own = np.flatnonzero(prototypes.object_class == label)
+        solids = [list(prototypes.parts[row].solids()) for row in own]
+        ends = np.stack([ends for each in solids for _, ends in each]) * (2 / margin)
+        kinds = np.array([kind for each in solids for kind, _ in each])
+        first = np.cumsum([0, *map(len, solids)])
+        offered[int(label)] = own, (kinds, *np.ascontiguousarray(np.moveaxis(ends, 2, 0)), first)
+
+    def ask_some(first: int, last: int) -> None:
+        for item in range(first, last):
+            if (label := int(object_class[item])) not in offered:
+                continue
+            own, solids = offered[label]
+            asked = RayPool(*(part[item, :ASKED] for part in rays))
+            wrong = np.empty((len(own), POSES))
+            counts = np.empty(len(own), np.int64)
+            for pose in range(POSES):
+                count_wrong(*as_prototype(asked, pose), *solids, counts)
+                sizes = turned_extents(np.log(prototypes.sizes_m[own]), pose)
+                differ = np.abs(np.log(sizes_m[item]) - sizes).sum(axis=1)
+                wrong[:, pose] = counts / ASKED + SIZE_WEIGHT * differ
+            row, pose = divmod(int(wrong.argmin()), POSES)
+            looks[item] = own[row] * POSES + pose
+
+    in_threads(ask_some, len(looks))
+    return looks

@@ -1,0 +1,334 @@
+"""Fit a few parts to the rays of one kind of furniture: a greedy search, one part more at a time.
+
+The loss counts rays and has no gradient:
+
+    half the share of hits that meet no part + half the share of misses that meet one
+      + 0.003 (number of parts) + 0.003 (number of planes in which faces lie)
+      + 0.002 (number of curved parts) + 0.0003 (volume of the parts, 1 for the box)
+      + 0.06 (gaps between the parts and the six sides of the box, 1 for the box's length)
+      + 0.005 (connected pieces - 1)
+
+A ray is right if it meets a part exactly when its pixel is the object's. Few parts explain masks
+more cheaply than what a visual hull adds where no view sees past: a headboard and a mattress, not a
+dome. Parts and their mirror images count once, and so do planes and theirs; sides of the box cost
+nothing. So edges line up. The other prices settle what rays leave open: solids are small, fill
+their box, and hold together.
+"""
+
+import itertools
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int
+from scipy import ndimage
+
+from sceneprior.core.parts import (
+    ACROSS_X,
+    ACROSS_Z,
+    BOWL,
+    BOX,
+    CYLINDER,
+    DOME,
+    ELLIPSOID,
+    MOST_PARTS,
+    Parts,
+)
+from sceneprior.lifted.lifting.lifted import RayPool
+from sceneprior.lifted.lifting.part_rays import (
+    LEVELS,
+    count_planes,
+    descend,
+    gaps_and_pieces,
+    meets,
+    volume_of,
+    wrong_rays,
+)
+
+PART_PRICE, VOLUME_PRICE, GAP_PRICE, PIECE_PRICE = 0.003, 0.0003, 0.06, 0.005
+PLANE_PRICE = 0.003
+CURVED = (CYLINDER, ELLIPSOID, DOME, BOWL)
+CURVED_PRICE = 0.002
+LEAST_GAIN = 1e-4
+"""Loss by which a change must be better."""
+PLACES = (0.25, 0.5, 0.75)
+"""Where a part is split, as shares of its length."""
+SHORTEST = 4
+"""Length in levels below which a part is not split."""
+PIECES = 4
+"""Pieces of the hull without parts, the largest ones, in which new parts are tried."""
+SCREENED, FINALISTS = 768, 6
+"""Rays on which all changes are tried; the best of them (`FINALISTS`) are tried on all rays."""
+FEWEST = 50
+"""Added to the numbers of hits and misses, so that few rays do not weigh too much."""
+
+Change = dict[int, tuple[int, int, Int[np.ndarray, "3 2"]]]
+"""Kind, mirroring and ends of the parts that change, by their number; a number one past the last
+adds a part."""
+
+
+class Guess(NamedTuple):
+    """Parts under way."""
+
+    kinds: Int[np.ndarray, " parts"]
+    mirrored: Int[np.ndarray, " parts"]
+    ends: Int[np.ndarray, "parts 3 2"]
+    """On the levels of `part_rays.py`."""
+    covered: Bool[np.ndarray, "parts rays"]
+    """Which rays each part meets."""
+    met_by: Int[np.ndarray, " rays"]
+    """Number of parts that each ray meets."""
+
+    def parts(self) -> Parts:
+        """The parts in the frame of the object's box."""
+        return Parts(self.kinds, self.mirrored, self.ends / LEVELS - 0.5)
+
+
+class RayFit:
+    """The loss of parts on a set of rays, which lie in the frame of the object's box."""
+
+    def __init__(self, rays: RayPool, margin: float):
+        useful = np.abs(rays.spans).sum(axis=1) > 0
+        scale = margin / 2 * LEVELS  # the frame of rays spans [-1, 1], `margin` boxes
+        self.starts = rays.starts[useful].astype(np.float64) * scale + LEVELS / 2
+        spans = rays.spans[useful].astype(np.float64) * scale
+        self.spans = np.where(np.abs(spans) < 1e-6, 1e-6, spans)  # they are divided by
+        self.inverse = 1 / self.spans
+        self.hits = np.ascontiguousarray(rays.hits[useful])
+        hits = int(self.hits.sum())
+        self.hit_price = 0.5 / (hits + FEWEST)
+        self.miss_price = 0.5 / (len(self.hits) - hits + FEWEST)
+
+    def loss(self, guess: Guess) -> float:
+        """See the module's docstring."""
+        missed, wrongly_met = wrong_rays(guess.met_by, self.hits)
+        volume = sum(map(volume_of, guess.kinds, guess.mirrored, guess.ends))
+        gaps, pieces = gaps_and_pieces(guess.mirrored, guess.ends)
+        return float(
+            self.hit_price * missed
+            + self.miss_price * wrongly_met
+            + PART_PRICE * len(guess.kinds)
+            + CURVED_PRICE * (guess.kinds != BOX).sum()
+            + PLANE_PRICE * count_planes(guess.ends)
+            + VOLUME_PRICE * volume
+            + GAP_PRICE * gaps / LEVELS
+            + PIECE_PRICE * (pieces - 1)
+        )
+
+    def guess(
+        self,
+        kinds: Int[np.ndarray, " parts"],
+        mirrored: Int[np.ndarray, " parts"],
+        ends: Int[np.ndarray, "parts 3 2"],
+    ) -> Guess:
+        """Parts, and the rays that they meet."""
+        none = np.zeros((0, len(self.hits)), bool)
+        empty = Guess(kinds[:0], mirrored[:0], ends[:0], none, np.zeros(len(self.hits), np.int16))
+        rows = zip(kinds.tolist(), mirrored.tolist(), ends, strict=True)
+        return self.changed(empty, dict(enumerate(rows)))
+
+    def changed(self, guess: Guess, change: Change) -> Guess:
+        """A copy in which some parts are others, or new."""
+        more = max(0, max(change) + 1 - len(guess.kinds))
+        kinds, mirrored, ends, covered = (
+            np.concatenate([part, np.zeros((more, *part.shape[1:]), part.dtype)])
+            for part in guess[:4]
+        )
+        count = guess.met_by.copy()
+        for row, (kind, across, own) in change.items():
+            kinds[row], mirrored[row], ends[row] = kind, across, own
+            count -= covered[row]
+            meets(self.starts, self.spans, kind, across, ends[row], covered[row])
+            count += covered[row]
+        return Guess(kinds, mirrored, ends, covered, count)
+
+    def without(self, guess: Guess, row: int) -> Guess:
+        """A copy without one part."""
+        others = np.arange(len(guess.kinds)) != row
+        kinds, mirrored, ends, covered = (part[others] for part in guess[:4])
+        return Guess(kinds, mirrored, ends, covered, guess.met_by - guess.covered[row])
+
+    def settled(self, guess: Guess, rows: Iterable[int], sweeps: int) -> Guess:
+        """The guess after the faces of some parts have moved to where fewest rays are wrong, or as
+        it was if that is better, since moving knows nothing of gaps and pieces."""
+        moved = Guess(*(part.copy() for part in guess))
+        descend(
+            self.starts, self.spans, self.inverse, self.hits, moved.kinds, moved.mirrored,
+            moved.ends, moved.covered, moved.met_by, np.array(list(rows)), sweeps,
+            self.hit_price, self.miss_price, VOLUME_PRICE, PLANE_PRICE,
+        )  # fmt: skip
+        return min(guess, moved, key=self.loss)
+
+
+def fit_parts(rays: RayPool, hull: Bool[np.ndarray, "x y z"], margin: float) -> Parts:
+    """The parts that explain the rays of one object, or of several that look alike.
+
+    Rays lie in the frame that spans [-1, 1] and `margin` boxes, in random order; those without
+    information are left out. `hull`, a grid of the same frame, says where parts may be missing.
+    Without rays, the object's box is its only part.
+    """
+    cells = len(hull)
+    beyond = round((1 - 1 / margin) / 2 * cells)
+    hull = hull[(slice(beyond, cells - beyond),) * 3]
+    every = RayFit(rays, margin)
+    guess = every.guess(np.array([BOX]), np.array([0]), np.array([[[0, LEVELS]] * 3]))
+    if not len(every.hits):
+        return guess.parts()
+    some = RayFit(RayPool(*(part[:SCREENED] for part in rays)), margin)
+    while better := _one_more(every, some, guess, hull) or _one_more(every, every, guess, hull):
+        guess = better
+    return _joined(every, _needed(every, guess)).parts()
+
+
+def _one_more(
+    every: RayFit, some: RayFit, guess: Guess, hull: Bool[np.ndarray, "x y z"]
+) -> Guess | None:
+    """The guess after its best change, which often adds a part; None if no change is better."""
+    rough = some.guess(*guess[:3])
+    tried = []
+    curved = len(guess.kinds) > 1 or some is every  # not at first: a chair is no bowl
+    for change in _changes(guess, hull, curved):
+        trial = some.changed(rough, change)
+        if all(
+            kind == BOX for kind, _, _ in change.values()
+        ):  # curved parts take ten times as long
+            trial = some.settled(trial, change, 1)
+        parts = zip(trial.kinds.tolist(), trial.mirrored.tolist(), trial.ends, strict=True)
+        settled = {row: part for row, part in enumerate(parts) if row in change}
+        tried.append((some.loss(trial), settled))
+    best, least = None, every.loss(guess) - LEAST_GAIN
+    for _, change in sorted(tried, key=lambda each: each[0])[:FINALISTS]:
+        trial = every.settled(every.changed(guess, change), change, 2)
+        if (loss := every.loss(trial)) < least:
+            best, least = trial, loss
+    return best and every.settled(best, range(len(best.kinds)), 2)
+
+
+def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Iterator[Change]:
+    """What may be better: parts of another kind, parts made narrow and mirrored, parts split in two
+    with the hull's extents in each half, parts below others, and new parts around pieces of the
+    hull that no part fills."""
+    new = len(guess.kinds)
+    room = new < MOST_PARTS
+    for row in range(new):
+        across, ends = int(guess.mirrored[row]), guess.ends[row]
+        if curved:
+            yield from ({row: (kind, across, ends)} for kind in CURVED if kind != guess.kinds[row])
+        for axis, bit in enumerate((ACROSS_X, 0, ACROSS_Z)):
+            low, high = ends[axis]
+            if high - low < SHORTEST:
+                continue
+            single = bit and not across & bit
+            if single:
+                narrow = ends.copy()
+                narrow[axis, 1] = low + (high - low) // 4
+                yield {row: (BOX, across | bit, narrow)}
+            for share in PLACES if room else ():
+                one, other = ends.copy(), ends.copy()
+                one[axis, 1] = other[axis, 0] = low + round(share * (high - low))
+                one, other = _extents_of(hull, one), _extents_of(hull, other)
+                yield {row: (BOX, across, one), new: (BOX, across, other)}
+                if single and share < 0.5:
+                    yield {row: (BOX, across | bit, one), new: (BOX, across, other)}
+        if room and ends[1, 0] >= SHORTEST:
+            yield from ({new: (BOX, across, each)} for across, each in _below(ends))
+    labels, pieces = ndimage.label(hull & ~_cells_in(guess, len(hull)))
+    if not pieces or not room:
+        return
+    boxes = ndimage.find_objects(labels)
+    for piece in np.argsort(-np.bincount(labels.ravel())[1:], kind="stable")[:PIECES]:
+        own = np.array([[side.start, side.stop] for side in boxes[piece]]) * LEVELS // len(hull)
+        for across in (0, ACROSS_X, ACROSS_Z, ACROSS_X | ACROSS_Z):
+            yield {new: (BOX, across, own)}
+
+
+def _below(ends: Int[np.ndarray, "3 2"]) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
+    """Four legs, and panels at two or one of the sides, between a part and the floor; with their
+    mirroring."""
+    under = ends.copy()
+    under[1] = 0, ends[1, 0]
+    for axes, across in (((0, 2), ACROSS_X | ACROSS_Z), ((0,), ACROSS_X), ((2,), ACROSS_Z)):
+        leg = under.copy()
+        for axis in axes:
+            leg[axis, 1] = leg[axis, 0] + SHORTEST
+        yield across, leg
+
+
+def _extents_of(
+    hull: Bool[np.ndarray, "x y z"], ends: Int[np.ndarray, "3 2"]
+) -> Int[np.ndarray, "3 2"]:
+    """The smallest box around the hull's cells in a box; the box itself if there are none."""
+    cells = len(hull)
+    first, last = ends[:, 0] * cells // LEVELS, -(-ends[:, 1] * cells // LEVELS)
+    inner = hull[first[0] : last[0], first[1] : last[1], first[2] : last[2]]
+    if not inner.any():
+        return ends
+    found = ends.copy()
+    for axis in range(3):
+        filled = first[axis] + np.flatnonzero(inner.any(axis=tuple({0, 1, 2} - {axis})))
+        found[axis, 0] = max(ends[axis, 0], filled[0] * LEVELS // cells)
+        found[axis, 1] = min(ends[axis, 1], -(-(filled[-1] + 1) * LEVELS // cells))
+    return found
+
+
+def _cells_in(guess: Guess, cells: int) -> Bool[np.ndarray, "x y z"]:
+    """The cells of a grid over the object's box that lie in the boxes of parts."""
+    found = np.zeros((cells,) * 3, bool)
+    for _, ends in guess.parts().solids():
+        first, last = np.rint((ends.T + 0.5) * cells).astype(int)
+        found[first[0] : last[0], first[1] : last[1], first[2] : last[2]] = True
+    return found
+
+
+def _needed(every: RayFit, guess: Guess) -> Guess:
+    """The guess without the parts that cost more than they explain."""
+    row = 0
+    while row < len(guess.kinds) > 1:
+        trial = every.without(guess, row)
+        if every.loss(trial) < every.loss(guess):
+            guess, row = trial, 0
+        else:
+            row += 1
+    return guess
+
+
+def _joined(every: RayFit, guess: Guess) -> Guess:
+    """The guess with bars between its pieces, and from pieces to the top and the bottom of the box,
+    where that costs less than gaps: cords are often too thin for masks."""
+    while len(guess.kinds) < MOST_PARTS:
+        new = len(guess.kinds)
+        trials = [every.changed(guess, {new: (BOX, across, bar)}) for across, bar in _bars(guess)]
+        best = min(trials, key=every.loss)
+        if every.loss(best) >= every.loss(guess):
+            break
+        guess = best
+    return guess
+
+
+def _bars(guess: Guess) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
+    """Boxes from each part to each other, to the ceiling and to the floor, as wide as both together
+    allow and two levels wide; with their mirroring."""
+    ceiling, floor = np.array([[[0, LEVELS]] * 3] * 2)
+    ceiling[1], floor[1] = LEVELS, 0
+    both = ACROSS_X | ACROSS_Z
+    ends = list(zip(guess.mirrored.tolist(), guess.ends, strict=True))
+    for across, own in ends.copy():
+        whole = own.copy()  # with the mirror images
+        for bit, axis in ((ACROSS_X, 0), (ACROSS_Z, 2)):
+            if across & bit:
+                far = max(own[axis, 1], LEVELS - own[axis, 0])
+                whole[axis] = LEVELS - far, far
+        ends += [(0, whole)] if across else []
+    targets = [*ends, (both, ceiling), (both, floor)]
+    for (one, here), (other, there) in itertools.product(ends, targets):
+        last_low = np.maximum(here[:, 0], there[:, 0])
+        first_high = np.minimum(here[:, 1], there[:, 1])
+        between = np.sort([last_low, first_high], axis=0)  # the gap, or the overlap
+        narrow = between.copy()
+        overlaps = last_low <= first_high
+        middle = between.sum(axis=0)[overlaps] // 2
+        narrow[:, overlaps] = middle - 1, middle + 1
+        for low, high in (between, narrow):
+            bar = np.stack([low, np.maximum(high, low + 1)], axis=1).clip(0, LEVELS)
+            if (bar[:, 0] < bar[:, 1]).all():
+                yield one & other, bar

@@ -1,0 +1,331 @@
+"""Which rays meet a part, and where a part's face stands best, given all other faces.
+
+Faces lie on `LEVELS` + 1 evenly spaced levels between the sides of the object's box, so that the
+cost of all places of a face is counted in one pass over the rays, exactly and in integers.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOWL, BOX, CYLINDER, DOME
+
+LEVELS = 64
+"""Intervals between the levels on which faces lie."""
+FAR = 1e6
+"""A level beyond all rays."""
+NEVER = 1 << 20
+"""Level of a face from which no ray is met."""
+
+
+# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _meets_solid(start, span, kind, low, high):
+    """Whether a segment, from `start` to `start` + `span`, meets a solid."""
+    near, far = 0.0, 1.0
+    for axis in range(3):
+        one = (low[axis] - start[axis]) / span[axis]
+        other = (high[axis] - start[axis]) / span[axis]
+        near, far = max(near, min(one, other)), min(far, max(one, other))
+    if near > far:
+        return False
+    if kind == BOX:
+        return True
+    # |(start + t span - center) / radii|^2 <= 1, without y in a cylinder: a t^2 + 2 b t + c <= 0.
+    a, b, c = 0.0, 0.0, -1.0
+    for axis in range(3):
+        if axis == 1 and kind == CYLINDER:
+            continue
+        center, radius = (low[axis] + high[axis]) / 2, (high[axis] - low[axis]) / 2
+        if axis == 1 and kind == DOME:
+            center, radius = low[1], 2 * radius
+        elif axis == 1 and kind == BOWL:
+            center, radius = high[1], 2 * radius
+        offset, slope = (start[axis] - center) / radius, span[axis] / radius
+        a += slope * slope
+        b += slope * offset
+        c += offset * offset
+    # The least value on [near, far].
+    best = min(max(-b / a, near), far) if a > 1e-12 else near
+    return a * best * best + 2 * b * best + c <= 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def meets(starts, spans, kind, mirrored, ends, met):
+    """Fill `met` with whether each ray meets a part or one of its mirror images. `ends` are levels,
+    (3, 2); starts and spans are in levels, too."""
+    low, high = ends[:, 0].astype(np.float64), ends[:, 1].astype(np.float64)
+    start, span = np.empty(3), np.empty(3)
+    for ray in range(len(met)):
+        met[ray] = False
+        for copy in range(4):
+            if copy & ~mirrored:
+                continue
+            start[:] = starts[ray]
+            span[:] = spans[ray]
+            if copy & ACROSS_X:
+                start[0], span[0] = LEVELS - start[0], -span[0]
+            if copy & ACROSS_Z:
+                start[2], span[2] = LEVELS - start[2], -span[2]
+            if _meets_solid(start, span, kind, low, high):
+                met[ray] = True
+                break
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _face_costs(
+    starts, inverse, hits, others, mirrored, ends, axis, upper, hit_price, miss_price, costs
+):  # fmt: skip
+    """Fill `costs` with the change of the price of wrong rays, for each level at which the box's
+    face may lie, against a box that no ray meets. A ray meets the box if the face lies beyond a
+    threshold: the first point along the axis at which the ray is between the other five faces.
+    `inverse` are the reciprocals of the rays' spans."""
+    costs[:] = 0
+    low, high = ends[:, 0].astype(np.float64), ends[:, 1].astype(np.float64)
+    if upper:
+        high[axis] = FAR
+    else:
+        low[axis] = -FAR
+    copies = 0
+    lows, highs = np.empty((4, 3)), np.empty((4, 3))
+    flips = np.empty(4, np.bool_)
+    for copy in range(4):
+        if copy & ~mirrored:
+            continue
+        lows[copies], highs[copies] = low, high
+        if copy & ACROSS_X:
+            lows[copies, 0], highs[copies, 0] = LEVELS - high[0], LEVELS - low[0]
+        if copy & ACROSS_Z:
+            lows[copies, 2], highs[copies, 2] = LEVELS - high[2], LEVELS - low[2]
+        flips[copies] = (copy & ACROSS_X and axis == 0) or (copy & ACROSS_Z and axis == 2)
+        copies += 1
+    for ray in range(len(hits)):
+        if others[ray] > 0:
+            continue
+        threshold = NEVER
+        x, y, z = starts[ray, 0], starts[ray, 1], starts[ray, 2]
+        along_x, along_y, along_z = inverse[ray, 0], inverse[ray, 1], inverse[ray, 2]
+        for copy in range(copies):
+            one, other = (lows[copy, 0] - x) * along_x, (highs[copy, 0] - x) * along_x
+            near, far = max(0.0, min(one, other)), min(1.0, max(one, other))
+            one, other = (lows[copy, 1] - y) * along_y, (highs[copy, 1] - y) * along_y
+            near, far = max(near, min(one, other)), min(far, max(one, other))
+            one, other = (lows[copy, 2] - z) * along_z, (highs[copy, 2] - z) * along_z
+            near, far = max(near, min(one, other)), min(far, max(one, other))
+            if near > far:
+                continue
+            start, span = starts[ray, axis], 1 / inverse[ray, axis]
+            one, other = start + near * span, start + far * span
+            if flips[copy]:
+                one, other = LEVELS - one, LEVELS - other
+            if upper:
+                threshold = min(threshold, int(np.ceil(min(one, other))))
+            else:
+                threshold = min(threshold, LEVELS - int(np.floor(max(one, other))))
+        if threshold <= LEVELS:
+            place = max(threshold, 0) if upper else LEVELS - max(threshold, 0)
+            costs[place] += -hit_price if hits[ray] else miss_price
+    total = 0.0
+    for step in range(LEVELS + 1):
+        place = step if upper else LEVELS - step
+        total += costs[place]
+        costs[place] = total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def volume_of(kind, mirrored, ends):
+    """Volume of a part and its mirror images, as a share of the object's box; 1 for the box."""
+    copies = (2 if mirrored & ACROSS_X else 1) * (2 if mirrored & ACROSS_Z else 1)
+    share = 1.0
+    for axis in range(3):
+        share *= (ends[axis, 1] - ends[axis, 0]) / LEVELS
+    if kind == CYLINDER:
+        share *= np.pi / 4
+    elif kind != BOX:
+        share *= np.pi / 6
+    return copies * share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def wrong_rays(count, hits):
+    """The numbers of rays that meet no part though their pixel is the object's, and of those that
+    meet one though it is not."""
+    missed, wrongly_met = 0, 0
+    for ray in range(len(hits)):
+        if hits[ray]:
+            missed += count[ray] == 0
+        else:
+            wrongly_met += count[ray] > 0
+    return missed, wrongly_met
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def planes_of(ends, skipped):
+    """Mark the planes, by axis and level, in which faces of all parts but one lie; the sides of the
+    box are always marked, and across x and z a plane counts as its mirror image, too."""
+    used = np.zeros((3, LEVELS + 1), np.bool_)
+    used[:, 0] = True
+    used[:, LEVELS] = True
+    for part in range(len(ends)):
+        if part != skipped:
+            for axis in range(3):
+                for end in range(2):
+                    used[axis, ends[part, axis, end]] = True
+                    if axis != 1:
+                        used[axis, LEVELS - ends[part, axis, end]] = True
+    return used
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def count_planes(ends):
+    """The number of planes in which faces lie; sides of the box do not count, and across x and z a
+    plane and its mirror image count once."""
+    used = planes_of(ends, -1)
+    return (
+        used[1, 1:LEVELS].sum()
+        + used[0, 1 : LEVELS // 2 + 1].sum()
+        + used[2, 1 : LEVELS // 2 + 1].sum()
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def descend(
+    starts, spans, inverse, hits, kinds, mirrored, ends, covered, count, chosen, sweeps,
+    hit_price, miss_price, volume_price, plane_price,
+):  # fmt: skip
+    """Move the faces of the chosen parts, one after another, each to its best level; in place.
+
+    `covered` says which rays each part meets, and `count` how many parts each ray meets; both are
+    kept up to date. The prices are those of a hit that no part meets, of a miss that one meets, of
+    filling the whole box, and of a face in a plane of its own (`count_planes`). Boxes try all
+    levels; curved parts, whose faces hang together, try those nearby.
+    """
+    costs = np.empty(LEVELS + 1)
+    others = np.empty(len(hits), np.int16)
+    met = np.empty(len(hits), np.bool_)
+    for _ in range(sweeps):
+        moved = False
+        for part in chosen:
+            for ray in range(len(hits)):
+                others[ray] = count[ray] - covered[part, ray]
+            kind, mirror, own = kinds[part], mirrored[part], ends[part]
+            used = planes_of(ends, part)
+            changed = False
+            for face in range(6):
+                axis, upper = face // 2, face % 2 == 1
+                before = own[axis, 1 if upper else 0]
+                best = before
+                first, last = (own[axis, 0] + 1, LEVELS) if upper else (0, own[axis, 1] - 1)
+                if kind == BOX:
+                    _face_costs(
+                        starts, inverse, hits, others, mirror, own, axis, upper, hit_price,
+                        miss_price, costs,
+                    )  # fmt: skip
+                    least = np.inf
+                    for place in range(first, last + 1):
+                        own[axis, 1 if upper else 0] = place
+                        cost = costs[place] + volume_price * volume_of(kind, mirror, own)
+                        if not used[axis, place]:
+                            cost += plane_price
+                        # Equal costs: the place where the face is already, then the larger part.
+                        if cost < least - 1e-12 or (cost < least + 1e-12 and place == before):
+                            least, best = cost, place
+                else:
+                    least = np.inf
+                    for step in (0, -4, 4, -2, 2, -1, 1):
+                        place = before + step
+                        if place < first or place > last:
+                            continue
+                        own[axis, 1 if upper else 0] = place
+                        meets(starts, spans, kind, mirror, own, met)
+                        cost = volume_price * volume_of(kind, mirror, own)
+                        if not used[axis, place]:
+                            cost += plane_price
+                        for ray in range(len(hits)):
+                            if others[ray] == 0:
+                                if met[ray] and not hits[ray]:
+                                    cost += miss_price
+                                elif hits[ray] and not met[ray]:
+                                    cost += hit_price
+                        if cost < least - 1e-12:
+                            least, best = cost, place
+                own[axis, 1 if upper else 0] = best
+                changed |= best != before
+            if changed:
+                moved = True
+                meets(starts, spans, kind, mirror, own, covered[part])
+                for ray in range(len(hits)):
+                    count[ray] = others[ray] + covered[part, ray]
+        if not moved:
+            break
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def gaps_and_pieces(mirrored, ends):
+    """The sum of the gaps, in levels, between the six sides of the object's box and the connected
+    piece that comes nearest to them, and the number of pieces. Parts within a level touch."""
+    solids = np.empty((4 * len(ends), 3, 2), np.int64)
+    count = 0
+    for part in range(len(ends)):
+        for copy in range(4):
+            if copy & ~mirrored[part]:
+                continue
+            solids[count] = ends[part]
+            for bit, axis in ((ACROSS_X, 0), (ACROSS_Z, 2)):
+                if copy & bit:
+                    solids[count, axis, 0] = LEVELS - ends[part, axis, 1]
+                    solids[count, axis, 1] = LEVELS - ends[part, axis, 0]
+            count += 1
+    piece = np.arange(count)
+    pieces = count
+    for one in range(count):
+        for other in range(one):
+            touch = True
+            for axis in range(3):
+                touch &= solids[one, axis, 0] <= solids[other, axis, 1] + 1
+                touch &= solids[other, axis, 0] <= solids[one, axis, 1] + 1
+            if touch and piece[one] != piece[other]:
+                gone, pieces = piece[one], pieces - 1
+                for each in range(count):
+                    if piece[each] == gone:
+                        piece[each] = piece[other]
+    gaps = 6 * LEVELS
+    for one in range(count):
+        own = 0
+        for axis in range(3):
+            low, high = LEVELS, 0
+            for other in range(count):
+                if piece[other] == one:
+                    low, high = min(low, solids[other, axis, 0]), max(high, solids[other, axis, 1])
+            own += low + LEVELS - high
+        gaps = min(gaps, own)
+    return gaps, pieces
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def count_wrong(starts, spans, hits, kinds, lows, highs, first_solids, wrong):
+    """Fill `wrong` with the number of rays that each of several objects explains wrongly. Object i
+    is the union of the solids from `first_solids[i]` up to `first_solids[i + 1]`; rays and solids
+    are in the same units, and rays without a span are skipped."""
+    wrong[:] = 0
+    for ray in range(len(hits)):
+        if spans[ray, 0] == 0 and spans[ray, 1] == 0 and spans[ray, 2] == 0:
+            continue
+        for item in range(len(wrong)):
+            met = False
+            for solid in range(first_solids[item], first_solids[item + 1]):
+                if _meets_solid(starts[ray], spans[ray], kinds[solid], lows[solid], highs[solid]):
+                    met = True
+                    break
+            wrong[item] += met != hits[ray]

@@ -1,0 +1,109 @@
+"""Parts: their mirror images, the cells that they fill, and closed meshes that stretch."""
+
+import numpy as np
+import pytest
+import trimesh
+from parts_of_rooms import CORNER, TABLE, boxes
+
+from sceneprior.core.geometry.part_meshes import THIN_M, stretched, surface_of_parts
+from sceneprior.core.parts import (
+    ACROSS_X,
+    BOWL,
+    BOX,
+    CYLINDER,
+    DOME,
+    ELLIPSOID,
+    Parts,
+    filled_cells,
+    inside,
+)
+
+CURVED = [
+    Parts(np.array([kind]), np.array([0]), np.array([[[-0.5, 0.25], [-0.25, 0.5], [-0.5, 0.5]]]))
+    for kind in (CYLINDER, ELLIPSOID, DOME, BOWL)
+]
+VOLUMES = [np.pi / 4, np.pi / 6, np.pi / 6, np.pi / 6]
+
+
+def test_mirror_images_of_a_table_s_leg_stand_in_all_four_corners():
+    legs = [ends for _, ends in TABLE.solids()][1:]
+    corners = {tuple(np.sign(ends.mean(axis=1)[[0, 2]])) for ends in legs}
+    assert len(legs) == len(corners) == 4
+    assert all((ends[1] == legs[0][1]).all() for ends in legs)
+
+
+def test_cells_are_filled_where_points_are_inside():
+    cells = filled_cells(TABLE, 16, 1.0)
+    assert cells[:, 14:].all() and cells[:2, :, :2].all() and cells[-2:, :, -2:].all()
+    assert not cells[2:-2, :14].any()
+    assert not filled_cells(TABLE, 20, 1.25)[[0, 1, -2, -1]].any(), "beyond the box"
+
+
+@pytest.mark.parametrize(("parts", "share"), zip(CURVED, VOLUMES, strict=True))
+def test_curved_parts_fill_their_share_of_their_box(parts, share):
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (200_000, 3))
+    kind, ends = next(parts.solids())
+    found = inside(kind, ends, points)
+    assert found.mean() == pytest.approx(share * 0.75 * 0.75, rel=0.02)
+    assert (found <= inside(BOX, ends, points)).all()
+    vertices, faces = surface_of_parts(parts)
+    mesh = trimesh.Trimesh(vertices, faces)
+    assert mesh.is_volume and mesh.volume == pytest.approx(share * 0.75 * 0.75, rel=0.08)
+
+
+@pytest.mark.parametrize("parts", [TABLE, CORNER, *CURVED])
+def test_meshes_are_closed_and_have_few_faces(parts):
+    vertices, faces = surface_of_parts(parts)
+    mesh = trimesh.Trimesh(vertices, faces)
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+    assert len(faces) <= 300 and np.abs(vertices).max() <= 0.5
+
+
+def test_a_mesh_has_the_volume_of_the_cells():
+    for parts in (TABLE, CORNER):
+        vertices, faces = surface_of_parts(parts)
+        volume = filled_cells(parts, 64, 1.0).mean()
+        assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(volume, rel=0.02)
+
+
+def test_parts_that_touch_in_an_edge_alone_are_still_a_closed_mesh():
+    parts = boxes((0, 32, 0, 32, 0, 64), (32, 64, 32, 64, 0, 64))
+    vertices, faces = surface_of_parts(parts)
+    assert trimesh.Trimesh(vertices, faces).is_watertight
+
+
+def test_legs_keep_their_thickness_and_tables_fill_their_new_box():
+    size_m = np.array([0.8, 0.75, 0.4])
+    wide_m = np.array([1.6, 0.75, 0.8])
+    legs = boxes((0, 64, 62, 64, 0, 64), (0, 4, 0, 62, 0, 8), mirrored=(0, 3))
+    assert 4 / 64 * size_m[0] < THIN_M and 8 / 64 * size_m[2] < THIN_M
+    points = np.array([[-0.5, -0.5, -0.5], [4 / 64 - 0.5, 62 / 64 - 0.5, 8 / 64 - 0.5], [0.5] * 3])
+    low, inner, high = stretched(points, legs, size_m, wide_m) * wide_m
+    np.testing.assert_allclose(high - low, wide_m)
+    thickness = (inner - low)[[0, 2]]
+    np.testing.assert_allclose(thickness, [4 / 64 * 0.8, 8 / 64 * 0.4])
+    assert (inner - low)[1] == pytest.approx(62 / 64 * 0.75), "height is as before"
+
+
+def test_what_is_thin_throughout_is_stretched_as_a_whole():
+    board = boxes((0, 64, 0, 64, 0, 64))
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (9, 3))
+    found = stretched(points, board, np.array([0.05, 1, 1]), np.array([0.5, 2, 3]))
+    np.testing.assert_allclose(found, points)
+
+
+def test_stretching_keeps_the_order_of_points_and_meshes_closed():
+    vertices, faces = surface_of_parts(TABLE)
+    for new_m in ([2.0, 0.7, 0.5], [0.3, 0.2, 0.4]):
+        moved = stretched(vertices, TABLE, np.array([1.0, 0.75, 0.6]), np.array(new_m))
+        for axis in range(3):
+            order = np.argsort(vertices[:, axis], kind="stable")
+            assert (np.diff(moved[order, axis]) >= -1e-12).all()
+        assert trimesh.Trimesh(moved, faces).is_watertight
+
+
+def test_a_part_mirrored_along_x_alone_has_two_solids():
+    pair = boxes((0, 8, 0, 64, 10, 20), mirrored=(ACROSS_X,))
+    one, other = (ends for _, ends in pair.solids())
+    np.testing.assert_array_equal(other[0], -one[0, ::-1])
+    np.testing.assert_array_equal(other[1:], one[1:])

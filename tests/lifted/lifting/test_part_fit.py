@@ -1,0 +1,81 @@
+"""Parts fitted to rays: furniture is found again, cleanly and always the same."""
+
+import numpy as np
+import pytest
+from parts_of_rooms import CORNER, TABLE, boxes, rays_of
+
+from sceneprior.core.parts import BOX, CYLINDER, MOST_PARTS, Parts, filled_cells
+from sceneprior.lifted.lifting.lifted import RayPool
+from sceneprior.lifted.lifting.part_fit import RayFit, fit_parts
+
+MARGIN, CELLS = 1.1, 32
+
+
+def found_again(parts: Parts, hull=None):
+    hull = filled_cells(parts, CELLS, MARGIN) if hull is None else hull
+    found = fit_parts(rays_of(parts, 4000), hull, MARGIN)
+    ours, true = (filled_cells(each, 64, 1.0) for each in (found, parts))
+    return found, (ours & true).sum() / (ours | true).sum()
+
+
+@pytest.mark.parametrize(("parts", "most"), [(TABLE, 3), (CORNER, 4)])
+def test_furniture_is_found_again_in_as_few_parts(parts, most):
+    found, iou = found_again(parts)
+    assert iou > 0.9 and len(found.kind) <= most
+
+
+def test_legs_are_found_below_a_table_whose_hull_is_full():
+    hull = filled_cells(boxes((0, 64, 0, 64, 0, 64)), CELLS, MARGIN)
+    found, iou = found_again(TABLE, hull)
+    assert iou > 0.8
+    assert not filled_cells(found, CELLS, MARGIN)[12:20, 4:20, 12:20].any(), "air under the table"
+
+
+def test_a_round_table_is_round():
+    top = [[-0.5, 0.5], [0.3, 0.5], [-0.5, 0.5]]
+    stem = [[-0.125, 0.125], [-0.5, 0.3], [-0.125, 0.125]]
+    parts = Parts(np.array([CYLINDER, BOX]), np.zeros(2, int), np.array([top, stem]))
+    found, iou = found_again(parts)
+    assert iou > 0.85 and CYLINDER in found.kind
+
+
+def test_a_lamp_hangs_on_a_cord_that_no_mask_shows():
+    lamp = boxes((8, 56, 0, 16, 8, 56), (28, 36, 60, 64, 28, 36))
+    found, _ = found_again(lamp)
+    column = filled_cells(found, 64, 1.0)[26:38, :, 26:38].any(axis=(0, 2))
+    assert column.all(), "from the shade to the ceiling"
+
+
+def test_objects_without_rays_are_their_box():
+    nothing = RayPool(np.zeros((5, 3)), np.zeros((5, 3)), np.zeros(5, bool))
+    found = fit_parts(nothing, np.zeros((CELLS,) * 3, bool), MARGIN)
+    np.testing.assert_array_equal(found.ends, [[[-0.5, 0.5]] * 3])
+
+
+@pytest.mark.parametrize("hit", [False, True])
+def test_rays_that_all_say_the_same_end_in_parts(hit):
+    rays = rays_of(TABLE, 200)
+    found = fit_parts(rays._replace(hits=np.full(200, hit)), np.ones((CELLS,) * 3, bool), MARGIN)
+    assert 1 <= len(found.kind) <= MOST_PARTS and np.isfinite(found.ends).all()
+
+
+def test_the_same_rays_give_the_same_parts():
+    hull = filled_cells(CORNER, CELLS, MARGIN)
+    one, other = (fit_parts(rays_of(CORNER, 1500), hull, MARGIN) for _ in range(2))
+    for here, there in zip(one, other, strict=True):
+        np.testing.assert_array_equal(here, there)
+
+
+def test_the_loss_is_the_formula_of_the_docstring():
+    rays = rays_of(TABLE, 500)
+    fit = RayFit(rays, MARGIN)
+    ends = np.rint((TABLE.ends + 0.5) * 64).astype(np.int64)
+    guess = fit.guess(TABLE.kind, TABLE.mirrored, ends)
+    volume = 1 * 8 / 64 + 4 * (8 / 64) * (56 / 64) * (8 / 64)
+    # Three planes: below the top, and the inner sides of the legs along x and z.
+    assert fit.loss(guess) == pytest.approx(0.003 * 2 + 0.003 * 3 + 0.0003 * volume)
+    upper = fit.guess(TABLE.kind[:1], TABLE.mirrored[:1], ends[:1])
+    missed = (fit.hits & (upper.met_by == 0)).sum()
+    assert fit.loss(upper) == pytest.approx(
+        0.5 * missed / (fit.hits.sum() + 50) + 0.003 + 0.003 + 0.0003 / 8 + 0.06 * 56 / 64
+    )

@@ -1,0 +1,129 @@
+"""Rays against parts: every compiled count has a slow twin."""
+
+import numpy as np
+import pytest
+from parts_of_rooms import TABLE, rays_of
+
+from sceneprior.core.parts import BOX, Parts, inside
+from sceneprior.lifted.lifting.part_fit import RayFit
+from sceneprior.lifted.lifting.part_rays import (
+    LEVELS,
+    count_planes,
+    count_wrong,
+    descend,
+    gaps_and_pieces,
+    meets,
+    planes_of,
+    volume_of,
+)
+
+MARGIN = 1.1
+
+
+@pytest.mark.parametrize("kind", range(5))
+@pytest.mark.parametrize("mirrored", range(4))
+def test_a_ray_meets_a_part_where_points_along_it_are_inside(kind, mirrored):
+    rng = np.random.default_rng(kind)
+    starts, stops = rng.uniform(-10, LEVELS + 10, (2, 300, 3))
+    ends = np.array([[4, 30], [20, 60], [10, 50]])
+    met = np.empty(300, bool)
+    meets(starts, stops - starts, kind, mirrored, ends, met)
+    along = np.linspace(0, 1, 2000)[:, None, None]
+    points = (starts + along * (stops - starts)) / LEVELS - 0.5
+    parts = Parts(np.array([kind]), np.array([mirrored]), ends[None] / LEVELS - 0.5)
+    slow = np.zeros(300, bool)
+    for solid in parts.solids():
+        slow |= inside(*solid, points).any(axis=0)
+    assert (met >= slow).all() and (met & ~slow).sum() <= 3, "but for what steps leave out"
+    assert 0.1 < met.mean() < 0.9
+
+
+@pytest.mark.parametrize("mirrored", range(4))
+def test_a_face_goes_where_the_fewest_rays_are_wrong(mirrored):
+    """One face of a box is moved; each level is tried by itself."""
+    fit = RayFit(rays_of(TABLE, 400, seed=mirrored), MARGIN)
+    prices = fit.hit_price, fit.miss_price, 0.003, 0.002
+    rng = np.random.default_rng(mirrored)
+    for face in range(6):
+        low = rng.integers(0, 30, 3)
+        start = np.stack([low, low + rng.integers(5, 30, 3)], axis=1)
+        others = np.array([[[0, 64], [56, 64], [0, 64]]])
+        ends = np.concatenate([others, start[None]])
+        guess = fit.guess(np.zeros(2, int), np.array([0, mirrored]), ends)
+        axis, side = divmod(face, 2)
+        # The other faces are held by trying one face at a time, in the order of descend.
+        trials = {}
+        reach = range(start[axis, 0] + 1, LEVELS + 1) if side else range(start[axis, 1])
+        for place in reach:
+            moved = ends.copy()
+            moved[1, axis, side] = place
+            trial = fit.guess(np.zeros(2, int), np.array([0, mirrored]), moved)
+            wrong = (trial.met_by > 0) != fit.hits
+            cost = prices[0] * (wrong & fit.hits).sum() + prices[1] * (wrong & ~fit.hits).sum()
+            cost += prices[2] * volume_of(BOX, mirrored, moved[1])
+            cost += prices[3] * (not planes_of(moved, 1)[axis, place])
+            trials[place] = cost
+        if face == 0:  # the first face that descend moves
+            one_sweep = fit.guess(np.zeros(2, int), np.array([0, mirrored]), ends)
+            before = min(trials.values())
+            descend(
+                fit.starts, fit.spans, fit.inverse, fit.hits, one_sweep.kinds, one_sweep.mirrored,
+                one_sweep.ends, one_sweep.covered, one_sweep.met_by, np.array([1]), 1, *prices,
+            )  # fmt: skip
+            assert fit.loss(one_sweep) <= fit.loss(guess) + 1
+            assert trials[int(one_sweep.ends[1, 0, 0])] == pytest.approx(before)
+
+
+def test_moving_faces_never_makes_more_rays_wrong_and_keeps_the_counts():
+    fit = RayFit(rays_of(TABLE, 600), MARGIN)
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        low = rng.integers(0, 30, (3, 3))
+        ends = np.stack([low, low + rng.integers(2, 30, (3, 3))], axis=2)
+        kinds, mirrored = rng.integers(0, 5, 3), rng.integers(0, 4, 3)
+        guess = fit.guess(kinds, mirrored, ends)
+        moved = fit.settled(guess, range(3), 2)
+        assert fit.loss(moved) <= fit.loss(guess)
+        again = fit.guess(*moved[:3])
+        assert (again.covered == moved.covered).all() and (again.met_by == moved.met_by).all()
+        assert (moved.ends[..., 0] < moved.ends[..., 1]).all()
+        assert moved.ends.min() >= 0 and moved.ends.max() <= LEVELS
+
+
+def test_planes_are_shared_by_parts_and_by_mirror_images():
+    ends = np.array([[[0, 64], [56, 64], [0, 64]], [[0, 8], [0, 56], [4, 8]]])
+    assert count_planes(ends) == 1 + 1 + 2  # y 56; x 8; z 4 and 8
+    mirrored = ends.copy()
+    mirrored[1, 0] = 56, 64  # the mirror image of x 8
+    assert count_planes(np.concatenate([ends, mirrored[1:]])) == 4
+
+
+def test_gaps_are_those_of_the_best_piece():
+    legs = np.array([[[0, 8], [0, 40], [0, 8]]])
+    top = np.array([[[0, 64], [41, 64], [0, 64]]])
+    both = np.concatenate([legs, top])
+    assert gaps_and_pieces(np.array([3, 0]), both) == (0, 1), "within a level"
+    top[0, 1, 0] = 42
+    apart = np.concatenate([legs, top])
+    assert gaps_and_pieces(np.array([3, 0]), apart) == (42, 5)
+    # A small part in a far corner does not fill the box.
+    corner = np.array([[[62, 64], [62, 64], [62, 64]]])
+    middle = np.array([[[10, 40], [0, 30], [10, 40]]])
+    gaps, pieces = gaps_and_pieces(np.zeros(2, int), np.concatenate([corner, middle]))
+    assert pieces == 2 and gaps == 10 + 24 + 0 + 34 + 10 + 24
+
+
+def test_wrong_rays_of_several_objects_are_counted_at_once():
+    rays = rays_of(TABLE, 300)
+    rays.spans[:5] = 0  # these tell nothing
+    whole = np.array([[[-0.5, 0.5]] * 3])
+    solids = [*TABLE.solids(), (BOX, whole[0])]
+    kinds = np.array([kind for kind, _ in solids])
+    lows, highs = (np.stack([ends[:, side] for _, ends in solids]) * 2 / MARGIN for side in (0, 1))
+    wrong = np.empty(2, np.int64)
+    first = np.array([0, len(solids) - 1, len(solids)])
+    count_wrong(rays.starts, rays.spans, rays.hits, kinds, lows, highs, first, wrong)
+    assert wrong[0] == 0
+    fit = RayFit(rays, MARGIN)
+    box = fit.guess(np.array([BOX]), np.array([0]), np.array([[[0, LEVELS]] * 3]))
+    assert wrong[1] == ((box.met_by > 0) != fit.hits).sum() > 50

@@ -1,0 +1,109 @@
+"""Looks: prototypes in parts, their codes, and how the prior decodes them."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from parts_of_rooms import CORNER, boxes
+from tiny_runs import tiny_lifted
+
+from sceneprior.core.geometry.turns import turn_grids
+from sceneprior.core.parts import Parts, filled_cells
+from sceneprior.lifted.looks import LookConfig, LookDecoder
+from sceneprior.lifted.prototypes import POSES, Prototypes, turn_of, turned_extents
+from sceneprior.paper.prior import ScenePrior
+
+SMALL = {"prototypes": 9, "codes": 4, "width": 8, "cells": 8, "margin": 1.2}
+
+
+@pytest.fixture
+def prior(tmp_path) -> ScenePrior:
+    return tiny_lifted(tmp_path, model__shape=SMALL).build_prior()
+
+
+@pytest.fixture
+def prototypes() -> Prototypes:
+    """Three shapes without symmetry."""
+    rng = np.random.default_rng(0)
+    parts = (CORNER, CORNER._replace(ends=CORNER.ends * 0.8), Parts(*(p[1:] for p in CORNER)))
+    grids = np.stack([filled_cells(each, 8, 1.1) for each in parts])
+    labels, common = np.array([2, 1, 2]), np.array([True, True, False])
+    return Prototypes(parts, grids, rng.uniform(0.5, 2, (3, 3)), labels, common)
+
+
+@pytest.fixture
+def decoder(prototypes) -> LookDecoder:
+    torch.manual_seed(0)
+    decoder = LookConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
+    decoder.learn_prototypes(prototypes)
+    return decoder
+
+
+def test_an_object_has_the_look_whose_code_is_nearest(decoder, torch_rng):
+    looks = torch.arange(3 * POSES)
+    codes, cells = decoder.targets(looks)
+    assert torch.equal(decoder.looks(codes), looks)
+    # Half a look's way to its neighbour is still its own; beyond that it is the neighbour.
+    assert torch.equal(decoder.looks(torch.lerp(codes[:-1], codes[1:], 0.4)), looks[:-1])
+    assert torch.equal(decoder.looks(torch.lerp(codes[:-1], codes[1:], 0.6)), looks[1:])
+    some = 3 * torch.randn(2, 4, 30, generator=torch_rng)
+    slow = ((some.unsqueeze(2) - codes) ** 2).sum(dim=-1).argmin(dim=-1)
+    assert torch.equal(decoder.looks(some), slow)  # never one of those that are none
+    assert torch.equal(cells, decoder.filled[looks // POSES]) and (cells > 20).all()
+
+
+def test_prototypes_are_kept_in_checkpoints_and_are_no_weights(decoder, prototypes):
+    fresh = LookConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
+    assert fresh.known == []
+    assert fresh.looks(torch.zeros(2, 30)).tolist() == [0, 0]
+    fresh.load_state_dict(decoder.state_dict())
+    for one, other in zip(fresh.prototypes[1:], prototypes[1:], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+    for one, other in zip(fresh.prototypes.parts, prototypes.parts, strict=True):
+        for here, there in zip(one, other, strict=True):
+            np.testing.assert_allclose(here, there, rtol=1e-6)
+    assert all(name.startswith("mlp.") for name, _ in fresh.named_parameters())
+
+
+def test_meshes_turn_and_fill_boxes_as_grids_do():
+    """A look's mesh against the cells of its turned grid, on a shape without symmetry."""
+    decoder = LookConfig(prototypes=2, codes=8, cells=32, margin=1.0).build(6)
+    grids = filled_cells(CORNER, 32, 1.0)[None]
+    size_m = np.array([[2.0, 0.5, 1.0]])
+    decoder.learn_prototypes(Prototypes((CORNER,), grids, size_m, np.array([1]), np.ones(1, bool)))
+    center_m = np.random.default_rng(0).normal(size=3)
+    middles = (np.arange(32) + 0.5) / 32 - 0.5
+    points = np.stack(np.meshgrid(middles, middles, middles, indexing="ij"), axis=-1)
+    for pose in range(POSES):
+        own_m = turned_extents(size_m, pose)[0]
+        mesh = decoder.mesh(pose, np.array([*center_m, *own_m]))
+        here = trimesh.Trimesh(mesh.vertices_m, mesh.faces)
+        assert here.is_volume
+        turned = turn_grids(grids, *turn_of(pose))[0]
+        assert here.volume == pytest.approx(turned.mean() * own_m.prod(), rel=0.02)
+        middle_m = points[turned].mean(axis=0) * own_m + center_m
+        np.testing.assert_allclose(here.center_mass, middle_m, atol=0.01)
+
+
+def test_a_look_stretches_into_its_box_and_boards_keep_their_thickness():
+    decoder = LookConfig(prototypes=1, codes=8, cells=16).build(6)
+    table = boxes((0, 64, 60, 64, 0, 64), (0, 4, 0, 60, 0, 4), mirrored=(0, 3))
+    grids = filled_cells(table, 16, 1.1)[None]
+    decoder.learn_prototypes(
+        Prototypes((table,), grids, np.ones((1, 3)), np.array([1]), np.ones(1, bool))
+    )
+    box = np.array([0, 0, 0, 2.0, 1.5, 3.0])
+    heights = np.unique(decoder.mesh(0, box).vertices_m[:, 1].round(3))
+    assert heights[0] == -0.75 and heights[-1] == 0.75
+    assert np.abs(heights - (0.75 - 4 / 64)).min() < 2e-3
+
+
+def test_the_prior_decodes_looks_in_place_of_meshes(prior, torch_rng):
+    logits = torch.randn(3, 10, generator=torch_rng)
+    scenes = prior(logits)
+    assert prior.faces is None and scenes.vertices_m is None
+    assert scenes.looks.shape == (3, 6)
+    bare = prior(logits, with_shape=False)
+    assert scenes.shape_codes.shape == (3, 6, 4)
+    assert bare.looks is None and torch.equal(bare.shape_codes, scenes.shape_codes)
+    assert torch.equal(bare.centers_m, scenes.centers_m)
