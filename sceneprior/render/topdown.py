@@ -157,7 +157,8 @@ def perspective(
     view: CornerView | None = None,
     colors: UInt8[np.ndarray, "objects 3"] | None = None,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """A shaded picture from above a corner, outside the room: for pages, not for metrics.
+    """A picture with soft shadows from above a corner, outside the room: for pages, not for
+    metrics.
 
     Without a `view`, one of `image_size` is fitted to the room; a common view makes several rooms
     comparable. `colors` of the objects are those of their classes unless given.
@@ -166,7 +167,8 @@ def perspective(
     colors = object_colors(scene) if colors is None else colors
     colors = np.concatenate([colors, [FLOOR_COLOR]]).astype(np.uint8)
     meshes = [*scene_meshes(scene), view.floor]
-    return renderer.shaded(meshes, colors, view.camera, view.image_size, BACKGROUND)
+    size = view.image_size
+    return renderer.shaded(meshes, colors, view.camera, size, BACKGROUND, shadows=True)
 
 
 def turntable(

@@ -9,14 +9,9 @@ import os
 import sys
 
 from sceneprior.core.errors import InputError
+from sceneprior.render.offscreen.cameras import Camera, Orthographic, Pinhole
 from sceneprior.render.offscreen.gl import NoGLError, open_pyrender
-from sceneprior.render.offscreen.renderer import (
-    Camera,
-    Orthographic,
-    Pinhole,
-    Renderer,
-    SoftwareRenderer,
-)
+from sceneprior.render.offscreen.renderer import Renderer, SoftwareRenderer
 
 __all__ = ["Camera", "Orthographic", "Pinhole", "Renderer", "SoftwareRenderer", "open_renderer"]
 

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from sceneprior.core.scene import Mesh
+from sceneprior.render.offscreen.cameras import Camera, Pinhole
 from sceneprior.render.offscreen.gl_ids import id_renderer_class
-from sceneprior.render.offscreen.renderer import Camera, Pinhole, Renderer
+from sceneprior.render.offscreen.renderer import Renderer
 
 _FAR_M = 200.0
 

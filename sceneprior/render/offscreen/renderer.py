@@ -6,34 +6,13 @@ draw nothing (prep-scannet) should not spend.
 
 import abc
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from sceneprior.core.scene import Mesh
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """A perspective camera: `point_camera = world_to_camera @ point_world`, OpenCV axes."""
-
-    world_to_camera: np.ndarray
-    """(4, 4), metres."""
-    intrinsics: np.ndarray
-    """(3, 3), pixels; without skew."""
-
-
-@dataclass(frozen=True)
-class Orthographic:
-    """A parallel camera; the centre of the image lies on its optical axis."""
-
-    world_to_camera: np.ndarray
-    """(4, 4), metres. Only geometry in front of the camera is drawn."""
-    metres_per_pixel: float
-
-
-Camera = Pinhole | Orthographic
+from sceneprior.render.offscreen.cameras import Camera, Pinhole
+from sceneprior.render.offscreen.sky import sky_light
 
 
 class Renderer(abc.ABC):
@@ -67,19 +46,26 @@ class Renderer(abc.ABC):
         camera: Camera,
         image_size: tuple[int, int],
         background: tuple[int, int, int] | np.ndarray = (255, 255, 255),
+        shadows: bool = False,
     ) -> np.ndarray:
-        """A shaded picture (H, W, 3), with mesh k in `colors[k]` (uint8), lit from the camera.
+        """A shaded picture (H, W, 3), with mesh k in `colors[k]` (uint8), lit from the camera and,
+        with `shadows`, from the sky (`sky.py`); these take a pinhole.
 
         The background is a colour, or a picture of this size. Both renderers use the software
         z-buffer for it, so that pictures look the same everywhere.
         """
         height, width = image_size
         soup = _join(meshes)
-        face_index = _draw(soup, camera, (2 * height, 2 * width), supersampling=2)
+        face_index, depth_m = _draw(soup, camera, (2 * height, 2 * width), supersampling=2)
         light = _face_light(soup, camera)
         palette = np.asarray(colors, dtype=np.float64).reshape(-1, 3)[soup.mesh_of_face]
         palette = np.concatenate([palette * light[:, None], [(0, 0, 0)]])  # -1 is the last row
-        fine = palette[face_index].reshape(height, 2, width, 2, 3)
+        picture = palette[face_index]
+        if shadows and isinstance(camera, Pinhole):
+            # At half the resolution: light changes slowly.
+            light = sky_light(soup.vertices, soup.faces, camera, depth_m[::2, ::2])
+            picture *= light.repeat(2, axis=0).repeat(2, axis=1)[..., None]
+        fine = picture.reshape(height, 2, width, 2, 3)
         behind = np.broadcast_to(np.asarray(background), (height, width, 3))[:, None, :, None]
         fine = np.where((face_index < 0).reshape(height, 2, width, 2, 1), behind, fine)
         return np.rint(fine.mean(axis=(1, 3))).astype(np.uint8)
@@ -97,7 +83,7 @@ class SoftwareRenderer(Renderer):
         soup = _join(meshes)
         images = np.empty((len(cameras), *image_size), dtype=np.uint16)
         for image, camera in zip(images, cameras, strict=True):
-            image[...] = _draw(soup, camera, image_size, labels=soup.mesh_of_face) + 1
+            image[...] = _draw(soup, camera, image_size, labels=soup.mesh_of_face)[0] + 1
         return images
 
 
@@ -128,8 +114,9 @@ def _draw(
     image_size: tuple[int, int],
     supersampling: int = 1,
     labels: np.ndarray | None = None,
-) -> np.ndarray:
-    """Draw with `zbuffer.rasterize`; `image_size` is the supersampled size."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw with `zbuffer.rasterize`, whose result this is; `image_size` is the supersampled
+    size."""
     from sceneprior.render.offscreen.zbuffer import rasterize
 
     if isinstance(camera, Pinhole):
@@ -141,7 +128,7 @@ def _draw(
     return rasterize(
         soup.vertices, soup.faces, camera.world_to_camera, projection, image_size,
         isinstance(camera, Pinhole), labels,
-    )[0]  # fmt: skip
+    )  # fmt: skip
 
 
 def _face_light(soup: _Soup, camera: Camera) -> np.ndarray:
