@@ -8,16 +8,17 @@ from torch.nn import functional as F
 from sceneprior.core.mixtures import draw_index
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.sampler.contents import END
-from sceneprior.lifted.sampler.network import Frame, Reading, RoomSampler
+from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.plan import (
-    BEYOND_M,
     Given,
     Plan,
     nothing_given,
     plan_rooms,
     uniform_numbers,
 )
-from sceneprior.lifted.sampler.rooms import FRAME_M, GRAZE_M, gaps_m, shared_extents
+from sceneprior.lifted.sampler.reading import Frame, Reading
+from sceneprior.lifted.sampler.rooms import FRAME_M, gaps_m
+from sceneprior.lifted.sampler.violations import settled, violation
 
 PLACES = 16
 """Places sampled for an object in the last attempt, in which it takes the best one."""
@@ -27,8 +28,6 @@ since an object whose likely places are taken would end at an unlikely one; the 
 again instead."""
 LOOKS = 16
 """Looks sampled for a given object, one of which is chosen by the likelihood of its place."""
-INTERSECTING = 0.01
-"""Share of the smaller volume from which two boxes count as intersecting, as in the evaluation."""
 OPEN_M = 3 * FRAME_M
 """Distance in metres beyond which a side counts as empty: 1 of 370 sides in the training rooms
 exceeds it."""
@@ -109,22 +108,21 @@ def _draw(
     stuck = torch.zeros_like(number, dtype=torch.bool)
     added = (plan.coming != END).any(dim=1)
     for step, chance in enumerate(uniform.unbind(dim=1)):
-        label = plan.coming[:, step]
         # Rooms to be furnished again are not completed.
-        going = (label != END) & (last | ~stuck)
-        if not going.any():
+        rows = ((plan.coming[:, step] != END) & (last | ~stuck)).nonzero()[:, 0]
+        if not len(rows):
             break
-        reading = _read(sampler, rooms, number, plan, plan.coming[:, step:])
-        some = label.where(going, label[going][0])  # finished rooms get a dummy class
-        look, box_m, wrong = _placed(
-            sampler, reading, some, going, chance, PLACES if last else TRIES
-        )
-        stuck = stuck | (going & (wrong > 0))
-        placed = going & ((wrong == 0) | (last & keep))
-        at = (placed.nonzero()[:, 0], number[placed])
-        rooms.object_class[at], rooms.is_object[at] = some[placed], True
+        label, begun = plan.coming[rows, step], rooms.changed(lambda part, rows=rows: part[rows])
+        reading = _read(sampler, begun, number[rows], plan.rows(rows), plan.coming[rows, step:])
+        tries = PLACES if last else TRIES
+        look, box_m, wrong = _placed(sampler, reading, label, chance[rows], tries)
+        stuck[rows] |= wrong > 0
+        placed = (wrong == 0) | (last & keep)
+        rows = rows[placed]
+        at = (rows, number[rows])
+        rooms.object_class[at], rooms.is_object[at] = label[placed], True
         rooms.boxes_m[at], looks[at] = box_m[placed], look[placed]
-        number = number + placed
+        number[rows] += 1
     side_open = gaps_m(rooms, plan.rectangle_m).amax(dim=-1) > OPEN_M
     return rooms, stuck | (added & plan.drawn & side_open)
 
@@ -149,13 +147,11 @@ def _placed(
     sampler: RoomSampler,
     reading: Reading,
     label: Int[Tensor, " rooms"],
-    going: Bool[Tensor, " rooms"],
     chance: Float[Tensor, "rooms numbers"],
     tries: int,
 ) -> tuple[Int[Tensor, " rooms"], Float[Tensor, "rooms 6"], Float[Tensor, " rooms"]]:
     """A look and a box for an object of a class, at the first of `tries` sampled places without a
-    violation, and its violation; if all have one, at the place with the least. Rooms that are not
-    `going` get any box."""
+    violation, and its violation; if all have one, at the place with the least."""
     look = draw_index(sampler.look_logits(reading, label), chance[:, 1])
     details = sampler.details(reading, label, look).draw(chance[:, 2], chance[:, 3:7])
     off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)
@@ -168,15 +164,15 @@ def _placed(
     boxes_m = torch.cat([centre_m, size_m], dim=-1)
     wrong = torch.full_like(bottom_m, torch.inf)
     for number in range(tries):
-        rows = (going & (wrong > 0)).nonzero()[:, 0]
+        rows = (wrong > 0).nonzero()[:, 0]
         if not len(rows):
             break
         tried_m = boxes_m[rows]
         tried_m[:, [0, 2]] = places.rows(rows).draw(x[rows, number], numbers[rows, number, 2:])
         some = reading.rows(rows)
         apart = ~sampler.may_meet[label[rows, None], some.before.object_class]
-        tried_m = _settled(tried_m, some, apart)
-        found = _wrong(tried_m, some, apart)
+        tried_m = settled(tried_m, some, apart)
+        found = violation(tried_m, some, apart)
         better = rows[found < wrong[rows]]
         boxes_m[better] = tried_m[found < wrong[rows]]
         wrong[rows] = torch.minimum(found, wrong[rows])
@@ -206,7 +202,7 @@ def _recognised(
         label = rooms.object_class[:, step].clamp(min=1)
         centre_m, size_m = rooms.boxes_m[:, step].split(3, dim=-1)
         size_m = size_m.where(here[:, None], 1.0)
-        off = size_m.log().unsqueeze(1) - sampler.look_shown[:, -3:]
+        off = size_m.log().unsqueeze(1) - sampler.look_shown[: sampler.looks, -3:]
         logits = sampler.look_logits(reading, label)
         logits = logits - off.square().sum(dim=-1) / (2 * SIZE_DOUBT**2)
         chance = uniform[:, step]
@@ -219,41 +215,3 @@ def _recognised(
         chosen = draw_index(torch.stack(fits, dim=1), chance[:, 0])
         looks[:, step] = some.gather(1, chosen[:, None])[:, 0] * here
     return rooms
-
-
-def _settled(
-    boxes_m: Float[Tensor, "rooms 6"], reading: Reading, apart: Bool[Tensor, "rooms objects"]
-) -> Float[Tensor, "rooms 6"]:
-    """Move boxes out of objects that they should stand `apart` from, and into the rectangle, along
-    each axis by at most `GRAZE_M`: sampled places are not accurate to the centimetre."""
-    others_m = reading.before.boxes_m
-    shared = shared_extents(boxes_m.unsqueeze(1), others_m)
-    grazes = apart & reading.before.is_object & (shared > 0).all(dim=-1)
-    x_and_z, away = shared[..., ::2], (boxes_m.unsqueeze(1) - others_m)[..., [0, 2]]
-    least = x_and_z == x_and_z.amin(dim=-1, keepdim=True)
-    moves = x_and_z * away.sign() * (least & (x_and_z <= GRAZE_M) & grazes.unsqueeze(-1))
-    centre = boxes_m[:, [0, 2]] + moves.sum(dim=1)
-    middle, extents = reading.frame.rectangle_m.split(2, dim=-1)
-    free = ((extents - boxes_m[:, [3, 5]]) / 2).clamp(min=0)
-    inside = centre.clamp(middle - free, middle + free)
-    centre = inside.where((inside - centre).abs() <= GRAZE_M, centre)
-    settled = boxes_m.clone()
-    settled[:, [0, 2]] = centre
-    return settled
-
-
-def _wrong(
-    boxes_m: Float[Tensor, "rooms 6"], reading: Reading, apart: Bool[Tensor, "rooms objects"]
-) -> Float[Tensor, " rooms"]:
-    """Violation of a box, 0 if there is none: the intersected shares of the smaller boxes, summed
-    over objects that it should stand `apart` from, plus the metres by which it extends beyond the
-    rectangle."""
-    others = reading.before
-    here, theirs = boxes_m.unsqueeze(1), others.boxes_m
-    shared = shared_extents(here, theirs).prod(dim=-1)
-    least = torch.minimum(here[..., 3:].prod(dim=-1), theirs[..., 3:].prod(dim=-1))
-    share = shared / least.clamp(min=1e-9)
-    share = share.where((share > INTERSECTING) & others.is_object & apart, 0.0)
-    middle, extents = reading.frame.rectangle_m.split(2, dim=-1)
-    beyond = (boxes_m[:, [0, 2]] - middle).abs() + (boxes_m[:, [3, 5]] - extents) / 2
-    return share.sum(dim=-1) + (beyond.amax(dim=-1) - BEYOND_M).clamp(min=0)

@@ -5,7 +5,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.sampler.network import Frame, RoomSampler
+from sceneprior.lifted.sampler.network import RoomSampler
+from sceneprior.lifted.sampler.reading import Frame
 from sceneprior.lifted.sampler.rooms import frames_of, large_first, shuffled
 
 PARTS_OF_OBJECT = ("look", "size", "place")

@@ -2,7 +2,6 @@
 ones."""
 
 import math
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -13,20 +12,15 @@ from sceneprior.core.mixtures import LogisticMixture, draw_index
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turned_looks
 from sceneprior.lifted.sampler.contents import Contents
-from sceneprior.lifted.sampler.placement import SHOWN, Placement, Places
+from sceneprior.lifted.sampler.placement import SHOWN, Placement
+from sceneprior.lifted.sampler.places import Places
+from sceneprior.lifted.sampler.reading import LENGTHS, Frame, Reading, lengths_shown
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, gaps_m, rectangle_sides
 from sceneprior.lifted.sampler.settings import SamplerConfig
 from sceneprior.paper.layers import mlp
 
 CLASS_WIDTH = 32
 """Dimension of the class embedding."""
-OCTAVES = 6
-"""Frequencies in the encoding of a length."""
-LONGEST_M = 16.0
-"""Longest period of that encoding: sines and cosines of `OCTAVES` periods, this one, its half and
-so on."""
-LENGTHS = 1 + 2 * OCTAVES
-"""Numbers that encode a length."""
 RECTANGLES = 6
 """Components of the Gaussian mixture of the rectangle around a room's furniture."""
 DETAILS = 4
@@ -116,6 +110,11 @@ class RoomSampler(nn.Module):
         """Indices of the classes that can be sampled: those with looks, not the whole label set."""
         return [int(row) for row in self.look_class[self.look_class >= 0].unique()]
 
+    @property
+    def looks(self) -> int:
+        """Number of looks: 8 for each prototype found, often far fewer than there may be."""
+        return 1 + int((self.look_class >= 0).nonzero().max())
+
     def rectangles(
         self, choice: Float[Tensor, "*batch"], noise: Float[Tensor, "*batch 4"]
     ) -> Float[Tensor, "*batch 4"]:
@@ -138,15 +137,15 @@ class RoomSampler(nn.Module):
         low, high = (extents - footprint) / 2 + place, (extents - footprint) / 2 - place
         shown = lengths_shown(torch.cat([place, bottom, size, low, high], dim=-1))
         known = torch.cat([self.class_embedding(rooms.object_class), shown], dim=-1)
-        return self.object_embedding(known) + self.look_embedding(self.look_shown)[rooms.looks]
+        return self.object_embedding(known) + self.look_embedding(self.look_shown[rooms.looks])
 
     def read(
         self,
         before: RoomBoxes,
         coming: Float[Tensor, "rooms classes"],
-        frame: "Frame",
+        frame: Frame,
         tokens: Float[Tensor, "rooms objects width"],
-    ) -> "Reading":
+    ) -> Reading:
         """Encode the objects placed so far, in any order, from their `tokens`, and the counts of
         each class still to come."""
         query = self.query + self.summary_embedding(self.summary(before, coming, frame))
@@ -160,7 +159,7 @@ class RoomSampler(nn.Module):
         return Reading(before, frame, coming, features[:, 0])
 
     def summary(
-        self, before: RoomBoxes, coming: Float[Tensor, "rooms classes"], frame: "Frame"
+        self, before: RoomBoxes, coming: Float[Tensor, "rooms classes"], frame: Frame
     ) -> Float[Tensor, "rooms summary"]:
         """Features that attention would have to count: objects of each class, those to come, and
         the gaps between the furniture and each side of the rectangle, which are small in a finished
@@ -173,20 +172,21 @@ class RoomSampler(nn.Module):
         return torch.cat([counts, coming, lengths_shown(gaps)], dim=-1)
 
     def look_logits(
-        self, reading: "Reading", label: Int[Tensor, " rooms"]
+        self, reading: Reading, label: Int[Tensor, " rooms"]
     ) -> Float[Tensor, "rooms looks"]:
         """Logits of the next object's look, given its class; looks of other classes are ruled
         out."""
         known = torch.cat([reading.context, self.class_embedding(label)], dim=-1)
-        offered = self.offered_look(self.look_shown)
+        offered = self.offered_look(self.look_shown[: self.looks])
         logits = self.wanted_look(known) @ offered.T / math.sqrt(MATCH_WIDTH)
         own_pose = OWN_POSE.to(self.frequency.device)
-        frequency = self.frequency[:, own_pose].transpose(0, 1).flatten(1)
+        frequency = self.frequency[:, own_pose].transpose(0, 1).flatten(1)[:, : self.looks]
         logits = logits + frequency[reading.frame.symmetry]
-        return logits.masked_fill(self.look_class != label.unsqueeze(-1), -torch.inf)
+        others = self.look_class[: self.looks] != label.unsqueeze(-1)
+        return logits.masked_fill(others, -torch.inf)
 
     def details(
-        self, reading: "Reading", label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
+        self, reading: Reading, label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
     ) -> LogisticMixture:
         """Distribution of the log extents relative to those of the look, and of the height of the
         bottom."""
@@ -194,7 +194,7 @@ class RoomSampler(nn.Module):
 
     def place(
         self,
-        reading: "Reading",
+        reading: Reading,
         label: Int[Tensor, " rooms"],
         look: Int[Tensor, " rooms"],
         size_m: Float[Tensor, "rooms 3"],
@@ -211,7 +211,7 @@ class RoomSampler(nn.Module):
         """Number of objects of each class."""
         return self.contents.before(rooms.object_class, rooms.is_object)[:, -1]
 
-    def log_prob(self, reading: "Reading", coming: RoomBoxes) -> dict[str, Float[Tensor, " rooms"]]:
+    def log_prob(self, reading: Reading, coming: RoomBoxes) -> dict[str, Float[Tensor, " rooms"]]:
         """Log-probability of each room's next object given its class, by part. Every room of
         `coming` has one object."""
         assert coming.looks is not None
@@ -230,53 +230,10 @@ class RoomSampler(nn.Module):
         }
 
     def _known(
-        self, reading: "Reading", label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
+        self, reading: Reading, label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
     ) -> Float[Tensor, "rooms known"]:
         look_seen = self.look_embedding(self.look_shown[look])
         return torch.cat([reading.context, self.class_embedding(label), look_seen], dim=-1)
-
-
-class Frame(NamedTuple):
-    """Conditions of rooms that are known before they have any furniture."""
-
-    rectangle_m: Float[Tensor, "rooms 4"]
-    """Rectangle that the furniture may fill: centre x, z and extents x, z."""
-    symmetry: Int[Tensor, " rooms"]
-    """Index of the symmetry, out of `SYMMETRIES`, in which each room is presented; 0 is
-    untransformed."""
-
-    @classmethod
-    def plain(cls, rectangle_m: Float[Tensor, "rooms 4"]) -> "Frame":
-        """The frame of untransformed rooms."""
-        return cls(rectangle_m, rectangle_m.new_zeros(len(rectangle_m), dtype=torch.int64))
-
-    def rows(self, chosen: Tensor) -> "Frame":
-        """The frame of the chosen rooms."""
-        return Frame(self.rectangle_m[chosen], self.symmetry[chosen])
-
-
-class Reading(NamedTuple):
-    """Encoder outputs for partly furnished rooms."""
-
-    before: RoomBoxes
-    frame: Frame
-    coming: Float[Tensor, "rooms classes"]
-    """Counts of each class still to come."""
-    context: Float[Tensor, "rooms width"]
-    """Output of the query: the context for the next object."""
-
-    def rows(self, rows: Int[Tensor, " some"]) -> "Reading":
-        """The outputs of these rooms."""
-        before = self.before.changed(lambda part: part[rows])
-        return Reading(before, self.frame.rows(rows), self.coming[rows], self.context[rows])
-
-
-def lengths_shown(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch shown"]:
-    """Fourier features of lengths: the lengths themselves (in units of 4 m), their sines and
-    cosines."""
-    octaves = torch.arange(OCTAVES, device=lengths_m.device, dtype=lengths_m.dtype)
-    phase = (lengths_m.unsqueeze(-1) * (2 * math.pi / LONGEST_M * 2**octaves)).flatten(-2)
-    return torch.cat([lengths_m / 4, phase.sin(), phase.cos()], dim=-1)
 
 
 def _head(inputs: int, width: int, outputs: int) -> nn.Sequential:

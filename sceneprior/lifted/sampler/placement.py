@@ -2,21 +2,25 @@
 objects that are there."""
 
 import math
-from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.mixtures import FIRST_SCALE, LogisticMixture
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import PARTS
-from sceneprior.lifted.sampler.frames import (
-    backs_of,
-    into_frames,
-    turn_places,
-    turn_rectangles,
+from sceneprior.lifted.sampler.frames import backs_of, into_frames, turn_rectangles
+from sceneprior.lifted.sampler.places import (
+    BY_OBJECT,
+    BY_SIDES,
+    GAPS_M,
+    OF_OBJECT,
+    OF_SIDES,
+    Anchors,
+    Places,
+    ramps,
 )
 from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, shared_extents
 
@@ -27,40 +31,11 @@ EMBEDDING = 16
 identify a training room."""
 WIDTH = 64
 """Width of the hidden layers."""
-BY_SIDES = 8
-"""Anchors along an axis that the room gives: flush with the lower side of the rectangle, with its
-upper side, in its middle, and at the origin, which is the floor's middle; a narrow one and a wide
-one each."""
-BY_OBJECT = 7
-"""Anchors along an axis per object that is there: adjacent before it, flush with its lower side,
-centred, flush with its upper side, adjacent behind it, and `APART_M` before and behind it."""
-APART_M = 0.4
-"""Gap of the anchors apart from an object."""
 NARROW_M, WIDE_M = 0.03, 0.2
 """Scales of narrow and wide logistics for a network output of 0. The room's second anchors and
 those apart from objects are wide."""
 SHIFT_M = 0.3
 """Shift of an anchor for a network output of 1."""
-GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 1.0, 2.0)
-"""Knots of `ramps` for gaps; negative gaps are overlaps."""
-OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
-"""Knots of `ramps` for offsets of centres and sides."""
-OF_GAP, OF_OFFSET = len(GAPS_M) - 1, len(OFFSETS_M) - 1
-OF_OBJECT, OF_SIDES = OF_GAP + 3 * OF_OFFSET, 2 * OF_GAP
-"""Features of the relation to an object along an axis, and to the two sides of the rectangle."""
-
-
-def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> Tensor:
-    """Piecewise linear features of lengths: each rises from 0 to 1 between two knots.
-
-    Example:
-
-        >>> ramps(torch.tensor([0.5]), (0.0, 1.0, 2.0))
-        tensor([0.5000, 0.0000])
-    """
-    knots = torch.tensor(knots_m).to(lengths_m)
-    rising = (lengths_m.unsqueeze(-1) - knots[:-1]) / knots.diff()
-    return rising.clamp(0, 1).flatten(-2)
 
 
 class Placement(nn.Module):
@@ -100,7 +75,7 @@ class Placement(nn.Module):
         counts: Float[Tensor, "rooms counts"],
         look_shown: Float[Tensor, "looks shown"],
         backs: Int[Tensor, " prototypes"],
-    ) -> "Places":
+    ) -> Places:
         """The distribution for an object of a class, look and size, given the rectangle (centre
         x, z, extents x, z), the objects there, and the counts of each class there and to come.
 
@@ -133,7 +108,7 @@ class Placement(nn.Module):
         level = centre * torch.tensor([0.0, 1.0, 0.0]).to(centre)
         meets = shared_extents(own_box, torch.cat([level, extents], dim=-1))[..., 1] > 0
         return Places(
-            self, label, before.object_class,
+            self.along_x, self.along_z, label, before.object_class,
             self.dropout(torch.relu(self.own(own))), self.dropout(torch.relu(self.there(there))),
             size_m[:, ::2], rectangle_m, before.boxes_m[..., [0, 2, 3, 5]], before.is_object,
             meets, quarters,
@@ -172,18 +147,24 @@ class AxisScore(nn.Module):
             self.out.weight *= 0.5
             self.out.bias.zero_()
 
-    def forward(self, places: "Places", anchors: "Anchors") -> LogisticMixture:
+    def forward(self, places: Places, anchors: Anchors) -> LogisticMixture:
         """The mixture along the axis of the `anchors`."""
         is_object = places.is_object.unsqueeze(-1)
         given = (self.own(places.own).unsqueeze(1) + self.there(places.there)).unsqueeze(1)
-        pairs = torch.relu(self.relation(anchors.relations) + given) * is_object.unsqueeze(1)
+        widths = [part.shape[-1] for part in anchors.relations]
+        for part, weight in zip(
+            anchors.relations, self.relation.weight.split(widths, 1), strict=True
+        ):
+            given = given + part @ weight.T
+        pairs = torch.relu(given + self.relation.bias) * is_object.unsqueeze(1)
         known = self.sides(anchors.sides) + self.anchor(anchors.kind)
         hidden = (
             self.pooled(pairs.sum(dim=2) / 2) + known + self.anchor_own(places.own).unsqueeze(1)
         )
         logit, shift, scale = self.out(self.dropout(torch.relu(hidden))).unbind(dim=-1)
         table = self.pair_table[places.label.unsqueeze(1), places.object_class] * is_object
-        logit = logit + torch.einsum("raof,rof->ra", anchors.relations, table)
+        for part, weight in zip(anchors.relations, table.split(widths, dim=-1), strict=True):
+            logit = logit + torch.einsum("raof,rof->ra", part, weight)
         logit = logit + torch.einsum("raf,rf->ra", anchors.sides, self.side_table[places.label])
         logit = logit + self.anchor_table[places.label][:, anchors.kind]
         means = anchors.at_m + SHIFT_M * shift
@@ -192,121 +173,6 @@ class AxisScore(nn.Module):
             means.unsqueeze(-1),
             (scale + self.first_log_scale[anchors.kind]).unsqueeze(-1),
         )
-
-
-class Anchors(NamedTuple):
-    """Positions along an axis, and what an object there would stand next to."""
-
-    at_m: Float[Tensor, "rooms anchors"]
-    exists: Bool[Tensor, "rooms anchors"]
-    """False for the anchors of padding."""
-    kind: Int[Tensor, " anchors"]
-    """0 to 7 for those that the room gives, 8 to 14 for those of an object."""
-    relations: Float[Tensor, "rooms anchors objects features"]
-    sides: Float[Tensor, "rooms anchors features"]
-
-
-class Places(NamedTuple):
-    """The distribution of the next object's centre (x, z) in each room; lengths are in the frames
-    of these objects."""
-
-    placement: Placement
-    label: Int[Tensor, " rooms"]
-    object_class: Int[Tensor, "rooms objects"]
-    own: Float[Tensor, "rooms width"]
-    there: Float[Tensor, "rooms objects width"]
-    size_m: Float[Tensor, "rooms 2"]
-    rectangle_m: Float[Tensor, "rooms 4"]
-    footprints_m: Float[Tensor, "rooms objects 4"]
-    """Centre x, z and extents x, z of the objects there."""
-    is_object: Bool[Tensor, "rooms objects"]
-    meets: Bool[Tensor, "rooms objects"]
-    """True for objects that overlap with the next object in height."""
-    quarters: Int[Tensor, " rooms"]
-    """Quarter turns that take the room to the frame."""
-
-    def rows(self, rows: Int[Tensor, " some"]) -> "Places":
-        """The distribution in these rooms."""
-        return Places(self.placement, *(part[rows] for part in self[1:]))
-
-    def log_prob(self, place_m: Float[Tensor, "rooms 2"]) -> Float[Tensor, " rooms"]:
-        """Log-densities of places in the rooms."""
-        x, z = turn_places(place_m, self.quarters).split(1, dim=-1)
-        return self._along_x().log_prob(x) + self._along_z(x[:, 0]).log_prob(z)
-
-    def draw_x(self, uniform: Float[Tensor, "rooms tries 2"]) -> Float[Tensor, "rooms tries"]:
-        """Positions along x of the frames from uniform numbers."""
-        return self._along_x().drawn(uniform[..., 0], uniform[..., 1:])[..., 0]
-
-    def draw(
-        self, x: Float[Tensor, " rooms"], uniform: Float[Tensor, "rooms 2"]
-    ) -> Float[Tensor, "rooms 2"]:
-        """Places in the rooms, given the position along x of the frames, from uniform numbers."""
-        z = self._along_z(x).draw(uniform[:, 0], uniform[:, 1:])[:, 0]
-        return turn_places(torch.stack([x, z], dim=-1), -self.quarters % QUARTERS)
-
-    def _along_x(self) -> LogisticMixture:
-        at_m, exists, kind = self._anchors(0)
-        relations, sides, _ = self._relations(0, at_m)
-        return self.placement.along_x(self, Anchors(at_m, exists, kind, relations, sides))
-
-    def _along_z(self, x: Float[Tensor, " rooms"]) -> LogisticMixture:
-        at_m, exists, kind = self._anchors(1)
-        relations_x, sides_x, overlap_x = self._relations(0, x.unsqueeze(1))
-        relations_z, sides_z, overlap_z = self._relations(1, at_m)
-        many = at_m.shape[1]
-        least = torch.minimum(
-            self.size_m.prod(dim=-1, keepdim=True), self.footprints_m[..., 2:].prod(dim=-1)
-        )
-        shared = overlap_x * overlap_z / least.clamp(min=1e-6).unsqueeze(1)
-        shared = (shared * self.meets.unsqueeze(1)).clamp(max=1).unsqueeze(-1)
-        relations = [relations_x.expand(-1, many, -1, -1), relations_z, shared.sqrt()]
-        sides = [sides_x.expand(-1, many, -1), sides_z]
-        return self.placement.along_z(
-            self,
-            Anchors(at_m, exists, kind, torch.cat(relations, dim=-1), torch.cat(sides, dim=-1)),
-        )
-
-    def _anchors(self, axis: int) -> tuple[Tensor, Tensor, Tensor]:
-        """`at_m`, `exists` and `kind` of `Anchors` along x (0) or z (1)."""
-        middle, extent = self.rectangle_m[:, axis], self.rectangle_m[:, 2 + axis]
-        size = self.size_m[:, axis]
-        free = ((extent - size) / 2).clamp(min=0)
-        sides = torch.stack([middle - free, middle + free, middle, torch.zeros_like(free)], dim=1)
-        sides = sides.repeat_interleave(2, dim=1)
-        centre, theirs = self.footprints_m[..., axis], self.footprints_m[..., 2 + axis]
-        total, difference = (theirs + size.unsqueeze(1)) / 2, (theirs - size.unsqueeze(1)) / 2
-        away = torch.stack(
-            [-total, -difference, torch.zeros_like(total), difference, total,
-             -total - APART_M, total + APART_M], dim=-1,
-        )  # fmt: skip
-        beside = (centre.unsqueeze(-1) + away).flatten(1)
-        theirs = self.is_object.repeat_interleave(BY_OBJECT, dim=1)
-        kinds = torch.arange(BY_SIDES + BY_OBJECT, device=size.device)
-        return (
-            torch.cat([sides, beside], dim=1),
-            torch.cat([torch.ones_like(sides, dtype=torch.bool), theirs], dim=1),
-            torch.cat([kinds[:BY_SIDES], kinds[BY_SIDES:].repeat(centre.shape[1])]),
-        )
-
-    def _relations(self, axis: int, at_m: Float[Tensor, "rooms anchors"]) -> tuple[Tensor, ...]:
-        """Features along an axis of the relations to the objects there and to the sides of the
-        rectangle, and the overlap with each object in metres."""
-        size = self.size_m[:, axis].unsqueeze(1)
-        offset = self.footprints_m[:, None, :, axis] - at_m.unsqueeze(-1)
-        theirs = self.footprints_m[..., 2 + axis]
-        total, difference = ((theirs + size) / 2).unsqueeze(1), ((theirs - size) / 2).unsqueeze(1)
-        gap = offset.abs() - total
-        offsets = torch.stack([offset, offset - difference, offset + difference], dim=-1)
-        relations = [ramps(gap.unsqueeze(-1), GAPS_M), ramps(offsets, OFFSETS_M)]
-        middle, extent = (self.rectangle_m[:, [at]] for at in (axis, 2 + axis))
-        to_middle = at_m - middle
-        sides = (
-            torch.stack([extent / 2 + to_middle, extent / 2 - to_middle], dim=-1)
-            - size[..., None] / 2
-        )
-        overlap = (-gap).clamp(min=0)
-        return torch.cat(relations, dim=-1), ramps(sides, GAPS_M), overlap
 
 
 def _alone(

@@ -7,9 +7,10 @@ from torch.testing import assert_close
 
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.sampler import draw as module
-from sceneprior.lifted.sampler.draw import INTERSECTING, draw_rooms
+from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.lifted.sampler.plan import BEYOND_M, Given, holding, nothing_given
 from sceneprior.lifted.sampler.rooms import SamplerRooms, gaps_m, rectangles_of, shared_extents
+from sceneprior.lifted.sampler.violations import INTERSECTING
 
 
 @pytest.fixture(scope="module")

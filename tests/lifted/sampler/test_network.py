@@ -12,7 +12,7 @@ from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import turned_looks
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
-from sceneprior.lifted.sampler.network import Frame
+from sceneprior.lifted.sampler.reading import Frame
 from sceneprior.lifted.sampler.rooms import (
     SYMMETRIES,
     SamplerRooms,
@@ -135,7 +135,9 @@ def test_looks_of_other_classes_are_ruled_out(sampler, rooms):
     whole = in_float64(rooms.rooms)
     reading = read(sampler, whole, rectangles_of(whole))
     logits = sampler.look_logits(reading, torch.full((len(rooms),), 2))
-    assert torch.equal(logits.isfinite(), (sampler.look_class == 2).expand_as(logits))
+    classes = sampler.look_class[: logits.shape[1]]
+    assert torch.equal(logits.isfinite(), (classes == 2).expand_as(logits))
+    assert (sampler.look_class[logits.shape[1] :] == -1).all()
 
 
 def test_gradients_of_the_likelihood_are_right(rooms):

@@ -1,0 +1,62 @@
+"""Inputs of the sampler's network: a room's frame, and partly furnished rooms as its encoder reads
+them."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sceneprior.core.views import RoomBoxes
+
+OCTAVES = 6
+"""Frequencies in the encoding of a length."""
+LONGEST_M = 16.0
+"""Longest period of that encoding: sines and cosines of `OCTAVES` periods, this one, its half and
+so on."""
+LENGTHS = 1 + 2 * OCTAVES
+"""Numbers that encode a length."""
+
+
+class Frame(NamedTuple):
+    """Conditions of rooms that are known before they have any furniture."""
+
+    rectangle_m: Float[Tensor, "rooms 4"]
+    """Rectangle that the furniture may fill: centre x, z and extents x, z."""
+    symmetry: Int[Tensor, " rooms"]
+    """Index of the symmetry, out of `SYMMETRIES`, in which each room is presented; 0 is
+    untransformed."""
+
+    @classmethod
+    def plain(cls, rectangle_m: Float[Tensor, "rooms 4"]) -> "Frame":
+        """The frame of untransformed rooms."""
+        return cls(rectangle_m, rectangle_m.new_zeros(len(rectangle_m), dtype=torch.int64))
+
+    def rows(self, chosen: Tensor) -> "Frame":
+        """The frame of the chosen rooms."""
+        return Frame(self.rectangle_m[chosen], self.symmetry[chosen])
+
+
+class Reading(NamedTuple):
+    """Encoder outputs for partly furnished rooms."""
+
+    before: RoomBoxes
+    frame: Frame
+    coming: Float[Tensor, "rooms classes"]
+    """Counts of each class still to come."""
+    context: Float[Tensor, "rooms width"]
+    """Output of the query: the context for the next object."""
+
+    def rows(self, rows: Int[Tensor, " some"]) -> "Reading":
+        """The outputs of these rooms."""
+        before = self.before.changed(lambda part: part[rows])
+        return Reading(before, self.frame.rows(rows), self.coming[rows], self.context[rows])
+
+
+def lengths_shown(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch shown"]:
+    """Fourier features of lengths: the lengths themselves (in units of 4 m), their sines and
+    cosines."""
+    octaves = torch.arange(OCTAVES, device=lengths_m.device, dtype=lengths_m.dtype)
+    phase = (lengths_m.unsqueeze(-1) * (2 * math.pi / LONGEST_M * 2**octaves)).flatten(-2)
+    return torch.cat([lengths_m / 4, phase.sin(), phase.cos()], dim=-1)

@@ -1,0 +1,50 @@
+"""Violations: boxes that intersect what they should not, or stick out of the rectangle."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from sceneprior.lifted.sampler.plan import BEYOND_M
+from sceneprior.lifted.sampler.reading import Reading
+from sceneprior.lifted.sampler.rooms import GRAZE_M, shared_extents
+
+INTERSECTING = 0.01
+"""Share of the smaller volume from which two boxes count as intersecting, as in the evaluation."""
+
+
+def settled(
+    boxes_m: Float[Tensor, "rooms 6"], reading: Reading, apart: Bool[Tensor, "rooms objects"]
+) -> Float[Tensor, "rooms 6"]:
+    """Move boxes out of objects that they should stand `apart` from, and into the rectangle, along
+    each axis by at most `GRAZE_M`: sampled places are not accurate to the centimetre."""
+    others_m = reading.before.boxes_m
+    shared = shared_extents(boxes_m.unsqueeze(1), others_m)
+    grazes = apart & reading.before.is_object & (shared > 0).all(dim=-1)
+    x_and_z, away = shared[..., ::2], (boxes_m.unsqueeze(1) - others_m)[..., [0, 2]]
+    least = x_and_z == x_and_z.amin(dim=-1, keepdim=True)
+    moves = x_and_z * away.sign() * (least & (x_and_z <= GRAZE_M) & grazes.unsqueeze(-1))
+    centre = boxes_m[:, [0, 2]] + moves.sum(dim=1)
+    middle, extents = reading.frame.rectangle_m.split(2, dim=-1)
+    free = ((extents - boxes_m[:, [3, 5]]) / 2).clamp(min=0)
+    inside = centre.clamp(middle - free, middle + free)
+    centre = inside.where((inside - centre).abs() <= GRAZE_M, centre)
+    moved = boxes_m.clone()
+    moved[:, [0, 2]] = centre
+    return moved
+
+
+def violation(
+    boxes_m: Float[Tensor, "rooms 6"], reading: Reading, apart: Bool[Tensor, "rooms objects"]
+) -> Float[Tensor, " rooms"]:
+    """Violation of a box, 0 if there is none: the intersected shares of the smaller boxes, summed
+    over objects that it should stand `apart` from, plus the metres by which it extends beyond the
+    rectangle."""
+    others = reading.before
+    here, theirs = boxes_m.unsqueeze(1), others.boxes_m
+    shared = shared_extents(here, theirs).prod(dim=-1)
+    least = torch.minimum(here[..., 3:].prod(dim=-1), theirs[..., 3:].prod(dim=-1))
+    share = shared / least.clamp(min=1e-9)
+    share = share.where((share > INTERSECTING) & others.is_object & apart, 0.0)
+    middle, extents = reading.frame.rectangle_m.split(2, dim=-1)
+    beyond = (boxes_m[:, [0, 2]] - middle).abs() + (boxes_m[:, [3, 5]] - extents) / 2
+    return share.sum(dim=-1) + (beyond.amax(dim=-1) - BEYOND_M).clamp(min=0)
