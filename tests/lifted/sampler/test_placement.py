@@ -5,6 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
+from sceneprior.core.mixtures import LogisticMixture
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turned_looks
 from sceneprior.lifted.sampler import places as module
@@ -93,15 +94,22 @@ def test_order_and_padding_of_objects_change_nothing(placement, given):
     )
 
 
+def log_probs(one: Places, places_m: torch.Tensor) -> torch.Tensor:
+    """Log-densities of many places in one room, in parts that need little memory."""
+    with torch.no_grad():
+        parts = [
+            one.rows(torch.zeros(len(part), dtype=torch.int64)).log_prob(part)
+            for part in places_m.split(500)
+        ]
+    return torch.cat(parts)
+
+
 def test_density_integrates_to_one(placement, given):
     rooms, look, size_m, rectangle_m = given
-    places = distribution(placement, rooms, look, size_m, rectangle_m).rows(torch.tensor([0]))
+    one = distribution(placement, rooms, look, size_m, rectangle_m).rows(torch.tensor([0]))
     step = 0.05
     axis = torch.arange(-5, 5, step).double()
-    grid = torch.cartesian_prod(axis, axis)
-    every = places.rows(torch.zeros(len(grid), dtype=torch.int64))
-    with torch.no_grad():
-        total = float(every.log_prob(grid).exp().sum()) * step**2
+    total = float(log_probs(one, torch.cartesian_prod(axis, axis)).exp().sum()) * step**2
     assert total == pytest.approx(1, abs=0.01)
 
 
@@ -111,17 +119,19 @@ def test_draws_follow_the_density(placement, given, monkeypatch):
     monkeypatch.setattr(module, "SPREAD", 1.0)
     rooms, look, size_m, rectangle_m = given
     one = distribution(placement, rooms, look, size_m, rectangle_m).rows(torch.tensor([1]))
-    many = one.rows(torch.zeros(20000, dtype=torch.int64))
-    uniform = torch.rand(20000, 4, generator=torch.Generator().manual_seed(3)).double()
-    axis = torch.arange(-5, 5, 0.05).double()
-    grid = torch.cartesian_prod(axis, axis)
+    uniform = torch.rand(8000, 4, generator=torch.Generator().manual_seed(3)).double()
+    many = one.rows(torch.zeros(500, dtype=torch.int64))
     with torch.no_grad():
-        x = many.draw_x(uniform[:, None, :2])[:, 0]
-        drawn = many.log_prob(many.draw(x, uniform[:, 2:]))
-        density = one.rows(torch.zeros(len(grid), dtype=torch.int64)).log_prob(grid)
+        drawn_m = torch.cat([
+            many.draw(many.draw_x(part[:, None, :2])[:, 0], part[:, 2:])
+            for part in uniform.split(500)
+        ])  # fmt: skip
+    drawn = log_probs(one, drawn_m)
+    axis = torch.arange(-5, 5, 0.05).double()
+    density = log_probs(one, torch.cartesian_prod(axis, axis))
     wanted = float((density.exp() * density).sum()) * 0.05**2
     assert float(drawn.mean()) == pytest.approx(
-        wanted, abs=4 * float(drawn.std()) / 20000**0.5 + 0.02
+        wanted, abs=4 * float(drawn.std()) / len(drawn) ** 0.5 + 0.02
     )
 
 
@@ -194,3 +204,13 @@ def test_ramps_are_piecewise_linear():
     lengths = torch.tensor([-1.0, 0.25, 1.5, 9.0])
     expected = [[0, 0], [0.25, 0], [1, 0.25], [1, 1]]
     assert torch.stack([ramps(one[None], (0.0, 1.0, 3.0)) for one in lengths]).tolist() == expected
+
+
+def test_draws_are_sharper_than_the_density():
+    """Weights 1 and 3 become 1 and 3 ** 2.5; scales shrink."""
+    weights = torch.tensor([1.0, 3.0])
+    plain = LogisticMixture(weights.log(), torch.zeros(2, 1), torch.zeros(2, 1))
+    sharp = module._sharpened(plain)
+    odds = sharp.weight_logits.softmax(dim=0)
+    assert float(odds[1] / odds[0]) == pytest.approx(3**module.SHARPNESS)
+    assert sharp.log_scales.exp().tolist() == [[pytest.approx(module.SPREAD)]] * 2
