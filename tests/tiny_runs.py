@@ -81,7 +81,7 @@ def tiny_lifted(shards: Path, **changes: Any) -> RunConfig:
     return check_config(tiny_lifted_settings(shards, **changes), "tiny")
 
 
-VIEWLESS = ("gan", "atiss", "sync2gen")
+VIEWLESS = ("gan", "atiss", "sync2gen", "set_flow")
 """Baselines that draw no views by `data.views_per_room`."""
 TINY_BASELINES: dict[str, dict[str, Any]] = {
     "gan": {
@@ -105,6 +105,10 @@ TINY_BASELINES: dict[str, dict[str, Any]] = {
     "sync2gen": {
         "model": {"width": 32, "latent": 8, "slots": 2, "refine_steps": 5},
         "training": {"epochs": 6, "batch_size": 5, "learning_rate": 3e-3},
+    },
+    "set_flow": {
+        "model": {"max_objects": 6, "width": 16, "layers": 1, "heads": 2, "hidden": 16, "steps": 4},
+        "training": {"epochs": 6, "batch_size": 5, "learning_rate": 5e-3},
     },
     "usl": {
         "model": {

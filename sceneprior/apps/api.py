@@ -44,7 +44,7 @@ def load(where: str | Path) -> "Prior":
 class Prior:
     """A trained prior of rooms. Rooms are `Scene`s: classes, boxes and meshes in metres, y up.
 
-    Runs of methods without a latent space (`atiss`, `sync2gen`) can only `sample`.
+    Runs of methods without a latent space (`atiss`, `sync2gen`, `set_flow`) can only `sample`.
     """
 
     trained: Trained

@@ -24,6 +24,7 @@ METHODS = {
     "gan": "sceneprior.baselines.gan.stage:GanConfig",
     "atiss": "sceneprior.baselines.atiss.stage:AtissConfig",
     "sync2gen": "sceneprior.baselines.sync2gen.stage:Sync2genConfig",
+    "set_flow": "sceneprior.baselines.set_flow.stage:SetFlowConfig",
     "usl": "sceneprior.baselines.single_view.usl:UslConfig",
     "total3d": "sceneprior.baselines.single_view.total3d:Total3dConfig",
     "im3d": "sceneprior.baselines.single_view.im3d:Im3dConfig",

@@ -1,7 +1,7 @@
 """Training on the true 3D boxes of a shard folder: their batches, config and mean loss.
 
-Only ATISS and Sync2Gen train on them; methods that learn from masks and 2D boxes never open them
-(tests/baselines/test_true_boxes.py).
+Only ATISS, Sync2Gen and the set flow train on them; methods that learn from masks and 2D boxes
+never open them (tests/baselines/test_true_boxes.py).
 """
 
 import math
@@ -24,7 +24,10 @@ from sceneprior.training.method import TrainedSampler, ready_copy
 
 class TruthDataset(RoomDataset):
     """The boxes of all furniture in the rooms of a split, in memory, visible to a camera or not.
-    Rows and turns are those of `ViewDataset`."""
+
+    Rows and turns are those of `ViewDataset`. With turns, each row is mirrored in every second
+    epoch, so two epochs hold the eight symmetries of each room.
+    """
 
     counted = "objects"
 
@@ -48,25 +51,31 @@ class TruthDataset(RoomDataset):
         return self
 
     def everything(self) -> RoomBoxes:
-        """All rows as one batch, for statistics."""
-        return self.__getitems__([(row, 0) for row in range(len(self))])
+        """All rows as one batch, with turns also mirrored, for statistics."""
+        epochs = 2 if self.rotations > 1 else 1
+        return self.__getitems__(
+            [(row, epoch) for epoch in range(epochs) for row in range(len(self))]
+        )
 
     def __getitems__(self, draws: list[tuple[int, int]]) -> RoomBoxes:
         """A batch of rows; each draw is (row, epoch). The epoch `BLANK` gives an empty room without
         an id, which has no loss."""
         device = self._counts.device
         rows = torch.tensor([row for row, _ in draws], device=device)
-        shown = torch.tensor([epoch != BLANK for _, epoch in draws], device=device)
+        epochs = torch.tensor([epoch for _, epoch in draws], device=device)
+        shown = epochs != BLANK
         rooms = rows // self.rotations
         counts = self._counts[rooms] * shown
         widest = max(int(counts.max()), 1)
         is_object = torch.arange(widest, device=device) < counts[:, None]
         quarters = rows % self.rotations
-        yaw_rad = self._yaw_rad[rooms, :widest] + math.pi / 2 * quarters.unsqueeze(-1)
+        mirrored = ((rows + epochs) % 2 == 1) & (self.rotations > 1)
+        sides = 1 - 2 * mirrored.unsqueeze(-1).to(self._yaw_rad)  # a mirrored front turns back
+        yaw_rad = sides * self._yaw_rad[rooms, :widest] + math.pi / 2 * quarters.unsqueeze(-1)
         return RoomBoxes(
             object_class=self._classes[rooms, :widest] * is_object,
             is_object=is_object,
-            boxes_m=turn_boxes(self._boxes_m[rooms, :widest], quarters),
+            boxes_m=turn_boxes(self._boxes_m[rooms, :widest], quarters, mirrored),
             room_ids=tuple(self.plain_ids[room] for room in rooms[shown].tolist()),
             yaw_rad=torch.remainder(yaw_rad + math.pi, 2 * math.pi) - math.pi,
         )

@@ -16,7 +16,7 @@ from sceneprior.paper.decode import decode_training_rooms
 from sceneprior.training.fit import fit
 from sceneprior.training.steps import with_cosine
 
-METHODS = pytest.mark.parametrize("method", ("atiss", "sync2gen"))
+METHODS = pytest.mark.parametrize("method", ("atiss", "sync2gen", "set_flow"))
 
 
 def test_an_atiss_learns_by_heart_which_furniture_goes_together(tmp_path):
@@ -113,5 +113,7 @@ def test_what_does_not_fit_is_a_sentence(baseline_config, method, tmp_path):
     assert not list(tmp_path.iterdir())
     with pytest.raises(ConfigError, match="'model': width 16 is not a multiple of heads 3"):
         baseline_config("atiss", model__heads=3)
+    with pytest.raises(ConfigError, match=r"'model.steps'.*greater than or equal to 1"):
+        baseline_config("set_flow", model__steps=0)
     with pytest.raises(ConfigError, match="'model': width 36 is not a multiple of 8"):
         baseline_config("sync2gen", model__width=36)

@@ -22,6 +22,7 @@ LOGGED = {
     "gan": {"discriminator", "objects", "real_score", "fake_score"},
     "atiss": {"class", "position", "angle", "size"},
     "sync2gen": {"existence", "position", "size", "kl", "left_out"},
+    "set_flow": {"class", "position", "angle", "size"},
     "usl": {"box", "frustum", "mask"},
     "total3d": {"offset", "size", "bin", "residual", "corners", "chamfer", "edges"},
     "im3d": {"offset", "size", "bin", "residual", "corners", "refined", "refined_corners",
@@ -29,7 +30,7 @@ LOGGED = {
 }  # fmt: skip
 """Curves of the last stage of each baseline, beside its loss."""
 STAGES = {name: (name,) for name in LOGGED} | {"atiss2d": ("layout", "shape")}
-WITHOUT_LATENTS = ("gan", "atiss", "sync2gen")
+WITHOUT_LATENTS = ("gan", "atiss", "sync2gen", "set_flow")
 
 
 @pytest.mark.parametrize("method", LOGGED)
@@ -41,7 +42,7 @@ def test_a_run_leaves_its_checkpoints_and_curves(baseline_run, method):
     with (run / last / "metrics.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["train/loss"]]
     assert rows and all(row[f"train/{name}"] for row in rows for name in LOGGED[method])
-    if method in ("atiss", "sync2gen"):
+    if method in ("atiss", "sync2gen", "set_flow"):
         assert float(rows[-1]["train/loss"]) < float(rows[0]["train/loss"])
     assert not load_any_run(run).prior.training
 
@@ -98,7 +99,7 @@ def test_new_rooms_depend_on_the_seed_alone(baseline_run, method):
     assert objects and all((item.mesh is not None) == makes_meshes for item in objects)
     assert all(min(item.size_m) > 0 for item in objects)
     yaws = [room.extra.get("yaw_rad") for room in rooms[0]]
-    if method == "atiss":
+    if method in ("atiss", "set_flow"):
         assert [len(yaw) for yaw in yaws] == [len(room.objects) for room in rooms[0]]
     else:
         assert not any(yaws)

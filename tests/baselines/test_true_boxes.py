@@ -19,6 +19,8 @@ from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.training.fit import fit
 
 PACKAGE = Path(sceneprior.__file__).parent
+UNMIRRORED = [(row, row % 2) for row in range(8, 12)]
+"""Draws of the four turns of a room, each in an epoch in which it is not mirrored."""
 
 
 def test_a_batch_says_what_the_shards_say(toy_shards):
@@ -49,7 +51,7 @@ def test_rows_are_those_of_the_views(toy_shards):
 
 def test_a_turned_room_is_the_room_seen_by_turned_cameras(toy_shards):
     """Camera and box turn together: in the camera's frame the same corners, in another order."""
-    boxes = TruthDataset(toy_shards, "train", 4).__getitems__([(row, 0) for row in range(8, 12)])
+    boxes = TruthDataset(toy_shards, "train", 4).__getitems__(UNMIRRORED)
     views = ViewDataset(toy_shards, "train", 1, rotations=4).__getitems__(
         [(row, 0) for row in range(8, 12)]
     )
@@ -69,7 +71,7 @@ def test_a_turned_room_is_the_room_seen_by_turned_cameras(toy_shards):
 def test_fronts_turn_with_their_pieces(toy_shards, torch_rng):
     dataset = TruthDataset(toy_shards, "train", 4)
     dataset._yaw_rad = (torch.rand(dataset._yaw_rad.shape, generator=torch_rng) - 0.5) * 2 * np.pi
-    boxes = dataset.__getitems__([(row, 0) for row in range(8, 12)])
+    boxes = dataset.__getitems__(UNMIRRORED)
     quarter = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     fronts = torch.stack(
         [boxes.yaw_rad.sin(), torch.zeros_like(boxes.yaw_rad), boxes.yaw_rad.cos()], dim=-1
@@ -81,12 +83,40 @@ def test_fronts_turn_with_their_pieces(toy_shards, torch_rng):
         np.testing.assert_allclose(fronts[turn, there], wanted[there], atol=1e-6)
 
 
+def test_two_epochs_show_a_room_in_its_eight_symmetries(toy_shards, torch_rng):
+    dataset = TruthDataset(toy_shards, "train", 4)
+    dataset._yaw_rad = (torch.rand(dataset._yaw_rad.shape, generator=torch_rng) - 0.5) * 2 * np.pi
+    turns = dataset.__getitems__(UNMIRRORED)
+    mirrored = dataset.__getitems__([(row, 1 - epoch) for row, epoch in UNMIRRORED])
+    there = turns.is_object[0]
+    for turn in range(4):
+        # Mirroring x and then turning is turning back and then mirroring along the axis that x
+        # has become; it leaves a front's other component.
+        axis = 2 * (turn % 2)
+        signs = torch.ones(6)
+        signs[axis] = -1
+        wanted = turns.boxes_m[turn] * signs
+        assert torch.equal(mirrored.boxes_m[turn, there], wanted[there])
+        fronts = [torch.stack([b.yaw_rad.sin(), b.yaw_rad.cos()], -1) for b in (turns, mirrored)]
+        flipped = fronts[0][turn] * signs[[0, 2]]
+        np.testing.assert_allclose(fronts[1][turn, there], flipped[there], atol=1e-6)
+    shown = torch.cat([turns.boxes_m, mirrored.boxes_m])[:, there].flatten(1)
+    assert len(shown.unique(dim=0)) == 8
+    everything = dataset.everything()
+    assert len(everything.boxes_m) == 2 * len(dataset)
+    middle_m = everything.boxes_m[everything.is_object].double().mean(dim=0)
+    assert middle_m[[0, 2]].abs().max() < 1e-6
+    plain = TruthDataset(toy_shards, "train")
+    first, second = (plain.__getitems__([(1, epoch)]).boxes_m for epoch in (0, 1))
+    assert torch.equal(first, second)
+
+
 def test_a_process_without_a_room_of_its_own_gets_nothing_in_no_room(toy_shards):
     batch = TruthDataset(toy_shards, "train").__getitems__([(3, BLANK)])
     assert batch.room_ids == () and not batch.is_object.any() and not batch.object_class.any()
 
 
-@pytest.mark.parametrize("method", ("atiss", "sync2gen", "total3d", "im3d"))
+@pytest.mark.parametrize("method", ("atiss", "sync2gen", "set_flow", "total3d", "im3d"))
 def test_methods_under_3d_supervision_refuse_shards_without_it(
     baseline_config, toy_shards, tmp_path, method
 ):
@@ -127,5 +157,7 @@ def test_only_baselines_with_3d_supervision_read_the_ground_truth():
     views = "baselines/single_view"
     assert readers == {f"{views}/truth.py", "lifted/reconstruction/known_rooms.py"}
     assert importers["TruthDataset"] == set()
-    assert importers["BoxConfig"] == {"baselines/atiss/stage.py", "baselines/sync2gen/stage.py"}
+    assert importers["BoxConfig"] == {
+        f"baselines/{name}/stage.py" for name in ("atiss", "sync2gen", "set_flow")
+    }
     assert importers["TrueViewDataset"] == {f"{views}/total3d.py"}

@@ -53,21 +53,26 @@ class EncoderConfig(Section):
         )  # fmt: skip
 
 
-class AtissModel(EncoderConfig):
-    """Size of the network; the defaults are the published settings."""
+class SetModel(EncoderConfig):
+    """Size of a network that generates sets of objects, which the set flow has as well."""
 
     max_objects: int = Field(ge=1, le=1000)
     """Most objects in a sampled room."""
     width: int = Field(512, ge=8)
     """Width of the encoder and of the hidden layers."""
-    mixtures: int = Field(10, ge=1)
-    """K, logistics per number."""
 
     @model_validator(mode="after")
-    def _heads_divide_width(self) -> "AtissModel":
+    def _heads_divide_width(self) -> "SetModel":
         if self.width % self.heads:
             raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
         return self
+
+
+class AtissModel(SetModel):
+    """Size of the network; the defaults are the published settings."""
+
+    mixtures: int = Field(10, ge=1)
+    """K, logistics per number."""
 
 
 class Atiss(nn.Module):

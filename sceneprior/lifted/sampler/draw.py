@@ -1,5 +1,7 @@
 """Draw rooms from a trained sampler: whole rooms, or the rest of rooms with given objects."""
 
+from operator import itemgetter
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -112,7 +114,7 @@ def _draw(
         rows = ((plan.coming[:, step] != END) & (last | ~stuck)).nonzero()[:, 0]
         if not len(rows):
             break
-        label, begun = plan.coming[rows, step], rooms.changed(lambda part, rows=rows: part[rows])
+        label, begun = plan.coming[rows, step], rooms.changed(itemgetter(rows))
         reading = _read(sampler, begun, number[rows], plan.rows(rows), plan.coming[rows, step:])
         tries = PLACES if last else TRIES
         look, box_m, wrong = _placed(sampler, reading, label, chance[rows], tries)

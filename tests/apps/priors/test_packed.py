@@ -93,7 +93,7 @@ def test_with_latents_it_is_the_run_itself(toy_run, tmp_path):
     assert_same(sample_rooms(trained, 3, 1), sample_rooms(back, 3, 1))
 
 
-@pytest.mark.parametrize("method", ["atiss", "sync2gen"])
+@pytest.mark.parametrize("method", ["atiss", "sync2gen", "set_flow"])
 def test_methods_of_boxes_travel_too(method, toy_shards, tmp_path):
     config = tiny_baseline(toy_shards, method)
     fit(config, tmp_path / "run", trainer_options={"accelerator": "cpu"})

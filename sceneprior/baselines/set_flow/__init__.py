@@ -1,0 +1,1 @@
+"""A flow model of sets of objects, with 3D supervision."""

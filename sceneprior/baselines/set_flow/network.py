@@ -1,0 +1,194 @@
+"""The network of the set flow, which turns noise into all objects of a room at the same time.
+
+Sources: Tang et al., "DiffuScene: Denoising Diffusion Models for Generative Indoor Scene
+Synthesis", CVPR 2024 (a room as a set of tokens that a network denoises); Lipman et al., "Flow
+Matching for Generative Modeling", ICLR 2023 (the loss and the differential equation).
+docs/baselines_3d.md names the differences.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sceneprior.baselines.atiss.network import OCTAVES, SetModel, fourier_features
+from sceneprior.core.mixtures import draw_index
+from sceneprior.core.views import RoomBoxes
+from sceneprior.paper.layers import mlp
+
+NUMBERS = 8
+"""Numbers of a token beside its class: centre, log extents, cosine and sine of the yaw."""
+PARTS = {"position": slice(0, 3), "size": slice(3, 6), "angle": slice(6, 8)}
+"""The parts of the numbers, whose losses are logged apart."""
+WAVE = 4.0
+"""Half a period of the slowest Fourier feature, in standard deviations of a number."""
+LEAST_SPREAD = 1e-3
+BATCH = 256
+"""Rooms per batch in sampling."""
+
+
+class SetFlowModel(SetModel):
+    """Size of the network."""
+
+    class_scale: float = Field(2.0, gt=0)
+    """Value of a one-hot class, in standard deviations of the noise. With a larger one the class of
+    an object is decided before its place."""
+    steps: int = Field(100, ge=1)
+    """Steps of Euler's method from noise to a room."""
+
+
+class SetFlow(nn.Module):
+    """Velocities that carry noise to rooms, by a transformer without positional encoding.
+
+    A room is a set of tokens: `NUMBERS` standardised numbers, then a scaled one-hot class. The
+    number of objects is drawn first, with its frequency in the training rooms. `classes` is the
+    size of the label set with void.
+    """
+
+    mean: Tensor
+    spread: Tensor
+    counts: Tensor
+    """Number of training rooms by their number of objects."""
+
+    def __init__(self, config: SetFlowModel, classes: int):
+        super().__init__()
+        self.max_objects, self.steps = config.max_objects, config.steps
+        self.class_scale, self.classes = config.class_scale, classes
+        self.register_buffer("mean", torch.zeros(NUMBERS))
+        self.register_buffer("spread", torch.ones(NUMBERS))
+        self.register_buffer("counts", torch.ones(config.max_objects + 1))
+        width, token = config.width, NUMBERS + classes - 1
+        self.object = nn.Linear(token + NUMBERS * 2 * OCTAVES, width)
+        self.time = mlp(nn.Linear(2 * OCTAVES, width), nn.Linear(width, width))
+        self.blocks = nn.ModuleList(
+            Block(width, config.heads, config.hidden) for _ in range(config.layers)
+        )
+        self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, token))
+
+    def fit_statistics(self, rooms: RoomBoxes) -> None:
+        """Set the means and spreads of numbers, and the frequencies of numbers of objects."""
+        numbers = _numbers(rooms)[rooms.is_object]
+        self.mean.copy_(numbers.mean(dim=0))
+        # A number that is the same in all rooms would have a spread of 0.
+        self.spread.copy_(numbers.std(dim=0, correction=0).clamp(min=LEAST_SPREAD))
+        self.counts.copy_(torch.bincount(rooms.is_object.sum(dim=1), minlength=len(self.counts)))
+
+    def to_tokens(self, rooms: RoomBoxes) -> Float[Tensor, "rooms objects token"]:
+        """The tokens of rooms; those of padding have no meaning."""
+        one_hot = F.one_hot(rooms.object_class, self.classes)[..., 1:]
+        return torch.cat([self._unit(_numbers(rooms)), self.class_scale * one_hot], dim=-1)
+
+    def _unit(self, numbers: Tensor) -> Tensor:
+        return (numbers - self.mean) / self.spread
+
+    def to_rooms(
+        self, tokens: Float[Tensor, "rooms objects token"], is_object: Bool[Tensor, "rooms objects"]
+    ) -> RoomBoxes:
+        """The rooms of tokens: each object has the class with the largest value."""
+        numbers = self.mean + self.spread * tokens[..., :NUMBERS]
+        centers_m, log_sizes, cosine, sine = numbers.split([3, 3, 1, 1], dim=-1)
+        return RoomBoxes(
+            object_class=(1 + tokens[..., NUMBERS:].argmax(dim=-1)) * is_object,
+            is_object=is_object,
+            boxes_m=torch.cat([centers_m, log_sizes.exp()], dim=-1),
+            yaw_rad=torch.atan2(sine, cosine)[..., 0],
+        )
+
+    def predict(
+        self,
+        tokens: Float[Tensor, "rooms objects token"],
+        time: Float[Tensor, " rooms"],
+        is_object: Bool[Tensor, "rooms objects"],
+    ) -> tuple[Float[Tensor, "rooms objects 8"], Float[Tensor, "rooms objects furniture"]]:
+        """Velocity of the numbers of each token at `time`, from 0 (noise) to 1 (a room), and logits
+        of the class it will have; 0 for padding."""
+        # All but the attention runs on the objects alone: half of a batch is padding.
+        here, counts = tokens[is_object], is_object.sum(dim=1)
+        numbers = here[:, :NUMBERS]
+        known = self.time(fourier_features(time.unsqueeze(-1))).repeat_interleave(counts, dim=0)
+        hidden = known + self.object(torch.cat([here, fourier_features(numbers / WAVE)], dim=-1))
+        for block in self.blocks:
+            hidden = block(hidden, is_object)
+        change, logits = self.out(hidden).split([NUMBERS, self.classes - 1], dim=-1)
+        # The best linear guess of the velocity of standardised numbers, and what it leaves.
+        late = time.repeat_interleave(counts).unsqueeze(-1)
+        variance = late**2 + (1 - late) ** 2
+        velocity = (2 * late - 1) / variance * numbers + change / variance.sqrt()
+        return _padded(velocity, is_object), _padded(logits, is_object)
+
+    def velocity(
+        self,
+        tokens: Float[Tensor, "rooms objects token"],
+        time: Float[Tensor, " rooms"],
+        is_object: Bool[Tensor, "rooms objects"],
+    ) -> Float[Tensor, "rooms objects token"]:
+        """Velocity of each token at `time` below 1: classes move straight to their mean."""
+        velocity, logits = self.predict(tokens, time, is_object)
+        target = self.class_scale * logits.softmax(dim=-1)
+        left = (1 - time)[:, None, None]
+        return torch.cat([velocity, (target - tokens[..., NUMBERS:]) / left], dim=-1)
+
+    @torch.no_grad()
+    def sample(self, count: int, seed: int) -> RoomBoxes:
+        """New rooms. The first rooms of a seed do not depend on `count`."""
+        generator = torch.Generator().manual_seed(seed)
+        shape = self.max_objects, NUMBERS + self.classes - 1
+        choices, noise = [], []
+        for _ in range(count):
+            choices.append(torch.rand((), generator=generator))
+            noise.append(torch.randn(shape, generator=generator))
+        logits = self.counts.log().expand(count, -1)
+        objects = draw_index(logits, torch.stack(choices).to(self.counts))
+        is_object = torch.arange(self.max_objects, device=objects.device) < objects[:, None]
+        tokens = torch.stack(noise).to(self.counts)
+        parts = zip(tokens.split(BATCH), is_object.split(BATCH), strict=True)
+        return self.to_rooms(torch.cat([self._integrate(*part) for part in parts]), is_object)
+
+    def _integrate(self, tokens: Tensor, is_object: Tensor) -> Tensor:
+        """Follow the velocities from time 0 to 1 by Euler's method."""
+        for step in range(self.steps):
+            time = tokens.new_full(tokens.shape[:1], step / self.steps)
+            tokens = tokens + self.velocity(tokens, time, is_object) / self.steps
+        return tokens
+
+
+class Block(nn.Module):
+    """Attention among the objects of each room and a feed-forward layer, both normalised first."""
+
+    def __init__(self, width: int, heads: int, hidden: int):
+        super().__init__()
+        self.heads = heads
+        self.before_attention, self.before_mlp = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.queries_keys_values = nn.Linear(width, 3 * width)
+        self.mix = nn.Linear(width, width)
+        self.mlp = mlp(nn.Linear(width, hidden), nn.Linear(hidden, width))
+
+    def forward(
+        self, hidden: Float[Tensor, "all width"], is_object: Bool[Tensor, "rooms objects"]
+    ) -> Float[Tensor, "all width"]:
+        """The features of all objects of a batch, room by room, after the block."""
+        projected = _padded(self.queries_keys_values(self.before_attention(hidden)), is_object)
+        query, key, value = projected.unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        seen = F.scaled_dot_product_attention(query, key, value, is_object[:, None, None])
+        hidden = hidden + self.mix(seen.transpose(1, 2).flatten(-2)[is_object])
+        return hidden + self.mlp(self.before_mlp(hidden))
+
+
+def _padded(
+    values: Float[Tensor, "all numbers"], is_object: Bool[Tensor, "rooms objects"]
+) -> Float[Tensor, "rooms objects numbers"]:
+    """The values of all objects, room by room, with zeros for padding."""
+    padded = values.new_zeros(*is_object.shape, values.shape[-1])
+    padded[is_object] = values
+    return padded
+
+
+def _numbers(rooms: RoomBoxes) -> Float[Tensor, "rooms objects 8"]:
+    """Centre, log extents, cosine and sine of the yaw of each object."""
+    assert rooms.yaw_rad is not None, "true boxes have yaws"
+    centers_m, sizes_m = rooms.boxes_m.split(3, dim=-1)
+    front = torch.stack([rooms.yaw_rad.cos(), rooms.yaw_rad.sin()], dim=-1)
+    # Padding has boxes of size 0.
+    log_sizes = torch.where(rooms.is_object[..., None], sizes_m, 1.0).log()
+    return torch.cat([centers_m, log_sizes, front], dim=-1)
