@@ -1,23 +1,11 @@
 """Fit a few parts to the rays of one kind of furniture: a greedy search, one part more at a time.
 
-The loss counts rays and has no gradient:
-
-    half the share of hits that meet no part + half the share of misses that meet one
-      + 0.003 (number of parts) + 0.003 (number of planes in which faces lie)
-      + 0.002 (number of curved parts) + 0.0003 (volume of the parts, 1 for the box)
-      + 0.06 (gaps between the parts and the six sides of the box, 1 for the box's length)
-      + 0.005 (connected pieces - 1)
-
-A ray is right if it meets a part exactly when its pixel is the object's. Few parts explain masks
-more cheaply than what a visual hull adds where no view sees past: a headboard and a mattress, not a
-dome. Parts and their mirror images count once, and so do planes and theirs; sides of the box cost
-nothing. So edges line up. The other prices settle what rays leave open: solids are small, fill
-their box, and hold together.
+`part_loss.py` has the loss. Every step tries all changes on some of the rays, the best of them on
+all rays, and keeps the best one as long as the loss falls.
 """
 
 import itertools
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -35,20 +23,10 @@ from sceneprior.core.parts import (
     Parts,
 )
 from sceneprior.lifted.lifting.lifted import RayPool
-from sceneprior.lifted.lifting.part_rays import (
-    LEVELS,
-    count_planes,
-    descend,
-    gaps_and_pieces,
-    meets,
-    volume_of,
-    wrong_rays,
-)
+from sceneprior.lifted.lifting.part_loss import Change, Guess, RayFit
+from sceneprior.lifted.lifting.part_prices import LEVELS
 
-PART_PRICE, VOLUME_PRICE, GAP_PRICE, PIECE_PRICE = 0.003, 0.0003, 0.06, 0.005
-PLANE_PRICE = 0.003
 CURVED = (CYLINDER, ELLIPSOID, DOME, BOWL)
-CURVED_PRICE = 0.002
 LEAST_GAIN = 1e-4
 """Loss by which a change must be better."""
 PLACES = (0.25, 0.5, 0.75)
@@ -59,105 +37,6 @@ PIECES = 4
 """Pieces of the hull without parts, the largest ones, in which new parts are tried."""
 SCREENED, FINALISTS = 768, 6
 """Rays on which all changes are tried; the best of them (`FINALISTS`) are tried on all rays."""
-FEWEST = 50
-"""Added to the numbers of hits and misses, so that few rays do not weigh too much."""
-
-Change = dict[int, tuple[int, int, Int[np.ndarray, "3 2"]]]
-"""Kind, mirroring and ends of the parts that change, by their number; a number one past the last
-adds a part."""
-
-
-class Guess(NamedTuple):
-    """Parts under way."""
-
-    kinds: Int[np.ndarray, " parts"]
-    mirrored: Int[np.ndarray, " parts"]
-    ends: Int[np.ndarray, "parts 3 2"]
-    """On the levels of `part_rays.py`."""
-    covered: Bool[np.ndarray, "parts rays"]
-    """Which rays each part meets."""
-    met_by: Int[np.ndarray, " rays"]
-    """Number of parts that each ray meets."""
-
-    def parts(self) -> Parts:
-        """The parts in the frame of the object's box."""
-        return Parts(self.kinds, self.mirrored, self.ends / LEVELS - 0.5)
-
-
-class RayFit:
-    """The loss of parts on a set of rays, which lie in the frame of the object's box."""
-
-    def __init__(self, rays: RayPool, margin: float):
-        useful = np.abs(rays.spans).sum(axis=1) > 0
-        scale = margin / 2 * LEVELS  # the frame of rays spans [-1, 1], `margin` boxes
-        self.starts = rays.starts[useful].astype(np.float64) * scale + LEVELS / 2
-        spans = rays.spans[useful].astype(np.float64) * scale
-        self.spans = np.where(np.abs(spans) < 1e-6, 1e-6, spans)  # they are divided by
-        self.inverse = 1 / self.spans
-        self.hits = np.ascontiguousarray(rays.hits[useful])
-        hits = int(self.hits.sum())
-        self.hit_price = 0.5 / (hits + FEWEST)
-        self.miss_price = 0.5 / (len(self.hits) - hits + FEWEST)
-
-    def loss(self, guess: Guess) -> float:
-        """See the module's docstring."""
-        missed, wrongly_met = wrong_rays(guess.met_by, self.hits)
-        volume = sum(map(volume_of, guess.kinds, guess.mirrored, guess.ends))
-        gaps, pieces = gaps_and_pieces(guess.mirrored, guess.ends)
-        return float(
-            self.hit_price * missed
-            + self.miss_price * wrongly_met
-            + PART_PRICE * len(guess.kinds)
-            + CURVED_PRICE * (guess.kinds != BOX).sum()
-            + PLANE_PRICE * count_planes(guess.ends)
-            + VOLUME_PRICE * volume
-            + GAP_PRICE * gaps / LEVELS
-            + PIECE_PRICE * (pieces - 1)
-        )
-
-    def guess(
-        self,
-        kinds: Int[np.ndarray, " parts"],
-        mirrored: Int[np.ndarray, " parts"],
-        ends: Int[np.ndarray, "parts 3 2"],
-    ) -> Guess:
-        """Parts, and the rays that they meet."""
-        none = np.zeros((0, len(self.hits)), bool)
-        empty = Guess(kinds[:0], mirrored[:0], ends[:0], none, np.zeros(len(self.hits), np.int16))
-        rows = zip(kinds.tolist(), mirrored.tolist(), ends, strict=True)
-        return self.changed(empty, dict(enumerate(rows)))
-
-    def changed(self, guess: Guess, change: Change) -> Guess:
-        """A copy in which some parts are others, or new."""
-        more = max(0, max(change) + 1 - len(guess.kinds))
-        kinds, mirrored, ends, covered = (
-            np.concatenate([part, np.zeros((more, *part.shape[1:]), part.dtype)])
-            for part in guess[:4]
-        )
-        count = guess.met_by.copy()
-        for row, (kind, across, own) in change.items():
-            kinds[row], mirrored[row], ends[row] = kind, across, own
-            count -= covered[row]
-            meets(self.starts, self.spans, kind, across, ends[row], covered[row])
-            count += covered[row]
-        return Guess(kinds, mirrored, ends, covered, count)
-
-    def without(self, guess: Guess, row: int) -> Guess:
-        """A copy without one part."""
-        others = np.arange(len(guess.kinds)) != row
-        kinds, mirrored, ends, covered = (part[others] for part in guess[:4])
-        return Guess(kinds, mirrored, ends, covered, guess.met_by - guess.covered[row])
-
-    def settled(self, guess: Guess, rows: Iterable[int], sweeps: int) -> Guess:
-        """The guess after the faces of some parts have moved to where fewest rays are wrong, or as
-        it was if that is better, since moving knows nothing of gaps and pieces."""
-        moved = Guess(*(part.copy() for part in guess))
-        descend(
-            self.starts, self.spans, self.inverse, self.hits, moved.kinds, moved.mirrored,
-            moved.ends, moved.covered, moved.met_by, np.array(list(rows)), sweeps,
-            self.hit_price, self.miss_price, VOLUME_PRICE, PLANE_PRICE,
-        )  # fmt: skip
-        return min(guess, moved, key=self.loss)
 
 
 def fit_parts(rays: RayPool, hull: Bool[np.ndarray, "x y z"], margin: float) -> Parts:

@@ -6,7 +6,8 @@ from parts_of_rooms import CORNER, TABLE, boxes, rays_of
 
 from sceneprior.core.parts import BOX, CYLINDER, MOST_PARTS, Parts, filled_cells
 from sceneprior.lifted.lifting.lifted import RayPool
-from sceneprior.lifted.lifting.part_fit import RayFit, fit_parts
+from sceneprior.lifted.lifting.part_fit import fit_parts
+from sceneprior.lifted.lifting.part_loss import RayFit
 
 MARGIN, CELLS = 1.1, 32
 

@@ -5,17 +5,15 @@ import pytest
 from parts_of_rooms import TABLE, rays_of
 
 from sceneprior.core.parts import BOX, Parts, inside
-from sceneprior.lifted.lifting.part_fit import RayFit
-from sceneprior.lifted.lifting.part_rays import (
+from sceneprior.lifted.lifting.part_loss import RayFit
+from sceneprior.lifted.lifting.part_prices import (
     LEVELS,
     count_planes,
-    count_wrong,
-    descend,
     gaps_and_pieces,
-    meets,
     planes_of,
     volume_of,
 )
+from sceneprior.lifted.lifting.part_rays import count_wrong, descend, meets
 
 MARGIN = 1.1
 

@@ -1,0 +1,104 @@
+"""Prices of parts that hang on the parts alone: volume, planes of faces, gaps and pieces.
+
+Faces lie on `LEVELS` + 1 evenly spaced levels between the sides of the object's box.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, CYLINDER
+
+LEVELS = 64
+"""Intervals between the levels on which faces lie."""
+
+
+# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def volume_of(kind, mirrored, ends):
+    """Volume of a part and its mirror images, as a share of the object's box; 1 for the box."""
+    copies = (2 if mirrored & ACROSS_X else 1) * (2 if mirrored & ACROSS_Z else 1)
+    share = 1.0
+    for axis in range(3):
+        share *= (ends[axis, 1] - ends[axis, 0]) / LEVELS
+    if kind == CYLINDER:
+        share *= np.pi / 4
+    elif kind != BOX:
+        share *= np.pi / 6
+    return copies * share
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def planes_of(ends, skipped):
+    """Mark the planes, by axis and level, in which faces of all parts but one lie; the sides of the
+    box are always marked, and across x and z a plane counts as its mirror image, too."""
+    used = np.zeros((3, LEVELS + 1), np.bool_)
+    used[:, 0] = True
+    used[:, LEVELS] = True
+    for part in range(len(ends)):
+        if part != skipped:
+            for axis in range(3):
+                for end in range(2):
+                    used[axis, ends[part, axis, end]] = True
+                    if axis != 1:
+                        used[axis, LEVELS - ends[part, axis, end]] = True
+    return used
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def count_planes(ends):
+    """The number of planes in which faces lie; sides of the box do not count, and across x and z a
+    plane and its mirror image count once."""
+    used = planes_of(ends, -1)
+    return (
+        used[1, 1:LEVELS].sum()
+        + used[0, 1 : LEVELS // 2 + 1].sum()
+        + used[2, 1 : LEVELS // 2 + 1].sum()
+    )
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def gaps_and_pieces(mirrored, ends):
+    """The sum of the gaps, in levels, between the six sides of the object's box and the connected
+    piece that comes nearest to them, and the number of pieces. Parts within a level touch."""
+    solids = np.empty((4 * len(ends), 3, 2), np.int64)
+    count = 0
+    for part in range(len(ends)):
+        for copy in range(4):
+            if copy & ~mirrored[part]:
+                continue
+            solids[count] = ends[part]
+            for bit, axis in ((ACROSS_X, 0), (ACROSS_Z, 2)):
+                if copy & bit:
+                    solids[count, axis, 0] = LEVELS - ends[part, axis, 1]
+                    solids[count, axis, 1] = LEVELS - ends[part, axis, 0]
+            count += 1
+    piece = np.arange(count)
+    pieces = count
+    for one in range(count):
+        for other in range(one):
+            touch = True
+            for axis in range(3):
+                touch &= solids[one, axis, 0] <= solids[other, axis, 1] + 1
+                touch &= solids[other, axis, 0] <= solids[one, axis, 1] + 1
+            if touch and piece[one] != piece[other]:
+                gone, pieces = piece[one], pieces - 1
+                for each in range(count):
+                    if piece[each] == gone:
+                        piece[each] = piece[other]
+    gaps = 6 * LEVELS
+    for one in range(count):
+        own = 0
+        for axis in range(3):
+            low, high = LEVELS, 0
+            for other in range(count):
+                if piece[other] == one:
+                    low, high = min(low, solids[other, axis, 0]), max(high, solids[other, axis, 1])
+            own += low + LEVELS - high
+        gaps = min(gaps, own)
+    return gaps, pieces
