@@ -119,7 +119,10 @@ def unpack(packed: PackedPrior, config: RunConfig, source: str) -> Trained:
         found = {name: tensor.shape for name, tensor in packed.tensors.items()}
         different = sorted(name for name in shapes | found if shapes.get(name) != found.get(name))
         if different:
-            raise ValueError(f"{different[0]} and {len(different) - 1} others do not fit")
+            raise ValueError(
+                f"{different[0]} and {len(different) - 1} others do not fit; of another version, "
+                "it has to be trained again"
+            )
         classes = label_set(config.label_set)
         if packed.said.classes != list(classes):
             raise ValueError(f"its classes are not those of {config.label_set}")
