@@ -30,6 +30,8 @@ VERSION = 1
 SHAPES_VERSION = 5
 """Version of the cached hulls and rays. Raise it, or `VERSION`, when the same views give others."""
 
+HANGS_M = 0.3
+"""Height of an object's bottom from which it hangs."""
 RAYS_KEPT = 1024
 """Rays per object from which shapes are found."""
 
@@ -118,7 +120,11 @@ class LiftedDataset(RoomDataset):
         hulls, sizes_m, labels = self.hulls(), self.sizes_m, self.object_classes
         items, common = choose_prototypes(hulls, sizes_m, labels, self.usable, most)
         margin = self._shape.margin
-        parts = fit_kinds(items, hulls, self.rays, sizes_m, labels, self.usable, margin)
+        bottoms_m = np.concatenate(
+            [room.centers_m[:, 1] - room.sizes_m[:, 1] / 2 for room in self.boxes]
+        )
+        hangs = bottoms_m > HANGS_M
+        parts = fit_kinds(items, hulls, self.rays, sizes_m, labels, self.usable, hangs, margin)
         grids = [filled_cells(each, self._shape.cells, margin) for each in parts]
         return Prototypes(parts, np.stack(grids), sizes_m[items], labels[items], common)
 

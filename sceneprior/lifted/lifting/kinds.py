@@ -42,11 +42,12 @@ def fit_kinds(
     sizes_m: Float[np.ndarray, "objects 3"],
     object_class: Int[np.ndarray, " objects"],
     usable: Bool[np.ndarray, " objects"],
+    hangs: Bool[np.ndarray, " objects"],
     margin: float,
 ) -> tuple[Parts, ...]:
     """Parts of the prototypes, which are the objects `items`: fitted to the rays of all objects of
     their class that look like them, in the pose in which each does best and, for symmetric ones, in
-    those that are as good."""
+    those that are as good. Objects that `hang` are held from above."""
 
     def fit_one(item: int) -> Parts:
         rows = np.flatnonzero((object_class == object_class[item]) & usable)
@@ -67,7 +68,7 @@ def fit_kinds(
             pools.append(as_prototype(pool, int(pose)))
         order = rng.permutation(len(pools) * count)
         pool = RayPool(*(np.concatenate(part)[order] for part in zip(*pools, strict=True)))
-        return fit_parts(pool, hulls[item], margin)
+        return fit_parts(pool, hulls[item], margin, bool(hangs[item]))
 
     with ThreadPoolExecutor(thread_count()) as pool:
         found = pool.map(fit_one, items.tolist())

@@ -39,21 +39,24 @@ SCREENED, FINALISTS = 768, 6
 """Rays on which all changes are tried; the best of them (`FINALISTS`) are tried on all rays."""
 
 
-def fit_parts(rays: RayPool, hull: Bool[np.ndarray, "x y z"], margin: float) -> Parts:
+def fit_parts(
+    rays: RayPool, hull: Bool[np.ndarray, "x y z"], margin: float, hangs: bool = False
+) -> Parts:
     """The parts that explain the rays of one object, or of several that look alike.
 
     Rays lie in the frame that spans [-1, 1] and `margin` boxes, in random order; those without
-    information are left out. `hull`, a grid of the same frame, says where parts may be missing.
+    information are left out. `hull`, a grid of the same frame, says where parts may be missing. An
+    object that `hangs` is held from above, others stand.
     Without rays, the object's box is its only part.
     """
     cells = len(hull)
     beyond = round((1 - 1 / margin) / 2 * cells)
     hull = hull[(slice(beyond, cells - beyond),) * 3]
-    every = RayFit(rays, margin)
+    every = RayFit(rays, margin, hangs)
     guess = every.guess(np.array([BOX]), np.array([0]), np.array([[[0, LEVELS]] * 3]))
     if not len(every.hits):
         return guess.parts()
-    some = RayFit(RayPool(*(part[:SCREENED] for part in rays)), margin)
+    some = RayFit(RayPool(*(part[:SCREENED] for part in rays)), margin, hangs)
     while better := _one_more(every, some, guess, hull) or _one_more(every, every, guess, hull):
         guess = better
     return _joined(every, _needed(every, guess)).parts()
@@ -109,6 +112,10 @@ def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Ite
                 yield {row: (BOX, across, one), new: (BOX, across, other)}
                 if single and share < 0.5:
                     yield {row: (BOX, across | bit, one), new: (BOX, across, other)}
+        if ends[1, 0] > 0:
+            down = ends.copy()
+            down[1, 0] = 0
+            yield {row: (int(guess.kinds[row]), across, down)}
         if room and ends[1, 0] >= SHORTEST:
             yield from ({new: (BOX, across, each)} for across, each in _below(ends))
     labels, pieces = ndimage.label(hull & ~_cells_in(guess, len(hull)))
@@ -172,11 +179,14 @@ def _needed(every: RayFit, guess: Guess) -> Guess:
 
 
 def _joined(every: RayFit, guess: Guess) -> Guess:
-    """The guess with bars between its pieces, and from pieces to the top and the bottom of the box,
-    where that costs less than gaps: cords are often too thin for masks."""
+    """The guess with bars between its pieces, and to what it stands on or hangs from, where that
+    costs less than gaps: cords are often too thin for masks."""
     while len(guess.kinds) < MOST_PARTS:
         new = len(guess.kinds)
-        trials = [every.changed(guess, {new: (BOX, across, bar)}) for across, bar in _bars(guess)]
+        trials = [
+            every.changed(guess, {new: (BOX, across, bar)})
+            for across, bar in _bars(guess, every.hangs)
+        ]
         best = min(trials, key=every.loss)
         if every.loss(best) >= every.loss(guess):
             break
@@ -184,11 +194,11 @@ def _joined(every: RayFit, guess: Guess) -> Guess:
     return guess
 
 
-def _bars(guess: Guess) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
-    """Boxes from each part to each other, to the ceiling and to the floor, as wide as both together
-    allow and two levels wide; with their mirroring."""
-    ceiling, floor = np.array([[[0, LEVELS]] * 3] * 2)
-    ceiling[1], floor[1] = LEVELS, 0
+def _bars(guess: Guess, hangs: bool) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
+    """Boxes from each part to each other and to the floor, or to the ceiling for an object that
+    hangs, as wide as both together allow and two levels wide; with their mirroring."""
+    support = np.array([[0, LEVELS]] * 3)
+    support[1] = LEVELS if hangs else 0
     both = ACROSS_X | ACROSS_Z
     ends = list(zip(guess.mirrored.tolist(), guess.ends, strict=True))
     for across, own in ends.copy():
@@ -198,7 +208,7 @@ def _bars(guess: Guess) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
                 far = max(own[axis, 1], LEVELS - own[axis, 0])
                 whole[axis] = LEVELS - far, far
         ends += [(0, whole)] if across else []
-    targets = [*ends, (both, ceiling), (both, floor)]
+    targets = [*ends, (both, support)]
     for (one, here), (other, there) in itertools.product(ends, targets):
         last_low = np.maximum(here[:, 0], there[:, 0])
         first_high = np.minimum(here[:, 1], there[:, 1])

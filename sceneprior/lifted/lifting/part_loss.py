@@ -2,15 +2,15 @@
 
     half the share of hits that meet no part + half the share of misses that meet one
       + 0.003 (number of parts) + 0.003 (number of planes in which faces lie)
-      + 0.002 (number of curved parts) + 0.0003 (volume of the parts, 1 for the box)
-      + 0.06 (gaps between the parts and the six sides of the box, 1 for the box's length)
+      + 0.002 (number of curved parts) - 0.0005 (volume of the parts, 1 for the box)
+      + 0.06 (gap between the parts and the floor, or the ceiling for lamps; 1 for the box's height)
       + 0.005 (connected pieces - 1)
 
 A ray is right if it meets a part exactly when its pixel is the object's. Few parts explain masks
 more cheaply than what a visual hull adds where no view sees past: a headboard and a mattress, not a
 dome. Parts and their mirror images count once, and so do planes and theirs; sides of the box cost
-nothing. So edges line up. The other prices settle what rays leave open: solids are small, fill
-their box, and hold together.
+nothing. So edges line up. The other prices settle what rays leave open: solids are full
+where nobody has looked, stand or hang, and hold together.
 """
 
 from collections.abc import Iterable
@@ -21,11 +21,11 @@ from jaxtyping import Bool, Int
 
 from sceneprior.core.parts import BOX, Parts
 from sceneprior.lifted.lifting.lifted import RayPool
-from sceneprior.lifted.lifting.part_prices import LEVELS, count_planes, gaps_and_pieces, volume_of
+from sceneprior.lifted.lifting.part_prices import LEVELS, count_planes, gap_and_pieces, volume_of
 from sceneprior.lifted.lifting.part_rays import descend, meets, wrong_rays
 
 PART_PRICE, CURVED_PRICE, PLANE_PRICE = 0.003, 0.002, 0.003
-VOLUME_PRICE, GAP_PRICE, PIECE_PRICE = 0.0003, 0.06, 0.005
+VOLUME_PRICE, GAP_PRICE, PIECE_PRICE = -0.0005, 0.06, 0.005
 FEWEST = 50
 """Added to the numbers of hits and misses, so that few rays do not weigh too much."""
 
@@ -54,13 +54,14 @@ class Guess(NamedTuple):
 class RayFit:
     """The loss of parts on a set of rays, which lie in the frame of the object's box."""
 
-    def __init__(self, rays: RayPool, margin: float):
+    def __init__(self, rays: RayPool, margin: float, hangs: bool = False):
         useful = np.abs(rays.spans).sum(axis=1) > 0
         scale = margin / 2 * LEVELS  # the frame of rays spans [-1, 1], `margin` boxes
         self.starts = rays.starts[useful].astype(np.float64) * scale + LEVELS / 2
         spans = rays.spans[useful].astype(np.float64) * scale
         self.spans = np.where(np.abs(spans) < 1e-6, 1e-6, spans)  # they are divided by
         self.inverse = 1 / self.spans
+        self.hangs = hangs
         self.hits = np.ascontiguousarray(rays.hits[useful])
         hits = int(self.hits.sum())
         self.hit_price = 0.5 / (hits + FEWEST)
@@ -70,7 +71,7 @@ class RayFit:
         """See the module's docstring."""
         missed, wrongly_met = wrong_rays(guess.met_by, self.hits)
         volume = sum(map(volume_of, guess.kinds, guess.mirrored, guess.ends))
-        gaps, pieces = gaps_and_pieces(guess.mirrored, guess.ends)
+        gap, pieces = gap_and_pieces(guess.mirrored, guess.ends, self.hangs)
         return float(
             self.hit_price * missed
             + self.miss_price * wrongly_met
@@ -78,7 +79,7 @@ class RayFit:
             + CURVED_PRICE * (guess.kinds != BOX).sum()
             + PLANE_PRICE * count_planes(guess.ends)
             + VOLUME_PRICE * volume
-            + GAP_PRICE * gaps / LEVELS
+            + GAP_PRICE * gap / LEVELS
             + PIECE_PRICE * (pieces - 1)
         )
 

@@ -1,4 +1,5 @@
-"""Prices of parts that hang on the parts alone: volume, planes of faces, gaps and pieces.
+"""Prices of parts that hang on the parts alone: volume, planes of faces, pieces, and the
+gap to what they stand on or hang from.
 
 Faces lie on `LEVELS` + 1 evenly spaced levels between the sides of the object's box.
 """
@@ -63,9 +64,10 @@ def count_planes(ends):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def gaps_and_pieces(mirrored, ends):
-    """The sum of the gaps, in levels, between the six sides of the object's box and the connected
-    piece that comes nearest to them, and the number of pieces. Parts within a level touch."""
+def gap_and_pieces(mirrored, ends, hangs):
+    """The gap, in levels, between the floor of the object's box, or its ceiling for an object that
+    hangs, and the connected piece that comes nearest to it; and the number of pieces. Parts within
+    a level touch."""
     solids = np.empty((4 * len(ends), 3, 2), np.int64)
     count = 0
     for part in range(len(ends)):
@@ -91,14 +93,7 @@ def gaps_and_pieces(mirrored, ends):
                 for each in range(count):
                     if piece[each] == gone:
                         piece[each] = piece[other]
-    gaps = 6 * LEVELS
-    for one in range(count):
-        own = 0
-        for axis in range(3):
-            low, high = LEVELS, 0
-            for other in range(count):
-                if piece[other] == one:
-                    low, high = min(low, solids[other, axis, 0]), max(high, solids[other, axis, 1])
-            own += low + LEVELS - high
-        gaps = min(gaps, own)
-    return gaps, pieces
+    gap = LEVELS
+    for solid in range(count):
+        gap = min(gap, LEVELS - solids[solid, 1, 1] if hangs else solids[solid, 1, 0])
+    return gap, pieces

@@ -49,7 +49,7 @@ def objects():
 def test_objects_in_all_poses_teach_one_kind_and_are_known_again_by_their_rays():
     hulls, rays, sizes_m, classes = objects()
     items, usable = np.array([0, 8]), np.ones(10, bool)
-    parts = fit_kinds(items, hulls, rays, sizes_m, classes, usable, MARGIN)
+    parts = fit_kinds(items, hulls, rays, sizes_m, classes, usable, ~usable, MARGIN)
     for found, true in zip(parts, (CORNER, TABLE), strict=True):
         ours, wanted = (filled_cells(each, CELLS, MARGIN) for each in (found, true))
         assert (ours & wanted).sum() > 0.85 * (ours | wanted).sum()
@@ -65,7 +65,7 @@ def test_objects_in_all_poses_teach_one_kind_and_are_known_again_by_their_rays()
 def test_kinds_do_not_depend_on_the_order_in_which_they_are_fitted():
     hulls, rays, sizes_m, classes = objects()
     usable = np.ones(10, bool)
-    both = fit_kinds(np.array([0, 8]), hulls, rays, sizes_m, classes, usable, MARGIN)
-    alone = fit_kinds(np.array([8]), hulls, rays, sizes_m, classes, usable, MARGIN)
+    both = fit_kinds(np.array([0, 8]), hulls, rays, sizes_m, classes, usable, ~usable, MARGIN)
+    alone = fit_kinds(np.array([8]), hulls, rays, sizes_m, classes, usable, ~usable, MARGIN)
     for here, there in zip(both[1], alone[0], strict=True):
         np.testing.assert_array_equal(here, there)

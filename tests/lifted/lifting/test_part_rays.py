@@ -9,7 +9,7 @@ from sceneprior.lifted.lifting.part_loss import RayFit
 from sceneprior.lifted.lifting.part_prices import (
     LEVELS,
     count_planes,
-    gaps_and_pieces,
+    gap_and_pieces,
     planes_of,
     volume_of,
 )
@@ -96,19 +96,16 @@ def test_planes_are_shared_by_parts_and_by_mirror_images():
     assert count_planes(np.concatenate([ends, mirrored[1:]])) == 4
 
 
-def test_gaps_are_those_of_the_best_piece():
+def test_gaps_are_those_to_the_floor_or_the_ceiling():
     legs = np.array([[[0, 8], [0, 40], [0, 8]]])
-    top = np.array([[[0, 64], [41, 64], [0, 64]]])
+    top = np.array([[[0, 64], [41, 60], [0, 64]]])
     both = np.concatenate([legs, top])
-    assert gaps_and_pieces(np.array([3, 0]), both) == (0, 1), "within a level"
+    assert gap_and_pieces(np.array([3, 0]), both, False) == (0, 1), "within a level"
+    assert gap_and_pieces(np.array([3, 0]), both, True) == (4, 1)
     top[0, 1, 0] = 42
     apart = np.concatenate([legs, top])
-    assert gaps_and_pieces(np.array([3, 0]), apart) == (42, 5)
-    # A small part in a far corner does not fill the box.
-    corner = np.array([[[62, 64], [62, 64], [62, 64]]])
-    middle = np.array([[[10, 40], [0, 30], [10, 40]]])
-    gaps, pieces = gaps_and_pieces(np.zeros(2, int), np.concatenate([corner, middle]))
-    assert pieces == 2 and gaps == 10 + 24 + 0 + 34 + 10 + 24
+    assert gap_and_pieces(np.array([3, 0]), apart, False) == (0, 5)
+    assert gap_and_pieces(np.zeros(1, int), top, False) == (42, 1)
 
 
 def test_wrong_rays_of_several_objects_are_counted_at_once():
