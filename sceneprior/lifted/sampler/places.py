@@ -22,7 +22,7 @@ BY_OBJECT = 7
 centred, flush with its upper side, adjacent behind it, and `APART_M` before and behind it."""
 APART_M = 0.4
 """Gap of the anchors apart from an object."""
-SHARPNESS, SPREAD = 2.5, 0.7
+SHARPNESS, SPREAD = 1.5, 0.7
 """Drawing raises the weights of anchors to this power and multiplies the scales around them by this
 factor: what a network learns from a few hundred rooms is less certain than the rooms are."""
 GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 1.0, 2.0)

@@ -207,7 +207,7 @@ def test_ramps_are_piecewise_linear():
 
 
 def test_draws_are_sharper_than_the_density():
-    """Weights 1 and 3 become 1 and 3 ** 2.5; scales shrink."""
+    """Weights 1 and 3 become 1 and 3 ** 1.5; scales shrink."""
     weights = torch.tensor([1.0, 3.0])
     plain = LogisticMixture(weights.log(), torch.zeros(2, 1), torch.zeros(2, 1))
     sharp = module._sharpened(plain)
