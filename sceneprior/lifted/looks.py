@@ -118,7 +118,9 @@ class LookDecoder(ShapeModule):
             part[rows].cpu().numpy() for part in (self.sizes_m, self.object_class, self.common)
         )
         parts = tuple(map(self.parts, rows))
-        grids = np.stack([filled_cells(each, self.cells, self.margin) for each in parts])
+        grids = np.zeros((len(parts), *(self.cells,) * 3), bool)
+        for grid, each in zip(grids, parts, strict=True):
+            grid[...] = filled_cells(each, self.cells, self.margin)
         return Prototypes(parts, grids, sizes_m.astype(np.float64), labels, common)
 
     def parts(self, prototype: int) -> Parts:

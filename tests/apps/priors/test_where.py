@@ -36,8 +36,11 @@ def test_a_repository_of_the_hub_is_a_prior(hub, sampler_run, tmp_path):
     (repository / "refs" / "main").write_text(COMMIT)
     found = find_prior("hf://someone/bedrooms")
     assert {path.name for path in found.iterdir()} == set(FILES)
-    one, other = (sample_rooms(t, 2, 0) for t in (trained, load_any_run("hf://someone/bedrooms")))
-    assert [room.objects[0].center_m for room in one] == [r.objects[0].center_m for r in other]
+    one, other = (
+        [item.center_m for room in sample_rooms(run, 8, 0) for item in room.objects]
+        for run in (trained, load_any_run("hf://someone/bedrooms"))
+    )
+    assert one == other and one
 
 
 def test_what_the_hub_does_not_give_is_one_sentence(hub):
