@@ -46,12 +46,8 @@ def test_what_hangs_reaches_the_ceiling_and_what_stands_the_floor():
     hull = filled_cells(shade, CELLS, MARGIN)
     for hangs in (False, True):
         found = fit_parts(rays_of(shade, 4000), hull, MARGIN, hangs)
-        end = (
-            max(e[1, 1] for _, e in found.solids())
-            if hangs
-            else min(e[1, 0] for _, e in found.solids())
-        )
-        assert end == (0.5 if hangs else -0.5)
+        heights = np.stack([ends[1] for _, ends in found.solids()])
+        assert heights.max() == 0.5 if hangs else heights.min() == -0.5
 
 
 def test_objects_without_rays_are_their_box():
