@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from sceneprior.core.geometry.part_meshes import stretched, surface_of_parts
 from sceneprior.core.geometry.turns import quarter_rotation
-from sceneprior.core.parts import MOST_PARTS, Parts, filled_cells
+from sceneprior.core.parts import MOST_PARTS, Parts, filled_cells, whole_box
 from sceneprior.core.scene import Mesh
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototypes import (
@@ -124,8 +124,10 @@ class LookDecoder(ShapeModule):
         return Prototypes(parts, grids, sizes_m.astype(np.float64), labels, common)
 
     def parts(self, prototype: int) -> Parts:
-        """The parts of a prototype."""
+        """The parts of a prototype; the box for one that is not in use."""
         used = self.part_kind[prototype] != self.unknown
+        if not used.any():
+            return whole_box()
         kind, mirrored, ends = (
             part[prototype, used].cpu().numpy()
             for part in (self.part_kind, self.part_mirrored, self.part_ends)
