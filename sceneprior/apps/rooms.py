@@ -12,7 +12,8 @@ from rich.progress import Progress
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import PARTS, check_writable, write_whole
-from sceneprior.core.scene import FORMAT, Scene
+from sceneprior.core.scene import Scene
+from sceneprior.core.scene_json import FORMAT
 from sceneprior.paper.sampling import LATENTS_FILE, write_latents
 from sceneprior.render.offscreen import Renderer
 from sceneprior.render.pictures import contact_sheet, png_bytes

@@ -1,4 +1,4 @@
-"""A room as 3D objects, and its JSON format, which generation writes and evaluation reads."""
+"""A room as 3D objects with its floor, doors and windows; `scene_json` has its file format."""
 
 import base64
 import html
@@ -7,26 +7,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import json_text, read_json
-from sceneprior.core.instances.checked import checked
-
-FORMAT = "sceneprior-scene"
-VERSION = 1
-LARGEST_M = 20.0
-"""Maximum length of a piece of furniture; the longest wardrobes and shelves have half of it."""
-FARTHEST_M = 100.0
-"""Maximum absolute coordinate of a box centre or a corner of the floor."""
-MOST_OBJECTS = 1000
-"""Maximum number of objects in a room, because metrics compare all pairs."""
-_DECIMALS = 5
-_LEAST_M = 10.0**-_DECIMALS
 
 
 @dataclass(frozen=True)
@@ -106,9 +92,32 @@ class SceneObject:
         return SceneObject(self.label, center, size, mesh)
 
 
+def bound_m(turned: Turned) -> tuple[float, float, float]:
+    """Extents of the axis-aligned bounding box of an oriented box.
+
+    >>> [round(side, 3) for side in bound_m(Turned(np.pi / 4, (1.0, 0.7, 1.0)))]
+    [1.414, 0.7, 1.414]
+    """
+    width, height, depth = turned.size_m
+    cosine, sine = abs(np.cos(turned.yaw_rad)), abs(np.sin(turned.yaw_rad))
+    return _triple((cosine * width + sine * depth, height, sine * width + cosine * depth))
+
+
 def _triple(values: Sequence[float]) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in values)
     return (x, y, z)
+
+
+class Opening(NamedTuple):
+    """A door or a window: an upright rectangle in a wall."""
+
+    kind: Literal["door", "window"]
+    start_m: tuple[float, float]
+    """One lower corner as x, z; `end_m` is the other."""
+    end_m: tuple[float, float]
+    bottom_m: float
+    """Height of its lower edge above the floor: 0 for a door, the sill of a window."""
+    top_m: float
 
 
 @dataclass(frozen=True)
@@ -119,11 +128,15 @@ class Scene:
     label_set: str
     objects: tuple[SceneObject, ...] = ()
     floor_m: np.ndarray | None = None
-    """(P, 2) outline of the floor as x, z; None if unknown, as for generated rooms."""
+    """(P, 2) outline of the floor as x, z; None if unknown. Walls stand on its sides."""
     extra: dict[str, Any] = field(default_factory=dict)
     """Origin of the scene (seed, run, room), written to the JSON and never interpreted."""
     latent: np.ndarray | None = field(default=None, compare=False, repr=False)
     """(D,) latent vector that the scene was decoded from, if any."""
+    openings: tuple[Opening, ...] = ()
+    """Doors and windows, each on one side of the floor's outline."""
+    ceiling_m: float | None = None
+    """Height of the ceiling above the floor; None if unknown."""
 
     @property
     def class_indices(self) -> np.ndarray:
@@ -195,154 +208,3 @@ class Scene:
             f'<figure><img src="data:image/png;base64,{picture}" alt="a room">'
             f"<figcaption>{html.escape(self.name)}: {told}</figcaption></figure>"
         )
-
-
-def scene_to_json(scene: Scene) -> dict[str, Any]:
-    """Convert a scene to its JSON format (docs/conventions.md): classes and boxes, no meshes."""
-    objects = []
-    for item in scene.objects:
-        entry: dict[str, Any] = {"class": item.label}
-        entry["center_m"] = [round(value, _DECIMALS) for value in item.center_m]
-        entry["size_m"] = _rounded_size(item.size_m)
-        if item.turned is not None:
-            entry["yaw_rad"] = round(item.turned.yaw_rad, 7)
-            entry["own_size_m"] = _rounded_size(item.turned.size_m)
-        objects.append(entry)
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "name": scene.name,
-        "label_set": scene.label_set,
-        "units": "metres",
-        "axes": "x right, y up, z towards the viewer; floor at y = 0, its centre at the origin",
-        "objects": objects,
-        **({} if scene.floor_m is None else {"floor_m": scene.floor_m.tolist()}),
-        **({"extra": scene.extra} if scene.extra else {}),
-    }
-
-
-def _rounded_size(size_m: Sequence[float]) -> list[float]:
-    # A flat side stays above 0, because `read_scene` rejects sizes of 0.
-    return [max(round(value, _DECIMALS), _LEAST_M) for value in size_m]
-
-
-# Strict, because "1.8" and true are not valid lengths; JSON has lists for our tuples.
-_STRICT = ConfigDict(strict=True)
-_Triple = Annotated[tuple[float, float, float], Field(strict=False)]
-_Pair = Annotated[tuple[float, float], Field(strict=False)]
-
-
-class _ObjectEntry(BaseModel):
-    model_config = _STRICT
-
-    label: str = Field(alias="class")
-    center_m: _Triple
-    size_m: _Triple
-    yaw_rad: float | None = None
-    own_size_m: _Triple | None = None
-
-
-class _SceneEntry(BaseModel):
-    model_config = _STRICT
-
-    name: str | None = None
-    label_set: str
-    objects: Annotated[list[_ObjectEntry], Field(max_length=MOST_OBJECTS)]
-    floor_m: Annotated[list[_Pair], Field(min_length=3)] | None = None
-    extra: dict[str, Any] = {}
-
-
-def read_scene(path: Path) -> Scene:
-    """Read a scene's JSON."""
-    path = Path(path)
-    data = read_json(path)
-    where = f"{path} is not a scene JSON, which docs/conventions.md describes"
-    if not isinstance(data, dict) or not {"format", "version"} <= data.keys():
-        raise InputError(f"{where}: expected an object with 'format', 'version' and 'objects'.")
-    if (data["format"], data["version"]) != (FORMAT, VERSION):
-        raise InputError(
-            f"{path} says format '{_short(data['format'])}' version {_short(data['version'])}; "
-            f"expected '{FORMAT}' version {VERSION}. Write it again with `sceneprior synthesize`."
-        )
-    entry = checked(_SceneEntry, data, where)
-    try:
-        json_text(entry.extra)  # it is written again with the scene
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{where}: extra cannot be written as JSON ({error}).") from None
-    names = label_set(entry.label_set)
-    objects = []
-    for item in entry.objects:
-        if item.label not in names:
-            raise InputError(
-                f"{path}: class '{_short(item.label)}' is not in label set "
-                f"'{_short(entry.label_set)}'; use one of {', '.join(names)}."
-            )
-        check_box(path, item.label, item.center_m, item.size_m)
-        turned = _turned_of(path, item)
-        objects.append(SceneObject(item.label, item.center_m, item.size_m, turned=turned))
-    floor = None if entry.floor_m is None else np.array(entry.floor_m, dtype=np.float64)
-    if floor is not None:
-        check_floor(path, floor)
-    name = path.stem if entry.name is None else entry.name
-    return Scene(name, entry.label_set, tuple(objects), floor, entry.extra)
-
-
-def check_box(path: Path, label: str, center_m: Sequence[float], size_m: Sequence[float]) -> None:
-    """Reject an implausible box; all readers of boxes use this check."""
-    said = f"{path}: a {label} has centre {[*center_m]} and size {[*size_m]}"
-    if not np.isfinite([*center_m, *size_m]).all() or min(size_m) <= 0:
-        raise InputError(f"{said}; expected finite metres, and sizes above 0.")
-    if max(size_m) > LARGEST_M or np.abs(center_m).max() > FARTHEST_M:
-        raise InputError(
-            f"{said}; no furniture is above {LARGEST_M:g} m long, or further than "
-            f"{FARTHEST_M:g} m from the floor's centre. {_unit_guess([*center_m, *size_m])}"
-        )
-
-
-def check_floor(path: Path, outline_m: np.ndarray) -> None:
-    """Reject a floor outline that is implausibly large, or has no area."""
-    far = np.abs(outline_m).max(initial=0)
-    if not far <= FARTHEST_M:
-        raise InputError(
-            f"{path}: the floor reaches {far:g} m from its centre; expected finite metres, at most "
-            f"{FARTHEST_M:g}. {_unit_guess(far)}"
-        )
-    if np.linalg.matrix_rank(outline_m - outline_m[0]) < 2:
-        raise InputError(f"{path}: all corners of the floor lie on one line, so it has no area.")
-
-
-def _unit_guess(numbers: Any) -> str:
-    unit = "millimetres" if np.abs(numbers).max() > 1000 else "centimetres"
-    return f"Are these {unit}? Give metres."
-
-
-def _turned_of(path: Path, item: _ObjectEntry) -> Turned | None:
-    """Oriented box of an entry, if it has one; it must fill the axis-aligned box."""
-    if item.yaw_rad is None and item.own_size_m is None:
-        return None
-    if item.yaw_rad is not None and item.own_size_m is not None:
-        check_box(path, item.label, item.center_m, item.own_size_m)
-        turned = Turned(item.yaw_rad, item.own_size_m)
-        if np.allclose(bound_m(turned), item.size_m, rtol=0, atol=1e-3):
-            return turned
-    raise InputError(
-        f"{path}: a {item.label} of size_m {item.size_m} has yaw_rad {item.yaw_rad} and "
-        f"own_size_m {item.own_size_m}; expected both, such that the box turned by yaw_rad fills "
-        "size_m, or neither."
-    )
-
-
-def bound_m(turned: Turned) -> tuple[float, float, float]:
-    """Extents of the axis-aligned bounding box of an oriented box.
-
-    >>> [round(side, 3) for side in bound_m(Turned(np.pi / 4, (1.0, 0.7, 1.0)))]
-    [1.414, 0.7, 1.414]
-    """
-    width, height, depth = turned.size_m
-    cosine, sine = abs(np.cos(turned.yaw_rad)), abs(np.sin(turned.yaw_rad))
-    return _triple((cosine * width + sine * depth, height, sine * width + cosine * depth))
-
-
-def _short(text: object) -> str:
-    """Shorten a value from a file for a message."""
-    return str(text)[:60]

@@ -13,16 +13,8 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.geometry.turns import yaw_rotation
-from sceneprior.core.scene import (
-    MOST_OBJECTS,
-    Mesh,
-    Scene,
-    SceneObject,
-    Turned,
-    bound_m,
-    check_box,
-    check_floor,
-)
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m
+from sceneprior.core.scene_json import MOST_OBJECTS, check_box, check_floor
 from sceneprior.render.topdown import box_mesh
 
 NEEDED = ("class_labels", "translations", "sizes", "angles")

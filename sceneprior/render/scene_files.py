@@ -14,7 +14,8 @@ import numpy as np
 
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.files import is_name, read_json, write_json, write_whole
-from sceneprior.core.scene import FORMAT, Mesh, Scene, mesh_of_file, read_scene, scene_to_json
+from sceneprior.core.scene import Mesh, Scene, mesh_of_file
+from sceneprior.core.scene_json import FORMAT, read_scene, scene_to_json
 from sceneprior.render.offscreen import Renderer, open_renderer
 from sceneprior.render.pictures import png_bytes
 from sceneprior.render.topdown import FLOOR_COLOR, object_colors, scene_meshes, topdown

@@ -56,7 +56,7 @@ def use_scenes(scenes: list, folder: Path) -> None:
 
 
 def fuzz_json(folder: Path) -> None:
-    from sceneprior.core.scene import scene_to_json
+    from sceneprior.core.scene_json import scene_to_json
     from sceneprior.render.scene_files import load_scene_folder
 
     rng, data, path = begun(folder), scene_to_json(example()), folder / "given" / "room.json"

@@ -12,15 +12,8 @@ from PIL import Image
 from sceneprior.apps.rooms import write_scene, write_scenes
 from sceneprior.core.classes import class_colors
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import (
-    Mesh,
-    Scene,
-    SceneObject,
-    Turned,
-    bound_m,
-    mesh_of_file,
-    scene_to_json,
-)
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m, mesh_of_file
+from sceneprior.core.scene_json import scene_to_json
 from sceneprior.render.offscreen import open_renderer
 from sceneprior.render.scene_files import (
     load_scene,
