@@ -197,7 +197,7 @@ class GanStage(lightning.LightningModule):
                 group["lr"] = group["initial_lr"] * self._left()
 
     def _left(self) -> float:
-        """Share of the epochs that are still to come."""
+        """Share of the epochs that remain."""
         return 1 - self.current_epoch / self.settings.epochs
 
     def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:

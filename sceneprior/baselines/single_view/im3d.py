@@ -103,7 +103,7 @@ class SceneGraph(nn.Module):
     def forward(
         self, found: Detections, features: Float[Tensor, "masks width"], start: CameraBoxes
     ) -> tuple[Float[Tensor, "masks width"], CameraBoxes]:
-        """The nodes after the last round, and the refined boxes."""
+        """Features of the nodes after the last round, and the refined boxes."""
         placed = start.in_room(found)
         away = found.to_frame(placed.centers_m - found.eye_m)
         box = torch.cat([away, found.to_frame(placed.sizes_m).abs().log()], dim=-1)
@@ -188,7 +188,7 @@ class Im3d(ViewNetwork):
     ) -> tuple[Estimate, CameraBoxes, Float[Tensor, "masks blobs 7"]]:
         """The detector's output, the refined boxes, and the shapes."""
         features, estimate = self.detector(found)
-        # The graph refines the likeliest boxes and sends no gradient back through them.
+        # The graph refines the most likely boxes; no gradient flows back through them.
         start = CameraBoxes(*(part.detach() for part in estimate.boxes()))
         features, refined = self.graph(found, features, start)
         return estimate, refined, self.blobs(features)

@@ -208,7 +208,7 @@ class TrueObjects(NamedTuple):
     ahead: Bool[Tensor, " masks"]
     """True where the centre is in front of the camera; only there do `boxes.offsets` count."""
     points: Float[Tensor, "masks points 3"]
-    """Surface points in the image's frame; the box is [-1, 1]^3."""
+    """Points on the surface, along the axes of the image's frame; the object's box is [-1, 1]^3."""
     occupied: Bool[Tensor, "masks x y z"]
     """Occupied cells along the axes of the room."""
 

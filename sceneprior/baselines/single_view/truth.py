@@ -36,7 +36,7 @@ class TrueViews(NamedTuple):
     boxes_m: Float[Tensor, "rooms objects 6"]
     """Centre, then full extents, in the room frame."""
     points: Float[Tensor, "rooms objects points 3"]
-    """Surface points; the box is [-1, 1]^3."""
+    """Points on the surface, in the frame in which the object's box is [-1, 1]^3."""
     occupied: Bool[Tensor, "rooms objects x y z"]
     """Cells of the box inside the object."""
 
