@@ -138,7 +138,7 @@ def test_a_run_is_evaluated_with_its_own_shards(command, toy_run, tmp_path):
     ("arguments", "sentence"),
     [
         ([], "There is nothing to evaluate; give --run RUN, or --scenes DIR with --shards SHARDS."),
-        (["--run", "a", "--scenes", "b"], "Both --run and --scenes came; give --run"),
+        (["--run", "a", "--scenes", "b"], "Both --run and --scenes were given; give --run"),
         (["--scenes", "b"], "--scenes needs --shards: the folder with the test rooms."),
         (
             ["--scenes", "b", "--shards", "c", "--distribution", "paper"],

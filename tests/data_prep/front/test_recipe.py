@@ -38,7 +38,7 @@ def test_recipes_load_and_say_what_is_wrong():
         ("scale_range=[1]", r"'scale_range\.1' is missing"),
         (
             "required_classes=[bed]",
-            r"bedroom\.yaml: 'bed' is no class of its label set, which has void, armchair,",
+            r"bedroom\.yaml: 'bed' is not in its label set, which has void, armchair,",
         ),
         ("categories=[crib]", r"'categories': input should be a valid dictionary"),
         ("label_set=attic", "No label set is called 'attic'; there are front3d_bedroom,"),
@@ -181,5 +181,5 @@ def test_lists_of_what_is_invalid_are_read_where_the_user_has_them(tmp_path):
     recipe = load_recipe("bedroom", (f"invalid_rooms={path}", "invalid_models=[a, b]"))
     assert recipe.invalid_rooms == ("Bedroom-1", "Bedroom-2")
     assert recipe.invalid_models == ("a", "b")
-    with pytest.raises(InputError, match="invalid_models names no file of ids that can be read"):
+    with pytest.raises(InputError, match="invalid_models names a file of ids that cannot be read"):
         load_recipe("bedroom", (f"invalid_models={tmp_path / 'none.txt'}",))
