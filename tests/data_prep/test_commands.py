@@ -78,7 +78,7 @@ def test_pictures_and_wrong_words(front, tmp_path, prep, cli):
     assert made.exit_code == 3 and "its instanceid, '[/] [bold]'" in made.stdout, made.output
     assert len(list((tmp_path / "shards" / "rgb").glob("*/0000.png"))) == 6
     for words, said in (
-        (("--recipe", "attic"), "No recipe is called 'attic'; there are all, atiss_bedroom,"),
+        (("--recipe", "attic"), "No recipe is called 'attic'; choose from all, atiss_bedroom,"),
         (
             ("--rule", "max_floor_m=wide"),
             "'max_floor_m': input should be a valid number (got 'wide')",

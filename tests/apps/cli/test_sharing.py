@@ -33,7 +33,7 @@ def test_scores_of_a_packed_prior_need_a_file_and_shards(command, packed, toy_sh
         command("eval-fid", "--run", "mine.prior", "-n", 3)
     )
     call = ["eval-fid", "--run", "procthor-bedroom", "-n", 3, "--out", "s.json"]
-    assert "procthor-bedroom was trained on shards 'front_bedroom_large', which are not" in (
+    assert "procthor-bedroom was trained on shards 'front_bedroom_large', which do not" in (
         one_sentence(command(*call))
     )
     call = ["eval-fid", "--run", "mine.prior", "-n", 3, "--resamples", 0, *SOFT, "--out", "s.json"]

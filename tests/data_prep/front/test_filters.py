@@ -84,7 +84,7 @@ def test_rules(front, tmp_path, pieces, rule, said):
         (
             {"jid": "far", "entry": {"category": "Grand / Piano"}},
             "allowed",
-            "'grand/piano' is none",
+            "'grand/piano' is not among",
         ),
         ({"jid": "far"}, "allowed", "'others' is not among allowed_categories"),
         ({"jid": "known"}, "invalid_models", "'known' is among the invalid_models"),

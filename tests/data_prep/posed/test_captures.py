@@ -185,7 +185,7 @@ def test_where_a_colmap_model_may_lie(room):
     assert said.startswith(
         "1 of 1 rooms do not state the up direction: it is estimated from the cameras, as if"
     )
-    assert "Where they roll by 5 degrees it is 1.3 degrees off" in said
+    assert "If they roll by 5 degrees, the median error is 1.3 degrees" in said
 
 
 def test_colmap_models_that_cannot_be_read(room):

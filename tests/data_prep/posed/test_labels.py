@@ -28,7 +28,7 @@ def test_tables(tmp_path, name, text):
 
 def test_one_table_a_room(tmp_path):
     with pytest.raises(
-        InputError, match=r"has no classes\.json or .* or panoptic\.json; one table"
+        InputError, match=r"has no classes\.json or .* or panoptic\.json; expected one table"
     ):
         find_table(tmp_path)
     table(table(tmp_path, "{}"), "", "classes.csv")
