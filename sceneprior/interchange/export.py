@@ -16,14 +16,14 @@ OF_CLASSES: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
 }
 """Formats in which every object needs a furniture class, so that void objects are left out."""
 ENDINGS = {"obj": ".obj", "usd": ".usda"}
-"""Formats of one file a room."""
+"""Formats with one file per room."""
 FORMATS = (*OF_CLASSES, *ENDINGS)
 
 
 def export_scenes(scenes: Sequence[Scene], to: str, folder: Path) -> list[str]:
-    """Write rooms to a folder in one of `FORMATS`; in all of them y is up, in metres.
+    """Write rooms to a folder in one of `FORMATS`, all with y up and in metres.
 
-    Notes for the user on objects that were left out are returned.
+    Returns notes for the user on objects that were left out.
     """
     if to not in FORMATS:
         raise InputError(f"No format '{to}'; choose from {', '.join(FORMATS)}, or scenes.")
