@@ -6,7 +6,7 @@ legs of a table. Every part is convex; an object is the union of its parts.
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,6 +15,10 @@ KINDS = 5
 BOX, CYLINDER, ELLIPSOID, DOME, BOWL = range(KINDS)
 """Kinds of parts: each fills its own box as far as its kind can. A cylinder stands upright; a dome
 is the upper half of an ellipsoid, a bowl the lower half."""
+KIND_NAMES: tuple[Literal["box", "cylinder", "ellipsoid", "dome", "bowl"], ...] = (
+    "box", "cylinder", "ellipsoid", "dome", "bowl"
+)  # fmt: skip
+"""Names of the kinds, in their order."""
 ACROSS_X, ACROSS_Z = 1, 2
 """Bits of `Parts.mirrored`: the part also stands on the other side along this axis."""
 

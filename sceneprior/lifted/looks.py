@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from sceneprior.core.geometry.part_meshes import stretched, surface_of_parts
 from sceneprior.core.geometry.turns import quarter_rotation
-from sceneprior.core.parts import MOST_PARTS, Parts, filled_cells, whole_box
-from sceneprior.core.scene import Mesh
+from sceneprior.core.parts import KIND_NAMES, MOST_PARTS, Parts, filled_cells, whole_box
+from sceneprior.core.scene import Mesh, Solid
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototypes import (
     POSES,
@@ -157,8 +157,12 @@ class LookDecoder(ShapeModule):
     def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:
         if decoded.looks is None:
             return None
-        box_m = torch.cat((decoded.centers_m[room, item], decoded.sizes_m[room, item]))
-        return self.mesh(int(decoded.looks[room, item]), box_m.double().cpu().numpy())
+        return self.mesh(int(decoded.looks[room, item]), _box_m(decoded, room, item))
+
+    def solids_of(self, decoded: DecodedScenes, room: int, item: int) -> tuple[Solid, ...]:
+        if decoded.looks is None:
+            return ()
+        return self.solids(int(decoded.looks[room, item]), _box_m(decoded, room, item))
 
     def looks(self, codes: Float[Tensor, "*objects codes"]) -> Int[Tensor, "*objects"]:
         """The look whose code is nearest, the first of equal ones; 0 if there are no prototypes
@@ -181,15 +185,36 @@ class LookDecoder(ShapeModule):
         """The mesh of a look, stretched into a box (centre, full extents)."""
         prototype, pose = divmod(look, POSES)
         surface = self.surface(prototype)
+        faces = surface.faces
+        if turn_of(pose)[1]:  # mirroring inverts the faces: reverse their corners
+            faces = faces[:, ::-1].copy()
+        return Mesh(self._in_box(surface.vertices_m, look, box_m), faces)
+
+    def solids(self, look: int, box_m: Float[np.ndarray, "6"]) -> tuple[Solid, ...]:
+        """The solids of a look in a box (centre, full extents), as `mesh` places its surface."""
+        kinds, ends = zip(*self.parts(look // POSES).solids(), strict=True)
+        corners = np.stack(ends).transpose(0, 2, 1).reshape(-1, 3)
+        placed_m = np.sort(self._in_box(corners, look, box_m).reshape(-1, 2, 3), axis=1)
+        # A part in the middle is its own mirror image, to rounding.
+        _, first = np.unique(placed_m.round(5), axis=0, return_index=True)
+        low_m, high_m = placed_m.swapaxes(0, 1).tolist()
+        return tuple(
+            Solid(KIND_NAMES[kinds[row]], tuple(low_m[row]), tuple(high_m[row]))
+            for row in sorted(first)
+        )
+
+    def _in_box(
+        self, points: Float[np.ndarray, "points 3"], look: int, box_m: Float[np.ndarray, "6"]
+    ) -> Float[np.ndarray, "points 3"]:
+        """Points in the frame of a prototype, in the room: stretched, mirrored, turned, scaled."""
+        prototype, pose = divmod(look, POSES)
         size_m = self.sizes_m[prototype].double().cpu().numpy()
         own_m = turned_extents(box_m[None, 3:], pose)[0]
-        vertices = stretched(surface.vertices_m, self.parts(prototype), size_m, own_m)
-        faces = surface.faces
+        placed = stretched(points, self.parts(prototype), size_m, own_m)
         quarters, mirrored = turn_of(pose)
-        if mirrored:  # inverts the faces: reverse their corners
-            vertices, faces = vertices * [-1, 1, 1], faces[:, ::-1].copy()
-        vertices = vertices @ quarter_rotation(quarters).T
-        return Mesh(vertices * box_m[3:] + box_m[:3], faces)
+        if mirrored:
+            placed = placed * [-1, 1, 1]
+        return placed @ quarter_rotation(quarters).T * box_m[3:] + box_m[:3]
 
     @property
     def known(self) -> list[int]:
@@ -201,3 +226,8 @@ class LookDecoder(ShapeModule):
         if prototype not in self._meshes:
             self._meshes[prototype] = Mesh(*surface_of_parts(self.parts(prototype)))
         return self._meshes[prototype]
+
+
+def _box_m(decoded: DecodedScenes, room: int, item: int) -> Float[np.ndarray, "6"]:
+    box_m = torch.cat((decoded.centers_m[room, item], decoded.sizes_m[room, item]))
+    return np.asarray(box_m.double().cpu().numpy())

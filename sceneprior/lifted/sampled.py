@@ -56,8 +56,9 @@ def sample_scenes(
             # A given object whose class has no prototype gets no mesh.
             known = int(sampler.look_class[look]) == index
             mesh = shapes.mesh(look, box) if known else None
-            label = classes[index]
-            objects.append(SceneObject(label, tuple(box[:3]), tuple(box[3:]), mesh))
+            solids = shapes.solids(look, box) if known else ()
+            label, (center, size) = classes[index], np.split(box, 2)
+            objects.append(SceneObject(label, tuple(center), tuple(size), mesh, solids=solids))
         scenes.append(Scene(name, trained.config.label_set, tuple(objects)))
     return scenes
 

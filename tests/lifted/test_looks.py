@@ -7,6 +7,7 @@ import trimesh
 from parts_of_rooms import CORNER, boxes
 from tiny_runs import tiny_lifted
 
+from sceneprior.core.colliders import mesh_of
 from sceneprior.core.geometry.turns import turn_grids
 from sceneprior.core.parts import Parts, filled_cells
 from sceneprior.lifted.looks import LookConfig, LookDecoder
@@ -107,3 +108,22 @@ def test_the_prior_decodes_looks_in_place_of_meshes(prior, torch_rng):
     assert scenes.shape_codes.shape == (3, 6, 4)
     assert bare.looks is None and torch.equal(bare.shape_codes, scenes.shape_codes)
     assert torch.equal(bare.centers_m, scenes.centers_m)
+
+
+def test_solids_of_a_look_cover_its_mesh_in_every_pose():
+    """In each pose, the union of the solids has the volume and the middle of the mesh."""
+    decoder = LookConfig(prototypes=1, codes=8, cells=16).build(6)
+    grids = filled_cells(CORNER, 16, 1.1)[None]
+    size_m = np.array([[2.0, 0.5, 1.0]])
+    decoder.learn_prototypes(Prototypes((CORNER,), grids, size_m, np.array([1]), np.ones(1, bool)))
+    center_m = np.random.default_rng(1).normal(size=3)
+    for pose in range(POSES):
+        box = np.array([*center_m, *turned_extents(size_m, pose)[0] * 1.3])
+        mesh = decoder.mesh(pose, box)
+        here = trimesh.Trimesh(mesh.vertices_m, mesh.faces)
+        solids = decoder.solids(pose, box)
+        assert len({tuple(np.round(each[1:], 4).ravel()) for each in solids}) == len(solids)
+        parts = [mesh_of(each) for each in solids]
+        union = trimesh.boolean.union([trimesh.Trimesh(p.vertices_m, p.faces) for p in parts])
+        assert union.volume == pytest.approx(here.volume, rel=0.01)
+        np.testing.assert_allclose(union.center_mass, here.center_mass, atol=0.01)

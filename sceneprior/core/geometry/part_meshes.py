@@ -38,14 +38,29 @@ def surface_of_parts(
     return vertices.clip(-0.5, 0.5), np.asarray(mesh.tri_verts, dtype=np.int64)
 
 
+def convex_surface(
+    points: Float[np.ndarray, "points 3"],
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    """Vertices and outward triangles of the convex hull of points."""
+    from manifold3d import Manifold
+
+    mesh = Manifold.hull_points(points).to_mesh64()
+    vertices = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
+    return vertices, np.asarray(mesh.tri_verts, dtype=np.int64)
+
+
 def _solid(kind: int, ends: Float[np.ndarray, "3 2"]) -> "Manifold":
     from manifold3d import Manifold
 
-    grown = ends + np.array([-OVERLAP, OVERLAP])
+    return Manifold.hull_points(solid_points(kind, ends + np.array([-OVERLAP, OVERLAP])))
+
+
+def solid_points(kind: int, ends: Float[np.ndarray, "3 2"]) -> Float[np.ndarray, "points 3"]:
+    """Points whose convex hull is a solid; circles have `SIDES` corners."""
     if kind == BOX:
-        corners = CUBE_CORNERS / 2 * (grown[:, 1] - grown[:, 0]) + grown.mean(axis=1)
+        corners = CUBE_CORNERS / 2 * (ends[:, 1] - ends[:, 0]) + ends.mean(axis=1)
     else:
-        center, radii = center_and_radii(kind, grown)
+        center, radii = center_and_radii(kind, ends)
         turns = np.arange(SIDES) * 2 * np.pi / SIDES
         circle = np.stack([np.cos(turns), np.zeros(SIDES), np.sin(turns)], axis=1)
         if kind == CYLINDER:
@@ -56,7 +71,7 @@ def _solid(kind: int, ends: Float[np.ndarray, "3 2"]) -> "Manifold":
             rises = np.linspace(low, high, steps) * np.pi / 2
             rings = [np.cos(rise) * circle + np.array([0, np.sin(rise), 0]) for rise in rises]
         corners = np.concatenate(rings) * radii + center
-    return Manifold.hull_points(corners)
+    return corners
 
 
 def stretched(
