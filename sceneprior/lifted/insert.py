@@ -84,7 +84,7 @@ def _mean_apart(room: Scene, given: Scene, partners: dict[int, int]) -> float | 
 
 
 def _with_mesh(item: SceneObject, lender: SceneObject) -> SceneObject:
-    """A given object; if it has no mesh, it gets `lender`'s shape, moved and scaled into its box."""
+    """A given object; if it has no mesh, it gets `lender`'s shape, scaled into its box."""
     if item.mesh is not None:
         return item
     lent = lender.in_box(item.center_m, item.size_m)
