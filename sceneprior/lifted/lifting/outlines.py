@@ -9,9 +9,9 @@ from numba import njit
 
 from sceneprior.core.parts import MOST_CORNERS, SQUARE
 
-SMOOTHED = 0.5
-"""Distance in cells by which an outline may be simplified: corners of cells vanish, and so does
-nothing else."""
+SMOOTHED = 0.3
+"""Distance in cells by which an outline, which cuts the corners of cells, may be simplified. More
+would slant the sides of rectangles: a side would end at either end of such a cut."""
 FULL = 0.97
 """Share of its box from which an outline counts as filling it."""
 
@@ -29,13 +29,11 @@ def outline_of(hull: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "corners 2"
         return SQUARE
     largest = max(found, key=lambda each: float(each.area))
     tolerance = SMOOTHED
-    polygon = largest.simplify(tolerance)
-    while len(polygon.exterior.coords) - 1 > MOST_CORNERS:
+    while len((polygon := largest.simplify(tolerance)).exterior.coords) - 1 > MOST_CORNERS:
         tolerance *= 1.25
-        polygon = largest.simplify(tolerance)
     corners = shapely.get_coordinates(shapely.geometry.polygon.orient(polygon))[:-1]
     low, high = corners.min(axis=0), corners.max(axis=0)
-    if (high - low).min() < 1 or polygon.area > FULL * cells**2:
+    if (high - low).min() < 3 or polygon.area > FULL * cells**2:
         return SQUARE
     outline: np.ndarray = (corners - low) / (high - low) - 0.5
     return outline if shapely.Polygon(outline).area <= FULL else SQUARE
