@@ -84,7 +84,8 @@ def _mean_apart(room: Scene, given: Scene, partners: dict[int, int]) -> float | 
 
 
 def _with_mesh(item: SceneObject, lender: SceneObject) -> SceneObject:
-    """A given object; if it has no mesh, it gets `lender`'s, moved and scaled into its box."""
+    """A given object; if it has no mesh, it gets `lender`'s shape, scaled into its box."""
     if item.mesh is not None:
         return item
-    return replace(item, mesh=lender.in_box(item.center_m, item.size_m).mesh)
+    lent = lender.in_box(item.center_m, item.size_m)
+    return replace(item, mesh=lent.mesh, solids=lent.solids)

@@ -11,6 +11,7 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.threads import single_threaded
+from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.looks import LookDecoder
 from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.lifted.sampler.plan import Given
@@ -41,25 +42,30 @@ def sample_scenes(
     trained: TrainedLifted, names: Sequence[str], seed: int, given: Given | None = None
 ) -> list[Scene]:
     """A new room with meshes for each name; see `draw_rooms`."""
+    assert trained.sampler is not None, "callers ask trained.sampler first"
+    rooms = draw_rooms(trained.sampler, len(names), seed, given)
+    return [scene_of(trained, name, rooms, row) for row, name in enumerate(names)]
+
+
+def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> Scene:
+    """A drawn room as a scene with meshes."""
     sampler, shapes = trained.sampler, trained.prior.shape
     assert sampler is not None, "callers ask trained.sampler first"
     assert isinstance(shapes, LookDecoder), "whose looks the sampler draws"
-    rooms = draw_rooms(sampler, len(names), seed, given)
     assert rooms.looks is not None
     classes = label_set(trained.config.label_set)
-    scenes = []
-    for row, name in enumerate(names):
-        objects = []
-        for item in rooms.is_object[row].nonzero()[:, 0].tolist():
-            box = rooms.boxes_m[row, item].double().numpy()
-            look, index = int(rooms.looks[row, item]), int(rooms.object_class[row, item])
-            # A given object whose class has no prototype gets no mesh.
-            known = int(sampler.look_class[look]) == index
-            mesh = shapes.mesh(look, box) if known else None
-            label = classes[index]
-            objects.append(SceneObject(label, tuple(box[:3]), tuple(box[3:]), mesh))
-        scenes.append(Scene(name, trained.config.label_set, tuple(objects)))
-    return scenes
+    objects = []
+    for item in rooms.is_object[row].nonzero()[:, 0].tolist():
+        box = rooms.boxes_m[row, item].double().numpy()
+        look, index = int(rooms.looks[row, item]), int(rooms.object_class[row, item])
+        # A given object whose class has no prototype gets no mesh.
+        known = int(sampler.look_class[look]) == index
+        mesh = shapes.mesh(look, box) if known else None
+        solids = shapes.solids(look, box) if known else ()
+        label = classes[index]
+        center, size = tuple(box[:3]), tuple(box[3:])
+        objects.append(SceneObject(label, center, size, mesh, solids=solids))
+    return Scene(name, trained.config.label_set, tuple(objects))
 
 
 def class_rows(trained: TrainedLifted, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:

@@ -72,7 +72,9 @@ def scene_of(
         logits[VOID] = -torch.inf
         center, size = (part[row, item].tolist() for part in (decoded.centers_m, decoded.sizes_m))
         mesh = prior.shape.mesh_of(decoded, row, item)
-        objects.append(SceneObject(classes[int(logits.argmax())], tuple(center), tuple(size), mesh))
+        solids = prior.shape.solids_of(decoded, row, item)
+        label = classes[int(logits.argmax())]
+        objects.append(SceneObject(label, tuple(center), tuple(size), mesh, solids=solids))
     return Scene(name, label_set_name, tuple(objects))
 
 

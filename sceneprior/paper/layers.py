@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sceneprior.core.scene import Mesh
+from sceneprior.core.scene import Mesh, Solid
 from sceneprior.core.settings import Section
 from sceneprior.core.views import DecodedScenes
 
@@ -55,6 +55,10 @@ class ShapeModule(nn.Module, ABC):
     @abstractmethod
     def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:
         """The mesh of prediction `item`; None if shapes were not decoded."""
+
+    def solids_of(self, decoded: DecodedScenes, room: int, item: int) -> tuple[Solid, ...]:
+        """The convex solids of prediction `item`; none for shapes that are not made of solids."""
+        return ()
 
 
 class ShapeModuleConfig(Section, ABC):

@@ -237,8 +237,8 @@ def test_set_overrides_what_the_file_says(config):
          ": 'model.latent_space' has no name; add one of sphere, cube."),
         ("method=nerf", f": no method is called 'nerf'; choose from {', '.join(METHODS)}."),
         ("method=[a]", f": no method is called '['a']'; choose from {', '.join(METHODS)}."),
-        ("method=ours", " was written when `method: ours` stood for two methods; they are `paper` "
-         "and `lifted` now, with sections of their own. Train it again with a config of today."),
+        ("method=ours", " was written when `method: ours` stood for two methods; they are now "
+         "`paper` and `lifted`, each with its own sections. Train it again with a current config."),
     ],
 )  # fmt: skip
 def test_an_override_that_cannot_be_is_a_sentence(config, override, said):

@@ -107,7 +107,7 @@ def _draw(
     With `keep`, the last attempt places objects in any case.
     """
     number = plan.objects.is_object.sum(dim=1)
-    rooms = _recognised(sampler, uniform, plan)
+    rooms = with_looks(sampler, uniform, plan)
     looks = rooms.looks
     assert looks is not None
     stuck = torch.zeros_like(number, dtype=torch.bool)
@@ -118,7 +118,8 @@ def _draw(
         if not len(rows):
             break
         label, begun = plan.coming[rows, step], rooms.changed(itemgetter(rows))
-        reading = _read(sampler, begun, number[rows], plan.rows(rows), plan.coming[rows, step:])
+        coming, rectangle_m = plan.coming[rows, step:], plan.rectangle_m[rows]
+        reading = read_rooms(sampler, begun, number[rows], rectangle_m, coming)
         tries = PLACES if last else TRIES
         look, box_m, wrong = _placed(sampler, reading, label, chance[rows], tries)
         stuck[rows] |= wrong > 0
@@ -132,11 +133,11 @@ def _draw(
     return rooms, stuck | (added & plan.drawn & side_open)
 
 
-def _read(
+def read_rooms(
     sampler: RoomSampler,
     rooms: RoomBoxes,
     number: Int[Tensor, " rooms"],
-    plan: Plan,
+    rectangle_m: Float[Tensor, "rooms 4"],
     coming: Int[Tensor, "rooms wanted"],
 ) -> Reading:
     """Encode the first `number` objects of each room, and the classes still to come."""
@@ -144,8 +145,8 @@ def _read(
     first = torch.arange(most, device=number.device) < number[:, None]
     before = rooms.changed(lambda part: part[:, :most]).only(first)
     still = sampler.contents.before(coming, coming != END)[:, -1]
-    tokens = sampler.tokens(before, plan.rectangle_m)
-    return sampler.read(before, still, Frame.plain(plan.rectangle_m), tokens)
+    tokens = sampler.tokens(before, rectangle_m)
+    return sampler.read(before, still, Frame.plain(rectangle_m), tokens)
 
 
 def _placed(
@@ -187,7 +188,7 @@ def _placed(
     return look, boxes_m, wrong
 
 
-def _recognised(
+def with_looks(
     sampler: RoomSampler,
     uniform: Float[Tensor, "rooms slots numbers"],
     plan: Plan,
@@ -206,7 +207,8 @@ def _recognised(
     )  # fmt: skip
     for step in range(known):
         here = rooms.is_object[:, step]
-        reading = _read(sampler, rooms, torch.full((count,), step), plan, still[:, step:])
+        number = torch.full((count,), step)
+        reading = read_rooms(sampler, rooms, number, plan.rectangle_m, still[:, step:])
         label = rooms.object_class[:, step].clamp(min=1)
         centre_m, size_m = rooms.boxes_m[:, step].split(3, dim=-1)
         size_m = size_m.where(here[:, None], 1.0)

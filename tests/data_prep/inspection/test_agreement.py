@@ -113,4 +113,4 @@ def test_a_mirrored_truth_does_not_agree(made):
     tally = compare(bodies, views).agreement.of("mesh")
     assert tally.masks == views.visible.sum() and tally.mean_iou < 0.6
     assert Agreement({"mesh": tally}).failing() == ["mesh"]
-    assert len(problems) >= 2 and "m off the box round its placed mesh" in problems[0]
+    assert len(problems) >= 2 and "m from the box around its placed mesh" in problems[0]
