@@ -77,7 +77,7 @@ def scene_to_glb(scene: Scene, floor: Mesh | None = None) -> bytes:
 
 
 def scene_to_obj(scene: Scene, materials: str) -> tuple[str, bytes]:
-    """The scene as the texts of a Wavefront OBJ, with one named object per piece, and of its MTL.
+    """The scene as a Wavefront OBJ, with one named object per piece of furniture, and as its MTL.
 
     The OBJ refers to the MTL file by the name `materials`. y is up, in metres, as in the GLB.
     """

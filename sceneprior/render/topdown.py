@@ -131,7 +131,7 @@ def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480
     """A view from outside, above a corner, that just contains all given rooms.
 
     The camera is two diagonals of the rooms' bounding box away. The floor is the rectangle around
-    the outlines of the rooms; a room without an outline contributes its objects.
+    the outlines of the rooms; for a room without an outline, it includes the objects instead.
     """
     floors = np.array([floor_rectangle(scene) for scene in scenes])
     low, high = floors[:, 0].min(axis=0), floors[:, 1].max(axis=0)
