@@ -12,7 +12,7 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, read_json
 from sceneprior.core.instances.checked import checked
-from sceneprior.core.scene import Opening, Scene, SceneObject, Turned, bound_m
+from sceneprior.core.scene import Opening, Scene, SceneObject, Solid, Turned, bound_m
 
 FORMAT = "sceneprior-scene"
 VERSION = 1
@@ -22,6 +22,10 @@ FARTHEST_M = 100.0
 """Maximum absolute coordinate of a box centre or a corner of the floor."""
 MOST_OBJECTS = 1000
 """Maximum number of objects in a room, because metrics compare all pairs."""
+MOST_SOLIDS = 200
+"""Maximum number of solids of an object."""
+BEYOND_BOX_M = 0.05
+"""Distance that a solid may reach beyond the box of its object."""
 WALL_M = 0.05
 """Maximum distance of a door or a window from the outline of its floor."""
 _DECIMALS = 5
@@ -33,11 +37,17 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
     objects = []
     for item in scene.objects:
         entry: dict[str, Any] = {"class": item.label}
-        entry["center_m"] = [round(value, _DECIMALS) for value in item.center_m]
+        entry["center_m"] = _rounded(item.center_m)
         entry["size_m"] = _rounded_size(item.size_m)
         if item.turned is not None:
             entry["yaw_rad"] = round(item.turned.yaw_rad, 7)
             entry["own_size_m"] = _rounded_size(item.turned.size_m)
+        solids = [solid for solid in item.solids if isinstance(solid, Solid)]
+        if solids and len(solids) == len(item.solids):  # the file holds no meshes
+            entry["solids"] = [
+                {"kind": kind, "low_m": _rounded(low), "high_m": _rounded(high)}
+                for kind, low, high in solids
+            ]
         objects.append(entry)
     return {
         "format": FORMAT,
@@ -54,6 +64,10 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
     }
 
 
+def _rounded(values_m: Sequence[float]) -> list[float]:
+    return [round(value, _DECIMALS) for value in values_m]
+
+
 def _rounded_size(size_m: Sequence[float]) -> list[float]:
     # A flat side stays above 0, because `read_scene` rejects sizes of 0.
     return [max(round(value, _DECIMALS), _LEAST_M) for value in size_m]
@@ -65,6 +79,14 @@ _Triple = Annotated[tuple[float, float, float], Field(strict=False)]
 _Pair = Annotated[tuple[float, float], Field(strict=False)]
 
 
+class _SolidEntry(BaseModel):
+    model_config = _STRICT
+
+    kind: Literal["box", "cylinder", "ellipsoid", "dome", "bowl"]
+    low_m: _Triple
+    high_m: _Triple
+
+
 class _ObjectEntry(BaseModel):
     model_config = _STRICT
 
@@ -73,6 +95,7 @@ class _ObjectEntry(BaseModel):
     size_m: _Triple
     yaw_rad: float | None = None
     own_size_m: _Triple | None = None
+    solids: Annotated[list[_SolidEntry], Field(max_length=MOST_SOLIDS)] = []
 
 
 class _OpeningEntry(BaseModel):
@@ -124,7 +147,11 @@ def read_scene(path: Path) -> Scene:
             )
         check_box(path, item.label, item.center_m, item.size_m)
         turned = _turned_of(path, item)
-        objects.append(SceneObject(item.label, item.center_m, item.size_m, turned=turned))
+        solids = tuple(Solid(**solid.model_dump()) for solid in item.solids)
+        check_solids(path, item.label, item.center_m, item.size_m, solids)
+        objects.append(
+            SceneObject(item.label, item.center_m, item.size_m, turned=turned, solids=solids)
+        )
     floor = None if entry.floor_m is None else np.array(entry.floor_m, dtype=np.float64)
     if floor is not None:
         check_floor(path, floor)
@@ -141,7 +168,9 @@ def read_scene(path: Path) -> Scene:
     )
 
 
-def check_box(path: Path, label: str, center_m: Sequence[float], size_m: Sequence[float]) -> None:
+def check_box(
+    path: Path | str, label: str, center_m: Sequence[float], size_m: Sequence[float]
+) -> None:
     """Reject an implausible box; all readers of boxes use this check."""
     said = f"{path}: a {label} has centre {[*center_m]} and size {[*size_m]}"
     if not np.isfinite([*center_m, *size_m]).all() or min(size_m) <= 0:
@@ -153,7 +182,27 @@ def check_box(path: Path, label: str, center_m: Sequence[float], size_m: Sequenc
         )
 
 
-def check_floor(path: Path, outline_m: np.ndarray) -> None:
+def check_solids(
+    path: Path,
+    label: str,
+    center_m: Sequence[float],
+    size_m: Sequence[float],
+    solids: Sequence[Solid],
+) -> None:
+    """Reject solids without volume, or outside the box of their object."""
+    center, half = np.asarray(center_m), np.asarray(size_m) / 2 + BEYOND_BOX_M
+    for kind, low, high in solids:
+        said = f"{path}: a {label} has a {kind} from {[*low]} to {[*high]}"
+        if not np.less(low, high).all():
+            raise InputError(f"{said}; expected low_m below high_m along each axis.")
+        if not (np.abs([low, high] - center) <= half).all():
+            raise InputError(
+                f"{said}, which is not in its box (center_m {[*center_m]}, size_m {[*size_m]}); "
+                "give solids in the frame of the room, as center_m."
+            )
+
+
+def check_floor(path: Path | str, outline_m: np.ndarray) -> None:
     """Reject a floor outline that is implausibly large, or has no area."""
     far = np.abs(outline_m).max(initial=0)
     if not far <= FARTHEST_M:
@@ -165,7 +214,9 @@ def check_floor(path: Path, outline_m: np.ndarray) -> None:
         raise InputError(f"{path}: all corners of the floor lie on one line, so it has no area.")
 
 
-def check_openings(path: Path, outline_m: np.ndarray | None, openings: Sequence[Opening]) -> None:
+def check_openings(
+    path: Path | str, outline_m: np.ndarray | None, openings: Sequence[Opening]
+) -> None:
     """Reject doors and windows without extent, or farther than 5 cm from the floor's outline."""
     for opening in openings:
         said = f"{path}: a {opening.kind} from {[*opening.start_m]} to {[*opening.end_m]}"

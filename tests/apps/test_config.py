@@ -192,7 +192,7 @@ def test_a_typo_names_the_key_the_file_and_the_nearest_key(config, old, new, key
          f"label_set: No label set is called 'attic'; there are {', '.join(LABEL_SETS)}, or write "
          "your own as void,bed,chair."),
         ("label_set: front3d_bedroom", "label_set: 'void,bed,bed'",
-         "label_set: The class 'bed' is twice in the label set"),
+         "label_set: The class 'bed' is in the label set twice"),
         ("loss: {}", "loss: 3", "'loss': input should be a valid dictionary or instance of"),
     ],
 )  # fmt: skip

@@ -255,7 +255,7 @@ def test_damaged_or_foreign_checkpoints_are_sentences(toy_run, tmp_path):
     for path in run.rglob("*.ckpt"):
         path.unlink()
     with pytest.raises(
-        InputError, match=r"holds no checkpoint yet; let `sceneprior fit --config .*config.yaml"
+        InputError, match=r"holds no checkpoint yet; continue .* --config .*config.yaml"
     ):
         load_run(run)
     with pytest.raises(
@@ -291,7 +291,7 @@ def _zip_of_a_text(path):
     [
         (lambda path: path.write_bytes(path.read_bytes()[:-3000]), "it is damaged. Delete it"),
         (_zip_of_a_text, "it is damaged. Delete it"),
-        (lambda path: torch.save([1, 2], path), "is no checkpoint of `sceneprior fit` (no state"),
+        (lambda path: torch.save([1, 2], path), "is not a checkpoint of `sceneprior fit` (it"),
         (lambda path: torch.save({"state_dict": {}}, path), "it has no epoch. Delete it, and"),
     ],
     ids=["truncated", "zip", "list", "weights"],

@@ -100,7 +100,9 @@ def export(
     source: Annotated[
         Path, typer.Argument(help="Folder of scenes, or of box lists for `--to scenes`.")
     ],
-    to: Annotated[str, typer.Option(help="Format: atiss, threed-front, obj or usd; or scenes.")],
+    to: Annotated[
+        str, typer.Option(help="Format: mujoco, usd, obj, atiss or threed-front; or scenes.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
     label_set: Annotated[
         str | None, typer.Option(help="Label set of box lists, such as front3d_bedroom.")

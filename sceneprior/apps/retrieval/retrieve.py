@@ -61,7 +61,7 @@ def retrieve(scene: Scene, models: CadModels) -> Scene:
         if of_class := models.by_class.get(item.label):
             best = most_similar(box, of_class)
             mesh = placed(models.load(best.model_id), box, best.turn_deg)
-            objects.append(replace(box, mesh=mesh, turned=None))
+            objects.append(replace(box, mesh=mesh, turned=None, solids=()))
             told = best._asdict() | {"distance_m": round(best.distance_m, 5)}
         else:
             objects.append(item if box is item else item.in_box(box.center_m, box.size_m))

@@ -97,8 +97,8 @@ def test_other_json_among_scenes_is_said(command, scenes, toy_shards, tmp_path):
     assert status == 0
     (said,) = (line for line in errors.splitlines() if "Warning: " in line)
     assert said.endswith(
-        f"4 scenes are read from {folder}; 2 other JSON files there are no scenes ('format' is not "
-        "sceneprior-scene) and are passed over: cameras.json, room_9.json."
+        f"4 scenes are read from {folder}; 2 other JSON files there are not scenes ('format' is "
+        "not sceneprior-scene) and are skipped: cameras.json, room_9.json."
     )
 
 

@@ -77,7 +77,7 @@ def test_a_path_leads_from_the_room_on_show_to_a_seed(explorer, prior):
     with pytest.raises(InputError, match=r"'nowhere' is neither a training room .* nor here"):
         explorer.draw_path(start, "here", "nowhere")
     drawn = replace(start, scene=replace(start.scene, latent=None))
-    with pytest.raises(InputError, match="comes from no latent"):
+    with pytest.raises(InputError, match="has no latent"):
         explorer.draw_path(drawn, "here", "seed:9")
 
 

@@ -44,7 +44,7 @@ def test_recipes_load_and_say_what_is_wrong():
         ("label_set=attic", "No label set is called 'attic'; there are front3d_bedroom,"),
         (
             "label_set=[bed, bed]",
-            r"'label_set': the class 'bed' is twice in the label set; once is enough .got",
+            r"'label_set': the class 'bed' is in the label set twice; list it once .got",
         ),
         (
             "views.image_size=[0, 0]",

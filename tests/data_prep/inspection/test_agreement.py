@@ -93,7 +93,7 @@ def test_models_that_are_missing_or_damaged_are_named(made):
     path.unlink()
     bodies, problems = true_bodies(*made)
     assert None in bodies and not compare(bodies, views).judged[:, bodies.index(None)].any()
-    assert ".ply is missing, but a room's ground truth stands on it" in problems[0]
+    assert ".ply is missing, but a room's ground truth refers to it" in problems[0]
 
 
 def test_agreements_add_up():

@@ -52,12 +52,12 @@ def test_label_sets(tmp_path):
         (
             "a.txt",
             "bed\nbed\n",
-            "a.txt: The class 'bed' is twice in the label set; once is enough.",
+            "a.txt: The class 'bed' is in the label set twice; list it once.",
         ),
-        ("a.txt", "# nothing\n", "a.txt: A label set needs a class beside void."),
+        ("a.txt", "# nothing\n", "a.txt: A label set needs at least one class in addition to"),
         ("a.json", "{", "a.json holds no class names (Expecting"),
         ("a.json", '{"1": "bed"}', "a.json holds no list of class names."),
-        ("a.json", '["bed, large"]', "a.json: The class name 'bed, large' holds a comma, which"),
+        ("a.json", '["bed, large"]', "a.json: The class name 'bed, large' has a comma, which"),
     ],
 )
 def test_bad_label_sets(tmp_path, name, text, said):
