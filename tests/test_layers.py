@@ -63,7 +63,7 @@ OWNERS = {
     "typer": ["sceneprior/apps/cli/", "data_prep/cli.py"],
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
-    "skimage": ["sceneprior/core/geometry/isosurface.py"],
+    "skimage": ["sceneprior/core/geometry/isosurface", "sceneprior/lifted/lifting/outlines"],
     "manifold3d": ["sceneprior/core/geometry/part_meshes.py"],
     "fast_simplification": ["sceneprior/core/geometry/isosurface.py"],
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/stage"],

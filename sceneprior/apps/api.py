@@ -88,8 +88,8 @@ class Prior:
             ceiling_m: Requested height of the ceiling.
             want: Wishes: numbers of objects by class, such as `{"nightstand": 2, "desk": 0}`.
 
-        Requests are for priors with a sampler; see docs/requests.md. `extra["wishes"]` of a room
-        lists each wish and whether it holds.
+        Requests need a prior with a sampler; see docs/requests.md. `extra["wishes"]` of a room
+        lists each wish, and whether the room fulfils it.
 
         Raises:
             InputError: the prior has no such distribution, or no room holds the request.

@@ -19,7 +19,7 @@ OF_CLASSES: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
 }
 """Formats in which every object needs a furniture class, so that void objects are left out."""
 SIMULATORS: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {"mujoco": write_mujoco}
-"""Formats of simulators, for which objects stand first (`core/standing.py`)."""
+"""Formats of simulators; objects are made to stand before they are written (`core/standing.py`)."""
 ENDINGS = {"obj": ".obj", "usd": ".usda"}
 """Formats with one file per room."""
 FORMATS = (*OF_CLASSES, *SIMULATORS, *ENDINGS)
@@ -53,7 +53,7 @@ def export_scenes(scenes: Sequence[Scene], to: str, folder: Path) -> list[str]:
 
 
 def stand_all(scenes: Sequence[Scene]) -> tuple[list[Scene], list[str]]:
-    """The scenes with their objects standing, and a note on what changed, if anything did."""
+    """The scenes with all objects made to stand, and a note on the changes, if there are any."""
     pairs = [stand(scene) for scene in scenes]
     changes = sum((told for _, told in pairs), Counter[str]())
     standing = [scene for scene, _ in pairs]

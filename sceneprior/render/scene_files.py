@@ -16,9 +16,10 @@ from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.files import is_name, read_json, write_json, write_whole
 from sceneprior.core.scene import Mesh, Scene, mesh_of_file
 from sceneprior.core.scene_json import FORMAT, read_scene, scene_to_json
+from sceneprior.render.floor_plans import floor_plan
 from sceneprior.render.offscreen import Renderer, open_renderer
 from sceneprior.render.pictures import png_bytes
-from sceneprior.render.topdown import FLOOR_COLOR, object_colors, scene_meshes, topdown
+from sceneprior.render.topdown import FLOOR_COLOR, object_colors, scene_meshes
 
 PACKAGE_FORMATS = "sceneprior-"
 """Prefix of the names of the package's formats."""
@@ -29,9 +30,8 @@ def save_scene(scene: Scene, path: Path, renderer: Renderer | None = None) -> No
 
     `.json`: classes and boxes. `.glb`: one node per object, called `<index>_<class>`, in the class
     colour; an object without a mesh is written as its box. `.obj`: the same objects, with an `.mtl`
-    file. `.usda`: one mesh per object, its class in `userProperties:class`. `.png`: the top-down
-    picture that metrics use, but with borders between objects. 3D formats keep the axes and the
-    unit of the room frame: y up, metres.
+    file. `.usda`: one mesh per object, its class in `userProperties:class`. `.png`: a floor plan
+    of the whole room. 3D formats keep the axes and the unit of the room frame: y up, metres.
 
     Args:
         renderer: Renderer of the picture; None opens one.
@@ -53,8 +53,7 @@ def save_scene(scene: Scene, path: Path, renderer: Renderer | None = None) -> No
         case ".usda":
             write_whole(path, scene_to_usd(scene))
         case ".png":
-            picture = topdown(scene, renderer or open_renderer(), outlines=True)
-            write_whole(path, png_bytes(picture))
+            write_whole(path, png_bytes(floor_plan(scene, renderer or open_renderer())))
         case suffix:
             raise InputError(
                 f"{path} ends with '{suffix}', which is not a scene format; end it with one of "
