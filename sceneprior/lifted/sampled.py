@@ -40,7 +40,8 @@ def sample_scenes(
     assert sampler is not None, "callers ask trained.sampler first"
     assert isinstance(shapes, LookDecoder), "whose looks the sampler draws"
     rooms = draw_rooms(sampler, len(names), seed, given)
-    assert rooms.looks is not None
+    assert rooms.looks is not None and rooms.rectangle_m is not None
+    floors_m = _outlines(rooms.rectangle_m.double().numpy())
     classes = label_set(trained.config.label_set)
     scenes = []
     for row, name in enumerate(names):
@@ -54,8 +55,15 @@ def sample_scenes(
             solids = shapes.solids(look, box) if known else ()
             label, (center, size) = classes[index], np.split(box, 2)
             objects.append(SceneObject(label, tuple(center), tuple(size), mesh, solids=solids))
-        scenes.append(Scene(name, trained.config.label_set, tuple(objects)))
+        scenes.append(Scene(name, trained.config.label_set, tuple(objects), floors_m[row]))
     return scenes
+
+
+def _outlines(rectangle_m: Float[np.ndarray, "rooms 4"]) -> Float[np.ndarray, "rooms 4 2"]:
+    """Corners (x, z) of rectangles, in millimetres' precision."""
+    center, extents = rectangle_m[:, None, :2], rectangle_m[:, None, 2:]
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
+    return np.asarray((center + corners * extents).round(3))
 
 
 def class_rows(trained: TrainedLifted, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:
