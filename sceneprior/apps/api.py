@@ -20,6 +20,7 @@ from sceneprior.training.method import Trained
 
 if TYPE_CHECKING:
     from sceneprior.apps.reconstruction.reconstruct import Reconstruction
+    from sceneprior.lifted.requests.request import Floor, Want
 
 
 def load(where: str | Path) -> "Prior":
@@ -50,19 +51,19 @@ class Prior:
     trained: Trained
     """The trained networks, with their configuration."""
     where: str
-    """The path or name that it was loaded from."""
+    """The path or name from which the prior was loaded."""
 
     def __repr__(self) -> str:
         return f"Prior({self.where!r}, {self.label_set}, rooms from: {self.distribution})"
 
     @property
     def label_set(self) -> str:
-        """The name of its classes' label set."""
+        """The name of the label set of the prior's classes."""
         return self.trained.config.label_set
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of its classes; the first, `void`, stands for unlabelled objects."""
+        """Names of the prior's classes; the first, `void`, stands for unlabelled objects."""
         return tuple(label_set(self.label_set))
 
     @property
@@ -70,21 +71,44 @@ class Prior:
         """The default distribution of `sample`."""
         return self.trained.distribution
 
-    def sample(self, count: int = 1, seed: int = 0, distribution: str | None = None) -> list[Scene]:
+    def sample(
+        self,
+        count: int = 1,
+        seed: int = 0,
+        distribution: str | None = None,
+        floor: "Floor | None" = None,
+        ceiling_m: float | None = None,
+        want: "Want | None" = None,
+    ) -> list[Scene]:
         """Sample new rooms; the same seed gives the same rooms.
 
         Args:
             distribution: `sampler`, or a distribution of latents: `paper` or `kernel`.
+            floor: Requested floor: `"4x3"` (metres along x and z) or a list of corners [x, z].
+            ceiling_m: Requested height of the ceiling.
+            want: Wishes: numbers of objects by class, such as `{"nightstand": 2, "desk": 0}`.
+
+        Requests are for priors with a sampler; see docs/requests.md. `extra["wishes"]` of a room
+        lists each wish and whether it holds.
 
         Raises:
-            InputError: the prior has no such distribution.
+            InputError: the prior has no such distribution, or no room holds the request.
 
         Examples:
-            >>> rooms = load("procthor-bedroom").sample(2, seed=1)
-            >>> [room.name for room in rooms]
+            >>> prior = load("procthor-bedroom")
+            >>> [room.name for room in prior.sample(2, seed=1)]
             ['seed1_0000', 'seed1_0001']
+            >>> (room,) = prior.sample(floor="4x3", want={"nightstand": 2})
+            >>> [item.label for item in room.objects].count("nightstand"), room.floor_m.shape
+            (2, (4, 2))
         """
-        return sample_rooms(self.trained, count, seed, distribution)
+        if floor is None and ceiling_m is None and want is None:
+            return sample_rooms(self.trained, count, seed, distribution)
+        from sceneprior.lifted.requests.answers import sample_requested
+        from sceneprior.lifted.requests.request import make_request
+
+        request = make_request(floor, ceiling_m, want)
+        return sample_requested(self.with_latents, request, count, seed, distribution)
 
     def interpolate(self, start: Point, end: Point, steps: int = 9) -> list[Scene]:
         """Rooms on the geodesic between two latents, both ends included.
@@ -94,7 +118,7 @@ class Prior:
                 or a vector.
 
         Raises:
-            InputError: an end is no latent of this prior, or the two ends are antipodal.
+            InputError: an end is not a latent of this prior, or the two ends are antipodal.
 
         Examples:
             >>> way = load("procthor-bedroom").interpolate("seed:1", "seed:2", steps=3)
@@ -160,7 +184,7 @@ class Prior:
         """The latent of an end of `interpolate`.
 
         Raises:
-            InputError: the point is no latent of this prior.
+            InputError: the point is not a latent of this prior.
 
         Examples:
             >>> load("procthor-bedroom").latent("seed:1").shape

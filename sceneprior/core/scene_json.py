@@ -168,7 +168,9 @@ def read_scene(path: Path) -> Scene:
     )
 
 
-def check_box(path: Path, label: str, center_m: Sequence[float], size_m: Sequence[float]) -> None:
+def check_box(
+    path: Path | str, label: str, center_m: Sequence[float], size_m: Sequence[float]
+) -> None:
     """Reject an implausible box; all readers of boxes use this check."""
     said = f"{path}: a {label} has centre {[*center_m]} and size {[*size_m]}"
     if not np.isfinite([*center_m, *size_m]).all() or min(size_m) <= 0:
@@ -200,7 +202,7 @@ def check_solids(
             )
 
 
-def check_floor(path: Path, outline_m: np.ndarray) -> None:
+def check_floor(path: Path | str, outline_m: np.ndarray) -> None:
     """Reject a floor outline that is implausibly large, or has no area."""
     far = np.abs(outline_m).max(initial=0)
     if not far <= FARTHEST_M:
@@ -212,7 +214,9 @@ def check_floor(path: Path, outline_m: np.ndarray) -> None:
         raise InputError(f"{path}: all corners of the floor lie on one line, so it has no area.")
 
 
-def check_openings(path: Path, outline_m: np.ndarray | None, openings: Sequence[Opening]) -> None:
+def check_openings(
+    path: Path | str, outline_m: np.ndarray | None, openings: Sequence[Opening]
+) -> None:
     """Reject doors and windows without extent, or farther than 5 cm from the floor's outline."""
     for opening in openings:
         said = f"{path}: a {opening.kind} from {[*opening.start_m]} to {[*opening.end_m]}"

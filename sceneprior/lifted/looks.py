@@ -14,7 +14,15 @@ from torch import Tensor, nn
 
 from sceneprior.core.geometry.part_meshes import stretched, surface_of_parts
 from sceneprior.core.geometry.turns import quarter_rotation
-from sceneprior.core.parts import KIND_NAMES, MOST_PARTS, Parts, filled_cells, whole_box
+from sceneprior.core.parts import (
+    KIND_NAMES,
+    MOST_CORNERS,
+    MOST_PARTS,
+    SQUARE,
+    Parts,
+    filled_cells,
+    whole_box,
+)
 from sceneprior.core.scene import Mesh, Solid
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototypes import (
@@ -75,6 +83,7 @@ class LookDecoder(ShapeModule):
         self.part_kind: Tensor
         self.part_mirrored: Tensor
         self.part_ends: Tensor
+        self.outlines: Tensor
         self.filled: Tensor
         self.sizes_m: Tensor
         self.object_class: Tensor
@@ -85,6 +94,7 @@ class LookDecoder(ShapeModule):
         self.register_buffer("part_kind", torch.full(slots, self.unknown, dtype=torch.int8))
         self.register_buffer("part_mirrored", torch.zeros(slots, dtype=torch.int8))
         self.register_buffer("part_ends", torch.zeros(*slots, 3, 2))
+        self.register_buffer("outlines", _padded(SQUARE).repeat(most, 1, 1))
         self.register_buffer("filled", torch.ones(most))
         self.register_buffer("sizes_m", torch.ones(most, 3))
         self.register_buffer("object_class", torch.full((most,), self.unknown))
@@ -101,6 +111,7 @@ class LookDecoder(ShapeModule):
             self.part_kind[row, used] = torch.from_numpy(parts.kind)
             self.part_mirrored[row, used] = torch.from_numpy(parts.mirrored)
             self.part_ends[row, used] = torch.from_numpy(parts.ends).float()
+            self.outlines[row] = _padded(parts.outline)
         filled = prototypes.grids.sum(axis=(1, 2, 3)).clip(min=1)
         self.filled[:count] = torch.from_numpy(filled.astype(np.float32))
         self.sizes_m[:count] = torch.from_numpy(prototypes.sizes_m)
@@ -132,7 +143,11 @@ class LookDecoder(ShapeModule):
             part[prototype, used].cpu().numpy()
             for part in (self.part_kind, self.part_mirrored, self.part_ends)
         )
-        return Parts(kind.astype(np.int64), mirrored.astype(np.int64), ends.astype(np.float64))
+        corners = self.outlines[prototype].double().cpu().numpy()
+        new = (corners != np.roll(corners, 1, axis=0)).any(axis=1)  # the last corner is repeated
+        return Parts(
+            kind.astype(np.int64), mirrored.astype(np.int64), ends.astype(np.float64), corners[new]
+        )
 
     def forward(
         self, features: Float[Tensor, "*objects features"]
@@ -231,3 +246,9 @@ class LookDecoder(ShapeModule):
 def _box_m(decoded: DecodedScenes, room: int, item: int) -> Float[np.ndarray, "6"]:
     box_m = torch.cat((decoded.centers_m[room, item], decoded.sizes_m[room, item]))
     return np.asarray(box_m.double().cpu().numpy())
+
+
+def _padded(outline: Float[np.ndarray, "corners 2"]) -> Float[Tensor, "most 2"]:
+    """An outline of `MOST_CORNERS` corners, its last one repeated."""
+    missing = MOST_CORNERS - len(outline)
+    return torch.from_numpy(np.pad(outline, ((0, missing), (0, 0)), mode="edge")).float()

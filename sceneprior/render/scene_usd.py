@@ -36,7 +36,7 @@ def scene_to_usd(scene: Scene, shell: Mapping[str, Mesh], physics: bool = False)
     try:
         from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
     except ImportError:
-        raise InputError("USD needs a package more: pip install 'sceneprior[usd]'.") from None
+        raise InputError("USD needs another package: pip install 'sceneprior[usd]'.") from None
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)

@@ -1,4 +1,4 @@
-"""Pictures of scenes: top-down, as metrics compare them, from above a corner, and turntables."""
+"""Pictures of scenes: from straight above (for metrics), from above a corner, and turntables."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -101,9 +101,10 @@ def topdown(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Orthographic picture of a room from above: one flat colour per class, without shading.
 
-    Image right is +x, image down is +z, and the room's origin is the centre of the image. Of
-    objects above each other, the highest surface is drawn. Without a `protocol`, it is that of the
-    scene's label set. `outlines` darkens the borders between objects, for readers, not for metrics.
+    Image right is +x, image down is +z, and the room's origin is the centre of the image. Where
+    objects overlap, the highest surface is drawn. If `protocol` is None, the protocol of the
+    scene's label set is used. `outlines` darkens the borders between objects; such pictures are for
+    readers, not for metrics.
 
     Source:
         The paper, section 4.2: 512 x 512, orthographic, a colour per category.
@@ -124,7 +125,10 @@ def topdown(
 def look_at(
     eye_m: Float[np.ndarray, "3"], target_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """`world_to_camera` of a camera at `eye_m` that looks at `target_m`, y up, not vertically."""
+    """`world_to_camera` of a camera at `eye_m` that looks at `target_m`, with y up.
+
+    The viewing direction must not be vertical.
+    """
     forward = target_m - eye_m
     right = np.cross(forward, [0.0, 1.0, 0.0])
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
@@ -157,10 +161,10 @@ def room_view(scene: Scene, image_size: tuple[int, int] = (360, 480)) -> CornerV
 
 
 def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480)) -> CornerView:
-    """A view from above a corner, outside the room, into which all these rooms just fit.
+    """A view from outside, above a corner, that just contains all given rooms.
 
-    The floor is the rectangle around the rooms' outlines or, for rooms without an outline, their
-    objects.
+    The floor is the rectangle around the outlines of the rooms; a room without an outline
+    contributes its objects.
     """
     floors = np.array([floor_rectangle(scene) for scene in scenes])
     low, high = floors[:, 0].min(axis=0), floors[:, 1].max(axis=0)
@@ -200,11 +204,10 @@ def perspective(
     view: CornerView | None = None,
     colors: UInt8[np.ndarray, "objects 3"] | None = None,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """A picture with soft shadows from above a corner, outside the room: for pages, not for
-    metrics.
+    """Draw a room with soft shadows, from outside and above a corner: for pages, not for metrics.
 
-    Without a `view`, one of `image_size` is fitted to the room; a common view makes several rooms
-    comparable. `colors` of the objects are those of their classes unless given.
+    If `view` is None, a view of `image_size` is fitted to the room; with a common view, pictures of
+    several rooms can be compared. If `colors` is None, objects have the colours of their classes.
     """
     view = view or corner_view([scene], image_size)
     colors = object_colors(scene) if colors is None else colors
@@ -222,7 +225,7 @@ def turntable(
     count: int = 36,
     image_size: tuple[int, int] = (240, 320),
 ) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """Shaded pictures from `count` directions around a room, at one scale.
+    """Shaded pictures from `count` directions around a room, all at the same scale.
 
     The first has the viewing direction of `perspective`.
     """

@@ -137,5 +137,5 @@ def test_what_cannot_be_exported_is_a_sentence(scenes, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="atiss has no walls; leave out --shell"):
         export_scenes(scenes, "atiss", tmp_path, "walls")
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)
-    with pytest.raises(InputError, match=r"USD needs a package more: pip install 'sceneprior\[usd"):
+    with pytest.raises(InputError, match=r"USD needs another package: pip install 'sceneprior\[us"):
         export_scenes(scenes, "usd", tmp_path)

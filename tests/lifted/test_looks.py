@@ -9,7 +9,7 @@ from tiny_runs import tiny_lifted
 
 from sceneprior.core.colliders import mesh_of
 from sceneprior.core.geometry.turns import turn_grids
-from sceneprior.core.parts import Parts, filled_cells
+from sceneprior.core.parts import SQUARE, Parts, filled_cells
 from sceneprior.lifted.looks import LookConfig, LookDecoder
 from sceneprior.lifted.prototypes import POSES, Prototypes, turn_of, turned_extents
 from sceneprior.paper.prior import ScenePrior
@@ -26,7 +26,8 @@ def prior(tmp_path) -> ScenePrior:
 def prototypes() -> Prototypes:
     """Three shapes without symmetry."""
     rng = np.random.default_rng(0)
-    parts = (CORNER, CORNER._replace(ends=CORNER.ends * 0.8), Parts(*(p[1:] for p in CORNER)))
+    later = Parts(*(part[1:] for part in CORNER[:3]), SQUARE.clip(max=[0.25, 0.5]))
+    parts = (CORNER, CORNER._replace(ends=CORNER.ends * 0.8), later)
     grids = np.stack([filled_cells(each, 8, 1.1) for each in parts])
     labels, common = np.array([2, 1, 2]), np.array([True, True, False])
     return Prototypes(parts, grids, rng.uniform(0.5, 2, (3, 3)), labels, common)

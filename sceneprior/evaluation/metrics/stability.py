@@ -70,6 +70,6 @@ def _mujoco() -> Any:
         import mujoco
     except ImportError:
         raise InputError(
-            "Simulating rooms needs a package more: pip install 'sceneprior[sim]'."
+            "Simulating rooms needs another package: pip install 'sceneprior[sim]'."
         ) from None
     return mujoco
