@@ -65,7 +65,9 @@ _Triple = Annotated[tuple[float, float, float], Field(strict=False)]
 _Pair = Annotated[tuple[float, float], Field(strict=False)]
 
 
-class _ObjectEntry(BaseModel):
+class ObjectEntry(BaseModel):
+    """An object of a file."""
+
     model_config = _STRICT
 
     label: str = Field(alias="class")
@@ -75,7 +77,9 @@ class _ObjectEntry(BaseModel):
     own_size_m: _Triple | None = None
 
 
-class _OpeningEntry(BaseModel):
+class OpeningEntry(BaseModel):
+    """A door or a window of a file."""
+
     model_config = _STRICT
 
     kind: Literal["door", "window"]
@@ -90,9 +94,9 @@ class _SceneEntry(BaseModel):
 
     name: str | None = None
     label_set: str
-    objects: Annotated[list[_ObjectEntry], Field(max_length=MOST_OBJECTS)]
+    objects: Annotated[list[ObjectEntry], Field(max_length=MOST_OBJECTS)]
     floor_m: Annotated[list[_Pair], Field(min_length=3)] | None = None
-    openings: list[_OpeningEntry] = []
+    openings: list[OpeningEntry] = []
     ceiling_m: Annotated[float, Field(gt=0, le=FARTHEST_M)] | None = None
     extra: dict[str, Any] = {}
 
@@ -115,16 +119,13 @@ def read_scene(path: Path) -> Scene:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: extra cannot be written as JSON ({error}).") from None
     names = label_set(entry.label_set)
-    objects = []
     for item in entry.objects:
         if item.label not in names:
             raise InputError(
                 f"{path}: class '{_short(item.label)}' is not in label set "
                 f"'{_short(entry.label_set)}'; use one of {', '.join(names)}."
             )
-        check_box(path, item.label, item.center_m, item.size_m)
-        turned = _turned_of(path, item)
-        objects.append(SceneObject(item.label, item.center_m, item.size_m, turned=turned))
+    objects = [read_object(path, item) for item in entry.objects]
     floor = None if entry.floor_m is None else np.array(entry.floor_m, dtype=np.float64)
     if floor is not None:
         check_floor(path, floor)
@@ -139,6 +140,13 @@ def read_scene(path: Path) -> Scene:
         openings=openings,
         ceiling_m=entry.ceiling_m,
     )
+
+
+def read_object(path: Path, item: ObjectEntry) -> SceneObject:
+    """An object of a file; its boxes are checked, its class is not."""
+    check_box(path, item.label, item.center_m, item.size_m)
+    turned = _turned_of(path, item)
+    return SceneObject(item.label, item.center_m, item.size_m, turned=turned)
 
 
 def check_box(
@@ -194,7 +202,7 @@ def _unit_guess(numbers: Any) -> str:
     return f"Are these {unit}? Give metres."
 
 
-def _turned_of(path: Path, item: _ObjectEntry) -> Turned | None:
+def _turned_of(path: Path, item: ObjectEntry) -> Turned | None:
     """Oriented box of an entry, if it has one; it must fill the axis-aligned box."""
     if item.yaw_rad is None and item.own_size_m is None:
         return None

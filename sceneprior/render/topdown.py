@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
+import shapely
 from jaxtyping import Float, UInt8
 
 from sceneprior.core.classes import class_colors, label_set
+from sceneprior.core.floor import floor_polygon
 from sceneprior.core.geometry.corners import BOX_FACES, box_corners
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.render.offscreen import Orthographic, Pinhole, Renderer
@@ -126,14 +128,14 @@ class CornerView:
 def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480)) -> CornerView:
     """A view from above a corner, outside the room, into which all these rooms just fit.
 
-    The camera is two diagonals away. The floor is the rectangle around the rooms' outlines or, for
-    rooms without an outline, their objects.
+    The camera is two diagonals away. The floor is that of the rooms' outlines; for rooms without
+    an outline, and for several rooms, it is the rectangle around outlines and objects.
     """
     floors = np.array([floor_rectangle(scene) for scene in scenes])
     low, high = floors[:, 0].min(axis=0), floors[:, 1].max(axis=0)
     # Top face 2 cm below y = 0, so that objects on the floor do not z-fight with it.
-    center = ((low[0] + high[0]) / 2, -0.03, (low[1] + high[1]) / 2)
-    floor = box_mesh(center, (high[0] - low[0], 0.02, high[1] - low[1]))
+    outline = floor_polygon(scenes[0]) if len(scenes) == 1 else None
+    floor = slab_mesh(outline or shapely.box(*low, *high), -0.04, -0.02)
     meshes = [floor, *(mesh for scene in scenes for mesh in scene_meshes(scene))]
     points = np.concatenate([mesh.vertices_m for mesh in meshes])
     target, diagonal = (points.min(0) + points.max(0)) / 2, np.linalg.norm(np.ptp(points, axis=0))
@@ -148,6 +150,32 @@ def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480
     )
     intrinsics = np.array([[focal, 0, x_px], [0, focal, y_px], [0, 0, 1]])
     return CornerView(Pinhole(world_to_camera, intrinsics), image_size, floor)
+
+
+def slab_mesh(outline: shapely.Geometry, bottom_m: float, top_m: float) -> Mesh:
+    """An outline (x, z) as a closed solid between two heights.
+
+    >>> slab_mesh(shapely.box(0, 0, 2, 1), -0.1, 0.0).vertices_m.min(axis=0).tolist()
+    [0.0, -0.1, 0.0]
+    """
+    parts = shapely.get_parts(shapely.constrained_delaunay_triangles(outline))
+    flat = np.concatenate([np.asarray(part.exterior.coords)[:3] for part in parts])
+    rings = [np.asarray(part.exterior.coords) for part in shapely.get_parts(outline)]
+    edges = np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
+    heights = np.array([top_m, bottom_m])
+
+    def raised(points: np.ndarray, height: float) -> np.ndarray:
+        return np.insert(points, 1, height, axis=-1)
+
+    upper, lower = (raised(flat, height) for height in heights)
+    sides = np.stack([raised(edges, height) for height in heights], axis=1).reshape(-1, 4, 3)
+    vertices = np.concatenate([upper, lower, sides.reshape(-1, 3)])
+    number = len(flat)
+    caps = np.arange(2 * number).reshape(-1, 3)
+    corners = 2 * number + 4 * np.arange(len(sides))[:, None]
+    walls = [corners + np.array(corner) for corner in ([0, 1, 2], [1, 3, 2])]
+    faces = np.concatenate([caps, *walls])
+    return Mesh(vertices, faces)
 
 
 def perspective(
