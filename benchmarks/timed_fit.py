@@ -56,7 +56,7 @@ class StageTimes:
     starts_s: list[float] = field(default_factory=list)
     """Start times of the epochs by the wall clock."""
     starts_cpu_s: list[float] = field(default_factory=list)
-    """CPU seconds of the process at these times."""
+    """CPU seconds of the process at the starts of the epochs."""
     steps_s: list[list[float]] = field(default_factory=list)
     """Seconds of the steps, by epoch."""
     peak_mib: float = 0.0

@@ -73,6 +73,8 @@ OWNERS = {
     ],
     "cv2": ["data_prep/posed/lens.py"],
     "viser": ["sceneprior/apps/viewer/"],
+    "mujoco": ["sceneprior/evaluation/metrics/stability.py"],
+    "coacd": ["sceneprior/core/colliders.py"],
     "distributed": ["data_prep/engine/cluster.py"],
 }  # fmt: skip
 

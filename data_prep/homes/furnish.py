@@ -71,7 +71,7 @@ def furnish(room_type: RoomType, catalog: Catalog, rng: np.random.Generator, sha
         if arranged and is_liveable(plan, room_type.reach):
             return plan
     raise RuntimeError(
-        f"No {room_type.name} with {count} pieces found room in 400 tries: {groups}."
+        f"No {room_type.name} could hold these {count} pieces in 400 tries: {groups}."
     )
 
 

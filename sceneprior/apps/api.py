@@ -51,19 +51,19 @@ class Prior:
     trained: Trained
     """The trained networks, with their configuration."""
     where: str
-    """The path or name that it was loaded from."""
+    """The path or name from which the prior was loaded."""
 
     def __repr__(self) -> str:
         return f"Prior({self.where!r}, {self.label_set}, rooms from: {self.distribution})"
 
     @property
     def label_set(self) -> str:
-        """The name of its classes' label set."""
+        """The name of the label set of the prior's classes."""
         return self.trained.config.label_set
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of its classes; the first, `void`, stands for unlabelled objects."""
+        """Names of the prior's classes; the first, `void`, stands for unlabelled objects."""
         return tuple(label_set(self.label_set))
 
     @property
@@ -139,7 +139,7 @@ class Prior:
                 or a vector.
 
         Raises:
-            InputError: an end is no latent of this prior, or the two ends are antipodal.
+            InputError: an end is not a latent of this prior, or the two ends are antipodal.
 
         Examples:
             >>> way = load("procthor-bedroom").interpolate("seed:1", "seed:2", steps=3)
@@ -213,7 +213,7 @@ class Prior:
         """The latent of an end of `interpolate`.
 
         Raises:
-            InputError: the point is no latent of this prior.
+            InputError: the point is not a latent of this prior.
 
         Examples:
             >>> load("procthor-bedroom").latent("seed:1").shape

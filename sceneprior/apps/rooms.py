@@ -46,10 +46,10 @@ def check_free(folder: Path, overwrite: bool = False) -> None:
 
 
 def clear_scenes(folder: Path) -> None:
-    """Delete the old scenes of a folder, so that they are not taken for new ones.
+    """Delete the old scenes of a folder, so that they are not mistaken for new ones.
 
-    Deleted are scene JSONs with their GLBs and PNGs, latents, the page, and the partial files of
-    interrupted writers; all other files stay.
+    Scene JSONs with their GLBs and PNGs, latents, the page, and the partial files of interrupted
+    writers are deleted; all other files stay.
     """
     for path in Path(folder).glob("*.json"):
         if format_of(path) == FORMAT:
@@ -62,7 +62,7 @@ def clear_scenes(folder: Path) -> None:
 
 
 def write_scenes(scenes: Sequence[Scene], folder: Path, renderer: Renderer) -> None:
-    """Write scenes under their own names, in place of the scenes of a folder.
+    """Write scenes under their own names, replacing the scenes of a folder.
 
     `overview.png` shows the first few, and `latents.npz` is written if all scenes are decoded from
     latents.

@@ -12,7 +12,7 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, read_json
 from sceneprior.core.instances.checked import checked
-from sceneprior.core.scene import Opening, Scene, SceneObject, Turned, bound_m
+from sceneprior.core.scene import Opening, Scene, SceneObject, Solid, Turned, bound_m
 
 FORMAT = "sceneprior-scene"
 VERSION = 1
@@ -22,6 +22,10 @@ FARTHEST_M = 100.0
 """Maximum absolute coordinate of a box centre or a corner of the floor."""
 MOST_OBJECTS = 1000
 """Maximum number of objects in a room, because metrics compare all pairs."""
+MOST_SOLIDS = 200
+"""Maximum number of solids of an object."""
+BEYOND_BOX_M = 0.05
+"""Distance that a solid may reach beyond the box of its object."""
 WALL_M = 0.05
 """Maximum distance of a door or a window from the outline of its floor."""
 _DECIMALS = 5
@@ -33,11 +37,17 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
     objects = []
     for item in scene.objects:
         entry: dict[str, Any] = {"class": item.label}
-        entry["center_m"] = [round(value, _DECIMALS) for value in item.center_m]
+        entry["center_m"] = _rounded(item.center_m)
         entry["size_m"] = _rounded_size(item.size_m)
         if item.turned is not None:
             entry["yaw_rad"] = round(item.turned.yaw_rad, 7)
             entry["own_size_m"] = _rounded_size(item.turned.size_m)
+        solids = [solid for solid in item.solids if isinstance(solid, Solid)]
+        if solids and len(solids) == len(item.solids):  # the file holds no meshes
+            entry["solids"] = [
+                {"kind": kind, "low_m": _rounded(low), "high_m": _rounded(high)}
+                for kind, low, high in solids
+            ]
         objects.append(entry)
     return {
         "format": FORMAT,
@@ -54,6 +64,10 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
     }
 
 
+def _rounded(values_m: Sequence[float]) -> list[float]:
+    return [round(value, _DECIMALS) for value in values_m]
+
+
 def _rounded_size(size_m: Sequence[float]) -> list[float]:
     # A flat side stays above 0, because `read_scene` rejects sizes of 0.
     return [max(round(value, _DECIMALS), _LEAST_M) for value in size_m]
@@ -63,6 +77,14 @@ def _rounded_size(size_m: Sequence[float]) -> list[float]:
 _STRICT = ConfigDict(strict=True)
 _Triple = Annotated[tuple[float, float, float], Field(strict=False)]
 _Pair = Annotated[tuple[float, float], Field(strict=False)]
+
+
+class _SolidEntry(BaseModel):
+    model_config = _STRICT
+
+    kind: Literal["box", "cylinder", "ellipsoid", "dome", "bowl"]
+    low_m: _Triple
+    high_m: _Triple
 
 
 class ObjectEntry(BaseModel):
@@ -75,6 +97,7 @@ class ObjectEntry(BaseModel):
     size_m: _Triple
     yaw_rad: float | None = None
     own_size_m: _Triple | None = None
+    solids: Annotated[list[_SolidEntry], Field(max_length=MOST_SOLIDS)] = []
 
 
 class OpeningEntry(BaseModel):
@@ -146,7 +169,9 @@ def read_object(path: Path, item: ObjectEntry) -> SceneObject:
     """An object of a file; its boxes are checked, its class is not."""
     check_box(path, item.label, item.center_m, item.size_m)
     turned = _turned_of(path, item)
-    return SceneObject(item.label, item.center_m, item.size_m, turned=turned)
+    solids = tuple(Solid(**solid.model_dump()) for solid in item.solids)
+    check_solids(path, item.label, item.center_m, item.size_m, solids)
+    return SceneObject(item.label, item.center_m, item.size_m, turned=turned, solids=solids)
 
 
 def check_box(
@@ -161,6 +186,26 @@ def check_box(
             f"{said}; no furniture is above {LARGEST_M:g} m long, or further than "
             f"{FARTHEST_M:g} m from the floor's centre. {_unit_guess([*center_m, *size_m])}"
         )
+
+
+def check_solids(
+    path: Path,
+    label: str,
+    center_m: Sequence[float],
+    size_m: Sequence[float],
+    solids: Sequence[Solid],
+) -> None:
+    """Reject solids without volume, or outside the box of their object."""
+    center, half = np.asarray(center_m), np.asarray(size_m) / 2 + BEYOND_BOX_M
+    for kind, low, high in solids:
+        said = f"{path}: a {label} has a {kind} from {[*low]} to {[*high]}"
+        if not np.less(low, high).all():
+            raise InputError(f"{said}; expected low_m below high_m along each axis.")
+        if not (np.abs([low, high] - center) <= half).all():
+            raise InputError(
+                f"{said}, which is not in its box (center_m {[*center_m]}, size_m {[*size_m]}); "
+                "give solids in the frame of the room, as center_m."
+            )
 
 
 def check_floor(path: Path | str, outline_m: np.ndarray) -> None:

@@ -21,7 +21,7 @@ from sceneprior.render.topdown import corner_view
 FACES_PER_PAGE = 100_000
 """Limit on the faces of all models of a page. A face takes 24 bytes, so a page has a few MB."""
 FEWEST_FACES = 200
-"""Least limit on the faces of one object, however many objects a page shows."""
+"""Smallest limit on the faces of one object, used on pages with many objects."""
 
 
 def render(template: str, **values: Any) -> bytes:

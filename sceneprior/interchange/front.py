@@ -102,6 +102,6 @@ def category_of_class(label: str, label_set_name: str) -> str:
         if class_of_category(category, label_set_name) == label:
             return category
     raise InputError(
-        f"No category of 3D-FRONT is a '{label}' in label set '{label_set_name}'; leave such "
+        f"3D-FRONT has no category for class '{label}' of label set '{label_set_name}'; leave such "
         "objects out, or export to another format."
     )

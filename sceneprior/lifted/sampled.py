@@ -20,8 +20,13 @@ from sceneprior.paper.trained import TrainedPrior
 
 
 def drawn_by_sampler(trained: TrainedPrior, distribution: str | None) -> TrainedLifted | None:
-    """`trained` if its sampler is to draw new rooms, by `distribution` or else by the run's own
-    settings; None if new rooms come from latents. An `InputError` if there is no sampler yet."""
+    """Return `trained` if its sampler draws new rooms; None if new rooms come from latents.
+
+    This is decided by `distribution`, or by the run's own settings if `distribution` is None.
+
+    Raises:
+        InputError: the sampler should draw, but the run has none, or none yet.
+    """
     if (distribution or trained.distribution) != SAMPLER:
         return None
     if not isinstance(trained, TrainedLifted) or trained.sampler is None:
@@ -56,21 +61,26 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
         # A given object whose class has no prototype gets no mesh.
         known = int(sampler.look_class[look]) == index
         mesh = shapes.mesh(look, box) if known else None
+        solids = shapes.solids(look, box) if known else ()
         label = classes[index]
-        objects.append(SceneObject(label, tuple(box[:3]), tuple(box[3:]), mesh))
+        center, size = tuple(box[:3]), tuple(box[3:])
+        objects.append(SceneObject(label, center, size, mesh, solids=solids))
     return Scene(name, trained.config.label_set, tuple(objects))
 
 
 def class_rows(trained: TrainedLifted, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:
-    """Indices of named classes, as `Given.coming` takes them; an `InputError` for a class that is
-    not in the training rooms."""
+    """Indices of named classes, in the form of `Given.coming`.
+
+    Raises:
+        InputError: a class is not in the training rooms.
+    """
     assert trained.sampler is not None
     classes = label_set(trained.config.label_set)
     known = [classes[row] for row in trained.sampler.drawn_classes]
     for label in labels:
         if label not in known:
             raise InputError(
-                f"'{label}' is no class of this run's training rooms; choose from "
+                f"'{label}' is not a class of this run's training rooms; choose from "
                 f"{', '.join(known)}."
             )
     return torch.tensor([[classes.index(label) for label in labels]], dtype=torch.int64)

@@ -30,8 +30,8 @@ def save_scene(scene: Scene, path: Path, renderer: Renderer | None = None) -> No
     `.json`: classes and boxes. `.glb`: one node per object, called `<index>_<class>`, in the class
     colour; an object without a mesh is written as its box. `.obj`: the same objects, with an `.mtl`
     file. `.usda`: one mesh per object, its class in `userProperties:class`. `.png`: the top-down
-    picture of the metrics, with borders between objects. Axes and unit are the room frame's: y up,
-    metres.
+    picture that metrics use, but with borders between objects. 3D formats keep the axes and the
+    unit of the room frame: y up, metres.
 
     Args:
         renderer: Renderer of the picture; None opens one.
@@ -57,7 +57,7 @@ def save_scene(scene: Scene, path: Path, renderer: Renderer | None = None) -> No
             write_whole(path, png_bytes(picture))
         case suffix:
             raise InputError(
-                f"{path} ends with '{suffix}', which is no format of scenes; end it with one of "
+                f"{path} ends with '{suffix}', which is not a scene format; end it with one of "
                 ".json, .glb, .obj, .usda, .png."
             )
 
@@ -78,7 +78,7 @@ def scene_to_glb(scene: Scene, floor: Mesh | None = None) -> bytes:
 
 
 def scene_to_obj(scene: Scene, materials: str) -> tuple[str, bytes]:
-    """The scene as Wavefront OBJ with one named object each, and its materials (MTL).
+    """The scene as the texts of a Wavefront OBJ, with one named object per piece, and of its MTL.
 
     The OBJ refers to the MTL file by the name `materials`. y is up, in metres, as in the GLB.
     """
@@ -98,7 +98,7 @@ def scene_to_usd(scene: Scene) -> str:
     try:
         from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
     except ImportError:
-        raise InputError("USD needs a package more: pip install 'sceneprior[usd]'.") from None
+        raise InputError("USD needs another package: pip install 'sceneprior[usd]'.") from None
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -178,7 +178,7 @@ def read_glb_meshes(path: Path) -> dict[str, Mesh]:
     import trimesh
 
     try:
-        # process=False keeps vertices and faces as written; materials follow from the classes.
+        # process=False keeps vertices and faces as written. Materials depend on the class alone.
         loaded = trimesh.load_scene(Path(path), file_type="glb", process=False, skip_materials=True)
         meshes = {}
         for node in loaded.graph.nodes_geometry:
@@ -248,7 +248,7 @@ def load_scene_folder(folder: Path) -> list[Scene]:
     ]:
         warnings.warn(
             f"{len(scenes)} scenes are read from {folder}; {len(other)} other JSON files there are "
-            f"no scenes ('format' is not {FORMAT}) and are passed over: {', '.join(other[:3])}"
+            f"not scenes ('format' is not {FORMAT}) and are skipped: {', '.join(other[:3])}"
             f"{', ...' if len(other) > 3 else ''}.",
             InputWarning,
             stacklevel=2,
@@ -257,13 +257,13 @@ def load_scene_folder(folder: Path) -> list[Scene]:
 
 
 def _refuse_box_lists(given: Path, paths: Iterable[Path]) -> None:
-    """Raise an InputError with the command for conversion if box lists like ATISS's were given."""
+    """Raise an `InputError` that names the conversion command if a path is a box list of ATISS."""
     for path in paths:
         if _is_box_list(path):
             raise InputError(
-                f"{given} holds box lists ({path.name}) and no scenes; `sceneprior export {given} "
-                "--to scenes --label-set front3d_bedroom --out DIR` makes scenes of them, with "
-                "the label set of their classes."
+                f"{given} holds box lists ({path.name}), not scenes; `sceneprior export {given} "
+                "--to scenes --label-set front3d_bedroom --out DIR` converts them, if you give the "
+                "label set of their classes."
             )
 
 
@@ -286,7 +286,7 @@ def check_names(scenes: Sequence[Scene]) -> None:
     for name, count in counts.items():
         if count > 1:
             raise InputError(
-                f"{count} rooms are called '{name}', and files are named by rooms; give each "
+                f"{count} rooms are called '{name}', and files are named after rooms; give each "
                 "another `name` in its JSON."
             )
         if not is_name(name):

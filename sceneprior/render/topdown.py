@@ -1,4 +1,4 @@
-"""Pictures of scenes: top-down, as metrics compare them, from above a corner, and turntables."""
+"""Pictures of scenes: from straight above (for metrics), from above a corner, and turntables."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -83,9 +83,10 @@ def topdown(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Orthographic picture of a room from above: one flat colour per class, without shading.
 
-    Image right is +x, image down is +z, and the room's origin is the centre of the image. Of
-    objects above each other, the highest surface is drawn. Without a `protocol`, it is that of the
-    scene's label set. `outlines` darkens the borders between objects, for readers, not for metrics.
+    Image right is +x, image down is +z, and the room's origin is the centre of the image. Where
+    objects overlap, the highest surface is drawn. If `protocol` is None, the protocol of the
+    scene's label set is used. `outlines` darkens the borders between objects; such pictures are for
+    readers, not for metrics.
 
     Source:
         The paper, section 4.2: 512 x 512, orthographic, a colour per category.
@@ -106,7 +107,10 @@ def topdown(
 def look_at(
     eye_m: Float[np.ndarray, "3"], target_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """`world_to_camera` of a camera at `eye_m` that looks at `target_m`, y up, not vertically."""
+    """`world_to_camera` of a camera at `eye_m` that looks at `target_m`, with y up.
+
+    The viewing direction must not be vertical.
+    """
     forward = target_m - eye_m
     right = np.cross(forward, [0.0, 1.0, 0.0])
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
@@ -126,10 +130,11 @@ class CornerView:
 
 
 def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480)) -> CornerView:
-    """A view from above a corner, outside the room, into which all these rooms just fit.
+    """A view from outside, above a corner, that just contains all given rooms.
 
-    The camera is two diagonals away. The floor is that of the rooms' outlines; for rooms without
-    an outline, and for several rooms, it is the rectangle around outlines and objects.
+    The camera is two diagonals of the rooms' bounding box away. The floor is that of the room's
+    outline; without an outline, and for several rooms, it is the rectangle around outlines and
+    objects.
     """
     floors = np.array([floor_rectangle(scene) for scene in scenes])
     low, high = floors[:, 0].min(axis=0), floors[:, 1].max(axis=0)
@@ -185,11 +190,10 @@ def perspective(
     view: CornerView | None = None,
     colors: UInt8[np.ndarray, "objects 3"] | None = None,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """A picture with soft shadows from above a corner, outside the room: for pages, not for
-    metrics.
+    """Draw a room with soft shadows, from outside and above a corner: for pages, not for metrics.
 
-    Without a `view`, one of `image_size` is fitted to the room; a common view makes several rooms
-    comparable. `colors` of the objects are those of their classes unless given.
+    If `view` is None, a view of `image_size` is fitted to the room; with a common view, pictures of
+    several rooms can be compared. If `colors` is None, objects have the colours of their classes.
     """
     view = view or corner_view([scene], image_size)
     colors = object_colors(scene) if colors is None else colors
@@ -205,7 +209,7 @@ def turntable(
     count: int = 36,
     image_size: tuple[int, int] = (240, 320),
 ) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """Shaded pictures from `count` directions around a room, at one scale.
+    """Shaded pictures from `count` directions around a room, all at the same scale.
 
     The first has the viewing direction of `perspective`.
     """
@@ -234,7 +238,7 @@ def turntable(
 def floor_rectangle(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper (x, z) of the rectangle around the floor.
 
-    Without a known floor, it is the rectangle around the objects with a margin of 20 cm.
+    If the floor is unknown, of the rectangle around the objects, with a margin of 20 cm.
     """
     if scene.floor_m is not None and len(scene.floor_m):
         outline = np.asarray(scene.floor_m, dtype=np.float64)

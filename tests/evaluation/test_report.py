@@ -100,7 +100,7 @@ def test_every_part_is_there(page):
     assert page.count("<img") == 2 * (4 + 4 + 5 + 2 * 2) + 6 + 1
     assert "99.1%" in page and "10.0 min" in page and "not FID" in page
     assert "of the Frechet gap to real rooms closed" in page and "Gap closed, from" in page
-    assert "can be compared with the paper" in page
+    assert "cannot be compared with the paper" in page
     assert "100% of 2 classes right, mean 3D box IoU 1.00" in page
 
 

@@ -1,6 +1,7 @@
 """Rooms go out in other formats and come back: axes, units, classes, floors."""
 
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import read_house
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.masses import mass_kg
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid
 from sceneprior.interchange.box_lists import read_box_lists
 from sceneprior.interchange.export import export_scenes
 from sceneprior.render.offscreen import SoftwareRenderer
@@ -146,10 +148,49 @@ def test_usd_holds_meshes_in_metres_with_y_up(scenes, tmp_path):
 
 
 def test_what_cannot_be_exported_is_a_sentence(scenes, tmp_path, monkeypatch):
-    with pytest.raises(InputError, match="No format 'max'; choose from atiss, threed-front, obj"):
+    with pytest.raises(
+        InputError, match="No format 'max'; choose from atiss, threed-front, mujoco, obj"
+    ):
         export_scenes(scenes, "max", tmp_path)
     with pytest.raises(InputError, match="2 rooms are called 'first'"):
         export_scenes([scenes[0], scenes[0]], "obj", tmp_path)
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)
-    with pytest.raises(InputError, match=r"USD needs a package more: pip install 'sceneprior\[usd"):
+    with pytest.raises(InputError, match=r"USD needs another package: pip install 'sceneprior\[us"):
         export_scenes(scenes, "usd", tmp_path)
+
+
+def numbers(element: ElementTree.Element, name: str) -> list[float]:
+    return [float(number) for number in element.get(name).split()]
+
+
+def test_mujoco_gets_primitives_that_stand(tmp_path):
+    """A box, a round cylinder and a dome; the oval cylinder is a mesh."""
+    solids = (
+        Solid("box", (-0.5, 0.7, -0.5), (0.5, 0.8, 0.5)),
+        Solid("cylinder", (-0.5, 0.1, -0.5), (-0.4, 0.7, -0.4)),
+        Solid("cylinder", (0.3, 0.1, -0.5), (0.5, 0.7, 0.5)),
+        Solid("dome", (-0.2, 0.8, -0.2), (0.2, 1.0, 0.2)),
+    )
+    table = SceneObject("table", (0.0, 0.55, 0.0), (1.0, 0.9, 1.0), solids=solids)
+    lamp = SceneObject("pendant_lamp", (1.0, 2.2, -0.5), (0.3, 0.4, 0.2))
+    (note,) = export_scenes([Scene("one", BEDROOM, (table, lamp))], "mujoco", tmp_path)
+    assert note.endswith("of 2 objects: 1 set down.")
+    root = ElementTree.parse(tmp_path / "one.xml").getroot()
+    first, second = root.findall(".//body")
+    assert (first.get("name"), second.get("name")) == ("0_table", "1_pendant_lamp")
+    assert first.find("freejoint") is not None and second.find("freejoint") is None
+    geoms = first.findall("geom")
+    assert [geom.get("type") for geom in geoms] == ["box", "cylinder", "mesh", "mesh"]
+    np.testing.assert_allclose(numbers(first, "pos"), (0, 0, 0.45))
+    np.testing.assert_allclose(numbers(geoms[1], "size"), (0.05, 0.3))
+    np.testing.assert_allclose(numbers(geoms[1], "pos"), (-0.45, 0.45, -0.15))
+    total = sum(float(geom.get("mass")) for geom in geoms)
+    assert total == pytest.approx(mass_kg(table), rel=1e-3)
+
+
+def test_mujoco_loads_what_is_exported(scenes, tmp_path):
+    mujoco = pytest.importorskip("mujoco", reason="no mujoco here: pip install -e '.[sim]'")
+    export_scenes(scenes, "mujoco", tmp_path)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "first.xml"))
+    assert model.nbody == 1 + 2 and model.njnt == 1
+    assert model.body("0_double_bed").mass[0] == pytest.approx(mass_kg(scenes[0].objects[0]))

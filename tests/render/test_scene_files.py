@@ -245,7 +245,7 @@ def test_rooms_need_names_for_their_files(scene, tmp_path, renderer):
 
 
 def test_box_lists_in_place_of_scenes_are_sent_to_their_command(tmp_path):
-    told = r"holds box lists \({}\) and no scenes; `sceneprior export .* --to scenes --label-set"
+    told = r"holds box lists \({}\), not scenes; `sceneprior export .* --to scenes --label-set"
     (tmp_path / "a").mkdir()
     np.savez(tmp_path / "a" / "boxes.npz", class_labels=np.zeros((1, 23)))
     for given in (tmp_path, tmp_path / "a" / "boxes.npz"):

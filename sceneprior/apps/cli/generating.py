@@ -109,7 +109,7 @@ def complete(
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
 ) -> None:
-    """Complete a room of which some objects, or the floor, are given."""
+    """Complete a room, given some objects and optionally the floor."""
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.render.offscreen import open_renderer
@@ -122,8 +122,8 @@ def complete(
     scenes = prior.complete(scene, count, seed, distribution, wanted, want)
     write_scenes(scenes, out, open_renderer(renderer))
     note_unmet(scenes)
-    how = "drawn by the sampler" if scenes[0].latent is None else "of fitted latents"
-    typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects, {how}, to {out}")
+    how = "drawn by the sampler" if scenes[0].latent is None else "decoded from fitted latents"
+    typer.echo(f"Wrote {count} rooms around {len(scene.objects)} given objects, {how}, to {out}")
     for room in scenes:
         if lacking := room.extra.get("no_place"):
             typer.echo(f"Note: {room.name} has no place for {', '.join(lacking)}.", err=True)

@@ -106,7 +106,7 @@ def result_file(run: str, out: Path | None, name: str) -> Path:
         return checked_target(out)
     folder = find_prior(run)
     if folder != Path(run) or not folder.is_dir():
-        raise InputError(f"{run} is no folder to keep {name} in; name a file with --out.")
+        raise InputError(f"{run} is not a folder that {name} could go to; name a file with --out.")
     return checked_target(folder / name)
 
 

@@ -37,7 +37,7 @@ def pack(
     from sceneprior.paper.trained import TrainedPrior
 
     if out.exists() and (out.is_dir() or not overwrite):
-        raise InputError(f"{out} is there; name another file, or replace a file by --overwrite.")
+        raise InputError(f"{out} already exists; name another file, or add --overwrite.")
     found = scores or run / "scores.json"
     measured = read_json(found) if scores is not None or found.is_file() else None
     stated = None if about is None else _text_of(about)
@@ -48,14 +48,14 @@ def pack(
     typer.echo(f"Wrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
     if stated is None:
         typer.echo(
-            "Note: the card says nothing of the data's authors and licence; --about adds it.",
+            "Note: the card does not state the data's authors and licence; --about adds them.",
             err=True,
         )
     alone = isinstance(trained, TrainedPrior) and trained.distribution not in (SAMPLER, "paper")
     if alone and not latents:
         typer.echo(
-            f"Note: the run draws rooms by '{trained.distribution}', which needs --latents; of "
-            "this file they come from `paper`.",
+            f"Note: the run draws rooms from '{trained.distribution}', which needs --latents; with "
+            "this file they are drawn from 'paper'.",
             err=True,
         )
 
@@ -65,7 +65,7 @@ def _text_of(path: Path) -> str:
     from sceneprior.apps.priors.packed import CARD, LARGEST
 
     if not path.is_file():
-        raise InputError(f"{path} cannot be read: it is missing, or no regular file.")
+        raise InputError(f"{path} cannot be read: it is missing or not a regular file.")
     try:
         with path.open() as file:
             return file.read(LARGEST[CARD])  # a card with a longer text is refused later
@@ -100,7 +100,9 @@ def export(
     source: Annotated[
         Path, typer.Argument(help="Folder of scenes, or of box lists for `--to scenes`.")
     ],
-    to: Annotated[str, typer.Option(help="Format: atiss, threed-front, obj or usd; or scenes.")],
+    to: Annotated[
+        str, typer.Option(help="Format: mujoco, usd, obj, atiss or threed-front; or scenes.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
     label_set: Annotated[
         str | None, typer.Option(help="Label set of box lists, such as front3d_bedroom.")
@@ -125,12 +127,12 @@ def export(
     check_free(out, overwrite)
     if to == "scenes":
         if label_set is None:
-            raise InputError("--to scenes needs --label-set: that of the box lists' classes.")
+            raise InputError("--to scenes needs --label-set, the label set of the box lists.")
         rooms = read_box_lists(source, label_set, classes, sizes or "half")
         write_scenes(rooms, out, SoftwareRenderer())
     else:
         if (label_set, classes, sizes) != (None, None, None):
-            raise InputError("--label-set, --classes and --sizes are of box lists: --to scenes.")
+            raise InputError("--label-set, --classes and --sizes apply only with --to scenes.")
         rooms = load_scene_folder(source)
         for note in export_scenes(rooms, to, out):
             typer.echo(f"Note: {note}", err=True)

@@ -88,7 +88,7 @@ def _scene(trained: TrainedLifted, name: str, answer: Answer, request: Request) 
         scene,
         objects=tuple(
             # Given objects as they were, with the mesh of a look if they had none.
-            replace(own, mesh=own.mesh or drawn.mesh)
+            replace(own, mesh=drawn.mesh, solids=drawn.solids) if own.mesh is None else own
             for own, drawn in zip(given, scene.objects, strict=False)
         )
         + scene.objects[len(given) :],

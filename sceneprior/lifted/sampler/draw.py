@@ -25,9 +25,9 @@ from sceneprior.lifted.sampler.violations import settled, violation
 PLACES = 16
 """Places sampled for an object in the last attempt, in which it takes the best one."""
 TRIES = 4
-"""Places sampled for an object in each attempt before; it takes the first without a violation. Few,
-since an object whose likely places are taken would end at an unlikely one; the room is furnished
-again instead."""
+"""Places sampled for an object in each earlier attempt, of which it takes the first one without a
+violation. With more places, an object whose likely places are taken would end up at an unlikely
+one; instead, the room is furnished again."""
 LOOKS = 16
 """Looks sampled for a given object, one of which is chosen by the likelihood of its place."""
 OPEN_M = 3 * FRAME_M
@@ -54,8 +54,8 @@ def draw_rooms(
     A room's contents are sampled first (`plan_rooms`), then its objects one by one, each at the
     first of `TRIES` sampled places where it neither intersects an object that it should not
     (`RoomSampler.may_meet`) nor extends beyond the rectangle. A room is furnished again if some
-    object has no such place, or if a side of its sampled rectangle stays empty (`OPEN_M`), as
-    hardly any training room's does. After `ROUNDS` attempts it is planned again.
+    object has no such place, or if a side of its sampled rectangle stays empty (`OPEN_M`), which is
+    rare in training rooms. After `ROUNDS` attempts, the room is planned again.
 
     In the last attempt, `PLACES` places are sampled. Objects without a place are left out; if their
     classes were requested, they take the place with the least violation instead.
@@ -101,8 +101,11 @@ def _draw(
     last: bool,
     keep: bool,
 ) -> tuple[RoomBoxes, Bool[Tensor, " rooms"]]:
-    """The rooms, and a mask of those to furnish again: some object found no place, or a side of a
-    sampled rectangle stays empty. With `keep`, the last round places objects in any case."""
+    """Furnish rooms once; also returns a mask of the rooms to furnish again, because some object
+    found no place, or a side of a sampled rectangle stays empty.
+
+    With `keep`, the last attempt places objects in any case.
+    """
     number = plan.objects.is_object.sum(dim=1)
     rooms = with_looks(sampler, uniform, plan)
     looks = rooms.looks
@@ -153,8 +156,11 @@ def _placed(
     chance: Float[Tensor, "rooms numbers"],
     tries: int,
 ) -> tuple[Int[Tensor, " rooms"], Float[Tensor, "rooms 6"], Float[Tensor, " rooms"]]:
-    """A look and a box for an object of a class, at the first of `tries` sampled places without a
-    violation, and its violation; if all have one, at the place with the least."""
+    """Sample a look and a box for an object of a class; also returns the violation of the box.
+
+    The box is at the first of `tries` sampled places without a violation, or, if all places have
+    one, at the place with the least violation.
+    """
     look = draw_index(sampler.look_logits(reading, label), chance[:, 1])
     details = sampler.details(reading, label, look).draw(chance[:, 2], chance[:, 3:7])
     off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)

@@ -27,10 +27,10 @@ class Renderer(abc.ABC):
     def instance_ids_of_views(
         self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
     ) -> np.ndarray:
-        """The mesh that is visible at each pixel centre, in many views of one room.
+        """Draw which mesh is visible at each pixel centre, in several views of one room.
 
-        (views, height, width) uint16: 0 for none, k + 1 for `meshes[k]`. Both sides of a face are
-        drawn.
+        Returns (views, height, width) uint16: k + 1 where `meshes[k]` is visible, 0 for no mesh.
+        Both sides of a face are drawn.
         """
 
     def instance_ids(
@@ -48,11 +48,12 @@ class Renderer(abc.ABC):
         background: tuple[int, int, int] | np.ndarray = (255, 255, 255),
         shadows: bool = False,
     ) -> np.ndarray:
-        """A shaded picture (H, W, 3), with mesh k in `colors[k]` (uint8), lit from the camera and,
-        with `shadows`, from the sky (`sky.py`); these take a pinhole.
+        """Draw a shaded picture, (H, W, 3) uint8, with mesh k in the colour `colors[k]`.
 
-        The background is a colour, or a picture of this size. Both renderers use the software
-        z-buffer for it, so that pictures look the same everywhere.
+        The light comes from the camera. `shadows` adds soft shadows under light from the sky
+        (`sky.py`), if the camera is a `Pinhole`. The background is a colour, or a picture of the
+        same size. Both renderers draw this with the software z-buffer, so that pictures look the
+        same everywhere.
         """
         height, width = image_size
         soup = _join(meshes)
@@ -62,7 +63,7 @@ class Renderer(abc.ABC):
         palette = np.concatenate([palette * light[:, None], [(0, 0, 0)]])  # -1 is the last row
         picture = palette[face_index]
         if shadows and isinstance(camera, Pinhole):
-            # At half the resolution: light changes slowly.
+            # Computed at half the resolution, because this light changes slowly.
             light = sky_light(soup.vertices, soup.faces, camera, depth_m[::2, ::2])
             picture *= light.repeat(2, axis=0).repeat(2, axis=1)[..., None]
         fine = picture.reshape(height, 2, width, 2, 3)
@@ -115,7 +116,7 @@ def _draw(
     supersampling: int = 1,
     labels: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw with `zbuffer.rasterize`, whose result this is; `image_size` is the supersampled
+    """Draw with `zbuffer.rasterize` and return its result; `image_size` is the supersampled
     size."""
     from sceneprior.render.offscreen.zbuffer import rasterize
 

@@ -1,20 +1,20 @@
 """Visible soft masks from the coverage and depth order of single objects, and their gradient.
 
-With coverage_k = 1 - 1 / odds_k of object k alone, the modes are:
+The coverage of object k, drawn alone, is coverage_k = 1 - 1 / odds_k. There are three modes:
 
-`alone`: the coverage itself, without occlusion.
+`alone`: the mask of an object is its coverage, without occlusion.
 
-`paper`: the coverage of the whole scene, assigned to the front-most object of each pixel. Two
-objects that touch in the image do not push each other.
+`paper`: the coverage of the whole scene, assigned to the front-most object of each pixel. The loss
+cannot shift the boundary between two objects that touch in the image.
 
-`layered`: alpha compositing, object k is visible where it covers and no nearer object does,
+`layered`: alpha compositing. Object k is visible where it covers a pixel and no nearer object does,
 
     visible_k = coverage_k * prod_{j nearer than k} (1 - coverage_j),
 
-so the loss at a boundary between two objects moves the front one, which reveals or hides the one
+so a loss at the boundary between two objects moves the front one, which reveals or hides the one
 behind.
 
-The objects are ordered by their depth at the pixel (see faces.py), without a gradient.
+Objects are ordered by their depth at the pixel (see faces.py); the order carries no gradient.
 """
 
 import numpy as np
