@@ -17,6 +17,8 @@ from sceneprior.apps.cli.options import (
     RendererOption,
     RunOption,
     SeedOption,
+    ShellOption,
+    checked_shell,
 )
 
 
@@ -29,10 +31,14 @@ def synthesize(
     html: Annotated[
         bool, typer.Option("--html", help="Write rooms.html, too: one page of 3D models.")
     ] = False,
+    shell: ShellOption = None,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
 ) -> None:
-    """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them."""
+    """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them.
+
+    Without --shell, GLBs hold furniture alone.
+    """
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import PAGE_FILE, check_free, write_scenes
     from sceneprior.evaluation.metrics.contents import emptiness
@@ -40,10 +46,11 @@ def synthesize(
     from sceneprior.render.offscreen import open_renderer
 
     check_free(out, overwrite)
+    drawn = checked_shell(shell or "none")
     prior = load(run)
     artist = open_renderer(renderer)
     scenes = prior.sample(count, seed, distribution)
-    write_scenes(scenes, out, artist)
+    write_scenes(scenes, out, artist, drawn)
     origin = distribution or prior.distribution
     if html:
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
