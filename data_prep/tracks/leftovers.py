@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from data_prep.tracks.affinity import CLASS_ERROR, ONE_VIEW
 
 ENOUGH = 0.6
-"""Share of a mask's rays that must meet a cluster's hull for the hull to speak for joining."""
+"""Share of a mask's rays that meet a cluster's hull from which on the hull favours joining."""
 HULL, CLASS, PAIRS = 4.0, 1.0, 3.0
 """Weights of hulls, of classes and of the mean weight of pairs."""
 
@@ -20,10 +20,10 @@ def join_leftovers(
 ) -> Int[np.ndarray, " masks"]:
     """Join each cluster, the smallest first, to the larger one that gains most, if any gains.
 
-    The gain is HULL times how far the mean share of its masks' rays that meet the other's hull is
-    above `ENOUGH` (0 to 1; three times as steep below), plus CLASS times the log-odds of its
-    classes, plus PAIRS times the mean weight of pairs of different views, plus ONE_VIEW times the
-    share of its views that show a mask of both.
+    The gain is HULL times the excess over `ENOUGH` of the mean share of the smaller cluster's rays
+    that meet the larger one's hull (scaled to 0 to 1; three times as steep below), plus CLASS times
+    the log-odds of the classes, plus PAIRS times the mean weight of pairs of different views, plus
+    ONE_VIEW times the share of the smaller cluster's views that show both clusters.
     """
     count = int(labels.max()) + 1
     size = np.bincount(labels, minlength=count)
