@@ -44,7 +44,7 @@ OWNERS = {
     "OpenGL": ["sceneprior/render/offscreen/"],
     "numba": [
         "sceneprior/render/silhouettes/", "sceneprior/render/offscreen/zbuffer.py",
-        "sceneprior/lifted/lifting/",
+        "sceneprior/lifted/lifting/", "data_prep/tracks/",
     ],
     "triton": ["sceneprior/render/silhouettes/"],
     "lightning": [
@@ -53,7 +53,7 @@ OWNERS = {
     ],
     "safetensors": ["sceneprior/apps/priors/"],
     "huggingface_hub": ["sceneprior/apps/priors/"],
-    "pxr": ["sceneprior/render/scene_files.py"],
+    "pxr": ["sceneprior/render/scene_usd.py"],
     "yaml": ["sceneprior/core/settings.py", "data_prep/homes/furniture.py"],
     "pydantic": [
         "sceneprior/core/", "sceneprior/training/", "sceneprior/paper/", "sceneprior/lifted/",
@@ -63,8 +63,8 @@ OWNERS = {
     "typer": ["sceneprior/apps/cli/", "data_prep/cli.py"],
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
-    "skimage": ["sceneprior/core/geometry/isosurface.py"],
-    "manifold3d": ["sceneprior/core/geometry/part_meshes.py"],
+    "skimage": ["sceneprior/core/geometry/isosurface", "sceneprior/lifted/lifting/outlines"],
+    "manifold3d": ["sceneprior/core/geometry/part_meshes.py", "sceneprior/core/shell.py"],
     "fast_simplification": ["sceneprior/core/geometry/isosurface.py"],
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/stage"],
     "scipy.optimize": [

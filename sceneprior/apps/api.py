@@ -94,8 +94,8 @@ class Prior:
                 `{"nightstand": 2, "desk": 0}`.
             objects: Objects that are there already, in the coordinates of the floor.
 
-        Requests are for priors with a sampler; see docs/requests.md. `extra["wishes"]` of a room
-        lists each wish and whether it holds.
+        Requests need a prior with a sampler; see docs/requests.md. `extra["wishes"]` of a room
+        lists each wish, and whether the room fulfils it.
 
         Raises:
             InputError: the prior has no such distribution, or no room holds the request.

@@ -144,6 +144,8 @@ class RoomBoxes(Batch):
     """Rotation about +y that takes +z to each piece's front, in [-pi, pi]; None if unknown."""
     looks: Int[Tensor, "rooms objects"] | None = None
     """Look of each object, prototype * 8 + pose (`lifted/prototypes.py`); None if unknown."""
+    rectangle_m: Float[Tensor, "rooms 4"] | None = None
+    """Rectangle in which each room was furnished: centre x, z and extents x, z; None if unknown."""
 
     def split(self, rooms: int) -> list["RoomBoxes"]:
         """Split into batches of at most `rooms` rooms, without ids."""
@@ -165,4 +167,6 @@ class RoomBoxes(Batch):
             rows = order if tensor.ndim == 2 else order.unsqueeze(-1)
             return torch.take_along_dim(tensor, rows, dim=1)
 
-        return self.changed(taken)
+        # Rectangles have no slots.
+        slots = replace(self, rectangle_m=None).changed(taken)
+        return replace(slots, rectangle_m=self.rectangle_m)

@@ -57,7 +57,7 @@ def glb_of(scene: Scene, most_faces: int) -> bytes:
             mesh = Mesh(*decimate(vertices_m, np.asarray(item.mesh.faces), most_faces))
             item = replace(item, mesh=mesh)
         light.append(item)
-    return scene_to_glb(replace(scene, objects=tuple(light)), corner_view([scene]).floor)
+    return scene_to_glb(replace(scene, objects=tuple(light)), {"floor": corner_view([scene]).floor})
 
 
 def png_uri(image: Image.Image) -> str:

@@ -7,10 +7,12 @@ from pathlib import Path
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
+from sceneprior.core.shell import ShellName, shell_of
 from sceneprior.core.standing import stand
 from sceneprior.interchange.atiss import write_atiss
 from sceneprior.interchange.front import write_front
 from sceneprior.interchange.mujoco import write_mujoco
+from sceneprior.interchange.usd import write_usd
 from sceneprior.render.scene_files import check_names, save_scene
 
 OF_CLASSES: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
@@ -18,29 +20,37 @@ OF_CLASSES: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
     "threed-front": write_front,
 }
 """Formats in which every object needs a furniture class, so that void objects are left out."""
-SIMULATORS: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {"mujoco": write_mujoco}
+SIMULATORS: Mapping[str, Callable[[Sequence[Scene], Path, ShellName], None]] = {
+    "mujoco": write_mujoco,
+    "usd": write_usd,
+}
 """Formats of simulators, for which objects stand first (`core/standing.py`)."""
-ENDINGS = {"obj": ".obj", "usd": ".usda"}
-"""Formats with one file per room."""
-FORMATS = (*OF_CLASSES, *SIMULATORS, *ENDINGS)
+FORMATS = (*OF_CLASSES, *SIMULATORS, "obj")
+GROWN_M = 0.01
+"""Distance from which on the user is told that walls were moved."""
 
 
-def export_scenes(scenes: Sequence[Scene], to: str, folder: Path) -> list[str]:
+def export_scenes(
+    scenes: Sequence[Scene], to: str, folder: Path, shell: ShellName | None = None
+) -> list[str]:
     """Write rooms to a folder in one of `FORMATS`, in metres; y is up, except in MuJoCo (z).
 
-    Returns notes for the user on objects that were left out or moved.
+    `shell` is what is written of the room itself; None writes walls for simulators, and nothing in
+    other formats. Notes for the user on what was left out or changed are returned.
     """
     if to not in FORMATS:
         raise InputError(f"No format '{to}'; choose from {', '.join(FORMATS)}, or scenes.")
     check_names(scenes)
-    if to in ENDINGS:
+    if to == "obj":
         for scene in scenes:
-            save_scene(scene, Path(folder) / f"{scene.name}{ENDINGS[to]}")
+            save_scene(scene, Path(folder) / f"{scene.name}.obj", shell=shell or "none")
         return []
     if to in SIMULATORS:
-        standing, told = stand_all(scenes)
-        SIMULATORS[to](standing, Path(folder))
-        return told
+        standing, notes = stand_all(scenes)
+        SIMULATORS[to](standing, Path(folder), shell or "walls")
+        return notes if shell in ("floor", "none") else [*notes, *_moved_walls(standing)]
+    if shell is not None:
+        raise InputError(f"{to} has no walls; leave out --shell.")
     named = [
         replace(scene, objects=tuple(o for o in scene.objects if o.label != "void"))
         for scene in scenes
@@ -53,7 +63,7 @@ def export_scenes(scenes: Sequence[Scene], to: str, folder: Path) -> list[str]:
 
 
 def stand_all(scenes: Sequence[Scene]) -> tuple[list[Scene], list[str]]:
-    """The scenes with their objects standing, and a note on what changed, if anything did."""
+    """The scenes with all objects made to stand, and a note on the changes, if there are any."""
     pairs = [stand(scene) for scene in scenes]
     changes = sum((told for _, told in pairs), Counter[str]())
     standing = [scene for scene, _ in pairs]
@@ -61,3 +71,14 @@ def stand_all(scenes: Sequence[Scene]) -> tuple[list[Scene], list[str]]:
         return standing, []
     total = sum(len(scene.objects) for scene in scenes)
     return standing, [f"So that nothing falls over or overlaps, of {total} objects: {said}."]
+
+
+def _moved_walls(scenes: Sequence[Scene]) -> list[str]:
+    grown_m = [shell_of(scene).grown_m for scene in scenes]
+    rooms = sum(far > GROWN_M for far in grown_m)
+    if not rooms:
+        return []
+    return [
+        f"Walls of {rooms} rooms stand further out than floor_m, by up to {max(grown_m):.2f} m, "
+        "because furniture stands there."
+    ]

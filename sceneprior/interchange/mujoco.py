@@ -5,10 +5,12 @@ from pathlib import Path
 
 from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Scene
+from sceneprior.core.shell import ShellName, shell_of
 from sceneprior.render.scene_mjcf import scene_to_mjcf
 
 
-def write_mujoco(scenes: Sequence[Scene], folder: Path) -> None:
-    """Write `<name>.xml` for each scene; see `scene_to_mjcf`."""
+def write_mujoco(scenes: Sequence[Scene], folder: Path, shell: ShellName) -> None:
+    """Write `<name>.xml` for each scene; see `scene_to_mjcf`. The floor is there in any case."""
     for scene in scenes:
-        write_whole(folder / f"{scene.name}.xml", scene_to_mjcf(scene))
+        room = shell_of(scene) if shell == "walls" else None
+        write_whole(folder / f"{scene.name}.xml", scene_to_mjcf(scene, room))

@@ -28,11 +28,11 @@ def insert(
       `match_scenes`). A given object without a mesh takes the mesh of its match;
     - other objects that overlap a given one badly (`BADLY`), unless their classes may overlap.
 
-    The result has the floor of `given`. `may_meet` is true for pairs of classes that may overlap,
-    such as a chair and its table; None allows no pair. The result's `extra` holds `extra`, `given`
-    (the rows of the given objects), `replaced` and `removed` (the number of objects removed for
-    either reason), and `replaced_off_m` (mean distance in metres, over centre and sides, between
-    the matches and the given objects; null if there are none).
+    The result has the floor of `given`, if it has one. `may_meet` is true for pairs of classes that
+    may overlap, such as a chair and its table; None allows no pair. The result's `extra` holds
+    `extra`, `given` (the rows of the given objects), `replaced` and `removed` (the number of
+    objects removed for either reason), and `replaced_off_m` (mean distance in metres, over centre
+    and sides, between the matches and the given objects; null if there are none).
     """
     given = replace(given, label_set=room.label_set)
     partners = _partners(room, given)
@@ -55,7 +55,8 @@ def insert(
         **extra,
     }
     objects = (*placed, *added)
-    return replace(room, objects=objects, floor_m=given.floor_m, extra=marks)
+    floor_m = room.floor_m if given.floor_m is None else given.floor_m
+    return replace(room, objects=objects, floor_m=floor_m, extra=marks)
 
 
 def _partners(room: Scene, given: Scene) -> dict[int, int]:

@@ -48,7 +48,7 @@ def sample_scenes(
 
 
 def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> Scene:
-    """A drawn room as a scene with meshes."""
+    """A drawn room as a scene with meshes; its floor is the rectangle of the room, if known."""
     sampler, shapes = trained.sampler, trained.prior.shape
     assert sampler is not None, "callers ask trained.sampler first"
     assert isinstance(shapes, LookDecoder), "whose looks the sampler draws"
@@ -65,7 +65,15 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
         label = classes[index]
         center, size = tuple(box[:3]), tuple(box[3:])
         objects.append(SceneObject(label, center, size, mesh, solids=solids))
-    return Scene(name, trained.config.label_set, tuple(objects))
+    floor_m = None if rooms.rectangle_m is None else _outline(rooms.rectangle_m[row])
+    return Scene(name, trained.config.label_set, tuple(objects), floor_m)
+
+
+def _outline(rectangle_m: Float[Tensor, "4"]) -> Float[np.ndarray, "4 2"]:
+    """Corners (x, z) of a rectangle, to millimetres."""
+    center, extents = rectangle_m.double().numpy().reshape(2, 2)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
+    return np.asarray((center + corners * extents).round(3))
 
 
 def class_rows(trained: TrainedLifted, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:

@@ -9,22 +9,25 @@ from jaxtyping import Float
 from sceneprior.core.colliders import colliders, is_fixed, points_of, volume_and_centroid
 from sceneprior.core.masses import mass_kg
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid
-from sceneprior.render.topdown import FLOOR_COLOR, object_colors
+from sceneprior.core.shell import Panel, Shell, panels
+from sceneprior.render.topdown import FLOOR_COLOR, WALL_COLOR, node_names, object_colors
 
 TIMESTEP_S = 0.001
 TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """From the room frame (y up) to MuJoCo's axes (z up), for column vectors."""
+WALL_OPACITY = 0.35
 ROUND = 1e-3
 """Relative difference of a cylinder's widths up to which it is a circular one."""
 
 
-def scene_to_mjcf(scene: Scene) -> str:
+def scene_to_mjcf(scene: Scene, shell: Shell | None = None) -> str:
     """The scene as the text of an MJCF file without other files.
 
     Each object is a body at the centre of its box, named `<index>_<class>`, with a free joint
     unless it hangs (`is_fixed`). Its solids are geoms: boxes, cylinders and ellipsoids; domes,
     bowls and cylinders with an oval plan are meshes. The mass is that of `masses.py`, shared by
-    the solids in proportion to their volumes. The floor is an infinite plane.
+    the solids in proportion to their volumes. The floor is an infinite plane; the walls of
+    `shell` are boxes round its doors and windows, half transparent, without a ceiling.
     """
     root = Element("mujoco", model=scene.name)
     SubElement(root, "compiler", angle="radian", autolimits="true")
@@ -33,8 +36,13 @@ def scene_to_mjcf(scene: Scene) -> str:
     SubElement(world, "light", pos="0 0 6", dir="0 0 -1", diffuse="0.8 0.8 0.8")
     floor_color = _numbers(np.append(np.array(FLOOR_COLOR) / 255, 1))
     SubElement(world, "geom", name="floor", type="plane", size="20 20 0.1", rgba=floor_color)
-    for row, (item, color) in enumerate(zip(scene.objects, object_colors(scene), strict=True)):
-        _add_body(world, assets, f"{row}_{item.label}", item, color / 255)
+    for node, item, color in zip(
+        node_names(scene), scene.objects, object_colors(scene), strict=True
+    ):
+        _add_body(world, assets, node, item, color / 255)
+    for row, wall in enumerate(shell.walls if shell else ()):
+        for number, panel in enumerate(panels(wall, shell.height_m if shell else 0.0)):
+            _add_panel(world, f"wall_{row}_{number}", panel)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -53,6 +61,18 @@ def _add_body(
         shape = _shape(each, center, assets, f"{name}_{number}")
         geom = SubElement(body, "geom", shape, name=f"{name}_{number}")
         geom.attrib |= {"mass": f"{mass:.6g}", "rgba": _numbers(np.append(color, 1))}
+
+
+def _add_panel(world: Element, name: str, panel: Panel) -> None:
+    length, height, thickness = panel.size_m
+    half = np.array([length, thickness, height]) / 2
+    geom = SubElement(world, "geom", name=name, type="box", size=_numbers(half))
+    color = np.append(np.array(WALL_COLOR) / 255, WALL_OPACITY)
+    turn = np.array([0.0, 0.0, 1.0, panel.yaw_rad])
+    geom.attrib |= {
+        "pos": _numbers(TO_Z_UP @ panel.center_m), "axisangle": _numbers(turn),
+        "rgba": _numbers(color),
+    }  # fmt: skip
 
 
 def _shape(

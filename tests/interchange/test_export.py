@@ -1,7 +1,6 @@
 """Rooms go out in other formats and come back: axes, units, classes, floors."""
 
 from dataclasses import replace
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -12,8 +11,7 @@ from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import read_house
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.errors import InputError
-from sceneprior.core.masses import mass_kg
-from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid
+from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.interchange.box_lists import read_box_lists
 from sceneprior.interchange.export import export_scenes
 from sceneprior.render.offscreen import SoftwareRenderer
@@ -129,68 +127,15 @@ def test_objects_of_unknown_classes_cannot_become_models(tmp_path):
     assert "throne" in (tmp_path / "named" / "3D-FUTURE-model" / "model_info.json").read_text()
 
 
-def test_usd_holds_meshes_in_metres_with_y_up(scenes, tmp_path):
-    usd = pytest.importorskip("pxr.Usd")
-    geometry = pytest.importorskip("pxr.UsdGeom")
-    export_scenes(scenes, "usd", tmp_path)
-    stage = usd.Stage.Open(str(tmp_path / "first.usda"))
-    assert geometry.GetStageUpAxis(stage) == "Y" and geometry.GetStageMetersPerUnit(stage) == 1.0
-    bed, lamp = stage.GetDefaultPrim().GetChildren()
-    assert bed.GetAttribute("userProperties:class").Get() == "double_bed"
-    mesh = geometry.Mesh(bed)
-    np.testing.assert_allclose(np.array(mesh.GetPointsAttr().Get()), PYRAMID.vertices_m, atol=1e-6)
-    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
-    np.testing.assert_array_equal(faces, PYRAMID.faces)
-    assert list(mesh.GetFaceVertexCountsAttr().Get()) == [3] * len(faces)
-    low, high = (np.array(corner) for corner in geometry.Mesh(lamp).GetExtentAttr().Get())
-    np.testing.assert_allclose((low + high) / 2, (1.0, 2.2, -0.5), atol=1e-6)
-    assert usd.Stage.Open(str(tmp_path / "second.usda")).GetDefaultPrim().GetName() == "room"
-
-
 def test_what_cannot_be_exported_is_a_sentence(scenes, tmp_path, monkeypatch):
     with pytest.raises(
-        InputError, match="No format 'max'; choose from atiss, threed-front, mujoco, obj"
+        InputError, match="No format 'max'; choose from atiss, threed-front, mujoco, usd"
     ):
         export_scenes(scenes, "max", tmp_path)
     with pytest.raises(InputError, match="2 rooms are called 'first'"):
         export_scenes([scenes[0], scenes[0]], "obj", tmp_path)
+    with pytest.raises(InputError, match="atiss has no walls; leave out --shell"):
+        export_scenes(scenes, "atiss", tmp_path, "walls")
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)
     with pytest.raises(InputError, match=r"USD needs another package: pip install 'sceneprior\[us"):
         export_scenes(scenes, "usd", tmp_path)
-
-
-def numbers(element: ElementTree.Element, name: str) -> list[float]:
-    return [float(number) for number in element.get(name).split()]
-
-
-def test_mujoco_gets_primitives_that_stand(tmp_path):
-    """A box, a round cylinder and a dome; the oval cylinder is a mesh."""
-    solids = (
-        Solid("box", (-0.5, 0.7, -0.5), (0.5, 0.8, 0.5)),
-        Solid("cylinder", (-0.5, 0.1, -0.5), (-0.4, 0.7, -0.4)),
-        Solid("cylinder", (0.3, 0.1, -0.5), (0.5, 0.7, 0.5)),
-        Solid("dome", (-0.2, 0.8, -0.2), (0.2, 1.0, 0.2)),
-    )
-    table = SceneObject("table", (0.0, 0.55, 0.0), (1.0, 0.9, 1.0), solids=solids)
-    lamp = SceneObject("pendant_lamp", (1.0, 2.2, -0.5), (0.3, 0.4, 0.2))
-    (note,) = export_scenes([Scene("one", BEDROOM, (table, lamp))], "mujoco", tmp_path)
-    assert note.endswith("of 2 objects: 1 set down.")
-    root = ElementTree.parse(tmp_path / "one.xml").getroot()
-    first, second = root.findall(".//body")
-    assert (first.get("name"), second.get("name")) == ("0_table", "1_pendant_lamp")
-    assert first.find("freejoint") is not None and second.find("freejoint") is None
-    geoms = first.findall("geom")
-    assert [geom.get("type") for geom in geoms] == ["box", "cylinder", "mesh", "mesh"]
-    np.testing.assert_allclose(numbers(first, "pos"), (0, 0, 0.45))
-    np.testing.assert_allclose(numbers(geoms[1], "size"), (0.05, 0.3))
-    np.testing.assert_allclose(numbers(geoms[1], "pos"), (-0.45, 0.45, -0.15))
-    total = sum(float(geom.get("mass")) for geom in geoms)
-    assert total == pytest.approx(mass_kg(table), rel=1e-3)
-
-
-def test_mujoco_loads_what_is_exported(scenes, tmp_path):
-    mujoco = pytest.importorskip("mujoco", reason="no mujoco here: pip install -e '.[sim]'")
-    export_scenes(scenes, "mujoco", tmp_path)
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "first.xml"))
-    assert model.nbody == 1 + 2 and model.njnt == 1
-    assert model.body("0_double_bed").mass[0] == pytest.approx(mass_kg(scenes[0].objects[0]))

@@ -21,7 +21,9 @@ from sceneprior.apps.cli.options import (
     RequestOption,
     RunOption,
     SeedOption,
+    ShellOption,
     WantOption,
+    checked_shell,
     note_unmet,
     request_of,
 )
@@ -41,10 +43,14 @@ def synthesize(
     html: Annotated[
         bool, typer.Option("--html", help="Write rooms.html, too: one page of 3D models.")
     ] = False,
+    shell: ShellOption = None,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
 ) -> None:
-    """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them."""
+    """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them.
+
+    Without --shell, GLBs hold furniture alone.
+    """
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import PAGE_FILE, check_free, write_scenes
     from sceneprior.evaluation.metrics.contents import emptiness
@@ -52,11 +58,12 @@ def synthesize(
     from sceneprior.render.offscreen import open_renderer
 
     check_free(out, overwrite)
+    drawn = checked_shell(shell or "none")
     asked = request_of(floor, openings, ceiling, want, request)
     prior = load(run)
     artist = open_renderer(renderer)
     scenes = prior.sample(count, seed, distribution, **asked)
-    write_scenes(scenes, out, artist)
+    write_scenes(scenes, out, artist, drawn)
     note_unmet(scenes)
     origin = distribution or prior.distribution
     if html:

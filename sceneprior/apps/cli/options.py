@@ -11,6 +11,7 @@ from sceneprior.core.seeds import LARGEST_SEED
 
 if TYPE_CHECKING:
     from sceneprior.core.scene import Scene
+    from sceneprior.core.shell import ShellName
 
 RendererOption = Annotated[
     str, typer.Option(help="Renderer of the pictures: auto, pyrender or software (without GL).")
@@ -60,6 +61,12 @@ RequestOption = Annotated[
     Path | None, typer.Option(help="JSON of a request: floor, openings, wishes (samplers only).")
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+ShellOption = Annotated[
+    str | None,
+    typer.Option(
+        help="What to write of the room itself: walls (with floor and ceiling), floor, or none."
+    ),
+]
 InceptionOption = Annotated[
     Path | None, typer.Option(help="The file inception-2015-12-05.pt (TorchScript), for FID.")
 ]
@@ -108,6 +115,16 @@ def result_file(run: str, out: Path | None, name: str) -> Path:
     if folder != Path(run) or not folder.is_dir():
         raise InputError(f"{run} is not a folder that {name} could go to; name a file with --out.")
     return checked_target(folder / name)
+
+
+def checked_shell(shell: str) -> "ShellName":
+    """Check the value of `--shell`."""
+    from sceneprior.core.shell import SHELLS
+
+    for known in SHELLS:
+        if shell == known:
+            return known
+    raise InputError(f"--shell {shell} is not known; choose from {', '.join(SHELLS)}.")
 
 
 def checked_target(target: Path) -> Path:

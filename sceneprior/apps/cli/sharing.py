@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.apps.cli.options import OverwriteOption
+from sceneprior.apps.cli.options import OverwriteOption, ShellOption, checked_shell
 from sceneprior.core.errors import InputError
 
 
@@ -115,9 +115,13 @@ def export(
         str | None,
         typer.Option(help="Extents in box lists: half, as ATISS writes them (default), or full."),
     ] = None,
+    shell: ShellOption = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Export scenes to another format, or convert box lists, such as ATISS's, to scenes."""
+    """Export scenes to another format, or convert box lists, such as ATISS's, to scenes.
+
+    Simulators get walls unless --shell says otherwise, and objects that stand and lie apart.
+    """
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.interchange.box_lists import read_box_lists
     from sceneprior.interchange.export import export_scenes
@@ -134,6 +138,7 @@ def export(
         if (label_set, classes, sizes) != (None, None, None):
             raise InputError("--label-set, --classes and --sizes apply only with --to scenes.")
         rooms = load_scene_folder(source)
-        for note in export_scenes(rooms, to, out):
+        asked = None if shell is None else checked_shell(shell)
+        for note in export_scenes(rooms, to, out, asked):
             typer.echo(f"Note: {note}", err=True)
     typer.echo(f"Wrote {len(rooms)} rooms to {out}")

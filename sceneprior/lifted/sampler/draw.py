@@ -1,5 +1,6 @@
 """Draw rooms from a trained sampler: whole rooms, or the rest of rooms with given objects."""
 
+from dataclasses import replace
 from operator import itemgetter
 
 import torch
@@ -49,7 +50,7 @@ BATCH = 256
 def draw_rooms(
     sampler: RoomSampler, count: int, seed: int, given: Given | None = None
 ) -> RoomBoxes:
-    """New rooms with looks; given objects come first, with their own boxes.
+    """New rooms with looks and rectangles; given objects come first, with their own boxes.
 
     A room's contents are sampled first (`plan_rooms`), then its objects one by one, each at the
     first of `TRIES` sampled places where it neither intersects an object that it should not
@@ -65,13 +66,14 @@ def draw_rooms(
     given = given or nothing_given(count)
     keep = given.coming is not None
     slots, waiting = sampler.max_objects, torch.arange(count)
-    drawn = _nothing_drawn(count, slots)
+    drawn, rectangle_m = _nothing_drawn(count, slots), torch.zeros(count, 4)
     for number in range(PLANS * ROUNDS):
         last = number + 1 == PLANS * ROUNDS
         if number % ROUNDS == 0:
             plan = plan_rooms(sampler, given, count, (seed, number // ROUNDS))
         numbers = uniform_numbers(count, slots * (7 + 4 * PLACES), (seed, PLANS + number))
         numbers = numbers.unflatten(1, (slots, -1))
+        rectangle_m[waiting] = plan.rectangle_m[waiting]
         stuck = []
         for rows in waiting.split(BATCH):
             found, found_stuck = _draw(sampler, numbers[rows], plan.rows(rows), last, keep)
@@ -81,7 +83,7 @@ def draw_rooms(
         waiting = torch.cat(stuck)
         if last or not len(waiting):
             break
-    return drawn
+    return replace(drawn, rectangle_m=rectangle_m)
 
 
 def _nothing_drawn(count: int, slots: int) -> RoomBoxes:
