@@ -133,7 +133,7 @@ def score(views: RoomViews, truth: RoomGroundTruth, noisy: bool, seed: int) -> S
         for image, classes in ((found.ids, found.object_class), (named, views.object_class))
     )
     visible = observe(np.maximum(found.ids, 0).astype(np.uint32), found.object_class).tracked
-    rand = rand_index(true[judged], found.ids[judged])
+    rand = rand_index(true[judged], np.maximum(found.ids[judged], 0))
     return Score(rand, len(visible), count, iou, iou_true_ids, seconds)
 
 
