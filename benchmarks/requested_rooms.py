@@ -116,9 +116,7 @@ def requests_of(
     return requests
 
 
-def relations_of(
-    room: Scene, half: Sequence[Any], classes: tuple[str, ...]
-) -> list[RelationWish]:
+def relations_of(room: Scene, half: Sequence[Any], classes: tuple[str, ...]) -> list[RelationWish]:
     """Relations between these objects that hold in the room; its boxes have no known front."""
     labels = sorted({item.label for item in half})
     wishes = [RelationWish(label, relation) for label in labels for relation in OF_ONE]

@@ -43,7 +43,7 @@ def test_every_file_gives_the_outline(to, tmp_path):
 def test_a_room_of_a_house_is_named(tmp_path):
     name = written(tmp_path, "threed-front")
     assert len(read_floor_file(f"{name}:Bedroom-0").outline_m) == 6
-    with pytest.raises(InputError, match=r"has the rooms Bedroom-0; name one of them as room\.json:"):
+    with pytest.raises(InputError, match=r"the rooms Bedroom-0; name one of them as room\.json:"):
         read_floor_file(f"{name}:Kitchen-1")
 
 

@@ -14,7 +14,7 @@ KNOWN = [
 @pytest.mark.parametrize(
     ("text", "floor", "openings", "counts", "relations"),
     [
-        ("a 4 x 3 m bedroom with a door and two nightstands", "4x3", ["door"], ["2 nightstand"], []),
+        ("a 4 x 3 m bedroom with a door, two nightstands", "4x3", ["door"], ["2 nightstand"], []),
         (
             "A double bed and two nightstands beside it, a desk under the window, no sofa.",
             None, [], ["1 double_bed", "2 nightstand", "1 desk", "0 sofa"],
