@@ -12,30 +12,24 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import ndimage
 
 from data_prep.tracks.affinity import pair_weights
 from data_prep.tracks.clusters import cluster
 from data_prep.tracks.explained import explained
 from data_prep.tracks.leftovers import join_leftovers
-from data_prep.tracks.merged import cut, find_merged, owners
-from data_prep.tracks.rays import first_hits, surface
+from data_prep.tracks.merged import SPECK, Split, owners, split_merged
+from data_prep.tracks.rays import first_hits, surface, widened
 from data_prep.tracks.voxels import Grid, cameras_of, fill
 
 STEP = 3
 """Step between the rows and columns that are used, for a picture of 480 pixels."""
-WIDEN_PX = 1.5
-"""Width in sampled pixels by which masks are widened to compare views, since outlines, cells and
-poses are not exact."""
 ROUNDS, STRICT = 7, 2
 """Rounds of clustering and carving; from round STRICT on, cells need two views that agree."""
 AGREE = 0.45
 """Share of the views of a filled cell that must show one cluster there."""
-SPLIT = (3, 4, 5)
+SPLIT = (3, 5)
 """Rounds in which merged masks are split."""
 JOINS = 4
-SPECK = 5e-4
-"""Share of an image up to which a mask that joins no other is left unknown, not an object."""
 UNKNOWN = -1
 
 
@@ -93,19 +87,21 @@ def _labels(
     step = max(1, round(STEP * max(masks.ids.shape[1:]) / 480))
     cameras = cameras_of(world_to_camera, intrinsics, step)
     ids = np.ascontiguousarray(masks.ids[:, ::step, ::step])
-    near, view, classes = _widened(ids), masks.mask_view, masks.mask_class
+    near, view, classes = widened(ids), masks.mask_view, masks.mask_class
     grid = fill(ids, cameras)
     for number in range(ROUNDS):
         depth = first_hits(ids, cameras, grid)
         cells, shown = surface(near, cameras, grid, depth)
         weights = pair_weights(shown, view, classes)
         labels = cluster(weights)
-        if number in SPLIT and (split := find_merged(shown, labels, view)):
-            full = cut(masks.ids, step, split, shown, cells, labels, view, cameras, grid)
+        split: Split = []
+        if number in SPLIT:
+            full, split = split_merged(masks.ids, step, cells, shown, labels, view, cameras, grid)
+        if split:
             main = [np.bincount(classes[labels == other]).argmax() for _, other in split]
             masks = FrameMasks(full, np.concatenate([classes, main]))
             ids = np.ascontiguousarray(masks.ids[:, ::step, ::step])
-            near, classes = _widened(ids), masks.mask_class
+            near, classes = widened(ids), masks.mask_class
             view = np.concatenate([view, view[[mask for mask, _ in split]]])
         elif number < ROUNDS - 1:
             _carve(grid, cells, owners(shown, labels), shown, number >= STRICT)
@@ -116,17 +112,6 @@ def _labels(
             break
         labels = joined
     return masks, labels
-
-
-def _widened(ids: np.ndarray) -> np.ndarray:
-    """Widen masks into the background by `WIDEN_PX`."""
-    wide = ids.copy()
-    for image, new in zip(ids, wide, strict=True):
-        if (image > 0).any():
-            far, (rows, columns) = ndimage.distance_transform_edt(image <= 0, return_indices=True)
-            rim = (image == 0) & (far <= WIDEN_PX)
-            new[rim] = image[rows[rim], columns[rim]]
-    return wide
 
 
 def _carve(

@@ -4,6 +4,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
 
+from data_prep.tracks.explained import explained
+from data_prep.tracks.rays import widened
 from data_prep.tracks.voxels import Cameras, Grid
 
 CELLS = 4
@@ -15,8 +17,47 @@ PART = 0.03
 OTHERS = 2
 """Views, other than the mask's own, that must agree on the cluster of a cell."""
 
+OWN, OTHER = 0.75, 0.6
+"""Largest share of a part's rays that meet the hull of the mask's own cluster, and least share of
+those that meet the hull of the part's."""
+SPECK = 5e-4
+"""Share of an image that a part, or a mask that joins no other, must exceed."""
+
 Split = list[tuple[int, int]]
 """Pairs of a mask and another cluster that it shows as well as its own."""
+
+
+def split_merged(
+    full: Int[np.ndarray, "views rows columns"],
+    step: int,
+    cells: Int[np.ndarray, "cells 3"],
+    shown: Int[np.ndarray, "cells views"],
+    labels: Int[np.ndarray, " masks"],
+    mask_view: Int[np.ndarray, " masks"],
+    cameras: Cameras,
+    grid: Grid,
+) -> tuple[Int[np.ndarray, "views rows columns"], Split]:
+    """Cut masks of several clusters into parts, one per pair returned, with ids after the last.
+
+    A part must be explained by the hull of its own cluster and not by that of its mask's, which
+    else may hide the former. `full` are the images of ids, of which every `step`-th row and column
+    belongs to `cameras`.
+    """
+    split = find_merged(shown, labels, mask_view)
+    if not split:
+        return full, []
+    parted = cut(full, step, split, shown, cells, labels, mask_view, cameras, grid)
+    ids = np.ascontiguousarray(parted[:, ::step, ::step])
+    own = np.array([labels[mask] for mask, _ in split])
+    share = explained(ids, widened(ids), np.concatenate([labels, own]), cameras, grid)
+    rows, others = len(labels) + np.arange(len(split)), np.array([other for _, other in split])
+    pixels = np.bincount(parted[parted > 0], minlength=rows[-1] + 2)[rows + 1]
+    kept = (share[rows, own] <= OWN) & (share[rows, others] >= OTHER)
+    kept &= pixels > SPECK * full[0].size
+    back = np.arange(rows[-1] + 2)
+    back[rows + 1] = np.where(kept, len(labels) + np.cumsum(kept), [one + 1 for one, _ in split])
+    parted = np.where(parted > 0, back[np.maximum(parted, 0)], parted).astype(full.dtype)
+    return parted, [pair for pair, keep in zip(split, kept, strict=True) if keep]
 
 
 def owners(
@@ -72,11 +113,7 @@ def cut(
     cameras: Cameras,
     grid: Grid,
 ) -> Int[np.ndarray, "views rows columns"]:
-    """Give each part found by `find_merged` an id of its own, after the last: one per pair.
-
-    A pixel goes to the cluster whose cell projects nearest to it. `full` are the images of ids, of
-    which every `step`-th row and column belongs to `cameras`.
-    """
+    """Give each part an id of its own. A pixel goes to the cluster whose cell projects nearest."""
     full = full.copy()
     votes = owners(shown, labels)
     number = len(labels)
