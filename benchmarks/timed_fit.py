@@ -76,12 +76,13 @@ class StageTimes:
 
     @property
     def epoch_cpu_s(self) -> float:
-        """Median CPU seconds of these epochs in this process, without loader processes."""
+        """Median CPU seconds of the epochs of `epoch_s` in this process, without its loaders."""
         return _between(self.starts_cpu_s)
 
     @property
     def step_s(self) -> float:
-        """Median seconds of a step in these epochs: loss, backward and update, without loading."""
+        """Median seconds of a step (loss, backward and update, without loading), in the epochs of
+        `epoch_s`."""
         return statistics.median(step for epoch in self.steps_s[1:-1] for step in epoch)
 
     def figures(self) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """Commands that prepare data, mounted by `sceneprior.apps.cli`.
 
-Heavy imports stand inside the functions, so that the command line starts quickly.
+Heavy imports are inside the functions, so that the command line starts quickly.
 """
 
 from pathlib import Path

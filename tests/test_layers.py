@@ -44,7 +44,7 @@ OWNERS = {
     "OpenGL": ["sceneprior/render/offscreen/"],
     "numba": [
         "sceneprior/render/silhouettes/", "sceneprior/render/offscreen/zbuffer.py",
-        "sceneprior/lifted/lifting/",
+        "sceneprior/lifted/lifting/", "data_prep/tracks/",
     ],
     "triton": ["sceneprior/render/silhouettes/"],
     "lightning": [
@@ -58,12 +58,12 @@ OWNERS = {
     "pydantic": [
         "sceneprior/core/", "sceneprior/training/", "sceneprior/paper/", "sceneprior/lifted/",
         "sceneprior/baselines/", "sceneprior/apps/decoders.py", "sceneprior/apps/experiments/",
-        "data_prep/",
+        "sceneprior/apps/requests.py", "data_prep/",
     ],
     "typer": ["sceneprior/apps/cli/", "data_prep/cli.py"],
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
-    "skimage": ["sceneprior/core/geometry/isosurface.py"],
+    "skimage": ["sceneprior/core/geometry/isosurface", "sceneprior/lifted/lifting/outlines"],
     "manifold3d": ["sceneprior/core/geometry/part_meshes.py", "sceneprior/core/shell.py"],
     "fast_simplification": ["sceneprior/core/geometry/isosurface.py"],
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/stage"],

@@ -44,7 +44,9 @@ def report_tables(report: dict[str, Any]) -> list[Table]:
     ]
     tables = [
         make_table(("rooms", ""), outcomes),
-        make_table(("split", *_COUNTS, "views a room", "objects a room", "objects a view"), splits),
+        make_table(
+            ("split", *_COUNTS, "views per room", "objects per room", "objects per view"), splits
+        ),
         make_table(("class", *report["counts"]), classes),
     ]
     if notes := [*report["notes"].items()]:

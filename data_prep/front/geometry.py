@@ -151,7 +151,10 @@ def _wall_angle(floor: Floor) -> float:
 
 
 def height_of(surfaces: dict[str, list[np.ndarray]], floor_y: float) -> float:
-    """Room height: up to the top of the inner walls, else of the ceiling, else the default."""
+    """Room height in metres, up to the top of the inner walls, or else of the ceiling.
+
+    Without either, it is `DEFAULT_HEIGHT_M`.
+    """
     for kind in ("WallInner", "Ceiling"):
         tops = [float(part[..., 1].max()) for part in surfaces.get(kind, []) if len(part)]
         if tops and max(tops) - floor_y > 1.0:

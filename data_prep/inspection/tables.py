@@ -39,7 +39,7 @@ def count_tables(folder: Path) -> list[Table]:
         totals.append((split, len(rooms), views, objects, *means, in_3d, image_size))
         classes[split] = Counter(names[index] for room in rooms for index in room.object_class)
     columns = (
-        "split", "rooms", "views", "objects", "objects a room", "objects a view", "known in 3D",
+        "split", "rooms", "views", "objects", "objects per room", "objects per view", "known in 3D",
         "image size",
     )  # fmt: skip
     every = sorted({name for counts in classes.values() for name in counts})

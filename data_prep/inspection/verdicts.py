@@ -18,8 +18,8 @@ from sceneprior.core.shards import RoomViews
 _ROOM_MASKS = 5
 """Minimum number of masks for a statement about a room."""
 _OUTLIER = 0.5
-"""In a room that agrees as a whole, views and objects with a smaller share of agreeing masks are
-reported."""
+"""Share of agreeing masks below which a view or object is reported, in a room that agrees as a
+whole."""
 _CAMERA_HEIGHTS_M = 0.2, 4.0
 _OBJECT_SIZES_M = 0.15, 6.0
 """Plausible ranges of a room's median camera height and median object length."""

@@ -84,7 +84,7 @@ class PosedFrame:
     instances: Path
     """PNG of tracked ids; it may be missing."""
     known: Path | None
-    """PNG from `mask_path`, 0 where the ids are unknown."""
+    """PNG from `mask_path`; 0 marks pixels with unknown ids."""
     camera: Camera
 
 

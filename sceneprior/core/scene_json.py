@@ -87,7 +87,9 @@ class _SolidEntry(BaseModel):
     high_m: _Triple
 
 
-class _ObjectEntry(BaseModel):
+class ObjectEntry(BaseModel):
+    """An object of a file."""
+
     model_config = _STRICT
 
     label: str = Field(alias="class")
@@ -98,7 +100,9 @@ class _ObjectEntry(BaseModel):
     solids: Annotated[list[_SolidEntry], Field(max_length=MOST_SOLIDS)] = []
 
 
-class _OpeningEntry(BaseModel):
+class OpeningEntry(BaseModel):
+    """A door or a window of a file."""
+
     model_config = _STRICT
 
     kind: Literal["door", "window"]
@@ -113,9 +117,9 @@ class _SceneEntry(BaseModel):
 
     name: str | None = None
     label_set: str
-    objects: Annotated[list[_ObjectEntry], Field(max_length=MOST_OBJECTS)]
+    objects: Annotated[list[ObjectEntry], Field(max_length=MOST_OBJECTS)]
     floor_m: Annotated[list[_Pair], Field(min_length=3)] | None = None
-    openings: list[_OpeningEntry] = []
+    openings: list[OpeningEntry] = []
     ceiling_m: Annotated[float, Field(gt=0, le=FARTHEST_M)] | None = None
     extra: dict[str, Any] = {}
 
@@ -138,20 +142,13 @@ def read_scene(path: Path) -> Scene:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: extra cannot be written as JSON ({error}).") from None
     names = label_set(entry.label_set)
-    objects = []
     for item in entry.objects:
         if item.label not in names:
             raise InputError(
                 f"{path}: class '{_short(item.label)}' is not in label set "
                 f"'{_short(entry.label_set)}'; use one of {', '.join(names)}."
             )
-        check_box(path, item.label, item.center_m, item.size_m)
-        turned = _turned_of(path, item)
-        solids = tuple(Solid(**solid.model_dump()) for solid in item.solids)
-        check_solids(path, item.label, item.center_m, item.size_m, solids)
-        objects.append(
-            SceneObject(item.label, item.center_m, item.size_m, turned=turned, solids=solids)
-        )
+    objects = [read_object(path, item) for item in entry.objects]
     floor = None if entry.floor_m is None else np.array(entry.floor_m, dtype=np.float64)
     if floor is not None:
         check_floor(path, floor)
@@ -166,6 +163,15 @@ def read_scene(path: Path) -> Scene:
         openings=openings,
         ceiling_m=entry.ceiling_m,
     )
+
+
+def read_object(path: Path, item: ObjectEntry) -> SceneObject:
+    """An object of a file; its boxes are checked, its class is not."""
+    check_box(path, item.label, item.center_m, item.size_m)
+    turned = _turned_of(path, item)
+    solids = tuple(Solid(**solid.model_dump()) for solid in item.solids)
+    check_solids(path, item.label, item.center_m, item.size_m, solids)
+    return SceneObject(item.label, item.center_m, item.size_m, turned=turned, solids=solids)
 
 
 def check_box(
@@ -241,7 +247,7 @@ def _unit_guess(numbers: Any) -> str:
     return f"Are these {unit}? Give metres."
 
 
-def _turned_of(path: Path, item: _ObjectEntry) -> Turned | None:
+def _turned_of(path: Path, item: ObjectEntry) -> Turned | None:
     """Oriented box of an entry, if it has one; it must fill the axis-aligned box."""
     if item.yaw_rad is None and item.own_size_m is None:
         return None

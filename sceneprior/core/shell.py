@@ -64,12 +64,12 @@ class Shell:
 
     def meshes(self) -> dict[str, Mesh]:
         """Closed meshes by name: `floor`, `wall_0` and so on, and `ceiling`."""
-        named = {"floor": _slab(self.outline_m, -THICK_M, 0.0)}
+        named = {"floor": slab(self.outline_m, -THICK_M, 0.0)}
         corners = _outer_corners(self.walls)
         for row, wall in enumerate(self.walls):
             outer = (corners[row], corners[(row + 1) % len(corners)])
             named[f"wall_{row}"] = _wall_mesh(wall, outer, self.height_m)
-        named["ceiling"] = _slab(self.outline_m, self.height_m, self.height_m + THICK_M)
+        named["ceiling"] = slab(self.outline_m, self.height_m, self.height_m + THICK_M)
         return named
 
 
@@ -94,7 +94,7 @@ def shell_of(scene: Scene) -> Shell:
     """
     outline = scene.floor_m
     if outline is None:
-        outline = _rectangle(*floor_rectangle(scene))
+        outline = rectangle(*floor_rectangle(scene))
     plain = _corners(outline)
     grown, grown_m = _grown(plain, scene)
     walls = _walls(grown)
@@ -146,9 +146,10 @@ def _height(scene: Scene) -> float:
     return float(max(hung.max(initial=0) or HEIGHT_M, others))
 
 
-def _rectangle(
+def rectangle(
     low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "4 2"]:
+    """Corners (x, z) of a rectangle between two of them."""
     return np.array([low, (high[0], low[1]), high, (low[0], high[1])])
 
 
@@ -202,7 +203,7 @@ def _grown(
     every = np.concatenate([corners, [low, high]])
     low, high = every.min(axis=0), every.max(axis=0)
     far = np.concatenate([corners.min(axis=0) - low, high - corners.max(axis=0)]).max()
-    return _rectangle(low, high), float(far)
+    return rectangle(low, high), float(far)
 
 
 def _push(
@@ -274,11 +275,12 @@ def _within(wall: Wall, height_m: float) -> Wall:
     return wall._replace(openings=tuple(s for s in spans if s[0] < s[1] and s[2] < s[3]))
 
 
-def _slab(outline_m: Float[np.ndarray, "corners 2"], low_m: float, high_m: float) -> Mesh:
-    from manifold3d import CrossSection
+def slab(outline_m: Float[np.ndarray, "corners 2"], low_m: float, high_m: float) -> Mesh:
+    """A closed mesh that fills an outline (x, z) between two heights."""
+    from manifold3d import CrossSection, FillRule
 
-    # The cross section lies in x and -z, where the outline runs clockwise, and is extruded along y.
-    flat = CrossSection([(outline_m * [1, -1])[::-1]])
+    # The cross section lies in x and -z, and is extruded along y. Outlines run either way.
+    flat = CrossSection([np.asarray(outline_m, np.float64) * [1, -1]], FillRule.NonZero)
     mesh = flat.extrude(high_m - low_m).to_mesh64()
     points = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
     placed = np.stack([points[:, 0], points[:, 2] + low_m, -points[:, 1]], axis=1)

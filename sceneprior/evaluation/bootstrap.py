@@ -27,7 +27,7 @@ class Estimate:
     """A metric's value on the rooms and on every resample of them."""
 
     value: float | None
-    """None if the metric is undefined for this set."""
+    """Value on the rooms themselves; None if the metric is undefined for this set."""
     resamples: Float[np.ndarray, " resamples"]
     """Values on the resamples; those on which the metric is undefined are left out."""
     low: float = -np.inf

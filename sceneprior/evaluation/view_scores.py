@@ -31,7 +31,7 @@ class ObjectPair:
 
     truth: SceneObject
     found: SceneObject | None
-    """None if no object was fitted: its IoUs and F-score are 0, and it has no distance."""
+    """The fitted object. If it is None, the true object has IoUs and F-score 0, and no distance."""
 
 
 @dataclass(frozen=True)

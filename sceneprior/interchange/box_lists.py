@@ -84,7 +84,7 @@ def read_boxes(
                 f"{path}: a room has {len(objects)} objects; expected at most {MOST_OBJECTS}."
             )
         come_from = {"converted_from": path.name}
-        scenes.append(Scene(own, label_set_name, objects, _floor(path, room), come_from))
+        scenes.append(Scene(own, label_set_name, objects, floor_outline(path, room), come_from))
     return scenes
 
 
@@ -215,7 +215,7 @@ def turned_box(
     return replace(item, mesh=Mesh(own.vertices_m @ yaw_rotation(yaw_rad).T + center, own.faces))
 
 
-def _floor(path: Path, room: dict[str, Any]) -> np.ndarray | None:
+def floor_outline(path: Path, room: dict[str, Any]) -> np.ndarray | None:
     """Outline of the floor's triangles relative to its centroid, the origin of ATISS's boxes."""
     if any(key not in room for key in FLOOR):
         return None

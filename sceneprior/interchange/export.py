@@ -70,7 +70,7 @@ def export_scenes(
 
 
 def stand_all(scenes: Sequence[Scene]) -> tuple[list[Scene], list[str]]:
-    """The scenes with their objects standing, and a note on what changed, if anything did."""
+    """The scenes with all objects made to stand, and a note on the changes, if there are any."""
     pairs = [stand(scene) for scene in scenes]
     changes = sum((told for _, told in pairs), Counter[str]())
     standing = [scene for scene, _ in pairs]

@@ -78,7 +78,7 @@ def mixed_colors(room: DecodedRoom) -> UInt8[np.ndarray, "objects 3"]:
     probabilities, so that colours change as gradually as the room does."""
     share = room.class_logits.softmax(dim=-1).double().numpy()
     share[:, VOID] = 0
-    # A decoded object's likeliest class is not void, so the sum is not 0.
+    # The most likely class of a decoded object is not void, so the sum is not 0.
     mixed = share @ class_colors(share.shape[1]).astype(np.float64)
     return np.rint(mixed / share.sum(axis=-1, keepdims=True)).astype(np.uint8)
 

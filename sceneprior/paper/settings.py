@@ -100,7 +100,8 @@ class ShapeConfig(StageConfig):
     """Visible masks of overlapping objects. `paper`: the scene's coverage goes to the front-most
     object of each pixel; `layered`: a boundary between two objects also moves the one in front."""
     box_from: Literal["mesh", "proxy"] = "mesh"
-    """`mesh`: 2D boxes come from the deformed mesh (paper); `proxy`: still from the proxy."""
+    """Shape from which 2D boxes are computed in this stage: the deformed `mesh` (paper), or the
+    `proxy`, as in the layout stage."""
 
     @property
     def shape_rate(self) -> float:

@@ -17,6 +17,7 @@ from sceneprior.core.files import is_name, read_json, write_json, write_whole
 from sceneprior.core.scene import Mesh, Scene, mesh_of_file
 from sceneprior.core.scene_json import FORMAT, read_scene, scene_to_json
 from sceneprior.core.shell import ShellName, is_shell, shell_meshes
+from sceneprior.render.floor_plans import floor_plan
 from sceneprior.render.offscreen import Renderer, open_renderer
 from sceneprior.render.pictures import png_bytes
 from sceneprior.render.scene_usd import scene_to_usd
@@ -26,7 +27,6 @@ from sceneprior.render.topdown import (
     object_colors,
     scene_meshes,
     shell_color,
-    topdown,
 )
 
 NO_SHELL: Mapping[str, Mesh] = {}
@@ -41,9 +41,8 @@ def save_scene(
 
     `.json`: classes and boxes. `.glb`: one node per object, called `<index>_<class>`, in the class
     colour; an object without a mesh is written as its box. `.obj`: the same objects, with an `.mtl`
-    file. `.usda`: one mesh per object, its class in `userProperties:class`. `.png`: the top-down
-    picture that metrics use, but with borders between objects. 3D formats keep the axes and the
-    unit of the room frame: y up, metres.
+    file. `.usda`: one mesh per object, its class in `userProperties:class`. `.png`: a floor plan
+    of the whole room. 3D formats keep the axes and the unit of the room frame: y up, metres.
 
     Args:
         renderer: Renderer of the picture; None opens one.
@@ -67,8 +66,7 @@ def save_scene(
         case ".usda":
             write_whole(path, scene_to_usd(scene, shell_meshes(scene, shell)))
         case ".png":
-            picture = topdown(scene, renderer or open_renderer(), outlines=True)
-            write_whole(path, png_bytes(picture))
+            write_whole(path, png_bytes(floor_plan(scene, renderer or open_renderer())))
         case suffix:
             raise InputError(
                 f"{path} ends with '{suffix}', which is not a scene format; end it with one of "
@@ -92,7 +90,7 @@ def scene_to_glb(scene: Scene, shell: Mapping[str, Mesh] = NO_SHELL) -> bytes:
 def scene_to_obj(
     scene: Scene, materials: str, shell: Mapping[str, Mesh] = NO_SHELL
 ) -> tuple[str, bytes]:
-    """The scene as the texts of a Wavefront OBJ, with one named object per piece, and of its MTL.
+    """The scene as a Wavefront OBJ, with one named object per piece of furniture, and as its MTL.
 
     The OBJ refers to the MTL file by the name `materials`. y is up, in metres, as in the GLB.
     """

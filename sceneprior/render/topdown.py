@@ -10,7 +10,7 @@ from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.floor import floor_rectangle
 from sceneprior.core.geometry.corners import BOX_FACES, box_corners
 from sceneprior.core.scene import Mesh, Scene, SceneObject
-from sceneprior.core.shell import shell_of
+from sceneprior.core.shell import rectangle, shell_of, slab
 from sceneprior.render.offscreen import Orthographic, Pinhole, Renderer
 from sceneprior.render.pictures import paint_ids
 
@@ -163,14 +163,14 @@ def room_view(scene: Scene, image_size: tuple[int, int] = (360, 480)) -> CornerV
 def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480)) -> CornerView:
     """A view from outside, above a corner, that just contains all given rooms.
 
-    The floor is the rectangle around the outlines of the rooms; a room without an outline
-    contributes its objects.
+    The floor is that of the room's outline; without an outline, and for several rooms, it is the
+    rectangle around outlines and objects.
     """
     floors = np.array([floor_rectangle(scene) for scene in scenes])
     low, high = floors[:, 0].min(axis=0), floors[:, 1].max(axis=0)
     # Top face 2 cm below y = 0, so that objects on the floor do not z-fight with it.
-    center = ((low[0] + high[0]) / 2, -0.03, (low[1] + high[1]) / 2)
-    floor = box_mesh(center, (high[0] - low[0], 0.02, high[1] - low[1]))
+    outline = scenes[0].floor_m if len(scenes) == 1 else None
+    floor = slab(rectangle(low, high) if outline is None else outline, -0.04, -0.02)
     meshes = [floor, *(mesh for scene in scenes for mesh in scene_meshes(scene))]
     return _fitted(meshes, image_size, floor)
 

@@ -17,6 +17,7 @@ from sceneprior.core.classes import class_colors
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m, mesh_of_file
 from sceneprior.core.scene_json import scene_to_json
+from sceneprior.render.floor_plans import floor_plan
 from sceneprior.render.offscreen import open_renderer
 from sceneprior.render.scene_files import (
     load_scene,
@@ -88,7 +89,7 @@ def test_what_is_written_comes_back(scene, tmp_path, renderer):
     np.testing.assert_allclose((high + low) / 2, (1.5, 0.25, -0.5), atol=1e-6)
     np.testing.assert_allclose(high - low, (0.5, 0.5, 0.4), atol=1e-6)
     picture = np.asarray(Image.open(tmp_path / "new" / "room_0.png"))
-    np.testing.assert_array_equal(picture, topdown(scene, renderer, outlines=True))
+    np.testing.assert_array_equal(picture, floor_plan(scene, renderer))
     np.testing.assert_array_equal(topdown(back, renderer), topdown(scene, renderer))
 
 

@@ -11,14 +11,21 @@ import typer
 from sceneprior.apps.cli.options import (
     MODELS_HELP,
     CacheOption,
+    CeilingOption,
     CountOption,
     DistributionOption,
+    FloorOption,
+    OpeningsOption,
     OverwriteOption,
     RendererOption,
+    RequestOption,
     RunOption,
     SeedOption,
     ShellOption,
+    WantOption,
     checked_shell,
+    note_unmet,
+    request_of,
 )
 
 
@@ -28,6 +35,11 @@ def synthesize(
     count: CountOption = 16,
     seed: SeedOption = 0,
     distribution: DistributionOption = None,
+    floor: FloorOption = None,
+    openings: OpeningsOption = None,
+    ceiling: CeilingOption = None,
+    want: WantOption = None,
+    request: RequestOption = None,
     html: Annotated[
         bool, typer.Option("--html", help="Write rooms.html, too: one page of 3D models.")
     ] = False,
@@ -47,10 +59,12 @@ def synthesize(
 
     check_free(out, overwrite)
     drawn = checked_shell(shell or "none")
+    asked = request_of(floor, openings, ceiling, want, request)
     prior = load(run)
     artist = open_renderer(renderer)
-    scenes = prior.sample(count, seed, distribution)
+    scenes = prior.sample(count, seed, distribution, **asked)
     write_scenes(scenes, out, artist, drawn)
+    note_unmet(scenes)
     origin = distribution or prior.distribution
     if html:
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
@@ -97,6 +111,7 @@ def complete(
         str | None,
         typer.Option(help="Classes of the objects to add: double_bed,nightstand (samplers only)."),
     ] = None,
+    want: WantOption = None,
     distribution: DistributionOption = None,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
@@ -111,8 +126,9 @@ def complete(
     scene = load_scene(given)
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
     prior = load(run)
-    scenes = prior.complete(scene, count, seed, distribution, wanted)
+    scenes = prior.complete(scene, count, seed, distribution, wanted, want)
     write_scenes(scenes, out, open_renderer(renderer))
+    note_unmet(scenes)
     how = "drawn by the sampler" if scenes[0].latent is None else "decoded from fitted latents"
     typer.echo(f"Wrote {count} rooms around {len(scene.objects)} given objects, {how}, to {out}")
     for room in scenes:

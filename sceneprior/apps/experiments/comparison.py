@@ -146,7 +146,7 @@ class Run:
     rooms: str
     method: str
     seed: int | None
-    """None for scenes."""
+    """Seed of training; None for scenes."""
     config: str
     settings: tuple[str, ...]
     """Changes to the config, for `fit --set`."""

@@ -32,9 +32,10 @@ class Row:
     group: str
     title: str
     variant: str
-    """Value that distinguishes the row from other rows of its run, under `Form.variant`."""
+    """Value that distinguishes the row from other rows of its run; `Form.variant` is the heading of
+    its column."""
     seed: int | None
-    """None for existing scenes."""
+    """Seed of training; None for existing scenes."""
     scores: dict[str, Any]
     """Values by key of a result, with its protocol, reference rows and the costs of training."""
     made_by: str
@@ -170,8 +171,8 @@ def _caption(rows: Sequence[Row], form: Form) -> str:
 def _of_new_rooms(scores: dict[str, Any]) -> str:
     protocol = scores["protocol"]
     return (
-        f"{protocol['n_generated']} generated rooms a run against {protocol['n_test']} test rooms "
-        f"of {protocol['shards']}; {protocol['n_train_rooms']} real training rooms"
+        f"{protocol['n_generated']} generated rooms per run against {protocol['n_test']} test "
+        f"rooms of {protocol['shards']}; {protocol['n_train_rooms']} real training rooms"
     )
 
 
@@ -205,9 +206,9 @@ NEW_ROOMS = Form(
 )
 CD = TableColumn("CD (m)", 3, "CD: mean distance to the other surface, both ways added")
 SECONDS = TableColumn(
-    "s an image",
+    "s per image",
     3,
-    "s an image: CPU seconds, all images together; [from, to]: 95% interval over rooms, all views "
+    "s per image: CPU seconds, all images together; [from, to]: 95% interval over rooms, all views "
     "of a room together",
 )
 VIEWS = Form(

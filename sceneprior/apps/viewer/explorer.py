@@ -26,7 +26,7 @@ from sceneprior.paper.trained import TrainedPrior, with_training_latents
 PATH_STEPS = 49
 """Number of rooms of a path with both ends; neighbours are rarely more than 4 degrees apart."""
 SOME = 64
-"""Largest number of training rooms for estimating room sizes; all would take a second."""
+"""Largest number of training rooms for estimating room sizes; decoding all would take a second."""
 HERE = "here"
 """Name of the shown room as an end of a path."""
 

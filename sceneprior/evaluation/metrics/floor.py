@@ -1,7 +1,7 @@
 """Metrics of the floor: objects outside its outline, and the walkable area between objects.
 
 An object's footprint is its axis-aligned box on the floor (x, z). Areas are exact (shapely), except
-that round corners are polygons of `ARC_SEGMENTS` sides per quarter turn.
+that rounded corners are polygons of `ARC_SEGMENTS` sides per quarter turn.
 """
 
 from functools import partial

@@ -18,12 +18,12 @@ MOVED_M, TURNED_RAD = 0.01, 0.1
 
 @dataclass(frozen=True)
 class Settled:
-    """What became of the objects of a scene."""
+    """Motion of a scene's objects in a simulation, and their overlap at the start."""
 
     moved_m: Float[np.ndarray, " objects"]
     turned_rad: Float[np.ndarray, " objects"]
     penetration_m: float
-    """Deepest overlap of two objects, or of an object and the room, at the start."""
+    """Largest penetration depth of two objects, or of an object and the room, at the start."""
 
     @property
     def stable(self) -> Bool[np.ndarray, " objects"]:
@@ -70,6 +70,6 @@ def _mujoco() -> Any:
         import mujoco
     except ImportError:
         raise InputError(
-            "Simulating rooms needs another package: pip install 'sceneprior[sim]'."
+            "Simulating rooms needs one more package: pip install 'sceneprior[sim]'."
         ) from None
     return mujoco

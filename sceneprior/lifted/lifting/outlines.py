@@ -22,7 +22,6 @@ def outline_of(hull: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "corners 2"
     is empty."""
     from skimage.measure import find_contours  # imported here: recognising looks needs none
 
-    cells = len(hull)
     seen = np.pad(hull.any(axis=1), 1).astype(np.float64)
     found = [shapely.Polygon(line) for line in find_contours(seen, 0.5) if len(line) > 3]
     if not found:
@@ -33,7 +32,7 @@ def outline_of(hull: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "corners 2"
         tolerance *= 1.25
     corners = shapely.get_coordinates(shapely.geometry.polygon.orient(polygon))[:-1]
     low, high = corners.min(axis=0), corners.max(axis=0)
-    if (high - low).min() < 3 or polygon.area > FULL * cells**2:
+    if (high - low).min() < 3:
         return SQUARE
     outline: np.ndarray = (corners - low) / (high - low) - 0.5
     return outline if shapely.Polygon(outline).area <= FULL else SQUARE

@@ -22,7 +22,7 @@ POINTS_LEVEL = 1
 """Icosphere level of the 42 directions in which a shape's extreme points are compared."""
 
 UNIT_BOX = np.array([0.0, 0, 0, 1, 1, 1])
-"""A box (centre, extents) of 1 m at the origin."""
+"""Centre and extents of a cube at the origin, with sides of 1 m."""
 
 
 class Candidates(NamedTuple):
@@ -36,7 +36,7 @@ class Candidates(NamedTuple):
     bottom_m: Float[Tensor, " objects"]
     sizes_m: Float[Tensor, "objects 3"]
     points: Float[Tensor, "objects points 3"]
-    """Points of the surface; the box is [-0.5, 0.5]^3."""
+    """Points on the surface, in the frame in which the object's box is [-0.5, 0.5]^3."""
 
     def take(self, rows: Int[Tensor, " rows"]) -> "Candidates":
         """The candidates of these rows."""

@@ -76,7 +76,7 @@ class KnownAnswer(NamedTuple):
 
 
 def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
-    """The rooms of a split, turned by 0, 90, 180 and 270 degrees."""
+    """The rooms of a split, each turned by 0, 90, 180 and 270 degrees."""
     rooms = [
         (shard.path, reference_scene(shard, room_id, shards, meshes=False))
         for shard, room_id in iterate_rooms(shards, split)

@@ -13,8 +13,8 @@ from sceneprior.lifted.requests.judge import Judge
 from sceneprior.lifted.requests.particles import PARTICLES, Particles, begin
 from sceneprior.lifted.requests.plans import RoomPlan, check_area, plan_room
 from sceneprior.lifted.requests.request import Request
-from sceneprior.lifted.requests.steps import HANGING, Hurdles, place_next
-from sceneprior.lifted.requests.wishes import check_wishes
+from sceneprior.lifted.requests.steps import HANGING, Hurdles, furniture_of, place_next
+from sceneprior.lifted.requests.wishes import RelationWish, check_wishes
 from sceneprior.lifted.sampler.draw import LOOKS, with_looks
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.plan import Plan
@@ -60,7 +60,6 @@ def draw_requested(
         sampler.max_objects,
     )  # fmt: skip
     check_area(sampler, request, classes)
-    hanging = [classes.index(label) for label in HANGING if label in classes]
     given = _given(sampler, request, classes, seed)
     answers: list[Answer | None] = [None] * count
     hurdles: Hurdles = Counter()
@@ -76,7 +75,9 @@ def draw_requested(
                 )
                 for row, own in zip(rows, draws, strict=True)
             ]  # fmt: skip
-            found = _furnish(sampler, plans, given, draws, hanging, number, hurdles)
+            found = _furnish(
+                sampler, plans, given, draws, request.wishes.relations, classes, number, hurdles
+            )
             for row, answer in zip(rows, found, strict=True):
                 answers[row] = answer
     drawn = [answer for answer in answers if answer is not None]
@@ -114,13 +115,16 @@ def _furnish(
     plans: Sequence[RoomPlan],
     given: RoomBoxes,
     draws: Sequence[np.random.Generator],
-    hanging: Sequence[int],
+    relations: Sequence[RelationWish],
+    classes: tuple[str, ...],
     number: int,
     hurdles: Hurdles,
 ) -> list[Answer | None]:
     """One attempt at each room; None where an object found no place."""
     particles = begin(sampler, plans, given)
-    judges = [Judge(plan.shape) for plan in plans]
+    objects = furniture_of(sampler, given, 0)
+    judges = [Judge(plan.shape, relations, classes, objects) for plan in plans]
+    hanging = [classes.index(label) for label in HANGING if label in classes]
     failed = [False] * len(plans)
     lacking: list[list[int]] = [[] for _ in plans]
     for step in range(max((len(plan.coming) for plan in plans), default=0)):

@@ -7,6 +7,7 @@ import torch
 
 from sceneprior.core.errors import InputError
 from sceneprior.lifted.requests.contents import draw_contents, wanted_rows
+from sceneprior.lifted.requests.openings import place_openings
 from sceneprior.lifted.requests.request import Request
 from sceneprior.lifted.requests.shape import RoomShape
 from sceneprior.lifted.sampler.network import RoomSampler
@@ -61,7 +62,7 @@ def _shape(
     sampler: RoomSampler, request: Request, needed: list[int], draws: np.random.Generator
 ) -> RoomShape:
     if request.outline_m is not None:
-        return RoomShape(request.outline_m, ceiling_m=request.ceiling_m)
+        return _with_openings(request.outline_m, request, draws)
     needed_m2 = float(sampler.footprints_m2[needed].sum()) / FULL_SHARE
     numbers = torch.from_numpy(draws.random((RECTANGLES, 5))).float()
     noise = torch.special.ndtri(numbers[:, 1:].clamp(1e-6, 1 - 1e-6))
@@ -73,7 +74,14 @@ def _shape(
         boxes_m = np.array([[*item.center_m, *item.size_m] for item in request.objects])
         reach = (np.abs(boxes_m[:, [0, 2]]) + boxes_m[:, [3, 5]] / 2).max(axis=0)
         x, z = max(x, reach[0]), max(z, reach[1])
-    return RoomShape(np.array([[-x, -z], [x, -z], [x, z], [-x, z]]), ceiling_m=request.ceiling_m)
+    return _with_openings(np.array([[-x, -z], [x, -z], [x, z], [-x, z]]), request, draws)
+
+
+def _with_openings(
+    outline_m: np.ndarray, request: Request, draws: np.random.Generator
+) -> RoomShape:
+    openings = place_openings(outline_m, request.openings, draws)
+    return RoomShape(outline_m, openings, request.ceiling_m)
 
 
 def check_area(sampler: RoomSampler, request: Request, classes: tuple[str, ...]) -> None:

@@ -26,6 +26,7 @@ import shapely
 from jaxtyping import Bool, Float, Int
 
 from sceneprior.core.scene import Opening
+from sceneprior.lifted.requests.openings import inward_of
 from sceneprior.lifted.requests.shape import RoomShape, sides_of
 
 OF_ONE = ("at a wall", "in a corner")
@@ -82,14 +83,6 @@ def _opening_box(opening: Opening) -> list[float]:
     (x, z), (along_x, along_z) = ends.mean(axis=0), np.ptp(ends, axis=0)
     height = opening.top_m - opening.bottom_m
     return [x, (opening.top_m + opening.bottom_m) / 2, z, along_x, height, along_z]
-
-
-def inward_of(shape: RoomShape, opening: Opening) -> Float[np.ndarray, "2"]:
-    """Unit normal into the room of the side that a door or window is in."""
-    middle = shapely.Point(np.mean([opening.start_m, opening.end_m], axis=0))
-    sides = sides_of(shape.outline_m)
-    lines = [shapely.LineString([side.start_m, side.end_m]) for side in sides]
-    return sides[int(np.argmin(shapely.distance(lines, middle)))].inward
 
 
 def related(

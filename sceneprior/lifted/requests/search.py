@@ -1,6 +1,7 @@
 """A place for a wanted object where the sampler draws none that fits: candidates all over the room,
 one of which is chosen by the sampler's density."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,8 @@ from torch import Tensor
 from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.mixtures import draw_index
 from sceneprior.lifted.prototypes import turned_looks
-from sceneprior.lifted.requests.judge import Candidates, Judge, Standing
+from sceneprior.lifted.requests.holding import Furniture
+from sceneprior.lifted.requests.judge import Judge
 from sceneprior.lifted.sampler.frames import backs_of
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.reading import Frame, Reading
@@ -40,7 +42,8 @@ def search(
     reading: Reading,
     piece: Piece,
     judge: Judge,
-    standing: Standing,
+    standing: Furniture,
+    coming: Sequence[int],
     draws: np.random.Generator,
 ) -> tuple[int, Float[Tensor, "6"]] | str:
     """The look, turned by quarters, and the box of a place that fits; or what is in the way.
@@ -50,6 +53,8 @@ def search(
 
     Args:
         reading: The encoder's outputs for the particle, one row.
+        standing: The objects that are there.
+        coming: Classes that come later.
     """
     quarters = torch.from_numpy(draws.integers(QUARTERS, size=CANDIDATES))
     looks = turned_looks(
@@ -70,9 +75,11 @@ def search(
     if not len(free):
         return "free floor"
     back = backs_of(looks[free], sampler.backs)
-    candidates = Candidates(boxes_m[free].double().numpy(), back.numpy())
+    candidates = Furniture(
+        boxes_m[free].double().numpy(), np.full(len(free), piece.label), back.numpy()
+    )
     allowed, hurdle = judge.allows(
-        piece.label, candidates, standing, rectangle_m[free].double().numpy()
+        piece.label, candidates, standing, coming, rectangle_m[free].double().numpy(), COMPARED
     )
     fits = free[torch.from_numpy(np.flatnonzero(allowed)[:COMPARED])]
     if not len(fits):

@@ -11,7 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.core.mixtures import draw_index
-from sceneprior.lifted.requests.judge import Candidates, Judge, Standing
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.requests.holding import Furniture
+from sceneprior.lifted.requests.judge import Judge
 from sceneprior.lifted.requests.particles import PARTICLES, Particles
 from sceneprior.lifted.requests.search import Piece, search
 from sceneprior.lifted.sampler.draw import SIZE_RANGE
@@ -76,7 +78,8 @@ def place_next(
             room = row // PARTICLES
             placed = search(
                 sampler, found.reading.rows(torch.tensor([at])), piece, judges[room],
-                standing(sampler, particles, row, step), draws[room],
+                furniture_of(sampler, particles.rooms, row),
+                particles.plan(row).coming[step + 1 :], draws[room],
             )  # fmt: skip
         if isinstance(placed, str):
             hurdles[label, placed] += 1
@@ -85,15 +88,13 @@ def place_next(
             particles.place(row, label, *placed)
 
 
-def standing(sampler: RoomSampler, particles: Particles, row: int, step: int) -> Standing:
-    """The objects of a particle before a step."""
-    number = int(particles.number[row])
-    looks = particles.looks[row, :number]
-    coming = particles.plan(row).coming
-    return Standing(
-        particles.rooms.boxes_m[row, :number].double().numpy(),
-        particles.rooms.object_class[row, :number].numpy(),
-        backs_of(looks, sampler.backs).numpy(), coming[step + 1 :],
+def furniture_of(sampler: RoomSampler, rooms: RoomBoxes, row: int) -> Furniture:
+    """The objects of a room."""
+    assert rooms.looks is not None
+    here = rooms.is_object[row]
+    return Furniture(
+        rooms.boxes_m[row, here].double().numpy(), rooms.object_class[row, here].numpy(),
+        backs_of(rooms.looks[row, here], sampler.backs).numpy(),
     )  # fmt: skip
 
 
@@ -168,10 +169,13 @@ def _draw_places(
             row, look = int(found.rows[at]), int(found.look[at])
             if is_free:
                 back = backs_of(found.look[at : at + 1], sampler.backs).numpy()
-                candidates = Candidates(box_m[None].double().numpy(), back)
+                candidates = Furniture(
+                    box_m[None].double().numpy(), found.label[at : at + 1].numpy(), back
+                )
                 allowed, hurdle = judges[row // PARTICLES].allows(
-                    int(found.label[at]), candidates, standing(sampler, particles, row, step),
-                    rectangle_m[None].double().numpy(),
+                    int(found.label[at]), candidates,
+                    furniture_of(sampler, particles.rooms, row),
+                    particles.plan(row).coming[step + 1 :], rectangle_m[None].double().numpy(), 1,
                 )  # fmt: skip
                 if allowed[0]:
                     particles.place(row, int(found.label[at]), look, box_m)

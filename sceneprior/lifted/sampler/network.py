@@ -213,8 +213,8 @@ class RoomSampler(nn.Module):
         return self.contents.before(rooms.object_class, rooms.is_object)[:, -1]
 
     def log_prob(self, reading: Reading, coming: RoomBoxes) -> dict[str, Float[Tensor, " rooms"]]:
-        """Log-probability of each room's next object given its class, by part. Every room of
-        `coming` has one object."""
+        """Log-probabilities of the look, size and place of each room's next object, given its
+        class. Every room of `coming` has one object."""
         assert coming.looks is not None
         label, look = coming.object_class[:, 0], coming.looks[:, 0]
         centre_m, size_m = coming.boxes_m[:, 0].split(3, dim=-1)

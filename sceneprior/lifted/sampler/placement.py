@@ -1,5 +1,5 @@
 """The distribution of an object's place, as a choice between places relative to the room and to the
-objects that are there."""
+objects already placed."""
 
 import math
 

@@ -1,5 +1,5 @@
 """Places of the next object, as mixtures around anchors: positions relative to the room and to the
-objects that are there."""
+objects already placed."""
 
 import math
 from collections.abc import Callable
@@ -59,8 +59,8 @@ class Anchors(NamedTuple):
     kind: Int[Tensor, " anchors"]
     """0 to 7 for anchors that the room gives, 8 to 14 for anchors of an object."""
     relations: tuple[Float[Tensor, "rooms #anchors objects _"], ...]
-    """Features of the relations to the objects, in parts; a part that all anchors share comes
-    once."""
+    """Features of the relations to the objects, in several tensors. A tensor that is the same for
+    all anchors has size 1 along that axis."""
     sides: Float[Tensor, "rooms anchors features"]
 
 

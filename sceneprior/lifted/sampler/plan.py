@@ -63,7 +63,7 @@ def uniform_numbers(count: int, each: int, seed: tuple[int, int]) -> Float[Tenso
 
 def plan_rooms(sampler: RoomSampler, given: Given, count: int, seed: tuple[int, int]) -> Plan:
     """Rectangles and classes, sampled where they are not given. Classes with the largest footprints
-    come first, so that tables are there before their chairs."""
+    come first, so that tables are placed before their chairs."""
     slots, objects, rectangle_m = sampler.max_objects, given.objects, given.rectangle_m
     numbers = uniform_numbers(count, 5 * RECTANGLES + slots, seed)
     frames, uniform = numbers.split([5 * RECTANGLES, slots], dim=1)

@@ -44,7 +44,7 @@ class Reading(NamedTuple):
     before: RoomBoxes
     frame: Frame
     coming: Float[Tensor, "rooms classes"]
-    """Counts of each class still to come."""
+    """Number of objects of each class that are still to be placed."""
     context: Float[Tensor, "rooms width"]
     """Output of the query: the context for the next object."""
 

@@ -64,7 +64,7 @@ def test_methods_are_trained_scored_and_tabulated(toy_shards, tmp_path, monkeypa
         "3D box IoU ↑",
         "CD (m) ↓",
         "F at 5 cm ↑",
-        "s an image ↓",
+        "s per image ↓",
     ]
     rows = {(line[0], line[1]): line[2:] for line in lines[2:] if len(line) == len(head)}
     found, cad = rows["USL", "as found"], rows["USL", "CAD models"]

@@ -108,4 +108,4 @@ def test_a_round_bench_keeps_its_outline():
     assert iou > 0.9 and 8 <= len(found.outline) <= MOST_CORNERS
     vertices, faces = surface_of_parts(found)
     mesh = trimesh.Trimesh(vertices, faces)
-    assert mesh.is_volume and mesh.volume == pytest.approx(np.pi / 4, rel=0.05)
+    assert mesh.is_volume and mesh.volume == pytest.approx(np.pi / 4, rel=0.08)

@@ -8,7 +8,8 @@ import sceneprior
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
-from sceneprior.lifted.requests.judge import Candidates, backed_by_walls
+from sceneprior.lifted.requests.holding import Furniture
+from sceneprior.lifted.requests.judge import backed_by_walls
 from sceneprior.lifted.requests.shape import RoomShape, read_floor
 from sceneprior.lifted.sampled import scene_of
 from sceneprior.lifted.sampler.draw import draw_rooms
@@ -99,7 +100,7 @@ def test_nothing_reaches_through_the_ceiling_and_lamps_hang_from_it(prior):
     [
         ({"floor": "3x2", "want": {"double_bed": 4}}, r"cover .* square metres at their smallest"),
         (
-            {"floor": "1x6", "want": {"double_bed": 1}},
+            {"floor": "0.6x6", "want": {"double_bed": 1}},
             "No room holds the request: in 8 attempts .* double bed found no place; most places "
             "lacked free floor",
         ),
@@ -117,5 +118,5 @@ def test_backs_at_the_inner_side_of_an_l_are_no_backs_at_walls():
     shape = RoomShape(read_floor(L_SHAPE))
     arm = np.array([[2.5, 1.5, 5.0, 3.0]] * 3)
     boxes = np.array([[1.0, 0.5, 2.5, 1, 1, 1], [4.0, 0.5, 2.5, 1, 1, 1], [1.0, 0.5, 1.5, 1, 1, 1]])
-    at_high_z = Candidates(boxes, np.array([2, 2, 2]))
+    at_high_z = Furniture(boxes, np.array([1, 1, 1]), np.array([2, 2, 2]))
     assert backed_by_walls(shape, at_high_z, arm).tolist() == [False, True, True]

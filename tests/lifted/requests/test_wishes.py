@@ -79,10 +79,10 @@ def test_wishes_that_fit_pass():
 @pytest.mark.parametrize("height", [0.2, 250.0])
 def test_ceilings_are_of_rooms(height):
     with pytest.raises(InputError, match="expected 1 to 20 m above the floor"):
-        make_request(ceiling_m=height)
+        make_request(KNOWN, "toy", ceiling_m=height)
 
 
 def test_a_floor_is_moved_to_its_middle_unless_objects_stand_on_it():
     floor = [[0, 0], [4, 0], [4, 2], [0, 2]]
-    outline = make_request(floor).outline_m
+    outline = make_request(KNOWN, "toy", floor).outline_m
     assert outline is not None and outline.tolist() == [[-2, -1], [2, -1], [2, 1], [-2, 1]]

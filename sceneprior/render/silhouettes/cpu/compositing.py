@@ -28,7 +28,7 @@ ALONE, LAYERED, PAPER = range(3)
 
 @njit(inline="always")
 def _in_row(bounds, origin, objects, row, here):
-    """Write the objects whose window meets an image row to `here`, and return their number."""
+    """Write to `here` the objects whose window meets an image row, and return their number."""
     count = 0
     for k in range(objects):
         if bounds[origin + k, 0] <= row < bounds[origin + k, 1]:
@@ -39,8 +39,8 @@ def _in_row(bounds, origin, objects, row, here):
 
 @njit(inline="always")
 def _in_strip(bounds, starts, origin, row, strip, here, count, who, where):
-    """Write those objects whose window meets a strip to `who`, and the buffer offset of the row to
-    `where`; return their number."""
+    """Write to `who` the objects of `here` whose window meets a strip, and to `where` the offset of
+    the strip's row in their buffers; return their number."""
     found = 0
     for i in range(count):
         mesh = origin + here[i]

@@ -95,7 +95,8 @@ def bits_of(hit, lane):  # pragma: no cover - compiled
 
 @triton.jit
 def tile_pixels(windows, first_tiles, tile_meshes):  # pragma: no cover - compiled
-    """Mesh, top row and left column of this program's tile; its pixels and their packed indices."""
+    """Mesh, top row and left column of this program's tile; rows, columns and packed indices of the
+    tile's pixels."""
     tile = tl.program_id(0).to(tl.int64)
     mesh = tl.load(tile_meshes + tile).to(tl.int64)
     base, stride = window(windows, first_tiles, mesh)

@@ -1,0 +1,225 @@
+"""Objects found from masks whose ids mean nothing across frames, against the true ones.
+
+Run `python benchmarks/tracks.py SHARDS ... [--noise 0 1]`. The shards must hold 3D ground truth,
+as those of `make-homes` with `prep-front` do. Every frame's ids are drawn anew. Noise, by seed: 10%
+of the masks missing, 5% merged with the nearest mask of the same view, 5% cut in two, 5% with the
+class of another object, each pose off by 1 cm and 0.5 degrees.
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+from scipy.optimize import linear_sum_assignment
+
+from data_prep.tracks.associate import FrameMasks, associate
+from sceneprior.core.instances.observations import observe
+from sceneprior.core.overlaps import box_iou_3d
+from sceneprior.core.shards import RoomGroundTruth, RoomViews, Shard, list_shards
+from sceneprior.lifted.lifting.boxes import lift_boxes
+
+MISSING, MERGED, CUT, WRONG_CLASS = 0.1, 0.05, 0.05, 0.05
+DEGREES, METRES = 0.5, 0.01
+UNKNOWN = -1
+
+
+class Frames(NamedTuple):
+    """Masks of single frames and the poses given with them."""
+
+    masks: FrameMasks
+    world_to_camera: np.ndarray
+
+
+def shuffled(views: RoomViews, noisy: bool, seed: int) -> Frames:
+    """Give every mask an id of its own, in random order, spoilt by noise or not."""
+    assert views.instance_ids is not None, "read with images"
+    rng = np.random.default_rng(seed)
+    void = len(views.object_class) + 1
+    poses = views.world_to_camera.astype(np.float64)
+    ids = np.zeros(views.instance_ids.shape, dtype=np.int32)
+    classes: list[int] = []
+    for view, image in enumerate(views.instance_ids.astype(np.int64)):
+        class_of = {k + 1: int(name) for k, name in enumerate(views.object_class)}
+        if noisy:
+            image, class_of = _spoilt(image, class_of, void, rng)
+            poses[view] = _moved(poses[view], rng)
+        ids[view][image == void] = UNKNOWN
+        numbers = [k for k in np.unique(image).tolist() if k not in (0, void)]
+        for k in rng.permutation(numbers).tolist():
+            classes.append(class_of[k])
+            ids[view][image == k] = len(classes)
+    return Frames(FrameMasks(ids, np.array(classes, dtype=np.int64)), poses)
+
+
+def _spoilt(
+    image: np.ndarray, class_of: dict[int, int], void: int, rng: np.random.Generator
+) -> tuple[np.ndarray, dict[int, int]]:
+    """One image with masks missing, merged and cut, and wrong classes."""
+    image, class_of = image.copy(), dict(class_of)
+    for k in _numbers(image, void):
+        if rng.random() < MISSING:
+            image[image == k] = 0
+    for k in _numbers(image, void):
+        others = [other for other in _numbers(image, void) if other != k]
+        if rng.random() < MERGED and others and (image == k).any():
+            far = ndimage.distance_transform_edt(image != k)
+            nearest = min(others, key=lambda other: far[image == other].min())
+            if (image == nearest).sum() > (image == k).sum():
+                class_of[k] = class_of[nearest]
+            image[image == nearest] = k
+    for k in _numbers(image, void):
+        if rng.random() < CUT:
+            y, x = np.nonzero(image == k)
+            angle = rng.uniform(0, np.pi)
+            side = (x - x.mean()) * np.cos(angle) + (y - y.mean()) * np.sin(angle) > 0
+            part = max(void, *class_of) + 1
+            class_of[part] = class_of[k]
+            image[y[side], x[side]] = part
+    names = sorted(set(class_of.values()))
+    for k in _numbers(image, void):
+        if rng.random() < WRONG_CLASS and len(names) > 1:
+            class_of[k] = int(rng.choice([name for name in names if name != class_of[k]]))
+    return image, class_of
+
+
+def _numbers(image: np.ndarray, void: int) -> list[int]:
+    return [k for k in np.unique(image).tolist() if k not in (0, void)]
+
+
+def _moved(pose: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A camera turned about a random axis and moved in a random direction."""
+    axis, way = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
+    cross = np.cross(np.eye(3), axis)
+    angle = np.radians(DEGREES)
+    change = np.eye(4)
+    change[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    change[:3, 3] = METRES * way
+    return change @ pose
+
+
+class Score(NamedTuple):
+    """Scores of one room."""
+
+    rand: float
+    """Adjusted Rand index over the pixels of given masks."""
+    found: int
+    true: int
+    iou: float
+    """Mean 3D IoU of the lifted boxes of the objects found with the true boxes."""
+    iou_true_ids: float
+    """The same, with the given masks named by the true object that has most of their pixels."""
+    seconds: float
+
+
+def score(views: RoomViews, truth: RoomGroundTruth, noisy: bool, seed: int) -> Score:
+    """Associate the masks of one room, and compare."""
+    assert views.instance_ids is not None
+    frames = shuffled(views, noisy, seed)
+    start = time.process_time()
+    found = associate(frames.masks, frames.world_to_camera, views.intrinsics)
+    seconds = time.process_time() - start
+    true, ids = views.instance_ids.astype(np.int64), frames.masks.ids
+    count = len(views.object_class)
+    judged = (ids > 0) & (true > 0) & (true <= count)
+    table = np.zeros((int(ids.max()) + 1, count + 2), dtype=np.int64)
+    np.add.at(table, (ids[judged], true[judged]), 1)
+    named = np.where(ids > 0, table.argmax(axis=1)[np.maximum(ids, 0)], ids)
+    iou, iou_true_ids = (
+        _mean_iou(*_boxes(views, image, classes, frames.world_to_camera), truth, count)
+        for image, classes in ((found.ids, found.object_class), (named, views.object_class))
+    )
+    visible = observe(np.maximum(found.ids, 0).astype(np.uint32), found.object_class).tracked
+    rand = rand_index(true[judged], found.ids[judged])
+    return Score(rand, len(visible), count, iou, iou_true_ids, seconds)
+
+
+def rand_index(a: np.ndarray, b: np.ndarray) -> float:
+    """Adjusted Rand index of two labellings (Hubert and Arabie, 1985)."""
+    if not len(a):
+        return 1.0
+    table = np.zeros((a.max() + 1, b.max() + 2))
+    np.add.at(table, (a, b), 1)
+
+    def pairs(counts: np.ndarray) -> float:
+        return float((counts * (counts - 1) / 2).sum())
+
+    rows, columns = pairs(table.sum(axis=1)), pairs(table.sum(axis=0))
+    chance = rows * columns / pairs(np.array([len(a)]))
+    most = (rows + columns) / 2
+    return 1.0 if most == chance else (pairs(table) - chance) / (most - chance)
+
+
+def _boxes(
+    views: RoomViews, ids: np.ndarray, classes: np.ndarray, poses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Centres and sizes of the boxes lifted from images of object ids."""
+    void = len(classes) + 1
+    seen = observe(np.where(ids < 0, void, ids).astype(np.uint32), [*classes.tolist(), 0])
+    boxes = lift_boxes(seen.room_views(views.room_id, poses, views.intrinsics))
+    return boxes.centers_m, boxes.sizes_m
+
+
+def _mean_iou(centers: np.ndarray, sizes: np.ndarray, truth: RoomGroundTruth, count: int) -> float:
+    """Mean IoU of the true tracked objects with the boxes assigned to them; 0 without one."""
+    near = truth.centers_m[:count], truth.sizes_m[:count]
+    iou = box_iou_3d(centers, sizes, *near)
+    return float(iou[linear_sum_assignment(-iou)].sum() / count)
+
+
+def rooms(
+    folder: Path, split: str, first: int, count: int
+) -> Iterator[tuple[RoomViews, RoomGroundTruth]]:
+    """Some rooms of a split, in the order of the shards."""
+    place = 0
+    for path in list_shards(folder, split):
+        with Shard(path) as shard:
+            for name in shard.room_ids:
+                if first <= place < first + count:
+                    yield shard.read_room(name, images=True), shard.read_ground_truth(name)
+                place += 1
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("shards", type=Path, nargs="+")
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--rooms", type=int, default=24)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--noise", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--each", action="store_true", help="print every room")
+    options = parser.parse_args()
+    print(
+        "| rooms | masks | ARI | least ARI | objects found / true | box IoU | with true ids "
+        "| CPU s |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for folder in options.shards:
+        for noisy in map(bool, options.noise):
+            scores = []
+            for seed in options.seeds:
+                for place, (views, truth) in enumerate(
+                    rooms(folder, options.split, options.first, options.rooms)
+                ):
+                    scores.append(score(views, truth, noisy, 1000 * seed + place))
+                    if options.each:
+                        print(
+                            place, views.room_id[:20], *(f"{x:.3f}" for x in scores[-1]), flush=True
+                        )
+            rand, found, true, iou, with_ids, seconds = np.array(scores).T
+            print(
+                f"| {folder.name} {options.split} ({len(scores)}) "
+                f"| {'noisy' if noisy else 'clean'} "
+                f"| {rand.mean():.3f} | {rand.min():.3f} | {found.sum():.0f} / {true.sum():.0f} "
+                f"| {iou.mean():.3f} | {with_ids.mean():.3f} "
+                f"| {np.median(seconds):.2f}, at most {seconds.max():.2f} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

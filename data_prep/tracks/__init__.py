@@ -1,0 +1,1 @@
+"""Joins masks of single frames to objects, by geometry and classes."""

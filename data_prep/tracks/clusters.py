@@ -1,0 +1,93 @@
+"""Clusters masks so that the sum of the weights of pairs in one cluster is greatest.
+
+Correlation clustering (Bansal et al., "Correlation clustering", Machine Learning 2004): a positive
+weight says that two masks show one object, a negative one that they do not. The number of clusters
+is not given. Greedy contraction of pairs comes first, then moves of single masks, in turns until
+neither gains (Keuper et al., "Efficient decomposition of image and mesh graphs by lifted
+multicuts", ICCV 2015).
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+_ROUNDS = 10
+_SWEEPS = 20
+
+
+def cluster(weights: Float[np.ndarray, "masks masks"]) -> Int[np.ndarray, " masks"]:
+    """Number of the cluster of each mask, from 0; `weights` is symmetric."""
+    weights = weights.copy()
+    np.fill_diagonal(weights, 0.0)
+    labels = np.arange(len(weights))
+    for _ in range(_ROUNDS):
+        before = labels
+        labels = _move(weights, _contract(weights, labels))
+        if np.array_equal(labels, before):
+            break
+    return labels
+
+
+def total_weight(
+    weights: Float[np.ndarray, "masks masks"], labels: Int[np.ndarray, " masks"]
+) -> float:
+    """The objective: the weights of all pairs of different masks in one cluster, summed."""
+    same = labels[:, None] == labels
+    return float(np.triu(weights * same, 1).sum())
+
+
+def _contract(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Join the two clusters whose pairs weigh most, as long as that is above zero."""
+    member = np.eye(labels.max() + 1)[labels] if len(labels) else np.zeros((0, 0))
+    between = member.T @ weights @ member
+    np.fill_diagonal(between, -np.inf)
+    into = np.arange(len(between))
+    best = between.argmax(axis=1) if len(between) else into
+    top = between[into, best]
+    while len(top) and top.max() > 0:
+        one = int(top.argmax())
+        other = int(best[one])
+        into[into == other] = one
+        between[one] += between[other]
+        between[:, one] = between[one]
+        between[other] = between[:, other] = -np.inf
+        between[one, one] = -np.inf
+        # Rows whose best partner has changed.
+        stale = np.flatnonzero((best == one) | (best == other))
+        for row in {one, other, *stale.tolist()}:
+            best[row] = between[row].argmax()
+            top[row] = between[row, best[row]]
+        better = between[:, one] > top
+        best[better], top[better] = one, between[better, one]
+    return _renumbered(into[labels])
+
+
+def _move(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Move single masks to the cluster, or to one of their own, that gains most."""
+    count = len(labels)
+    labels = labels.copy()
+    gains = np.zeros((count, count + 1))
+    for k in range(count):
+        gains[:, labels[k]] += weights[:, k]
+    for _ in range(_SWEEPS):
+        moved = False
+        for k in range(count):
+            own = labels[k]
+            best = int(gains[k].argmax())
+            if gains[k, best] <= max(gains[k, own], 0.0) + 1e-9:
+                if gains[k, own] >= -1e-9:
+                    continue
+                # Alone it gains nothing, which is more than in its cluster.
+                best = int(np.setdiff1d(np.arange(count + 1), labels)[0])
+            gains[:, own] -= weights[:, k]
+            gains[:, best] += weights[:, k]
+            labels[k] = best
+            moved = True
+        if not moved:
+            break
+    return _renumbered(labels)
+
+
+def _renumbered(labels: np.ndarray) -> np.ndarray:
+    """The same clusters, numbered in the order of their first masks."""
+    _, first, back = np.unique(labels, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[back]

@@ -1,0 +1,63 @@
+"""Joins small clusters to larger ones whose visual hulls explain their masks."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from data_prep.tracks.affinity import CLASS_ERROR, ONE_VIEW
+
+ENOUGH = 0.6
+"""Share of a mask's rays that must meet a cluster's hull for the hull to speak for joining."""
+HULL, CLASS, PAIRS = 4.0, 1.0, 3.0
+"""Weights of hulls, of classes and of the mean weight of pairs."""
+
+
+def join_leftovers(
+    labels: Int[np.ndarray, " masks"],
+    share: Float[np.ndarray, "masks clusters"],
+    weights: Float[np.ndarray, "masks masks"],
+    mask_view: Int[np.ndarray, " masks"],
+    mask_class: Int[np.ndarray, " masks"],
+) -> Int[np.ndarray, " masks"]:
+    """Join each cluster, the smallest first, to the larger one that gains most, if any gains.
+
+    The gain is HULL times how far the mean share of its masks' rays that meet the other's hull is
+    above `ENOUGH` (0 to 1; three times as steep below), plus CLASS times the log-odds of its
+    classes, plus PAIRS times the mean weight of pairs of different views, plus ONE_VIEW times the
+    share of its views that show a mask of both.
+    """
+    count = int(labels.max()) + 1
+    size = np.bincount(labels, minlength=count)
+    masks_in = np.zeros((count, int(mask_view.max()) + 1), dtype=np.int64)
+    np.add.at(masks_in, (labels, mask_view), 1)
+    member = np.eye(count)[labels]
+    between = np.where(mask_view[:, None] == mask_view, 0.0, weights)
+    mean = member.T @ between @ member / np.maximum(size[:, None] * size, 1)
+    main = np.array([np.bincount(mask_class[labels == k]).argmax() for k in range(count)])
+    frequency = np.bincount(mask_class) / len(mask_class)
+    agree = float((frequency**2).sum())
+    equal = np.log((1 - CLASS_ERROR) / agree)
+    unequal = np.log(CLASS_ERROR / (1 - agree + 1e-3))
+    into = np.arange(count)
+    for k in np.argsort(size, kind="stable").tolist():
+        own = labels == k
+        open_to = (into == np.arange(count)) & (size >= max(2, size[k]))
+        open_to[k] = False
+        above = (share[own].mean(axis=0) - ENOUGH) / (1 - ENOUGH)
+        alike = (mask_class[own][:, None] == main).mean(axis=0)
+        shared = ((masks_in[k] > 0) & (masks_in > 0)).sum(axis=1) / (masks_in[k] > 0).sum()
+        gain = (
+            HULL * np.where(above > 0, above, 3 * above * (1 - ENOUGH))
+            + CLASS * (alike * equal + (1 - alike) * unequal)
+            + PAIRS * mean[k]
+            + ONE_VIEW * shared
+        )
+        gain[~open_to] = -np.inf
+        best = int(gain.argmax())
+        if gain[best] > 0:
+            into[k] = best
+            masks_in[best] += masks_in[k]
+            size[best] += size[k]
+    while (into[into] != into).any():
+        into = into[into]
+    joined: Int[np.ndarray, " masks"] = np.unique(into[labels], return_inverse=True)[1]
+    return joined
