@@ -35,10 +35,10 @@ class RequestFile(BaseModel):
 
     format: Literal["sceneprior-request"]
     version: Literal[1]
-    floor: str | Annotated[list[_Pair], Field(min_length=3)] | None = None
+    floor: Annotated[list[_Pair], Field(min_length=3)] | str | None = None
     openings: list[str | OpeningEntry] = []
     ceiling_m: float | None = None
-    want: str | dict[str, int | str | list[RelationEntry]] | None = None
+    want: dict[str, list[RelationEntry] | int | str] | str | None = None
     objects: Annotated[list[ObjectEntry], Field(max_length=MOST_OBJECTS)] = []
 
 

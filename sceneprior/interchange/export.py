@@ -30,7 +30,7 @@ SIMULATORS: Mapping[str, Callable[[Sequence[Scene], Path, ShellName], None]] = {
 """Formats of simulators, for which objects stand first (`core/standing.py`)."""
 FORMATS = (*OF_CLASSES, *SIMULATORS, "sceneeval", "obj")
 GROWN_M = 0.01
-"""Distance from which on the user is told that walls were moved."""
+"""Smallest displacement of walls, in metres, of which a note informs the user."""
 
 
 def export_scenes(
@@ -38,9 +38,9 @@ def export_scenes(
 ) -> list[str]:
     """Write rooms to a folder in one of `FORMATS`, in metres.
 
-    y is up; in `mujoco` and `sceneeval`, z is. `shell` is what is written of the room itself; None
-    writes walls for simulators, and nothing in other formats. Notes for the user on what was left
-    out or changed are returned.
+    y is up; in `mujoco` and `sceneeval`, z is. `shell` names the parts of the room itself to write;
+    None writes walls for simulators, and nothing in other formats. Returns notes for the user on
+    omissions and changes.
     """
     if to not in FORMATS:
         raise InputError(f"No format '{to}'; choose from {', '.join(FORMATS)}, or scenes.")

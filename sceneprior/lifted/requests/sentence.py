@@ -106,7 +106,8 @@ class _Reader:
     def read(self) -> None:
         """Read all tokens."""
         while self.at < len(self.tokens):
-            if self._relation() or self._group() is not None:
+            start = self.at
+            if self._relation() or self._group() is not None or self.at > start:
                 continue
             word = self.tokens[self.at]
             self.at += 1

@@ -34,7 +34,7 @@ class Ways:
         self.low_m = np.array([low_x, low_z])
         x, z = (np.arange(a + CELL_M / 2, b, CELL_M) for a, b in ((low_x, high_x), (low_z, high_z)))
         # A little less than half of the way, since cells are sampled at their centres.
-        inner = shape.polygon.buffer(-WAY_M / 2 + CELL_M / 2, join_style="mitre")
+        inner = shape.polygon.buffer(-WAY_M / 2 + CELL_M / 2 - 1e-6, join_style="mitre")
         shapely.prepare(inner)
         self.floor: Bool[np.ndarray, "x z"] = shapely.contains_xy(inner, x[:, None], z[None])
         self.starts: list[Int[np.ndarray, 2]] = []
