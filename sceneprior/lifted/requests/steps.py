@@ -24,7 +24,7 @@ from sceneprior.lifted.sampler.violations import settled, violation
 
 TRIES = 4
 """Places drawn for an object in each particle, which takes the first that fits."""
-SIZE_RANGE = 0.2
+SIZE_RANGE = 0.35
 """Largest difference between the log extents of an object and of its look. Smaller than that of
 rooms without a request: where floor is scarce, particles with the smallest pieces survive."""
 LOW_M = 0.15
