@@ -20,7 +20,7 @@ ROOMS_PER_SHARD = 8
 
 @dataclass(frozen=True)
 class ShardPlan:
-    """One shard: the unit of work, so an interrupted run loses at most one per worker."""
+    """The rooms of one shard, the unit of work: an interrupted run loses one shard per worker."""
 
     name: str
     """Path within the output folder: `train/bedroom_0000.h5`."""

@@ -12,25 +12,25 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import ndimage
 
 from data_prep.tracks.affinity import pair_weights
 from data_prep.tracks.clusters import cluster
 from data_prep.tracks.explained import explained
 from data_prep.tracks.leftovers import join_leftovers
-from data_prep.tracks.rays import first_hits, surface
+from data_prep.tracks.merged import SPECK, Split, owners, split_merged
+from data_prep.tracks.rays import first_hits, surface, widened
 from data_prep.tracks.voxels import Grid, cameras_of, fill
 
 STEP = 3
-"""Every how many rows and columns of a picture of 480 pixels are used."""
-WIDEN_PX = 1.5
-"""Sampled pixels by which masks are widened where views are compared: outlines, cells and poses
-are not exact."""
-ROUNDS, STRICT = 6, 2
+"""Step between the rows and columns that are used, for a picture of 480 pixels."""
+ROUNDS, STRICT = 7, 2
 """Rounds of clustering and carving; from round STRICT on, cells need two views that agree."""
 AGREE = 0.45
 """Share of the views of a filled cell that must show one cluster there."""
+SPLIT = (3, 5)
+"""Rounds in which merged masks are split."""
 JOINS = 4
+UNKNOWN = -1
 
 
 class FrameMasks(NamedTuple):
@@ -55,7 +55,7 @@ class Tracks(NamedTuple):
     ids: Int[np.ndarray, "views height width"]
     """int32: k + 1 for object k, 0 for background, -1 where the content is unknown."""
     object_class: Int[np.ndarray, " objects"]
-    """The class of most of an object's masks."""
+    """The most frequent class among an object's masks."""
 
 
 def associate(
@@ -69,57 +69,55 @@ def associate(
     """
     if not len(masks.mask_class):
         return Tracks(np.minimum(masks.ids, 0), masks.mask_class)
-    labels = _labels(masks, world_to_camera, intrinsics)
-    of_id = np.concatenate([[0], labels + 1])
-    ids = np.where(masks.ids < 0, -1, of_id[np.maximum(masks.ids, 0)]).astype(np.int32)
-    classes = [np.bincount(masks.mask_class[labels == k]).argmax() for k in range(labels.max() + 1)]
+    parts, labels = _labels(masks, world_to_camera, intrinsics)
+    pixels = np.bincount(parts.ids[parts.ids > 0], minlength=len(labels) + 1)[1:]
+    size, area = np.bincount(labels), np.bincount(labels, pixels)
+    kept = (area > 0) & ((size > 1) | (area > SPECK * parts.ids[0].size))
+    number = np.where(kept, np.cumsum(kept), UNKNOWN)
+    of_id = np.concatenate([[0], number[labels]])
+    ids = np.where(parts.ids < 0, UNKNOWN, of_id[np.maximum(parts.ids, 0)]).astype(np.int32)
+    classes = [np.bincount(parts.mask_class[labels == k]).argmax() for k in np.flatnonzero(kept)]
     return Tracks(ids, np.array(classes, dtype=np.int64))
 
 
 def _labels(
     masks: FrameMasks, world_to_camera: np.ndarray, intrinsics: np.ndarray
-) -> Int[np.ndarray, " masks"]:
-    """Number of the object, from 0, that each mask shows."""
-    view, classes = masks.mask_view, masks.mask_class
+) -> tuple[FrameMasks, Int[np.ndarray, " masks"]]:
+    """The masks, merged ones split, and the number of the object, from 0, that each shows."""
     step = max(1, round(STEP * max(masks.ids.shape[1:]) / 480))
-    ids = np.ascontiguousarray(masks.ids[:, ::step, ::step])
-    near = _widened(ids)
     cameras = cameras_of(world_to_camera, intrinsics, step)
+    ids = np.ascontiguousarray(masks.ids[:, ::step, ::step])
+    near, view, classes = widened(ids), masks.mask_view, masks.mask_class
     grid = fill(ids, cameras)
     for number in range(ROUNDS):
         depth = first_hits(ids, cameras, grid)
         cells, shown = surface(near, cameras, grid, depth)
         weights = pair_weights(shown, view, classes)
         labels = cluster(weights)
-        if number < ROUNDS - 1:
-            _carve(grid, cells, shown, labels, number >= STRICT)
+        split: Split = []
+        if number in SPLIT:
+            full, split = split_merged(masks.ids, step, cells, shown, labels, view, cameras, grid)
+        if split:
+            main = [np.bincount(classes[labels == other]).argmax() for _, other in split]
+            masks = FrameMasks(full, np.concatenate([classes, main]))
+            ids = np.ascontiguousarray(masks.ids[:, ::step, ::step])
+            near, classes = widened(ids), masks.mask_class
+            view = np.concatenate([view, view[[mask for mask, _ in split]]])
+        elif number < ROUNDS - 1:
+            _carve(grid, cells, owners(shown, labels), shown, number >= STRICT)
     for _ in range(JOINS):
         share = explained(ids, near, labels, cameras, grid)
         joined = join_leftovers(labels, share, weights, view, classes)
         if np.array_equal(joined, labels):
             break
         labels = joined
-    return labels
-
-
-def _widened(ids: np.ndarray) -> np.ndarray:
-    """Widen masks into the background by `WIDEN_PX`."""
-    wide = ids.copy()
-    for image, new in zip(ids, wide, strict=True):
-        if (image > 0).any():
-            far, (rows, columns) = ndimage.distance_transform_edt(image <= 0, return_indices=True)
-            rim = (image == 0) & (far <= WIDEN_PX)
-            new[rim] = image[rows[rim], columns[rim]]
-    return wide
+    return masks, labels
 
 
 def _carve(
-    grid: Grid, cells: np.ndarray, shown: np.ndarray, labels: np.ndarray, strict: bool
+    grid: Grid, cells: np.ndarray, votes: np.ndarray, shown: np.ndarray, strict: bool
 ) -> None:
     """Empty the cells whose views show different clusters, or background."""
-    votes = np.zeros((len(cells), labels.max() + 1), dtype=np.int32)
-    rows, views = np.nonzero(shown > 0)
-    np.add.at(votes, (rows, labels[shown[rows, views] - 1]), 1)
     most, seen = votes.max(axis=1), (shown >= 0).sum(axis=1)
     wrong = (seen >= 3) & (most < AGREE * seen)
     if strict:

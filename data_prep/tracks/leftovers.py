@@ -3,12 +3,15 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from data_prep.tracks.affinity import CLASS_ERROR, ONE_VIEW
+from data_prep.tracks.affinity import CLASS_ERROR
 
 ENOUGH = 0.6
 """Share of a mask's rays that must meet a cluster's hull for the hull to speak for joining."""
-HULL, CLASS, PAIRS = 4.0, 1.0, 3.0
-"""Weights of hulls, of classes and of the mean weight of pairs."""
+HULL, CLASS, PAIRS, ONE_VIEW = 4.0, 1.0, 2.0, -2.0
+"""Weights of hulls, of classes, of the mean weight of pairs, and of common views."""
+FEW = 6.0
+"""Gain of joining a cluster of one mask, whatever the other: most objects are seen more often. It
+is divided by the number of masks."""
 
 
 def join_leftovers(
@@ -20,10 +23,11 @@ def join_leftovers(
 ) -> Int[np.ndarray, " masks"]:
     """Join each cluster, the smallest first, to the larger one that gains most, if any gains.
 
-    The gain is HULL times how far the mean share of its masks' rays that meet the other's hull is
-    above `ENOUGH` (0 to 1; three times as steep below), plus CLASS times the log-odds of its
-    classes, plus PAIRS times the mean weight of pairs of different views, plus ONE_VIEW times the
-    share of its views that show a mask of both.
+    The gain is HULL times the excess over `ENOUGH` of the mean share of the smaller cluster's rays
+    that meet the larger one's hull (scaled to 0 to 1; three times as steep below), plus CLASS times
+    the log-odds of the classes, plus PAIRS times the mean weight of pairs of different views, plus
+    ONE_VIEW times the share of the smaller cluster's views that show both clusters, plus FEW over
+    the number of its masks.
     """
     count = int(labels.max()) + 1
     size = np.bincount(labels, minlength=count)
@@ -50,6 +54,7 @@ def join_leftovers(
             + CLASS * (alike * equal + (1 - alike) * unequal)
             + PAIRS * mean[k]
             + ONE_VIEW * shared
+            + FEW / size[k]
         )
         gain[~open_to] = -np.inf
         best = int(gain.argmax())

@@ -5,11 +5,26 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
+from scipy import ndimage
 
 from data_prep.tracks.voxels import MIN_DEPTH_M, Cameras, Grid
 
+WIDEN_PX = 1.5
+"""Sampled pixels by which masks are widened where views are compared: outlines, cells and poses
+are not exact."""
 BEHIND = 1.5
 """Cells by which a cell may lie behind the first one of a ray and still count as seen."""
+
+
+def widened(ids: Int[np.ndarray, "views height width"]) -> Int[np.ndarray, "views height width"]:
+    """Widen masks into the background by `WIDEN_PX`."""
+    wide = ids.copy()
+    for image, new in zip(ids, wide, strict=True):
+        if (image > 0).any():
+            far, (rows, columns) = ndimage.distance_transform_edt(image <= 0, return_indices=True)
+            rim = (image == 0) & (far <= WIDEN_PX)
+            new[rim] = image[rows[rim], columns[rim]]
+    return wide
 
 
 def first_hits(

@@ -92,7 +92,7 @@ class Prior:
             ceiling_m: Requested height of the ceiling.
             want: Wishes: a sentence, or numbers of objects by class, such as
                 `{"nightstand": 2, "desk": 0}`.
-            objects: Objects that are there already, in the coordinates of the floor.
+            objects: Objects that are already in the room, in the coordinates of the floor.
 
         Requests need a prior with a sampler; see docs/requests.md. `extra["wishes"]` of a room
         lists each wish, and whether the room fulfils it.
@@ -245,7 +245,7 @@ class Prior:
 
 
 def _has_walls(scene: Scene) -> bool:
-    """Whether more is known of a room's walls than the rectangle around its floor."""
+    """True if a room has openings, a ceiling, or a floor that is not a rectangle."""
     if scene.openings or scene.ceiling_m is not None:
         return True
     if scene.floor_m is None:

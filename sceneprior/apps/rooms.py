@@ -90,7 +90,7 @@ def overview(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Contact sheet of one or more rooms from above a corner, four per row, coloured by class.
 
-    With `walls`, those behind the furniture are drawn; the floor always is.
+    If `shell` is `walls`, the walls behind the furniture are drawn; the floor is always drawn.
     """
     views = [room_view(scene, OVERVIEW_TILE) if shell == "walls" else None for scene in scenes]
     tiles = [

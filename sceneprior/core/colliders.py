@@ -18,7 +18,7 @@ MOUNTED = ("cabinet", "shelf", "shelves", "sink", "television", "whiteboard", "w
 """Classes that hang on a wall if their lower face is above `MOUNTED_M`."""
 MOUNTED_M = 0.4
 CONCAVITY = 0.05
-"""CoACD's threshold: how far a part may be from convex."""
+"""Threshold of CoACD: the largest concavity of a part that is not divided further."""
 _FILL = {
     "box": 1.0, "cylinder": np.pi / 4, "ellipsoid": np.pi / 6, "dome": np.pi / 6, "bowl": np.pi / 6,
 }  # fmt: skip
@@ -31,8 +31,8 @@ def is_fixed(item: SceneObject) -> bool:
 
 
 def colliders(item: SceneObject) -> tuple[Solid | Mesh, ...]:
-    """Convex bodies of an object: its solids; or convex parts of its mesh (by CoACD if it is
-    installed, else the convex hull); or its box."""
+    """Convex bodies of an object: its solids; without solids, the convex parts of its mesh
+    (`convex_parts`); without a mesh, its box."""
     if item.solids:
         return item.solids
     if item.mesh is not None:
@@ -46,7 +46,7 @@ def colliders(item: SceneObject) -> tuple[Solid | Mesh, ...]:
 
 
 def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
-    """Convex meshes whose union approximates a mesh; its convex hull without CoACD."""
+    """Convex meshes whose union approximates a mesh; its convex hull if CoACD is not installed."""
     coacd = _coacd()
     hull = Mesh(*convex_surface(np.asarray(mesh.vertices_m, dtype=np.float64)))
     if coacd is None or not len(hull.faces):

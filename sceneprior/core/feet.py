@@ -12,22 +12,24 @@ from sceneprior.core.scene import Mesh, SceneObject, Solid
 CONTACT_M = 1e-3
 """Height above the lowest point up to which a body touches the floor."""
 MARGIN = 0.2
-"""Least distance of the centre of mass from the edge of the support, as a share of its distance
-from the edge of the object seen from above."""
+"""Minimum distance of the centre of mass from the edge of the support polygon, relative to its
+distance from the outline of the object seen from above."""
 WIDE_M = 0.05
 """Width of a foot."""
 LOWER = 0.2
-"""Lower part of a body, as a share of its height, that a foot may meet."""
+"""Share of a body's height, from below, within which a foot may end."""
 HIGH = 0.3
-"""Metres that a body may lie farther from a corner for each metre that it is lower."""
+"""Cost of a metre of height between floor and body, relative to a metre of distance from the
+corner, when a foot chooses the body that it supports."""
 INTO_M = 0.01
 """Length by which a foot reaches into the body above it."""
 
 
 def with_feet(item: SceneObject) -> SceneObject:
-    """The object, with four feet under its corners if it would fall over otherwise.
+    """The object, with feet near its four corners if it would fall over otherwise.
 
-    Feet are boxes, under the body that is largest in plan; they join the object's solids and mesh.
+    Feet are boxes, which are added to the object's solids and mesh. A corner where a body already
+    stands on the floor gets none.
     """
     if stands_safely(item):
         return item
@@ -38,7 +40,8 @@ def with_feet(item: SceneObject) -> SceneObject:
 
 
 def stands_safely(item: SceneObject) -> bool:
-    """True if the centre of mass lies well above the polygon round the object's contacts."""
+    """True if the centre of mass lies well inside (`MARGIN`) the convex hull of the object's
+    contacts with the floor, seen from above."""
     bodies = colliders(item)
     points = np.concatenate([points_of(body) for body in bodies])
     low = points[points[:, 1] <= points[:, 1].min() + CONTACT_M][:, ::2]
@@ -77,11 +80,11 @@ def _feet(bodies: tuple[Solid | Mesh, ...]) -> tuple[Solid, ...]:
 def _under(
     clouds: list[Float[np.ndarray, "_ 3"]], at: Float[np.ndarray, "2"], floor_m: float
 ) -> tuple[Float[np.ndarray, "2"], float]:
-    """The place near a corner where a foot meets a body from below, and the height to which the
-    foot reaches: near and low places are preferred."""
+    """The place near a corner where a foot meets a body from below, and the height of the foot's
+    top. Places near the corner, under low bodies, are preferred."""
     found = []
     for points in clouds:
-        # Of a round body, the lower part alone: its rim may be as high as the object.
+        # Only the lower part, because the rim of a round body may be as high as the object.
         heights = points[:, 1]
         lower = points[heights <= heights.min() + LOWER * np.ptp(heights)]
         plan = shapely.convex_hull(shapely.MultiPoint(lower[:, ::2]))

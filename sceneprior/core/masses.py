@@ -11,15 +11,15 @@ DENSITY_KG_M3 = {
     "stool": 45, "table": 40, "television": 120, "toilet": 130, "tv_stand": 85, "wardrobe": 70,
     "whiteboard": 150,
 }  # fmt: skip
-"""Mass over the volume of the bounding box, by class. Estimates, to a factor of about two: the mass
-of one common piece of each class over its outer volume (a chair of 5 kg in 0.5 x 0.9 x 0.45 m, a
-wardrobe of 80 kg in 1 x 2 x 0.58 m, a double bed with mattress of 90 kg in 1.7 x 1 x 2.1 m)."""
+"""Mass per volume of the bounding box, by class. Estimates, accurate to a factor of about two: the
+mass of one common piece of the class over its outer volume (a chair of 5 kg in 0.5 x 0.9 x 0.45 m,
+a wardrobe of 80 kg in 1 x 2 x 0.58 m, a double bed with mattress of 90 kg in 1.7 x 1 x 2.1 m)."""
 OTHER_KG_M3 = 60
 """Density of classes that are not in the table."""
 
 
 def mass_kg(item: SceneObject) -> float:
-    """Mass of an object, by its class and the volume of its box.
+    """Mass of an object, from its class and the volume of its box.
 
     >>> mass_kg(SceneObject("double_bed", (0.0, 0.5, 0.0), (1.7, 1.0, 2.1)))
     89.25

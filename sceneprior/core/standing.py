@@ -1,7 +1,7 @@
-"""Rooms made ready for physics: objects stand on the floor or on others, and apart.
+"""Prepares rooms for physics: objects stand on the floor or on other objects, and do not intersect.
 
-Generated rooms are nearly so: furniture floats by a centimetre, a lifted chair lacks a leg, or
-reaches into its table. Each change is counted.
+Generated rooms almost do: furniture may float by a centimetre, and a lifted chair may lack a leg,
+or reach into its table. Each change is counted.
 """
 
 import itertools
@@ -18,32 +18,33 @@ from sceneprior.core.floor import floor_polygon
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 
 GAP_M = 2e-3
-"""Distance that objects keep after they are pushed apart."""
+"""Distance between objects after they are pushed apart."""
 TOUCHING_M = 5e-4
-"""Largest overlap of two bodies that are left where they are."""
+"""Largest overlap of two bodies that is left as it is."""
 RESTS_M = 0.15
-"""An object above `FLOOR_M` rests on another one whose top is that near to its lower face."""
+"""Largest distance between the lower face of an object and the top of another one on which it is
+then set; for objects above `FLOOR_M`."""
 FLOOR_M = 0.3
-"""Objects whose lower face is at most that high stand on the floor."""
+"""Height of the lower face up to which an object is set on the floor."""
 SLABS = 8
-"""Slices of a body that is a mesh."""
+"""Number of slices into which a body that is a mesh is cut."""
 STEP_M, REACH_M = 0.05, 2.0
-"""Grid of places that are tried for an object that has to move."""
+"""Spacing and range, along x and z, of the moves that are tried for an object."""
 
 Boxes = Float[np.ndarray, "_ 2 3"]
-"""Lower and upper corners of the boxes round an object's bodies."""
+"""Lower and upper corners of the boxes around an object's bodies."""
 
 
 def stand(scene: Scene) -> tuple[Scene, Counter[str]]:
-    """The scene with its objects set down, on feet where they would fall over, and apart.
+    """Set down a scene's objects, give feet to those that would fall over, and move them apart.
 
-    Objects are set down in the order of their heights. Then, the largest first, each goes to the
-    nearest place where it overlaps none before it, inside the floor if it was inside. Lamps and
-    wall pieces keep their heights.
+    Objects are set down in the order of their heights. Then, the largest first, each is moved to
+    the nearest place where it overlaps no earlier one, and it stays inside the floor if it was
+    inside. Lamps and pieces that hang on walls keep their heights.
 
     Returns:
-        The scene, and how many objects were `set down`, `given feet`, `moved` and, because there
-        was no free place, `left out`.
+        The scene, and the number of objects that were `set down`, `given feet`, `moved`, and `left
+        out` because there was no free place.
     """
     told: Counter[str] = Counter()
     # Found once: convex parts of meshes take seconds.
@@ -55,7 +56,7 @@ def stand(scene: Scene) -> tuple[Scene, Counter[str]]:
 
 
 def body_boxes(item: SceneObject) -> Boxes:
-    """Boxes round the bodies of an object; bodies of meshes are cut into slabs along x."""
+    """Boxes around the bodies of an object; bodies that are meshes are cut into slabs along x."""
     boxes = []
     for body in colliders(item):
         if isinstance(body, Mesh):
@@ -66,7 +67,7 @@ def body_boxes(item: SceneObject) -> Boxes:
 
 
 def _slabs(points: Float[np.ndarray, "points 3"]) -> list[Float[np.ndarray, "2 3"]]:
-    """Boxes round slices of a convex body, which may stand at an angle."""
+    """Boxes around slices of a convex body, which may stand at an angle."""
     low, high = points.min(axis=0), points.max(axis=0)
     plan = shapely.convex_hull(shapely.MultiPoint(points[:, ::2]))
     ends = np.linspace(low[0], high[0], SLABS + 1)
@@ -140,7 +141,7 @@ def free_offset(
     boxes: Boxes, taken: Boxes, floor: shapely.Geometry | None
 ) -> Float[np.ndarray, "2"] | None:
     """The shortest move along x and z after which no box overlaps a taken one; None if there is
-    none within `REACH_M`. An object on the floor stays on it."""
+    none within `REACH_M`. The area outside the floor may not grow."""
     still = np.zeros((1, 2))
     if not _overlaps(boxes, taken, still, -TOUCHING_M)[0]:
         return still[0]

@@ -11,7 +11,9 @@ from sceneprior.core.shell import ShellName, shell_of
 from sceneprior.core.standing import stand
 from sceneprior.interchange.atiss import write_atiss
 from sceneprior.interchange.front import write_front
+from sceneprior.interchange.habitat import write_habitat
 from sceneprior.interchange.mujoco import write_mujoco
+from sceneprior.interchange.sceneeval import write_sceneeval
 from sceneprior.interchange.usd import write_usd
 from sceneprior.render.scene_files import check_names, save_scene
 
@@ -23,20 +25,22 @@ OF_CLASSES: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
 SIMULATORS: Mapping[str, Callable[[Sequence[Scene], Path, ShellName], None]] = {
     "mujoco": write_mujoco,
     "usd": write_usd,
+    "habitat": write_habitat,
 }
 """Formats of simulators, for which objects stand first (`core/standing.py`)."""
-FORMATS = (*OF_CLASSES, *SIMULATORS, "obj")
+FORMATS = (*OF_CLASSES, *SIMULATORS, "sceneeval", "obj")
 GROWN_M = 0.01
-"""Distance from which on the user is told that walls were moved."""
+"""Smallest displacement of walls, in metres, of which a note informs the user."""
 
 
 def export_scenes(
     scenes: Sequence[Scene], to: str, folder: Path, shell: ShellName | None = None
 ) -> list[str]:
-    """Write rooms to a folder in one of `FORMATS`, in metres; y is up, except in MuJoCo (z).
+    """Write rooms to a folder in one of `FORMATS`, in metres.
 
-    `shell` is what is written of the room itself; None writes walls for simulators, and nothing in
-    other formats. Notes for the user on what was left out or changed are returned.
+    y is up; in `mujoco` and `sceneeval`, z is. `shell` names the parts of the room itself to write;
+    None writes walls for simulators, and nothing in other formats. Returns notes for the user on
+    omissions and changes.
     """
     if to not in FORMATS:
         raise InputError(f"No format '{to}'; choose from {', '.join(FORMATS)}, or scenes.")
@@ -50,7 +54,10 @@ def export_scenes(
         SIMULATORS[to](standing, Path(folder), shell or "walls")
         return notes if shell in ("floor", "none") else [*notes, *_moved_walls(standing)]
     if shell is not None:
-        raise InputError(f"{to} has no walls; leave out --shell.")
+        raise InputError(f"What {to} has of a room is fixed; leave out --shell.")
+    if to == "sceneeval":
+        write_sceneeval(scenes, Path(folder))
+        return []
     named = [
         replace(scene, objects=tuple(o for o in scene.objects if o.label != "void"))
         for scene in scenes

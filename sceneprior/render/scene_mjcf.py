@@ -1,4 +1,4 @@
-"""Scenes as MuJoCo's MJCF: one body an object, convex geoms, z up, metres and kilograms."""
+"""Scenes as MuJoCo's MJCF: one body per object, convex geoms, z up, metres and kilograms."""
 
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -14,20 +14,20 @@ from sceneprior.render.topdown import FLOOR_COLOR, WALL_COLOR, node_names, objec
 
 TIMESTEP_S = 0.001
 TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""From the room frame (y up) to MuJoCo's axes (z up), for column vectors."""
+"""Rotation from the room frame (y up) to MuJoCo's axes (z up), for column vectors."""
 WALL_OPACITY = 0.35
 ROUND = 1e-3
-"""Relative difference of a cylinder's widths up to which it is a circular one."""
+"""Relative difference of a cylinder's widths up to which it counts as circular."""
 
 
 def scene_to_mjcf(scene: Scene, shell: Shell | None = None) -> str:
-    """The scene as the text of an MJCF file without other files.
+    """The scene as the text of an MJCF file that needs no other files.
 
     Each object is a body at the centre of its box, named `<index>_<class>`, with a free joint
-    unless it hangs (`is_fixed`). Its solids are geoms: boxes, cylinders and ellipsoids; domes,
-    bowls and cylinders with an oval plan are meshes. The mass is that of `masses.py`, shared by
-    the solids in proportion to their volumes. The floor is an infinite plane; the walls of
-    `shell` are boxes round its doors and windows, half transparent, without a ceiling.
+    unless it hangs (`is_fixed`). Its solids become geoms: boxes, cylinders and ellipsoids; domes,
+    bowls and cylinders with an oval plan become meshes. The mass is that of `mass_kg`, divided
+    among the geoms in proportion to their volumes. The floor is an infinite plane; the walls of
+    `shell` are boxes around its doors and windows, half transparent, without a ceiling.
     """
     root = Element("mujoco", model=scene.name)
     SubElement(root, "compiler", angle="radian", autolimits="true")
@@ -78,7 +78,7 @@ def _add_panel(world: Element, name: str, panel: Panel) -> None:
 def _shape(
     body: Solid | Mesh, origin_m: Float[np.ndarray, "3"], assets: Element, name: str
 ) -> dict[str, str]:
-    """Attributes of a geom that is a body, relative to `origin_m`."""
+    """Attributes of the geom of a body, at positions relative to `origin_m`."""
     if isinstance(body, Solid):
         low, high = np.array(body.low_m), np.array(body.high_m)
         half = (high - low) / 2

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from rooms_of_solids import solid_box
 
-from sceneprior.core.colliders import colliders, mesh_of, volume_and_centroid
+from sceneprior.core.colliders import colliders, convex_parts, mesh_of, volume_and_centroid
 from sceneprior.core.feet import stands_safely, with_feet
-from sceneprior.core.scene import Scene, SceneObject, Solid, Turned
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, Turned
 from sceneprior.core.standing import body_boxes, stand
 
 KINDS = ("box", "cylinder", "ellipsoid", "dome", "bowl")
@@ -134,3 +134,24 @@ def test_volumes_and_centroids_are_those_of_meshes(kind):
     found = volume_and_centroid(mesh_of(solid))
     assert found[0] == pytest.approx(mesh.volume)
     np.testing.assert_allclose(found[1], mesh.center_mass)
+
+
+def test_coacd_cuts_a_mesh_into_convex_parts():
+    pytest.importorskip("coacd", reason="no coacd here: pip install -e '.[sim]'")
+    blocks = [
+        trimesh.creation.box(bounds=bounds)
+        for bounds in ([[0, 0, 0], [1, 0.2, 1]], [[0, 0, 0], [0.2, 1, 1]])
+    ]
+    corner = trimesh.boolean.union(blocks)
+    parts = convex_parts(Mesh(corner.vertices, corner.faces))
+    assert len(parts) == 2
+    total = sum(volume_and_centroid(part)[0] for part in parts)
+    assert total == pytest.approx(corner.volume, rel=0.02)
+
+
+def test_without_coacd_a_mesh_is_its_convex_hull(monkeypatch):
+    monkeypatch.setattr("sceneprior.core.colliders._coacd", lambda: None)
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    dented = Mesh(np.vstack([ball.vertices, [[0, 0.1, 0]]]), ball.faces)
+    (hull,) = convex_parts(dented)
+    assert volume_and_centroid(hull)[0] == pytest.approx(ball.volume)

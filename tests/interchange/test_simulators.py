@@ -1,13 +1,18 @@
 """Rooms for simulators, each format read by its own library."""
 
+import json
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import shapely
+import trimesh
 from rooms_of_solids import solid_box
 
+from sceneprior.core.colliders import colliders, mesh_of
 from sceneprior.core.masses import mass_kg
-from sceneprior.core.scene import Opening, Scene, SceneObject, Solid
+from sceneprior.core.scene import Opening, Scene, SceneObject, Solid, Turned, bound_m
 from sceneprior.interchange.export import export_scenes
 from sceneprior.render.scene_files import save_scene
 
@@ -117,3 +122,64 @@ def test_usd_of_simulators_has_bodies_and_passes_every_check(scene, tmp_path):
     assert [prim.GetTypeName() for prim in colliders] == ["Cylinder", "Mesh"]
     walls = [prim for prim in stage.Traverse() if prim.GetName().startswith("wall_")]
     assert len(walls) == 6 and all(prim.HasAPI(physics.CollisionAPI) for prim in walls)
+
+
+def test_habitat_gets_a_dataset_whose_files_are_all_there(scene, tmp_path):
+    """Every template is a config, every asset a GLB; transforms put assets where objects are."""
+    turned = Turned(np.pi / 4, (1.0, 0.5, 0.2))
+    bench = SceneObject("stool", (0.0, 0.25, 1.5), bound_m(turned), turned=turned)
+    bench = replace(bench, mesh=mesh_of(colliders(bench)[0]))
+    more = replace(scene, objects=(*scene.objects, bench))
+    export_scenes([more], "habitat", tmp_path)
+    dataset = json.loads((tmp_path / "rooms.scene_dataset_config.json").read_text())
+    assert dataset["scene_instances"]["paths"] == {".json": ["scenes"]}
+    room = json.loads((tmp_path / "scenes" / "room.scene_instance.json").read_text())
+    stage = f"{room['stage_instance']['template_name']}.stage_config.json"
+    config = json.loads((tmp_path / stage).read_text())
+    named = trimesh.load_scene(tmp_path / "stages" / config["render_asset"])
+    assert {"floor", "wall_0", "ceiling"} <= set(named.graph.nodes_geometry)
+    # Standing moved the desk down by 5 cm.
+    centers = [(-1.2, 0.3, -0.9), (2.3, 0.4, -0.6), (1.0, 2.2, -0.5), (0.0, 0.25, 1.5)]
+    for entry, item, center in zip(room["object_instances"], more.objects, centers, strict=True):
+        path = tmp_path / f"{entry['template_name']}.object_config.json"
+        config = json.loads(path.read_text())
+        assert config["mass"] == mass_kg(item) and config["front"] == [0, 0, -1]
+        for asset in ("render_asset", "collision_asset"):
+            mesh = trimesh.load_scene(path.parent / config[asset]).to_geometry()
+            place = trimesh.transformations.quaternion_matrix(entry["rotation"])
+            place[:3, 3] = entry["translation"]
+            placed = mesh.apply_transform(place)
+            np.testing.assert_allclose(placed.bounds.mean(axis=0), center, atol=1e-5)
+            np.testing.assert_allclose(placed.extents, item.size_m, atol=1e-5)
+    kinds = [entry["motion_type"] for entry in room["object_instances"]]
+    assert kinds == ["DYNAMIC", "DYNAMIC", "STATIC", "DYNAMIC"]
+    # The turned bench is straight in its own frame.
+    own = trimesh.load_scene(tmp_path / "objects" / "room_3_stool.glb").extents
+    np.testing.assert_allclose(own, turned.size_m, atol=1e-5)
+
+
+def test_sceneeval_gets_a_scene_state_with_z_up(scene, tmp_path):
+    export_scenes([scene], "sceneeval", tmp_path)
+    state = json.loads((tmp_path / "scene_0.json").read_text())
+    assert (state["format"], state["scene"]["version"]) == ("sceneState", "scene@1.0.2")
+    for entry, item in zip(state["scene"]["object"], scene.objects, strict=True):
+        model = entry["modelId"].removeprefix("sceneprior.")
+        asset = tmp_path / "assets" / model
+        about = json.loads((asset / "data.json").read_text())["annotations"]
+        assert about["category"] == item.label
+        matrix = np.array(entry["transform"]["data"]).reshape(4, 4).T
+        placed = trimesh.load_scene(asset / f"{model}.glb").to_geometry().apply_transform(matrix)
+        x, y, z = item.center_m
+        np.testing.assert_allclose(placed.bounds.mean(axis=0), (x, -z, y), atol=1e-6)
+        np.testing.assert_allclose(placed.extents, np.array(item.size_m)[[0, 2, 1]], atol=1e-6)
+    floor, *walls = state["scene"]["arch"]["elements"]
+    outline = shapely.Polygon([(x, y) for x, y, _ in floor["points"]])
+    assert outline.exterior.is_ccw and len(walls) == 6
+    (wall,) = (wall for wall in walls if wall["holes"])
+    (hole,) = wall["holes"]
+    start, end = np.array(wall["points"])[:, :2]
+    along = (end - start) / np.linalg.norm(end - start)
+    # The door's ends, counted from the wall's first point, are where the room has them.
+    ends = sorted((start + along * hole["box"][side][0]).tolist() for side in ("min", "max"))
+    np.testing.assert_allclose(ends, [[1.0, 2.0], [1.9, 2.0]], atol=1e-9)
+    assert (hole["type"], hole["box"]["max"][1]) == ("Door", 2.0)

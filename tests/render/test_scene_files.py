@@ -2,7 +2,9 @@
 
 import json
 import re
+import shutil
 import struct
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -314,3 +316,25 @@ def test_a_room_with_walls_is_read_as_its_furniture(tmp_path):
     assert sorted(named) == sorted(["0_double_bed", *shell])
     (item,) = load_scene(tmp_path / "a.json").objects
     assert len(item.mesh.faces) == 12
+
+
+VALIDATE = """
+const validator = require("gltf-validator");
+const bytes = new Uint8Array(require("fs").readFileSync(process.argv[1]));
+validator.validateBytes(bytes).then(report => console.log(JSON.stringify(report.issues)));
+"""
+
+
+@pytest.mark.parametrize("shell", ["none", "floor", "walls"])
+def test_the_gltf_validator_finds_nothing(tmp_path, shell):
+    """By gltf-validator of npm: `npm install gltf-validator`, and NODE_PATH names node_modules."""
+    known = shutil.which("node") and subprocess.run(
+        ["node", "-e", "require('gltf-validator')"], capture_output=True
+    )
+    if not known or known.returncode:
+        pytest.skip("no gltf-validator here: npm install gltf-validator, and set NODE_PATH")
+    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
+    save_scene(Scene("a", "front3d_bedroom", (bed,)), tmp_path / "a.glb", shell=shell)
+    command = ["node", "-e", VALIDATE, str(tmp_path / "a.glb")]
+    issues = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]

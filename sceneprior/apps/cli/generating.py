@@ -49,7 +49,7 @@ def synthesize(
 ) -> None:
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them.
 
-    Without --shell, GLBs hold furniture alone.
+    Without --shell, GLBs hold furniture only.
     """
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import PAGE_FILE, check_free, write_scenes

@@ -64,7 +64,7 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace exis
 ShellOption = Annotated[
     str | None,
     typer.Option(
-        help="What to write of the room itself: walls (with floor and ceiling), floor, or none."
+        help="Parts of the room itself to write: walls (with floor and ceiling), floor, or none."
     ),
 ]
 InceptionOption = Annotated[

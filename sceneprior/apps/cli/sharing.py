@@ -101,7 +101,10 @@ def export(
         Path, typer.Argument(help="Folder of scenes, or of box lists for `--to scenes`.")
     ],
     to: Annotated[
-        str, typer.Option(help="Format: mujoco, usd, obj, atiss or threed-front; or scenes.")
+        str,
+        typer.Option(
+            help="Format: mujoco, usd, habitat, sceneeval, obj, atiss, threed-front; or scenes."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
     label_set: Annotated[

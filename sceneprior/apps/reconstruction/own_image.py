@@ -42,7 +42,7 @@ SAME_CLASS = {
 CAMERA_HEIGHTS_M = (1.0, 1.2, 1.4, 1.6, 1.8)
 """Camera heights that are tried if no pose is given, from a sitting to a standing photographer."""
 LARGEST_PX = 640
-"""Longest side, about that of training images; larger images are subsampled."""
+"""Longest side of an image in pixels, as in training images; larger images are subsampled."""
 FILM_DIAGONAL_MM = math.hypot(36, 24)
 UPSIDE_DOWN = 0.1
 """Largest upward component of a camera's y axis (a sine); cameras above it are refused as upside

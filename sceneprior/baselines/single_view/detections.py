@@ -112,8 +112,10 @@ class Detections:
     def offsets_and_distances(
         self, centers_m: Float[Tensor, "masks 3"]
     ) -> tuple[Float[Tensor, "masks 2"], Float[Tensor, " masks"], Bool[Tensor, " masks"]]:
-        """The inverse of `centers_at`, and True for centres in front of the camera. The offsets of
-        other centres are 0."""
+        """The inverse of `centers_at`; the third result is True for centres in front of the camera.
+
+        The offsets of centres behind the camera are 0.
+        """
         away = self.to_frame(centers_m - self.eye_m)
         seen = (self.frame_to_camera @ away.unsqueeze(-1))[..., 0]
         ahead = seen[:, 2] > NEAR_M

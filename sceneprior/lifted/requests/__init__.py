@@ -1,2 +1,2 @@
-"""Rooms on request: a floor, doors and windows, and wishes enter the sampler's distribution; what
-cannot be conditioned is met by sequential Monte Carlo over partly furnished rooms."""
+"""Rooms on request: the sampler is conditioned on a floor, doors, windows and wishes. Conditions
+that are not inputs of its network are met by sequential Monte Carlo over partly furnished rooms."""

@@ -11,7 +11,7 @@ from sceneprior.lifted.sampler.network import RoomSampler
 
 
 def wanted_rows(wishes: Wishes, classes: tuple[str, ...], given: list[int]) -> list[int]:
-    """Classes of the objects that the wishes need beside the given ones, by index."""
+    """Classes, by index, of the objects that the wishes need in addition to the given ones."""
     wanted = []
     for label in wishes.labels:
         index = classes.index(label)
@@ -29,8 +29,8 @@ def draw_contents(
 ) -> list[int]:
     """Classes to add to the given objects: those that the wishes need, then others by the network.
 
-    The network learnt to continue any part of a room's list, so it draws the others given that the
-    wanted ones are there; a class of which there is the largest wanted number is ruled out.
+    The network has learnt to continue any part of a room's list, so it draws the other classes
+    given the wanted ones. A class that has reached its largest wanted number is ruled out.
     """
     added = wanted_rows(wishes, classes, given)
     counts = torch.zeros(1, len(sampler.contents.known))

@@ -18,8 +18,8 @@ for the wanted objects, or else the largest."""
 FULL_SHARE = 0.5
 """Largest share of a drawn floor that the mean footprints of wanted and given objects may cover."""
 CROWDED_SHARE = 1.2
-"""Share of a requested floor from which their smallest footprints are certain not to fit: two may
-intersect, such as a chair and its table."""
+"""Share of a requested floor above which the smallest footprints of these objects are taken not to
+fit. It is above 1, because some objects may intersect, such as a chair and its table."""
 
 
 class RoomPlan(NamedTuple):

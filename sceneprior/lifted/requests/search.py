@@ -1,5 +1,5 @@
-"""A place for a wanted object where the sampler draws none that fits: candidates all over the room,
-one of which is chosen by the sampler's density."""
+"""Searches a place for a wanted object if the sampler draws none that fits: candidates are spread
+over the whole room, and one is chosen by the sampler's density."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,9 +20,9 @@ from sceneprior.lifted.sampler.reading import Frame, Reading
 from sceneprior.lifted.sampler.violations import violation
 
 CANDIDATES = 128
-"""Places and quarter turns that are tried."""
+"""Number of candidates, each a place and a quarter turn."""
 COMPARED = 16
-"""Fitting candidates whose densities are compared."""
+"""Number of fitting candidates whose densities are compared."""
 FLUSH, ADJACENT = 0.5, 0.25
 """Probabilities, along each axis, that a candidate stands flush with a side of a rectangle in the
 floor, and next to an object or flush with it."""

@@ -14,9 +14,9 @@ from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import check_floor
 
 NARROWEST_M = 0.3
-"""Shortest side of a rectangle that furniture is placed in."""
+"""Minimum side of a rectangle in which furniture is placed."""
 SPACING_M = 0.25
-"""Distance of the points on slanted sides at which rectangles may end."""
+"""Distance between the points on slanted sides at which rectangles may end."""
 NEW_SHARE = 0.01
 """Share of the floor that a rectangle must cover beyond the larger ones to be kept."""
 LEAST_AREA_M2 = 1.0
@@ -66,8 +66,8 @@ class RoomShape:
 
     @property
     def extents_m(self) -> Float[np.ndarray, "2"]:
-        """Extents of the bounding rectangle, scaled to the area of the floor: what the contents of
-        the room are drawn by."""
+        """Extents of the bounding rectangle, scaled to the area of the floor; the room's contents
+        are drawn given these."""
         extents_m = self.rectangle_m[2:]
         return np.asarray(extents_m * np.sqrt(self.polygon.area / extents_m.prod()))
 

@@ -158,7 +158,8 @@ def _draw_places(
     chance: Float[np.ndarray, "rows numbers"],
     hurdles: Hurdles,
 ) -> list[int]:
-    """Place objects at the first of `TRIES` drawn places that fits; rows of `found` left over."""
+    """Place objects at the first of `TRIES` drawn places that fits; returns the rows of `found`
+    without a place."""
     numbers = torch.from_numpy(chance[found.rows.numpy(), 7:]).float().unflatten(1, (TRIES, 4))
     x = found.places.draw_x(numbers[..., :2])
     waiting = torch.arange(len(found.rows))

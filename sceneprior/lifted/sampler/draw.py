@@ -43,7 +43,7 @@ ROUNDS = 16
 PLANS = 3
 """Maximum number of plans of a room."""
 BATCH = 256
-"""Rooms drawn at a time."""
+"""Number of rooms sampled at a time."""
 
 
 @torch.no_grad()

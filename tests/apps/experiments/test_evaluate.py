@@ -173,8 +173,8 @@ def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
     assert (
         "<h2>New rooms</h2>" in page and "The test rooms of these shards have no 3D boxes" in page
     )
-    assert "<h2>What training saw</h2>" in page and "Real, test split" not in page
-    assert "<h2>Scores</h2>" not in page and "read back in 3D" not in page
+    assert "<h2>Training input</h2>" in page and "Real, test split" not in page
+    assert "<h2>Scores</h2>" not in page and "<h2>Decoded training rooms<" not in page
     # Scores that are named have to be there.
     status, _, errors = command("report", "--run", "run", "--scores", "missing.json")
     assert status == 2 and errors.startswith("Error: missing.json holds no scores")
@@ -210,7 +210,7 @@ def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
     status, _, errors = command("report", "--run", "run", "--renderer", "software")
     assert status == 0, errors
     page = (tmp_path / "run" / "report.html").read_text()
-    assert "<h2>New rooms</h2>" in page and "read back in 3D" in page
+    assert "<h2>New rooms</h2>" in page and "<h2>Decoded training rooms<" in page
     # Runs whose rooms are known still have to be evaluated first.
     config.write_text(config.read_text().replace(str(tmp_path / "bare"), str(toy_shards)))
     status, _, errors = command("report", "--run", "run", "--renderer", "software")
