@@ -45,7 +45,7 @@ def boxes_ratio(
     level: int = 4,
 ) -> dict[str, float]:
     """Median seconds of a step in closed form and with an icosphere (the authors' has level 4), and
-    their ratio, after one warm-up step."""
+    the ratio of the two, after one warm-up step."""
     centers, sizes, cameras, intrinsics = make_batch(rooms, views, objects)
     sphere = icosphere(level)[0].expand(rooms, objects, -1, -1)
 

@@ -34,8 +34,8 @@ def measure(work: Callable[[], T]) -> tuple[T, dict[str, float]]:
 
 
 def time_evaluation(run: Path, shards: Path | None, count: int, renderer: str) -> dict[str, Any]:
-    """Seconds of synthesis and of scoring, without and with a reference file, which its first use
-    writes; they are also printed as measured."""
+    """Seconds of synthesis, and of scoring without a reference file, while writing one, and with
+    the file; each value is also printed once it is measured."""
     seconds: dict[str, Any] = {}
 
     def timed(name: str, work: Callable[[], T]) -> T:

@@ -177,8 +177,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     names = ["ids", "workers", "sens"]
     parser.add_argument("--only", nargs="+", choices=names, default=names)
-    parser.add_argument("--rooms", type=int, default=240, help="that the workers prepare")
-    parser.add_argument("--json", type=Path, help="write the figures to this file, too")
+    parser.add_argument("--rooms", type=int, default=240, help="rooms that the workers prepare")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
     arguments = parser.parse_args()
     parts: dict[str, Callable[[], dict[str, Any]]] = {
         "ids": ids,

@@ -86,7 +86,7 @@ def _child(
         text=True,
     )
     if child.returncode:
-        lines = child.stderr.strip().splitlines() or ["it said nothing"]
+        lines = child.stderr.strip().splitlines() or ["it printed nothing"]
         raise RuntimeError(f"{processes} training processes stopped: {lines[-1]}")
     return json.loads((run / "clock.json").read_text())
 
@@ -146,7 +146,7 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=4, help="of each stage, at least 3")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--set", action="append", default=[], help="shape.silhouettes=fast")
-    parser.add_argument("--json", type=Path, help="write the figures to this file, too")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--processes", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()

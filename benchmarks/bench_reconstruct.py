@@ -71,7 +71,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True)
     parser.add_argument("--shards", type=Path, required=True)
     parser.add_argument("--images", type=int, default=32)
-    parser.add_argument("--steps", type=int, default=4, help="of the fit of latents")
+    parser.add_argument("--steps", type=int, default=4, help="steps of the latent fit")
     parser.add_argument("--singles", type=int, default=4, help="images timed alone")
     parser.add_argument("--threads", type=int, default=1)
     given = parser.parse_args()
@@ -88,7 +88,7 @@ def main() -> None:
         "object by object": (lambda some: reconstruct(trained, some, FitOptions()), 1.0),
         f"a latent, {FULL} steps": (lambda some: fit_some(trained, some, given.steps), scale),
     }
-    print(f"{len(images)} images, {given.threads} threads, seconds of processor time an image")
+    print(f"{len(images)} images, {given.threads} threads, CPU seconds per image")
     for name, (way, times) in rows.items():
         alone = times * statistics.mean(cpu_seconds(partial(way, [image])) for image in picked)
         many = times * cpu_seconds(partial(way, images)) / len(images)

@@ -157,7 +157,7 @@ def _told(figures: dict[str, float]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--rooms", nargs="+", type=int, default=[500, 2000, 6000])
-    parser.add_argument("--json", type=Path, help="write the figures to this file, too")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
     parser.add_argument("--folder", type=Path, help="keep what is made here")
     parser.add_argument("--part", nargs=2, help=argparse.SUPPRESS)  # for child processes
     arguments = parser.parse_args()

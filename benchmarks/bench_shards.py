@@ -189,7 +189,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--shards", type=Path, help="measure these instead of made homes")
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--json", type=Path, help="write the figures to this file, too")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     figures: dict[str, Any] = {"cores": os.cpu_count(), "load_average": os.getloadavg()}

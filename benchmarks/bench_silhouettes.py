@@ -209,7 +209,7 @@ def machine() -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file, too")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
     parser.add_argument("--repeats", type=int, default=15)
     arguments = parser.parse_args()
     figures: dict[str, Any] = {}

@@ -27,7 +27,7 @@ def main() -> None:
     """Measure and print."""
     options = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     options.add_argument("--run", default="demo-bedroom")
-    options.add_argument("--rooms", type=int, default=1000, help="of the large set")
+    options.add_argument("--rooms", type=int, default=1000, help="rooms of the large set")
     options.add_argument("--json", type=Path)
     given = options.parse_args()
     measured: dict[str, object] = {"cores": os.cpu_count(), "load": os.getloadavg()[0]}

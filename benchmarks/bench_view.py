@@ -42,8 +42,8 @@ RADIUS = 0.35
 def main() -> None:
     """Measure and print."""
     options = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    options.add_argument("run", help="as `sceneprior view` takes it")
-    options.add_argument("--rooms", type=int, default=200, help="one round of the circle")
+    options.add_argument("run", help="run or prior, as for `sceneprior view`")
+    options.add_argument("--rooms", type=int, default=200, help="rooms of one round of the circle")
     options.add_argument("--json", type=Path)
     given = options.parse_args()
     measured: dict[str, Any] = {"cores": os.cpu_count(), "load": os.getloadavg()[0]}

@@ -2,22 +2,23 @@
 
     python benchmarks/complete_rooms.py --run RUN --shards SHARDS [--answers 4] [--seed 0]
 
-Half of the objects of each test room, rounded down and at least one, are given, drawn by --seed;
-the rest is hidden. The rows of the table are
+In each test room, half of the objects (rounded down, at least one), drawn by --seed, are given; the
+others are hidden. The rows of the table are
 
 - completed: results of `complete`, --answers per room;
 - untouched start: the same without the fit (0 steps): the best sampled rooms, with the given
   objects inserted;
-- nearest training room: the real training room (its 3D ground truth, which the prior never saw)
-  whose objects are nearest to the given ones of their class, with these inserted; one per room;
+- nearest training room: the training room (its 3D ground truth, which training does not use) whose
+  objects are nearest to the given objects of the same class, with the given objects inserted; one
+  per room;
 - test rooms: the test rooms themselves.
 
 `overlaps` is the mean number of intersecting pairs of boxes, and `beds` the share of rooms with the
 furniture of their type (a bed in bedrooms). `found` is the share of given objects for which the
-room already had an object of the class, and `off_m` the mean distance between the two (over centres
-and sides). `differ` is the diversity of the completions of one room: the mean over pairs of 1 - the
-summed IoU of matched added objects of the same class, divided by the larger number of added
-objects; 0 means equal.
+room already had an object of the class, and `off_m` the mean distance between the two objects (over
+centres and sides). `differ` is the diversity of the completions of one room, a mean over pairs of
+completions. Added objects of the same class are matched, and a pair scores 1 minus the summed IoU
+of the matches divided by the larger number of added objects; 0 means equal.
 """
 
 import argparse
@@ -50,7 +51,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True)
     parser.add_argument("--shards", type=Path, required=True)
     parser.add_argument("--answers", type=int, default=4)
-    parser.add_argument("--rooms", type=int, help="only so many test rooms")
+    parser.add_argument("--rooms", type=int, help="number of test rooms (default: all)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()

@@ -51,7 +51,7 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=24)
     parser.add_argument("--steps", type=int, default=150)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--level", type=int, default=2, help="of the icosphere")
+    parser.add_argument("--level", type=int, default=2, help="level of the icosphere")
     parser.add_argument("--image-step", type=int, default=4)
     parser.add_argument("--variants", nargs="+", default=VARIANTS)
     parser.add_argument("--json", type=Path)
@@ -93,7 +93,7 @@ def main() -> None:
 
 def lift_rooms(shards: Path, seed: int) -> list[list[Mesh]]:
     """Meshes of all rooms' objects by lifting; empty for an object that no view shows."""
-    with tempfile.TemporaryDirectory() as name:  # the cache next to the shards is of all views
+    with tempfile.TemporaryDirectory() as name:  # the cache next to the shards uses all views
         for each in shards.iterdir():
             if not each.name.startswith("lifted_"):
                 (Path(name) / each.name).symlink_to(each.resolve())

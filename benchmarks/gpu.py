@@ -93,7 +93,7 @@ def run_part(name: str, out: Path, words: list[str], seconds: float) -> str | No
         try:
             status = child.wait(seconds)
         except subprocess.TimeoutExpired:
-            return f"stopped after {seconds / 60:.1f} minutes; the rows are what it had by then"
+            return f"stopped after {seconds / 60:.1f} minutes; the rows were measured until then"
         finally:
             if child.poll() is None:
                 os.killpg(child.pid, signal.SIGKILL)

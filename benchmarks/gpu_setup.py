@@ -54,13 +54,13 @@ class Setup:
     folder: Path
     """Folder shared by all parts, which keeps the homes."""
     note: Callable[[str, dict[str, float]], None]
-    """Writes a row of the part's table at once: its title, and values by names that end in units.
-    """
+    """Function that writes a row of the part's table at once, from the row's title and its values
+    by name; names end in units."""
 
 
 @contextmanager
 def peak_mib(device: str) -> Iterator[Callable[[], float]]:
-    """Yield a function that returns the peak MiB of tensors on the GPU since then; 0 on a CPU."""
+    """Yield a function that returns the peak MiB of tensors on the GPU since entry; 0 on a CPU."""
     if device == "cpu":
         yield lambda: 0.0
         return

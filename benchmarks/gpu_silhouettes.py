@@ -93,12 +93,12 @@ def speed(setup: Setup) -> None:
             step = forward_backward(room, mode=mode)
             with peak_mib(setup.device) as peak:
                 seconds = medians({mode: step}, setup.sizes.repeats)[mode]
-            what = f"{mode}, rooms: {rooms}, faces an object: {len(room['faces']):,}"
+            what = f"{mode}, rooms: {rooms}, faces per object: {len(room['faces']):,}"
             setup.note(what, {"forward_backward_s": seconds, "peak_mib": peak()})
     room = furnished_room(setup.sizes.levels[0])
     for mode in MODES:
         seconds = medians({mode: forward_backward(room, mode=mode)}, setup.sizes.repeats)[mode]
-        what = f"{mode}, rooms: 1, faces an object: {len(room['faces']):,}; on the CPU beside it"
+        what = f"{mode}, rooms: 1, faces per object: {len(room['faces']):,}; on the CPU beside it"
         setup.note(what, {"forward_backward_s": seconds})
 
 

@@ -59,7 +59,7 @@ def whole_epochs_s(times: StageTimes, epochs: int, rotations: int) -> float:
 def batches(setup: Setup) -> None:
     """Time the steps with more rooms per batch."""
     batch = setup.sizes.large_batch
-    _time(setup, f"{batch} rooms a batch", "32-true", "high", batch)
+    _time(setup, f"{batch} rooms per batch", "32-true", "high", batch)
 
 
 def precision(setup: Setup) -> None:

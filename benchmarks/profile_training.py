@@ -144,7 +144,7 @@ def main() -> None:
     parser.add_argument("configs", nargs="*", default=CONFIGS, metavar="CONFIG")
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--steps", type=int, default=20)
-    parser.add_argument("--shards", type=Path, help="prepared bedrooms; made here if not given")
+    parser.add_argument("--shards", type=Path, help="prepared bedrooms (default: homes are made)")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         shards = options.shards or made_shards(Path(name), ROOMS, workers=1)

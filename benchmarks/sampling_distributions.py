@@ -1,9 +1,10 @@
 """Frechet distances to the test rooms of decoded training rooms, and of samples by distribution.
 
 Run `python benchmarks/sampling_distributions.py RUN [RUN ...]`. Decoded training rooms are a limit
-for generated rooms: their distance measures the decoder, and the difference to it measures the
-sampling distribution. The distances are in EfficientNet-Lite0 features (not FID), seed 0, with as
-many rooms as training rooms; in brackets, with all rooms drawn as boxes.
+for generated rooms: the distance of decoded training rooms measures the decoder, and the excess of
+generated rooms over this distance measures the sampling distribution. The distances are in
+EfficientNet-Lite0 features (not FID), for seed 0 and as many rooms as training rooms; the values in
+brackets are for rooms drawn as boxes.
 """
 
 import argparse
@@ -27,7 +28,9 @@ DISTRIBUTIONS = ("kernel", "paper")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("runs", type=Path, nargs="+", help="that remember training rooms")
+    parser.add_argument(
+        "runs", type=Path, nargs="+", help="runs that keep the latents of training rooms"
+    )
     for name in parser.parse_args().runs:
         trained = load_run(name)
         shards = Path(trained.config.data.shards)

@@ -1,7 +1,7 @@
 """Chamfer distance and volumetric IoU between decoded training objects and true ones, by class.
 
 Run `python benchmarks/shape_fidelity.py RUN`. The rows compare three kinds of decoded shapes with
-the true meshes, which training never saw: the layout stage's boxes, drawn as the inscribed
+the true meshes, which training does not use: the layout stage's boxes, drawn as the inscribed
 ellipsoids (the paper's proxy) and as boxes (in a run of one stage, that stage's boxes), and the
 final meshes. Objects are matched by boxes (`match_scenes`), each object has the same weight, and
 points are sampled with a fixed seed. Two more tables list the distance and the IoU by class.
@@ -179,10 +179,10 @@ def main() -> None:
     """Print a table in Markdown."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("run", type=Path)
-    options.add_argument("--points", type=int, default=2000, help="on each surface")
-    options.add_argument("--rooms", type=int, help="compare surfaces in so many, not in all")
-    options.add_argument("--json", type=Path, help="also writes five figures")
-    options.add_argument("--sheet", type=Path, help="also draws 24 rooms, truth beside them (PNG)")
+    options.add_argument("--points", type=int, default=2000, help="points on each surface")
+    options.add_argument("--rooms", type=int, help="rooms compared by surface (default: all)")
+    options.add_argument("--json", type=Path, help="file for five of the numbers")
+    options.add_argument("--sheet", type=Path, help="file for a picture of 24 rooms (PNG)")
     options.add_argument("--renderer", default="auto")
     given = options.parse_args()
     trained = load_run(given.run)

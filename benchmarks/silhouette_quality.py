@@ -4,8 +4,8 @@
     python benchmarks/silhouette_quality.py --run out/small --epochs 10 --seed 0
 
 Every variant starts from the same layout checkpoint and trains on the same batches. The decoded
-training rooms are then rasterised hard, and each object's visible mask is compared with the
-observed one (mask IoU, mean over objects and views), and its 3D box with the truth (mean over
+training rooms are then rasterised without softness. Each object's visible mask is compared with the
+observed one (mask IoU, mean over objects and views), and its 3D box with the true box (mean over
 objects).
 """
 

@@ -56,7 +56,7 @@ class StageTimes:
     starts_s: list[float] = field(default_factory=list)
     """Start times of the epochs by the wall clock."""
     starts_cpu_s: list[float] = field(default_factory=list)
-    """CPU seconds of the process at these times."""
+    """CPU seconds of the process at the starts of the epochs."""
     steps_s: list[list[float]] = field(default_factory=list)
     """Seconds of the steps, by epoch."""
     peak_mib: float = 0.0
@@ -76,12 +76,13 @@ class StageTimes:
 
     @property
     def epoch_cpu_s(self) -> float:
-        """Median CPU seconds of these epochs in this process, without loader processes."""
+        """Median CPU seconds of the epochs of `epoch_s` in this process, without its loaders."""
         return _between(self.starts_cpu_s)
 
     @property
     def step_s(self) -> float:
-        """Median seconds of a step in these epochs: loss, backward and update, without loading."""
+        """Median seconds of a step (loss, backward and update, without loading), in the epochs of
+        `epoch_s`."""
         return statistics.median(step for epoch in self.steps_s[1:-1] for step in epoch)
 
     def figures(self) -> dict[str, float]:

@@ -1,9 +1,9 @@
 """Objects found from masks whose ids mean nothing across frames, against the true ones.
 
 Run `python benchmarks/tracks.py SHARDS ... [--noise 0 1]`. The shards must hold 3D ground truth,
-as those of `make-homes` with `prep-front` do. Every frame's ids are drawn anew. Noise, by seed: 10%
-of the masks missing, 5% merged with the nearest mask of the same view, 5% cut in two, 5% with the
-class of another object, each pose off by 1 cm and 0.5 degrees.
+as those of `make-homes` with `prep-front` do. Every frame gets random new ids. The noise, drawn by
+the seed, removes 10% of the masks, merges 5% with the nearest mask of the same view, cuts 5% in
+two, gives 5% the class of another object, and displaces each pose by 1 cm and 0.5 degrees.
 """
 
 import argparse
@@ -111,7 +111,7 @@ class Score(NamedTuple):
     iou: float
     """Mean 3D IoU of the lifted boxes of the objects found with the true boxes."""
     iou_true_ids: float
-    """The same, with the given masks named by the true object that has most of their pixels."""
+    """Mean 3D IoU if each given mask gets the id of the true object with most of its pixels."""
     seconds: float
 
 

@@ -1,6 +1,6 @@
 """Commands that prepare data, mounted by `sceneprior.apps.cli`.
 
-Heavy imports stand inside the functions, so that the command line starts quickly.
+Heavy imports are inside the functions, so that the command line starts quickly.
 """
 
 from pathlib import Path
@@ -127,7 +127,7 @@ def prep_scannet(
     ] = False,
     frame_step: Annotated[int, typer.Option(help="Every n-th frame is a candidate.")] = 15,
     max_views: Annotated[
-        int, typer.Option(help="Most views of a scan; more candidates are thinned.")
+        int, typer.Option(help="Largest number of views per scan; others are thinned out.")
     ] = 100,
     train_list: Annotated[
         Path | None, typer.Option(help="List of training scans, scannetv2_train.txt.")
@@ -139,7 +139,7 @@ def prep_scannet(
     seed: SeedOption = 0,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    only: Annotated[str | None, typer.Option(help="One scan, or all whose names begin so.")] = None,
+    only: Annotated[str | None, typer.Option(help="A scan, or a prefix of scans' names.")] = None,
     strict: StrictOption = False,
     retry_failed: RetryOption = False,
 ) -> None:
@@ -168,7 +168,7 @@ def prep_posed(
     label_set: Annotated[
         str,
         typer.Option(
-            help="Classes: a file with one a line, a list such as void,bed,chair, or a set's name."
+            help="Classes: a file with one per line, a list (void,bed,chair), or a set's name."
         ),
     ],
     up: Annotated[
@@ -192,20 +192,20 @@ def prep_posed(
         float, typer.Option(help="Height of the lowest camera, where no furniture shows the floor.")
     ] = 1.2,
     metres_per_unit: Annotated[
-        float, typer.Option(help="Metres a unit of the poses, in rooms whose file does not say.")
+        float, typer.Option(help="Metres per unit of the poses, in rooms whose file has none.")
     ] = 1.0,
     max_side: Annotated[
         int | None,
         typer.Option(help="Longest side of stored masks in pixels (default: as they are)."),
     ] = None,
     max_views: Annotated[
-        int, typer.Option(help="Most views of a room; more frames are thinned.")
+        int, typer.Option(help="Largest number of views per room; others are thinned out.")
     ] = 100,
     test_share: Annotated[float, typer.Option(help="Share of rooms in the test split.")] = 0.1,
     seed: SeedOption = 0,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    only: Annotated[str | None, typer.Option(help="One room, or all whose names begin so.")] = None,
+    only: Annotated[str | None, typer.Option(help="A room, or a prefix of rooms' names.")] = None,
     strict: StrictOption = False,
 ) -> None:
     """Turn posed pictures with instance masks into view shards (docs/posed_data.md).
@@ -302,7 +302,7 @@ def run_job(job: "Job") -> None:
     try:
         summary = build_shards(job)
     except KeyboardInterrupt:
-        typer.echo("Stopped; finished shards are kept. Run the same command to go on.", err=True)
+        typer.echo("Stopped; finished shards are kept. Run the same command to continue.", err=True)
         raise typer.Exit(130) from None
     except RoomFailedError as error:
         typer.echo(f"Error: {error}", err=True)
@@ -317,8 +317,8 @@ def run_job(job: "Job") -> None:
     typer.echo(f"{job.out}: {summary} ({made}{drawn})")
     if job.source.only is None and not summary.counts["test"]["rooms"]:
         typer.echo(
-            "Note: the 'test' split is empty. `fit` and `synthesize` need none; eval-fid compares "
-            "with test rooms: prepare more rooms, or name some in a file of splits.",
+            "Note: the 'test' split is empty. `fit` and `synthesize` do not need it, but eval-fid "
+            "does: prepare more rooms, or assign some to `test` in a file of splits.",
             err=True,
         )
     if summary.statuses.get("failed"):

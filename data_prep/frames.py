@@ -30,7 +30,7 @@ class FrameChoice:
     step: int
 
     def notes(self, mask: str) -> list[str]:
-        """Say how many candidates were rejected; `mask` is what those without a mask lack."""
+        """Sentences on the numbers of rejected candidates; `mask` is the name of a missing mask."""
         of = f"of {self.candidates} frames" + (f" (every {self.step})" if self.step > 1 else "")
         rejected = {"usable pose": self.bad_poses, mask: self.without_mask}
         return [
@@ -166,8 +166,8 @@ def mask_intrinsics(
     if abs(shapes[0] / shapes[1] - 1) > _ASPECT_SLACK:
         raise InputError(
             f"The masks are {mask_size[1]} x {mask_size[0]} pixels but the colour frames "
-            f"{color_size[1]} x {color_size[0]}, another shape: they do not show the same "
-            "picture. Use the masks that belong to this recording."
+            f"{color_size[1]} x {color_size[0]}: with different aspect ratios they do not show the "
+            "same picture. Use the masks that belong to this recording."
         )
     intrinsics = np.array(intrinsics, dtype=np.float64)
     # Axis 0 is u (width), axis 1 is v (height).

@@ -42,7 +42,7 @@ class _Given(NamedTuple):
 def own_sides(seen: Sightings, image_size: tuple[int, int]) -> np.ndarray:
     """Find the sides of the 2D boxes at which the object itself ends: (T, n, 4) bool.
 
-    At the other sides, another object or the image border may cut it off.
+    At the other sides, another object or the image border may cut the object off.
     """
     height, width = image_size
     within = np.abs(seen.boxes - 0.5) < 0.5 - 0.5 / np.array([width, height] * 2)

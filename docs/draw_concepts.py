@@ -133,7 +133,7 @@ def draw_generation(prior: TrainedPrior, renderer: Renderer, path: Path) -> None
 
 
 def draw_silhouettes(prior: TrainedPrior, views: SceneViews, path: Path) -> None:
-    """A sphere in the bed's decoded box goes where the bed's masks pull it."""
+    """A sphere in the bed's decoded box, before and after it is fitted to the bed's masks."""
     bed = label_set(prior.config.label_set).index("double_bed")
     item = int((views.object_class[0] == bed).nonzero())
     decoded = prior.prior.decode(latent_of(prior, ROOM)[None])

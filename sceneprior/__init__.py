@@ -12,16 +12,18 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from sceneprior.apps.api import Prior, load
+    from sceneprior.apps.requests import load_request
     from sceneprior.core.scene import Scene
     from sceneprior.render.scene_files import load_scene
 
 __version__ = "0.1.0"
-__all__ = ["Prior", "Scene", "__version__", "load", "load_scene"]
+__all__ = ["Prior", "Scene", "__version__", "load", "load_request", "load_scene"]
 
 _HOMES = {
     "Prior": "sceneprior.apps.api",
     "Scene": "sceneprior.core.scene",
     "load": "sceneprior.apps.api",
+    "load_request": "sceneprior.apps.requests",
     "load_scene": "sceneprior.render.scene_files",
 }
 

@@ -30,7 +30,7 @@ def rays_of(parts: Parts, count: int, seed: int = 0, margin: float = 1.1) -> Ray
     spans *= 2
     hits = np.zeros(len(starts), bool)
     scale = margin / 2 * LEVELS
-    for kind, bits, ends in zip(*parts, strict=True):
+    for kind, bits, ends in zip(*parts[:3], strict=True):
         met = np.empty(len(starts), bool)
         levels = np.rint((ends + 0.5) * LEVELS).astype(np.int64)
         meets(starts * scale + LEVELS / 2, spans * scale, int(kind), int(bits), levels, met)

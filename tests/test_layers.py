@@ -53,18 +53,18 @@ OWNERS = {
     ],
     "safetensors": ["sceneprior/apps/priors/"],
     "huggingface_hub": ["sceneprior/apps/priors/"],
-    "pxr": ["sceneprior/render/scene_files.py"],
+    "pxr": ["sceneprior/render/scene_usd.py"],
     "yaml": ["sceneprior/core/settings.py", "data_prep/homes/furniture.py"],
     "pydantic": [
         "sceneprior/core/", "sceneprior/training/", "sceneprior/paper/", "sceneprior/lifted/",
         "sceneprior/baselines/", "sceneprior/apps/decoders.py", "sceneprior/apps/experiments/",
-        "data_prep/",
+        "sceneprior/apps/requests.py", "data_prep/",
     ],
     "typer": ["sceneprior/apps/cli/", "data_prep/cli.py"],
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
-    "skimage": ["sceneprior/core/geometry/isosurface.py"],
-    "manifold3d": ["sceneprior/core/geometry/part_meshes.py"],
+    "skimage": ["sceneprior/core/geometry/isosurface", "sceneprior/lifted/lifting/outlines"],
+    "manifold3d": ["sceneprior/core/geometry/part_meshes.py", "sceneprior/core/shell.py"],
     "fast_simplification": ["sceneprior/core/geometry/isosurface.py"],
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/stage"],
     "scipy.optimize": [
@@ -73,6 +73,8 @@ OWNERS = {
     ],
     "cv2": ["data_prep/posed/lens.py"],
     "viser": ["sceneprior/apps/viewer/"],
+    "mujoco": ["sceneprior/evaluation/metrics/stability.py"],
+    "coacd": ["sceneprior/core/colliders.py"],
     "distributed": ["data_prep/engine/cluster.py"],
 }  # fmt: skip
 

@@ -123,7 +123,7 @@ def _asked_for(source: Source, plan: Plan, shards: list[ShardPlan]) -> list[Shar
             if is_asked_for(source.only, line.room_id, line.house)
         ]
         raise InputError(
-            f"No room of the plan is asked for by --only {source.only}{whys[0] if whys else ''}."
+            f"--only {source.only} selects no room of the plan{whys[0] if whys else ''}."
         )
     return chosen
 

@@ -12,7 +12,7 @@ from sceneprior.core.errors import InputError
 
 _CONNECT_S = 20
 _WORKERS_S = 60
-_KEPT = "Finished shards are kept: run the same command again to go on."
+_KEPT = "Finished shards are kept: run the same command again to continue."
 
 
 @contextlib.contextmanager
@@ -35,8 +35,8 @@ def cluster(address: str) -> Iterator[Run]:
             yield lambda *work: in_order(submit, *work)
         except KilledWorker:
             raise InputError(
-                f"A task of the cluster at {address} killed every worker it was given to (for lack "
-                f"of memory?). {_KEPT}"
+                f"A task of the cluster at {address} killed every worker that ran it (for lack of "
+                f"memory?). {_KEPT}"
             ) from None
         except (CancelledError, CommClosedError, TimeoutError) as error:
             raise InputError(
@@ -93,7 +93,7 @@ _thread = ThreadPoolExecutor(max_workers=1)
 def _in_one_thread(function: Callable[..., Any], *arguments: Any) -> Any:
     """Call the function in the worker's single task thread.
 
-    A worker may have several threads, but GL contexts and our caches belong to one.
+    A worker may have several threads, but a GL context and our caches belong to one thread.
     """
     # llvmpipe's own threads would compete with the other workers for the same cores.
     os.environ.setdefault("LP_NUM_THREADS", "1")

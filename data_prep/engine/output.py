@@ -27,7 +27,7 @@ def claimed(out: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def writing(out: Path, what: str = "") -> Iterator[None]:
-    """Turn an OSError into an InputError that names the lost work, `what`, and how to go on."""
+    """Turn an OSError into an InputError that names the lost work, `what`, and how to continue."""
     try:
         yield
     except OSError as error:
@@ -36,5 +36,5 @@ def writing(out: Path, what: str = "") -> Iterator[None]:
         advice = "make room on the disk and " if error.errno in _FULL else ""
         raise InputError(
             f"{where}{about} cannot be written ({error.strerror or error}). "
-            f"Finished shards are kept: {advice}run the same command again to go on."
+            f"Finished shards are kept: {advice}run the same command again to continue."
         ) from None

@@ -20,7 +20,7 @@ ROOMS_PER_SHARD = 8
 
 @dataclass(frozen=True)
 class ShardPlan:
-    """One shard: the unit of work, so an interrupted run loses at most one per worker."""
+    """The rooms of one shard, the unit of work: an interrupted run loses one shard per worker."""
 
     name: str
     """Path within the output folder: `train/bedroom_0000.h5`."""
@@ -69,7 +69,7 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
         data = json.loads(path.read_bytes())
         before = dict(data["settings"])
         if (version := before["plan_version"]) != PLAN_VERSION:
-            why = f"is of another release (plan version {version})"
+            why = f"was written by another release (plan version {version})"
             raise InputError(f"{path} {why}; choose a new folder, or delete {out}.")
         drawn_with = before.pop("renderer")
         plan = TypeAdapter(Plan).validate_python(data)

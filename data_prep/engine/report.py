@@ -1,4 +1,4 @@
-"""The outcome of every room, and what says so: report.json, report.csv and, last, index.json."""
+"""The outcome of every room, and its files: report.json, report.csv and, last, index.json."""
 
 import csv
 import io
@@ -157,7 +157,7 @@ class Summary:
 
     source: Source
     lines: list[Line]
-    """One per room considered; with `--only` in a larger folder, one per requested room."""
+    """One line per room considered; with `--only` in a larger folder, one per requested room."""
     renderer: str | None
     """Name of the renderer; None if nothing was drawn."""
     shards_made: int

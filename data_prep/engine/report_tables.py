@@ -44,7 +44,9 @@ def report_tables(report: dict[str, Any]) -> list[Table]:
     ]
     tables = [
         make_table(("rooms", ""), outcomes),
-        make_table(("split", *_COUNTS, "views a room", "objects a room", "objects a view"), splits),
+        make_table(
+            ("split", *_COUNTS, "views per room", "objects per room", "objects per view"), splits
+        ),
         make_table(("class", *report["counts"]), classes),
     ]
     if notes := [*report["notes"].items()]:
@@ -53,10 +55,10 @@ def report_tables(report: dict[str, Any]) -> list[Table]:
         about = Column("note of prepared rooms", overflow="fold")
         tables.append(make_table((about, "rooms"), rows))
     if unknown := _most_first(report["unknown_categories"]):
-        why = "void: the recipe does not say"
+        why = "counted as void: the recipe does not list them"
         tables.append(make_table(("category without a class", "pieces"), unknown, why))
     if failed := [(item["room_id"], item["reason"]) for item in report["failed"]]:
-        more = [(f"and {len(failed) - _FAILURES_SHOWN} more", "report.csv has them all")]
+        more = [(f"and {len(failed) - _FAILURES_SHOWN} more", "report.csv lists all of them")]
         rows = failed[:_FAILURES_SHOWN] + more * (len(failed) > _FAILURES_SHOWN)
         tables.append(make_table((Column("failed", overflow="fold"), "why"), rows))
     if "expected" in report:

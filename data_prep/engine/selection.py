@@ -18,7 +18,7 @@ def house_may_match(only: str | None, house: str) -> bool:
 
 
 def is_asked_for(only: str | None, room_id: str, house: str) -> bool:
-    """Test whether `--only HOUSE`, `HOUSE/ROOM` or a room id selects this room (None: all).
+    """True if `--only HOUSE`, `HOUSE/ROOM` or a room id selects this room; None selects all rooms.
 
     Example:
 
@@ -99,5 +99,5 @@ def _in_words(left_out: Iterable[Line]) -> str:
     if shapes:
         shape = shapes.most_common(1)[0][0]
         often = next(reason for reason in reasons if re.sub(r"[\d.]+", "#", reason) == shape)
-        often = f"; most often as here: {often.rstrip('.')}"
+        often = f"; the most frequent reason: {often.rstrip('.')}"
     return f"{len(reasons)} were left out{often}"

@@ -39,7 +39,7 @@ class RoomFailedError(InputError):
         """Error for the line of a failed room."""
         return cls(
             f"Room {line.room_id} failed: {line.reason.rstrip('.')}. --strict stops here; finished "
-            "shards are kept, and the same command without --strict goes on."
+            "shards are kept, and the same command without --strict continues."
         )
 
 

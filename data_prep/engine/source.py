@@ -59,9 +59,9 @@ class Line:
     status: str
     """prepared; filtered: excluded by a rule; failed: the files are faulty."""
     rule: str = ""
-    """Name of the rule that filters it: a rule of the recipe, or `split`, `no_view`, ..."""
+    """Name of the rule that filters the room: a rule of the recipe, or `split`, `no_view`, ..."""
     reason: str = ""
-    """Why it is not prepared, as a sentence."""
+    """Reason why the room is not prepared, as a sentence."""
     split: str = ""
     views: int = 0
     objects: int = 0
@@ -143,7 +143,7 @@ class Source(Protocol):
         """Make one cheap pass over the data set and list the rooms to prepare.
 
         `run(function, argument_lists, title)` does the work in worker processes and yields the
-        results in order. It is an `InputError` if nothing is left, or `train` is empty.
+        results in order. Raises InputError if no room is left, or `train` is empty.
         """
 
     def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:

@@ -46,7 +46,7 @@ def pool(workers: int) -> Iterator[Run]:
             "run the same command again, perhaps with fewer --workers."
         ) from None
     except BaseException:
-        # What they were about to write is not missed: files appear whole or not at all.
+        # Killing them leaves no partial files: files are written whole or not at all.
         for worker in multiprocessing.active_children():
             worker.kill()
         raise

@@ -36,12 +36,12 @@ def broken_rule(room: Room, recipe: Recipe) -> tuple[str, str] | None:
     known = [(piece.model_id, piece.category) for piece in room.furniture]
     for model_id, category in (*known, *room.without_model):
         if recipe.allowed_categories and category not in recipe.allowed_categories:
-            return "allowed_categories", f"{shown(category)} is none of allowed_categories"
+            return "allowed_categories", f"{shown(category)} is not among allowed_categories"
         if model_id in recipe.invalid_models:
             return "invalid_models", f"{shown(model_id)} is among the invalid_models"
     if recipe.required_classes and not set(labels) & set(recipe.required_classes):
         names = ", ".join(recipe.required_classes)
-        return "required_classes", f"none of {names}, which required_classes asks for"
+        return "required_classes", f"none of {names}, of which required_classes needs one"
     if recipe.max_floor_m is not None and max(x2 - x1, z2 - z1) > recipe.max_floor_m:
         floor = f"floor {x2 - x1:.2f} x {z2 - z1:.2f} m"
         return "max_floor_m", f"{floor}, max_floor_m is {recipe.max_floor_m:g}"

@@ -11,7 +11,7 @@ import shapely.affinity
 from sceneprior.core.errors import InputError
 
 FAR_M = 1e5
-"""Coordinates beyond this are damage: no house is so large."""
+"""Largest plausible coordinate; larger ones mean a damaged file."""
 DEFAULT_HEIGHT_M = 2.8
 """Height of the few rooms that have neither inner walls nor a ceiling."""
 _LEAST_FLOOR_M2 = 0.1
@@ -25,11 +25,11 @@ def numbers(values: Any) -> np.ndarray:
     if isinstance(values, str):
         values = values.replace(",", " ").strip("[]() ").split()
     if values is None or not isinstance(values, list):
-        raise InputError("what should be a list of numbers is none")
+        raise InputError("expected a list of numbers, found something else")
     try:
         return np.array([float(value) for value in values])
     except (TypeError, ValueError, OverflowError):
-        raise InputError("what should be a list of numbers holds something else") from None
+        raise InputError("a list of numbers holds something else") from None
 
 
 def placement_of(
@@ -52,7 +52,7 @@ def placement_of(
     if len(place) != 3 or len(quaternion) != 4 or len(scale) != 3:
         raise InputError("its placement is incomplete")
     if not (np.abs([*place, *scale, *quaternion]) < FAR_M).all():  # NaN fails, too
-        raise InputError("its placement holds numbers that are no places")
+        raise InputError("its placement holds implausible numbers")
     length = float(quaternion @ quaternion)
     if length < 1e-12:
         raise InputError("its placement is incomplete: the quaternion is zero")
@@ -151,7 +151,10 @@ def _wall_angle(floor: Floor) -> float:
 
 
 def height_of(surfaces: dict[str, list[np.ndarray]], floor_y: float) -> float:
-    """Room height: up to the top of the inner walls, else of the ceiling, else the default."""
+    """Room height in metres, up to the top of the inner walls, or else of the ceiling.
+
+    Without either, it is `DEFAULT_HEIGHT_M`.
+    """
     for kind in ("WallInner", "Ceiling"):
         tops = [float(part[..., 1].max()) for part in surfaces.get(kind, []) if len(part)]
         if tops and max(tops) - floor_y > 1.0:

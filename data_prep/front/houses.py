@@ -22,7 +22,7 @@ class House:
 
 
 def house_files(folder: Path) -> list[Path]:
-    """The house files of a 3D-FRONT folder, sorted; an `InputError` if it holds none."""
+    """The house files of a 3D-FRONT folder, sorted; raises InputError if it holds none."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(
@@ -39,7 +39,7 @@ def house_files(folder: Path) -> list[Path]:
 
 
 def parse_house(path: Path) -> House:
-    """Read the JSON of one house; an `InputError` if it is none."""
+    """Read the JSON of one house; raises InputError if the file is not a house."""
     data = read_json(path)
     lists = {
         "furniture": _inside(data, "furniture"),
@@ -70,7 +70,7 @@ def key_of(uid: Any) -> str:
 
 
 def _by_uid(entries: list[Any]) -> dict[str, dict[str, Any]]:
-    """Index entries by uid. Entries that repeat a uid may differ in `valid`: a valid one wins."""
+    """Index entries by uid. Of several entries with one uid, a valid one is preferred."""
     found: dict[str, dict[str, Any]] = {}
     for entry in entries:
         key = key_of(entry.get("uid")) if isinstance(entry, dict) else ""

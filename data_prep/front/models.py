@@ -34,11 +34,11 @@ class ModelBank:
         return self._categories.get(model_id, "others")
 
     def lists(self, model_id: str) -> bool:
-        """Test whether the release's list has this model; its mesh may be missing all the same."""
+        """True if the release lists this model; its mesh may nevertheless be missing."""
         return model_id in self._categories
 
     def has(self, model_id: str) -> bool:
-        """Test whether the release has a mesh of this model."""
+        """True if the release has a mesh of this model."""
         return is_name(model_id) and (self.folder / model_id / MODEL_FILE).is_file()
 
     def load(self, model_id: str) -> Mesh:
@@ -58,7 +58,7 @@ class ModelBank:
         return mesh
 
     def color(self, model_id: str) -> tuple[int, int, int] | None:
-        """One RGB colour for the whole model: the mean of its texture, else its material's colour.
+        """One RGB colour for the whole model: the texture's mean, or else the material's colour.
 
         None if the release has neither or they are damaged; colours are only used in pictures.
         """

@@ -50,11 +50,11 @@ class ViewRules(Section):
     min_objects: int = 2
     """A view with fewer visible objects is redrawn, unless the room has fewer."""
     min_object_pixels: int = 300
-    """Pixels from which on an object counts as visible for `min_objects`."""
+    """Smallest number of pixels of an object that counts as visible for `min_objects`."""
     max_object_share: Finite = 0.6
     """A view is redrawn if one object covers more than this share of it."""
     tries: int = Field(8, gt=0)
-    """Number of tries, after which the best view drawn stays."""
+    """Largest number of tries per view; after that, the best view drawn is kept."""
 
 
 def _named(given: Any) -> Any:
@@ -139,7 +139,7 @@ def find_recipe(text: str) -> Path:
     path = FOLDER / f"{text}.yaml"
     if not is_name(text) or not path.is_file():
         known = ", ".join(sorted(item.stem for item in FOLDER.glob("*.yaml")))
-        raise InputError(f"No recipe is called '{text}'; there are {known}, and files: mine.yaml.")
+        raise InputError(f"No recipe is called '{text}'; choose from {known}, or name a YAML file.")
     return path
 
 
@@ -154,12 +154,14 @@ def load_recipe(text: str, changes: tuple[str, ...] = ()) -> Recipe:
             data[key] = _lines(Path(data[key]), key)
     recipe = check_settings(Recipe, data, path.name)
     if not is_name(recipe.name):
-        raise InputError(f"{path.name}: its name, {ascii(recipe.name)[:60]}, can name no shards.")
+        raise InputError(
+            f"{path.name}: shards cannot be named by its name, {ascii(recipe.name)[:60]}."
+        )
     names = label_set(recipe.label_set)
     for used in (*recipe.required_classes, *recipe.categories.values()):
         if used not in names:
             raise InputError(
-                f"{path.name}: '{used}' is no class of its label set, which has {', '.join(names)}."
+                f"{path.name}: '{used}' is not in its label set, which has {', '.join(names)}."
             )
     return recipe
 
@@ -168,7 +170,7 @@ def _lines(path: Path, key: str) -> list[str]:
     try:
         return sorted({line.strip() for line in path.read_text().splitlines()} - {""})
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{key} names no file of ids that can be read ({error}).") from None
+        raise InputError(f"{key} names a file of ids that cannot be read ({error}).") from None
 
 
 def recipe_text(name: str) -> str:
@@ -182,7 +184,7 @@ def recipe_text(name: str) -> str:
     classes = {category: recipe.class_of(category) for category in category_table()}
     table = [f"  {category}: {label}\n" for category, label in classes.items() if label != "void"]
     head = (
-        "# 3D-FUTURE's categories, or others. One that is not listed is of the class of its own\n"
-        "# name, or void. `label_set` may be a list of your own: [bed, night stand].\n"
+        "# 3D-FUTURE's categories, or others. A category that is not listed gets the class of the\n"
+        "# same name, or void. `label_set` may be a list of your own: [bed, night stand].\n"
     )
     return f"{text.rstrip()}\n{head}categories:\n{''.join(table)}"

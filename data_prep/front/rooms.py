@@ -72,7 +72,7 @@ def read_house(
         if not wanted(room_id, room_type):
             continue
         if not is_name(name):
-            result.failures.append((room_id, f"its instanceid, {shown(name)}, can be no name"))
+            result.failures.append((room_id, f"its instanceid, {shown(name)}, is not a valid name"))
             continue
         if room_id in seen:
             result.failures.append((room_id, "another room of the house has the same instanceid"))
@@ -105,7 +105,7 @@ class _RoomReader:
     def read(self, room: dict[str, Any], room_id: str, room_type: str) -> Room:
         children = room.get("children") or []
         if not isinstance(children, list):
-            raise InputError("its children are no list")
+            raise InputError("its children are not a list")
         children = [child for child in children if isinstance(child, dict)]
         placed = [
             (child, entry)
@@ -152,7 +152,7 @@ class _RoomReader:
                 notes.append(f"a {kind} mesh is left out: {error}")
                 continue
             if unusable:
-                notes.append(f"a {kind} mesh has {unusable} triangles without places")
+                notes.append(f"a {kind} mesh has {unusable} triangles without valid corners")
             surfaces.setdefault(kind, []).append(surface)
         return surfaces
 

@@ -98,8 +98,8 @@ class FrontSource:
             kinds = " or ".join(self.recipe.room_types or ("any type",))
             there = ", ".join(_room_types(files)) or "none that could be read"
             raise InputError(
-                f"No room of {self.front} is of a type that {self.recipe.name} is about ({kinds}); "
-                f"there are {there}."
+                f"No room of {self.front} is of a type that {self.recipe.name} selects ({kinds}); "
+                f"the folder has {there}."
             )
         if self.splits is None:
             room_ids = [room_id for room_id, _, _ in found]
@@ -126,7 +126,7 @@ class FrontSource:
         read = read_house(house, self.bank, self.recipe, lambda its_id, _: its_id == task.room_id)
         if not read.rooms:
             reasons = [why for _, why in read.failures] + [why for *_, why in read.filtered]
-            why = reasons[0] if reasons else "its house lost it meanwhile"
+            why = reasons[0] if reasons else "it is no longer in the house file"
             return Line(task.room_id, task.house, "failed", reason=why)
         room = read.rooms[0]
         # Checked again, now with meshes: unreadable models may leave too little furniture.

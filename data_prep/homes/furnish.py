@@ -71,7 +71,7 @@ def furnish(room_type: RoomType, catalog: Catalog, rng: np.random.Generator, sha
         if arranged and is_liveable(plan, room_type.reach):
             return plan
     raise RuntimeError(
-        f"No {room_type.name} with {count} pieces found room in 400 tries: {groups}."
+        f"No {room_type.name} could hold these {count} pieces in 400 tries: {groups}."
     )
 
 
@@ -84,7 +84,10 @@ def count_at(histogram: dict[int, int], share: float) -> int:
 def draw_basics(
     rng: np.random.Generator, basics: list[tuple[str, int, float]], left: int
 ) -> tuple[list[str], int]:
-    """Sample groups from (name, pieces, chance); returns them and the number of pieces left."""
+    """Sample groups from `basics`, (name, pieces, chance), with at most `left` pieces in total.
+
+    Returns the sampled groups and the number of pieces that remain for other groups.
+    """
     groups = []
     for name, pieces, chance in [basics[k] for k in rng.permutation(len(basics))]:
         if 0 < pieces <= left and rng.random() < chance:

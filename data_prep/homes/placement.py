@@ -75,9 +75,9 @@ class Furnisher:
     ) -> Piece | None:
         """Place a piece with its back to one of the walls, by default of all.
 
-        `clearance` metres stay clear in front of it, `corner` is the chance to try an end of the
-        wall, and `where` the desired position of its centre along the wall in metres, with a
-        standard deviation of 0.15.
+        `clearance` metres in front of the piece stay clear. `corner` is the chance to try an end of
+        the wall. `where` is the desired position of the piece's centre along the wall in metres;
+        the sampled position varies with a standard deviation of 0.15.
         """
         choice = self.plan.walls if walls is None else walls
         lengths = np.array([wall.length for wall in choice])

@@ -82,4 +82,4 @@ def _box_problem(k: int, points: np.ndarray, truth: RoomGroundTruth) -> list[str
     off = np.abs(stored - np.stack([points.min(axis=0), points.max(axis=0)])).max()
     if off <= _BOX_SLACK_M + 1e-5 * np.abs(stored).max():
         return []
-    return [f"the 3D box of object {k} is {off:.3f} m off the box round its placed mesh"]
+    return [f"the 3D box of object {k} differs by {off:.3f} m from the box around its placed mesh"]

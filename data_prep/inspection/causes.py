@@ -20,7 +20,7 @@ from sceneprior.core.shards import RoomViews
 Bodies = Sequence[Body | None]
 
 CHANCE = "chance"
-"""Not a mistake but the baseline: shuffled cameras."""
+"""Cause under which the baseline, shuffled cameras, is listed; it is not a mistake."""
 _OPENGL_AXES = np.diag(np.array([1, -1, -1, 1], dtype=np.float32))
 _Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float32)
 """Rotation from a world with y up to one with z up."""

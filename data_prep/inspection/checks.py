@@ -23,7 +23,7 @@ def array_problems(views: RoomViews, classes: int) -> Iterator[str]:
     pinhole = (K[:, (0, 1), (0, 1)] > 0).all(axis=1)
     pinhole &= (K[:, (0, 1, 2, 2, 2), (1, 0, 0, 1, 2)] == (0, 0, 0, 0, 1)).all(axis=1)
     if not pinhole.all():
-        yield f"the intrinsics of view {int(np.argmin(pinhole))} are those of no pinhole"
+        yield f"the intrinsics of view {int(np.argmin(pinhole))} are not those of a pinhole camera"
     if not ((views.boxes >= 0) & (views.boxes <= 1)).all():
         yield "a 2D box reaches beyond the image"
     if (views.boxes[~views.visible] != 0).any() or (views.mask_pixels[~views.visible] != 0).any():

@@ -39,7 +39,7 @@ def count_tables(folder: Path) -> list[Table]:
         totals.append((split, len(rooms), views, objects, *means, in_3d, image_size))
         classes[split] = Counter(names[index] for room in rooms for index in room.object_class)
     columns = (
-        "split", "rooms", "views", "objects", "objects a room", "objects a view", "known in 3D",
+        "split", "rooms", "views", "objects", "objects per room", "objects per view", "known in 3D",
         "image size",
     )  # fmt: skip
     every = sorted({name for counts in classes.values() for name in counts})
@@ -117,7 +117,10 @@ def summary(found: FolderCheck) -> str:
             text += f"; {tally.whole} unoccluded ones have a mean 2D IoU of {tally.mean_iou:.3f}"
         parts.append(text)
     if not found.agreement.tallies:
-        parts.append("no object could be held against its masks in 3D")
+        parts.append("no object could be compared with its masks in 3D")
     elif "found" in found.agreement.tallies:
-        parts.append("found boxes do not tell whether all is too large, too small or mirrored")
+        parts.append(
+            "boxes found from masks cannot show whether everything is too large, too small or "
+            "mirrored"
+        )
     return "; ".join(parts) + "."

@@ -18,8 +18,8 @@ from sceneprior.core.shards import RoomViews
 _ROOM_MASKS = 5
 """Minimum number of masks for a statement about a room."""
 _OUTLIER = 0.5
-"""In a room that agrees as a whole, views and objects with a smaller share of agreeing masks are
-reported."""
+"""Share of agreeing masks below which a view or object is reported, in a room that agrees as a
+whole."""
 _CAMERA_HEIGHTS_M = 0.2, 4.0
 _OBJECT_SIZES_M = 0.15, 6.0
 """Plausible ranges of a room's median camera height and median object length."""
@@ -43,7 +43,7 @@ def disagreement(
         )
     chance = chance_of(trials, kind)
     if tally.share <= chance + 0.1:
-        text += f"; no better than cameras dealt out at random ({chance:.0%})"
+        text += f"; no better than randomly shuffled cameras ({chance:.0%})"
     return f"{text}: {likely_cause(trials, kind, share, least)}"
 
 
@@ -85,7 +85,7 @@ def _outliers(bodies: Sequence[Body | None], views: RoomViews, seen: Comparison)
         if not len(wrong):
             yield (
                 f"object {k} is not where its ground truth has it: {lost[k]} of its {seen_in[k]} "
-                "masks stick out of its projection, those of other objects do not"
+                "masks reach beyond its projection, unlike those of other objects"
             )
 
 

@@ -151,7 +151,7 @@ def _check_room(shard: Shard, folder: Path, name: str, room_id: str, try_causes:
         return RoomCheck(name, room_id, problems=(str(error).removesuffix("."),))
     problems = []
     if stored is not None and stored != room_checksum(views, truth):
-        problems.append("its checksum is not that of its contents: the file was changed or damaged")
+        problems.append("its checksum does not match its contents: the file was changed or damaged")
     wrong = [*array_problems(views, len(label_set(shard.label_set)))]
     problems += [*wrong, *mask_problems(views)]
     if truth is not None:

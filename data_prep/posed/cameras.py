@@ -54,8 +54,8 @@ def _turn_of_cameras(recording: Recording, poses: np.ndarray) -> np.ndarray:
     _, strength, axes = np.linalg.svd(poses[:, :3, 0])
     if len(strength) < 2 or strength[1] < _LEAST_TURN * strength[0]:
         raise InputError(
-            f"{recording.path}: its cameras all look about the same way, which does not tell which "
-            "way is up; turn the poses until an axis points up, and name it with --up."
+            f"{recording.path}: its cameras all look in about the same direction, so the up "
+            "direction is unknown; turn the poses until an axis points up, and name it with --up."
         )
     y = axes[2] * np.sign(axes[2] @ poses[:, :3, 1].sum(axis=0))
     x = np.eye(3)[np.argmin(np.abs(y))]

@@ -78,9 +78,9 @@ def _camera(path: Path, model: str, size: tuple[int, int], values: list[float]) 
     names = next((text.split() for name, text in _MODELS.values() if name == model), None)
     if names is None:
         raise InputError(
-            f"{path}: its camera model {plain(model)} is not read; `colmap image_undistorter` "
-            "makes pinhole pictures and a model of them (the masks are then of those), or model "
-            "again with OPENCV or OPENCV_FISHEYE."
+            f"{path}: its camera model {plain(model)} is not supported; use `colmap "
+            "image_undistorter` to make pinhole pictures and a model of them (and make masks of "
+            "those pictures), or reconstruct again with OPENCV or OPENCV_FISHEYE."
         )
     if len(values) != len(names):
         raise ValueError(f"{plain(model)} has {len(names)} parameters, not {len(values)}")

@@ -23,7 +23,7 @@ def read_label_set(text: str) -> str:
         if text.startswith("void,"):
             return label_set_name([name.strip() for name in text.split(",")[1:]])
         raise InputError(
-            f"--label-set {text} is neither a file with a class a line, nor one of "
+            f"--label-set {text} is neither a file with one class per line, nor one of "
             f"{', '.join(LABEL_SETS)}, nor a list such as void,bed,chair."
         )
     try:
@@ -50,5 +50,5 @@ def find_table(folder: Path) -> Path:
     found = [Path(folder) / name for name in TABLES if (Path(folder) / name).is_file()]
     if len(found) != 1:
         named = " and ".join(path.name for path in found) or f"no {' or '.join(TABLES)}"
-        raise InputError(f"{folder} has {named}; one table says which class each instance id is.")
+        raise InputError(f"{folder} has {named}; expected one table with the class of each id.")
     return found[0]

@@ -97,8 +97,8 @@ def straighten(lens: Lens, intrinsics: np.ndarray, size: tuple[int, int]) -> Str
     too_wide = np.linalg.norm(straight, axis=1) > 0.999 * math.tan(_WIDEST_RAD)
     if not ((off < _RETURNS_PX) | (too_wide & lens.fisheye)).all():  # NaN fails, too
         raise InputError(
-            f"its lens ({lens}) bends so much that the picture cannot be made straight as far as "
-            "its rim; check the coefficients and the intrinsics"
+            f"its lens ({lens}) distorts so much that the picture cannot be undistorted up to its "
+            "border; check the coefficients and the intrinsics"
         )
     x, y = np.moveaxis(straight.reshape(_GRID, _GRID, 2), 2, 0)
     low = np.array([x[:, 0].max(), y[0].max()])

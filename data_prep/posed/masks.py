@@ -41,7 +41,7 @@ class MaskPixels:
         notes = []
         for lens in dict.fromkeys(lens for lens, _ in self._views):
             cut = max(view.cut_share for (other, _), view in self._views.items() if other == lens)
-            notes.append(f"the lens {lens} is straightened; {cut:.0%} of its pictures is cut away")
+            notes.append(f"the lens {lens} is undistorted; {cut:.0%} of its pictures is cut away")
         return notes
 
     def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray]:

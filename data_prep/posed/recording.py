@@ -84,7 +84,7 @@ class PosedFrame:
     instances: Path
     """PNG of tracked ids; it may be missing."""
     known: Path | None
-    """PNG from `mask_path`, 0 where the ids are unknown."""
+    """PNG from `mask_path`; 0 marks pixels with unknown ids."""
     camera: Camera
 
 
@@ -112,7 +112,7 @@ def path_text(name: str) -> str:
     except UnicodeEncodeError:
         longest = 0
     if not 0 < longest <= _LONGEST_NAME or "\0" in name:
-        raise InputError(f"{shown(name)} can be no file's name.")
+        raise InputError(f"{shown(name)} is not a valid file name.")
     return name
 
 
@@ -142,7 +142,7 @@ def check_one_png_a_frame(path: Path, frames: tuple[PosedFrame, ...]) -> None:
         if other is not frame.name:
             raise InputError(
                 f"{path}: frames {shown(other)} and {shown(frame.name)} would share the ids in "
-                f"{frame.instances}; put them where the frames lie, in "
+                f"{frame.instances}; store the ids in the same folders as the frames: "
                 f"{INSTANCES}/{_as_png(other)}."
             )
 

@@ -84,7 +84,7 @@ class PosedSource:
             if size != usual:
                 why = (
                     f"its views are {size[1]} x {size[0]} pixels, those of most rooms {usual[1]} x "
-                    f"{usual[0]}, and a folder of shards has one size; prepare its folder by itself"
+                    f"{usual[0]}, and all shards of a folder need one size; prepare it separately"
                 )
                 left_out.append(Line(name, name, "filtered", "image_size", why))
         names = [name for name, size in sizes.items() if size == usual]
@@ -97,7 +97,7 @@ class PosedSource:
         """Read one room and label its views."""
         folders = {room_name(room): room for room in find_rooms(self.folder)}
         if task.house not in folders:
-            raise InputError(f"{self.folder} has lost this room meanwhile; give it back.")
+            raise InputError(f"{self.folder} no longer has this room; restore its folder.")
         recording = read_recording(folders[task.house])
         made = prepare_posed(recording, self.label_set, self.posed_settings)
         if made is None:
@@ -118,25 +118,25 @@ class PosedSource:
         unknown = sum(recording.floor_m is None for recording in recordings)
         if unknown and settings.floor_m is None:
             sentences.append(
-                f"{unknown} of {count} rooms give no floor_m: the floor is where the lowest pieces "
-                f"end (1 to 2 cm off in the median, where tried), or else "
-                f"{settings.camera_height_m:g} m below the lowest camera (21 cm off); report.csv "
+                f"{unknown} of {count} rooms give no floor_m: the floor is estimated from the "
+                "lowest pieces (median error 1 to 2 cm in our tests), or else assumed "
+                f"{settings.camera_height_m:g} m below the lowest camera (error 21 cm); report.csv "
                 "says which. Measure the floor and give floor_m or --floor-m, or at least the "
                 "lowest camera's height with --camera-height-m."
             )
         unknown = sum(recording.metres_per_unit is None for recording in recordings)
         if unknown and settings.metres_per_unit == 1:
             sentences.append(
-                f"{unknown} of {count} rooms give no metres_per_unit: poses are taken as metres; "
-                "those of COLMAP are not."
+                f"{unknown} of {count} rooms give no metres_per_unit: poses are assumed to be in "
+                "metres, which COLMAP's are not."
             )
         lying = sum(not recording.leveled for recording in recordings)
         if lying and settings.up == "auto":
             sentences.append(
-                f"{lying} of {count} rooms say nothing of up: it is taken from the cameras, as if "
-                "they were held upright. Where they roll by 5 degrees it is 1.3 degrees off in the "
-                "median, so that floors rise by 5 cm in 2 m. Turn the poses until an axis points "
-                "up, and name it with --up."
+                f"{lying} of {count} rooms do not state the up direction: it is estimated from the "
+                "cameras, as if they were held upright. If they roll by 5 degrees, the median "
+                "error is 1.3 degrees, and floors rise by 5 cm in 2 m. Turn the poses until an "
+                "axis points up, and name it with --up."
             )
         taken = "z" if settings.up == "auto" else settings.up
         tops = [seems_up(recording) for recording in recordings if recording.leveled]

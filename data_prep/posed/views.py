@@ -144,7 +144,7 @@ def _check_tracked(images: np.ndarray, void: int) -> None:
 def _unsaid_floor(
     seen: Observations, upright: np.ndarray, intrinsics: np.ndarray, settings: PosedSettings
 ) -> tuple[float, str]:
-    """Estimate or assume the height of an unknown floor, with a note that says which."""
+    """Estimate or assume the height of an unknown floor; a note states the origin of the height."""
     lowest = float(upright[:, 1, 3].min())
     found = find_floor(seen, room_cameras(upright, np.eye(4)), intrinsics)
     if found is not None and found[0] < lowest:

@@ -67,8 +67,8 @@ def axis_alignment(path: Path, properties: dict[str, str]) -> np.ndarray:
         ) from None
     if not is_pose(matrix[None])[0]:
         raise InputError(
-            f"{path}: axisAlignment does not turn and move the scan: {pose_fault(matrix)}; the "
-            "file is damaged, or an axis was flipped. Download the scan again."
+            f"{path}: axisAlignment is not a rotation with a translation: {pose_fault(matrix)}; "
+            "the file is damaged, or an axis was flipped. Download the scan again."
         )
     return matrix
 

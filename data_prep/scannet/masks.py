@@ -70,8 +70,8 @@ class MaskArchive:
             parts = item.filename.replace("\\", "/").split("/")
             if parts[0] == "" or ".." in parts or re.match(r"[A-Za-z]:", parts[0]):
                 raise InputError(
-                    f"{self.path} holds {shown(item.filename)}, a name that leads out of the "
-                    "archive; no file of ScanNet's does. Do not use it: download the archive again."
+                    f"{self.path} holds {shown(item.filename)}, a path outside of the archive, "
+                    "which ScanNet's files never have. Do not use it: download the archive again."
                 )
             found = re.fullmatch(r"([0-9]{1,9})\.png", parts[-1], re.IGNORECASE)
             if not found:

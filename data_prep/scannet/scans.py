@@ -124,7 +124,7 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
     if "axisAlignment" not in properties:
         notes.append(
             f"{properties_path.name} has no axisAlignment: walls may stand at an angle to the axes "
-            "and boxes be larger than what is in them; ScanNet v2's file has one"
+            "and boxes may be larger than their objects; ScanNet v2's file has one"
         )
     segments_path = folder / f"{name}_vh_clean_2.0.010000.segs.json"
     mesh_path = folder / f"{name}_vh_clean_2.ply"

@@ -12,7 +12,7 @@ from sceneprior.core.errors import InputError
 VERSION = 4
 _COLOR_KINDS, _DEPTH_KINDS = (-1, 0, 1, 2), (-1, 0, 1, 2)
 _LONGEST_SIDE_PX = 1 << 16
-"""Image sizes from here on are damage: the data set has none so large."""
+"""Image sizes from here on mean a damaged file: the data set has none so large."""
 _FRAME = struct.Struct("<16f4Q")
 """Header of a frame: camera_to_world; timestamps and byte counts of colour and depth."""
 _AFTER_CALIBRATION = struct.Struct("<2i4IfQ")
@@ -66,7 +66,7 @@ class _Reader:
         if version != VERSION:
             raise InputError(
                 f"{self._where('header', 0)}: version {version}, expected {VERSION}; "
-                "this is no .sens of ScanNet's release, or it is damaged."
+                "this is not a .sens file of ScanNet's release, or it is damaged."
             )
         length = int.from_bytes(self._read(4, 8, "header", "the sensor's name"), "little")
         self._check_end("header", 12, length, "the sensor's name")
@@ -94,7 +94,7 @@ class _Reader:
         if min(width, height) < 1 or max(width, height, *depth) >= _LONGEST_SIDE_PX:
             raise InputError(
                 f"{where}: colour pictures of {width} x {height} and depth of {depth[0]} x "
-                f"{depth[1]} cannot be; the file is damaged. Download it again."
+                f"{depth[1]} are implausible; the file is damaged. Download it again."
             )
         if not frames:
             raise InputError(f"{where}: the recording has no frames. Download it again.")

@@ -36,7 +36,7 @@ class ScanNetSource:
     scan_settings: ScanSettings = field(default_factory=ScanSettings)
     train: Path | None = None
     val: Path | None = None
-    """The official lists; `val` is the split `test`. Without, spaces are split 9:1, seeded."""
+    """The official lists; `val` is the split `test`. None splits the spaces 9:1 by the seed."""
     seed: int = 0
     only: str | None = None
 

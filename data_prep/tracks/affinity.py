@@ -4,10 +4,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 SAME, OTHER = 0.75, 0.08
-"""Chance that a cell which one mask shows is shown by the other: masks of one object, of two."""
+"""Probability that a cell shown by one mask is also shown by the other mask, for two masks of the
+same object and of different objects."""
 STRENGTH, ENOUGH = 4.0, 10.0
-"""Weight of a pair's geometry, and the number of cells from which most of it counts: cells of a
-surface are no independent witnesses."""
+"""Weight of a pair's geometry, and the number of cells at which 63% of this weight is reached: the
+cells of a surface are not independent observations."""
 CLASS_ERROR = 0.05
 """Assumed share of wrong classes."""
 ONE_VIEW = -4.0

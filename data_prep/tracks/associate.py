@@ -22,7 +22,7 @@ from data_prep.tracks.rays import first_hits, surface, widened
 from data_prep.tracks.voxels import Grid, cameras_of, fill
 
 STEP = 3
-"""Every how many rows and columns of a picture of 480 pixels are used."""
+"""Step between the rows and columns that are used, for a picture of 480 pixels."""
 ROUNDS, STRICT = 7, 2
 """Rounds of clustering and carving; from round STRICT on, cells need two views that agree."""
 AGREE = 0.45
@@ -55,7 +55,7 @@ class Tracks(NamedTuple):
     ids: Int[np.ndarray, "views height width"]
     """int32: k + 1 for object k, 0 for background, -1 where the content is unknown."""
     object_class: Int[np.ndarray, " objects"]
-    """The class of most of an object's masks."""
+    """The most frequent class among an object's masks."""
 
 
 def associate(

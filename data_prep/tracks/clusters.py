@@ -30,7 +30,7 @@ def cluster(weights: Float[np.ndarray, "masks masks"]) -> Int[np.ndarray, " mask
 def total_weight(
     weights: Float[np.ndarray, "masks masks"], labels: Int[np.ndarray, " masks"]
 ) -> float:
-    """The objective: the weights of all pairs of different masks in one cluster, summed."""
+    """The objective: the sum of the weights of all pairs of different masks in one cluster."""
     same = labels[:, None] == labels
     return float(np.triu(weights * same, 1).sum())
 

@@ -9,11 +9,12 @@ from numba import njit
 from data_prep.tracks.voxels import MIN_DEPTH_M, Cameras, Grid
 
 VIEWS_AT_LEAST = 2
-"""Views, other than the mask's own, that must show the cluster in a cell of its hull."""
+"""Smallest number of views, other than the mask's own, that show the cluster in a cell of its
+hull."""
 PAST = 0.3
 """Largest share of views that see past a cell of a hull; half a view more is allowed."""
 EVERY = 2
-"""Every how many rows and columns a ray is followed."""
+"""Step between the rows and columns whose rays are followed."""
 
 
 def explained(
@@ -26,8 +27,8 @@ def explained(
     """Share of the rays of each mask that meet the hull of each cluster.
 
     A cell is in the hull if at least two views show the cluster there and few see background.
-    Masks of others are no evidence: they may be in front. The view of the mask itself is left out
-    of its own cluster's hull. `near` are the ids with masks widened by a pixel.
+    Masks of other clusters are no evidence, since they may be in front. The hull of a mask's own
+    cluster is computed without the mask's view. `near` are the ids with masks widened by a pixel.
     """
     clusters = int(labels.max()) + 1
     full = np.concatenate([[-1], labels]).astype(np.int32)

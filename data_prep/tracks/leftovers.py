@@ -23,10 +23,11 @@ def join_leftovers(
 ) -> Int[np.ndarray, " masks"]:
     """Join each cluster, the smallest first, to the larger one that gains most, if any gains.
 
-    The gain is HULL times how far the mean share of its masks' rays that meet the other's hull is
-    above `ENOUGH` (0 to 1; three times as steep below), plus CLASS times the log-odds of its
-    classes, plus PAIRS times the mean weight of pairs of different views, plus ONE_VIEW times the
-    share of its views that show a mask of both, plus FEW over the number of its masks.
+    The gain is HULL times the excess over `ENOUGH` of the mean share of the smaller cluster's rays
+    that meet the larger one's hull (scaled to 0 to 1; three times as steep below), plus CLASS times
+    the log-odds of the classes, plus PAIRS times the mean weight of pairs of different views, plus
+    ONE_VIEW times the share of the smaller cluster's views that show both clusters, plus FEW over
+    the number of its masks.
     """
     count = int(labels.max()) + 1
     size = np.bincount(labels, minlength=count)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 
 BEYOND_M = 3.0
-"""Distance from the cameras' bounding box within which objects are looked for."""
+"""Largest distance of objects from the cameras' bounding box."""
 COARSE_M, FINE = 0.32, 4
 """Edge length of the first grid's cells, and fine cells along it (8 cm each)."""
 MISSED = 0.12

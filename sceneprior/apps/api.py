@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from jaxtyping import Float
 from torch import Tensor
@@ -12,7 +12,7 @@ from sceneprior.apps.config import load_any_run, with_latents
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.classes import label_set
 from sceneprior.core.observed_image import ObservedImage
-from sceneprior.core.scene import Scene
+from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.sampling import Point, latent_of
 from sceneprior.paper.trained import TrainedPrior
@@ -20,6 +20,7 @@ from sceneprior.training.method import Trained
 
 if TYPE_CHECKING:
     from sceneprior.apps.reconstruction.reconstruct import Reconstruction
+    from sceneprior.lifted.requests.request import Floor, Openings, Want
 
 
 def load(where: str | Path) -> "Prior":
@@ -50,19 +51,19 @@ class Prior:
     trained: Trained
     """The trained networks, with their configuration."""
     where: str
-    """The path or name that it was loaded from."""
+    """The path or name from which the prior was loaded."""
 
     def __repr__(self) -> str:
         return f"Prior({self.where!r}, {self.label_set}, rooms from: {self.distribution})"
 
     @property
     def label_set(self) -> str:
-        """The name of its classes' label set."""
+        """The name of the label set of the prior's classes."""
         return self.trained.config.label_set
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of its classes; the first, `void`, stands for unlabelled objects."""
+        """Names of the prior's classes; the first, `void`, stands for unlabelled objects."""
         return tuple(label_set(self.label_set))
 
     @property
@@ -70,21 +71,65 @@ class Prior:
         """The default distribution of `sample`."""
         return self.trained.distribution
 
-    def sample(self, count: int = 1, seed: int = 0, distribution: str | None = None) -> list[Scene]:
+    def sample(
+        self,
+        count: int = 1,
+        seed: int = 0,
+        distribution: str | None = None,
+        floor: "Floor | None" = None,
+        openings: "Openings | None" = None,
+        ceiling_m: float | None = None,
+        want: "Want | None" = None,
+        objects: Sequence[SceneObject] | None = None,
+    ) -> list[Scene]:
         """Sample new rooms; the same seed gives the same rooms.
 
         Args:
             distribution: `sampler`, or a distribution of latents: `paper` or `kernel`.
+            floor: Requested floor: `"4x3"` (metres along x and z), a list of corners [x, z], or
+                a file with a floor.
+            openings: Requested doors and windows: `"door,window@north"`, or a list.
+            ceiling_m: Requested height of the ceiling.
+            want: Wishes: a sentence, or numbers of objects by class, such as
+                `{"nightstand": 2, "desk": 0}`.
+            objects: Objects that are already in the room, in the coordinates of the floor.
+
+        Requests need a prior with a sampler; see docs/requests.md. `extra["wishes"]` of a room
+        lists each wish, and whether the room fulfils it.
 
         Raises:
-            InputError: the prior has no such distribution.
+            InputError: the prior has no such distribution, or no room holds the request.
 
         Examples:
-            >>> rooms = load("procthor-bedroom").sample(2, seed=1)
-            >>> [room.name for room in rooms]
+            >>> prior = load("procthor-bedroom")
+            >>> [room.name for room in prior.sample(2, seed=1)]
             ['seed1_0000', 'seed1_0001']
+            >>> (room,) = prior.sample(floor="4x3", want={"nightstand": 2})
+            >>> [item.label for item in room.objects].count("nightstand"), room.floor_m.shape
+            (2, (4, 2))
         """
-        return sample_rooms(self.trained, count, seed, distribution)
+        asked = {
+            "floor": floor, "openings": openings, "ceiling_m": ceiling_m, "want": want,
+            "objects": objects,
+        }  # fmt: skip
+        asked = {key: value for key, value in asked.items() if value is not None}
+        if not asked:
+            return sample_rooms(self.trained, count, seed, distribution)
+        return self._requested(asked, count, seed, distribution)
+
+    def _requested(
+        self,
+        asked: dict[str, Any],
+        count: int,
+        seed: int,
+        distribution: str | None,
+        name: str | None = None,
+    ) -> list[Scene]:
+        from sceneprior.apps.requests import with_floor_of_file
+        from sceneprior.lifted.requests.answers import sample_requested
+
+        asked = with_floor_of_file(asked)
+        return sample_requested(self.with_latents, asked, count, seed, distribution, name)
 
     def interpolate(self, start: Point, end: Point, steps: int = 9) -> list[Scene]:
         """Rooms on the geodesic between two latents, both ends included.
@@ -94,7 +139,7 @@ class Prior:
                 or a vector.
 
         Raises:
-            InputError: an end is no latent of this prior, or the two ends are antipodal.
+            InputError: an end is not a latent of this prior, or the two ends are antipodal.
 
         Examples:
             >>> way = load("procthor-bedroom").interpolate("seed:1", "seed:2", steps=3)
@@ -112,12 +157,14 @@ class Prior:
         seed: int = 0,
         distribution: str | None = None,
         classes: Sequence[str] | None = None,
+        want: "Want | None" = None,
     ) -> list[Scene]:
         """Complete a partly furnished room; the given objects stay unchanged.
 
         Args:
-            scene: The given objects and, optionally, the floor.
+            scene: The given objects and, optionally, the floor, doors, windows and ceiling.
             count: Number of completions.
+            want: Wishes for the whole room, as in `sample`.
             classes: Classes of the objects to add, and no others; only for priors with a sampler.
 
         Raises:
@@ -132,6 +179,12 @@ class Prior:
             >>> [item.label for item in room.objects]
             ['double_bed', 'nightstand']
         """
+        if want is not None or (classes is None and _has_walls(scene)):
+            asked: dict[str, Any] = {"objects": scene.objects, "want": want}
+            asked |= {"ceiling_m": scene.ceiling_m}
+            asked |= {"floor": scene.floor_m, "openings": scene.openings or None}
+            asked = {key: value for key, value in asked.items() if value is not None}
+            return self._requested(asked, count, seed, distribution, "complete")
         from sceneprior.lifted.complete import complete
 
         return complete(self.with_latents, [scene], count, seed, distribution, classes=classes)[0]
@@ -160,7 +213,7 @@ class Prior:
         """The latent of an end of `interpolate`.
 
         Raises:
-            InputError: the point is no latent of this prior.
+            InputError: the point is not a latent of this prior.
 
         Examples:
             >>> load("procthor-bedroom").latent("seed:1").shape
@@ -189,3 +242,14 @@ class Prior:
     def with_latents(self) -> TrainedPrior:
         """`trained`, with an InputError if it has no latent space."""
         return with_latents(self.trained, self.where)
+
+
+def _has_walls(scene: Scene) -> bool:
+    """True if a room has openings, a ceiling, or a floor that is not a rectangle."""
+    if scene.openings or scene.ceiling_m is not None:
+        return True
+    if scene.floor_m is None:
+        return False
+    from sceneprior.lifted.requests.shape import RoomShape
+
+    return not RoomShape(scene.floor_m).is_rectangle

@@ -1,8 +1,8 @@
 """The registry of methods, and the loading of configs and runs.
 
-A method is listed in `METHODS`, a baseline's decoder of object features in `decoders.py`. Each
-section is defined beside what it configures; `training/method.py` says what a method's config has
-to offer.
+`METHODS` lists the methods; `decoders.py` lists the baselines' decoders of object features. Each
+section of a config is defined in the module that it configures; `training/method.py` defines the
+interface of a method's config.
 """
 
 import pkgutil
@@ -29,8 +29,9 @@ METHODS = {
     "total3d": "sceneprior.baselines.single_view.total3d:Total3dConfig",
     "im3d": "sceneprior.baselines.single_view.im3d:Im3dConfig",
 }
-"""Import path of each method's config, by the value of its key `method`. Configs are imported when
-they are asked for: a baseline's stands beside its stage, and Lightning takes seconds to import."""
+"""Import path of each method's config, by the value of the key `method`. Configs are imported on
+demand: a baseline's config is defined beside its stage, which imports Lightning, and that takes
+seconds."""
 WITH_BASELINE_DECODERS = {
     "paper": "sceneprior.apps.decoders:PaperRun",
     "lifted": "sceneprior.apps.decoders:LiftedRun",
@@ -45,22 +46,22 @@ def load_config(name: str, overrides: tuple[str, ...] = ()) -> RunConfig:
 
 
 def check_config(data: dict[str, Any], source: str) -> RunConfig:
-    """Turn plain data into the config of its method, or say in one sentence what is wrong.
+    """Turn plain data into the config of its method; an error is a ConfigError of one sentence.
 
-    Runs and packed priors of earlier versions have a section `samples`, by which checkpoints were
-    chosen. It is dropped where it asks for nothing (`every` is 0 or missing), and else refused.
+    Runs and packed priors of earlier versions have a section `samples`, which chose checkpoints. It
+    is dropped if it has no effect (`every` is 0 or missing), and refused otherwise.
     """
     if "method" not in data and "stages" in data:
         raise ConfigError(
-            f"{source} was written before methods had names (it says `stages`), and cannot be read "
-            "any more; train it again with a config of today, such as demo.yaml."
+            f"{source} was written before methods had names (it says `stages`), and can no longer "
+            "be read; train it again with a current config, such as demo.yaml."
         )
     data = without_samples(data, source)
     method = data.get("method")
     if method == "ours":
         raise ConfigError(
-            f"{source} was written when `method: ours` stood for two methods; they are `paper` and "
-            "`lifted` now, with sections of their own. Train it again with a config of today."
+            f"{source} was written when `method: ours` stood for two methods; they are now `paper` "
+            "and `lifted`, each with its own sections. Train it again with a current config."
         )
     if not isinstance(method, str) or method not in METHODS:
         raise ConfigError(
@@ -91,25 +92,25 @@ def load_run(run: Path | str) -> TrainedPrior:
 
 
 def with_latents(trained: Trained, run: Path | str) -> TrainedPrior:
-    """The run, if it is a prior; else an InputError: baselines have no latent space."""
+    """Return `trained` if it has a latent space; otherwise, as for baselines, raise InputError."""
     if not isinstance(trained, TrainedPrior):
         works = "synthesize`, `eval-fid` and `report"
         if isinstance(trained, TrainedReconstructor):
             works = "reconstruct` and `eval-svr"
         raise InputError(
             f"{run} is a run of `method: {trained.config.method}`, which has no latent space of "
-            "rooms, and this needs one. Take a run of `method: paper` or `lifted`; with this one, "
-            f"`sceneprior {works}` work."
+            "rooms, and this command needs one. Use a run of `method: paper` or `lifted`; this run "
+            f"works with `sceneprior {works}`."
         )
     return trained
 
 
 def run_config(run: Path | str) -> RunConfig:
-    """The config that a run was trained with; InputError if the folder is no run."""
+    """The config that a run was trained with; InputError if the folder is not a run."""
     path = Path(run) / "config.yaml"
     if not path.is_file():
         raise InputError(
-            f"{run} is not a run folder: there is no config.yaml in it, and a packed prior is "
-            "none; train one with `sceneprior fit --config demo.yaml --run RUN`."
+            f"{run} is not a run folder: it has no config.yaml (packed priors are not run "
+            "folders); train a run with `sceneprior fit --config demo.yaml --run RUN`."
         )
     return load_config(str(path))

@@ -14,11 +14,12 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import PARTS, check_writable, write_whole
 from sceneprior.core.scene import Scene
 from sceneprior.core.scene_json import FORMAT
+from sceneprior.core.shell import ShellName
 from sceneprior.paper.sampling import LATENTS_FILE, write_latents
 from sceneprior.render.offscreen import Renderer
 from sceneprior.render.pictures import contact_sheet, png_bytes
 from sceneprior.render.scene_files import check_names, format_of, save_scene
-from sceneprior.render.topdown import perspective
+from sceneprior.render.topdown import perspective, room_view
 
 PAGE_FILE = "rooms.html"
 OVERVIEW_ROOMS = 12
@@ -26,13 +27,15 @@ OVERVIEW_TILE = (240, 320)
 """Height and width of one room of the overview, in pixels."""
 
 
-def write_scene(scene: Scene, folder: Path, name: str, renderer: Renderer) -> None:
+def write_scene(
+    scene: Scene, folder: Path, name: str, renderer: Renderer, shell: ShellName = "none"
+) -> None:
     """Write `<name>.glb`, `<name>.png` and `<name>.json`; see `save_scene`.
 
     The JSON is written last, so that a JSON implies that the other two files exist.
     """
     for ending in (".glb", ".png", ".json"):
-        save_scene(scene, Path(folder) / f"{name}{ending}", renderer)
+        save_scene(scene, Path(folder) / f"{name}{ending}", renderer, shell)
 
 
 def check_free(folder: Path, overwrite: bool = False) -> None:
@@ -46,10 +49,10 @@ def check_free(folder: Path, overwrite: bool = False) -> None:
 
 
 def clear_scenes(folder: Path) -> None:
-    """Delete the old scenes of a folder, so that they are not taken for new ones.
+    """Delete the old scenes of a folder, so that they are not mistaken for new ones.
 
-    Deleted are scene JSONs with their GLBs and PNGs, latents, the page, and the partial files of
-    interrupted writers; all other files stay.
+    Scene JSONs with their GLBs and PNGs, latents, the page, and the partial files of interrupted
+    writers are deleted; all other files stay.
     """
     for path in Path(folder).glob("*.json"):
         if format_of(path) == FORMAT:
@@ -61,8 +64,10 @@ def clear_scenes(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def write_scenes(scenes: Sequence[Scene], folder: Path, renderer: Renderer) -> None:
-    """Write scenes under their own names, in place of the scenes of a folder.
+def write_scenes(
+    scenes: Sequence[Scene], folder: Path, renderer: Renderer, shell: ShellName = "none"
+) -> None:
+    """Write scenes under their own names, replacing the scenes of a folder.
 
     `overview.png` shows the first few, and `latents.npz` is written if all scenes are decoded from
     latents.
@@ -72,15 +77,24 @@ def write_scenes(scenes: Sequence[Scene], folder: Path, renderer: Renderer) -> N
     with ThreadPoolExecutor(os.cpu_count()) as pool, Progress(console=Console(stderr=True)) as bar:
         # Drawing, compression and disk access run in parallel, except that GL has one thread.
         each = pool.map if renderer.kind == "software" else map
-        done = each(lambda scene: write_scene(scene, folder, scene.name, renderer), scenes)
+        done = each(lambda scene: write_scene(scene, folder, scene.name, renderer, shell), scenes)
         for _ in bar.track(done, total=len(scenes), description="Writing scenes"):
             pass
-    sheet = overview(scenes[:OVERVIEW_ROOMS], renderer)
+    sheet = overview(scenes[:OVERVIEW_ROOMS], renderer, shell)
     write_whole(Path(folder) / "overview.png", png_bytes(sheet))
     write_latents(folder, scenes)
 
 
-def overview(scenes: Sequence[Scene], renderer: Renderer) -> UInt8[np.ndarray, "height width 3"]:
-    """Contact sheet of one or more rooms from above a corner, four per row, coloured by class."""
-    tiles = [perspective(scene, renderer, OVERVIEW_TILE) for scene in scenes]
+def overview(
+    scenes: Sequence[Scene], renderer: Renderer, shell: ShellName = "none"
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Contact sheet of one or more rooms from above a corner, four per row, coloured by class.
+
+    If `shell` is `walls`, the walls behind the furniture are drawn; the floor is always drawn.
+    """
+    views = [room_view(scene, OVERVIEW_TILE) if shell == "walls" else None for scene in scenes]
+    tiles = [
+        perspective(scene, renderer, OVERVIEW_TILE, view)
+        for scene, view in zip(scenes, views, strict=True)
+    ]
     return contact_sheet(tiles, min(4, len(tiles)))

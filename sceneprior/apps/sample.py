@@ -21,11 +21,11 @@ def sample_rooms(
 ) -> list[Scene]:
     """Sample new rooms from a run of any method, by its sampler or a distribution of latents.
 
-    The same seed gives the same rooms; without a distribution, the run's own is taken.
+    The same seed gives the same rooms; without a distribution, the run's default is used.
     """
     if isinstance(trained, TrainedReconstructor):
         raise InputError(
-            f"`method: {trained.config.method}` answers images and makes no new rooms; use "
+            f"`method: {trained.config.method}` reconstructs images and makes no new rooms; use "
             "`sceneprior reconstruct` or `eval-svr`, or a run of another method."
         )
     check_seed(seed)
@@ -37,8 +37,8 @@ def sample_rooms(
         return decode_latents(trained, z, names)
     if distribution is not None:
         raise InputError(
-            f"A distribution says where latents of rooms come from, but `method: "
-            f"{trained.config.method}` has none; leave out --distribution {distribution}."
+            f"--distribution {distribution} chooses a distribution of latents, but `method: "
+            f"{trained.config.method}` has no latents; leave the option out."
         )
     rooms = trained.prior.sample(count, seed)
     return boxes_to_scenes(rooms, trained.config.label_set, names)

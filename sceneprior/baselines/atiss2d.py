@@ -15,8 +15,8 @@ class Atiss2dConfig(EncoderConfig, DecoderConfig):
 
     name: Literal["atiss2d"] = "atiss2d"
     norm_first: bool = False
-    """Normalise before attention and feed-forward instead of after their residuals, as published.
-    It allows higher learning rates (docs/baselines_2d.md)."""
+    """If true, normalise before attention and feed-forward layers; if false, after their residuals
+    (as published). Normalising before allows higher learning rates (docs/baselines_2d.md)."""
 
     def build(self, width: int, max_objects: int) -> "SceneAtiss":
         return SceneAtiss(width, self)
@@ -56,7 +56,7 @@ class SceneAtiss(nn.Module):
         z: Float[Tensor, "rooms width"],
         previous: Float[Tensor, "rooms objects width"],
     ) -> Float[Tensor, "rooms width"]:
-        """The feature of the next object, whatever the order of the previous ones.
+        """The feature of the next object; it does not depend on the order of the previous ones.
 
         z is scaled to about the size of the features, as in the paper's transformer.
         """

@@ -23,7 +23,7 @@ class OneStageTraining(TrainConfig):
 
     learning_rate: float = Field(gt=0)
     schedule: Literal["constant", "cosine"] = "constant"
-    """`constant` keeps the rate; `cosine` lets it rise shortly, then fall to zero."""
+    """`constant` keeps the rate; with `cosine`, it rises briefly and then falls to 0."""
 
 
 class OneStageConfig(RunConfig):
@@ -38,7 +38,11 @@ class OneStageConfig(RunConfig):
 
     @abstractmethod
     def open_rooms(self) -> Any:
-        """The training rooms; InputError if they do not fit the config."""
+        """The training rooms.
+
+        Raises:
+            InputError: they do not fit the config.
+        """
 
     def build(self, rooms: Any, previous: Path | None) -> "OneStage":
         """The module to train, with statistics of the training rooms if it needs any."""

@@ -25,8 +25,8 @@ from sceneprior.training.method import TrainedSampler, ready_copy
 class TruthDataset(RoomDataset):
     """The boxes of all furniture in the rooms of a split, in memory, visible to a camera or not.
 
-    Rows and turns are those of `ViewDataset`. With turns, each row is mirrored in every second
-    epoch, so two epochs hold the eight symmetries of each room.
+    Rows and rotations are those of `ViewDataset`. With rotations, each row is mirrored in every
+    second epoch, so that two epochs contain the eight symmetries of each room.
     """
 
     counted = "objects"
@@ -51,7 +51,7 @@ class TruthDataset(RoomDataset):
         return self
 
     def everything(self) -> RoomBoxes:
-        """All rows as one batch, with turns also mirrored, for statistics."""
+        """All rows as one batch, for statistics; with rotations, each row also comes mirrored."""
         epochs = 2 if self.rotations > 1 else 1
         return self.__getitems__(
             [(row, epoch) for epoch in range(epochs) for row in range(len(self))]
@@ -59,7 +59,7 @@ class TruthDataset(RoomDataset):
 
     def __getitems__(self, draws: list[tuple[int, int]]) -> RoomBoxes:
         """A batch of rows; each draw is (row, epoch). The epoch `BLANK` gives an empty room without
-        an id, which has no loss."""
+        an id, which does not contribute to the loss."""
         device = self._counts.device
         rows = torch.tensor([row for row, _ in draws], device=device)
         epochs = torch.tensor([epoch for _, epoch in draws], device=device)
@@ -70,7 +70,7 @@ class TruthDataset(RoomDataset):
         is_object = torch.arange(widest, device=device) < counts[:, None]
         quarters = rows % self.rotations
         mirrored = ((rows + epochs) % 2 == 1) & (self.rotations > 1)
-        sides = 1 - 2 * mirrored.unsqueeze(-1).to(self._yaw_rad)  # a mirrored front turns back
+        sides = 1 - 2 * mirrored.unsqueeze(-1).to(self._yaw_rad)  # mirroring reverses the yaw
         yaw_rad = sides * self._yaw_rad[rooms, :widest] + math.pi / 2 * quarters.unsqueeze(-1)
         return RoomBoxes(
             object_class=self._classes[rooms, :widest] * is_object,
@@ -82,7 +82,7 @@ class TruthDataset(RoomDataset):
 
 
 def check_ground_truth(shard: Shard, room_id: str) -> None:
-    """Refuse a room without 3D ground truth with a `ShardError`."""
+    """Raise a `ShardError` if a room has no 3D ground truth."""
     if not shard.has_ground_truth(room_id):
         raise ShardError(
             f"{shard.path}, room {room_id} carries no 3D ground truth, which this method learns "
@@ -120,7 +120,7 @@ class BoxConfig(OneStageConfig):
 def room_means(
     losses: dict[str, Float[Tensor, " rooms"]], rooms: RoomBoxes
 ) -> dict[str, Float[Tensor, ""]]:
-    """Mean of each loss over the rooms that have an id, of all processes together."""
+    """Mean of each loss over the rooms of all processes; rooms without an id are left out."""
     count = len(rooms.room_ids)
     share = share_of_batch(torch.tensor(count, device=rooms.boxes_m.device))
     return {name: share * loss.sum() / max(count, 1) for name, loss in losses.items()}

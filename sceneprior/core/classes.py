@@ -25,7 +25,8 @@ LABEL_SETS: dict[str, tuple[str, ...]] = {
     ),
 }  # fmt: skip
 """Label sets of the paper's supplement A; `refridgerator` is ScanNet's spelling."""
-# Room types that are not in the paper have label sets of their own, which name their priors' data.
+# Room types that the paper does not have. The name of a label set identifies the data of a prior,
+# so each of these has its own name, even if it has the same classes as another.
 LABEL_SETS |= {
     "front3d_dining": LABEL_SETS["front3d_living"],
     "front3d_library": LABEL_SETS["front3d_living"],
@@ -37,7 +38,7 @@ LABEL_SETS |= {
 }  # fmt: skip
 
 VOID = 0
-"""Index of `void`, the furniture outside the list, in every label set."""
+"""Index of `void` in every label set: the class of furniture that belongs to no other class."""
 
 _OWN = "void,"
 _LONGEST_NAME = 60
@@ -68,15 +69,15 @@ def own_label_set(names: Sequence[str]) -> tuple[str, ...]:
     for name in classes:
         if name != name.strip() or not 0 < len(name) <= _LONGEST_NAME or not name.isprintable():
             raise InputError(
-                f"'{name[:_LONGEST_NAME]}' is no class name: 1 to {_LONGEST_NAME} printable "
-                "characters, no space at either end."
+                f"'{name[:_LONGEST_NAME]}' is not a class name; expected 1 to {_LONGEST_NAME} "
+                "printable characters, without a space at either end."
             )
         if "," in name:
-            raise InputError(f"The class name '{name}' holds a comma, which parts class names.")
+            raise InputError(f"The class name '{name}' has a comma, which separates class names.")
         if classes.count(name) > 1:
-            raise InputError(f"The class '{name}' is twice in the label set; once is enough.")
+            raise InputError(f"The class '{name}' is in the label set twice; list it once.")
     if len(classes) < 2:
-        raise InputError("A label set needs a class beside void.")
+        raise InputError("A label set needs at least one class in addition to void.")
     return classes
 
 
@@ -88,9 +89,9 @@ def label_set_name(names: Sequence[str]) -> str:
 def class_colors(count: int) -> np.ndarray:
     """One RGB colour per class, (count, 3) uint8, deterministic.
 
-    Hues advance by the golden ratio, so that neighbours in the list differ most; lightness cycles
-    through three values, so that classes differ in greyscale prints, too. Void is grey; black and
-    white are left for backgrounds.
+    Hues advance by the golden ratio, so that neighbours in the list differ clearly; lightness
+    cycles through three values, so that classes differ in greyscale prints, too. Void is grey.
+    Black and white are never used, because backgrounds have them.
     """
     colors = np.full((count, 3), 128, dtype=np.uint8)
     for index in range(VOID + 1, count):

@@ -53,7 +53,7 @@ def write_whole(path: Path, content: bytes | str | Callable[[Path], object]) -> 
 
 
 def write_changed(path: Path, content: bytes | str) -> None:
-    """Write a file unless it already has this content, because its folder may be read-only."""
+    """Write a file unless it already has this content; its folder may then be read-only."""
     with contextlib.suppress(OSError):
         if path.read_bytes() == (content.encode() if isinstance(content, str) else content):
             return
@@ -71,15 +71,19 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def remove_parts(folder: Path) -> None:
-    """Delete the temporary files of killed writers under a folder that no process writes to."""
+    """Delete temporary files that killed writers left under a folder.
+
+    No other process may be writing there.
+    """
     for path in sorted(Path(folder).rglob(f"*{PART}")):
         path.unlink(missing_ok=True)
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file or folder can be written, before the work whose result it will hold.
+    """Check that a file or folder can be written, before work starts whose result goes there.
 
-    The `OSError` of one that cannot be written names it.
+    Raises:
+        OSError: it cannot be written; `filename` is `path`.
     """
     path = Path(path)
     folder = path if path.is_dir() else path.parent
@@ -152,7 +156,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
-    """Modification time and size of a file, to notice that it has changed."""
+    """Modification time (ns) and size (bytes) of a file, to detect changes."""
     try:
         status = path.stat()
     except OSError as error:
@@ -171,7 +175,7 @@ def read_json(path: Path) -> Any:
 
 
 def is_name(text: Any) -> bool:
-    """Test whether a value is a text fit for a path component and a report: short, printable."""
+    """Test whether a value is a short, printable string that can be one component of a path."""
     return (
         isinstance(text, str)
         and 0 < len(text) <= _LONGEST_NAME

@@ -34,7 +34,7 @@ def model_info_path(folder: Path, option: str = "--future") -> Path:
 
 
 def model_categories(folder: Path, option: str = "--future") -> dict[str, str]:
-    """Category by model id: lower case, "a / b" as "a/b"; "others" if the release has null."""
+    """Category of each model id, as `tidy_category` writes it; "others" if the release has null."""
     path = model_info_path(folder, option)
     data = read_json(path)
     try:
@@ -50,7 +50,7 @@ def model_categories(folder: Path, option: str = "--future") -> dict[str, str]:
 
 
 def tidy_category(text: str) -> str:
-    """Normalise a category as in the table: lower case, "a / b" as "a/b"."""
+    """Write a category as in `category_table`: in lower case, and "a / b" as "a/b"."""
     return text.strip().lower().replace(" / ", "/")
 
 
@@ -64,9 +64,10 @@ _COLUMNS = {
 
 @functools.cache
 def category_table() -> dict[str, dict[str, str]]:
-    """Rows of front3d_categories.csv by 3D-FUTURE's category.
+    """Rows of front3d_categories.csv, by category of 3D-FUTURE.
 
-    A row has the class in bedrooms (`bedroom_class`) and in living rooms (`living_room_class`).
+    A row holds the class that the category has in bedrooms (`bedroom_class`) and in living rooms
+    (`living_room_class`).
     """
     with Path(__file__).with_name("front3d_categories.csv").open(newline="") as file:
         return {row["model_info_category"]: row for row in csv.DictReader(file)}
@@ -75,8 +76,9 @@ def category_table() -> dict[str, dict[str, str]]:
 def class_of_category(category: str, label_set_name: str) -> str:
     """Class of a category in a label set; `void` if it has none.
 
-    The label sets of 3D-FRONT follow the paper's table. In any other label set, the first of these
-    that it contains is the class: the category itself, its bedroom class, its living-room class.
+    The label sets of 3D-FRONT follow the paper's table. In any other label set, the class is the
+    first of these names that the label set contains: the category, its class in bedrooms, its class
+    in living rooms.
 
         >>> class_of_category("king-size bed", "front3d_bedroom")
         'double_bed'

@@ -35,7 +35,7 @@ def reference_scenes(
 
 
 def known_in_3d(shards: Path, split: str) -> bool:
-    """Test whether a split has rooms and all have ground truth; rooms of posed pictures do not."""
+    """Test whether a split has rooms, all with ground truth; rooms of posed pictures have none."""
     return any((Path(shards) / split).glob("*.h5")) and all(
         shard.has_ground_truth(room_id) for shard, room_id in iterate_rooms(shards, split)
     )
@@ -61,9 +61,9 @@ def independent_rooms(
 ) -> list[Scene]:
     """Sample rooms from the marginals of real rooms: a baseline without object relations.
 
-    The number of objects is that of a random real room. Each object is drawn at random from all
-    objects of all rooms, with its class and position. Single objects are therefore real, but
-    independent of each other.
+    A room has as many objects as a randomly chosen real room. Each object is drawn from the objects
+    of all real rooms, and keeps its class, box and position. So every single object is real, but
+    the objects of a room are independent of each other.
 
     `with_meshes` keeps the real meshes, a stronger baseline; otherwise objects are boxes.
     """
@@ -161,7 +161,7 @@ def load_model(path: Path) -> Mesh:
     """Read a model of a folder of shards (`model_path`) in its own frame."""
     if not path.is_file():
         raise ShardError(
-            f"{path} is missing, but a room's ground truth stands on it. Keep `models/` beside "
+            f"{path} is missing, but a room's ground truth refers to it. Keep `models/` beside "
             "the shards, or run `sceneprior prep-front` again."
         )
     import trimesh

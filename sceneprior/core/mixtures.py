@@ -31,8 +31,11 @@ class LogisticMixture(NamedTuple):
 
     @classmethod
     def of(cls, features: Float[Tensor, "*batch features"], numbers: int) -> "LogisticMixture":
-        """Build a mixture of D-dimensional components from a network's output: for each component a
-        logit of its weight, D means and D log-scales."""
+        """Build a mixture of D-dimensional components from a network's output.
+
+        The output holds, for each component, the logit of its weight, D means and D log-scales;
+        `numbers` is D.
+        """
         weight_logits, means, scales = features.unflatten(-1, (-1, 1 + 2 * numbers)).split(
             [1, numbers, numbers], dim=-1
         )
@@ -55,7 +58,8 @@ class LogisticMixture(NamedTuple):
     ) -> Float[Tensor, "*batch draws numbers"]:
         """Sample several values per mixture by inverse transform of uniform numbers.
 
-        `choice` chooses the components, `place` the quantiles within them.
+        `choice` selects the components, and `place` the quantiles within them; both are uniform in
+        [0, 1).
         """
         logits = self.weight_logits.unsqueeze(-2).expand(*choice.shape, -1)
         chosen = draw_index(logits, choice).unsqueeze(-1)

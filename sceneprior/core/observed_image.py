@@ -21,7 +21,7 @@ class ObservedImage:
     """Camera and instance masks of one image with n visible objects; arrays as in `RoomViews`."""
 
     name: str
-    """Stem for the names of its files."""
+    """Stem of the names of files about this image."""
     label_set: str
     object_class: Int64[np.ndarray, " n"]
     instance_ids: Integer[np.ndarray, "height width"]
@@ -45,7 +45,10 @@ class ObservedImage:
 
 
 def image_of_room(room: RoomViews, view: int, label_set: str) -> ObservedImage:
-    """Extract one view of a room read with its images, reduced to the objects visible in it."""
+    """Extract one view of a room, with only the objects that are visible in it.
+
+    `room` must have been read with its images.
+    """
     if not 0 <= view < (count := len(room.visible)):
         raise InputError(
             f"Room {room.room_id} has no view {view}; its {count} views are 0 to {count - 1}."
@@ -96,9 +99,11 @@ def images_of_split(
 ) -> tuple[list[ObservedImage], list[str]]:
     """Sample views of each room of a split from those that show an object.
 
-    The views of a room depend on the seed and its id alone, not on other rooms; with a larger
-    `views` per room, further views are added. Also returns the ids of the rooms left out because no
-    view shows an object.
+    The sampled views of a room depend only on the seed and on the room's id. A larger `views` (the
+    number of views per room) keeps these views and adds more.
+
+    Returns:
+        The images, and the ids of rooms left out because none of their views shows an object.
     """
     images: list[ObservedImage] = []
     blank: list[str] = []
@@ -123,8 +128,8 @@ def as_views(images: Sequence[ObservedImage], mask_step: int) -> SceneViews:
     sizes = sorted({image.instance_ids.shape for image in images})
     if len(sizes) > 1:
         raise InputError(
-            f"Images that are fitted together have one size, but {sizes[0]} and {sizes[1]} pixels "
-            "(height, width) came; reconstruct each size on its own."
+            f"Images that are fitted together must have one size, but these have {sizes[0]} and "
+            f"{sizes[1]} pixels (height, width); reconstruct each size on its own."
         )
 
     def padded(rows: Sequence[np.ndarray]) -> Tensor:
@@ -152,7 +157,7 @@ def as_views(images: Sequence[ObservedImage], mask_step: int) -> SceneViews:
 def rows_of(
     views: SceneViews, rows: Integer[Tensor, " rows"] | Bool[Tensor, " rows"]
 ) -> SceneViews:
-    """Select rooms of a batch and trim the padding to their largest object count."""
+    """Select rooms of a batch, and trim the padding to the largest object count among them."""
     chosen = views.changed(lambda tensor: tensor[rows])
     most = max(int(chosen.is_object.sum(dim=-1).max()), 1)
     return replace(

@@ -26,9 +26,9 @@ def intersection_volumes(
 
 
 def shared_of_smaller(a: Scene, b: Scene) -> Float[np.ndarray, "n m"]:
-    """Intersection over the smaller volume of each box of a with each of b, in [0, 1].
+    """Intersection of each box of a with each box of b, as a share of the smaller box, in [0, 1].
 
-    0 if a box has no volume.
+    The share is 0 if one of the two boxes has no volume.
     """
     shared = intersection_volumes(a.centers_m, a.sizes_m, b.centers_m, b.sizes_m)
     smaller = np.minimum(a.sizes_m.prod(1)[:, None], b.sizes_m.prod(1)[None])

@@ -1,26 +1,38 @@
-"""Furniture as a few solid parts: boxes, upright cylinders, ellipsoids and their halves.
+"""Furniture as a few solid parts, cut to an outline: boxes, upright cylinders, ellipsoids and their
+halves.
 
 Parts lie in the frame of their object's box, which spans [-0.5, 0.5] along each axis. A part may be
 mirrored to the other side of the frame along x, along z, or along both, so one part can be all four
-legs of a table. Every part is convex; an object is the union of its parts.
+legs of a table. Every part is convex. An object is the union of its parts within its outline, a
+polygon that limits it as seen from above: the side of a sofa may be curved though its parts are
+boxes.
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
+import shapely
 from jaxtyping import Bool, Float, Int
 
 KINDS = 5
 BOX, CYLINDER, ELLIPSOID, DOME, BOWL = range(KINDS)
 """Kinds of parts: each fills its own box as far as its kind can. A cylinder stands upright; a dome
 is the upper half of an ellipsoid, a bowl the lower half."""
+KIND_NAMES: tuple[Literal["box", "cylinder", "ellipsoid", "dome", "bowl"], ...] = (
+    "box", "cylinder", "ellipsoid", "dome", "bowl"
+)  # fmt: skip
+"""Names of the kinds, in their order."""
 ACROSS_X, ACROSS_Z = 1, 2
 """Bits of `Parts.mirrored`: the part also stands on the other side along this axis."""
 
 
 MOST_PARTS = 10
 """Maximum number of parts of an object, mirror images not counted."""
+MOST_CORNERS = 24
+"""Maximum number of corners of an outline."""
+SQUARE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+"""The outline of an object that fills its box as seen from above; it cuts nothing off."""
 
 
 class Parts(NamedTuple):
@@ -31,9 +43,13 @@ class Parts(NamedTuple):
     """0, `ACROSS_X`, `ACROSS_Z`, or the sum of both."""
     ends: Float[np.ndarray, "parts 3 2"]
     """Lower and upper end of each part along x, y and z."""
+    outline: Float[np.ndarray, "corners 2"] = SQUARE
+    """Corners (x, z) of the outline, a simple polygon; counter-clockwise with x to the right and z
+    up."""
 
     def solids(self) -> Iterator[tuple[int, Float[np.ndarray, "3 2"]]]:
-        """Kind and ends of every part and its mirror images, which may touch or overlap."""
+        """Kind and ends of every part and its mirror images, which may touch or overlap; they are
+        not cut to the outline."""
         for kind, mirrored, ends in zip(self.kind, self.mirrored, self.ends, strict=True):
             copies = [ends]
             for bit, axis in ((ACROSS_X, 0), (ACROSS_Z, 2)):
@@ -80,10 +96,16 @@ def center_and_radii(
 
 
 def filled_cells(parts: Parts, cells: int, margin: float) -> Bool[np.ndarray, "x y z"]:
-    """True for the cells of a grid whose centres lie in a part; the grid spans `margin` boxes."""
+    """True for the cells of a grid whose centres lie in a part and within the outline; the grid
+    spans `margin` boxes."""
     middles = ((np.arange(cells) + 0.5) / cells - 0.5) * margin
     points = np.stack(np.meshgrid(middles, middles, middles, indexing="ij"), axis=-1)
     found = np.zeros(points.shape[:3], bool)
     for kind, ends in parts.solids():
         found |= inside(kind, ends, points)
+    if not np.array_equal(parts.outline, SQUARE):
+        seen = points[:, 0, :, ::2]
+        found &= shapely.contains_xy(shapely.Polygon(parts.outline), *np.moveaxis(seen, 2, 0))[
+            :, None
+        ]
     return found

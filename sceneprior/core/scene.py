@@ -65,6 +65,15 @@ class Turned(NamedTuple):
     """Full extents in the box's own frame."""
 
 
+class Solid(NamedTuple):
+    """A convex solid in the room frame that fills its axis-aligned box as far as its kind can."""
+
+    kind: Literal["box", "cylinder", "ellipsoid", "dome", "bowl"]
+    """As in `core/parts.py`: cylinders stand upright; domes and bowls are halves of ellipsoids."""
+    low_m: tuple[float, float, float]
+    high_m: tuple[float, float, float]
+
+
 @dataclass(frozen=True)
 class SceneObject:
     """A piece of furniture: class, axis-aligned box in the room frame, and optionally a mesh."""
@@ -75,6 +84,8 @@ class SceneObject:
     mesh: Mesh | None = None
     turned: Turned | None = None
     """Oriented box whose axis-aligned bounding box has `size_m`, if known."""
+    solids: tuple[Solid | Mesh, ...] = ()
+    """Convex bodies whose union is the object, or contains it; none if they are not known."""
 
     def __post_init__(self) -> None:
         # Convert to plain floats, because users print them.
@@ -82,14 +93,26 @@ class SceneObject:
         object.__setattr__(self, "size_m", _triple(self.size_m))
 
     def in_box(self, center_m: Sequence[float], size_m: Sequence[float]) -> "SceneObject":
-        """Copy of the object in another box; its mesh is moved and scaled accordingly."""
+        """Copy of the object in another box; mesh and solids are moved and scaled accordingly."""
         center, size = _triple(center_m), _triple(size_m)
-        mesh = self.mesh
-        if mesh is not None:
-            scale = np.asarray(size) / np.maximum(self.size_m, 1e-9)
-            vertices_m = (mesh.vertices_m - np.asarray(self.center_m)) * scale + np.asarray(center)
-            mesh = Mesh(vertices_m, mesh.faces)
-        return SceneObject(self.label, center, size, mesh)
+        scale = np.asarray(size) / np.maximum(self.size_m, 1e-9)
+
+        def placed(points_m: np.ndarray) -> np.ndarray:
+            return (points_m - np.asarray(self.center_m)) * scale + np.asarray(center)
+
+        def rescaled(body: Solid | Mesh) -> Solid | Mesh:
+            if isinstance(body, Mesh):
+                return Mesh(placed(body.vertices_m), body.faces)
+            return Solid(body.kind, *map(_triple, placed(np.array(body[1:])).tolist()))
+
+        mesh = self.mesh and Mesh(placed(self.mesh.vertices_m), self.mesh.faces)
+        solids = tuple(map(rescaled, self.solids))
+        return SceneObject(self.label, center, size, mesh, solids=solids)
+
+    def moved(self, offset_m: Sequence[float]) -> "SceneObject":
+        """Copy of the object, moved by x, y and z."""
+        center = _triple((np.asarray(self.center_m) + np.asarray(offset_m)).tolist())
+        return replace(self.in_box(center, self.size_m), turned=self.turned)
 
 
 def bound_m(turned: Turned) -> tuple[float, float, float]:
@@ -155,8 +178,9 @@ class Scene:
         return np.array([item.size_m for item in self.objects], dtype=np.float64).reshape(-1, 3)
 
     def without_meshes(self) -> "Scene":
-        """Copy of the scene with boxes instead of meshes, for methods without meshes."""
-        return replace(self, objects=tuple(replace(item, mesh=None) for item in self.objects))
+        """Copy of the scene with boxes alone, for methods without meshes."""
+        bare = (replace(item, mesh=None, solids=()) for item in self.objects)
+        return replace(self, objects=tuple(bare))
 
     def save(self, path: Path | str) -> None:
         """Write the scene to a file: `.json`, `.glb`, `.obj`, `.usda` or `.png`; see `save_scene`.

@@ -12,7 +12,7 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, read_json
 from sceneprior.core.instances.checked import checked
-from sceneprior.core.scene import Opening, Scene, SceneObject, Turned, bound_m
+from sceneprior.core.scene import Opening, Scene, SceneObject, Solid, Turned, bound_m
 
 FORMAT = "sceneprior-scene"
 VERSION = 1
@@ -22,6 +22,10 @@ FARTHEST_M = 100.0
 """Maximum absolute coordinate of a box centre or a corner of the floor."""
 MOST_OBJECTS = 1000
 """Maximum number of objects in a room, because metrics compare all pairs."""
+MOST_SOLIDS = 200
+"""Maximum number of solids of an object."""
+BEYOND_BOX_M = 0.05
+"""Distance that a solid may reach beyond the box of its object."""
 WALL_M = 0.05
 """Maximum distance of a door or a window from the outline of its floor."""
 _DECIMALS = 5
@@ -33,11 +37,17 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
     objects = []
     for item in scene.objects:
         entry: dict[str, Any] = {"class": item.label}
-        entry["center_m"] = [round(value, _DECIMALS) for value in item.center_m]
+        entry["center_m"] = _rounded(item.center_m)
         entry["size_m"] = _rounded_size(item.size_m)
         if item.turned is not None:
             entry["yaw_rad"] = round(item.turned.yaw_rad, 7)
             entry["own_size_m"] = _rounded_size(item.turned.size_m)
+        solids = [solid for solid in item.solids if isinstance(solid, Solid)]
+        if solids and len(solids) == len(item.solids):  # the file holds no meshes
+            entry["solids"] = [
+                {"kind": kind, "low_m": _rounded(low), "high_m": _rounded(high)}
+                for kind, low, high in solids
+            ]
         objects.append(entry)
     return {
         "format": FORMAT,
@@ -54,6 +64,10 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
     }
 
 
+def _rounded(values_m: Sequence[float]) -> list[float]:
+    return [round(value, _DECIMALS) for value in values_m]
+
+
 def _rounded_size(size_m: Sequence[float]) -> list[float]:
     # A flat side stays above 0, because `read_scene` rejects sizes of 0.
     return [max(round(value, _DECIMALS), _LEAST_M) for value in size_m]
@@ -65,7 +79,17 @@ _Triple = Annotated[tuple[float, float, float], Field(strict=False)]
 _Pair = Annotated[tuple[float, float], Field(strict=False)]
 
 
-class _ObjectEntry(BaseModel):
+class _SolidEntry(BaseModel):
+    model_config = _STRICT
+
+    kind: Literal["box", "cylinder", "ellipsoid", "dome", "bowl"]
+    low_m: _Triple
+    high_m: _Triple
+
+
+class ObjectEntry(BaseModel):
+    """An object of a file."""
+
     model_config = _STRICT
 
     label: str = Field(alias="class")
@@ -73,9 +97,12 @@ class _ObjectEntry(BaseModel):
     size_m: _Triple
     yaw_rad: float | None = None
     own_size_m: _Triple | None = None
+    solids: Annotated[list[_SolidEntry], Field(max_length=MOST_SOLIDS)] = []
 
 
-class _OpeningEntry(BaseModel):
+class OpeningEntry(BaseModel):
+    """A door or a window of a file."""
+
     model_config = _STRICT
 
     kind: Literal["door", "window"]
@@ -90,9 +117,9 @@ class _SceneEntry(BaseModel):
 
     name: str | None = None
     label_set: str
-    objects: Annotated[list[_ObjectEntry], Field(max_length=MOST_OBJECTS)]
+    objects: Annotated[list[ObjectEntry], Field(max_length=MOST_OBJECTS)]
     floor_m: Annotated[list[_Pair], Field(min_length=3)] | None = None
-    openings: list[_OpeningEntry] = []
+    openings: list[OpeningEntry] = []
     ceiling_m: Annotated[float, Field(gt=0, le=FARTHEST_M)] | None = None
     extra: dict[str, Any] = {}
 
@@ -115,16 +142,13 @@ def read_scene(path: Path) -> Scene:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: extra cannot be written as JSON ({error}).") from None
     names = label_set(entry.label_set)
-    objects = []
     for item in entry.objects:
         if item.label not in names:
             raise InputError(
                 f"{path}: class '{_short(item.label)}' is not in label set "
                 f"'{_short(entry.label_set)}'; use one of {', '.join(names)}."
             )
-        check_box(path, item.label, item.center_m, item.size_m)
-        turned = _turned_of(path, item)
-        objects.append(SceneObject(item.label, item.center_m, item.size_m, turned=turned))
+    objects = [read_object(path, item) for item in entry.objects]
     floor = None if entry.floor_m is None else np.array(entry.floor_m, dtype=np.float64)
     if floor is not None:
         check_floor(path, floor)
@@ -141,7 +165,18 @@ def read_scene(path: Path) -> Scene:
     )
 
 
-def check_box(path: Path, label: str, center_m: Sequence[float], size_m: Sequence[float]) -> None:
+def read_object(path: Path, item: ObjectEntry) -> SceneObject:
+    """An object of a file; its boxes are checked, its class is not."""
+    check_box(path, item.label, item.center_m, item.size_m)
+    turned = _turned_of(path, item)
+    solids = tuple(Solid(**solid.model_dump()) for solid in item.solids)
+    check_solids(path, item.label, item.center_m, item.size_m, solids)
+    return SceneObject(item.label, item.center_m, item.size_m, turned=turned, solids=solids)
+
+
+def check_box(
+    path: Path | str, label: str, center_m: Sequence[float], size_m: Sequence[float]
+) -> None:
     """Reject an implausible box; all readers of boxes use this check."""
     said = f"{path}: a {label} has centre {[*center_m]} and size {[*size_m]}"
     if not np.isfinite([*center_m, *size_m]).all() or min(size_m) <= 0:
@@ -153,7 +188,27 @@ def check_box(path: Path, label: str, center_m: Sequence[float], size_m: Sequenc
         )
 
 
-def check_floor(path: Path, outline_m: np.ndarray) -> None:
+def check_solids(
+    path: Path,
+    label: str,
+    center_m: Sequence[float],
+    size_m: Sequence[float],
+    solids: Sequence[Solid],
+) -> None:
+    """Reject solids without volume, or outside the box of their object."""
+    center, half = np.asarray(center_m), np.asarray(size_m) / 2 + BEYOND_BOX_M
+    for kind, low, high in solids:
+        said = f"{path}: a {label} has a {kind} from {[*low]} to {[*high]}"
+        if not np.less(low, high).all():
+            raise InputError(f"{said}; expected low_m below high_m along each axis.")
+        if not (np.abs([low, high] - center) <= half).all():
+            raise InputError(
+                f"{said}, which is not in its box (center_m {[*center_m]}, size_m {[*size_m]}); "
+                "give solids in the frame of the room, as center_m."
+            )
+
+
+def check_floor(path: Path | str, outline_m: np.ndarray) -> None:
     """Reject a floor outline that is implausibly large, or has no area."""
     far = np.abs(outline_m).max(initial=0)
     if not far <= FARTHEST_M:
@@ -165,7 +220,9 @@ def check_floor(path: Path, outline_m: np.ndarray) -> None:
         raise InputError(f"{path}: all corners of the floor lie on one line, so it has no area.")
 
 
-def check_openings(path: Path, outline_m: np.ndarray | None, openings: Sequence[Opening]) -> None:
+def check_openings(
+    path: Path | str, outline_m: np.ndarray | None, openings: Sequence[Opening]
+) -> None:
     """Reject doors and windows without extent, or farther than 5 cm from the floor's outline."""
     for opening in openings:
         said = f"{path}: a {opening.kind} from {[*opening.start_m]} to {[*opening.end_m]}"
@@ -190,7 +247,7 @@ def _unit_guess(numbers: Any) -> str:
     return f"Are these {unit}? Give metres."
 
 
-def _turned_of(path: Path, item: _ObjectEntry) -> Turned | None:
+def _turned_of(path: Path, item: ObjectEntry) -> Turned | None:
     """Oriented box of an entry, if it has one; it must fill the axis-aligned box."""
     if item.yaw_rad is None and item.own_size_m is None:
         return None

@@ -28,7 +28,7 @@ TRUTH_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
     "floor_m": ("float32", ("P", 2)),
 }
 UNOCCLUDED: dict[str, tuple[str, tuple[_Side, ...]]] = {"unoccluded": ("bool", ("T", "n"))}
-"""Optional array of rooms in which more than objects can occlude objects."""
+"""Optional array, for rooms in which things without a mask may occlude objects."""
 _MOST_DEFLATED = 1032
 """Maximum compression ratio of DEFLATE."""
 
@@ -76,7 +76,10 @@ def checked_images(group: "h5py.Group") -> "h5py.Dataset":
 
 
 def _check_size(name: str, stored: "h5py.Dataset") -> None:
-    """Reject a data set that claims more bytes than it can hold; a damaged shape may be huge."""
+    """Reject an array whose shape needs more bytes than the file can hold for it.
+
+    A damaged shape may be huge.
+    """
     if stored.nbytes > _MOST_DEFLATED * stored.id.get_storage_size():
         raise ValueError(f"{name} claims {stored.nbytes} bytes, more than are stored")
 

@@ -21,8 +21,8 @@ def shard_bytes(
 ) -> bytes:
     """Encode rooms as the bytes of a shard; the same rooms give the same bytes.
 
-    The shard, a few MB, is built in memory because HDF5 does not recover from a full disk. From a
-    generator, one room is held in memory at a time. `name` is for messages.
+    The shard, a few MB, is built in memory because HDF5 does not recover from a full disk. If
+    `rooms` is a generator, only one room is held in memory at a time. `name` appears in messages.
     """
     import h5py
 
@@ -105,8 +105,10 @@ def _images(views: RoomViews) -> np.ndarray:
 
 
 def check_views(where: str, views: RoomViews) -> None:
-    """Check that the arrays of a room have consistent shapes and valid ids; `where` begins the
-    message."""
+    """Check that the arrays of a room have consistent shapes and valid ids.
+
+    `where` is the beginning of an error's message.
+    """
     where = f"{where}, room {views.room_id}"
     count, objects = views.visible.shape
     height, width = views.image_size

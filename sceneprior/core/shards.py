@@ -52,8 +52,8 @@ class Sightings:
     mask_pixels: np.ndarray
     """(T, n) int32, pixels of the visible mask."""
     sides_clear: np.ndarray
-    """(T, n, 4) bool: no other object touches the mask at this side of its box, so the object
-    itself ends there rather than being occluded."""
+    """(T, n, 4) bool: True if no other object touches the mask at this side of its box, so that the
+    object ends there and is not occluded."""
     instance_ids: np.ndarray | None
     """(T, H, W) uint8 (uint16 if an id is above 255): 0 = background, k + 1 = object k, n + 1 =
     void, which may occlude objects; None if the images were not read."""
@@ -76,7 +76,7 @@ class RoomViews(Sightings):
 class RoomGroundTruth:
     """3D ground truth of a room, for evaluation and baselines with 3D supervision.
 
-    The first n of its m rows are the tracked objects.
+    The first n of the m rows are the tracked objects.
     """
 
     object_class: np.ndarray
@@ -90,14 +90,15 @@ class RoomGroundTruth:
     model_ids: tuple[str, ...]
     """(m,) names of the files `models/<id>.ply`; '' if the data set has no mesh."""
     model_to_room: np.ndarray
-    """(m, 4, 4) float32, transform from the model's frame to the room frame (with scale)."""
+    """(m, 4, 4) float32, transform from the model's frame to the room frame, including scale."""
     floor_m: np.ndarray
     """(P, 2) float32, x and z along the floor's outline."""
     height_m: float
     """Height from floor to ceiling."""
     unoccluded: np.ndarray | None = None
-    """(T, n) bool: a tracked object is fully inside the image and occluded by nothing in the room.
-    None if only objects with masks can occlude, so that `sides_clear` suffices."""
+    """(T, n) bool: True if the tracked object is fully inside the image and nothing in the room
+    occludes it. None if only objects with masks can occlude others, so that `sides_clear`
+    suffices."""
 
 
 class Shard(contextlib.AbstractContextManager["Shard"]):
@@ -192,7 +193,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
                 raise ShardError(
                     f"{self.path}, room {room_id} carries no 3D ground truth, which this "
                     "evaluation compares with; posed pictures have none. Without it, `sceneprior "
-                    "eval-fid` compares what views tell (docs/posed_data.md)."
+                    "eval-fid` compares the observations in views (docs/posed_data.md)."
                 )
             hidden = group["ground_truth"]
             known = TRUTH_ARRAYS | (UNOCCLUDED if "unoccluded" in hidden else {})
@@ -221,7 +222,7 @@ def _short(value: Any) -> str:
 def _text(attributes: Any, name: str) -> str:
     value = _decoded(attributes[name])
     if not isinstance(value, str) or not value.isprintable():
-        raise ValueError(f"its {name} is no text")
+        raise ValueError(f"its {name} is not text")
     return value
 
 

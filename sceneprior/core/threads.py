@@ -1,4 +1,4 @@
-"""Limits torch to one thread where results must not depend on the number of cores."""
+"""Limits torch to one thread, for results that do not depend on the number of cores."""
 
 import contextlib
 from collections.abc import Iterator

@@ -35,7 +35,7 @@ class SceneViews(Batch):
     """
 
     room_index: Int[Tensor, " rooms"]
-    """Row of each room in the data set: which latent vector is its own."""
+    """Row of each room in the data set, which is also the row of its latent vector."""
     object_class: Int[Tensor, "rooms objects"]
     """Index into the label set; 0 where `is_object` is false."""
     is_object: Bool[Tensor, "rooms objects"]
@@ -52,7 +52,7 @@ class SceneViews(Batch):
     """Height and width in pixels that `intrinsics` refer to."""
     instance_ids: Integer[Tensor, "rooms views height width"] | None = None
     """Downsampled images of ids: 0 for background, k + 1 for object k, n + 1 for void in a room of
-    n objects. Only the shape stage has them."""
+    n objects. None except in the shape stage."""
     room_ids: tuple[str, ...] = ()
 
     @property
@@ -109,7 +109,7 @@ class LiftedRooms(Batch):
     """
 
     room_index: Int[Tensor, " rooms"]
-    """Row of each room in the data set: which latent vector is its own."""
+    """Row of each room in the data set, which is also the row of its latent vector."""
     object_class: Int[Tensor, "rooms objects"]
     """Index into the label set; 0 where `is_object` is false."""
     is_object: Bool[Tensor, "rooms objects"]
@@ -129,7 +129,8 @@ class RoomBoxes(Batch):
     """A batch of rooms as labelled 3D boxes: the supervision and the output of methods that learn
     from boxes.
 
-    Each room is padded to the batch's highest number of objects, whose order has no meaning.
+    Each room is padded to the batch's highest number of objects. The order of objects has no
+    meaning.
     """
 
     object_class: Int[Tensor, "rooms objects"]
@@ -143,6 +144,8 @@ class RoomBoxes(Batch):
     """Rotation about +y that takes +z to each piece's front, in [-pi, pi]; None if unknown."""
     looks: Int[Tensor, "rooms objects"] | None = None
     """Look of each object, prototype * 8 + pose (`lifted/prototypes.py`); None if unknown."""
+    rectangle_m: Float[Tensor, "rooms 4"] | None = None
+    """Rectangle in which each room was furnished: centre x, z and extents x, z; None if unknown."""
 
     def split(self, rooms: int) -> list["RoomBoxes"]:
         """Split into batches of at most `rooms` rooms, without ids."""
@@ -154,14 +157,16 @@ class RoomBoxes(Batch):
         return [batch(start) for start in range(0, len(self.is_object), rooms)]
 
     def only(self, here: Bool[Tensor, "rooms objects"]) -> "RoomBoxes":
-        """Copy in which the slots are empty where `here` is false."""
+        """Copy that keeps the objects where `here` is true; the other slots become padding."""
         return replace(self, object_class=self.object_class * here, is_object=self.is_object & here)
 
     def take(self, order: Int[Tensor, "rooms slots"]) -> "RoomBoxes":
-        """Gather the slots of each room in the given order."""
+        """Gather the slots of each room in the order of the indices `order`."""
 
         def taken(tensor: Tensor) -> Tensor:
             rows = order if tensor.ndim == 2 else order.unsqueeze(-1)
             return torch.take_along_dim(tensor, rows, dim=1)
 
-        return self.changed(taken)
+        # Rectangles have no slots.
+        slots = replace(self, rectangle_m=None).changed(taken)
+        return replace(slots, rectangle_m=self.rectangle_m)

@@ -103,8 +103,8 @@ def _weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise InputError(
             f"No AlexNet at {path}. The paper's SCA needs torchvision's file "
-            "`alexnet-owt-7be5be79.pth`; without it leave the option out: sca_effnet_lite0 needs "
-            "no download."
+            "`alexnet-owt-7be5be79.pth`. If you do not have it, leave the option out: "
+            "sca_effnet_lite0 needs no download."
         )
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int, Real, Shaped
 RESAMPLES = 200
 COVERAGE = 0.95
 METHOD = (
-    f"{COVERAGE:.0%} bootstrap over rooms, both sets drawn anew with replacement; quantiles moved "
-    "so that the resamples' mean meets the metric's value"
+    f"{COVERAGE:.0%} bootstrap over rooms, both sets resampled with replacement; quantiles shifted "
+    "so that the mean of the resamples equals the metric's value"
 )
 
 
@@ -24,10 +24,10 @@ def resample_counts(
 
 @dataclass(frozen=True)
 class Estimate:
-    """A metric's value, and its value on every resample."""
+    """A metric's value on the rooms and on every resample of them."""
 
     value: float | None
-    """None if the metric is undefined for this set."""
+    """Value on the rooms themselves; None if the metric is undefined for this set."""
     resamples: Float[np.ndarray, " resamples"]
     """Values on the resamples; those on which the metric is undefined are left out."""
     low: float = -np.inf
@@ -35,11 +35,11 @@ class Estimate:
     """Bounds of the metric by definition; the interval is clipped to [low, high]."""
 
     def interval(self) -> list[float] | None:
-        """[lower, upper] end of the interval; None without a value or without resamples.
+        """Lower and upper end of the interval; None if there is no value or there are no resamples.
 
         Drawing with replacement repeats rooms, and sets with fewer distinct rooms lie farther
         apart: the resamples of a Frechet distance all lie above the distance itself. This bias is
-        removed: the quantiles are shifted so that the resamples' mean meets the value.
+        removed: the quantiles are shifted so that the mean of the resamples equals the value.
         """
         if self.value is None or len(self.resamples) == 0:
             return None
@@ -57,14 +57,14 @@ class Estimate:
         return Estimate(self.value / other.value, ours[known] / theirs[known], 0.0)
 
     def minus(self, other: "Estimate") -> "Estimate":
-        """The difference of this metric and another; undefined if either is."""
+        """This metric minus another; undefined if either metric is undefined."""
         if self.value is None or other.value is None:
             return Estimate(None, np.zeros(0))
         ours, theirs = _paired(self, other)
         return Estimate(self.value - other.value, ours - theirs)
 
     def mean_with(self, other: "Estimate") -> "Estimate":
-        """The mean of two shares, from 0 to 1; undefined if either is."""
+        """The mean of two shares, from 0 to 1; undefined if either share is undefined."""
         if self.value is None or other.value is None:
             return Estimate(None, np.zeros(0))
         ours, theirs = _paired(self, other)
@@ -72,7 +72,7 @@ class Estimate:
 
 
 def _paired(a: Estimate, b: Estimate) -> tuple[np.ndarray, np.ndarray]:
-    """The resamples of both, cut to the shorter list."""
+    """The resamples of both estimates, cut to the length of the shorter list."""
     both = min(len(a.resamples), len(b.resamples))
     return a.resamples[:both], b.resamples[:both]
 

@@ -74,8 +74,9 @@ class Drawing:
     ) -> Features:
         """Draw scenes from above, a few at a time, and compute the networks' features.
 
-        The calling thread draws, and one thread per processor runs the networks; the bits do not
-        depend on their number. `on_progress` is called with the number of scenes just done.
+        The calling thread draws, and one thread per processor runs the networks; the features are
+        bitwise the same for any number of threads. `on_progress` is called with the number of
+        scenes just done.
         """
         protocol, stream = topdown_protocol(self.label_set), iter(scenes)
         parts: list[Features] = []

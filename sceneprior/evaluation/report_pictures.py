@@ -28,7 +28,7 @@ class RoomPictures:
 
     name: str
     contents: str
-    """Its objects in words: "double bed, nightstand ×2"."""
+    """The scene's objects in words: "double bed, nightstand ×2"."""
     topdown: str
     """Data URI of the flat top-down picture that metrics compare, with borders, at half size."""
     perspective: str

@@ -64,8 +64,8 @@ def choose_rooms(
     for group, scenes in groups.items():
         if len(scenes) < 2:
             raise InputError(
-                f"Scoring needs at least 2 {group} rooms, but {len(scenes)} came; synthesize or "
-                "prepare more."
+                f"Scoring needs at least 2 {group} rooms, but there are {len(scenes)}; synthesize "
+                "or prepare more."
             )
     groups["independent"] = independent_rooms(every_train, len(rows), seed)
     groups["shuffled"] = shuffled_rooms(every_train, len(rows), seed)

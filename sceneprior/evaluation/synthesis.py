@@ -30,8 +30,8 @@ all generated rooms, and required a near copy to have exactly the same objects. 
 threshold of near copies to 0.15 m, and did not split intersecting pairs. Version 1 hashed all
 pictures of a set as one, and had no intervals and only Frechet distances."""
 NOTE = (
-    "Measured on the rooms of these shards. Where they come from `sceneprior make-homes`, they "
-    "are made-up homes: no number here can be compared with the paper's, which are on 3D-FRONT."
+    "Measured on the rooms of these shards. Shards of `sceneprior make-homes` hold synthetic "
+    "homes: their scores cannot be compared with the paper's, which are on 3D-FRONT."
 )
 
 _PACKAGES = (
@@ -65,8 +65,8 @@ class EvalOptions:
     def __post_init__(self) -> None:
         if self.split not in ("val", "test"):
             raise InputError(
-                f"Generated rooms are compared with the split test, or with val to choose settings "
-                f"by, but '{self.split}' came."
+                f"Generated rooms are compared with the split test, or with val to choose "
+                f"settings, but '{self.split}' was given."
             )
 
 
@@ -183,7 +183,7 @@ def _networks(options: EvalOptions) -> list[str]:
 
 
 def _left_out(measured: Container[str], options: EvalOptions) -> dict[str, str]:
-    """The metrics of generated rooms that a result lacks, each with the missing option."""
+    """The metrics of generated rooms that a result lacks, each with the option it needs."""
     return {
         metric.key: metric.lacks(_networks(options), options.boxes) or "decoded training rooms"
         for metric in METRICS

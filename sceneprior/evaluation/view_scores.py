@@ -31,7 +31,7 @@ class ObjectPair:
 
     truth: SceneObject
     found: SceneObject | None
-    """None if no object was fitted: its IoUs and F-score are 0, and it has no distance."""
+    """The fitted object. If it is None, the true object has IoUs and F-score 0, and no distance."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ def score_views(
     """Scores of single-view reconstructions; every true object has the same weight.
 
     `summary` covers all objects of all images, `intervals` holds bootstrap intervals of its
-    metrics, and `classes` holds one summary per true class. Views of one room (`rooms` has that of
-    each view) are not independent, so intervals resample rooms.
+    metrics, and `classes` holds one summary per true class. `rooms` names the room of each view:
+    views of one room are not independent, so intervals resample rooms.
     """
     scores = [
         score_pair(pair, points, row)
@@ -127,9 +127,9 @@ def summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
 
 
 def intervals(scores: Sequence[PairScore], rooms: Sequence[str]) -> dict[str, list[float] | None]:
-    """[lower, upper] end for each metric of a summary; None for a metric without a value.
+    """Lower and upper end of the interval of each metric; None for a metric without a value.
 
-    Rooms (`rooms` has that of each score) are resampled with all objects of all their views. The
+    `rooms` names the room of each score. A room is resampled with all objects of all its views. The
     resamples depend only on the rooms, so that several methods share them.
     """
     names, number = np.unique(rooms, return_inverse=True)
@@ -148,12 +148,12 @@ def surface_note(objects: int, with_surface: int, shards: str) -> str | None:
     """A note that surface metrics cover fewer objects than box metrics; None if they do not."""
     if with_surface == objects:
         return None
-    short = f"only of the {with_surface} that do" if with_surface else "not at all"
+    short = f"only for the other {with_surface}" if with_surface else "for none"
     return (
-        f"{objects - with_surface} of {objects} true objects have a box but no surface, and a "
-        f"right shape would be punished for not being a box: Chamfer distance, F-score and "
-        f"oriented IoU are reported {short}. ScanNet's surfaces come with shards that `sceneprior "
-        f"prep-scannet` makes today; {shards} may be older."
+        f"{objects - with_surface} of {objects} true objects have a box but no surface. A correct "
+        f"shape scores worse against a box than a box does, so Chamfer distance, F-score and "
+        f"oriented IoU are reported {short}. Shards made by today's `sceneprior prep-scannet` have "
+        f"ScanNet's surfaces; {shards} may be older."
     )
 
 
@@ -163,12 +163,12 @@ METRICS = {
     "least area",
     "chamfer_l2_m": "mean distance to the nearest point of the other surface, both ways added, in "
     "metres",
-    "chamfer_squared_m2": "the same of squared distances, in square metres",
+    "chamfer_squared_m2": "like chamfer_l2_m with squared distances, in square metres",
     "f_score": f"at {F_THRESHOLD_M} m",
 }
 PROTOCOL = {
-    "objects": "those that the image shows, each matched to what was found for its mask by the "
-    "fit's own assignment (class and 2D box); every object weighs the same",
+    "objects": "objects that the image shows, each matched to the object fitted to its mask by the "
+    "fit's own assignment (class and 2D box); every object has the same weight",
     **METRICS,
     "intervals": f"{COVERAGE:.0%} bootstrap over rooms, {RESAMPLES:,} draws with replacement, all "
     "views of a room together",

@@ -21,9 +21,9 @@ ENDS = ("start", "end")
 def write_atiss(scenes: Sequence[Scene], folder: Path) -> None:
     """Write `<room>/boxes.npz` for each room, y up, in metres, with the floor's centre as origin.
 
-    Sizes are half extents in each box's own frame: of the turned box if the object has one, else of
-    the axis-aligned box, with angle 0. Meshes are not written. The columns of `class_labels` are
-    the label set without void, then start and end.
+    Sizes are half extents in the box's own frame. An object with a turned box is written with that
+    box; any other object with its axis-aligned box and angle 0. Meshes are not written. The columns
+    of `class_labels` are the label set without void, then `start` and `end`.
     """
     for scene in scenes:
         columns = [name for name in label_set(scene.label_set) if name not in NOT_FURNITURE]

@@ -38,7 +38,7 @@ def read_box_lists(
         sizes: `half` or `full` extents.
     """
     if sizes not in SIZES:
-        raise InputError(f"No sizes '{sizes}'; they are half (extents, as ATISS has them) or full.")
+        raise InputError(f"No sizes '{sizes}'; expected half (half extents, as in ATISS) or full.")
     columns = None if classes is None else [name.strip() for name in classes.split(",")]
     return [
         scene
@@ -48,7 +48,7 @@ def read_box_lists(
 
 
 def _files(boxes: Path) -> list[tuple[Path, str]]:
-    """Files, each with a room name: ATISS stores one folder with a boxes.npz per room."""
+    """Box-list files, each with a room name: ATISS stores a folder with a boxes.npz per room."""
     if boxes.is_file():
         return [(boxes, boxes.stem)]
     found = [path for path in sorted(boxes.rglob("*")) if path.suffix in (".npz", ".json")]
@@ -67,11 +67,11 @@ def read_boxes(
     columns: Sequence[str] | None = None,
     size_factor: float = 2.0,
 ) -> list[Scene]:
-    """Read the rooms of one file; see `read_box_lists`. Several rooms get a number in their name.
+    """Read the rooms of one file; see `read_box_lists`. Several rooms are named with a number.
 
     Args:
-        path: `.npz` with one room (arrays over objects) or several (one more axis in front), or
-            `.json` with one such object, or a list of them.
+        path: `.npz` with one room (arrays over objects) or several (one more leading axis), or
+            `.json` with one such record, or a list of records.
         size_factor: Factor from `sizes` to full extents.
     """
     rooms = [room for record in _records(path) for room in _one_by_one(path, record)]
@@ -84,7 +84,7 @@ def read_boxes(
                 f"{path}: a room has {len(objects)} objects; expected at most {MOST_OBJECTS}."
             )
         come_from = {"converted_from": path.name}
-        scenes.append(Scene(own, label_set_name, objects, _floor(path, room), come_from))
+        scenes.append(Scene(own, label_set_name, objects, floor_outline(path, room), come_from))
     return scenes
 
 
@@ -98,11 +98,11 @@ def _records(path: Path) -> list[dict[str, Any]]:
             records = loaded if isinstance(loaded, list) else [loaded]
     except Exception as error:  # a damaged file raises almost anything in numpy
         raise InputError(
-            f"{path} is no box list ({type(error).__name__}); expected an .npz or .json with "
+            f"{path} is not a box list ({type(error).__name__}); expected an .npz or .json with "
             f"{', '.join(NEEDED)}."
         ) from None
     if not all(isinstance(record, dict) for record in records):
-        raise InputError(f"{path} is no box list; expected objects with {', '.join(NEEDED)}.")
+        raise InputError(f"{path} is not a box list; expected objects with {', '.join(NEEDED)}.")
     missing = [key for key in NEEDED if any(key not in record for record in records)]
     if missing:
         raise InputError(f"{path} has no {' and no '.join(missing)}; a box list has all of them.")
@@ -185,8 +185,8 @@ def _label_names(
     wide = labels.shape[1] if labels.ndim == 2 else int(rows.max(initial=-1)) + 1
     if (labels.ndim == 2 and wide != len(columns)) or wide > len(columns) or (rows < 0).any():
         raise InputError(
-            f"{path}: class_labels know {wide} classes, but {len(columns)} names stand for them; "
-            "give all names in order with --classes, start, end and empty among them."
+            f"{path}: class_labels have {wide} columns, but there are {len(columns)} names; give "
+            "all names in order with --classes, including start, end and empty."
         )
     return [columns[row] for row in rows]
 
@@ -215,7 +215,7 @@ def turned_box(
     return replace(item, mesh=Mesh(own.vertices_m @ yaw_rotation(yaw_rad).T + center, own.faces))
 
 
-def _floor(path: Path, room: dict[str, Any]) -> np.ndarray | None:
+def floor_outline(path: Path, room: dict[str, Any]) -> np.ndarray | None:
     """Outline of the floor's triangles relative to its centroid, the origin of ATISS's boxes."""
     if any(key not in room for key in FLOOR):
         return None

@@ -1,13 +1,20 @@
 """Export of rooms to other formats, by name."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
+from sceneprior.core.shell import ShellName, shell_of
+from sceneprior.core.standing import stand
 from sceneprior.interchange.atiss import write_atiss
 from sceneprior.interchange.front import write_front
+from sceneprior.interchange.habitat import write_habitat
+from sceneprior.interchange.mujoco import write_mujoco
+from sceneprior.interchange.sceneeval import write_sceneeval
+from sceneprior.interchange.usd import write_usd
 from sceneprior.render.scene_files import check_names, save_scene
 
 OF_CLASSES: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
@@ -15,22 +22,41 @@ OF_CLASSES: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
     "threed-front": write_front,
 }
 """Formats in which every object needs a furniture class, so that void objects are left out."""
-ENDINGS = {"obj": ".obj", "usd": ".usda"}
-"""Formats of one file a room."""
-FORMATS = (*OF_CLASSES, *ENDINGS)
+SIMULATORS: Mapping[str, Callable[[Sequence[Scene], Path, ShellName], None]] = {
+    "mujoco": write_mujoco,
+    "usd": write_usd,
+    "habitat": write_habitat,
+}
+"""Formats of simulators, for which objects stand first (`core/standing.py`)."""
+FORMATS = (*OF_CLASSES, *SIMULATORS, "sceneeval", "obj")
+GROWN_M = 0.01
+"""Smallest displacement of walls, in metres, of which a note informs the user."""
 
 
-def export_scenes(scenes: Sequence[Scene], to: str, folder: Path) -> list[str]:
-    """Write rooms to a folder in one of `FORMATS`; in all of them y is up, in metres.
+def export_scenes(
+    scenes: Sequence[Scene], to: str, folder: Path, shell: ShellName | None = None
+) -> list[str]:
+    """Write rooms to a folder in one of `FORMATS`, in metres.
 
-    Notes for the user on objects that were left out are returned.
+    y is up; in `mujoco` and `sceneeval`, z is. `shell` names the parts of the room itself to write;
+    None writes walls for simulators, and nothing in other formats. Returns notes for the user on
+    omissions and changes.
     """
     if to not in FORMATS:
         raise InputError(f"No format '{to}'; choose from {', '.join(FORMATS)}, or scenes.")
     check_names(scenes)
-    if to in ENDINGS:
+    if to == "obj":
         for scene in scenes:
-            save_scene(scene, Path(folder) / f"{scene.name}{ENDINGS[to]}")
+            save_scene(scene, Path(folder) / f"{scene.name}.obj", shell=shell or "none")
+        return []
+    if to in SIMULATORS:
+        standing, notes = stand_all(scenes)
+        SIMULATORS[to](standing, Path(folder), shell or "walls")
+        return notes if shell in ("floor", "none") else [*notes, *_moved_walls(standing)]
+    if shell is not None:
+        raise InputError(f"What {to} has of a room is fixed; leave out --shell.")
+    if to == "sceneeval":
+        write_sceneeval(scenes, Path(folder))
         return []
     named = [
         replace(scene, objects=tuple(o for o in scene.objects if o.label != "void"))
@@ -41,3 +67,25 @@ def export_scenes(scenes: Sequence[Scene], to: str, folder: Path) -> list[str]:
     if left_out:
         return [f"Objects of class void are left out ({left_out}): {to} has no such class."]
     return []
+
+
+def stand_all(scenes: Sequence[Scene]) -> tuple[list[Scene], list[str]]:
+    """The scenes with all objects made to stand, and a note on the changes, if there are any."""
+    pairs = [stand(scene) for scene in scenes]
+    changes = sum((told for _, told in pairs), Counter[str]())
+    standing = [scene for scene, _ in pairs]
+    if not (said := ", ".join(f"{count} {change}" for change, count in changes.items() if count)):
+        return standing, []
+    total = sum(len(scene.objects) for scene in scenes)
+    return standing, [f"So that nothing falls over or overlaps, of {total} objects: {said}."]
+
+
+def _moved_walls(scenes: Sequence[Scene]) -> list[str]:
+    grown_m = [shell_of(scene).grown_m for scene in scenes]
+    rooms = sum(far > GROWN_M for far in grown_m)
+    if not rooms:
+        return []
+    return [
+        f"Walls of {rooms} rooms stand further out than floor_m, by up to {max(grown_m):.2f} m, "
+        "because furniture stands there."
+    ]

@@ -16,11 +16,11 @@ import shapely
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, write_json, write_whole
-from sceneprior.core.floor import floor_polygon
+from sceneprior.core.floor import floor_polygon, floor_rectangle
 from sceneprior.core.furniture import MODEL_FILE, category_table, class_of_category
 from sceneprior.core.scene import Scene
 from sceneprior.interchange.atiss import floor_plan
-from sceneprior.render.topdown import floor_rectangle, scene_meshes
+from sceneprior.render.topdown import scene_meshes
 
 ROOM_TYPES = {
     "front3d_bedroom": "Bedroom", "front3d_living": "LivingRoom", "front3d_dining": "DiningRoom",
@@ -102,6 +102,6 @@ def category_of_class(label: str, label_set_name: str) -> str:
         if class_of_category(category, label_set_name) == label:
             return category
     raise InputError(
-        f"No category of 3D-FRONT is a '{label}' in label set '{label_set_name}'; leave such "
+        f"3D-FRONT has no category for class '{label}' of label set '{label_set_name}'; leave such "
         "objects out, or export to another format."
     )

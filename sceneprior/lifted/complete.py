@@ -1,14 +1,14 @@
-"""Room completion: furnish the rest of a room of which some objects are given.
+"""Room completion: furnishes the rest of a room in which some objects are given.
 
 A run's sampler draws the missing objects, given the others. Without a sampler, latents are fitted:
 
-1. Latents are sampled from the run's distribution and decoded. Those whose rooms come nearest to
-   the given objects are the starts; each answer has its own.
+1. Latents are sampled from the run's distribution and decoded. Those whose rooms are most similar
+   to the given objects become starting points; each answer has `RESTARTS` of its own.
 2. The network is frozen, and each latent is optimised until its room holds the given classes and
    boxes, with a penalty on its distance from the start. Predictions are matched to the given
    objects anew in each step, as in training, but in 3D.
-3. The best of an answer's starts is kept, and the given objects are inserted into its room
-   (`sceneprior/lifted/insert.py`).
+3. For each answer, the fitted latent with the lowest loss is kept, and the given objects are
+   inserted into its room (`sceneprior/lifted/insert.py`).
 """
 
 import math
@@ -38,7 +38,7 @@ from sceneprior.paper.sampling import draw_latents
 from sceneprior.paper.trained import TrainedPrior
 
 DRAWN = 256
-"""Latents sampled, from which the starts are chosen."""
+"""Number of sampled latents, from which the starts are chosen."""
 RESTARTS = 3
 """Starts per answer."""
 STEPS = 150
@@ -46,10 +46,11 @@ STEPS = 150
 RATE = 0.05
 """Length of an early step of Adam on the sphere of radius 1; it falls to 0 along a cosine."""
 BOX_WEIGHT = 5.0
-"""Weight of the mean distance of centres and sides in metres, beside the class's cross entropy."""
+"""Weight of the mean distance of centres and sides in metres; the cross entropy of the class has
+weight 1."""
 START_WEIGHT = 2.0
-"""Weight of half the squared distance from the start, which on a sphere is 1 - cosine. A larger one
-keeps rooms as they were sampled; a smaller one fits the given objects better."""
+"""Weight of half the squared distance from the start, which on a sphere is 1 - cosine. A larger
+weight keeps rooms closer to the sampled ones; a smaller weight fits the given objects better."""
 
 
 def complete(
@@ -61,14 +62,22 @@ def complete(
     steps: int = STEPS,
     classes: Sequence[str] | None = None,
 ) -> list[list[Scene]]:
-    """Furnish the rest of rooms; all rooms and all answers are computed in one batch.
+    """Furnish the rest of each scene's room; all rooms and answers are computed in one batch.
 
-    Given objects may lack meshes; if there are none, the answers are rooms that the run generates.
-    A sampler stays within the bounding rectangle of a scene's floor. `distribution` is `sampler`,
-    or that of the latents that answers start from (`draw_latents`); with 0 `steps` of the fit,
-    these stay as they are. `classes` are added, and no others; None leaves the choice to the
-    sampler. The answers' `extra` is that of `insert`; if `classes` were given, `no_place` lists
-    those for which the sampler found no free place.
+    Given objects need no meshes. If a scene has no objects, its answers are rooms that the run
+    generates. A sampler keeps to the bounding rectangle of the scene's floor, if it has one.
+
+    Args:
+        scenes: The given objects of each room.
+        count: Number of answers per room.
+        distribution: `sampler`, or the distribution of the latents from which answers start; None
+            uses the run's default.
+        steps: Steps of the fit of latents; 0 leaves the sampled latents unchanged.
+        classes: Classes of the objects to add. None leaves the choice to the sampler.
+
+    Returns:
+        The answers of each room. Their `extra` is that of `insert`; if `classes` are given,
+        `no_place` in it lists the classes for which the sampler found no free place.
     """
     check_seed(seed)
     names = [f"complete_{k:02d}" for k in range(count)]
@@ -77,12 +86,12 @@ def complete(
         return _drawn(with_sampler, scenes, given, names, seed, classes)
     if classes is not None:
         raise InputError(
-            "Which classes to add can be asked of a sampler alone, and these rooms come from "
-            "latents; leave the classes out, or train with a section `sampler`."
+            "Only a sampler can add chosen classes, but these rooms come from latents; leave the "
+            "classes out, or train with a section `sampler`."
         )
     starts = _starts(trained, given, count * RESTARTS, seed, distribution)
     z, loss = fit_latents_to_objects(trained, starts, repeated(given, count * RESTARTS), steps)
-    # Starts are sorted, best first; dealing them out in turn gives every answer good ones.
+    # Starts are sorted, best first, and dealt out in turn, so that every answer gets good ones.
     best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
     z = z.view(len(scenes), RESTARTS, count, -1).take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
     return [
@@ -106,8 +115,8 @@ def _drawn(
     fullest = int(given.is_object.sum(dim=1).max()) + len(classes or ())
     if fullest > most:
         raise InputError(
-            f"Given and asked-for objects are {fullest} together, but rooms of this run hold at "
-            f"most {most} (model.max_objects); ask for fewer."
+            f"The given and the requested objects are {fullest} together, but rooms of this run "
+            f"hold at most {most} (model.max_objects); request fewer."
         )
     answers = []
     for scene, one in zip(scenes, given.split(1), strict=True):
@@ -124,14 +133,18 @@ def _drawn(
 
 
 def _with_no_place(room: Scene, classes: Sequence[str]) -> Scene:
-    """An answer with `extra["no_place"]`: the requested objects that it lacks, by class."""
+    """An answer with `extra["no_place"]`: the classes of the requested objects that it lacks."""
     added = Counter(item.label for item in room.objects[len(room.extra["given"]) :])
     lacking = sorted((Counter(classes) - added).elements())
     return replace(room, extra={**room.extra, "no_place": lacking})
 
 
 def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> RoomBoxes:
-    """Given objects as tensors; an `InputError` for those that the run cannot use."""
+    """Given objects as tensors.
+
+    Raises:
+        InputError: the run cannot use an object, or there are too many.
+    """
     config = trained.config
     names, most = label_set(config.label_set), config.model.max_objects
     counts = torch.tensor([len(scene.objects) for scene in scenes])
@@ -170,8 +183,8 @@ def repeated(rooms: RoomBoxes, times: int) -> RoomBoxes:
 def _starts(
     trained: TrainedPrior, given: RoomBoxes, each: int, seed: int, distribution: str | None
 ) -> Float[Tensor, "starts dimension"]:
-    """Starting latents for every room, a number of `each`: the sampled latents whose decoded rooms
-    have the lowest `given_loss`, best first."""
+    """Choose `each` starting latents for every room, best first: the sampled latents whose decoded
+    rooms have the lowest `given_loss`."""
     z, _ = draw_latents(trained, max(DRAWN, each), seed, distribution)
     decoded = trained.prior.decode(z, with_shape=False)
     target = trained.config.model.completeness_target
@@ -213,12 +226,12 @@ def fit_latents_to_objects(
 def given_loss(
     decoded: DecodedScenes, given: RoomBoxes, completeness_target: str = "first_n"
 ) -> Float[Tensor, " rooms"]:
-    """Loss of decoded rooms against the given objects, averaged over these; 0 if there are none.
+    """Loss of decoded rooms, averaged over the given objects; 0 if there are none.
 
         L = cross entropy of the class + `BOX_WEIGHT` * mean |b - b_given| - log p(part of the room)
 
-    with b centre and size in metres, for the prediction matched to each given object. The matching
-    cost has minus the class's probability in place of its cross entropy, as in DETR.
+    with b centre and size in metres, for the prediction matched to each given object. In the
+    matching cost, minus the class's probability replaces its cross entropy, as in DETR.
     """
     boxes = torch.cat([decoded.centers_m, decoded.sizes_m], dim=-1)
     kept = -log_kept(decoded.completeness_logits, completeness_target)

@@ -47,11 +47,11 @@ class LiftedLossConfig(Section):
 
 
 class LiftedStageConfig(LatentStageConfig):
-    """Training of the network and latents on lifted boxes and shapes at once. The learning rate
-    follows a cosine."""
+    """Training of the network and the latents on lifted boxes and shapes, in one stage. The
+    learning rate follows a cosine schedule."""
 
     decoder_learning_rate: float | None = Field(None, gt=0)
-    """Learning rate of the shape decoder; None takes `learning_rate`."""
+    """Learning rate of the shape decoder; None uses `learning_rate`."""
 
     @property
     def shape_rate(self) -> float:
@@ -62,27 +62,27 @@ class LiftedSamplingConfig(Section):
     """Sampling of new rooms."""
 
     distribution: Literal["sampler", "kernel", "paper"] = "paper"
-    """`sampler`: drawn object by object, without a latent (needs the section `sampler`). The others
-    are distributions of latents, as in a run of the paper's method."""
+    """`sampler`: rooms are sampled object by object, without a latent (needs the section
+    `sampler`). The others are distributions of latents, as in a run of the paper's method."""
 
 
 class LiftedModel(ModelConfig):
-    """The paper's network, with looks in place of deformed templates."""
+    """The paper's network, with looks (`lifted/prototypes.py`) in place of deformed templates."""
 
     decoder: TransformerConfig
     shape: LookConfig = LookConfig()
 
 
 class LiftedConfig(PriorConfig):
-    """A run of the lifted method: 3D boxes and shapes are found from the masks before training."""
+    """A run of the lifted method: 3D boxes and shapes are estimated from masks before training."""
 
     method: Literal["lifted"] = "lifted"
     model: LiftedModel
     loss: LiftedLossConfig = LiftedLossConfig()
     shape: LiftedStageConfig
-    """The sphere: the paper's network and latents, supervised by lifted boxes and shapes."""
+    """Training of the sphere: the paper's network and latents, on lifted boxes and shapes."""
     sampler: SamplerConfig | None = None
-    """A model of a room's objects one by one, which draws new rooms; null for none."""
+    """The autoregressive model that samples new rooms object by object; null for none."""
     sampling: LiftedSamplingConfig = LiftedSamplingConfig()
 
     remembers_rooms: ClassVar[bool] = True
@@ -123,14 +123,17 @@ class LiftedConfig(PriorConfig):
         return TrainedLifted(plain.prior, plain.logits, room_ids, self, stage, sampler)
 
     def build_sampler(self, settings: SamplerConfig) -> RoomSampler:
-        """The sampler's network, freshly initialised from the seed; it knows no rooms yet."""
+        """The sampler's network, freshly initialised from the seed; `teach` sets its buffers."""
         torch.manual_seed(self.seed)
         most = self.model.shape.prototypes
         return RoomSampler(settings, self.classes, most, self.model.max_objects)
 
     def open_lifted(self, split: str = "train") -> LiftedDataset:
-        """Rooms with the 3D boxes and shapes found from their masks; InputError if they do not fit
-        the config."""
+        """Rooms with the 3D boxes and shapes estimated from their masks.
+
+        Raises:
+            InputError: the rooms do not fit the config.
+        """
         data, shape = self.data, self.model.shape
         rooms = LiftedDataset(
             Path(data.shards),
@@ -147,7 +150,7 @@ class LiftedConfig(PriorConfig):
         return SamplerRooms(self.open_lifted(split))
 
     def _build(self, rooms: LiftedDataset, previous: Path | None) -> "LiftedStage":
-        # Imported where something is trained, here and below: Lightning takes seconds.
+        # Imported here and below, only where something is trained: Lightning takes seconds.
         from sceneprior.lifted.stages import LiftedStage
 
         prior, latents = self.build_prior(), self.build_latents(len(rooms))

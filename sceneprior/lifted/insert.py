@@ -20,19 +20,19 @@ def insert(
     may_meet: Bool[np.ndarray, "classes classes"] | None = None,
     **extra: Any,
 ) -> Scene:
-    """The given objects first, unchanged, then the room's remaining objects.
+    """A scene with the given objects first, unchanged, then the room's remaining objects.
 
     Two kinds of the room's own objects are removed:
 
     - objects that match a given one: of the same class, paired one to one by their boxes (see
       `match_scenes`). A given object without a mesh takes the mesh of its match;
-    - of the others, those that overlap a given one badly (`BADLY`), unless their classes may.
+    - other objects that overlap a given one badly (`BADLY`), unless their classes may overlap.
 
-    The result has the floor of `given`. `may_meet` are pairs of classes that may overlap, such as a
-    chair and its table; None: no pair. `extra` goes into the JSON beside `given` (the rows of the
-    given objects), `replaced` and `removed` (the number of objects removed for either reason), and
-    `replaced_off_m` (mean distance, over centre and sides, between the matches and the given
-    objects; null if none).
+    The result has the floor of `given`, if it has one. `may_meet` is true for pairs of classes that
+    may overlap, such as a chair and its table; None allows no pair. The result's `extra` holds
+    `extra`, `given` (the rows of the given objects), `replaced` and `removed` (the number of
+    objects removed for either reason), and `replaced_off_m` (mean distance in metres, over centre
+    and sides, between the matches and the given objects; null if there are none).
     """
     given = replace(given, label_set=room.label_set)
     partners = _partners(room, given)
@@ -55,7 +55,8 @@ def insert(
         **extra,
     }
     objects = (*placed, *added)
-    return replace(room, objects=objects, floor_m=given.floor_m, extra=marks)
+    floor_m = room.floor_m if given.floor_m is None else given.floor_m
+    return replace(room, objects=objects, floor_m=floor_m, extra=marks)
 
 
 def _partners(room: Scene, given: Scene) -> dict[int, int]:
@@ -84,7 +85,8 @@ def _mean_apart(room: Scene, given: Scene, partners: dict[int, int]) -> float | 
 
 
 def _with_mesh(item: SceneObject, lender: SceneObject) -> SceneObject:
-    """A given object; if it has no mesh, with `lender`'s, moved and scaled into its box."""
+    """A given object; if it has no mesh, it gets `lender`'s shape, scaled into its box."""
     if item.mesh is not None:
         return item
-    return replace(item, mesh=lender.in_box(item.center_m, item.size_m).mesh)
+    lent = lender.in_box(item.center_m, item.size_m)
+    return replace(item, mesh=lent.mesh, solids=lent.solids)

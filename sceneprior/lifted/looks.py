@@ -14,8 +14,16 @@ from torch import Tensor, nn
 
 from sceneprior.core.geometry.part_meshes import stretched, surface_of_parts
 from sceneprior.core.geometry.turns import quarter_rotation
-from sceneprior.core.parts import MOST_PARTS, Parts, filled_cells, whole_box
-from sceneprior.core.scene import Mesh
+from sceneprior.core.parts import (
+    KIND_NAMES,
+    MOST_CORNERS,
+    MOST_PARTS,
+    SQUARE,
+    Parts,
+    filled_cells,
+    whole_box,
+)
+from sceneprior.core.scene import Mesh, Solid
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototypes import (
     POSES,
@@ -75,6 +83,7 @@ class LookDecoder(ShapeModule):
         self.part_kind: Tensor
         self.part_mirrored: Tensor
         self.part_ends: Tensor
+        self.outlines: Tensor
         self.filled: Tensor
         self.sizes_m: Tensor
         self.object_class: Tensor
@@ -85,6 +94,7 @@ class LookDecoder(ShapeModule):
         self.register_buffer("part_kind", torch.full(slots, self.unknown, dtype=torch.int8))
         self.register_buffer("part_mirrored", torch.zeros(slots, dtype=torch.int8))
         self.register_buffer("part_ends", torch.zeros(*slots, 3, 2))
+        self.register_buffer("outlines", _padded(SQUARE).repeat(most, 1, 1))
         self.register_buffer("filled", torch.ones(most))
         self.register_buffer("sizes_m", torch.ones(most, 3))
         self.register_buffer("object_class", torch.full((most,), self.unknown))
@@ -101,6 +111,7 @@ class LookDecoder(ShapeModule):
             self.part_kind[row, used] = torch.from_numpy(parts.kind)
             self.part_mirrored[row, used] = torch.from_numpy(parts.mirrored)
             self.part_ends[row, used] = torch.from_numpy(parts.ends).float()
+            self.outlines[row] = _padded(parts.outline)
         filled = prototypes.grids.sum(axis=(1, 2, 3)).clip(min=1)
         self.filled[:count] = torch.from_numpy(filled.astype(np.float32))
         self.sizes_m[:count] = torch.from_numpy(prototypes.sizes_m)
@@ -132,7 +143,11 @@ class LookDecoder(ShapeModule):
             part[prototype, used].cpu().numpy()
             for part in (self.part_kind, self.part_mirrored, self.part_ends)
         )
-        return Parts(kind.astype(np.int64), mirrored.astype(np.int64), ends.astype(np.float64))
+        corners = self.outlines[prototype].double().cpu().numpy()
+        new = (corners != np.roll(corners, 1, axis=0)).any(axis=1)  # the last corner is repeated
+        return Parts(
+            kind.astype(np.int64), mirrored.astype(np.int64), ends.astype(np.float64), corners[new]
+        )
 
     def forward(
         self, features: Float[Tensor, "*objects features"]
@@ -157,8 +172,12 @@ class LookDecoder(ShapeModule):
     def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:
         if decoded.looks is None:
             return None
-        box_m = torch.cat((decoded.centers_m[room, item], decoded.sizes_m[room, item]))
-        return self.mesh(int(decoded.looks[room, item]), box_m.double().cpu().numpy())
+        return self.mesh(int(decoded.looks[room, item]), _box_m(decoded, room, item))
+
+    def solids_of(self, decoded: DecodedScenes, room: int, item: int) -> tuple[Solid, ...]:
+        if decoded.looks is None:
+            return ()
+        return self.solids(int(decoded.looks[room, item]), _box_m(decoded, room, item))
 
     def looks(self, codes: Float[Tensor, "*objects codes"]) -> Int[Tensor, "*objects"]:
         """The look whose code is nearest, the first of equal ones; 0 if there are no prototypes
@@ -181,15 +200,36 @@ class LookDecoder(ShapeModule):
         """The mesh of a look, stretched into a box (centre, full extents)."""
         prototype, pose = divmod(look, POSES)
         surface = self.surface(prototype)
+        faces = surface.faces
+        if turn_of(pose)[1]:  # mirroring inverts the faces: reverse their corners
+            faces = faces[:, ::-1].copy()
+        return Mesh(self._in_box(surface.vertices_m, look, box_m), faces)
+
+    def solids(self, look: int, box_m: Float[np.ndarray, "6"]) -> tuple[Solid, ...]:
+        """The solids of a look in a box (centre, full extents), as `mesh` places its surface."""
+        kinds, ends = zip(*self.parts(look // POSES).solids(), strict=True)
+        corners = np.stack(ends).transpose(0, 2, 1).reshape(-1, 3)
+        placed_m = np.sort(self._in_box(corners, look, box_m).reshape(-1, 2, 3), axis=1)
+        # A part in the middle is its own mirror image, to rounding.
+        _, first = np.unique(placed_m.round(5), axis=0, return_index=True)
+        low_m, high_m = placed_m.swapaxes(0, 1).tolist()
+        return tuple(
+            Solid(KIND_NAMES[kinds[row]], tuple(low_m[row]), tuple(high_m[row]))
+            for row in sorted(first)
+        )
+
+    def _in_box(
+        self, points: Float[np.ndarray, "points 3"], look: int, box_m: Float[np.ndarray, "6"]
+    ) -> Float[np.ndarray, "points 3"]:
+        """Points in the frame of a prototype, in the room: stretched, mirrored, turned, scaled."""
+        prototype, pose = divmod(look, POSES)
         size_m = self.sizes_m[prototype].double().cpu().numpy()
         own_m = turned_extents(box_m[None, 3:], pose)[0]
-        vertices = stretched(surface.vertices_m, self.parts(prototype), size_m, own_m)
-        faces = surface.faces
+        placed = stretched(points, self.parts(prototype), size_m, own_m)
         quarters, mirrored = turn_of(pose)
-        if mirrored:  # inverts the faces: reverse their corners
-            vertices, faces = vertices * [-1, 1, 1], faces[:, ::-1].copy()
-        vertices = vertices @ quarter_rotation(quarters).T
-        return Mesh(vertices * box_m[3:] + box_m[:3], faces)
+        if mirrored:
+            placed = placed * [-1, 1, 1]
+        return placed @ quarter_rotation(quarters).T * box_m[3:] + box_m[:3]
 
     @property
     def known(self) -> list[int]:
@@ -201,3 +241,14 @@ class LookDecoder(ShapeModule):
         if prototype not in self._meshes:
             self._meshes[prototype] = Mesh(*surface_of_parts(self.parts(prototype)))
         return self._meshes[prototype]
+
+
+def _box_m(decoded: DecodedScenes, room: int, item: int) -> Float[np.ndarray, "6"]:
+    box_m = torch.cat((decoded.centers_m[room, item], decoded.sizes_m[room, item]))
+    return np.asarray(box_m.double().cpu().numpy())
+
+
+def _padded(outline: Float[np.ndarray, "corners 2"]) -> Float[Tensor, "most 2"]:
+    """An outline of `MOST_CORNERS` corners, its last one repeated."""
+    missing = MOST_CORNERS - len(outline)
+    return torch.from_numpy(np.pad(outline, ((0, missing), (0, 0)), mode="edge")).float()

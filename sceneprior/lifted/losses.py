@@ -1,9 +1,9 @@
 """The layout loss (Eq. 7) against lifted 3D boxes instead of 2D boxes in views; and the losses of
 shapes and latents.
 
-None is in the paper, which compares 2D boxes in every view at every step. `lifting` estimates each
-object's 3D box from its masks beforehand, so boxes are compared in 3D, and no frustum loss is
-needed.
+These losses are not in the paper, which compares 2D boxes in every view at every step. `lifting`
+estimates each object's 3D box from its masks before training, so boxes are compared in 3D, and no
+frustum loss is needed.
 """
 
 import torch
@@ -21,7 +21,7 @@ PER_METRE = 1 / 6
 """Weight of a metre: the share of the image's width that 1 m spans at a distance of 3 m and a field
 of view of 90 degrees. So lambda_box and lambda_B have about the same effect as for 2D boxes."""
 DIRECTIONS = 32
-"""Projection directions per step; they are drawn anew in each step, so a stage uses thousands."""
+"""Number of projection directions per step. Each step draws new ones, so a stage uses thousands."""
 
 
 @torch.no_grad()
@@ -30,8 +30,8 @@ def match_lifted(scenes: DecodedScenes, rooms: LiftedRooms, box_weight: float = 
 
         sigma = argmin sum_k -p_k(l_j) + lambda_B |b_k - b_j|_1
 
-    as Eq. S2, but b is a 3D box, centre and extents, with weight `PER_METRE` per metre. An object
-    without a lifted box costs nothing.
+    as Eq. S2, but b is a 3D box (centre and extents), with weight `PER_METRE` per metre. An object
+    without a lifted box has zero cost, whatever prediction it is matched to.
     """
     distance = torch.cdist(predicted_boxes(scenes), rooms.boxes_m, p=1)
     cost = class_cost(scenes, rooms.object_class) + box_weight * PER_METRE * distance
@@ -51,8 +51,9 @@ def needed_predictions(rooms: LiftedRooms, slots: int) -> Bool[Tensor, "rooms sl
 def lifted_losses(
     scenes: DecodedScenes, rooms: LiftedRooms, matches: Matches, completeness_target: str
 ) -> dict[str, Float[Tensor, ""]]:
-    """The losses `class`, `box` and `completeness`, unweighted, as in `layout_losses`; completeness
-    covers only the predictions that are needed (`needed_predictions`).
+    """The losses `class`, `box` and `completeness`, unweighted, as in `layout_losses`.
+
+    Completeness covers only the predictions that are needed (`needed_predictions`).
 
         L_box = mean over objects of `PER_METRE` * (|c_k - c_j|_1 + |s_k - s_j|_1)
     """
@@ -89,8 +90,8 @@ def shape_code_loss(
     a_k is the code that the network predicts for an object, and a_j that of its lifted shape. The
     squared distance of two codes is about the number of grid cells in which their shapes differ,
     and cells_j is the number of cells that the lifted shape fills. Without the division, a lamp on
-    a cord, which fills a hundredth of its box, would hardly be learnt. `codes` and `cells` are
-    those of the objects' looks (`LookDecoder.targets`).
+    a cord, which fills a hundredth of its box, would hardly be learnt. `codes` holds a_j and
+    `cells` cells_j, from the objects' looks (`LookDecoder.targets`).
     """
     assert scenes.shape_codes is not None, "the prior decodes looks"
     apart = take(scenes.shape_codes, matches.prediction, dim=1) - codes
@@ -107,8 +108,8 @@ def latent_loss(
     applied to latents as in Kolouri et al. 2018 (sliced Wasserstein autoencoders), between the
     logits of all training rooms and as many from N(0, 1).
 
-    With `shift_free`, adding a constant to a room's logits changes nothing, as on the sphere; the
-    distance then ignores it, too. `generator`, on the CPU, draws normal logits and directions.
+    If `shift_free`, adding a constant to a room's logits changes nothing, as on the sphere, and the
+    distance ignores such a constant, too. `generator` is on the CPU.
     """
     normal = torch.randn(logits.shape, generator=generator).to(logits)
     directions = torch.randn(logits.shape[1], DIRECTIONS, generator=generator).to(logits)

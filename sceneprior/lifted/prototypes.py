@@ -1,4 +1,4 @@
-"""Prototype shapes: a few of a data set's objects, mirrored and turned, represent all of them.
+"""Prototype shapes: a few objects of a data set that, mirrored and turned, represent all others.
 
 A look is a prototype shape in one of its `POSES`. It is stored as one number, prototype * POSES +
 pose, where pose p mirrors the prototype (x reversed) if p >= 4 and then turns it about +y by p % 4
@@ -19,15 +19,16 @@ POSES = 2 * QUARTERS
 """Poses of a prototype: mirrored or not, times the quarter turns; numbered as in the module's
 docstring."""
 ALIKE = 0.25
-"""Largest distance (`distances`) at which two objects look alike. It is the squared difference of
-their coarse grids over the geometric mean of the cells that the two fill (without which a chair's
-legs would hardly count), plus `SIZE_WEIGHT` times the L1 distance of their log extents."""
+"""Largest distance (`pose_distances`) at which two objects look alike. The distance is the squared
+difference of their coarse grids, divided by the geometric mean of the numbers of cells that the two
+fill, plus `SIZE_WEIGHT` times the L1 distance of their log extents. Without the division, the legs
+of a chair would hardly count."""
 SIZE_WEIGHT = 0.3
 """Weight of the difference in log extents; see `ALIKE`."""
 COMMON = 3
-"""Number of objects, itself among them, that a common prototype looks like. The most frequent
-prototype of each class is common in any case. An odd shape is more often badly lifted than truly
-rare."""
+"""Number of objects, including itself, that a prototype must look like to be common. The most
+frequent prototype of each class is always common. The distinction exists because an odd shape is
+more often badly lifted than truly rare."""
 COARSE, PARTS = 8, 4
 """Cells along each axis of the coarse grids that are compared (`COARSE`), and of those that the
 sampler's network reads (`PARTS`)."""
@@ -69,12 +70,11 @@ def choose_prototypes(
     usable: Bool[np.ndarray, " objects"],
     most: int,
 ) -> tuple[Int[np.ndarray, " prototypes"], Bool[np.ndarray, " prototypes"]]:
-    """Objects that become prototypes, and whether each is common (`COMMON`): greedily for each
-    class, the object that looks like most of those left, until every usable object looks like a
-    prototype.
+    """Choose the objects that become prototypes, and tell which of them are common (`COMMON`).
 
-    The threshold `ALIKE` is raised by half until there are at most `most` prototypes, or one per
-    class.
+    For each class, the object that looks like most of the remaining objects is chosen, again and
+    again, until every usable object looks like a prototype. The threshold is `ALIKE`, raised by
+    half until there are at most `most` prototypes, or one per class.
     """
     apart = []
     for label in np.unique(object_class[usable]):
@@ -111,9 +111,10 @@ def _covering(
 def looks_apart(
     grids: Bool[np.ndarray, "prototypes x y z"], codes: int
 ) -> Float[np.ndarray, "looks codes"]:
-    """Codes of all looks whose squared distances approximate the number of cells in which the looks
-    differ: their leading principal components, padded with zeros if there are fewer looks than
-    `codes`.
+    """Code vectors of all looks: the leading principal components of their grids.
+
+    The squared distance of two code vectors approximates the number of cells in which the two looks
+    differ. `codes` is their length; if there are fewer looks, they are padded with zeros.
 
     Source:
         Torgerson, "Multidimensional scaling: I. Theory and method", Psychometrika 1952.
@@ -137,8 +138,10 @@ def pose_distances(
     objects: tuple[Bool[np.ndarray, "objects x y z"], Float[np.ndarray, "objects 3"]],
     offered: tuple[Bool[np.ndarray, "offered x y z"], Float[np.ndarray, "offered 3"]],
 ) -> Float[np.ndarray, "objects offered poses"]:
-    """Distance (`ALIKE`) of each object (grids, extents in metres) from each offered one in each
-    pose of the latter."""
+    """Distance (see `ALIKE`) of each object from each offered object, in each pose of the latter.
+
+    Both are given by their grids and their extents in metres.
+    """
     (coarse, log_sizes), (offered_coarse, offered_sizes) = (
         (pooled(grids, COARSE), np.log(sizes_m)) for grids, sizes_m in (objects, offered)
     )
@@ -156,12 +159,12 @@ def pose_distances(
 
 
 def turn_of(pose: int) -> tuple[int, bool]:
-    """Quarter turns and mirroring of a pose, as `turn_grids` takes them."""
+    """Quarter turns and mirroring of a pose, as arguments of `turn_grids`."""
     return pose % QUARTERS, pose >= QUARTERS
 
 
 def turned_extents(extents: Float[np.ndarray, "n 3"], pose: int) -> Float[np.ndarray, "n 3"]:
-    """Extents along x, y, z of objects that are put into a pose."""
+    """Extents along x, y, z that objects have in a pose."""
     return extents[:, ::-1] if pose % 2 else extents
 
 
@@ -170,7 +173,8 @@ def turned_looks(
     quarters: Int[Tensor, " rooms"],
     mirrored: Bool[Tensor, " rooms"],
 ) -> Int[Tensor, "rooms objects"]:
-    """The looks of objects whose rooms are optionally mirrored, then turned by `quarters`."""
+    """The looks of objects after their rooms are mirrored (optionally), then turned by
+    `quarters`."""
     pose = looks % POSES
     own, flipped = pose % QUARTERS, pose >= QUARTERS
     # Mirroring reverses the direction of a turn.

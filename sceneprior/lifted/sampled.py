@@ -11,6 +11,7 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.threads import single_threaded
+from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.looks import LookDecoder
 from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.lifted.sampler.plan import Given
@@ -19,8 +20,13 @@ from sceneprior.paper.trained import TrainedPrior
 
 
 def drawn_by_sampler(trained: TrainedPrior, distribution: str | None) -> TrainedLifted | None:
-    """`trained` if its sampler is to draw new rooms, by `distribution` or else by the run's own
-    settings; None if new rooms come from latents. An `InputError` if there is no sampler yet."""
+    """Return `trained` if its sampler draws new rooms; None if new rooms come from latents.
+
+    This is decided by `distribution`, or by the run's own settings if `distribution` is None.
+
+    Raises:
+        InputError: the sampler should draw, but the run has none, or none yet.
+    """
     if (distribution or trained.distribution) != SAMPLER:
         return None
     if not isinstance(trained, TrainedLifted) or trained.sampler is None:
@@ -36,37 +42,53 @@ def sample_scenes(
     trained: TrainedLifted, names: Sequence[str], seed: int, given: Given | None = None
 ) -> list[Scene]:
     """A new room with meshes for each name; see `draw_rooms`."""
+    assert trained.sampler is not None, "callers ask trained.sampler first"
+    rooms = draw_rooms(trained.sampler, len(names), seed, given)
+    return [scene_of(trained, name, rooms, row) for row, name in enumerate(names)]
+
+
+def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> Scene:
+    """A drawn room as a scene with meshes; its floor is the rectangle of the room, if known."""
     sampler, shapes = trained.sampler, trained.prior.shape
     assert sampler is not None, "callers ask trained.sampler first"
     assert isinstance(shapes, LookDecoder), "whose looks the sampler draws"
-    rooms = draw_rooms(sampler, len(names), seed, given)
     assert rooms.looks is not None
     classes = label_set(trained.config.label_set)
-    scenes = []
-    for row, name in enumerate(names):
-        objects = []
-        for item in rooms.is_object[row].nonzero()[:, 0].tolist():
-            box = rooms.boxes_m[row, item].double().numpy()
-            look, index = int(rooms.looks[row, item]), int(rooms.object_class[row, item])
-            # A given object whose class has no prototype gets no mesh.
-            known = int(sampler.look_class[look]) == index
-            mesh = shapes.mesh(look, box) if known else None
-            label = classes[index]
-            objects.append(SceneObject(label, tuple(box[:3]), tuple(box[3:]), mesh))
-        scenes.append(Scene(name, trained.config.label_set, tuple(objects)))
-    return scenes
+    objects = []
+    for item in rooms.is_object[row].nonzero()[:, 0].tolist():
+        box = rooms.boxes_m[row, item].double().numpy()
+        look, index = int(rooms.looks[row, item]), int(rooms.object_class[row, item])
+        # A given object whose class has no prototype gets no mesh.
+        known = int(sampler.look_class[look]) == index
+        mesh = shapes.mesh(look, box) if known else None
+        solids = shapes.solids(look, box) if known else ()
+        label = classes[index]
+        center, size = tuple(box[:3]), tuple(box[3:])
+        objects.append(SceneObject(label, center, size, mesh, solids=solids))
+    floor_m = None if rooms.rectangle_m is None else _outline(rooms.rectangle_m[row])
+    return Scene(name, trained.config.label_set, tuple(objects), floor_m)
+
+
+def _outline(rectangle_m: Float[Tensor, "4"]) -> Float[np.ndarray, "4 2"]:
+    """Corners (x, z) of a rectangle, to millimetres."""
+    center, extents = rectangle_m.double().numpy().reshape(2, 2)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
+    return np.asarray((center + corners * extents).round(3))
 
 
 def class_rows(trained: TrainedLifted, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:
-    """Indices of named classes, as `Given.coming` takes them; an `InputError` for a class that is
-    not in the training rooms."""
+    """Indices of named classes, in the form of `Given.coming`.
+
+    Raises:
+        InputError: a class is not in the training rooms.
+    """
     assert trained.sampler is not None
     classes = label_set(trained.config.label_set)
     known = [classes[row] for row in trained.sampler.drawn_classes]
     for label in labels:
         if label not in known:
             raise InputError(
-                f"'{label}' is no class of this run's training rooms; choose from "
+                f"'{label}' is not a class of this run's training rooms; choose from "
                 f"{', '.join(known)}."
             )
     return torch.tensor([[classes.index(label) for label in labels]], dtype=torch.int64)

@@ -14,12 +14,12 @@ class TrainedLifted(TrainedPrior):
     """A prior whose shapes are looks, and the sampler of its run."""
 
     sampler: RoomSampler | None = None
-    """None before its stage has begun, and in runs without a sampler."""
+    """None before the sampler's stage has begun, and in runs without a sampler."""
 
     @property
     def distribution(self) -> str:
-        """`sampler` if the run's settings say so and it has one; else the distribution of
-        latents."""
+        """Default distribution of new rooms: `sampler` if the settings say so and the run has a
+        sampler; else the distribution of latents."""
         with_sampler = self.sampler is not None and self.config.distribution == SAMPLER
         return SAMPLER if with_sampler else self.latent_distribution
 

@@ -37,10 +37,11 @@ def to_rooms(
     names: Sequence[str],
     completeness_target: str = "first_n",
 ) -> list[DecodedRoom]:
-    """Scenes of the predictions that completeness keeps, each with its likeliest class.
+    """Convert decoded rooms to scenes of those predictions that the completeness scores keep.
 
-    Predictions whose likeliest class is `void` are left out: to the network it is a class like any
-    other, but it is no furniture. `prior` is the network that decoded the scenes.
+    An object has its most likely class. Predictions whose most likely class is `void` are left out:
+    the network treats void like any other class, but it stands for no piece of furniture. `prior`
+    is the network that decoded the rooms.
     """
     kept = kept_objects(decoded.completeness_logits, completeness_target)
     kept = kept & (decoded.class_logits.argmax(dim=-1) != VOID)
@@ -60,8 +61,10 @@ def scene_of(
     label_set_name: str,
     name: str,
 ) -> Scene:
-    """A scene of the given predictions for one room, in the given order: each with its likeliest
-    class other than void, and with its mesh where shapes were decoded."""
+    """A scene of the given predictions of one room, in the given order.
+
+    An object has its most likely class other than void, and a mesh if shapes were decoded.
+    """
     classes = label_set(label_set_name)
     objects = []
     for item in predictions:
@@ -69,7 +72,9 @@ def scene_of(
         logits[VOID] = -torch.inf
         center, size = (part[row, item].tolist() for part in (decoded.centers_m, decoded.sizes_m))
         mesh = prior.shape.mesh_of(decoded, row, item)
-        objects.append(SceneObject(classes[int(logits.argmax())], tuple(center), tuple(size), mesh))
+        solids = prior.shape.solids_of(decoded, row, item)
+        label = classes[int(logits.argmax())]
+        objects.append(SceneObject(label, tuple(center), tuple(size), mesh, solids=solids))
     return Scene(name, label_set_name, tuple(objects))
 
 
@@ -78,7 +83,7 @@ def scene_of(
 def decode_rooms(
     trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: Sequence[str]
 ) -> list[DecodedRoom]:
-    """The rooms that latents decode into; they have meshes once the shape stage has finished.
+    """Decode latents into rooms, with meshes unless the run has only trained its layout stage.
 
     Decoding runs on one thread: the networks are too small to gain from several, and on one thread
     equal latents give bit-identical rooms.
@@ -104,7 +109,10 @@ def decode_latents(
 
 
 def decode_training_rooms(trained: Trained) -> list[Scene]:
-    """The training rooms decoded from their own latents, named by their ids. A run that keeps no
-    latents of its training rooms raises an `InputError`."""
+    """Decode the training rooms from their own latents; a scene's name is the room's id.
+
+    Raises:
+        InputError: the run keeps no latents of its training rooms.
+    """
     prior = with_training_latents(trained, "Decoding training rooms")
     return decode_latents(prior, prior.prior.latent_space(prior.logits), prior.room_ids)

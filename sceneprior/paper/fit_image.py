@@ -24,7 +24,7 @@ SMOOTHING, EPSILON = 0.99, 1e-8
 
 @dataclass(frozen=True)
 class FitSchedule:
-    """Schedule by which the latents of images are fitted."""
+    """Step count, learning rates and stopping rule for fitting the latents of images."""
 
     steps: int = 1000
     drop_at: int = 500
@@ -32,15 +32,15 @@ class FitSchedule:
     learning_rate: float = 0.01
     decay: float = 0.1
     patience: int = 100
-    """An image stalls when its score has not fallen by the fraction `least_gain` for this many
-    steps. It then goes on at the decayed rate, and is done when it stalls at that rate. 0 always
-    takes all steps."""
+    """Number of steps without progress after which an image counts as stalled. A stalled image
+    continues at the decayed learning rate, and is done when it stalls at that rate. 0 always takes
+    all steps."""
     least_gain: float = 2e-3
-    """Smallest relative fall of the score that counts as progress; see `patience`."""
+    """Smallest relative decrease of the score that counts as progress; see `patience`."""
 
 
 SCHEDULES = {"paper": FitSchedule()}
-"""By the name of a fit; `paper` is that of supplement D."""
+"""Schedules by name; `paper` is the one of supplement D."""
 
 
 class ViewLoss(NamedTuple):
@@ -62,11 +62,11 @@ class Fit(NamedTuple):
 
     z: Float[Tensor, "images width"]
     scenes: DecodedScenes
-    """The decoded scenes, with as many predictions as the fullest image has objects. In an image of
-    n objects, the first n predictions are the answer."""
+    """The decoded scenes, with as many predictions as the fullest image has objects. For an image
+    of n objects, the first n predictions are the reconstruction."""
     loss: ViewLoss
     steps: Int[Tensor, " images"]
-    """Steps taken until the image had converged."""
+    """Number of steps until the image converged."""
 
 
 def decode_images(
@@ -75,11 +75,10 @@ def decode_images(
     views: SceneViews,
     with_grids: bool = True,
 ) -> DecodedScenes:
-    """Decode as many objects of each latent as the fullest image shows, with shapes after the shape
-    stage.
+    """Decode from each latent as many objects as the fullest image shows.
 
-    Without `with_grids`, shapes are decoded only where they are meshes: looks are not
-    compared with masks, so the fit does not need them.
+    Shapes are decoded, too, unless the run has only trained its layout stage. If `with_grids` is
+    false, looks are not decoded: they are not compared with masks, so the fit does not need them.
     """
     z = trained.prior.latent_space.onto(points)
     with_shape = trained.stage != "layout" and (with_grids or trained.prior.faces is not None)
@@ -92,11 +91,10 @@ def view_loss(
     views: SceneViews,
     masks: bool = True,
 ) -> ViewLoss:
-    """The losses of training, per image (a room of `views`) and without completeness.
+    """The losses of training, but one value per image (a room of `views`), without completeness.
 
-    The scenes have at least as many objects as the fullest image shows. `masks` compares masks as
-    well, for which `views` needs instance ids; objects without meshes (before the shape stage, or
-    with looks) have none.
+    `scenes` have at least as many objects as the fullest image shows. If `masks` is true, rendered
+    masks are compared as well, which needs instance ids in `views`, and objects with meshes.
     """
     weights, drawing = trained.config.view_terms
     boxes = seen_boxes(scenes, views, drawing)
@@ -124,18 +122,18 @@ def fit_latents_to_images(
     schedule: FitSchedule = SCHEDULES["paper"],
     masks: bool = True,
 ) -> Fit:
-    """Fit one latent per image by RMSProp on its view loss; return the best latent on the way.
+    """Fit one latent per image with RMSProp on its view loss, and return the best latent found.
 
-    For shapes that are looks, only classes and 2D boxes are fitted: their masks are not
-    rendered.
+    Masks of looks are not rendered, so with looks only classes and 2D boxes are fitted.
 
     The fit moves z itself and projects it onto the sphere before each decoding. Training moves the
-    logits instead, but those only reach points between the anchors, and reach them slowly.
-    RMSProp's first steps are ten times the later ones and leave the start behind; smaller first
-    steps, and fitting the logits, end worse (docs/experiments/2026-11-22-one-image.md).
+    logits instead, but logits only reach points between the anchors, and reach them slowly. The
+    first steps of RMSProp are ten times as large as later ones and move far from the start; smaller
+    first steps, or fitting the logits, give worse results
+    (docs/experiments/2026-11-22-one-image.md).
 
-    Images are independent: an image takes the same steps alone and in a batch, apart from rounding,
-    which grows over a thousand steps.
+    Images are independent: an image takes the same steps alone as in a batch, apart from rounding
+    errors, which grow over a thousand steps.
     """
     refuse_crowds(trained, views)
     points, square = start.detach().clone(), torch.zeros_like(start)
@@ -177,7 +175,7 @@ def fit_latents_to_images(
 
 
 def refuse_crowds(trained: TrainedPrior, views: SceneViews) -> None:
-    """Raise an `InputError` where an image shows more objects than the prior can generate."""
+    """Raise an `InputError` if an image shows more objects than the prior can generate."""
     count, row = (int(value) for value in views.is_object.sum(dim=-1).max(dim=0))
     if count > trained.prior.max_objects:
         raise InputError(

@@ -22,23 +22,23 @@ from sceneprior.render.pictures import contact_sheet, gif_bytes, png_bytes
 from sceneprior.render.topdown import corner_view, perspective
 
 TILE = (240, 320)
-"""Height and width in pixels of a step in the strip, and of the animation."""
+"""Height and width in pixels of a picture in the strip, and of the animation."""
 STRIP_COLUMNS = 9
 """Pictures in a row of the strip."""
 BETWEEN = 4
-"""Pictures of the animation from one step to the next."""
+"""Number of pictures that the animation shows per step."""
 FRAME_MS = 70
-"""Milliseconds that a picture of the animation is shown."""
+"""Milliseconds for which the animation shows a picture."""
 PAUSE_MS = 700
-"""Milliseconds at either end, where the animation turns round."""
+"""Milliseconds for which the animation shows the first and the last picture before it reverses."""
 
 
 def interpolate(trained: TrainedPrior, start: Point, end: Point, steps: int) -> list[Scene]:
     """Rooms `step_00`, `step_01`, ... on the way from one latent to another.
 
-    A room's `extra` holds `along`, its position from 0 to 1, and `slots`, the prediction that each
-    object comes from: objects with the same slot in two rooms are the same object, moved. `steps`
-    counts both ends, which `latent_of` reads.
+    A room's `extra` holds `along`, its position from 0 to 1, and `slots`, the index of each
+    object's prediction: objects with the same slot in two rooms are the same object, moved. `steps`
+    includes both ends; `start` and `end` are anything that `latent_of` accepts.
     """
     z = path_latents(trained, latent_of(trained, start), latent_of(trained, end), steps)
     names = [f"step_{k:02d}" for k in range(steps)]
@@ -61,7 +61,7 @@ def path_latents(
     end: Float[Tensor, " dimension"],
     steps: int,
 ) -> Float[Tensor, "steps dimension"]:
-    """Evenly spaced points of the geodesic (in a cube: the straight line), both ends included."""
+    """Evenly spaced points on the geodesic (in a cube, the straight line), including both ends."""
     along = torch.linspace(0, 1, steps, dtype=start.dtype)
     try:
         space = trained.prior.latent_space
@@ -74,11 +74,11 @@ def path_latents(
 
 
 def mixed_colors(room: DecodedRoom) -> UInt8[np.ndarray, "objects 3"]:
-    """Each object's class colours, averaged by its class probabilities, so that they change as
-    gradually as the room does."""
+    """One colour per object: the mean of all class colours, weighted by the object's class
+    probabilities, so that colours change as gradually as the room does."""
     share = room.class_logits.softmax(dim=-1).double().numpy()
     share[:, VOID] = 0
-    # A decoded object's likeliest class is not void, so the sum is not 0.
+    # The most likely class of a decoded object is not void, so the sum is not 0.
     mixed = share @ class_colors(share.shape[1]).astype(np.float64)
     return np.rint(mixed / share.sum(axis=-1, keepdims=True)).astype(np.uint8)
 
@@ -101,8 +101,8 @@ def animation(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bytes:
 def write_pictures(
     trained: TrainedPrior, scenes: Sequence[Scene], folder: Path, renderer: Renderer
 ) -> None:
-    """Write `strip.png`, the steps of `interpolate`, and `animation.gif`, which has `BETWEEN`
-    pictures per step."""
+    """Write `strip.png`, which shows `scenes` (the rooms of `interpolate`), and `animation.gif`,
+    which has `BETWEEN` pictures per step."""
     start, end = (latent_of(trained, scene) for scene in (scenes[0], scenes[-1]))
     z = path_latents(trained, start, end, (len(scenes) - 1) * BETWEEN + 1)
     rooms = decode_rooms(trained, z, [""] * len(z))

@@ -1,9 +1,9 @@
 """The latent space Z: from learnt logits to points z of the hypersphere (section 3.1, Eq. 2).
 
-A latent space maps the learnt logits of rooms to latents z, which are decoded. Training rooms'
-logits start from N(0, 1), and the `paper` distribution of new rooms samples them from there, too. A
-space also measures how near two latents are, interpolates between them and takes small random
-steps. The hypersphere is the paper's; the cube is ablation c1.
+A latent space maps the learnt logits of rooms to latents z, which are decoded. The logits of
+training rooms are initialised from N(0, 1), and the distribution `paper` samples the logits of new
+rooms from N(0, 1), too. A space also measures how near two latents are, interpolates between them
+and takes small random steps. The hypersphere is the paper's; the cube is ablation c1.
 """
 
 import math
@@ -24,7 +24,8 @@ class SphereConfig(Section):
 
     name: Literal["sphere"] = "sphere"
     anchors: int = Field(100, ge=2)
-    """M, the number of fixed unit vectors that latents are mixed from; 100 in the authors' code."""
+    """M, the number of fixed unit vectors of which latents are mixtures; 100 in the authors'
+    code."""
 
     def build(self, dimension: int, seed: int) -> "LatentSphere":
         return LatentSphere(self.anchors, dimension, seed)
@@ -59,8 +60,8 @@ class LatentSphere(_Space):
 
         z = sum_i w_i phi_i / |sum_i w_i phi_i|,    w = softmax(logits)
 
-    Adding a constant to all logits of a room does not change z, hence `shift_free`. `seed` draws
-    the anchors phi_i, which are stored with the model.
+    Adding a constant to all logits of a room does not change z, hence `shift_free`. `seed`
+    determines the anchors phi_i, which are drawn at random and stored with the model.
     """
 
     shift_free = True
@@ -104,8 +105,7 @@ class LatentSphere(_Space):
         if bool((angle > torch.pi - 1e-4).any()):
             raise ValueError("The two latents are opposite points; any great circle joins them.")
         t = along.unsqueeze(-1)
-        # Where the two nearly coincide, sin(angle) vanishes, and the chord stands in for the
-        # geodesic.
+        # If the two nearly coincide, sin(angle) vanishes, and the chord replaces the geodesic.
         straight = F.normalize(torch.lerp(start, end, t), dim=-1)
         turned = torch.sin((1 - t) * angle) * start + torch.sin(t * angle) * end
         return torch.where(angle < 1e-3, straight, turned / torch.sin(angle).clamp(min=1e-6))

@@ -8,13 +8,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sceneprior.core.scene import Mesh
+from sceneprior.core.scene import Mesh, Solid
 from sceneprior.core.settings import Section
 from sceneprior.core.views import DecodedScenes
 
 
 def mlp(*layers: nn.Module, slope: float = 0.0) -> nn.Sequential:
-    """The layers in sequence with a ReLU between each two, or a leaky ReLU of the given `slope`."""
+    """The layers in sequence, with a ReLU between them, or a leaky ReLU if `slope` is not 0."""
     between = nn.LeakyReLU(slope) if slope else nn.ReLU()
     return nn.Sequential(*[part for layer in layers for part in (layer, between)][:-1])
 
@@ -23,10 +23,10 @@ def dropout(x: Float[Tensor, "*shape"], p: float) -> Float[Tensor, "*shape"]:
     """Set each number to 0 with probability `p` and divide the others by 1 - p, as `F.dropout` in
     training.
 
-    On a CPU this samples the positions of the zeros instead of deciding for every number, which
-    takes a quarter of the time. For n numbers, Poisson(-n ln(1 - p)) positions are drawn uniformly
-    with replacement. Each number is then hit Poisson(-ln(1 - p)) times, independently of the
-    others, so it is never hit with probability 1 - p.
+    On a CPU, this function samples the positions of the zeros instead of deciding for every number,
+    which takes a quarter of the time. For n numbers, Poisson(-n ln(1 - p)) positions are drawn
+    uniformly with replacement. Each number is then drawn Poisson(-ln(1 - p)) times, independently
+    of the others, so the probability that it is never drawn is 1 - p.
     """
     if p == 0 or x.device.type != "cpu":
         return F.dropout(x, p)
@@ -56,6 +56,10 @@ class ShapeModule(nn.Module, ABC):
     def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:
         """The mesh of prediction `item`; None if shapes were not decoded."""
 
+    def solids_of(self, decoded: DecodedScenes, room: int, item: int) -> tuple[Solid, ...]:
+        """The convex solids of prediction `item`; none for shapes that are not made of solids."""
+        return ()
+
 
 class ShapeModuleConfig(Section, ABC):
     """A config section that builds a shape decoder."""
@@ -69,7 +73,8 @@ class DecoderConfig(Section, ABC):
     """A config section that builds the decoder from a latent z to object features x_k.
 
     The module maps (z of shape (rooms, D_z), N) to features of shape (rooms, N, D_z). It also
-    accepts the number of features that each room needs; those beyond it are meaningless.
+    accepts the number of features that each room needs; features beyond that number are
+    meaningless.
     """
 
     name: str

@@ -44,9 +44,9 @@ class LayoutDecoder(nn.Module):
 
         {l_k, c_k, s_k, p_k} = MLP2(MLP1(x_k))
 
-    `heads` are `joint` (paper) or `separate` (`SeparateHeads`). `void` permits the class `void`, a
-    second way beside completeness to leave a prediction out. `floor_gradient` is that of
-    `ModelConfig`.
+    `heads` is `joint` (paper) or `separate` (`SeparateHeads`). If `void` is true, predictions may
+    have the class `void`, which leaves them out of the scene, as low completeness does.
+    `floor_gradient` is explained in `ModelConfig`.
     """
 
     def __init__(
@@ -114,8 +114,9 @@ class _AboveFloor(torch.autograd.Function):
 def above_floor(y: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """ReLU(y) whose gradient at y <= 0 is kept where a descent step would raise y, and 0 elsewhere.
 
-    Plain ReLU cannot lift an object off the floor once it is there. Most furniture stands on the
-    floor, and early in training, while the network cannot yet tell lamps apart, it pulls them down.
+    With a plain ReLU, an object that has reached the floor cannot leave it. Early in training, the
+    network cannot yet tell lamps from other furniture, most of which stands on the floor, so it
+    moves lamps down as well.
     """
     lifted: Tensor = _AboveFloor.apply(y)
     return lifted
@@ -124,9 +125,9 @@ def above_floor(y: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 class ClassBevels(nn.Module):
     """Fraction, in [0, 1], by which the box edges of each class are cut off; see `beveled_cube`.
 
-    Furniture fills its box less than a cuboid and more than an ellipsoid does, so the projected 2D
-    box of either one biases the predicted size. Chairs and round tables lack much of their edges,
-    wardrobes nothing; the bevels of a class are learnt from all views of its objects.
+    Furniture fills its box less than a cuboid and more than an ellipsoid does, so the 2D box of
+    either solid would bias the predicted size. Chairs and round tables leave the edges of their box
+    empty, wardrobes do not; the bevels of a class are learnt from all views of its objects.
     """
 
     def __init__(self, classes: int):
@@ -137,6 +138,6 @@ class ClassBevels(nn.Module):
     def forward(
         self, class_logits: Float[Tensor, "rooms objects classes"]
     ) -> Float[Tensor, "rooms objects 2"]:
-        """Bevels of vertical and horizontal edges: the mean over the predicted classes, whose
-        probabilities get no gradient from it."""
+        """Bevels of vertical and horizontal edges: the mean of the classes' bevels, weighted by the
+        class probabilities, which get no gradient here."""
         return class_logits.detach().softmax(dim=-1) @ self.logits.sigmoid()

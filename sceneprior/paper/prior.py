@@ -27,8 +27,8 @@ class ModelConfig(Section):
     """MLP2 is one MLP for all outputs (`joint`), or a linear layer for the classes and separate
     MLPs for x, y, z, width, height and depth (`separate`, released code)."""
     floor_gradient: bool = False
-    """Let an object that ReLU holds at the floor (Eq. S1) learn to leave it. With the paper's ReLU
-    (false) it cannot, and lamps may stay on the floor for good."""
+    """If true, an object that the ReLU of Eq. S1 keeps on the floor can still learn to leave it
+    (`above_floor`). With the paper's ReLU (false) it cannot, and lamps may stay on the floor."""
     completeness_target: Literal["first_n", "stop"] = "first_n"
     """Targets of the completeness scores of n objects. `first_n`: 1 for the first n predictions, 0
     after (supplement B). `stop`: 1 from the n-th prediction on; a generated scene then ends with
@@ -53,7 +53,7 @@ class ModelConfig(Section):
 class ScenePrior(nn.Module):
     """The mapping s = f(z) from the latent space to scenes (Eq. 1).
 
-    `seed` draws the fixed anchors of the latent sphere; `void` is that of `LayoutDecoder`.
+    `seed` determines the anchors of the latent sphere; `void` is explained in `LayoutDecoder`.
     """
 
     def __init__(self, config: ModelConfig, classes: int, seed: int = 0, void: bool = True):
@@ -88,10 +88,10 @@ class ScenePrior(nn.Module):
     ) -> DecodedScenes:
         """Decode rooms from points of the latent space; `with_shape` adds meshes or looks.
 
-        A tensor `with_shape` selects the objects that get a mesh; the vertices of the others lie at
-        their box's centre. `wanted` limits decoding to as many predictions as it has columns, and
-        to meshes where it is true; predictions after a room's last wanted one are meaningless. None
-        decodes all N.
+        If `with_shape` is a tensor, it selects the objects that get a mesh; all vertices of the
+        other objects lie at the centre of their box. `wanted` limits what is decoded: as many
+        predictions as it has columns, and meshes only where it is true. Predictions after a room's
+        last true entry are meaningless. None decodes all N.
 
         Layouts stay float32 under autocast: bfloat16 would round 3 m to steps of 2 cm.
         """

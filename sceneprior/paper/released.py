@@ -1,6 +1,6 @@
 """Parts that the authors' released code adds to the paper's network, each enabled by a config key.
 
-Written from descriptions of that code, not from the code itself. Off by default.
+They are written from descriptions of that code, not from the code itself, and are off by default.
 """
 
 import torch
@@ -12,10 +12,10 @@ from sceneprior.paper.layers import mlp
 
 
 class StepOutputs(nn.Module):
-    """A separate two-layer MLP at the end of each step k, which tells the object that it is the
-    k-th.
+    """A separate two-layer MLP at the end of each step k, so that features depend on k.
 
-    Its output is x_k, which later steps read, too. `steps` is N, `width` the size of a feature.
+    The output of the MLP is x_k, which later steps read, too. `steps` is N, and `width` the size of
+    a feature.
     """
 
     def __init__(self, steps: int, width: int):

@@ -22,12 +22,12 @@ from sceneprior.paper.trained import TrainedPrior
 
 BANDWIDTH = 0.15
 """Bandwidth of the kernel distribution, in standard deviations of the training rooms' logits: 0
-copies training rooms, 1 is one Gaussian fitted to all. A larger one gives more novel rooms, and
-more often rooms with no bed or two."""
+copies training rooms, 1 is one Gaussian fitted to all. A larger bandwidth gives more novel rooms,
+but also more rooms without a bed, or with two."""
 DISTRIBUTIONS = ("kernel", "paper")
 """Distributions that latents of new rooms can be sampled from; see `sample_logits`."""
 MARKS = {"kernel": "copies: near training rooms"}
-"""The note that tables add to a distribution that draws near training rooms."""
+"""Notes that tables add to the name of a distribution whose rooms are near training rooms."""
 COPIES = (
     "The distribution `kernel` draws close to single training rooms: nine in ten of its rooms are "
     "near copies of one. The distribution `paper` takes nothing from single training rooms."
@@ -52,8 +52,9 @@ def sample_latents(
     seed: int,
     distribution: str = "paper",
 ) -> Float[Tensor, "count dimension"]:
-    """Sample `count` points of the latent space, given the logits `trained` of the training rooms;
-    the same seed gives the same points. `sample_logits` describes the distributions.
+    """Sample `count` points of the latent space; the same seed gives the same points.
+
+    `trained` holds the logits of the training rooms; `sample_logits` describes the distributions.
     """
     if distribution not in DISTRIBUTIONS:
         raise InputError(
@@ -82,8 +83,8 @@ def sample_logits(
             training has moved them since. `kernel`: a mixture of Gaussians around the training
             rooms' logits, with their mean and covariance (a smoothed bootstrap of width
             `BANDWIDTH`).
-        shift_free: Adding a constant to all logits of a room changes nothing, as in a softmax;
-            that degree of freedom is then removed first.
+        shift_free: True if adding a constant to all logits of a room changes nothing, as in a
+            softmax; this degree of freedom is then removed before the covariance is estimated.
     """
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(count, trained.shape[1], generator=generator, dtype=torch.float64)
@@ -101,7 +102,7 @@ def sample_logits(
     rooms = len(logits)
     rounds = [torch.randperm(rooms, generator=generator) for _ in range(-(-count // rooms))]
     start = centred[torch.cat(rounds)[:count]]
-    # Shrunk towards the mean by as much as the noise adds, so that the covariance is preserved.
+    # Shrinking towards the mean offsets the variance of the noise, so the covariance is preserved.
     drawn = (1 - BANDWIDTH**2) ** 0.5 * start + BANDWIDTH * drawn
     return (mean + drawn).to(trained.dtype)
 
@@ -111,7 +112,7 @@ def draw_latents(
 ) -> tuple[Float[Tensor, "count dimension"], list[str]]:
     """Latents sampled from a distribution (None: the run's own), and the names of their rooms.
 
-    `kernel` raises a warning that its rooms are near copies (`COPIES`).
+    The distribution `kernel` gives a warning that its rooms are near copies (`COPIES`).
     """
     space = trained.prior.latent_space
     distribution = distribution or trained.latent_distribution
@@ -127,8 +128,10 @@ def scene_names(count: int, seed: int) -> list[str]:
 
 
 def write_latents(folder: Path, scenes: Sequence[Scene]) -> None:
-    """Write `latents.npz` with `latents`, one row per room, and `names`, the names of the rooms'
-    files. Writes nothing if any room has no latent."""
+    """Write `latents.npz`, with `latents`, one row per room, and `names`, the names of the rooms.
+
+    Nothing is written if any room has no latent.
+    """
     latents = [scene.latent for scene in scenes if scene.latent is not None]
     if not latents or len(latents) < len(scenes):
         return
@@ -146,7 +149,7 @@ def latent_of(trained: TrainedPrior, point: Point) -> Float[Tensor, " dimension"
     if isinstance(point, Scene):
         if point.latent is None:
             raise InputError(
-                f"Room {point.name} comes from no latent (a sampler drew it, or it was read from a "
+                f"Room {point.name} has no latent (a sampler generated it, or it was read from a "
                 "file); take a room of another distribution (`kernel`, `paper`), or name one, such "
                 "as 'seed:7'."
             )
@@ -171,9 +174,12 @@ def _onto(trained: TrainedPrior, point: np.ndarray, source: str) -> Float[Tensor
 def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]:
     """The point of a run's latent space that a text names.
 
-    A name is the id of a training room; `seed:7`, the room that `synthesize -n 1 --seed 7` makes;
-    or a file of latents: `FILE` (its first), `FILE:3` (counted from 0), `FILE:NAME`. Files are
-    `latents.npz`, an .npy of (D,) or (n, D) numbers, or a .json of such lists.
+    The text is one of three:
+
+    - the id of a training room;
+    - `seed:7`, for the room that `synthesize -n 1 --seed 7` makes;
+    - a file of latents: `FILE` (its first latent), `FILE:3` (counted from 0) or `FILE:NAME`. A file
+      is a `latents.npz`, an .npy of (D,) or (n, D) numbers, or a .json of such lists.
     """
     file, _, item = text.rpartition(":")
     path, item = (Path(file), item) if file.endswith(_ENDINGS) else (Path(text), "0")
@@ -193,7 +199,7 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
 def named_latent(trained: TrainedPrior, name: str, or_else: str) -> Float[Tensor, " dimension"]:
     """The latent of a training room, named by its id, or of the room that `seed:7` names.
 
-    The error for another name lists the valid ones, `or_else` last.
+    The error for any other name lists what is valid; `or_else` is the last item of that list.
     """
     if name in trained.room_ids:
         row = trained.room_ids.index(name)

@@ -24,11 +24,11 @@ class LossConfig(Section):
     match_box: float = Field(5.0, ge=0)
     """lambda_B of the matching cost (Eq. S2)."""
     occlusion_slack: float = Field(1.0, ge=0, le=1)
-    """Weight of the part of a predicted 2D box that extends beyond a side of the observed box where
-    another object touches the mask and may hide the rest. 1 is the paper, which trusts every side;
+    """Weight of the distance by which a predicted 2D box extends beyond the observed box at a side
+    where another object touches the mask and may occlude the rest. 1 (the paper) trusts every side;
     at 0, objects may extend behind others without limit."""
     iou_gate: float = Field(0.5, ge=0, lt=1)
-    """Masks whose IoU with the observed mask is not above this are left out of L_S (Eq. 8)."""
+    """Masks enter L_S (Eq. 8) only if their IoU with the observed mask is above this value."""
 
 
 class LatentStageConfig(TrainConfig):
@@ -39,10 +39,10 @@ class LatentStageConfig(TrainConfig):
     """Learning rate of the network."""
     latent_learning_rate: float = Field(1e-4, gt=0)
     """Learning rate of the latent logits, which get one gradient per epoch, and of the bevels of
-    `beveled_box`; the paper uses one rate for all."""
+    `beveled_box`; the paper uses one rate for everything."""
     latent_noise: float = Field(0.0, ge=0)
-    """Length of a random step that each latent takes on the sphere before it is decoded, so that
-    points between rooms decode into rooms, too. 0 (the paper) takes none."""
+    """Length of a random step on the sphere that is added to each latent before decoding, so that
+    points between the latents of rooms decode into rooms, too. 0 (the paper) adds none."""
     latent_noise_end: float | None = Field(None, ge=0)
     """Length of that step at the end of the stage, reached linearly; None keeps it constant."""
 
@@ -62,8 +62,8 @@ class Steps(Section):
 
 
 class Cosine(Section):
-    """Learning rates rise for a twentieth of the stage, then fall to 0 along a cosine; this reaches
-    the same loss in fewer epochs."""
+    """Learning rates rise during the first twentieth of the stage, then fall to 0 along a cosine.
+    The same loss is reached in fewer epochs than with `steps`."""
 
     name: Literal["cosine"] = "cosine"
 
@@ -74,33 +74,34 @@ class StageConfig(LatentStageConfig):
 
     schedule: Annotated[Steps | Cosine, Field(discriminator="name")] = Steps()
     proxy: Literal["ellipsoid", "beveled_box"] = "ellipsoid"
-    """Shape that an object's 2D box is computed from where its mesh is not used (see `box_from`),
-    in training from views and when rooms are fitted to images. `ellipsoid`: the smooth ellipsoid
-    that fills the 3D box, in closed form. `beveled_box`: the box with its edges cut off by the
-    learnt bevels of its class."""
+    """Shape from which an object's 2D box is computed where its mesh is not used (see `box_from`),
+    in training from views and when rooms are fitted to images. `ellipsoid`: the ellipsoid inscribed
+    in the 3D box, in closed form. `beveled_box`: the 3D box with its edges cut off by the learnt
+    bevels of the class."""
 
 
 class LayoutConfig(StageConfig):
-    """Training of the layout stage, on the 2D boxes of the views drawn in each step."""
+    """Training of the layout stage, on the 2D boxes of the views sampled in each step."""
 
 
 class ShapeConfig(StageConfig):
-    """Training of the shape stage of meshes: the layout losses continue beside the mask loss."""
+    """Training of the shape stage for meshes, with the layout losses and the mask loss."""
 
     decoder_learning_rate: float | None = Field(None, gt=0)
-    """Learning rate of the shape decoder, which starts fresh while the rest is trained; None takes
-    `learning_rate`."""
+    """Learning rate of the shape decoder, which is untrained when this stage begins, unlike the
+    rest of the network; None uses `learning_rate`."""
     views_per_room: int | None = Field(None, ge=1)
-    """Views drawn per room and step; None takes data.views_per_room."""
+    """Views sampled per room and step; None uses `data.views_per_room`."""
     sigma_px2: float | None = Field(None, gt=0)
-    """Softness of silhouettes in squared pixels; None takes the paper's 1e-4 squared NDC."""
+    """Softness of silhouettes in squared pixels; None uses the paper's 1e-4 squared NDC."""
     silhouettes: Literal["exact", "fast"] = "exact"
     """`exact`: every face near a pixel counts (paper); `fast`: the outline alone."""
     compositing: Literal["layered", "paper"] = "paper"
     """Visible masks of overlapping objects. `paper`: the scene's coverage goes to the front-most
     object of each pixel; `layered`: a boundary between two objects also moves the one in front."""
     box_from: Literal["mesh", "proxy"] = "mesh"
-    """`mesh`: 2D boxes come from the deformed mesh (paper); `proxy`: still from the proxy."""
+    """Shape from which 2D boxes are computed in this stage: the deformed `mesh` (paper), or the
+    `proxy`, as in the layout stage."""
 
     @property
     def shape_rate(self) -> float:
@@ -111,5 +112,5 @@ class SamplingConfig(Section):
     """Sampling of new rooms."""
 
     distribution: Literal["kernel", "paper"] = "paper"
-    """Distribution of latents. `paper`: logits from N(0, 1); `kernel`: near training rooms, most
-    of its rooms being near copies of one."""
+    """Distribution of latents. `paper`: logits from N(0, 1). `kernel`: logits near those of
+    training rooms; most of the resulting rooms are near copies of one."""

@@ -23,11 +23,11 @@ class ShapeDecoderConfig(ShapeModuleConfig):
     level: int = Field(4, ge=0, le=6)
     """Icosphere subdivisions of the template: 20 * 4**level faces."""
     template: Literal["sphere", "box"] = "sphere"
-    """Mesh that is deformed: the `sphere` (paper), or its vertices pushed out to the surface of the
-    `box` that the layout stage fitted."""
+    """Mesh that is deformed: the `sphere` (paper), or the same mesh with its vertices moved out to
+    the surface of the object's `box`."""
     fit_box: bool = False
-    """Scale each mesh to fill its box exactly, so that the box stays the mesh's own. In the paper
-    (false) the two may drift apart."""
+    """If true, each mesh is scaled to fill its box exactly, so that the box stays the bounding box
+    of the mesh. In the paper (false) the two may drift apart."""
 
     def build(self, features: int) -> "ShapeDecoder":
         return ShapeDecoder(features, self)
@@ -69,7 +69,7 @@ class ShapeDecoder(ShapeModule):
         )  # fmt: skip
         with torch.no_grad():
             last: nn.Linear = self.offsets[-1]  # type: ignore[assignment]
-            last.weight *= 0.01  # deformation starts from the plain template
+            last.weight *= 0.01  # so that training starts near the undeformed template
             last.bias.zero_()
 
     def forward(

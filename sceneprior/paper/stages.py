@@ -36,7 +36,8 @@ from sceneprior.training.steps import (
 class LatentStage(lightning.LightningModule, ABC):
     """A stage that trains the network, and the latents: one row of logits per training room.
 
-    `loss` has the weights of the losses by their names; `completeness_target` is the model's.
+    `loss` holds the weight of each loss by name; `completeness_target` is explained in
+    `ModelConfig`.
     """
 
     trains_shape: ClassVar[bool] = True
@@ -73,8 +74,8 @@ class LatentStage(lightning.LightningModule, ABC):
     def room_latents(
         self, views: SceneViews | LiftedRooms, batch_idx: int
     ) -> Float[Tensor, "rooms width"]:
-        """The rooms' latents z, each moved by a random step of the length that the stage's settings
-        give."""
+        """The rooms' latents z, each moved by a random step whose length the stage's settings
+        `latent_noise` and `latent_noise_end` determine."""
         stage, space = self.stage, self.prior.latent_space
         end = stage.latent_noise if stage.latent_noise_end is None else stage.latent_noise_end
         done = self.current_epoch / stage.epochs
@@ -91,15 +92,15 @@ class LatentStage(lightning.LightningModule, ABC):
         views: SceneViews | LiftedRooms,
         beside: dict[str, Tensor] | None = None,
     ) -> Tensor:
-        """The weighted sum of the losses, checked and logged; `beside` is only logged."""
+        """The weighted sum of the losses, checked and logged; `beside` is logged, not summed."""
         total = weighted_sum(losses, self.loss)
         check_finite(total, views)
         log_losses(self, losses | (beside or {}), total, len(views.room_index))
         return total
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
-        """Adam with the stage's schedule, and separate rates for the network, the shape decoder,
-        and the latents and bevels."""
+        """Adam with the stage's schedule and three learning rates: for the network, for the shape
+        decoder, and for latents and bevels."""
         stage, others = self.stage, ("shape.", "bevels.")
         trained = [p for name, p in self.prior.named_parameters() if not name.startswith(others)]
         tables = [*self.latents.parameters(), *self.prior.bevels.parameters()]
@@ -154,8 +155,8 @@ class ShapeStage(LatentStage):
             losses, matches = match_and_score(
                 scenes, boxes, views, self.loss, self.completeness_target
             )
-            # Checked before rendering, too, whose own error for vertices that are not finite names
-            # no room.
+            # Checked before rendering as well, because the renderer's own error for vertices that
+            # are not finite names no room.
             check_finite(weighted_sum(losses, self.loss), views)
             faces = self.prior.faces
             assert scenes.vertices_m is not None and faces is not None, "masks are of meshes"

@@ -30,8 +30,11 @@ class PriorConfig(RunConfig):
 
     @property
     def view_terms(self) -> tuple[LossConfig, ShapeConfig | None]:
-        """Settings of the view loss with which latents are fitted to images: the weights, and the
-        rendering of shapes. The paper's defaults, unless the run itself is trained on views."""
+        """Settings of the view loss for fitting latents to images: its weights, and how shapes are
+        rendered (None: not at all).
+
+        They are the paper's defaults, unless the run itself is trained on views.
+        """
         return LossConfig(), None
 
     def build_prior(self) -> ScenePrior:
@@ -70,7 +73,11 @@ class PriorConfig(RunConfig):
         return rooms
 
     def before(self, previous: Path, room_ids: tuple[str, ...]) -> "TrainedPrior":
-        """The networks of the previous stage, trained on the same rooms; else an `InputError`."""
+        """The networks of the previous stage.
+
+        Raises:
+            InputError: that stage was trained on other rooms.
+        """
         before = self.load(previous.parent.name, previous)
         assert isinstance(before, TrainedPrior)
         if before.room_ids != room_ids:
@@ -98,19 +105,22 @@ class TrainedPrior:
 
     @property
     def distribution(self) -> str:
-        """Distribution of new rooms unless a task asks for another."""
+        """Default distribution of new rooms."""
         return self.latent_distribution
 
     @property
     def latent_distribution(self) -> str:
-        """Distribution of new latents: the run's own, or `paper` where that needs the latents of
-        training rooms, which a packed prior may lack."""
+        """Default distribution of new latents: the run's own, or `paper` if the prior lacks the
+        latents of its training rooms, as a packed prior may."""
         return self.config.distribution if self.remembers_rooms else "paper"
 
 
 def with_training_latents(trained: Trained, purpose: str) -> TrainedPrior:
-    """`trained`, if it keeps the latents of its training rooms. Otherwise an `InputError` that
-    names the `purpose` that needs them and the priors that have them."""
+    """Return `trained` if it keeps the latents of its training rooms.
+
+    Raises:
+        InputError: it does not; the message names the `purpose`, and priors that keep them.
+    """
     if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
         return trained
     if trained.config.remembers_rooms:

@@ -24,20 +24,20 @@ class TransformerConfig(DecoderConfig):
     """Dropout rate, applied at the same places as in the library that the paper builds on; 0.1 is
     that library's default."""
     final_norm: bool = False
-    """Add a layer norm after the encoder layer and after the decoder layer, as the released code
-    and the default of the library that it builds on."""
+    """Add a layer norm after the encoder layer and after the decoder layer, as in the released code
+    (a default of the library that it builds on)."""
     query_self_attention: bool = False
     """Give the decoder layer self-attention over its single query z, as in the released code."""
     step_mlps: bool = False
-    """End step k with its own two-layer MLP, as in the released code: 0.5 million weights per step
-    at width 512. The k-th object then knows that it is the k-th."""
+    """End each step k with a two-layer MLP of its own, as in the released code: 0.5 million weights
+    per step at width 512. Features then depend on k."""
 
     def build(self, width: int, max_objects: int) -> "SceneTransformer":
         return SceneTransformer(width, self, max_objects)
 
 
 class FeedForward(nn.Module):
-    """MLP[hidden, width] with GELU, with residual connection and layer norm (supplement A)."""
+    """MLP[hidden, width] with GELU, a residual connection and a layer norm (supplement A)."""
 
     def __init__(self, width: int, hidden: int, dropout: float):
         super().__init__()
@@ -63,7 +63,7 @@ class SceneTransformer(nn.Module):
 
     Step k: one encoder layer (self-attention among x_0 .. x_(k-1), no positional encoding) gives
     the scene context F_k; one decoder layer attends to it with z as the query. Both layers apply
-    the norm after the residual connection, as the library that the paper builds on.
+    the norm after the residual connection, as in the library that the paper builds on.
 
     Two shortcuts save time and are exact. Encoder: an object's query, key and value do not change,
     so each is computed once and appended; only the attention is recomputed in each step, since
@@ -103,10 +103,10 @@ class SceneTransformer(nn.Module):
     ) -> Float[Tensor, "rooms objects width"]:
         """Generate `objects` features, starting from the start token x_0 (the empty room).
 
-        `needed` is the number of features that each room needs; those beyond it are meaningless.
+        `needed` is the number of features that each room needs; later features are meaningless.
         """
         if needed is not None and self.output is None:  # `step_mlps` are trained in every step
-            # Sorted by need, so that rooms that have all their features are dropped from the end.
+            # Sorted by need, so that rooms whose features are complete are dropped from the end.
             order = needed.argsort(descending=True)
             steps = torch.arange(objects, device=z.device)
             going_on = (needed[:, None] > steps).sum(dim=0).tolist()
@@ -136,8 +136,8 @@ class SceneTransformer(nn.Module):
         """(rooms, width): z as the query of every step.
 
         Coordinates of a unit vector are about 1 / sqrt(width), far below the normalised features to
-        which they are added, so z is scaled by sqrt(width). Without it the class loss falls far
-        more slowly (docs/experiments/2026-11-21-demo-settings.md).
+        which they are added, so z is scaled by sqrt(width). Without this scaling, the class loss
+        falls far more slowly (docs/experiments/2026-11-21-demo-settings.md).
         """
         return self.query(z * z.shape[-1] ** 0.5)
 
@@ -157,7 +157,8 @@ class SceneTransformer(nn.Module):
     def _key_query(self, z_query: Tensor) -> Tensor:
         """(rooms, heads, width): each head's query from z, multiplied by the key projection.
 
-        The key's bias would add the same to every token's score, which the softmax cancels.
+        A bias of the key would add the same number to the scores of all tokens, which the softmax
+        cancels.
         """
         query = self.decoder_query(z_query).unflatten(-1, (self.heads, -1))
         key = self.decoder_key.unflatten(0, (self.heads, -1))
@@ -182,6 +183,6 @@ class SceneTransformer(nn.Module):
 
 
 def _first(values: Tensor, rooms: int) -> Tensor:
-    """`values[:rooms]`, or `values` itself if that is all of it: a slice would copy its
-    gradient."""
+    """`values[:rooms]`; `values` itself if it has no more rooms, since a slice copies the gradient
+    in the backward pass."""
     return values if len(values) == rooms else values[:rooms]

@@ -35,8 +35,8 @@ def first_predictions(views: SceneViews, slots: int) -> Bool[Tensor, "rooms slot
 
 
 def _of_first(project: Callable[..., Boxes2D], views: SceneViews, *objects: Tensor) -> Boxes2D:
-    """Apply `project` to the first predictions only; the others get empty boxes outside the
-    frustum."""
+    """Apply `project` to the first predictions of each room only (`first_predictions`); the others
+    get empty boxes outside the frustum."""
     rooms, slots = objects[0].shape[:2]
     first = first_predictions(views, slots)
     room = first.nonzero()[:, 0]
@@ -59,8 +59,10 @@ def match_and_score(
     completeness_target: str,
     per_room: bool = False,
 ) -> tuple[dict[str, Float[Tensor, "*rooms"]], Matches]:
-    """Match predictions to tracked objects by their 2D `boxes`, and compute the layout losses,
-    averaged over the batch or `per_room`."""
+    """Match predictions to tracked objects by class and 2D box, and compute the layout losses.
+
+    `per_room` is explained in `layout_losses`.
+    """
     matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
     losses = layout_losses(
         scenes, boxes, views, matches, weights.occlusion_slack, completeness_target, per_room
@@ -73,7 +75,7 @@ def seen_boxes(scenes: DecodedScenes, views: SceneViews, settings: ShapeConfig |
     (`ShapeConfig.box_from`).
 
     In a room with n tracked objects, only the first n predictions, which are matched, get a box;
-    the boxes of the others are empty and in no frustum.
+    the others get empty boxes outside the frustum.
     """
     if settings is None:
         return proxy_boxes(scenes, views, "ellipsoid")

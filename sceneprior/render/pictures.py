@@ -19,10 +19,11 @@ def contact_sheet(
     captions: Sequence[str] = (),
     gap_px: int = 0,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Lay pictures out in rows of `columns` on white, from left to right.
+    """Lay out pictures on a white sheet, row by row, with `columns` pictures in each row.
 
-    Cells have the size of the largest tile; smaller ones go to the upper left. There is one caption
-    above each tile, or none at all, and white space of `gap_px` around it.
+    All cells have the size of the largest tile; a smaller tile lies in the upper left corner of its
+    cell. `captions` are written above the tiles, one for each. `gap_px` is the width of the white
+    space around each tile.
     """
     height, width = (max(tile.shape[axis] for tile in tiles) for axis in (0, 1))
     above = gap_px + (CAPTION_PX if captions else 0)
@@ -63,7 +64,7 @@ def paint_ids(
 
 
 def png_bytes(picture: UInt8[np.ndarray, "height width 3"] | Image.Image, **options: Any) -> bytes:
-    """A picture as a PNG; `options` are Pillow's (`compress_level`, `optimize`)."""
+    """Encode a picture as a PNG; `options` are passed to Pillow (`compress_level`, `optimize`)."""
     buffer = io.BytesIO()
     image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
     image.save(buffer, format="PNG", **options)
@@ -73,7 +74,7 @@ def png_bytes(picture: UInt8[np.ndarray, "height width 3"] | Image.Image, **opti
 def gif_bytes(
     pictures: Sequence[UInt8[np.ndarray, "height width 3"]], times: Sequence[int]
 ) -> bytes:
-    """Pictures of one size as an endlessly looping GIF; `times` are their durations in ms."""
+    """Encode pictures of one size as an endlessly looping GIF; `times` are durations in ms."""
     # One palette for all pictures; separate palettes would make flat areas flicker.
     palette = Image.fromarray(np.concatenate(pictures)).quantize(255, dither=Image.Dither.NONE)
     frames = [

@@ -5,7 +5,7 @@ import re
 import warnings
 import zipfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,25 +16,38 @@ from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.files import is_name, read_json, write_json, write_whole
 from sceneprior.core.scene import Mesh, Scene, mesh_of_file
 from sceneprior.core.scene_json import FORMAT, read_scene, scene_to_json
+from sceneprior.core.shell import ShellName, is_shell, shell_meshes
+from sceneprior.render.floor_plans import floor_plan
 from sceneprior.render.offscreen import Renderer, open_renderer
 from sceneprior.render.pictures import png_bytes
-from sceneprior.render.topdown import FLOOR_COLOR, object_colors, scene_meshes, topdown
+from sceneprior.render.scene_usd import scene_to_usd
+from sceneprior.render.topdown import (
+    linear_rgba,
+    node_names,
+    object_colors,
+    scene_meshes,
+    shell_color,
+)
 
+NO_SHELL: Mapping[str, Mesh] = {}
 PACKAGE_FORMATS = "sceneprior-"
 """Prefix of the names of the package's formats."""
 
 
-def save_scene(scene: Scene, path: Path, renderer: Renderer | None = None) -> None:
+def save_scene(
+    scene: Scene, path: Path, renderer: Renderer | None = None, shell: ShellName = "none"
+) -> None:
     """Write a scene to one file, atomically, in the format of its suffix.
 
     `.json`: classes and boxes. `.glb`: one node per object, called `<index>_<class>`, in the class
     colour; an object without a mesh is written as its box. `.obj`: the same objects, with an `.mtl`
-    file. `.usda`: one mesh per object, its class in `userProperties:class`. `.png`: the top-down
-    picture of the metrics, with borders between objects. Axes and unit are the room frame's: y up,
-    metres.
+    file. `.usda`: one mesh per object, its class in `userProperties:class`. `.png`: a floor plan
+    of the whole room. 3D formats keep the axes and the unit of the room frame: y up, metres.
 
     Args:
         renderer: Renderer of the picture; None opens one.
+        shell: With `walls`, models have nodes `floor`, `wall_0` and so on, and `ceiling`; with
+            `floor`, the first alone.
 
     Raises:
         InputError: the path has another suffix.
@@ -44,91 +57,65 @@ def save_scene(scene: Scene, path: Path, renderer: Renderer | None = None) -> No
         case ".json":
             write_json(path, scene_to_json(scene))
         case ".glb":
-            write_whole(path, scene_to_glb(scene))
+            write_whole(path, scene_to_glb(scene, shell_meshes(scene, shell)))
         case ".obj":
             materials = path.with_suffix(".mtl")
-            text, described = scene_to_obj(scene, materials.name)
+            text, described = scene_to_obj(scene, materials.name, shell_meshes(scene, shell))
             write_whole(materials, described)
             write_whole(path, text)
         case ".usda":
-            write_whole(path, scene_to_usd(scene))
+            write_whole(path, scene_to_usd(scene, shell_meshes(scene, shell)))
         case ".png":
-            picture = topdown(scene, renderer or open_renderer(), outlines=True)
-            write_whole(path, png_bytes(picture))
+            write_whole(path, png_bytes(floor_plan(scene, renderer or open_renderer())))
         case suffix:
             raise InputError(
-                f"{path} ends with '{suffix}', which is no format of scenes; end it with one of "
+                f"{path} ends with '{suffix}', which is not a scene format; end it with one of "
                 ".json, .glb, .obj, .usda, .png."
             )
 
 
-def scene_to_glb(scene: Scene, floor: Mesh | None = None) -> bytes:
+def scene_to_glb(scene: Scene, shell: Mapping[str, Mesh] = NO_SHELL) -> bytes:
     """The scene as binary glTF 2.0: a named node, mesh and material per object; no cameras.
 
     Args:
-        floor: Mesh of an additional node `floor`, for pages; `load_scene` rejects such a node.
+        shell: Meshes of the room by the names of their nodes (`core/shell.py`).
     """
-    if not scene.objects and floor is None:
+    if not scene.objects and not shell:
         return _empty_glb()
-    room = _trimesh_of(scene)
-    if floor is not None:
-        _add(room, "floor", "floor", floor, np.array(FLOOR_COLOR))
+    room = _trimesh_of(scene, shell)
     # Without normals, viewers use flat shading, and boxes keep sharp edges.
     return bytes(room.export(file_type="glb", include_normals=False))
 
 
-def scene_to_obj(scene: Scene, materials: str) -> tuple[str, bytes]:
-    """The scene as Wavefront OBJ with one named object each, and its materials (MTL).
+def scene_to_obj(
+    scene: Scene, materials: str, shell: Mapping[str, Mesh] = NO_SHELL
+) -> tuple[str, bytes]:
+    """The scene as a Wavefront OBJ, with one named object per piece of furniture, and as its MTL.
 
     The OBJ refers to the MTL file by the name `materials`. y is up, in metres, as in the GLB.
     """
     from trimesh.exchange.obj import export_obj
 
-    if not scene.objects:
+    if not scene.objects and not shell:
         return "", b""
     text, files = export_obj(
-        _trimesh_of(scene), include_normals=False, return_texture=True, mtl_name=materials,
+        _trimesh_of(scene, shell), include_normals=False, return_texture=True, mtl_name=materials,
         header=None,
     )  # fmt: skip
     return text + "\n", files[materials]
 
 
-def scene_to_usd(scene: Scene) -> str:
-    """The scene as the text of a USD stage: y up, metres, one mesh per object under `/room`."""
-    try:
-        from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
-    except ImportError:
-        raise InputError("USD needs a package more: pip install 'sceneprior[usd]'.") from None
-    stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/room").GetPrim())
-    meshes, colors = scene_meshes(scene), object_colors(scene)
-    for node, item, mesh, color in zip(_nodes(scene), scene.objects, meshes, colors, strict=True):
-        # USD names must begin with a letter.
-        prim = UsdGeom.Mesh.Define(
-            stage, Sdf.Path("/room").AppendChild(Tf.MakeValidIdentifier(f"object_{node}"))
-        )
-        vertices = np.ascontiguousarray(mesh.vertices_m, dtype=np.float32)
-        faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
-        prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(vertices))
-        prim.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), 3))
-        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.ravel()))
-        prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([vertices.min(0), vertices.max(0)])))
-        prim.CreateDisplayColorAttr([Gf.Vec3f(*_linear_rgba(color)[:3])])
-        label = prim.GetPrim().CreateAttribute("userProperties:class", Sdf.ValueTypeNames.String)
-        label.Set(item.label)
-    return str(stage.GetRootLayer().ExportToString())
-
-
-def _trimesh_of(scene: Scene) -> Any:
+def _trimesh_of(scene: Scene, shell: Mapping[str, Mesh]) -> Any:
     import trimesh
 
     room = trimesh.Scene(base_frame="room")
     meshes, colors = scene_meshes(scene), object_colors(scene)
-    for node, item, mesh, color in zip(_nodes(scene), scene.objects, meshes, colors, strict=True):
+    for node, item, mesh, color in zip(
+        node_names(scene), scene.objects, meshes, colors, strict=True
+    ):
         _add(room, node, item.label, mesh, color)
+    for node, mesh in shell.items():
+        _add(room, node, node.partition("_")[0], mesh, shell_color(node))
     return room
 
 
@@ -139,7 +126,7 @@ def _add(room: Any, node: str, material: str, mesh: Mesh, color: np.ndarray) -> 
 
     surface = PBRMaterial(
         name=material,
-        baseColorFactor=_linear_rgba(color),
+        baseColorFactor=linear_rgba(color),
         metallicFactor=0.0,
         roughnessFactor=0.9,
         # A learned mesh may fold over itself, and its back faces should be visible.
@@ -154,17 +141,6 @@ def _add(room: Any, node: str, material: str, mesh: Mesh, color: np.ndarray) -> 
     room.add_geometry(geometry, node_name=node, geom_name=node)
 
 
-def _nodes(scene: Scene) -> list[str]:
-    return [f"{index}_{item.label}" for index, item in enumerate(scene.objects)]
-
-
-def _linear_rgba(color: np.ndarray) -> list[float]:
-    # glTF's base colours are linear; class colours are sRGB.
-    srgb = color / 255.0
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return [*(float(value) for value in linear), 1.0]
-
-
 def _empty_glb() -> bytes:
     # trimesh does not export a scene without geometry, but an empty room is valid.
     text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{}]}).encode()
@@ -174,11 +150,11 @@ def _empty_glb() -> bytes:
 
 
 def read_glb_meshes(path: Path) -> dict[str, Mesh]:
-    """Meshes of a GLB by node name, with vertices in the room frame in metres."""
+    """Meshes of a GLB by node name, without the room's shell; vertices in the room frame."""
     import trimesh
 
     try:
-        # process=False keeps vertices and faces as written; materials follow from the classes.
+        # process=False keeps vertices and faces as written. Materials depend on the class alone.
         loaded = trimesh.load_scene(Path(path), file_type="glb", process=False, skip_materials=True)
         meshes = {}
         for node in loaded.graph.nodes_geometry:
@@ -187,7 +163,7 @@ def read_glb_meshes(path: Path) -> dict[str, Mesh]:
             vertices = np.asarray(mesh.vertices, dtype=np.float64)
             placed = vertices @ transform[:3, :3].T + transform[:3, 3]
             meshes[node] = mesh_of_file(placed, mesh.faces)
-        return meshes
+        return {node: mesh for node, mesh in meshes.items() if not is_shell(node)}
     except Exception as error:  # a damaged file raises almost anything in trimesh
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         raise InputError(
@@ -208,7 +184,7 @@ def load_scene(path: Path) -> Scene:
     if not glb.is_file() or not scene.objects:
         return scene
     meshes = read_glb_meshes(glb)
-    wanted = _nodes(scene)
+    wanted = node_names(scene)
     if set(meshes) != set(wanted):
         unlisted = sorted(set(meshes) ^ set(wanted))
         raise InputError(
@@ -248,7 +224,7 @@ def load_scene_folder(folder: Path) -> list[Scene]:
     ]:
         warnings.warn(
             f"{len(scenes)} scenes are read from {folder}; {len(other)} other JSON files there are "
-            f"no scenes ('format' is not {FORMAT}) and are passed over: {', '.join(other[:3])}"
+            f"not scenes ('format' is not {FORMAT}) and are skipped: {', '.join(other[:3])}"
             f"{', ...' if len(other) > 3 else ''}.",
             InputWarning,
             stacklevel=2,
@@ -257,13 +233,13 @@ def load_scene_folder(folder: Path) -> list[Scene]:
 
 
 def _refuse_box_lists(given: Path, paths: Iterable[Path]) -> None:
-    """Raise an InputError with the command for conversion if box lists like ATISS's were given."""
+    """Raise an `InputError` that names the conversion command if a path is a box list of ATISS."""
     for path in paths:
         if _is_box_list(path):
             raise InputError(
-                f"{given} holds box lists ({path.name}) and no scenes; `sceneprior export {given} "
-                "--to scenes --label-set front3d_bedroom --out DIR` makes scenes of them, with "
-                "the label set of their classes."
+                f"{given} holds box lists ({path.name}), not scenes; `sceneprior export {given} "
+                "--to scenes --label-set front3d_bedroom --out DIR` converts them, if you give the "
+                "label set of their classes."
             )
 
 
@@ -286,7 +262,7 @@ def check_names(scenes: Sequence[Scene]) -> None:
     for name, count in counts.items():
         if count > 1:
             raise InputError(
-                f"{count} rooms are called '{name}', and files are named by rooms; give each "
+                f"{count} rooms are called '{name}', and files are named after rooms; give each "
                 "another `name` in its JSON."
             )
         if not is_name(name):

@@ -1,4 +1,4 @@
-"""Pictures of scenes: top-down, as metrics compare them, from above a corner, and turntables."""
+"""Pictures of scenes: from straight above (for metrics), from above a corner, and turntables."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -7,8 +7,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from sceneprior.core.classes import class_colors, label_set
+from sceneprior.core.floor import floor_rectangle
 from sceneprior.core.geometry.corners import BOX_FACES, box_corners
 from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.shell import rectangle, shell_of, slab
 from sceneprior.render.offscreen import Orthographic, Pinhole, Renderer
 from sceneprior.render.pictures import paint_ids
 
@@ -16,6 +18,7 @@ BACKGROUND = (255, 255, 255)
 """White, which differs clearly from all class colours and prints as paper."""
 
 FLOOR_COLOR = (232, 228, 220)
+WALL_COLOR = (252, 251, 249)
 DIRECTION = np.array([0.42, 0.62, 0.66])
 """Unit vector from a room towards the camera of `perspective`; 3D models start in this view."""
 
@@ -73,6 +76,23 @@ def object_colors(scene: Scene) -> UInt8[np.ndarray, "objects 3"]:
     return class_colors(len(label_set(scene.label_set)))[scene.class_indices]
 
 
+def shell_color(node: str) -> UInt8[np.ndarray, "3"]:
+    """The RGB colour of a node of a room's shell."""
+    return np.array(FLOOR_COLOR if node == "floor" else WALL_COLOR, dtype=np.uint8)
+
+
+def node_names(scene: Scene) -> list[str]:
+    """Names of the objects in files: `<index>_<class>`."""
+    return [f"{index}_{item.label}" for index, item in enumerate(scene.objects)]
+
+
+def linear_rgba(color: UInt8[np.ndarray, "3"]) -> list[float]:
+    """An sRGB colour as linear numbers in [0, 1], as glTF and USD have them, with opacity 1."""
+    srgb = color / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return [*(float(value) for value in linear), 1.0]
+
+
 def topdown(
     scene: Scene,
     renderer: Renderer,
@@ -81,9 +101,10 @@ def topdown(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Orthographic picture of a room from above: one flat colour per class, without shading.
 
-    Image right is +x, image down is +z, and the room's origin is the centre of the image. Of
-    objects above each other, the highest surface is drawn. Without a `protocol`, it is that of the
-    scene's label set. `outlines` darkens the borders between objects, for readers, not for metrics.
+    Image right is +x, image down is +z, and the room's origin is the centre of the image. Where
+    objects overlap, the highest surface is drawn. If `protocol` is None, the protocol of the
+    scene's label set is used. `outlines` darkens the borders between objects; such pictures are for
+    readers, not for metrics.
 
     Source:
         The paper, section 4.2: 512 x 512, orthographic, a colour per category.
@@ -104,7 +125,10 @@ def topdown(
 def look_at(
     eye_m: Float[np.ndarray, "3"], target_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """`world_to_camera` of a camera at `eye_m` that looks at `target_m`, y up, not vertically."""
+    """`world_to_camera` of a camera at `eye_m` that looks at `target_m`, with y up.
+
+    The viewing direction must not be vertical.
+    """
     forward = target_m - eye_m
     right = np.cross(forward, [0.0, 1.0, 0.0])
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
@@ -116,25 +140,48 @@ def look_at(
 
 @dataclass(frozen=True)
 class CornerView:
-    """The camera of `perspective`, and the floor that it draws."""
+    """The camera of `perspective`, and the floor and walls that it draws."""
 
     camera: Pinhole
     image_size: tuple[int, int]
     floor: Mesh
+    walls: tuple[Mesh, ...] = ()
+    """Walls of one room behind its furniture, as the camera sees it."""
+
+
+def room_view(scene: Scene, image_size: tuple[int, int] = (360, 480)) -> CornerView:
+    """A view of a room with its floor and the walls behind its furniture, from above a corner."""
+    shell = shell_of(scene)
+    meshes = shell.meshes()
+    toward = DIRECTION[[0, 2]]
+    behind = (f"wall_{row}" for row, wall in enumerate(shell.walls) if wall.outward @ toward < 0)
+    walls = tuple(meshes[name] for name in behind)
+    floor = meshes["floor"]
+    return _fitted([floor, *walls, *scene_meshes(scene)], image_size, floor, walls)
 
 
 def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480)) -> CornerView:
-    """A view from above a corner, outside the room, into which all these rooms just fit.
+    """A view from outside, above a corner, that just contains all given rooms.
 
-    The camera is two diagonals away. The floor is the rectangle around the rooms' outlines or, for
-    rooms without an outline, their objects.
+    The floor is that of the room's outline; without an outline, and for several rooms, it is the
+    rectangle around outlines and objects.
     """
     floors = np.array([floor_rectangle(scene) for scene in scenes])
     low, high = floors[:, 0].min(axis=0), floors[:, 1].max(axis=0)
     # Top face 2 cm below y = 0, so that objects on the floor do not z-fight with it.
-    center = ((low[0] + high[0]) / 2, -0.03, (low[1] + high[1]) / 2)
-    floor = box_mesh(center, (high[0] - low[0], 0.02, high[1] - low[1]))
+    outline = scenes[0].floor_m if len(scenes) == 1 else None
+    floor = slab(rectangle(low, high) if outline is None else outline, -0.04, -0.02)
     meshes = [floor, *(mesh for scene in scenes for mesh in scene_meshes(scene))]
+    return _fitted(meshes, image_size, floor)
+
+
+def _fitted(
+    meshes: Sequence[Mesh],
+    image_size: tuple[int, int],
+    floor: Mesh,
+    walls: tuple[Mesh, ...] = (),
+) -> CornerView:
+    """The view into which these meshes just fit; the camera is two diagonals away."""
     points = np.concatenate([mesh.vertices_m for mesh in meshes])
     target, diagonal = (points.min(0) + points.max(0)) / 2, np.linalg.norm(np.ptp(points, axis=0))
     world_to_camera = look_at(target + 2 * diagonal * DIRECTION, target)
@@ -147,7 +194,7 @@ def corner_view(scenes: Sequence[Scene], image_size: tuple[int, int] = (360, 480
         for side, seen in ((width, across), (height, down))
     )
     intrinsics = np.array([[focal, 0, x_px], [0, focal, y_px], [0, 0, 1]])
-    return CornerView(Pinhole(world_to_camera, intrinsics), image_size, floor)
+    return CornerView(Pinhole(world_to_camera, intrinsics), image_size, floor, walls)
 
 
 def perspective(
@@ -157,18 +204,19 @@ def perspective(
     view: CornerView | None = None,
     colors: UInt8[np.ndarray, "objects 3"] | None = None,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """A picture with soft shadows from above a corner, outside the room: for pages, not for
-    metrics.
+    """Draw a room with soft shadows, from outside and above a corner: for pages, not for metrics.
 
-    Without a `view`, one of `image_size` is fitted to the room; a common view makes several rooms
-    comparable. `colors` of the objects are those of their classes unless given.
+    If `view` is None, a view of `image_size` is fitted to the room; with a common view, pictures of
+    several rooms can be compared. If `colors` is None, objects have the colours of their classes.
     """
     view = view or corner_view([scene], image_size)
     colors = object_colors(scene) if colors is None else colors
-    colors = np.concatenate([colors, [FLOOR_COLOR]]).astype(np.uint8)
-    meshes = [*scene_meshes(scene), view.floor]
-    size = view.image_size
-    return renderer.shaded(meshes, colors, view.camera, size, BACKGROUND, shadows=True)
+    walls = [WALL_COLOR] * len(view.walls)
+    colors = np.concatenate([colors, [FLOOR_COLOR], *([walls] if walls else [])]).astype(np.uint8)
+    meshes = [*scene_meshes(scene), view.floor, *view.walls]
+    # Walls cast no shadows: they would darken the whole room.
+    shadowed = len(meshes) - len(walls)
+    return renderer.shaded(meshes, colors, view.camera, view.image_size, BACKGROUND, shadowed)
 
 
 def turntable(
@@ -177,7 +225,7 @@ def turntable(
     count: int = 36,
     image_size: tuple[int, int] = (240, 320),
 ) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """Shaded pictures from `count` directions around a room, at one scale.
+    """Shaded pictures from `count` directions around a room, all at the same scale.
 
     The first has the viewing direction of `perspective`.
     """
@@ -201,17 +249,3 @@ def turntable(
     intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     views = [CornerView(Pinhole(pose, intrinsics), image_size, floor) for pose in poses]
     return [perspective(scene, renderer, view=view) for view in views]
-
-
-def floor_rectangle(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper (x, z) of the rectangle around the floor.
-
-    Without a known floor, it is the rectangle around the objects with a margin of 20 cm.
-    """
-    if scene.floor_m is not None and len(scene.floor_m):
-        outline = np.asarray(scene.floor_m, dtype=np.float64)
-        return outline.min(0), outline.max(0)
-    if not scene.objects:
-        return np.array([-1.5, -1.5]), np.array([1.5, 1.5])
-    flat, half = scene.centers_m[:, [0, 2]], scene.sizes_m[:, [0, 2]] / 2
-    return (flat - half).min(0) - 0.2, (flat + half).max(0) + 0.2

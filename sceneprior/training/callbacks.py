@@ -64,8 +64,8 @@ class StepSeed(Callback):
 class RollingCheckpoint(Callback):
     """Write `last.ckpt` after every epoch, the only point at which a run can be resumed exactly.
 
-    An interrupted run loses the epoch at hand; the resumed run draws that epoch's views again and
-    ends at the same weights as an uninterrupted one. `extra`, plain data under its own keys, is
+    An interrupted run loses the current epoch. The resumed run draws the views of that epoch again,
+    and ends at the same weights as an uninterrupted run. The entries of `extra` (plain data) are
     added to every checkpoint.
     """
 

@@ -3,7 +3,7 @@
 RUN/config.yaml            all settings, defaults included
 RUN/<stage>/last.ckpt      the stage's newest checkpoint, from which `--resume` continues
 RUN/<stage>/final.ckpt     the finished stage, which commands load
-RUN/<stage>/metrics.csv    one line per epoch; TensorBoard's files lie beside it
+RUN/<stage>/metrics.csv    one line per epoch; TensorBoard's files are in the same folder
 """
 
 from collections.abc import Callable, Sequence
@@ -20,20 +20,22 @@ if TYPE_CHECKING:
     import lightning
 
 _RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "pytorch-lightning_version")
-"""Keys that the trainer needs from a checkpoint to resume, beside the weights."""
+"""Keys of a checkpoint that the trainer needs to resume, in addition to the weights."""
 
 
 def find_checkpoint(run: Path, stages: Sequence[str]) -> tuple[str, Path]:
-    """Stage and path of the checkpoint that commands load, given a run's `stages` in order: that
-    of the last finished stage, or else the newest of the last stage begun.
+    """Stage and path of the checkpoint that commands load; `stages` are the run's, in order.
+
+    It is the checkpoint of the last finished stage. If no stage is finished, it is the newest
+    checkpoint of the last stage begun.
     """
     for name in ("final.ckpt", "last.ckpt"):
         for stage in reversed(stages):
             if (run / stage / name).is_file():
                 return stage, run / stage / name
     raise InputError(
-        f"{run} holds no checkpoint yet; let `sceneprior fit --config {run / 'config.yaml'} "
-        f"--run {run} --resume` get further."
+        f"{run} holds no checkpoint yet; continue its training with `sceneprior fit --config "
+        f"{run / 'config.yaml'} --run {run} --resume`."
     )
 
 
@@ -58,8 +60,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         ) from None
     if not isinstance(saved, dict) or not isinstance(saved.get("state_dict"), dict):
         raise InputError(
-            f"{path} is no checkpoint of `sceneprior fit` (no state_dict in it). Delete it and run "
-            "`sceneprior fit` with `--resume`."
+            f"{path} is not a checkpoint of `sceneprior fit` (it has no state_dict). Delete it and "
+            "run `sceneprior fit` with `--resume`."
         )
     return saved
 
@@ -73,16 +75,17 @@ def check_resumable(path: Path, module: nn.Module) -> None:
     if missing or shapes != expected:
         reason = f"it has no {missing[0]}" if missing else "its tensors are of another network"
         raise InputError(
-            f"No training can go on from {path}: {reason}. Delete it, and the stage begins anew "
-            "with the same command."
+            f"Training cannot be resumed from {path}: {reason}. Delete it, and the same command "
+            "trains the stage from its start."
         )
 
 
 def read_networks(
     path: Path, build: Callable[[int], nn.ModuleDict]
 ) -> tuple[nn.ModuleDict, tuple[str, ...]]:
-    """The networks of a checkpoint, and the ids of the rooms that it was trained on. `build` makes
-    the freshly initialised networks for a number of rooms.
+    """The networks of a checkpoint, and the ids of the rooms that it was trained on.
+
+    `build` takes the number of rooms and returns freshly initialised networks.
     """
     saved = read_checkpoint(path)
     try:

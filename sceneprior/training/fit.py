@@ -38,9 +38,10 @@ def fit(
 ) -> None:
     """Train the stages that `config.stages()` lists; config, checkpoints and logs go to `run`.
 
-    `resume` continues an interrupted run, whose finished stages are not trained again. A run that
-    is refused at its start leaves no files behind. `trainer_options` are passed on to Lightning's
-    Trainer (devices, accelerator, precision); its `callbacks` are called after those of `fit`.
+    `resume` continues an interrupted run, without training its finished stages again. A run that is
+    refused at its start leaves no files behind. `trainer_options` are passed on to Lightning's
+    Trainer (devices, accelerator, precision); `callbacks` among them are called after those of
+    `fit`.
     """
     run, config = Path(run), config.with_label_set()
     for name in loggers:
@@ -53,7 +54,7 @@ def fit(
         for stage in config.stages():
             final = run / stage.name / "final.ckpt"
             if final.is_file():
-                read_checkpoint(final)  # a damaged one is named, not counted as trained
+                read_checkpoint(final)  # raises an error if it is damaged
             else:
                 options = trainer_options or {}
                 _train(stage, config, final.parent, previous, resume, loggers, options)
@@ -62,8 +63,7 @@ def fit(
 
 @contextlib.contextmanager
 def _own_folder(run: Path) -> Iterator[None]:
-    """Lock a run's folder against other trainings; of this run's processes, the first holds the
-    lock."""
+    """Lock a run's folder against other trainings; only the run's first process holds the lock."""
 
     def report(ended: threading.ExceptHookArgs) -> None:
         if ended.exc_type is None or not issubclass(ended.exc_type, OSError):
@@ -198,8 +198,10 @@ def _trainer(
 
 
 def make_logger(name: str, folder: Path) -> Logger:
-    """The logger of that name from `LOGGERS` for a stage's folder; CSV appends to an interrupted
-    run's file."""
+    """Make a logger for a stage's folder; `name` is one of `LOGGERS`.
+
+    The CSV logger appends to the file of an interrupted run.
+    """
     if name == "csv":
         return _csv_logger(folder)
     if name == "tensorboard":

@@ -36,8 +36,8 @@ OF_SHARDS = "shards"
 
 @dataclass(frozen=True)
 class Stage:
-    """A LightningModule to train. Its network is the attribute `prior`; `latents` are those of
-    rooms, if any."""
+    """A LightningModule to train, and its training data. The attribute `prior` of the module is the
+    network; `latents`, if it has one, is the table of the rooms' latents."""
 
     name: str
     """Name of the stage, and of its folder in the run."""
@@ -132,7 +132,8 @@ class RunConfig(Section, ABC):
 
 @runtime_checkable
 class Trained(Protocol):
-    """Networks of a run, ready for use: the method's own class, or one of the two below."""
+    """Networks of a run, ready for use: a class of the method's own, or `TrainedSampler` or
+    `TrainedReconstructor`."""
 
     @property
     def prior(self) -> Any:
@@ -184,7 +185,7 @@ class TrainedSampler:
 
     @property
     def distribution(self) -> str:
-        """Distribution of new rooms: the method itself."""
+        """Name of the distribution of new rooms, which is the name of the method."""
         return self.config.method
 
 
@@ -201,8 +202,10 @@ class ViewReconstructor(Protocol):
     """A network that reconstructs images directly, object by object."""
 
     def find(self, views: SceneViews) -> list[list[FoundObject]]:
-        """The objects of each image (a room with one view): one per mask, in the order of the
-        masks."""
+        """Find the objects of each image, one per mask, in the order of the masks.
+
+        An image is a room of `views` with a single view.
+        """
 
     def parameters(self) -> Any: ...
 

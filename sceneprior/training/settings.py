@@ -44,7 +44,7 @@ class TrainConfig(Section):
     accumulate: int = Field(1, ge=1)
     """Batches whose gradients are averaged before each update."""
     clip_gradient: float = Field(0.0, ge=0)
-    """Largest gradient norm; 0 does not clip."""
+    """Norm to which gradients are clipped; 0 turns clipping off."""
     cpu_threads: int | None = Field(None, ge=1)
     """Torch threads when training on a CPU; None keeps torch's default. A small network gains
     little from a second thread, and loses much when another program uses that core."""

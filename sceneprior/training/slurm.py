@@ -30,9 +30,9 @@ def slurm_plugins() -> list[Any]:
 def requeue_on_signal() -> Iterator[None]:
     """In a SLURM job, handle SIGUSR1 by requeueing the job and stopping as Ctrl-C does.
 
-    Nothing needs to be saved at that point: `last.ckpt` is that of the last complete epoch, and a
-    resumed run repeats the interrupted epoch view for view. SIGTERM, which SLURM sends before it
-    preempts and requeues a job itself, stops training after the current batch.
+    Nothing needs to be saved at that point: `last.ckpt` holds the state after the last complete
+    epoch, and a resumed run repeats the interrupted epoch with the same views. SIGTERM, which SLURM
+    sends before it preempts and requeues a job itself, stops training after the current batch.
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
     if not (SLURMEnvironment.detect() and in_main_thread):

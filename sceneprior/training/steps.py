@@ -31,7 +31,7 @@ def weighted_sum(
 
 
 def check_finite(total: Tensor, views: SceneViews | LiftedRooms | RoomBoxes) -> None:
-    """Stop at the first loss that is not finite, and name the rooms of its batch.
+    """Raise a `FloatingPointError` that names the batch's rooms if the total loss is not finite.
 
     All processes stop together: if one stopped alone, the others would wait for it.
     """
@@ -55,13 +55,13 @@ def check_finite(total: Tensor, views: SceneViews | LiftedRooms | RoomBoxes) -> 
 
 
 def full_precision(device: torch.device) -> torch.autocast:
-    """Context without mixed precision, for latents, projections, matching, silhouettes and losses;
-    only the networks may run in lower precision."""
+    """Context that turns mixed precision off, for latents, projections, matching, silhouettes and
+    losses. Only the networks may run in lower precision."""
     return torch.autocast(device.type, enabled=False)
 
 
 def batch_seed(seed: int, trainer: "lightning.Trainer", batch_idx: int) -> int:
-    """A distinct seed for each batch and process, the same when a run is resumed."""
+    """A distinct seed for each batch and process; a resumed run gets the same seeds."""
     batch = trainer.current_epoch * int(trainer.num_training_batches) + batch_idx
     sequence = np.random.SeedSequence([seed, batch, trainer.global_rank])
     return int(sequence.generate_state(1, np.uint64)[0] >> 1)
@@ -70,7 +70,7 @@ def batch_seed(seed: int, trainer: "lightning.Trainer", batch_idx: int) -> int:
 def log_losses(
     module: "lightning.LightningModule", values: dict[str, Tensor], total: Tensor, rooms: int
 ) -> None:
-    """Log means over an epoch and all processes, as `train/<name>` and `train/loss`."""
+    """Log means over an epoch and all processes, as `train/<name>`, and `total` as `train/loss`."""
     named = {f"train/{name}": value.detach() for name, value in (values | {"loss": total}).items()}
     module.log_dict(named, on_step=False, on_epoch=True, batch_size=rooms, sync_dist=True)
 
@@ -78,8 +78,8 @@ def log_losses(
 def with_cosine(
     optimizer: torch.optim.Optimizer, steps: int
 ) -> "lightning.pytorch.utilities.types.OptimizerLRSchedulerConfig":
-    """The optimiser, with learning rates that rise for a twentieth of `steps`, then fall to 0 along
-    a cosine."""
+    """The optimiser with a schedule: learning rates rise during the first twentieth of `steps`, and
+    then fall to 0 along a cosine."""
     rise = torch.optim.lr_scheduler.OneCycleLR(
         optimizer,
         [group["lr"] for group in optimizer.param_groups],

@@ -32,7 +32,7 @@ def test_a_way_leads_from_room_to_room(prior):
     assert way[0].extra["from"] == start.name
     middle = prior.interpolate(way[1].latent, "seed:1", 2)
     np.testing.assert_allclose(middle[0].centers_m, way[1].centers_m, atol=1e-4)
-    with pytest.raises(InputError, match="Room drawn comes from no latent"):
+    with pytest.raises(InputError, match="Room drawn has no latent"):
         prior.interpolate(Scene("drawn", "front3d_bedroom"), end)
     with pytest.raises(InputError, match=r"The vector has a latent of shape \(3,\)"):
         prior.latent(torch.ones(3))
@@ -49,7 +49,7 @@ def test_a_scene_is_saved_as_its_name_says(ending, tmp_path):
 
 
 def test_other_endings_are_a_sentence(tmp_path):
-    with pytest.raises(InputError, match=r"ends with '.stl', which is no format of scenes"):
+    with pytest.raises(InputError, match=r"ends with '.stl', which is not a scene format"):
         Scene("mine", "front3d_bedroom").save(tmp_path / "room.stl")
 
 

@@ -192,7 +192,7 @@ def test_a_typo_names_the_key_the_file_and_the_nearest_key(config, old, new, key
          f"label_set: No label set is called 'attic'; there are {', '.join(LABEL_SETS)}, or write "
          "your own as void,bed,chair."),
         ("label_set: front3d_bedroom", "label_set: 'void,bed,bed'",
-         "label_set: The class 'bed' is twice in the label set"),
+         "label_set: The class 'bed' is in the label set twice"),
         ("loss: {}", "loss: 3", "'loss': input should be a valid dictionary or instance of"),
     ],
 )  # fmt: skip
@@ -237,8 +237,8 @@ def test_set_overrides_what_the_file_says(config):
          ": 'model.latent_space' has no name; add one of sphere, cube."),
         ("method=nerf", f": no method is called 'nerf'; choose from {', '.join(METHODS)}."),
         ("method=[a]", f": no method is called '['a']'; choose from {', '.join(METHODS)}."),
-        ("method=ours", " was written when `method: ours` stood for two methods; they are `paper` "
-         "and `lifted` now, with sections of their own. Train it again with a config of today."),
+        ("method=ours", " was written when `method: ours` stood for two methods; they are now "
+         "`paper` and `lifted`, each with its own sections. Train it again with a current config."),
     ],
 )  # fmt: skip
 def test_an_override_that_cannot_be_is_a_sentence(config, override, said):

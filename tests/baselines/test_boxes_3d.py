@@ -89,15 +89,14 @@ def test_what_needs_a_latent_space_says_that_there_is_none(baseline_run, method)
     with pytest.raises(InputError) as error:
         load_run(run)
     assert str(error.value) == (
-        f"{run} is a run of `method: {method}`, which has no latent space of rooms, and this needs "
-        "one. Take a run of `method: paper` or `lifted`; with this one, `sceneprior synthesize`, "
-        "`eval-fid` and "
-        "`report` work."
+        f"{run} is a run of `method: {method}`, which has no latent space of rooms, and this "
+        "command needs one. Use a run of `method: paper` or `lifted`; this run works with "
+        "`sceneprior synthesize`, `eval-fid` and `report`."
     )
     with pytest.raises(InputError, match=f"and a run of `method: {method}` keeps none; take"):
         decode_training_rooms(load_any_run(run))
     with pytest.raises(
-        InputError, match=f"but `method: {method}` has none; leave out --distribution kernel"
+        InputError, match=f"--distribution kernel chooses .* `method: {method}` has no latents"
     ):
         sample_rooms(load_any_run(run), 2, 0, "kernel")
 

@@ -116,8 +116,8 @@ def test_a_run_is_evaluated_and_reported_by_its_new_rooms_alone(baseline_run, me
     assert scores["mean_objects"] == sum(len(room.objects) for room in rooms) / 4
     report_run(run, tmp_path / "scores.json", tmp_path / "page.html", 0, (), "software")
     page = (tmp_path / "page.html").read_text()
-    assert "New rooms beside real ones" in page and "The sphere unfolding" not in page
+    assert "New rooms beside real ones" in page and "Interpolation on the sphere" not in page
     if method != "gan":
         assert "prior learnt from true boxes in 3D" in page
         assert f"the method {method}, which learns from true boxes in 3D" in page
-        assert "What training saw" not in page and "latent sphere" not in page
+        assert "Training input" not in page and "latent sphere" not in page

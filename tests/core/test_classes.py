@@ -30,9 +30,10 @@ def test_a_list_of_ones_own_is_its_own_name():
         ("attic", "No label set is called 'attic'; there are front3d_bedroom, front3d_living, "
          "scannet, front3d_dining, front3d_library, front3d_kitchen, front3d_all, or write your "
          "own as void,bed,chair."),
-        ("void,bed,bed", "The class 'bed' is twice in the label set; once is enough."),
-        ("void,", "'' is no class name: 1 to 60 printable characters, no space at either end."),
-        ("void," + "x" * 61, "is no class name: 1 to 60 printable characters"),
+        ("void,bed,bed", "The class 'bed' is in the label set twice; list it once."),
+        ("void,", "'' is not a class name; expected 1 to 60 printable characters, without a "
+         "space at either end."),
+        ("void," + "x" * 61, "is not a class name; expected 1 to 60 printable characters"),
     ],
 )  # fmt: skip
 def test_what_is_no_label_set(name, said):
@@ -42,9 +43,9 @@ def test_what_is_no_label_set(name, said):
 
 
 def test_what_is_no_list_of_names():
-    with pytest.raises(InputError, match="The class name 'bed, large' holds a comma, which parts"):
+    with pytest.raises(InputError, match="The class name 'bed, large' has a comma, which sep"):
         label_set_name(["bed, large"])
-    with pytest.raises(InputError, match=r"A label set needs a class beside void\."):
+    with pytest.raises(InputError, match=r"A label set needs at least one class in addition to"):
         label_set_name([])
 
 

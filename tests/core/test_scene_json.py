@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Opening, Scene
+from sceneprior.core.scene import Opening, Scene, SceneObject, Solid
 from sceneprior.core.scene_json import read_scene, scene_to_json
 
 FLOOR = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [2.0, 3.0], [2.0, 2.0], [0.0, 2.0]])
@@ -45,3 +45,30 @@ def test_an_opening_without_a_wall_is_refused(tmp_path, opening, said):
 def test_an_opening_needs_a_floor(tmp_path):
     with pytest.raises(InputError, match="give floor_m, too"):
         read_scene(written(tmp_path, DOOR, floor=None))
+
+
+def with_solid(solid: Solid) -> Scene:
+    chair = SceneObject("chair", (1.0, 0.5, 0.0), (0.5, 1.0, 0.5), solids=(solid,))
+    return Scene("room", "front3d_bedroom", (chair,))
+
+
+def test_solids_come_back(tmp_path):
+    solid = Solid("dome", (0.8, 0.0, -0.25), (1.2, 0.5, 0.25))
+    path = tmp_path / "room.json"
+    path.write_text(json.dumps(scene_to_json(with_solid(solid))))
+    assert read_scene(path).objects[0].solids == (solid,)
+
+
+@pytest.mark.parametrize(
+    ("solid", "said"),
+    [
+        (Solid("box", (-0.2, 0.0, -0.2), (0.2, 0.5, 0.2)), "which is not in its box"),
+        (Solid("box", (0.8, 0.5, -0.2), (1.2, 0.5, 0.2)), "low_m below high_m"),
+        (Solid("box", (0.8, 0.0, -0.2), (1.2, float("nan"), 0.2)), "low_m below high_m"),
+    ],
+)
+def test_solids_elsewhere_are_refused(tmp_path, solid, said):
+    path = tmp_path / "room.json"
+    path.write_text(json.dumps(scene_to_json(with_solid(solid))))
+    with pytest.raises(InputError, match=said):
+        read_scene(path)

@@ -40,8 +40,9 @@ def test_one_room_is_enough_to_train_on(front, tmp_path, prep):
     front.house("house", bedroom("Bedroom-1"))
     made = prep()
     assert made.exit_code == 0 and "train 1 rooms" in made.stdout, made.output
-    assert "Note: the 'test' split is empty. `fit` and `synthesize` need none; eval-fid" in (
-        made.stderr
+    assert (
+        "Note: the 'test' split is empty. `fit` and `synthesize` do not need it, but eval-fid"
+        in (made.stderr)
     )
     front.house("other", bedroom("Bedroom-2"))
     assert "split is empty" not in prep("--out", tmp_path / "two").stderr
@@ -77,12 +78,12 @@ def test_pictures_and_wrong_words(front, tmp_path, prep, cli):
     assert made.exit_code == 3 and "its instanceid, '[/] [bold]'" in made.stdout, made.output
     assert len(list((tmp_path / "shards" / "rgb").glob("*/0000.png"))) == 6
     for words, said in (
-        (("--recipe", "attic"), "No recipe is called 'attic'; there are all, atiss_bedroom,"),
+        (("--recipe", "attic"), "No recipe is called 'attic'; choose from all, atiss_bedroom,"),
         (
             ("--rule", "max_floor_m=wide"),
             "'max_floor_m': input should be a valid number (got 'wide')",
         ),
-        (("--recipe", "library"), "is about (library); there are Bedroom (7)"),
+        (("--recipe", "library"), "selects (library); the folder has Bedroom (7)"),
     ):
         result = cli(
             "prep-front", "--front", front.front, "--future", front.future,

@@ -116,10 +116,10 @@ def test_a_file_must_know_what_is_asked_and_may_know_more(shards):
 def test_what_is_no_reference_is_a_sentence(shards, renderer, generated, tmp_path):
     path = tmp_path / "scores.npz"
     path.write_text("no numbers")
-    with pytest.raises(InputError, match=r"scores\.npz is no reference of `eval-fid`"):
+    with pytest.raises(InputError, match=r"scores\.npz is not a reference file of `eval-fid`"):
         score(generated, shards, renderer, path)
     np.savez(path, other=np.zeros(3))
-    with pytest.raises(InputError, match=r"scores\.npz is no reference of `eval-fid`"):
+    with pytest.raises(InputError, match=r"scores\.npz is not a reference file of `eval-fid`"):
         score(generated, shards, renderer, path)
 
 

@@ -92,15 +92,15 @@ def test_the_page_needs_nothing_outside_itself(page, shards):
 
 def test_every_part_is_there(page):
     for heading in (
-        "New rooms beside real ones", "The sphere unfolding", "Scores", "What training saw",
-        "Training rooms, read back in 3D", "Learning curves", "The commands that made this",
+        "New rooms beside real ones", "Interpolation on the sphere", "Scores", "Training input",
+        "Decoded training rooms", "Learning curves", "Commands that made this page",
     ):  # fmt: skip
         assert f"<h2>{heading}</h2>" in page
     # 4 generated, 4 unfolding, 5 test rooms and 2 pairs, each drawn twice, 6 views, 1 of curves.
     assert page.count("<img") == 2 * (4 + 4 + 5 + 2 * 2) + 6 + 1
     assert "99.1%" in page and "10.0 min" in page and "not FID" in page
     assert "of the Frechet gap to real rooms closed" in page and "Gap closed, from" in page
-    assert "can be compared with the paper" in page
+    assert "cannot be compared with the paper" in page
     assert "100% of 2 classes right, mean 3D box IoU 1.00" in page
 
 
@@ -111,7 +111,7 @@ def test_parts_without_material_are_left_out(shards, renderer, tmp_path):
         renderer=renderer,
     )  # fmt: skip
     page = (tmp_path / "a.html").read_text()
-    assert re.findall("<h2>(.*)</h2>", page) == ["What training saw"]
+    assert re.findall("<h2>(.*)</h2>", page) == ["Training input"]
 
 
 def decode(uri: str) -> np.ndarray:

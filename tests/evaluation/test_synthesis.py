@@ -337,7 +337,7 @@ def test_val_rooms_are_compared_with_where_settings_are_chosen(
     evaluate_synthesis(generated, other, EvalOptions(reference=kept, **given))
     with pytest.raises(InputError, match=r"kept\.npz does not fit: its 'val rooms'"):
         evaluate_synthesis(generated, other, EvalOptions(split="val", reference=kept, **given))
-    with pytest.raises(InputError, match="or with val to choose settings by, but 'train' came"):
+    with pytest.raises(InputError, match="or with val to choose settings, but 'train' was given"):
         EvalOptions(split="train")
 
 
@@ -349,8 +349,8 @@ def test_mostly_empty_rooms_are_told_and_have_no_precision(generated, shards, re
     assert scores["precision_effnet_lite0"] is not None and "are empty" not in scores["note"]
     scores = evaluate_synthesis(half[1:], shards, options)
     assert scores["note"].startswith(
-        "2 of 3 generated rooms are empty, so no other number of theirs can be trusted: train "
-        "longer, and see that `samples/empty_share` falls (docs/cluster.md). Measured on"
+        "2 of 3 generated rooms are empty, so none of the other scores can be trusted: train "
+        "longer, and check that `samples/empty_share` falls (docs/cluster.md). Measured on"
     )
     assert scores["precision_effnet_lite0"] is None
     assert scores["train_rooms"]["precision_effnet_lite0"] is not None

@@ -96,8 +96,8 @@ def test_why_metrics_of_surfaces_stand_on_fewer_objects():
     assert surface_note(3, 3, "SHARDS") is None
     some, none = surface_note(5, 3, "SHARDS"), surface_note(5, 0, "SHARDS")
     assert some.startswith("2 of 5 true objects have a box but no surface")
-    assert "reported only of the 3 that do" in some and "SHARDS may be older" in some
-    assert none.startswith("5 of 5") and "are reported not at all" in none
+    assert "reported only for the other 3" in some and "SHARDS may be older" in some
+    assert none.startswith("5 of 5") and "are reported for none" in none
 
 
 def test_intervals_are_over_rooms_and_not_over_views():

@@ -133,7 +133,7 @@ def test_a_folder_becomes_scenes_that_are_read_back(tmp_path):
         ({"angles": np.zeros((2, 1), complex)}, "must be arrays, the last three of numbers"),
         ({key: np.ones((1001, 3)) for key in ("translations", "sizes")}
          | {"angles": np.zeros(1001), "class_labels": np.ones(1001, int)}, "1001 objects"),
-        ({"class_labels": np.eye(30)[:2]}, "know 30 classes, but 21 names stand for them"),
+        ({"class_labels": np.eye(30)[:2]}, "have 30 columns, but there are 21 names"),
         ({"class_labels": np.array(["desk", "lamp"])}, "'lamp' is not in label set"),
         ({"floor_plan_vertices": np.ones(3), "floor_plan_faces": np.ones(3),
           "floor_plan_centroid": np.ones(3)}, "its floor plan cannot be read"),
@@ -149,7 +149,7 @@ def test_what_is_no_box_list_is_a_sentence(tmp_path, changes, sentence):
 def test_files_that_are_none_are_named(tmp_path):
     for name, content in (("a.npz", "x"), ("a.json", "{"), ("b.json", "[1]")):
         (tmp_path / name).write_text(content)
-        with pytest.raises(InputError, match=f"{name} is no box list"):
+        with pytest.raises(InputError, match=f"{name} is not a box list"):
             read_boxes(tmp_path / name, "a", BEDROOM)
     (tmp_path / "c.json").write_text('{"sizes": []}')
     (tmp_path / "d.json").write_text('{"class_labels": [[1], [1, 2]], "translations": [], "sizes": '

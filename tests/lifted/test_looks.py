@@ -7,8 +7,9 @@ import trimesh
 from parts_of_rooms import CORNER, boxes
 from tiny_runs import tiny_lifted
 
+from sceneprior.core.colliders import mesh_of
 from sceneprior.core.geometry.turns import turn_grids
-from sceneprior.core.parts import Parts, filled_cells
+from sceneprior.core.parts import SQUARE, Parts, filled_cells
 from sceneprior.lifted.looks import LookConfig, LookDecoder
 from sceneprior.lifted.prototypes import POSES, Prototypes, turn_of, turned_extents
 from sceneprior.paper.prior import ScenePrior
@@ -25,7 +26,8 @@ def prior(tmp_path) -> ScenePrior:
 def prototypes() -> Prototypes:
     """Three shapes without symmetry."""
     rng = np.random.default_rng(0)
-    parts = (CORNER, CORNER._replace(ends=CORNER.ends * 0.8), Parts(*(p[1:] for p in CORNER)))
+    later = Parts(*(part[1:] for part in CORNER[:3]), SQUARE.clip(max=[0.25, 0.5]))
+    parts = (CORNER, CORNER._replace(ends=CORNER.ends * 0.8), later)
     grids = np.stack([filled_cells(each, 8, 1.1) for each in parts])
     labels, common = np.array([2, 1, 2]), np.array([True, True, False])
     return Prototypes(parts, grids, rng.uniform(0.5, 2, (3, 3)), labels, common)
@@ -107,3 +109,22 @@ def test_the_prior_decodes_looks_in_place_of_meshes(prior, torch_rng):
     assert scenes.shape_codes.shape == (3, 6, 4)
     assert bare.looks is None and torch.equal(bare.shape_codes, scenes.shape_codes)
     assert torch.equal(bare.centers_m, scenes.centers_m)
+
+
+def test_solids_of_a_look_cover_its_mesh_in_every_pose():
+    """In each pose, the union of the solids has the volume and the middle of the mesh."""
+    decoder = LookConfig(prototypes=1, codes=8, cells=16).build(6)
+    grids = filled_cells(CORNER, 16, 1.1)[None]
+    size_m = np.array([[2.0, 0.5, 1.0]])
+    decoder.learn_prototypes(Prototypes((CORNER,), grids, size_m, np.array([1]), np.ones(1, bool)))
+    center_m = np.random.default_rng(1).normal(size=3)
+    for pose in range(POSES):
+        box = np.array([*center_m, *turned_extents(size_m, pose)[0] * 1.3])
+        mesh = decoder.mesh(pose, box)
+        here = trimesh.Trimesh(mesh.vertices_m, mesh.faces)
+        solids = decoder.solids(pose, box)
+        assert len({tuple(np.round(each[1:], 4).ravel()) for each in solids}) == len(solids)
+        parts = [mesh_of(each) for each in solids]
+        union = trimesh.boolean.union([trimesh.Trimesh(p.vertices_m, p.faces) for p in parts])
+        assert union.volume == pytest.approx(here.volume, rel=0.01)
+        np.testing.assert_allclose(union.center_mass, here.center_mass, atol=0.01)

@@ -42,7 +42,7 @@ def test_new_rooms_come_from_the_sampler_and_others_if_asked(trained):
 def test_runs_without_a_sampler_say_so(toy_run):
     with pytest.raises(InputError, match="has no sampler"):
         sample_rooms(load_run(toy_run), 2, 0, "sampler")
-    with pytest.raises(InputError, match="asked of a sampler alone"):
+    with pytest.raises(InputError, match="Only a sampler can add"):
         complete(load_run(toy_run), [scene(BED)], classes=["desk"])
 
 
@@ -84,7 +84,7 @@ def test_too_many_and_unknown_classes_are_sentences(trained):
     with pytest.raises(InputError, match="are 7 together"):
         complete(trained, [scene(BED)], classes=[some] * 6)
     unseen = "dressing_table"  # in the label set, in no toy room
-    with pytest.raises(InputError, match="no class of this run's training rooms"):
+    with pytest.raises(InputError, match="not a class of this run's training rooms"):
         complete(trained, [scene()], classes=[unseen])
     stool = SceneObject(unseen, (0.0, 0.3, 0.0), (0.5, 0.6, 0.5))
     ((answer,),) = complete(trained, [scene(stool)], count=1)

@@ -2,11 +2,14 @@
 
 import json
 import re
+import shutil
 import struct
+import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from sceneprior.apps.rooms import write_scene, write_scenes
@@ -14,6 +17,7 @@ from sceneprior.core.classes import class_colors
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m, mesh_of_file
 from sceneprior.core.scene_json import scene_to_json
+from sceneprior.render.floor_plans import floor_plan
 from sceneprior.render.offscreen import open_renderer
 from sceneprior.render.scene_files import (
     load_scene,
@@ -85,7 +89,7 @@ def test_what_is_written_comes_back(scene, tmp_path, renderer):
     np.testing.assert_allclose((high + low) / 2, (1.5, 0.25, -0.5), atol=1e-6)
     np.testing.assert_allclose(high - low, (0.5, 0.5, 0.4), atol=1e-6)
     picture = np.asarray(Image.open(tmp_path / "new" / "room_0.png"))
-    np.testing.assert_array_equal(picture, topdown(scene, renderer, outlines=True))
+    np.testing.assert_array_equal(picture, floor_plan(scene, renderer))
     np.testing.assert_array_equal(topdown(back, renderer), topdown(scene, renderer))
 
 
@@ -245,7 +249,7 @@ def test_rooms_need_names_for_their_files(scene, tmp_path, renderer):
 
 
 def test_box_lists_in_place_of_scenes_are_sent_to_their_command(tmp_path):
-    told = r"holds box lists \({}\) and no scenes; `sceneprior export .* --to scenes --label-set"
+    told = r"holds box lists \({}\), not scenes; `sceneprior export .* --to scenes --label-set"
     (tmp_path / "a").mkdir()
     np.savez(tmp_path / "a" / "boxes.npz", class_labels=np.zeros((1, 23)))
     for given in (tmp_path, tmp_path / "a" / "boxes.npz"):
@@ -297,3 +301,40 @@ def test_an_obj_has_a_named_object_each_in_metres_and_its_class_colour(scene, tm
     assert colors[materials["1_nightstand"]] != colors[materials["0_double_bed"]]
     save_scene(replace(scene, objects=()), tmp_path / "none.obj")
     assert (tmp_path / "none.obj").read_text() == ""
+
+
+def test_a_room_with_walls_is_read_as_its_furniture(tmp_path):
+    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
+    scene = Scene("a", "front3d_bedroom", (bed,))
+    for ending in (".glb", ".obj", ".json"):
+        save_scene(scene, tmp_path / f"a{ending}", shell="walls")
+    loaded = trimesh.load_scene(tmp_path / "a.glb")
+    shell = ["floor", "wall_0", "wall_1", "wall_2", "wall_3", "ceiling"]
+    assert set(loaded.graph.nodes_geometry) == {"0_double_bed", *shell}
+    assert loaded.bounds[0] == pytest.approx([-1.2, -0.1, -1.3])
+    named = re.findall(r"^o (.*)$", (tmp_path / "a.obj").read_text(), re.MULTILINE)
+    assert sorted(named) == sorted(["0_double_bed", *shell])
+    (item,) = load_scene(tmp_path / "a.json").objects
+    assert len(item.mesh.faces) == 12
+
+
+VALIDATE = """
+const validator = require("gltf-validator");
+const bytes = new Uint8Array(require("fs").readFileSync(process.argv[1]));
+validator.validateBytes(bytes).then(report => console.log(JSON.stringify(report.issues)));
+"""
+
+
+@pytest.mark.parametrize("shell", ["none", "floor", "walls"])
+def test_the_gltf_validator_finds_nothing(tmp_path, shell):
+    """By gltf-validator of npm: `npm install gltf-validator`, and NODE_PATH names node_modules."""
+    known = shutil.which("node") and subprocess.run(
+        ["node", "-e", "require('gltf-validator')"], capture_output=True
+    )
+    if not known or known.returncode:
+        pytest.skip("no gltf-validator here: npm install gltf-validator, and set NODE_PATH")
+    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
+    save_scene(Scene("a", "front3d_bedroom", (bed,)), tmp_path / "a.glb", shell=shell)
+    command = ["node", "-e", VALIDATE, str(tmp_path / "a.glb")]
+    issues = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]

@@ -173,7 +173,7 @@ def test_ctrl_c_at_the_command_saves_and_resume_finishes(toy_shards, tmp_path, s
     _, errors = process.communicate(timeout=400)
     assert process.returncode == 130
     go_on = f"sceneprior fit --config {run / 'config.yaml'} --run {run} --resume"
-    assert f"Stopped and saved. Go on with: {go_on}" in errors
+    assert f"Stopped and saved. Continue with: {go_on}" in errors
     assert "Traceback" not in errors
     assert not list(run.rglob("*.part")) and not (run / "layout" / "final.ckpt").exists()
     reached = read_checkpoint(run / "layout" / "last.ckpt")["epoch"]
@@ -255,11 +255,11 @@ def test_damaged_or_foreign_checkpoints_are_sentences(toy_run, tmp_path):
     for path in run.rglob("*.ckpt"):
         path.unlink()
     with pytest.raises(
-        InputError, match=r"holds no checkpoint yet; let `sceneprior fit --config .*config.yaml"
+        InputError, match=r"holds no checkpoint yet; continue .* --config .*config.yaml"
     ):
         load_run(run)
     with pytest.raises(
-        InputError, match=r"is not a run folder: there is no config.yaml in it, .* train one"
+        InputError, match=r"is not a run folder: it has no config.yaml .* train a run"
     ):
         load_run(tmp_path)
 
@@ -291,7 +291,7 @@ def _zip_of_a_text(path):
     [
         (lambda path: path.write_bytes(path.read_bytes()[:-3000]), "it is damaged. Delete it"),
         (_zip_of_a_text, "it is damaged. Delete it"),
-        (lambda path: torch.save([1, 2], path), "is no checkpoint of `sceneprior fit` (no state"),
+        (lambda path: torch.save([1, 2], path), "is not a checkpoint of `sceneprior fit` (it"),
         (lambda path: torch.save({"state_dict": {}}, path), "it has no epoch. Delete it, and"),
     ],
     ids=["truncated", "zip", "list", "weights"],

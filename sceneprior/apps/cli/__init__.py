@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def _stopped() -> NoReturn:
-    print("Stopped by Ctrl-C. Every file that was written is whole.", file=sys.stderr)
+    print("Stopped by Ctrl-C. No file is left half-written.", file=sys.stderr)
     sys.exit(130)
 
 

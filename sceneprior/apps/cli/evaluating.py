@@ -62,8 +62,8 @@ def eval_fid(
     """Compare generated rooms with test rooms, by all metrics of docs/evaluation.md.
 
     FID and KID are computed only with --inception, the user's Inception network. Without it, the
-    Frechet and kernel distances use EfficientNet-Lite0 features; they are not FID, and their values
-    cannot be compared with it. The protocol is written with the scores.
+    Frechet and kernel distances use EfficientNet-Lite0 features; they are not FID or KID, and their
+    values cannot be compared with FID or KID. The protocol is written with the scores.
     """
     from sceneprior.apps.experiments.evaluate import evaluate_folder, evaluate_run
     from sceneprior.evaluation.score_table import print_scores
@@ -71,8 +71,8 @@ def eval_fid(
 
     if run is not None and scenes is not None:
         raise InputError(
-            "Both --run and --scenes came; give --run to evaluate what a run generates, or "
-            "--scenes to evaluate scenes that are there."
+            "Both --run and --scenes were given; give --run to evaluate rooms that a run "
+            "generates, or --scenes to evaluate existing scenes."
         )
     options = EvalOptions(seed, inception, alexnet, reference, split, boxes, resamples, renderer)
     if run is not None:

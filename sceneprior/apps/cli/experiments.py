@@ -50,8 +50,8 @@ def compare(
     if done.left_out:
         typer.echo(
             "Not in the table, since trained or evaluated otherwise (settings, rooms, seed, "
-            f"renderer or weights): {'; '.join(done.left_out)}. Ask for them as well, and they are "
-            "evaluated again.",
+            f"renderer or weights): {'; '.join(done.left_out)}. Name them in the options to "
+            "evaluate them again.",
             err=True,
         )
     if done.failures:

@@ -11,12 +11,21 @@ import typer
 from sceneprior.apps.cli.options import (
     MODELS_HELP,
     CacheOption,
+    CeilingOption,
     CountOption,
     DistributionOption,
+    FloorOption,
+    OpeningsOption,
     OverwriteOption,
     RendererOption,
+    RequestOption,
     RunOption,
     SeedOption,
+    ShellOption,
+    WantOption,
+    checked_shell,
+    note_unmet,
+    request_of,
 )
 
 
@@ -26,13 +35,22 @@ def synthesize(
     count: CountOption = 16,
     seed: SeedOption = 0,
     distribution: DistributionOption = None,
+    floor: FloorOption = None,
+    openings: OpeningsOption = None,
+    ceiling: CeilingOption = None,
+    want: WantOption = None,
+    request: RequestOption = None,
     html: Annotated[
         bool, typer.Option("--html", help="Write rooms.html, too: one page of 3D models.")
     ] = False,
+    shell: ShellOption = None,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
 ) -> None:
-    """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them."""
+    """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them.
+
+    Without --shell, GLBs hold furniture only.
+    """
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import PAGE_FILE, check_free, write_scenes
     from sceneprior.evaluation.metrics.contents import emptiness
@@ -40,10 +58,13 @@ def synthesize(
     from sceneprior.render.offscreen import open_renderer
 
     check_free(out, overwrite)
+    drawn = checked_shell(shell or "none")
+    asked = request_of(floor, openings, ceiling, want, request)
     prior = load(run)
     artist = open_renderer(renderer)
-    scenes = prior.sample(count, seed, distribution)
-    write_scenes(scenes, out, artist)
+    scenes = prior.sample(count, seed, distribution, **asked)
+    write_scenes(scenes, out, artist, drawn)
+    note_unmet(scenes)
     origin = distribution or prior.distribution
     if html:
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
@@ -90,11 +111,12 @@ def complete(
         str | None,
         typer.Option(help="Classes of the objects to add: double_bed,nightstand (samplers only)."),
     ] = None,
+    want: WantOption = None,
     distribution: DistributionOption = None,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
 ) -> None:
-    """Complete a room of which some objects, or the floor, are given."""
+    """Complete a room, given some objects and optionally the floor."""
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.render.offscreen import open_renderer
@@ -104,10 +126,11 @@ def complete(
     scene = load_scene(given)
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
     prior = load(run)
-    scenes = prior.complete(scene, count, seed, distribution, wanted)
+    scenes = prior.complete(scene, count, seed, distribution, wanted, want)
     write_scenes(scenes, out, open_renderer(renderer))
-    how = "drawn by the sampler" if scenes[0].latent is None else "of fitted latents"
-    typer.echo(f"Wrote {count} rooms round {len(scene.objects)} given objects, {how}, to {out}")
+    note_unmet(scenes)
+    how = "drawn by the sampler" if scenes[0].latent is None else "decoded from fitted latents"
+    typer.echo(f"Wrote {count} rooms around {len(scene.objects)} given objects, {how}, to {out}")
     for room in scenes:
         if lacking := room.extra.get("no_place"):
             typer.echo(f"Note: {room.name} has no place for {', '.join(lacking)}.", err=True)

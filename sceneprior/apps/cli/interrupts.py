@@ -26,11 +26,11 @@ def answering_ctrl_c() -> Iterator[Callable[[], bool]]:
     """Raise a KeyboardInterrupt on Ctrl-C, and repeat it until it is handled.
 
     Python drops exceptions raised in callbacks of the garbage collector, and some libraries catch
-    all exceptions while they import. Therefore Ctrl-C starts a timer: whenever it fires and no
-    KeyboardInterrupt is being handled, the previous one was dropped, and it is raised again.
+    all exceptions while they import. Therefore Ctrl-C starts a timer: if no KeyboardInterrupt is
+    being handled when the timer fires, the previous one was dropped, and it is raised again.
 
-    A process that ignores Ctrl-C, as shells start it in the background, keeps ignoring it. Ctrl-C
-    is also ignored while the process exits.
+    A process that was started to ignore Ctrl-C, such as a shell's background process, keeps
+    ignoring it. Ctrl-C is also ignored while the process exits.
 
     Yields:
         A function that returns True after Ctrl-C was pressed.

@@ -1,12 +1,17 @@
 """Options that several commands share."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.seeds import LARGEST_SEED
+
+if TYPE_CHECKING:
+    from sceneprior.core.scene import Scene
+    from sceneprior.core.shell import ShellName
 
 RendererOption = Annotated[
     str, typer.Option(help="Renderer of the pictures: auto, pyrender or software (without GL).")
@@ -32,7 +37,36 @@ SeedOption = Annotated[
         min=0, max=LARGEST_SEED, help="Seed of all random choices: the same seed, the same result."
     ),
 ]
+FloorOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Floor of the rooms: 4x3 (metres along x and z), or a file with a floor (FILE, or "
+        "FILE:ROOM of a 3D-FRONT house); samplers only."
+    ),
+]
+OpeningsOption = Annotated[
+    str | None,
+    typer.Option(help="Doors and windows: door,window@north,door@south:1.5 (samplers only)."),
+]
+CeilingOption = Annotated[
+    float | None, typer.Option(help="Height of the ceiling in metres (samplers only).")
+]
+WantOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Wishes, as a sentence: 'a double bed and two nightstands beside it' (samplers only)."
+    ),
+]
+RequestOption = Annotated[
+    Path | None, typer.Option(help="JSON of a request: floor, openings, wishes (samplers only).")
+]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+ShellOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Parts of the room itself to write: walls (with floor and ceiling), floor, or none."
+    ),
+]
 InceptionOption = Annotated[
     Path | None, typer.Option(help="The file inception-2015-12-05.pt (TorchScript), for FID.")
 ]
@@ -49,6 +83,28 @@ CacheOption = Annotated[
 ]
 
 
+def request_of(
+    floor: str | None,
+    openings: str | None,
+    ceiling: float | None,
+    want: str | None,
+    request: Path | None,
+) -> dict[str, Any]:
+    """Arguments of `Prior.sample` from the options of a request and its file."""
+    from sceneprior.apps.requests import load_request, merged
+
+    asked = {"floor": floor, "openings": openings, "ceiling_m": ceiling, "want": want}
+    return merged(asked, {} if request is None else load_request(request))
+
+
+def note_unmet(scenes: Sequence["Scene"]) -> None:
+    """Tell which wishes do not hold, by room."""
+    for room in scenes:
+        unmet = [each["wish"] for each in room.extra.get("wishes", []) if not each["holds"]]
+        if unmet:
+            typer.echo(f"Note: in {room.name} these do not hold: {', '.join(unmet)}.", err=True)
+
+
 def result_file(run: str, out: Path | None, name: str) -> Path:
     """The file of a run's results: `out` if given, else `name` in the run's folder."""
     from sceneprior.apps.priors.where import find_prior
@@ -57,8 +113,18 @@ def result_file(run: str, out: Path | None, name: str) -> Path:
         return checked_target(out)
     folder = find_prior(run)
     if folder != Path(run) or not folder.is_dir():
-        raise InputError(f"{run} is no folder to keep {name} in; name a file with --out.")
+        raise InputError(f"{run} is not a folder that {name} could go to; name a file with --out.")
     return checked_target(folder / name)
+
+
+def checked_shell(shell: str) -> "ShellName":
+    """Check the value of `--shell`."""
+    from sceneprior.core.shell import SHELLS
+
+    for known in SHELLS:
+        if shell == known:
+            return known
+    raise InputError(f"--shell {shell} is not known; choose from {', '.join(SHELLS)}.")
 
 
 def checked_target(target: Path) -> Path:

@@ -72,13 +72,13 @@ def reconstruct(
     ways = [mask is not None, room is not None, split is not None]
     if sum(ways) != 1 or (shards is None) != (mask is not None):
         raise InputError(
-            "Say what to reconstruct from, in one way: --shards with --room (and --view) or with "
-            "--split; or --mask with --intrinsics (and --classes)."
+            "Say what to reconstruct from, in exactly one way: --shards with --room (and --view); "
+            "--shards with --split; or --mask with --intrinsics (and --classes)."
         )
     if mask is None and any(given is not None for given in (classes, intrinsics, pose, gravity)):
         raise InputError("--classes, --intrinsics, --pose and --gravity belong to --mask.")
     if pose is not None and gravity is not None:
-        raise InputError("--pose says where things fall, too; leave out --gravity.")
+        raise InputError("--pose already gives the direction of gravity; leave out --gravity.")
     if (limit is not None and split is None) or (view and room is None):
         raise InputError("--limit belongs to --split, and --view to --room.")
     check_free(out, overwrite)
@@ -86,8 +86,8 @@ def reconstruct(
     notes = []
     if shards is None:
         if mask is None or intrinsics is None:
-            raise InputError("--mask needs --intrinsics beside it, and a PNG --classes, too.")
-        # A fit object by object does not depend on the side of the room.
+            raise InputError("--mask needs --intrinsics and, for a PNG, --classes.")
+        # A fit object by object does not depend on the side of the room that the camera is at.
         sides = 1 if fit == OBJECTS else QUARTERS
         own = read_own_image(
             mask, classes, intrinsics, prior.label_set, pose, camera_height, sides, gravity
@@ -109,7 +109,7 @@ def reconstruct(
     taken_for = {pair for one in found for pair in one.taken_for.items()}
     for name, other in sorted(taken_for):
         typer.echo(
-            f"Note: the run never generates the class {name}; a {other} stands for it.", err=True
+            f"Note: the run never generates the class {name}; a {other} is used instead.", err=True
         )
     artist = open_renderer(renderer)
     write_reconstructions(found, out, artist)
@@ -125,7 +125,7 @@ def eval_svr(
         Path | None, typer.Option(help="Scenes of `reconstruct` or `retrieve`, in place of --run.")
     ] = None,
     split: Annotated[str, typer.Option(help="Split: train, val or test.")] = "test",
-    views: Annotated[int, typer.Option(min=1, help="Views of each room, at the most.")] = 1,
+    views: Annotated[int, typer.Option(min=1, help="Largest number of views per room.")] = 1,
     limit: LimitOption = None,
     out: Annotated[
         Path | None, typer.Option(help="JSON file (default: svr.json in RUN or SCENES).")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.apps.cli.options import OverwriteOption
+from sceneprior.apps.cli.options import OverwriteOption, ShellOption, checked_shell
 from sceneprior.core.errors import InputError
 
 
@@ -37,7 +37,7 @@ def pack(
     from sceneprior.paper.trained import TrainedPrior
 
     if out.exists() and (out.is_dir() or not overwrite):
-        raise InputError(f"{out} is there; name another file, or replace a file by --overwrite.")
+        raise InputError(f"{out} already exists; name another file, or add --overwrite.")
     found = scores or run / "scores.json"
     measured = read_json(found) if scores is not None or found.is_file() else None
     stated = None if about is None else _text_of(about)
@@ -48,14 +48,14 @@ def pack(
     typer.echo(f"Wrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
     if stated is None:
         typer.echo(
-            "Note: the card says nothing of the data's authors and licence; --about adds it.",
+            "Note: the card does not state the data's authors and licence; --about adds them.",
             err=True,
         )
     alone = isinstance(trained, TrainedPrior) and trained.distribution not in (SAMPLER, "paper")
     if alone and not latents:
         typer.echo(
-            f"Note: the run draws rooms by '{trained.distribution}', which needs --latents; of "
-            "this file they come from `paper`.",
+            f"Note: the run draws rooms from '{trained.distribution}', which needs --latents; with "
+            "this file they are drawn from 'paper'.",
             err=True,
         )
 
@@ -65,7 +65,7 @@ def _text_of(path: Path) -> str:
     from sceneprior.apps.priors.packed import CARD, LARGEST
 
     if not path.is_file():
-        raise InputError(f"{path} cannot be read: it is missing, or no regular file.")
+        raise InputError(f"{path} cannot be read: it is missing or not a regular file.")
     try:
         with path.open() as file:
             return file.read(LARGEST[CARD])  # a card with a longer text is refused later
@@ -100,7 +100,12 @@ def export(
     source: Annotated[
         Path, typer.Argument(help="Folder of scenes, or of box lists for `--to scenes`.")
     ],
-    to: Annotated[str, typer.Option(help="Format: atiss, threed-front, obj or usd; or scenes.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            help="Format: mujoco, usd, habitat, sceneeval, obj, atiss, threed-front; or scenes."
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
     label_set: Annotated[
         str | None, typer.Option(help="Label set of box lists, such as front3d_bedroom.")
@@ -113,9 +118,13 @@ def export(
         str | None,
         typer.Option(help="Extents in box lists: half, as ATISS writes them (default), or full."),
     ] = None,
+    shell: ShellOption = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Export scenes to another format, or convert box lists, such as ATISS's, to scenes."""
+    """Export scenes to another format, or convert box lists, such as ATISS's, to scenes.
+
+    Simulators get walls unless --shell says otherwise, and objects that stand and lie apart.
+    """
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.interchange.box_lists import read_box_lists
     from sceneprior.interchange.export import export_scenes
@@ -125,13 +134,14 @@ def export(
     check_free(out, overwrite)
     if to == "scenes":
         if label_set is None:
-            raise InputError("--to scenes needs --label-set: that of the box lists' classes.")
+            raise InputError("--to scenes needs --label-set, the label set of the box lists.")
         rooms = read_box_lists(source, label_set, classes, sizes or "half")
         write_scenes(rooms, out, SoftwareRenderer())
     else:
         if (label_set, classes, sizes) != (None, None, None):
-            raise InputError("--label-set, --classes and --sizes are of box lists: --to scenes.")
+            raise InputError("--label-set, --classes and --sizes apply only with --to scenes.")
         rooms = load_scene_folder(source)
-        for note in export_scenes(rooms, to, out):
+        asked = None if shell is None else checked_shell(shell)
+        for note in export_scenes(rooms, to, out, asked):
             typer.echo(f"Note: {note}", err=True)
     typer.echo(f"Wrote {len(rooms)} rooms to {out}")

@@ -46,7 +46,7 @@ def fit(
         said = "Stopped before training began; run the same command again."
         if saved.is_file():
             go_on = f"sceneprior fit --config {saved} --run {folder} --resume"
-            said = f"Stopped and saved. Go on with: {go_on}"
+            said = f"Stopped and saved. Continue with: {go_on}"
         typer.echo(said, err=True)
         raise typer.Exit(130) from None
     typer.echo(f"Trained: {folder}")

@@ -1,1 +1,1 @@
-"""Commands in a row: evaluation of runs, comparisons of methods, the demo."""
+"""Experiments: evaluation of runs, comparisons of methods, and the demo."""

@@ -1,7 +1,7 @@
 """Trains and evaluates the runs of a comparison, and writes its tables and pictures.
 
-A run is a `fit` and the commands that score it, or these alone where scenes are there; what is done
-is kept.
+A run consists of `fit` and the commands that score it; for existing scenes, of the scoring commands
+alone. Finished commands are not repeated.
 """
 
 import hashlib
@@ -30,18 +30,18 @@ from sceneprior.evaluation.networks import check_inception
 from sceneprior.render.offscreen import open_renderer
 
 OF_SHARDS = "shards"
-"""In place of a folder of CAD models: those of the training rooms."""
+"""Value of `cad_models` that selects the CAD models of the training rooms."""
 
 
 @dataclass(frozen=True)
 class CompareOptions:
-    """Options by which all runs of a comparison are trained and evaluated."""
+    """Options for training and evaluating all runs of a comparison."""
 
     renderer: str = "auto"
     inception: Path | None = None
     """NVIDIA's `inception-2015-12-05.pt`; None leaves FID out."""
     accelerator: str = "auto"
-    """That trains the runs, one device each: Lightning's word."""
+    """Lightning's name of the accelerator; each run is trained on one device."""
 
 
 @dataclass(frozen=True)
@@ -49,28 +49,28 @@ class Compared:
     """Outcome of a call of `compare`."""
 
     table: Path | None
-    """None where no run is done."""
+    """File of the table; None if no run is done."""
     failures: list[str]
     """A sentence for each run that failed; the table is written without it."""
     left_out: list[str]
-    """Runs that were trained or evaluated otherwise than the table's."""
+    """Titles of runs that were trained or evaluated with other settings than the runs in the
+    table."""
 
 
 def compare(
     comparison: Comparison, part: Comparison, out: Path, options: CompareOptions
 ) -> Compared:
-    """Train and evaluate the runs of a part that are not done yet, then write `table.*` and the
-    pictures of all that is done.
+    """Finish the runs of `part`, then write tables and pictures of all finished runs.
 
-    A run lies in `<rooms>/<method>/seed<k>/` of `out`, and the tables beside. Ctrl-C, SIGTERM and
-    SIGHUP raise KeyboardInterrupt; the same call goes on.
+    The folder of a run is `<out>/<rooms>/<method>/seed<k>/`; tables and pictures are written to
+    `out`. Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
     """
     if options.inception is not None:
         check_inception(options.inception)
     renderer = open_renderer(options.renderer)
     count = cache(partial(count_of, comparison))
     for rooms in part.rooms:
-        count(rooms)  # refuses shards before anything is trained
+        count(rooms)  # unusable shards raise here, before anything is trained
     asked, done, failures, left_out = runs_of(part, out), [], [], []
     with open_runner(out) as runner:
         for run in runs_of(comparison, out):
@@ -94,12 +94,12 @@ def compare(
 
 
 def _do(runner: StepRunner, run: Run, steps: list[Step]) -> str | None:
-    """Do the steps of a run that are not done; a sentence where one fails."""
+    """Run the unfinished steps of a run; returns a sentence if one fails, else None."""
     try:
         if not keeps_settings(run):
             raise InputError(
-                f"{run.folder} holds a run of other settings than the comparison now asks for; "
-                "delete it to train anew, or name another --out."
+                f"{run.folder} holds a run with other settings than those of the comparison; "
+                "delete it to train again, or name another --out."
             )
         for step in steps:
             if not is_done(step, run.folder):
@@ -112,7 +112,11 @@ def _do(runner: StepRunner, run: Run, steps: list[Step]) -> str | None:
 
 
 def count_of(comparison: Comparison, rooms: str) -> int | None:
-    """Rooms that each run generates, or test rooms whose views it answers; None: all."""
+    """Number of rooms that each run generates, or of test rooms whose views each run reconstructs.
+
+    None means all test rooms. Raises InputError if single views are compared and the test rooms
+    have no 3D ground truth.
+    """
     shards = shards_of(comparison, rooms)
     if isinstance(comparison, ViewComparison):
         if not known_in_3d(shards, "test"):
@@ -128,7 +132,7 @@ def count_of(comparison: Comparison, rooms: str) -> int | None:
 def steps_of(
     comparison: Comparison, run: Run, count: int | None, options: CompareOptions
 ) -> list[Step]:
-    """The commands of a run: `fit`, if it is not of scenes, and those that score it."""
+    """The commands of a run: `fit`, unless the run is a folder of scenes, and its scoring steps."""
     scoring = scoring_steps(comparison, run, count, options)
     if run.scenes is not None:
         return scoring
@@ -142,16 +146,17 @@ def steps_of(
         "fit",
         [*words, *device, "--resume"],
         result=folder / last / "final.ckpt",
-        depends_on=[],  # never redone for other settings, but refused (`keeps_settings`)
+        depends_on=[],  # other settings do not repeat `fit`: `keeps_settings` refuses the run
         continues=folder / "config.yaml",
     )
     return [fit, *scoring]
 
 
 def keeps_settings(run: Run) -> bool:
-    """Test whether a run's folder is free, or holds a run trained with the settings wanted now.
+    """True if a run's folder is free, or holds a run that was trained with the run's settings.
 
-    The distribution that rooms are drawn from by default has no part in training, and rows name it.
+    The section `sampling` is not compared: it has no effect on training, and rows name the
+    distribution.
     """
     saved = run.folder / "run" / "config.yaml"
     if not saved.is_file():
@@ -160,16 +165,16 @@ def keeps_settings(run: Run) -> bool:
     try:
         kept = load_config(str(saved))
     except InputError:
-        return False  # of another version, or damaged
+        return False  # written by another version, or damaged
     return kept.model_dump(exclude={"sampling"}) == wanted.model_dump(exclude={"sampling"})
 
 
 def scoring_steps(
     comparison: Comparison, run: Run, count: int | None, options: CompareOptions
 ) -> list[Step]:
-    """`eval-fid` or `eval-svr` of a run, once for each of its variants.
+    """`eval-fid` or `eval-svr` of a run, once for each of the run's variants.
 
-    They depend on what the rows of one table have in common.
+    These steps depend on the settings that all rows of a table share.
     """
     shards, state = str(shards_of(comparison, run.rooms)), []
     source = ["--run", str(run.folder / "run")]
@@ -186,7 +191,7 @@ def scoring_steps(
         command, option = "eval-fid", "--distribution"
         if run.scenes is not None:
             source, state = ["--scenes", str(run.scenes), "--shards", shards], [_state(run.scenes)]
-        # Some methods decode meshes and some have boxes alone: --boxes compares what all have.
+        # Some methods decode meshes, others boxes only; --boxes compares the boxes of all methods.
         alike = ["-n", str(count), *seed, "--boxes", *renderer]
         if options.inception is not None:
             alike += ["--inception", str(options.inception)]
@@ -199,7 +204,7 @@ def scoring_steps(
 
 
 def _state(scenes: Path) -> str:
-    """A word that changes with the files of a folder of scenes; they are not read."""
+    """A fingerprint of a folder of scenes that changes with its files; the files are not read."""
     files = sorted(path for path in scenes.glob("*") if path.suffix in (".json", ".glb"))
     found = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
     return hashlib.sha256(repr((str(scenes), found)).encode()).hexdigest()

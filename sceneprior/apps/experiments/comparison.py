@@ -1,4 +1,4 @@
-"""Settings of `sceneprior compare`, and the runs that they ask for."""
+"""Settings of `sceneprior compare`, and the runs that result from them."""
 
 import json
 from dataclasses import dataclass
@@ -19,30 +19,31 @@ from sceneprior.training.method import RunConfig
 
 _T = TypeVar("_T")
 EVERY = "every"
-"""In `Method.set`: settings for every kind of room."""
+"""Key of `Method.set` for settings that apply to every kind of room."""
 
 
 class Rooms(Section):
     """A kind of room to compare on."""
 
     config: str
-    """Run config of the paper's or the lifted method; its rooms are those of all methods."""
+    """Run config of the paper's or the lifted method; all methods use the rooms of this config."""
     title: str
-    """Heading of its table."""
+    """Heading of the table of these rooms."""
 
 
 class Method(Section):
-    """One side of a comparison: a method to train, or scenes that exist."""
+    """One method of a comparison: a method to train, or existing scenes."""
 
     title: str | None = None
-    """Title of its rows. None: named by its config (`makers.py`), which only the paper's and the
-    lifted method are; their variations need a title, to which the table adds what they learn from
-    and how they draw rooms."""
+    """Title of the method's rows. None takes the title from the config (`makers.py`), which works
+    only for the paper's and the lifted method. Variations of these need a title; the table appends
+    the kind of supervision and the distribution."""
     config: str | None = None
-    """The method's own run config; None: that of the rooms. Label set, shards, seed and, where it
-    has the key, `model.max_objects` are the rooms' in either case."""
+    """The method's own run config; None takes the config of the rooms. Label set, shards, seed and
+    `model.max_objects` (if the config has this key) come from the rooms in either case."""
     set: dict[str, list[str]] = Field(default_factory=dict)
-    """Changes to the config as `section.key=value`, by kind of room; those for `every` first."""
+    """Changes to the config as `section.key=value`, by kind of room; changes under `every` are
+    applied first."""
     scenes: dict[str, str] = Field(default_factory=dict)
     """Folders of scenes, by kind of room, instead of `config` and `set`: nothing is trained, and
     the scenes are evaluated as they are."""
@@ -52,20 +53,20 @@ class Method(Section):
         if self.scenes and (self.config is not None or self.set):
             raise ValueError(
                 "scenes are evaluated as they are, so `config` and `set` have no effect on them; "
-                "leave out either"
+                "leave out `scenes`, or `config` and `set`"
             )
         if self.scenes and self.title is None:
-            raise ValueError("scenes need a title: no config says what made them")
+            raise ValueError("scenes need a title, since no config names their method")
         return self
 
 
 class Comparison(Section):
-    """Methods by kinds of rooms by seeds."""
+    """A comparison: every method is run on every kind of room with every seed."""
 
     seeds: tuple[int, ...] = Field(min_length=1, strict=False)
-    """A run each; the seed of training."""
+    """Seeds of training; each gives one run."""
     sampling_seed: int = Field(0, ge=0, le=LARGEST_SEED)
-    """Seed of the generated rooms, or of the views to answer, the same for every run."""
+    """Seed of the generated rooms, or of the views to reconstruct, the same for every run."""
     rooms: dict[str, Rooms] = Field(min_length=1)
     methods: dict[str, Method] = Field(min_length=1)
 
@@ -73,7 +74,7 @@ class Comparison(Section):
     @classmethod
     def _each_once(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
         if len(set(seeds)) < len(seeds) or min(seeds) < 0:
-            raise ValueError("seeds are numbers from 0 on, each once")
+            raise ValueError("seeds must be distinct integers of at least 0")
         return seeds
 
     @model_validator(mode="after")
@@ -99,13 +100,13 @@ class RoomComparison(Comparison):
 
     task: Literal["new_rooms"] = "new_rooms"
     count: int | None = Field(None, ge=2)
-    """Rooms that each run generates and is evaluated by. None: as many as there are training rooms,
-    the numbers at which Frechet distances compare with those of the reference rows."""
+    """Number of rooms that each run generates for its evaluation. None takes the number of training
+    rooms, at which Frechet distances can be compared with those of the reference rows."""
     distributions: tuple[Literal["paper", "kernel"], ...] = Field(
         ("paper", "kernel"), min_length=1, strict=False
     )
-    """Distributions of latents by which priors that remember training rooms are evaluated, a row
-    each. Pictures show the first. Methods without such latents have their own."""
+    """Distributions of latents for evaluating priors that keep the latents of training rooms, one
+    row each. Pictures show the first. Other methods are evaluated with their own distribution."""
 
 
 class ViewComparison(Comparison):
@@ -113,49 +114,49 @@ class ViewComparison(Comparison):
 
     task: Literal["single_views"] = "single_views"
     count: int | None = Field(None, ge=1)
-    """Test rooms whose views are answered; None: all."""
+    """Number of test rooms whose views are reconstructed; None: all."""
     views: int = Field(1, ge=1)
-    """Views answered of each test room; all where a room has fewer."""
+    """Number of views reconstructed per test room; all if a room has fewer."""
     fits: tuple[Literal["objects", "paper"], ...] = Field(("objects",), min_length=1, strict=False)
-    """Fits by which runs that remember rooms answer, as `eval-svr --fit`, a row each. Other methods
-    have their own."""
+    """Values of `eval-svr --fit` for runs that keep the latents of training rooms, one row each.
+    Other methods reconstruct in their own way."""
     cad_models: str | None = None
-    """Value of `eval-svr --models`: a folder of CAD models, or `shards` for those of the training
-    rooms. Null: no rows with CAD models."""
+    """Value of `eval-svr --models`: a folder of CAD models, or `shards` for the CAD models of the
+    training rooms. Null leaves out the rows with CAD models."""
 
     @model_validator(mode="after")
     def _answers_the_same_views(self) -> "ViewComparison":
         for key, method in self.methods.items():
             if method.scenes:
                 raise ValueError(
-                    f"methods.{key}.scenes: each method answers views that the comparison draws; "
-                    "score scenes that are there with `sceneprior eval-svr --scenes`"
+                    f"methods.{key}.scenes: the comparison chooses the views to reconstruct; "
+                    "score existing scenes with `sceneprior eval-svr --scenes`"
                 )
         return self
 
 
 TASKS: dict[str, type[Comparison]] = {"new_rooms": RoomComparison, "single_views": ViewComparison}
-"""Comparisons by the value of their key `task`."""
+"""Class of the comparison, by the value of the key `task`."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One training with one seed, or a folder of scenes, which needs none; and where it goes."""
+    """One training with one seed, or a folder of scenes, which needs no training."""
 
     rooms: str
     method: str
     seed: int | None
-    """None of scenes."""
+    """Seed of training; None for scenes."""
     config: str
     settings: tuple[str, ...]
     """Changes to the config, for `fit --set`."""
     folder: Path
     scenes: Path | None = None
-    """Scenes that are there, of any method; None of what is trained."""
+    """Folder of existing scenes, made by any method; None for a method to train."""
 
     @property
     def run_config(self) -> RunConfig:
-        """The settings that the run is trained with; of scenes, those of their kind of rooms."""
+        """The settings of the run's training; for scenes, the config of their kind of rooms."""
         return load_config(self.config, self.settings)
 
     @property
@@ -166,16 +167,16 @@ class Run:
 
 @dataclass(frozen=True)
 class Variant:
-    """A way in which a run makes rooms or answers: a command that scores it, and a row."""
+    """One way in which a run makes rooms or reconstructions; each has a command and a table row."""
 
     name: str | None
-    """Value of `--distribution` or `--fit`; None is the run's own way."""
+    """Value of `--distribution` or `--fit`; None leaves the option out."""
     title: str
-    """Title of the row; empty where neither the comparison nor a config gives one."""
+    """Title of the row; empty if neither the comparison nor a config gives one."""
     made_by: str
-    """Maker of its rooms or answers, as captions say it (`Maker.said`)."""
+    """Maker of the rooms or reconstructions, as named in captions (`Maker.said`)."""
     result: Path
-    """File of its scores."""
+    """File of the variant's scores."""
 
 
 def load_comparison(name: str) -> Comparison:
@@ -204,7 +205,7 @@ def load_comparison(name: str) -> Comparison:
 def part_of(
     comparison: Comparison, methods: str | None, rooms: str | None, seeds: str | None
 ) -> Comparison:
-    """Some methods, kinds of rooms and seeds of a comparison, each given as `a,b`; None is all."""
+    """A comparison of some methods, kinds of rooms and seeds, each given as `a,b`; None is all."""
     by_seed = {str(seed): seed for seed in comparison.seeds}
     return comparison.model_copy(
         update={
@@ -228,8 +229,8 @@ def _chosen(what: str, given: str | None, known: dict[str, _T]) -> dict[str, _T]
 
 
 def runs_of(comparison: Comparison, out: Path) -> list[Run]:
-    """Every run, scenes first, then seed by seed, so that a comparison that is stopped early is a
-    whole one of fewer seeds.
+    """Every run: scenes first, then seed by seed, so that a comparison that is stopped early is
+    complete for fewer seeds.
     """
     runs = []
     for seed in (None, *comparison.seeds):
@@ -257,7 +258,7 @@ def _taken_over(rooms: Rooms, method: Method) -> list[str]:
     if _value(own, "model.max_objects") is not None:
         keys.append("model.max_objects")
     values = {key: _value(shared, key) for key in keys}
-    # As JSON, which YAML reads as it is: a folder may be called 2024.
+    # Quoted as JSON, which is valid YAML, so that a folder called 2024 stays a string.
     return [f"{key}={json.dumps(v)}" for key, v in values.items() if v is not None]
 
 
@@ -268,9 +269,10 @@ def _value(data: Any, key: str) -> Any:
 
 
 def variants_of(comparison: Comparison, run: Run) -> list[Variant]:
-    """The rows of a run: of one that remembers rooms, one for each distribution or fit.
+    """The variants of a run, in the order of their rows.
 
-    A sampler comes before the distributions; scenes and other methods have their own way alone.
+    A run that keeps the latents of training rooms has one variant per distribution or fit; its
+    sampler, if it has one, comes first. Scenes and runs of other methods have a single variant.
     """
     config = run.run_config
     names: tuple[str | None, ...] = (None,)
@@ -295,5 +297,5 @@ def variants_of(comparison: Comparison, run: Run) -> list[Variant]:
 
 
 def shards_of(comparison: Comparison, rooms: str) -> Path:
-    """The shards that a kind of rooms is in."""
+    """The folder of shards that holds a kind of rooms."""
     return Path(load_config(comparison.rooms[rooms].config).data.shards)

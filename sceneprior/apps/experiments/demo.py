@@ -1,4 +1,4 @@
-"""The whole path on homes made here: homes, shards, a trained prior, new rooms, scores, a page.
+"""The whole pipeline on procedural homes: homes, shards, training, new rooms, scores, a page.
 
 Each step is a `sceneprior` command, so the commands on the page are the ones that ran.
 """
@@ -14,9 +14,9 @@ from sceneprior.core.files import write_json
 
 
 def run_demo(out: Path, config: str, rooms: int, count: int, renderer: str) -> None:
-    """Run every step that is not done yet, then put time and memory beside the scores.
+    """Run every unfinished step, then add time and memory to the scores.
 
-    Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; the same call goes on.
+    Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
     """
     steps = demo_steps(out, config, rooms, count, renderer)
     with open_runner(out) as runner:
@@ -35,14 +35,14 @@ def run_demo(out: Path, config: str, rooms: int, count: int, renderer: str) -> N
                 runner.do(step, out, unshown=told)
             except InputError:
                 raise InputError(
-                    f"The demo stopped at '{step.name}'; mend that and run it again."
+                    f"The demo stopped at '{step.name}'; fix the error and run it again."
                 ) from None
         _add_costs(out)
 
 
 def demo_steps(out: Path, config: str, rooms: int, count: int, renderer: str) -> list[Step]:
-    """The demo's commands in order; each is redone when its arguments change, or what `config`
-    holds."""
+    """The demo's commands in order; a command is repeated if its arguments or the contents of
+    `config` change."""
     homes, shards, run, scenes = (str(out / name) for name in ("homes", "shards", "run", "scenes"))
     scores, page = str(out / "scores.json"), str(out / "report.html")
     draw = ["--renderer", renderer]
@@ -75,7 +75,7 @@ def demo_steps(out: Path, config: str, rooms: int, count: int, renderer: str) ->
 
 
 def _add_costs(out: Path) -> None:
-    """Put what the finished steps took into scores.json, unless one was killed on the way."""
+    """Add the time and memory of all steps to scores.json, unless a step was killed."""
     noted = {name: entry for name, entry in read_journal(out).items() if entry.get("finished")}
     scores = read_result(out / "scores.json")
     seconds = {name: entry["wall_s"] for name, entry in noted.items()}

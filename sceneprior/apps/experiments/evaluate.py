@@ -47,16 +47,16 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Score generated rooms against test rooms, and write the scores.
 
-    In runs that remember their training rooms, those are decoded and scored against the truth, too;
-    against masks, where rooms are known from views alone.
+    If the run keeps the latents of its training rooms, these rooms are decoded and scored as well:
+    against their 3D ground truth or, if the shards have none, against the observed masks.
 
-    The options' seed draws the latents, too; `shards` and `distribution` are by default the run's.
+    The options' seed also draws the latents; `shards` and `distribution` default to the run's.
     """
     trained = load_any_run(run)
     folder = shards or Path(trained.config.data.shards)
     if shards is None and not folder.is_dir():
         raise InputError(
-            f"{run} was trained on shards '{folder}', which are not here; name the shards to "
+            f"{run} was trained on shards '{folder}', which do not exist; name the shards to "
             "compare with: --shards."
         )
     if known_from_views_alone(folder, options.split):
@@ -66,7 +66,7 @@ def evaluate_run(
         generated = sample_rooms(trained, count, options.seed, distribution)
         scores = evaluate_from_views(generated, folder, options) | masks
     else:
-        # First, because other shards than the run's are refused here.
+        # This comes first, because it refuses shards that are not the run's.
         pairs = decoded_and_true(trained, folder) if trained.remembers_rooms else []
         generated = sample_rooms(trained, count, options.seed, distribution)
         scores = evaluate_synthesis(generated, folder, options, [decoded for decoded, _ in pairs])
@@ -103,10 +103,11 @@ def evaluate_folder(
 def decoded_and_true(
     trained: Trained, shards: Path, meshes: bool = False
 ) -> list[tuple[Scene, Scene]]:
-    """Training rooms as decoded, each with what training never saw: the room in 3D.
+    """Pairs of each decoded training room and its 3D ground truth, which training does not use.
 
-    Only tracked objects count: what no camera saw cannot be known. Turned copies of a room
-    are left out. `meshes` are for pictures; scores of boxes need none of the true ones.
+    The truth holds only tracked objects, since other objects appear in no view. Rotated copies of
+    rooms are left out. `meshes` loads the true meshes, which pictures need and scores of boxes do
+    not.
     """
     real = reference_scenes(shards, "train", tracked_only=True, meshes=meshes)
     truth = {scene.name: scene for scene in real}
@@ -128,7 +129,7 @@ def report_run(
     commands: tuple[str, ...],
     renderer: str,
 ) -> None:
-    """Write the page of a run; of rooms not known in 3D, without what compares with true rooms."""
+    """Write the report page of a run, without comparisons if the rooms have no 3D ground truth."""
     trained = load_any_run(run)
     config, shards = trained.config, Path(trained.config.data.shards)
     found = read_scores(scores, run, shards, f"--run {run}")
@@ -167,7 +168,8 @@ def report_folder(
     commands: tuple[str, ...],
     renderer: str,
 ) -> None:
-    """Write the page of the user's scenes, of any method, without the parts that only a run has."""
+    """Write the report page of the user's scenes, made by any method, without the parts that need
+    a run."""
     scenes = load_scene_folder(folder)
     write_report(
         out,
@@ -183,8 +185,12 @@ def report_folder(
 
 
 def read_scores(path: Path | None, folder: Path, shards: Path, evaluated: str) -> dict[str, Any]:
-    """Read the scores that `eval-fid` wrote to a file. None reads the folder's `scores.json`, which
-    may be missing where rooms have no 3D ground truth; `evaluated` is the command that writes it.
+    """Read the scores that `eval-fid` wrote to a file.
+
+    Args:
+        path: The file; None reads `scores.json` of `folder`, which may be missing if the rooms have
+            no 3D ground truth.
+        evaluated: Arguments of the `eval-fid` command that writes the file, for the error message.
     """
     if path is None:
         path = folder / "scores.json"
@@ -202,7 +208,7 @@ def read_scores(path: Path | None, folder: Path, shards: Path, evaluated: str) -
 
 
 def unfold(trained: TrainedPrior) -> list[Scene]:
-    """Rooms between two training rooms that lie far apart: on the sphere, along the geodesic."""
+    """Rooms along the geodesic between two distant training rooms, from one latent to the other."""
     space = trained.prior.latent_space
     z = space(trained.logits)
     end = int(space.nearness(z[:1], z).argmin())

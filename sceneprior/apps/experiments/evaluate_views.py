@@ -1,4 +1,4 @@
-"""Evaluate generated rooms where real ones are known from views alone, as posed captures are."""
+"""Evaluation against rooms without 3D ground truth, such as posed captures: counts and masks."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,13 +37,13 @@ VIEWS = 4
 """Views of each training room in which its decoded masks are compared."""
 _BATCH = 8
 _NOTE = (
-    "The rooms of these shards are known from views alone: their objects are counted as cameras "
-    "saw them, and what compares with true rooms in 3D is left out."
+    "The rooms of these shards are known from views alone: objects are counted as they appear in "
+    "the views, and metrics that need 3D ground truth are left out."
 )
 
 
 def known_from_views_alone(shards: Path, split: str) -> bool:
-    """Test whether a room of a split lacks ground truth; a ShardError where there is no room."""
+    """True if a room of a split lacks 3D ground truth; ShardError if the split has no room."""
     list_shards(shards, split)
     return any(not shard.has_ground_truth(room) for shard, room in iterate_rooms(shards, split))
 
@@ -51,8 +51,10 @@ def known_from_views_alone(shards: Path, split: str) -> bool:
 def evaluate_from_views(
     generated: Sequence[Scene], shards: Path, options: EvalOptions
 ) -> dict[str, Any]:
-    """Scores by key of `METRICS`, of those that need no room in 3D, as `evaluate_synthesis` has
-    them: of generated rooms, of real training rooms, and of the rooms compared with (`_test`).
+    """Compute the metrics that need no 3D ground truth, in the format of `evaluate_synthesis`.
+
+    The result holds the scores of the generated rooms by key of `METRICS`, those of real training
+    rooms under `train_rooms`, and those of the rooms compared with under `<key>_test`.
     """
     names = common_label_set(generated)
     rooms = {split: _counted(shards, split, names) for split in ("train", options.split)}
@@ -94,9 +96,12 @@ def evaluate_from_views(
 
 
 def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
-    """Mean IoU of decoded training rooms' masks with observed ones, in views that training never
-    saw (`mask_iou_held_out`, where `data.view_fraction` left some out of every room), or else in
-    some that it did (`mask_iou_training_views`). Nothing where shapes are no meshes.
+    """Mean IoU of the masks of decoded training rooms with the observed masks.
+
+    The key is `mask_iou_held_out` if `data.view_fraction` holds views of every room out of
+    training; the IoU is then computed in such views. Otherwise it is computed in training views,
+    and the key is `mask_iou_training_views`. Empty for methods other than `paper`, whose shapes
+    need not be meshes.
     """
     config = trained.config
     if not isinstance(config, PaperConfig):
@@ -128,7 +133,7 @@ def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
 def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
     """Mean IoU of hard masks of decoded training rooms with the observed ones; void is left out.
 
-    The prior decodes meshes; before the shape stage each box has the plain template in it.
+    The network decodes meshes; before the shape stage, each box is filled by the shape template.
     """
     config, prior = trained.config, trained.prior
     assert isinstance(config, PaperConfig), "a run that remembers rooms has a view loss"
@@ -163,7 +168,7 @@ def _counted(shards: Path, split: str, names: str) -> Int[np.ndarray, "rooms cla
         if shard.label_set != names:
             raise InputError(
                 f"Scores compare scenes of one label set, but the scenes have '{names}' and "
-                f"{shards} '{shard.label_set}'."
+                f"{shards} has '{shard.label_set}'."
             )
         labels = shard.read_room(room_id).object_class
         tables.append(np.bincount(labels, minlength=len(label_set(names))))

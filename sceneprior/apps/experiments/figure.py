@@ -1,4 +1,4 @@
-"""Draws the picture of a comparison: a line of rooms, or of answers to images, for each method."""
+"""Draws the picture of a comparison: a row of rooms, or of reconstructions, for each method."""
 
 import textwrap
 from collections.abc import Sequence
@@ -32,26 +32,27 @@ from sceneprior.render.topdown import topdown
 ROOMS_SHOWN = 8
 IMAGES_SHOWN = 4
 DRAWN_FROM = 256
-"""Training rooms that the independent row draws objects from: thousands of meshes are gigabytes."""
+"""Number of training rooms whose objects the row of independent rooms uses; the meshes of thousands
+of rooms would take gigabytes."""
 TILE_PX = 160
 MARGIN_PX = 190
 TITLE_WIDTH = 22
-"""Characters of a line that fit into the margin."""
+"""Number of characters per line that fit into the margin."""
 
 
 def write_figure(
     comparison: Comparison, runs: Sequence[Run], count: int | None, path: Path, renderer: Renderer
 ) -> None:
-    """Draw what runs on the same rooms make, one run a method, under the truth.
+    """Draw the rooms or reconstructions of one run per method, below the real ones.
 
-    `count` rooms of each run are evaluated (`count_of`).
+    `count` is the number of rooms that each run was evaluated with (`count_of`).
     """
     of = _answers if isinstance(comparison, ViewComparison) else _rooms
     write_whole(path, png_bytes(sheet(of(comparison, runs, count, renderer)), optimize=True))
 
 
 def sheet(lines: dict[str, list[np.ndarray]]) -> Image.Image:
-    """Pictures in lines, each with its title in the margin."""
+    """Arrange pictures in rows, each with its title in the margin."""
     longest = max(len(pictures) for pictures in lines.values())
     size = (MARGIN_PX + longest * TILE_PX, len(lines) * TILE_PX)
     page, font = Image.new("RGB", size, "white"), ImageFont.load_default(size=16)
@@ -72,7 +73,7 @@ def sheet(lines: dict[str, list[np.ndarray]]) -> Image.Image:
 def _rooms(
     comparison: Comparison, runs: Sequence[Run], count: int | None, renderer: Renderer
 ) -> dict[str, list[np.ndarray]]:
-    """The first rooms of each run from above, under the real and the independent ones."""
+    """Top-down pictures of each run's first rooms, after those of real and independent rooms."""
     real = reference_scenes(shards_of(comparison, runs[0].rooms), "train", limit=DRAWN_FROM)
     independent = independent_rooms(real, ROOMS_SHOWN, comparison.sampling_seed, True)
     lines = {"Real training rooms": real, "Independent objects": independent}
@@ -96,8 +97,8 @@ def _rooms(
 def _answers(
     comparison: Comparison, runs: Sequence[Run], count: int | None, renderer: Renderer
 ) -> dict[str, list[np.ndarray]]:
-    """The answers of each run to the same images, from the image's camera and from above, under
-    the image's masks and the truth."""
+    """Pictures of each run's reconstructions of the same images, from the image's camera and from
+    above, after the image's masks and the true room."""
     shards, limit = shards_of(comparison, runs[0].rooms), min(count or IMAGES_SHOWN, IMAGES_SHOWN)
     images, _ = images_of_split(shards, "test", comparison.sampling_seed, limit)
     rooms = {room.name: room for room in reference_scenes(shards, "test", limit, tracked_only=True)}

@@ -1,5 +1,5 @@
-"""Names what made rooms or reconstructions, from the settings of the run: the paper's method, its
-network taught by lifted boxes, the lifted method, a baseline, or somebody else's scenes."""
+"""Names of the methods that made rooms or reconstructions, from the settings of a run: the paper's
+method, its network trained on lifted boxes, the lifted method, a baseline, or existing scenes."""
 
 from typing import NamedTuple
 
@@ -14,14 +14,14 @@ class Maker(NamedTuple):
     """The method that made rooms or reconstructions, as result tables name it."""
 
     title: str
-    """Title of a row whose method has none of its own."""
+    """Title of a row if the comparison gives its method no title."""
     said: str
-    """Such rows, in a caption."""
+    """Name of the method in a caption."""
     detail: str = ""
-    """Text that follows a method's own title, such as that of another decoder."""
+    """Text appended to the title that the comparison gives, such as the kind of supervision."""
 
     def named(self, title: str | None) -> str:
-        """The title of a row, from that of its method, if any."""
+        """The title of a row; `title` is the method's title in the comparison, if it has one."""
         if title is None:
             return self.title
         return f"{title}, {self.detail}" if self.detail else title
@@ -30,16 +30,16 @@ class Maker(NamedTuple):
 LIFTED = "the lifted method"
 PAPER = Maker("Paper's method", "the paper's method and variations of it")
 TAUGHT = Maker(
-    "Paper's sphere, taught by lifted boxes",
-    "the paper's network and latents taught by lifted boxes",
-    "taught by lifted boxes",
+    "Paper's sphere, trained on lifted boxes",
+    "the paper's network and latents trained on lifted boxes",
+    "trained on lifted boxes",
 )
 SAMPLED = Maker("Lifted method: sampler", LIFTED, "sampler of the lifted method")
 FITTED = Maker("Paper: fit of a latent", PAPER.said, "fit of a latent")
 FITTED_TAUGHT = Maker(
-    "Fit of a latent, taught by lifted boxes",
+    "Fit of a latent, trained on lifted boxes",
     TAUGHT.said,
-    "fit of a latent, taught by lifted boxes",
+    "fit of a latent, trained on lifted boxes",
 )
 ONE_BY_ONE = Maker("Object by object", LIFTED, "object by object")
 ONE_BY_ONE_PAPER = ONE_BY_ONE._replace(title="Object by object, by the paper's prior")
@@ -48,7 +48,7 @@ GIVEN = Maker("", "scenes as given, which were made elsewhere")
 
 
 def maker_of_rooms(config: RunConfig, distribution: str | None) -> Maker:
-    """Maker of a run's new rooms, drawn by a distribution; None is the run's own."""
+    """Maker of new rooms that a run draws from a distribution; None is the run's default."""
     if not isinstance(config, PaperConfig | LiftedConfig):
         return BASELINE
     if (distribution or config.distribution) == SAMPLER:
@@ -57,7 +57,7 @@ def maker_of_rooms(config: RunConfig, distribution: str | None) -> Maker:
 
 
 def maker_of_answers(config: RunConfig, fit: str = OBJECTS) -> Maker:
-    """Maker of a run's reconstructions, by a fit of `eval-svr`."""
+    """Maker of a run's reconstructions with a fit of `eval-svr`."""
     if not isinstance(config, PaperConfig | LiftedConfig):
         return BASELINE
     if isinstance(config, LiftedConfig):

@@ -1,4 +1,4 @@
-"""The rows of a comparison's table, from the results that its runs left."""
+"""The rows of a comparison's table, from the result files of its runs."""
 
 from typing import Any
 
@@ -17,25 +17,25 @@ from sceneprior.paper.sampling import marked
 from sceneprior.training.checkpoints import read_checkpoint
 
 OWN = "its own"
-"""The way of a method that has neither latents nor our sampler; `protocol.latents` says so."""
+"""Value of `protocol.latents` for a method with neither latents nor the lifted method's sampler."""
 AS_GIVEN = "as given"
 DECODED = "of training rooms, decoded"
 GROUPS = {
     "paper": "rooms of new latents (paper)",
-    SAMPLER: "rooms of our sampler, object by object",
-    OWN: "rooms of methods taught by {}",
+    SAMPLER: "rooms of the lifted method's sampler, object by object",
+    OWN: "rooms of methods trained on {}",
     AS_GIVEN: "scenes as given, made elsewhere",
     DECODED: "training rooms, decoded: nothing is new",
     "kernel": "copies: rooms near training rooms",
 }
-"""Headings of a table of new rooms in their order, by where rooms come from; `{}` is what a method
-learns from."""
+"""Headings of the groups of a table of new rooms, in order, by the origin of the rooms. `{}` stands
+for the method's supervision."""
 SHAPES = {"fit": "as found", "fit_cad": "CAD models"}
-"""Rows of a result of `eval-svr` that the table shows of a run."""
+"""Rows of an `eval-svr` result that the table shows, with their values in the column `shapes`."""
 
 
 def rows_of(comparison: Comparison, run: Run) -> list[Row]:
-    """The rows of a run that is scored; what training took stands in the first."""
+    """The rows of an evaluated run; the first row includes the costs of training."""
     found = {variant: read_result(variant.result) for variant in variants_of(comparison, run)}
     of_task = _rows_of_views if isinstance(comparison, ViewComparison) else _rows_of_rooms
     rows = of_task(run, comparison.rooms[run.rooms].title, found)
@@ -46,14 +46,14 @@ def rows_of(comparison: Comparison, run: Run) -> list[Row]:
 def costs_of(run: Run) -> dict[str, int | float | None]:
     """Costs of training: `cpu_s`, `steps` and `parameters`; empty for scenes.
 
-    CPU seconds are None where they are unknown: training was killed, or run by hand.
+    CPU seconds are None if they are unknown, since training was killed or started by hand.
     """
     if run.scenes is not None:
         return {}
     steps = 0
     for final in (run.folder / "run").glob("*/final.ckpt"):
         saved = read_checkpoint(final)
-        # Lightning counts updates; two networks that train each other make two a batch.
+        # Lightning counts updates; a GAN's two networks make two updates per batch.
         steps += saved["global_step"] // len(saved["optimizer_states"])
     networks = load_any_run(run.folder / "run").prior
     return {
@@ -64,9 +64,9 @@ def costs_of(run: Run) -> dict[str, int | float | None]:
 
 
 def _rows_of_rooms(run: Run, title: str, found: dict[Variant, dict[str, Any]]) -> list[Row]:
-    """A row for each distribution of latents, and one of decoded training rooms where there are
-    some."""
-    # A result says how its rooms were drawn, with the mark of the version that wrote it.
+    """A row for each distribution of latents, and one for decoded training rooms if there are
+    any."""
+    # A result names the distribution of its rooms, with the mark of the version that wrote it.
     drawn = [
         (variant, scores["protocol"].get("latents", AS_GIVEN).split(",")[0], scores)
         for variant, scores in found.items()
@@ -85,8 +85,8 @@ def _rows_of_rooms(run: Run, title: str, found: dict[Variant, dict[str, Any]]) -
 
 
 def _rows_of_views(run: Run, title: str, found: dict[Variant, dict[str, Any]]) -> list[Row]:
-    """A row for each fit, and one more where CAD models stand in for what was found."""
-    group = f"taught by {run.run_config.learns_from}"
+    """A row for each fit, and another one if its objects were also replaced by CAD models."""
+    group = f"trained on {run.run_config.learns_from}"
     rows = []
     for variant, result in found.items():
         of: dict[str, dict[str, Any]] = {

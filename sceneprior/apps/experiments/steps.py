@@ -1,7 +1,7 @@
-"""Runs commands of `sceneprior` as steps of an experiment, which can be stopped and goes on.
+"""Runs `sceneprior` commands as steps of an experiment that can be stopped and continued.
 
-Each command is a process of its own, so that a reader who doubts a number can type it again. The
-`steps.json` of a folder notes the command of each step, what it took and whether it finished.
+Each command is a separate process, so that a reader who doubts a number can run the command again.
+The `steps.json` of a folder records the command of each step, its costs and whether it finished.
 """
 
 import contextlib
@@ -22,52 +22,55 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import only_writer, read_json, write_json
 
 _COSTS: dict[str, Callable] = {"cpu_s": add, "wall_s": add, "peak_memory_gib": max}
-"""Costs noted of a command, and how those of a stopped command and its continuation combine."""
+"""Recorded costs of a command, each with the function that combines the cost of a stopped command
+with that of its continuation."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A command of `sceneprior`, and what tells whether it has to run."""
+    """A `sceneprior` command, and the conditions under which it has to run."""
 
     name: str
     arguments: list[str]
     result: Path
     """File that the command writes; a step whose result was deleted runs again."""
     depends_on: list[str]
-    """Inputs of the result: the step runs again once they differ."""
+    """Inputs of the result; the step runs again if they differ from the recorded ones."""
     continues: Path | None = None
-    """File from which the command continues after a stop; while it is there, costs add up."""
+    """File from which a stopped command continues; if it exists, the costs are added to those
+    recorded before."""
 
 
 class StepRunner:
-    """Runs steps one after the other, until it is stopped; from `open_runner`."""
+    """Runs steps one after the other until it is stopped; made by `open_runner`."""
 
     def __init__(self) -> None:
         self.stopped = self._calling = False
         self._process: subprocess.Popen[bytes] | None = None
 
     def stop(self, *signal_and_frame: Any) -> None:
-        """Answer a signal that asks this process to end: the command that runs saves what it has,
-        as it does after Ctrl-C, and no step follows."""
+        """Handle a signal to end this process: the running command saves its work, as after
+        Ctrl-C, and no further step starts."""
         self.stopped = True
         if not self._calling:
             raise KeyboardInterrupt
         if self._process is not None:
-            # Not Popen's own way, which would take the exit status that wait4 waits for.
+            # Not `Popen.send_signal`, which would collect the exit status that wait4 waits for.
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGINT)
 
     def do(
         self, step: Step, folder: Path, log: Path | None = None, unshown: Sequence[str] = ()
     ) -> None:
-        """Run a step, note it in `folder`, and forget the steps after it, whose results are old.
+        """Run a step, record it in `folder`, and drop the records of later steps, now out of date.
 
-        What the command prints goes to `log`, or to the terminal; `unshown` are further arguments,
-        neither printed nor noted.
+        Args:
+            log: File for the command's output; None prints it on the terminal.
+            unshown: Further arguments, which are neither printed nor recorded.
 
         Raises:
-            InputError: the command failed; its own sentence, where it left one in `log`.
-            KeyboardInterrupt: the runner was stopped; what the command took until then is noted.
+            InputError: the command failed; the message is the command's own, if `log` holds one.
+            KeyboardInterrupt: the runner was stopped; the command's costs so far are recorded.
         """
         if self.stopped:
             raise KeyboardInterrupt
@@ -78,7 +81,7 @@ class StepRunner:
             took = {cost: noted.get(step.name, {}).get(cost) for cost in _COSTS}
         earlier = dict(takewhile(lambda item: item[0] != step.name, noted.items()))
         entry: dict[str, Any] = {"arguments": step.arguments, "depends_on": step.depends_on}
-        # Without costs, until it ends: those of a command that is killed are unknown.
+        # Recorded without costs until the command ends: the costs of a killed command are unknown.
         write_json(folder / "steps.json", {**earlier, step.name: entry})
         status, costs = self.call([*step.arguments, *unshown], log)
         for cost, combine in _COSTS.items():
@@ -90,7 +93,7 @@ class StepRunner:
             raise InputError(failure_reason(log, status))
 
     def call(self, arguments: Sequence[str], log: Path | None) -> tuple[int, dict[str, float]]:
-        """Run a command to its end: its exit status and costs."""
+        """Run a command to its end; returns its exit status and costs."""
         start = time.monotonic()
         with contextlib.nullcontext() if log is None else log.open("wb") as output:
             self._calling = True
@@ -98,11 +101,11 @@ class StepRunner:
                 self._process = process = subprocess.Popen(
                     [sys.executable, "-m", "sceneprior", *arguments],
                     stdin=subprocess.DEVNULL, stdout=output, stderr=output,
-                    process_group=0,  # `stop` tells it of a Ctrl-C, and once
+                    process_group=0,  # so that only `stop` passes Ctrl-C on, and only once
                 )  # fmt: skip
-                if self.stopped:  # while it began
+                if self.stopped:  # a signal came while the process started
                     self.stop()
-                # wait4 knows what this child alone has used, with all that it waited for itself.
+                # wait4 returns the usage of this child alone, including that of its own children.
                 _, status, used = os.wait4(process.pid, 0)
                 process.returncode = os.waitstatus_to_exitcode(status)
             finally:
@@ -116,10 +119,10 @@ class StepRunner:
 
 @contextlib.contextmanager
 def open_runner(out: Path) -> Iterator[StepRunner]:
-    """A runner of steps that write below `out`, where no other may run meanwhile.
+    """A runner for steps that write to `out`, which it locks against other runners.
 
-    While it is open, Ctrl-C, SIGTERM and SIGHUP let its command save what it has, and raise
-    KeyboardInterrupt.
+    While the runner is open, Ctrl-C, SIGTERM and SIGHUP let the running command save its work, and
+    then raise KeyboardInterrupt.
     """
     runner = StepRunner()
     with contextlib.ExitStack() as until_done:
@@ -133,27 +136,27 @@ def open_runner(out: Path) -> Iterator[StepRunner]:
             if handler is not signal.SIG_IGN:
                 signal.signal(name, runner.stop)
             elif name == signal.SIGINT:
-                # In the background. Commands inherit what is ignored, but not an answer, and have
-                # to hear the SIGINT by which `StepRunner.stop` ends them.
+                # The signal is ignored, as in a background process. Commands would inherit that,
+                # but not a handler, and have to receive the SIGINT of `StepRunner.stop`.
                 signal.signal(name, lambda number, frame: None)
         yield runner
 
 
 def is_done(step: Step, folder: Path) -> bool:
-    """Test whether a step has finished for its present inputs, and its result is there."""
+    """True if a step has finished with its current inputs and its result exists."""
     noted = read_journal(folder).get(step.name, {})
     same = noted.get("depends_on") == step.depends_on
     return same and bool(noted.get("finished")) and step.result.exists()
 
 
 def read_journal(folder: Path) -> dict[str, Any]:
-    """Entries of `steps.json` by step; empty where nothing has run."""
+    """Entries of `steps.json` by step; empty if nothing has run."""
     path = folder / "steps.json"
     return read_result(path) if path.is_file() else {}
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """A JSON file that a step left."""
+    """The contents of a JSON file that a step wrote."""
     try:
         return dict(read_json(path))
     except (InputError, TypeError, ValueError):
@@ -163,7 +166,7 @@ def read_result(path: Path) -> dict[str, Any]:
 
 
 def failure_reason(log: Path | None, status: int) -> str:
-    """The sentence a command failed with, or its last words."""
+    """The error message of a failed command, or else the last line of its output."""
     if log is None:
         return f"exit status {status}"
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
@@ -171,4 +174,4 @@ def failure_reason(log: Path | None, status: int) -> str:
     told = errors or [line for line in lines if line]
     if status < 0 and not errors:
         return f"killed by {signal.Signals(-status).name}; the same command goes on"
-    return told[-1] if told else f"it said nothing in {log}"
+    return told[-1] if told else f"it printed nothing to {log}"

@@ -19,9 +19,9 @@ COSTS = {
     "cpu_s": TableColumn("CPU min", 1),
     "parameters": TableColumn("parameters (M)", 2),
 }
-"""Columns of what training took."""
+"""Columns of the costs of training."""
 FACTORS = {"cpu_s": 1 / 60, "parameters": 1e-6}
-"""From the units of costs to the table's."""
+"""Factors from the units of costs to those of the table."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +32,16 @@ class Row:
     group: str
     title: str
     variant: str
-    """Value that sets the row apart from others of its run (`Form.variant`)."""
+    """Value that distinguishes the row from other rows of its run; `Form.variant` is the heading of
+    its column."""
     seed: int | None
-    """None of scenes as given."""
+    """Seed of training; None for existing scenes."""
     scores: dict[str, Any]
-    """By key of a result, with its protocol and its rows of reference; and what training took."""
+    """Values by key of a result, with its protocol, reference rows and the costs of training."""
     made_by: str
-    """Who its method is of, as a caption says it (`Maker.said`)."""
+    """Name of the method in captions (`Maker.said`)."""
     rank: int = 0
-    """Groups stand in the order of their ranks."""
+    """Position of the row's group: groups are sorted by rank."""
 
 
 @dataclass(frozen=True)
@@ -48,23 +49,23 @@ class Form:
     """Columns and captions of the tables of one kind of comparison."""
 
     columns: dict[str, TableColumn]
-    """By key of the scores; `COSTS` follow."""
+    """Columns by key of the scores; the columns of `COSTS` follow."""
     references: dict[str, str]
-    """Rows that need no training: (title, where a result keeps their values)."""
+    """Key of the values in a result, by title, for each reference row, which needs no training."""
     variant: str
     """Heading of the second column."""
     say: Callable[[dict[str, Any]], str]
-    """Says in a caption how rooms were scored, from one of the results."""
+    """Function from one of the results to a sentence of the caption on the evaluation."""
 
 
 def write_tables(rows: Sequence[Row], out: Path, form: Form) -> None:
-    """Write `table.md` and `table.csv` (a line a run) into a folder."""
+    """Write `table.md` and `table.csv` (one line per run) into a folder."""
     write_whole(out / "table.md", markdown(rows, form).encode())
     write_whole(out / "table.csv", as_csv(rows, form).encode())
 
 
 def markdown(rows: Sequence[Row], form: Form) -> str:
-    """A table for each kind of rooms, methods under the headings of their groups."""
+    """A Markdown table for each kind of rooms, with methods under the headings of their groups."""
     parts = []
     for rooms, own in _by(rows, lambda row: row.rooms).items():
         columns = {
@@ -84,7 +85,7 @@ def markdown(rows: Sequence[Row], form: Form) -> str:
 
 
 def as_csv(rows: Sequence[Row], form: Form) -> str:
-    """A line a run and variant, numbers in full."""
+    """One line per run and variant, with unrounded numbers."""
     keys = [*form.columns, *COSTS]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -100,7 +101,7 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def _body(rows: Sequence[Row], columns: dict[str, TableColumn], form: Form) -> list[list[str]]:
-    """The cells of each line, the headings of groups among them."""
+    """The cells of each line, including the headings of groups."""
 
     def heading(group: str) -> list[str]:
         return [f"*{group}*", *[""] * (len(columns) + 1)]
@@ -147,12 +148,12 @@ def _by(rows: Sequence[Row], key: Callable[[Row], str]) -> dict[str, list[Row]]:
 
 
 def _arrowed(column: TableColumn, direction: Direction) -> TableColumn:
-    """A column whose title tells which values are good."""
+    """The column with an arrow in its title for the better direction."""
     return replace(column, title=column.title + ARROWS[direction])
 
 
 def _caption(rows: Sequence[Row], form: Form) -> str:
-    """The sentences above a table: which rows are whose method, how they were scored, the seeds."""
+    """The sentences above a table: the maker of each row, the evaluation, and the seeds."""
     titles: dict[str, list[str]] = {PAPER.said: [], LIFTED: []}
     for row in rows:
         named = titles.setdefault(row.made_by, [])
@@ -170,8 +171,8 @@ def _caption(rows: Sequence[Row], form: Form) -> str:
 def _of_new_rooms(scores: dict[str, Any]) -> str:
     protocol = scores["protocol"]
     return (
-        f"{protocol['n_generated']} generated rooms a run against {protocol['n_test']} test rooms "
-        f"of {protocol['shards']}; {protocol['n_train_rooms']} real training rooms"
+        f"{protocol['n_generated']} generated rooms per run against {protocol['n_test']} test "
+        f"rooms of {protocol['shards']}; {protocol['n_train_rooms']} real training rooms"
     )
 
 
@@ -188,7 +189,7 @@ def _of_views(scores: dict[str, Any]) -> str:
         "boxes are upright and along the room's axes, in the truth and in every answer",
     ]
     if known is not None:
-        told.insert(1, f"{known:.0%} of the objects are models that training rooms hold, too")
+        told.insert(1, f"{known:.0%} of the objects have a CAD model that training rooms hold, too")
     return "; ".join(told)
 
 
@@ -205,9 +206,9 @@ NEW_ROOMS = Form(
 )
 CD = TableColumn("CD (m)", 3, "CD: mean distance to the other surface, both ways added")
 SECONDS = TableColumn(
-    "s an image",
+    "s per image",
     3,
-    "s an image: CPU seconds, all images together; [from, to]: 95% interval over rooms, all views "
+    "s per image: CPU seconds, all images together; [from, to]: 95% interval over rooms, all views "
     "of a room together",
 )
 VIEWS = Form(

@@ -20,7 +20,7 @@ UNSTATED = (
     "before you pass this on."
 )
 SHOWN = ("generated", "real training", "independent")
-"""Columns of the table of scores, in addition to that of the test rooms."""
+"""Columns of the table of scores, besides the column of the test rooms."""
 
 
 def model_card(
@@ -104,30 +104,30 @@ def _scores(scores: dict[str, Any] | None) -> list[str]:
     ]
     return [
         f"`sceneprior eval-fid`, seed {protocol.get('seed')}, against {protocol.get('split')} "
-        "rooms, which training did not see; after a value its 95% interval, of "
+        "rooms, which training did not use; each value is followed by its 95% interval, from "
         f"{protocol.get('resamples')} resamples. Definitions: docs/evaluation.md of the package.",
         "\n".join(table),
     ]
 
 
 def _limits(trained: Trained, latents: bool, half: bool) -> list[str]:
-    limits = ["It makes rooms like its training rooms, of these classes, and no others."]
+    limits = ["The prior makes rooms like its training rooms, with objects of these classes only."]
     if isinstance(trained, TrainedPrior):
         limits.append(
             "Latents of the training rooms and their ids are in it: training rooms can be decoded "
             "from it."
             if latents
-            else "Latents of the training rooms are not in it: it draws no rooms near them "
-            "(`kernel`), and single images cannot be reconstructed."
+            else "Latents of the training rooms are not in it: rooms cannot be drawn from the "
+            "distribution `kernel`, and single images cannot be reconstructed."
         )
         if isinstance(trained, TrainedLifted) and trained.sampler is not None:
             limits.append(
                 "Shapes were lifted from training masks, and are part of the weights: an object is "
-                "drawn as one of a few hundred of them. Objects stand in quarter turns."
+                "drawn as one of a few hundred shapes. Objects stand in quarter turns."
             )
     if half:
         limits.append(
-            "Large tensors are in half precision: rooms differ from those of the run, of which the "
-            "scores are."
+            "Large tensors are in half precision: rooms differ a little from those of the run, for "
+            "which the scores were computed."
         )
     return ["\n".join(f"- {limit}" for limit in limits)]

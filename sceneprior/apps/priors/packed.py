@@ -6,7 +6,7 @@ README.md            the card (apps/priors/card.py)
 config.json          the run's settings, the stage, the classes; `PackedPrior`
 model.safetensors    the weights
 
-A folder with these three files is the same prior, and so is a repository of the Hugging Face Hub.
+A folder, or a repository of the Hugging Face Hub, with these three files is read like the zip.
 """
 
 import io
@@ -71,7 +71,7 @@ def pack(trained: Trained, card: str, latents: bool = False, half: bool = False)
     Args:
         latents: Keep the latents and ids of the training rooms. Without them, no `kernel` rooms can
             be drawn, and no images reconstructed.
-        half: Store large tensors in half precision: a smaller file, with slightly other rooms.
+        half: Store large tensors in half precision: the file is smaller, and rooms differ slightly.
     """
     networks: dict[str, Any] = {"prior": trained.prior}
     rooms: list[str] = []
@@ -120,8 +120,8 @@ def unpack(packed: PackedPrior, config: RunConfig, source: str) -> Trained:
         different = sorted(name for name in shapes | found if shapes.get(name) != found.get(name))
         if different:
             raise ValueError(
-                f"{different[0]} and {len(different) - 1} others do not fit; of another version, "
-                "it has to be trained again"
+                f"{different[0]} and {len(different) - 1} others do not fit; a prior of another "
+                "version has to be trained again"
             )
         classes = label_set(config.label_set)
         if packed.said.classes != list(classes):
@@ -134,7 +134,7 @@ def unpack(packed: PackedPrior, config: RunConfig, source: str) -> Trained:
     except (ValueError, RuntimeError, KeyError, TypeError, InputError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(
-            f"{source}: its weights are not those of its settings ({reason}); have it packed again "
+            f"{source}: its weights do not match its settings ({reason}); have it packed again "
             "with `sceneprior pack`."
         ) from None
 
@@ -207,8 +207,8 @@ def read_packed(path: Path) -> PackedPrior:
     except Exception as error:  # a damaged file raises almost anything in zipfile and safetensors
         reason = " ".join(str(error).split())[:200]
         raise InputError(
-            f"{path} is no packed prior, or is damaged ({type(error).__name__}: {reason}); fetch "
-            "it again, or have it packed again with `sceneprior pack RUN --out FILE`."
+            f"{path} is not a packed prior, or is damaged ({type(error).__name__}: {reason}); "
+            "fetch it again, or have it packed again with `sceneprior pack RUN --out FILE`."
         ) from None
 
 

@@ -40,7 +40,7 @@ def _fetch(where: str) -> Path:
         from huggingface_hub import snapshot_download
     except ImportError:
         raise InputError(
-            f"{where} is on the Hugging Face Hub, which needs a package more: pip install "
+            f"{where} is on the Hugging Face Hub, which needs one more package: pip install "
             "'sceneprior[hub]'."
         ) from None
     try:
@@ -48,7 +48,7 @@ def _fetch(where: str) -> Path:
     except Exception as error:  # errors of the network, of the Hub, or an invalid name
         reason = " ".join(str(error).split())[:160]
         raise InputError(
-            f"{where} cannot be fetched ({type(error).__name__}: {reason}). Look at the name, be "
-            "online the first time, and for a private repository set HF_TOKEN or run `hf auth "
+            f"{where} cannot be fetched ({type(error).__name__}: {reason}). Check the name and the "
+            "network connection; for a private repository, set HF_TOKEN or run `hf auth "
             "login`."
         ) from None

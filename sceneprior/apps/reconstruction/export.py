@@ -33,9 +33,9 @@ PAPER, INK, FRAME = (255, 255, 255), (40, 40, 40), (200, 200, 200)
 TURN_MS = 3600
 """Duration of the turntable animation."""
 MARGIN_M = 0.3
-"""Least margin around the camera in the plan."""
+"""Smallest margin around the camera in the top view."""
 SIGHT_M = 0.8
-"""Length of the lines that show the field of view in the plan."""
+"""Length of the lines that show the field of view in the top view."""
 
 
 def write_reconstructions(
@@ -75,7 +75,7 @@ def write_turning(found: Reconstruction, folder: Path, renderer: Renderer) -> No
         renderer,
         title=name,
         subtitle="A room from the masks of one image",
-        pictures=[("The masks, what was found from the same camera, and from above", seen)],
+        pictures=[("The masks, the reconstruction from the same camera, and from above", seen)],
     )
 
 

@@ -40,9 +40,9 @@ SAME_CLASS = {
 }
 """Maps class names of other data sets (COCO, ADE20K) to names that a label set may have instead."""
 CAMERA_HEIGHTS_M = (1.0, 1.2, 1.4, 1.6, 1.8)
-"""Heights that are tried without a pose, from a sitting to a standing photographer."""
+"""Camera heights that are tried if no pose is given, from a sitting to a standing photographer."""
 LARGEST_PX = 640
-"""Longest side, about that of training images; larger images are subsampled."""
+"""Longest side of an image in pixels, as in training images; larger images are subsampled."""
 FILM_DIAGONAL_MM = math.hypot(36, 24)
 UPSIDE_DOWN = 0.1
 """Largest upward component of a camera's y axis (a sine); cameras above it are refused as upside
@@ -97,8 +97,8 @@ def read_own_image(
     camera = np.diag([width / values.shape[1], height / values.shape[0], 1]) @ camera
     if not len(seen.tracked):
         raise InputError(
-            f"{mask} shows no object: none of its masks is of a class of the run and wider than "
-            f"4 pixels. Its values are {_some(np.unique(values))}; {classes} says what they are."
+            f"{mask} shows no object: none of its masks is wider than 4 pixels and has a class of "
+            f"the run. Its values are {_some(np.unique(values))}; {classes} lists their classes."
         )
     notes += table.notes
     if table.unlisted:
@@ -111,14 +111,14 @@ def read_own_image(
         told = " or ".join(f"{height_m:g}" for height_m in heights_m)
         notes.append(
             f"without --pose the camera is {'level' if gravity is None else 'tilted as given'}, "
-            f"{told} m above the floor (what fits best is kept) and {CAMERA_DISTANCE_M:g} m from "
+            f"{told} m above the floor (the best fit is kept) and {CAMERA_DISTANCE_M:g} m from "
             "the middle of the room, which it faces"
         )
         if gravity is None:
             notes.append(
-                "level is a guess: of cameras that look down by 13 degrees in the median it put "
-                "objects 34 cm off (1.1 m with a given --camera-height), where --gravity put them "
-                "7 cm off; give --gravity x,y,z from the phone's accelerometer, or --pose"
+                "a level camera is a guess: for cameras that look down by 13 degrees (median), it "
+                "displaced objects by 34 cm (by 1.1 m with --camera-height), and --gravity by 7 "
+                "cm; give --gravity x,y,z from the phone's accelerometer, or --pose"
             )
         tilt = np.eye(4) if gravity is None else tilted(read_gravity(gravity))
         poses = [tilt @ level_camera(height, side) for height in heights_m for side in range(sides)]
@@ -184,8 +184,8 @@ def read_gravity(text: str) -> np.ndarray:
         down = np.zeros(0)
     if down.shape != (3,) or not np.isfinite(down).all() or not down.any():
         raise InputError(
-            f"--gravity {text} is no direction; expected x,y,z in camera axes (x right, y down, z "
-            "forward): 0,1,0 of a level camera, 0,0.9,0.4 of one that looks down a little."
+            f"--gravity {text} is not a direction; expected x,y,z in camera axes (x right, y down, "
+            "z forward): 0,1,0 for a level camera, 0,0.9,0.4 for one that looks down a little."
         )
     down = down / np.linalg.norm(down)
     if down[1] < -UPSIDE_DOWN:
@@ -235,7 +235,7 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
             said = (data.get("height", height), data.get("width", width))
             if said != image_size:
                 raise InputError(
-                    f"{path} is of an image of {said[1]} x {said[0]} pixels, but the mask has "
+                    f"{path} is for an image of {said[1]} x {said[0]} pixels, but the mask has "
                     f"{width} x {height}; scale fx, fy, cx and cy, or the mask."
                 )
         elif text.startswith(("fov=", "35mm=")):
@@ -250,7 +250,7 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
     except InputError:
         raise
     except (KeyError, TypeError, ValueError):
-        source = f"{path} holds" if in_file else f"--intrinsics {text} is"
+        source = f"{path} holds" if in_file else f"--intrinsics {text} gives"
         raise InputError(f"{source} no intrinsics; expected {expected}.") from None
     pinhole = (
         matrix.shape == (3, 3)
@@ -261,7 +261,7 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
     )
     if not pinhole:
         raise InputError(
-            f"--intrinsics {text} is no pinhole camera (fx and fy above 0, no skew); "
+            f"--intrinsics {text} is not a pinhole camera (fx and fy above 0, no skew); "
             f"expected {expected}."
         )
     for focal in (matrix[0, 0], matrix[1, 1]):
@@ -270,8 +270,8 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
     if not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
         raise InputError(
             f"The middle of the camera's image, cx = {matrix[0, 2]:g} and cy = {matrix[1, 2]:g}, "
-            f"is outside the mask of {width} x {height} pixels; --intrinsics {text} is of an image "
-            "of another size. Scale it, or the mask."
+            f"is outside the mask of {width} x {height} pixels; --intrinsics {text} is for an "
+            "image of another size. Scale the intrinsics, or the mask."
         )
     return matrix
 
@@ -283,8 +283,8 @@ def _focal_px(text: str, image_size: tuple[int, int]) -> float:
     angle = float(number)
     if 0 < angle < math.pi:
         raise InputError(
-            f"--intrinsics {text}: no camera sees so few degrees. {number}: radians? Give degrees: "
-            f"fov={math.degrees(angle):.3g}."
+            f"--intrinsics {text}: no camera has so small a field of view. If {number} is in "
+            f"radians, give degrees: fov={math.degrees(angle):.3g}."
         )
     if not 0 < angle < 180:
         raise ValueError("no field of view")

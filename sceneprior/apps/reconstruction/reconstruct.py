@@ -22,11 +22,11 @@ from sceneprior.paper.trained import TrainedPrior, with_training_latents
 from sceneprior.training.method import Trained, TrainedReconstructor
 
 BATCH = 128
-"""Latents fitted at once: images times restarts."""
+"""Number of latents fitted at once: images times restarts."""
 OBJECTS = "objects"
 """Name of the fit object by object (method `lifted`); any other name is a schedule of latents."""
 START_BATCH = 256
-"""Training rooms decoded at once."""
+"""Number of training rooms decoded at once."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,11 @@ class FitOptions:
     fit: str = OBJECTS
     """`objects` fits object by object; a name of `SCHEDULES` fits one latent per image."""
     restarts: int = 1
-    """Latents fitted to each image, started at its nearest training rooms; the latent with the
-    lowest score is kept."""
+    """Number of latents fitted to each image, started at the nearest training rooms; the latent
+    with the lowest score is kept."""
     masks: bool = True
-    """Fit latents to masks too. False uses only classes and 2D boxes, as with looks."""
+    """Fit latents to masks, too. False uses classes and 2D boxes only, as is always done if shapes
+    are looks rather than meshes."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Reconstruction:
     `ObjectAnswer.energy`, for latents the layout loss plus lambda_S * (1 - mean mask IoU), and for
     direct predictions the box error of `_found_directly`."""
     mask_iou: float | None = None
-    """Mean over the image's masks; None if masks are not compared as pixels."""
+    """Mean IoU over the image's masks; None if masks are not compared as pixels."""
     steps: int | None = None
     """Steps of a latent fit; None for other fits."""
     taken_for: dict[str, str] = field(default_factory=dict)
@@ -76,7 +77,7 @@ def reconstruct(
     if options.restarts < 1:
         raise InputError(f"restarts is {options.restarts}; an image needs at least one.")
     if options.restarts > 1 and options.fit == OBJECTS:
-        raise InputError("restarts are of latents, which the fit `paper` finds; name that one.")
+        raise InputError("restarts apply only to the fit `paper`, which fits latents; name it.")
     if not isinstance(trained, TrainedReconstructor):
         with_training_latents(trained, "Reconstruction")
     elif options.fit != OBJECTS:
@@ -88,7 +89,7 @@ def reconstruct(
         if image.label_set != trained.config.label_set:
             raise InputError(
                 f"{image.name} has classes of label set '{image.label_set}', but the run was "
-                f"trained on '{trained.config.label_set}'; prepare the image with that one."
+                f"trained on '{trained.config.label_set}'; prepare the image with that label set."
             )
     if not images:
         return []
@@ -174,8 +175,8 @@ def starting_latents(
     """For each image, the latents of the training rooms with the lowest layout loss on it."""
     if count > len(trained.logits):
         raise InputError(
-            f"{count} nearest training rooms were asked for, but the run has "
-            f"{len(trained.logits)}; ask for fewer restarts."
+            f"{count} restarts need as many training rooms, but the run has "
+            f"{len(trained.logits)}; use fewer restarts."
         )
     losses = layout_losses_of_rooms(trained, views)
     nearest = losses.topk(count, dim=1, largest=False).indices

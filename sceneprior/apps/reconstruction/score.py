@@ -63,7 +63,7 @@ class SvrProtocol:
     seed: int = 0
     """Seed of the random training rooms and, for runs, of the views."""
     views: int = 1
-    """Views drawn from each room to evaluate a run; all if a room has fewer."""
+    """Number of views drawn from each room to evaluate a run; all if a room has fewer."""
     renderer: str = "auto"
 
     def as_dict(self) -> dict[str, Any]:
@@ -152,9 +152,9 @@ def scenes_with_images(
         room = scene.extra.get("room_id")
         if not isinstance(room, str) or not room or not isinstance(scene.extra.get("view"), int):
             raise InputError(
-                f"Scene '{scene.name}' of {folder} does not say which image it answers: its "
-                "'extra' needs a 'room_id' of the shards and a 'view', as `sceneprior reconstruct "
-                "--shards` writes them."
+                f"Scene '{scene.name}' of {folder} does not say which image it reconstructs: its "
+                "'extra' needs a 'room_id' of the shards and a 'view', as written by `sceneprior "
+                "reconstruct --shards`."
             )
         of_room[room].append(scene)
     images, scenes = [], []
@@ -166,14 +166,14 @@ def scenes_with_images(
                 raise InputError(
                     f"Scene '{scene.name}' of {folder} has {len(scene.objects)} objects, but view "
                     f"{image.view} of room {room} shows {len(image.rows)}; a reconstruction has "
-                    "one object a mask, in the masks' order."
+                    "one object per mask, in the masks' order."
                 )
             images.append(image)
             scenes.append(scene)
     if of_room:
         raise InputError(
-            f"The '{split}' split of {shards} has no room {', '.join(sorted(of_room)[:3])}, which "
-            f"scenes of {folder} are of; name the split, or the shards, they were made from."
+            f"The '{split}' split of {shards} has no room {', '.join(sorted(of_room)[:3])}, but "
+            f"{folder} has scenes of it; name the split or the shards that the scenes come from."
         )
     return images, scenes
 
@@ -181,7 +181,7 @@ def scenes_with_images(
 def score_answers(
     images: Sequence[ObservedImage], answers: dict[str, Answers], protocol: SvrProtocol
 ) -> dict[str, Any]:
-    """Scores by row: the given reconstructions, and baselines of real training rooms."""
+    """Scores by row: rows of the given reconstructions, and baseline rows of training rooms."""
     rooms = known_rooms(protocol.shards)
     nearest = nearest_answers(rooms, images, open_renderer(protocol.renderer))
     drawn = random_answers(rooms, images, protocol.seed)

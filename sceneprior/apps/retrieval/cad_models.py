@@ -30,7 +30,7 @@ SEED = 0
 FORMAT = 1
 """Version of the cache file; increase it when the sampling of points changes."""
 _FLAT = 1e-9
-"""Ratio to the longest side up to which a side counts as flat, and is not scaled."""
+"""Ratio to the longest side up to which a side counts as flat; flat sides are not scaled."""
 _MESHES_KEPT = 256
 
 Track = Callable[[list[str]], Iterable[str]]
@@ -97,7 +97,7 @@ def open_models(
     if not by_class:
         raise InputError(
             f"{folder} holds no usable model of a class of {label_set_name} ({len(labels)} models "
-            f"listed, {len(broken)} of them broken); --models names a folder with their files."
+            f"listed, {len(broken)} of them broken); give --models a folder with model files."
         )
 
     def load(model_id: str) -> Mesh:
@@ -112,8 +112,8 @@ def _labels_of_shards(folder: Path, label_set_name: str) -> dict[str, str]:
     for shard, room_id in iterate_rooms(folder, "train"):
         if shard.label_set != label_set_name:
             raise InputError(
-                f"The rooms of {folder} are labelled '{shard.label_set}', but the scenes "
-                f"'{label_set_name}'; --models names shards with the scenes' classes."
+                f"The rooms of {folder} have label set '{shard.label_set}', but the scenes have "
+                f"'{label_set_name}'; give --models shards with the scenes' label set."
             )
         truth = shard.read_ground_truth(room_id)
         names = label_set(label_set_name)

@@ -5,7 +5,7 @@ class is scaled into the box, turned by 0, 90, 180 and 270 degrees, and compared
 mesh; the model with the smallest Chamfer distance is taken. An object without a mesh is compared by
 its box.
 
-All models and turns are compared by few points, and the best of them by all points.
+All models and turns are first compared by few points, and the best candidates by all points.
 """
 
 import os
@@ -42,7 +42,7 @@ class Retrieved(NamedTuple):
 
     model_id: str
     turn_deg: int
-    """The yaw of the model in the room: 0, 90, 180 or 270; docs/conventions.md."""
+    """The yaw of the model in the room: 0, 90, 180 or 270 (docs/conventions.md)."""
     distance_m: float
     """Chamfer distance of `chamfer_mean`."""
 
@@ -50,9 +50,9 @@ class Retrieved(NamedTuple):
 def retrieve(scene: Scene, models: CadModels) -> Scene:
     """The scene with the mesh of the most similar CAD model in every box.
 
-    `extra["retrieval"]` holds {"model_id", "turn_deg", "distance_m"} for each object, in their
-    order. It is None for a class without models; such an object keeps its mesh, extruded with its
-    box.
+    `extra["retrieval"]` holds {"model_id", "turn_deg", "distance_m"} for each object, in the order
+    of the objects. The entry is None for a class without models; such an object keeps its mesh,
+    extruded together with its box.
     """
     objects: list[SceneObject] = []
     found: list[dict[str, object] | None] = []
@@ -61,7 +61,7 @@ def retrieve(scene: Scene, models: CadModels) -> Scene:
         if of_class := models.by_class.get(item.label):
             best = most_similar(box, of_class)
             mesh = placed(models.load(best.model_id), box, best.turn_deg)
-            objects.append(replace(box, mesh=mesh, turned=None))
+            objects.append(replace(box, mesh=mesh, turned=None, solids=()))
             told = best._asdict() | {"distance_m": round(best.distance_m, 5)}
         else:
             objects.append(item if box is item else item.in_box(box.center_m, box.size_m))
@@ -70,7 +70,7 @@ def retrieve(scene: Scene, models: CadModels) -> Scene:
 
 
 def retrieve_all(scenes: Sequence[Scene], models: CadModels) -> Iterator[Scene]:
-    """`retrieve` for many scenes, on all cores, in their order."""
+    """Apply `retrieve` to many scenes on all cores; yields the results in the scenes' order."""
     # One thread per core, each with one torch thread, since the matrix products are small.
     with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as p:
         yield from p.map(lambda scene: retrieve(scene, models), scenes)

@@ -80,7 +80,7 @@ class Board:
         face = self._scene.add_box(
             "/map/board", color=_BOARD, dimensions=(side, side, 0.02), position=(0, 0, -0.01)
         )
-        # Dots are spheres, raised so that they do not sink into the face.
+        # Dots are spheres, raised so that they do not intersect the board's face.
         dots = plane.on_board(rooms, 0.02 * side)
         self._scene.add_point_cloud(
             "/map/rooms", dots, np.array(_DOT), point_size=0.014 * side, point_shape="circle",

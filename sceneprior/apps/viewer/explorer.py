@@ -24,9 +24,9 @@ from sceneprior.paper.sampling import DISTRIBUTIONS, named_latent
 from sceneprior.paper.trained import TrainedPrior, with_training_latents
 
 PATH_STEPS = 49
-"""Rooms of a path, both ends included; neighbours are rarely more than 4 degrees apart."""
+"""Number of rooms of a path with both ends; neighbours are rarely more than 4 degrees apart."""
 SOME = 64
-"""Largest number of training rooms for estimating room sizes; all would take a second."""
+"""Largest number of training rooms for estimating room sizes; decoding all would take a second."""
 HERE = "here"
 """Name of the shown room as an end of a path."""
 
@@ -63,7 +63,7 @@ class Folder:
         return common_label_set(self.scenes)
 
     def some_layouts(self) -> tuple[Scene, ...]:
-        """The scenes from which the size of rooms is estimated: all of them."""
+        """The scenes from which the size of rooms is estimated: all scenes of the folder."""
         return self.scenes
 
     def room(self, row: int) -> Shown:
@@ -147,7 +147,7 @@ class Explorer:
         ends = [
             self.prior.latent(shown.scene)
             if text.strip() == HERE
-            else named_latent(self.prior.with_latents, text.strip(), f"{HERE}, the room on show")
+            else named_latent(self.prior.with_latents, text.strip(), f"{HERE}, the shown room")
             for text in (start, end)
         ]
         self.path = path_latents(self.prior.with_latents, ends[0], ends[1], PATH_STEPS)
@@ -163,10 +163,10 @@ class Explorer:
         """Keep the kept objects, and complete the room around them."""
         room = self.prior.complete(shown.given(), 1, seed)[0]
         kept = frozenset(range(len(shown.kept)))
-        return Shown(room, f"completed round {len(kept)} kept objects, seed {seed}", kept)
+        return Shown(room, f"completed around {len(kept)} kept objects, seed {seed}", kept)
 
     def nearest(self, scene: Scene) -> tuple[Shown, float]:
-        """The decoded training room with the nearest layout, and its `layout_distance`, metres."""
+        """The decoded training room with the nearest layout, and its `layout_distance` (metres)."""
         row, distance_m = nearest_room(scene, self._layouts)
         return self.training_room(row), distance_m
 

@@ -40,7 +40,7 @@ class _Node:
 class RoomNodes:
     """The nodes of one room, updated in place: only changes are sent to browsers.
 
-    Their names begin with `root`; `clicked` is called with the index of an object that is clicked.
+    The nodes' names begin with `root`; `clicked` is called with the index of the clicked object.
     """
 
     def __init__(

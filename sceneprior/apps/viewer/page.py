@@ -45,7 +45,7 @@ class Page:
         self.explorer = source if isinstance(source, Explorer) else None
         self.shown = source.room(0) if isinstance(source, Folder) else source.sample(0)
         self.scene = self.shown.scene
-        """The displayed scene: that of `shown`, with CAD models if these are switched on."""
+        """The displayed scene: the scene of `shown`, with CAD models if they are switched on."""
         # Callbacks come from many threads, and a callback may trigger another in its own thread.
         self._lock = threading.RLock()
         self._newest: Callable[[], None] | None = None
@@ -158,9 +158,9 @@ class Page:
             if self.source.map is not None:
                 share = f"{self.source.map.share:.0%}"
                 gui.add_markdown(
-                    "**Map**: drag over the board, or click a dot: a training room. It shows the "
-                    f"two directions in which their latents differ most ({share} of the "
-                    "variance); all other coordinates stay."
+                    "**Map**: drag over the board, or click a dot, which is a training room. The "
+                    "map shows the two directions in which the training rooms' latents differ "
+                    f"most ({share} of the variance); all other coordinates stay."
                 )
             elif self.source.without_map:
                 gui.add_html(_html(self.source.without_map))
@@ -246,7 +246,7 @@ class Page:
     def _add_completion(self, explorer: Explorer) -> None:
         gui = self.server.gui
         with gui.add_folder("Complete"):
-            gui.add_markdown("Click objects to keep them; all others are furnished anew.")
+            gui.add_markdown("Click objects to keep them; all others are replaced by new ones.")
             seed: Any = gui.add_number("Seed ", 0, min=0, step=1)
 
             def complete() -> None:

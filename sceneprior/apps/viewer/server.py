@@ -32,7 +32,7 @@ def check_can_serve(host: str, port: int) -> None:
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             raise InputError(
-                f"Port {port} of {host} cannot be had ({reason}); name another one: "
+                f"Port {port} of {host} cannot be used ({reason}); name another one: "
                 f"--port {port + 1 if port < 65535 else 8080}."
             ) from None
 
@@ -72,8 +72,9 @@ def refusal(headers: "Headers", host: str) -> str | None:
     hosts = headers.get_all("Host")
     if len(hosts) != 1 or not is_own_name(urlsplit(f"//{hosts[0]}").hostname or "", host):
         return (
-            f"This page does not answer to '{', '.join(hosts)}'. Open it at localhost or at an "
-            "address of this machine, or start it with its name: sceneprior view --host NAME.\n"
+            f"This page is not served under the name '{', '.join(hosts)}'. Open it at localhost or "
+            "at an address of this machine, or start it with that name: sceneprior view --host "
+            "NAME.\n"
         )
     if any(urlsplit(origin).netloc != hosts[0] for origin in headers.get_all("Origin")):
         return "This page does not answer other web sites.\n"

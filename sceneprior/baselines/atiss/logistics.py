@@ -13,11 +13,11 @@ from torch.nn import functional as F
 from sceneprior.core.mixtures import draw_index
 
 LEVELS = 256
-"""Steps of [-1, 1]. The probability of a step is at most 1, but a density of continuous numbers
-could grow without bound where many rooms share a number."""
+"""Number of steps into which [-1, 1] is divided. The probability of a step is at most 1, whereas a
+continuous density could grow without bound where many rooms share a value."""
 HALF_STEP = 1 / (LEVELS - 1)
 LEAST_LOG_SCALE = -7.0
-"""A logistic of this scale already lies within one step."""
+"""Minimum log-scale; at this scale, a logistic already lies within one step."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class LogisticMixture:
 
     @classmethod
     def of(cls, features: Float[Tensor, "*batch triples"]) -> "LogisticMixture":
-        """The mixture of a network's output: 3 K features per number."""
+        """Build the mixture from a network's output, 3 K features per number."""
         weight_logits, means, log_scales = features.chunk(3, dim=-1)
         return cls(weight_logits, means, log_scales.clamp(min=LEAST_LOG_SCALE))
 
@@ -57,8 +57,8 @@ class LogisticMixture:
     def draw(
         self, choice: Float[Tensor, "*batch"], place: Float[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Samples in [-1, 1] from uniform numbers: `choice` selects the logistic, `place` is its
-        quantile."""
+        """Samples in [-1, 1] from uniform numbers: `choice` selects the logistic, and `place` the
+        quantile within it."""
         chosen = draw_index(self.weight_logits, choice).unsqueeze(-1)
         mean = self.means.gather(-1, chosen)[..., 0]
         scale = self.log_scales.gather(-1, chosen)[..., 0].exp()

@@ -22,17 +22,17 @@ END = 0
 PARTS = {"position": (0, 3), "angle": (3, 4), "size": (4, 7)}
 """The parts of an object's seven numbers, in the order in which they are sampled."""
 CUT_RAD = -3 * math.pi / 4
-"""Angle at -1 and 1: a diagonal, because few pieces of furniture face one."""
+"""Yaw that is encoded as -1 and as 1: a diagonal, because few pieces of furniture face one."""
 CLASS_WIDTH = 64
 OCTAVES = 8
-"""Frequencies of `fourier_features`. The finest has a period of two steps of the mixture; the
-published 32 octaves exceed the precision of float32."""
+"""Number of frequencies of `fourier_features`. The highest has a period of two steps of the
+mixture; the published 32 octaves exceed the precision of float32."""
 BATCH = 256
 """Rooms per batch in sampling."""
 
 
 class EncoderConfig(Section):
-    """Size of the encoder, which ATISS-2D has as well; the defaults are the published settings."""
+    """Size of the encoder of ATISS and of ATISS-2D; the defaults are the published settings."""
 
     layers: int = Field(4, ge=1, le=100)
     heads: int = Field(8, ge=1)
@@ -54,10 +54,10 @@ class EncoderConfig(Section):
 
 
 class SetModel(EncoderConfig):
-    """Size of a network that generates sets of objects, which the set flow has as well."""
+    """Size of a network that generates sets of objects: ATISS or the set flow."""
 
     max_objects: int = Field(ge=1, le=1000)
-    """Most objects in a sampled room."""
+    """Maximum number of objects in a sampled room."""
     width: int = Field(512, ge=8)
     """Width of the encoder and of the hidden layers."""
 
@@ -72,7 +72,7 @@ class AtissModel(SetModel):
     """Size of the network; the defaults are the published settings."""
 
     mixtures: int = Field(10, ge=1)
-    """K, logistics per number."""
+    """K, the number of logistics in the mixture of each number."""
 
 
 class Atiss(nn.Module):

@@ -18,7 +18,7 @@ class AtissTraining(OneStageTraining):
     """The published settings. Do not clip gradients (docs/baselines_3d.md)."""
 
     epochs: int = Field(500, ge=1)
-    """These are the published 100,000 steps on 6,300 rooms with turned copies."""
+    """500 epochs are the published 100,000 steps for 6,300 rooms with turned copies."""
     batch_size: int = Field(128, ge=1)
     learning_rate: float = Field(1e-4, gt=0)
 
@@ -55,8 +55,10 @@ class AtissStage(OneStage):
 
 
 def part_of_rooms(rooms: RoomBoxes, seed: int) -> tuple[RoomBoxes, RoomBoxes]:
-    """Shuffle each room's n objects and keep the first k, with k drawn evenly from 0 to n. Also
-    returns the next object of each room, whose class is `END` if all are kept."""
+    """Shuffle each room's n objects and keep the first k, with k drawn uniformly from 0 to n.
+
+    Also returns the next object of each room, whose class is `END` if all objects are kept.
+    """
     generator = torch.Generator().manual_seed(seed)
     count = rooms.is_object.sum(dim=1)
     device = rooms.boxes_m.device

@@ -13,10 +13,10 @@ SLOPE = 0.2
 """Slope of the leaky ReLUs."""
 
 SMALLEST_PX = 4
-"""Smallest side of a map, which two halvings reduce to one pixel."""
+"""Minimum side of a map; halving it twice leaves one pixel."""
 
 GAIN = 10
-"""Factor on all scores, which spectral norm makes small."""
+"""Factor on all scores, which spectral normalisation makes small."""
 
 
 class MapDiscriminator(nn.Module):
@@ -41,7 +41,8 @@ class MapDiscriminator(nn.Module):
     ) -> tuple[Float[Tensor, "rooms views rows columns"], Float[Tensor, " rooms"]]:
         """Scores of patches and of rooms; higher means more real.
 
-        A room's features are the mean and the maximum over its views, of any order and number.
+        A room's features are the mean and the maximum over its views, so the order and number of
+        views do not matter.
         """
         height, width = maps.shape[-2:]
         if min(height, width) < SMALLEST_PX:

@@ -20,14 +20,14 @@ VARIED = (1.5, 1.5, 0.3, 0.3, 0.3)
 depth."""
 
 AREA = 10
-"""Factor on pixel shares in `contents`, which are a few hundredths."""
+"""Factor on the pixel shares in `contents`, because such a share is only a few hundredths."""
 
 MARGIN_M, CEILING_M = 0.5, 3.0
-"""Bounds of generated boxes: along x and z the batch's furthest camera from the floor centre and a
-margin, along y the floor and the ceiling."""
+"""Bounds of generated boxes in metres. Along x and z, they are `MARGIN_M` beyond the batch's
+furthest camera from the floor centre; along y, they are the floor and `CEILING_M`."""
 
 SIZES_M = (0.1, 2.5)
-"""Bounds of generated sizes."""
+"""Bounds of generated sizes in metres."""
 
 
 def adversarial_loss(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
@@ -42,15 +42,16 @@ def adversarial_loss(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
 def contents(
     maps: Float[Tensor, "rooms views classes height width"], counts: Float[Tensor, "rooms classes"]
 ) -> Float[Tensor, "rooms both"]:
-    """Per class, a room's number of objects and `AREA` times its share of the views' pixels."""
+    """For each class, the number of objects in a room, and `AREA` times the class's share of the
+    pixels of all views."""
     return torch.cat([counts, AREA * maps.mean(dim=(1, 3, 4))], dim=-1)
 
 
 def bounds_penalty(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""]:
     """Mean distance in metres by which boxes exceed the room's bounds and sizes exceed `SIZES_M`.
 
-    Maps do not distinguish a bed from a huge bed behind the room, and objects that no view shows
-    have no gradient. Without this penalty they would not return.
+    In a map, a bed looks the same as a huge bed behind the room. Objects that no view shows get no
+    other gradient, so without this penalty they would not return to the room.
     """
     reach = camera_centers(views.world_to_camera).abs().amax(dim=(0, 1)) + MARGIN_M
     reach[1] = CEILING_M / 2
@@ -65,7 +66,7 @@ def bounds_penalty(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""
 
 
 def logit_penalty(scenes: DecodedScenes) -> Float[Tensor, ""]:
-    """Mean squared completeness logits and class logits, without those of `void`."""
+    """Mean square of the completeness logits, plus that of the class logits except `void`."""
     classes = scenes.class_logits[..., VOID + 1 :]
     return classes.square().mean() + scenes.completeness_logits.square().mean()
 
@@ -74,9 +75,10 @@ def diversity_loss(scenes: DecodedScenes) -> Float[Tensor, ""]:
     """Minus the mean log of the standard deviation of the k-th object's position and size over
     rooms, relative to `VARIED`.
 
-    Up to a constant it is minus the entropy of normal distributions with these deviations (after
-    Kumar et al., "Maximum entropy generators for energy-based models", 2019). About 1 mm is added
-    to them, and there is no gain above `VARIED`, which would drive objects out of the room.
+    Up to a constant, this is minus the entropy of normal distributions with these deviations (after
+    Kumar et al., "Maximum entropy generators for energy-based models", 2019). A deviation is at
+    least about 1 mm, and it is not rewarded beyond `VARIED`, because that would drive objects out
+    of the room.
     """
     boxes = torch.cat([scenes.centers_m[..., [0, 2]], scenes.sizes_m], dim=-1)
     wanted = boxes.new_tensor(VARIED).square()

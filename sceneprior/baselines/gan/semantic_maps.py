@@ -11,8 +11,8 @@ from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.render.silhouettes.render import render_scene
 
 POOLING = 2
-"""Pixels of the instance ids along the side of a map's pixel. Pooling softens the hard edges of
-real maps, which would otherwise distinguish them from rendered ones."""
+"""Side of a map's pixel, in pixels of the instance ids. Pooling softens the hard edges of real
+maps, which would otherwise distinguish them from rendered ones."""
 
 SIGMA_PX2 = 0.25
 """Softness of rendered edges, about that of a pooled hard edge: coverage rises from 0.27 to 0.73
@@ -24,7 +24,7 @@ def observed_maps(
 ) -> Float[Tensor, "rooms views classes height width"]:
     """Maps of the observed views; pixels without an object are `void`."""
     ids = views.observed_ids.long()
-    # Id 0 is nothing, the last id void furniture.
+    # Id 0 means no object, and the last id means void furniture.
     of_id = F.pad(views.object_class, (1, 1), value=VOID)
     pixels = of_id.gather(1, ids.flatten(1)).view_as(ids)
     maps = F.one_hot(pixels, classes).movedim(-1, 2).to(views.intrinsics.dtype)
@@ -41,8 +41,8 @@ def rendered_maps(
 ) -> Float[Tensor, "rooms views classes height width"]:
     """Maps of decoded scenes, one per room, in the cameras of the views.
 
-    They have the size of observed maps. `kept` and `classes` come from `choices`; `mode` is that of
-    `render_silhouettes`.
+    They have the size of observed maps. `kept` and `classes` come from `choices`; `mode` is passed
+    to `render_scene`.
     """
     assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
     height, width = (side / POOLING for side in views.observed_ids.shape[-2:])
@@ -60,14 +60,14 @@ def rendered_maps(
     )
     coverage = alone.masks[:, :, 0].unflatten(0, (-1, objects)).transpose(1, 2)
     depth_m = alone.depth_m.unflatten(0, (-1, objects)).transpose(1, 2)
-    # Pixels of the soft edge alone have no depth; they take that of the object's centre.
+    # Pixels that only the soft edge covers have no depth; they get that of the object's centre.
     centers = project(scenes.centers_m.unsqueeze(2), views.world_to_camera, views.intrinsics)
     depth_m = depth_m.where(depth_m.isfinite(), centers[..., 2:].detach())
     return compose_maps(coverage, depth_m, kept, classes)
 
 
 def observed_counts(views: SceneViews, classes: int) -> Float[Tensor, "rooms classes"]:
-    """Tracked objects of each class in each room."""
+    """Number of tracked objects of each class in each room."""
     of_objects = F.one_hot(views.object_class.long(), classes) * views.is_object[..., None]
     return of_objects.sum(dim=1).to(views.intrinsics.dtype)
 
@@ -75,10 +75,10 @@ def observed_counts(views: SceneViews, classes: int) -> Float[Tensor, "rooms cla
 def choices(
     scenes: DecodedScenes, completeness_target: str = "first_n"
 ) -> tuple[Float[Tensor, "rooms objects"], Float[Tensor, "rooms objects classes"]]:
-    """Existence and one-hot class of each object, as decoding reads them.
+    """Existence and one-hot class of each object, as `to_rooms` decides them.
 
-    Values are 0 or 1; gradients are those of sigmoid and softmax (straight-through estimator), so
-    that objects which do not exist have gradients, too.
+    Values are 0 or 1. Gradients are those of sigmoid and softmax (straight-through estimator), so
+    that objects which do not exist get gradients, too.
     """
     scores = scenes.completeness_logits.sigmoid()
     shares = scenes.class_logits.softmax(dim=-1)
@@ -90,12 +90,13 @@ def choices(
 def kept_share(
     scores: Float[Tensor, "rooms slots"], convention: str = "first_n"
 ) -> Float[Tensor, "rooms slots"]:
-    """Probability that each prediction belongs to the scene, if each score is that of a yes.
+    """Probability that each prediction belongs to the scene, if completeness scores are independent
+    probabilities.
 
-    Scores of 0 or 1 give `kept_objects`; the gradient of a score is then the effect of ending the
-    scene there or of continuing it.
+    If all scores are 0 or 1, this equals `kept_objects`; the gradient with respect to a score is
+    then the effect of ending the scene there, or of continuing it.
     """
-    if convention == "stop":  # the first object that says stop still counts
+    if convention == "stop":  # the object whose score ends the scene still belongs to it
         scores = F.pad(1 - scores[:, :-1], (1, 0), value=1.0)
     return scores.cumprod(dim=1)
 

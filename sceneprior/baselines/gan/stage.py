@@ -40,33 +40,36 @@ from sceneprior.training.settings import TrainConfig
 from sceneprior.training.steps import check_finite, full_precision, log_losses
 
 BETAS = (0.0, 0.99)
-"""Betas of both Adam optimisers. Momentum would follow an opponent that has moved on."""
+"""Betas of both Adam optimisers. There is no momentum, because it would average gradients against
+earlier states of the other network."""
 
 STARTS = ((0.0, 1.2), (0.4, 0.4), (0.0, 1.2), (0.4, 0.5), (0.4, 0.5), (0.4, 0.5), (1.5, 1.0))
 """Mean and standard deviation, over rooms and objects, of the untrained layout decoder's outputs:
 x, y, z in metres, width, height, depth before their SoftPlus, and completeness."""
 
 START_ROOMS = 64
-"""Random rooms that `STARTS` is set on."""
+"""Number of random rooms over which the outputs are set to `STARTS`."""
 
 SHAPE_RATE = 0.1
-"""Share of the generator's learning rate for the shape decoder, since maps accept sheared boxes."""
+"""Learning rate of the shape decoder relative to that of the generator. It is low, because semantic
+maps do not rule out sheared boxes."""
 
 LOGIT_PENALTY = 0.01
-"""Weight of `logit_penalty`. Almost certain choices have no gradient, so a generator that has lost
-all objects could not recover."""
+"""Weight of `logit_penalty`. Without it, choices could become almost certain and lose their
+gradient, and a generator that has lost all objects could not recover."""
 
 BOUNDS_PENALTY = 10.0
 """Weight of `bounds_penalty`."""
 
 MEMORY = 0.9
-"""Share of `excess` kept at each step; one batch has too few objects of rare classes."""
+"""Decay per step of the running mean `excess`. A single batch has too few objects of rare
+classes."""
 
 
 class GanTraining(TrainConfig):
     """Settings of the training; docs/baselines_2d.md explains each.
 
-    Maps have half the size of the instance ids that `data.mask_step` keeps.
+    Maps have half the height and width of the instance ids that `data.mask_step` gives.
     """
 
     epochs: int = Field(400, ge=1)
@@ -76,29 +79,29 @@ class GanTraining(TrainConfig):
     """Every batch updates both networks."""
     views_per_room: int = Field(4, ge=1)
     learning_rate: float = Field(1e-3, gt=0)
-    """Rate of the generator; its shape decoder has a tenth of it."""
+    """Learning rate of the generator, whose shape decoder learns at a tenth of it."""
     discriminator_learning_rate: float = Field(4e-3, gt=0)
-    """Rate of the discriminator. Too large: it is always right and its gradient vanishes; too
-    small: the generator exploits its errors."""
+    """Learning rate of the discriminator. If it is too large, the discriminator is always right and
+    its gradient vanishes; if too small, the generator exploits the discriminator's errors."""
     counts: float = Field(1.0, ge=0)
     """Weight of the loss that matches each class's mean number of objects and pixels to real rooms.
     At 0, class frequencies drift."""
     variety: float = Field(4.0, ge=0)
-    """Weight of `diversity_loss`. Too small: all rooms become the same; too large: positions become
-    random."""
+    """Weight of `diversity_loss`. If it is too small, all rooms become the same; if too large,
+    positions become random."""
     averaging: float = Field(0.97, ge=0, lt=1)
-    """Decay of the generator's running average per step; 0 takes the newest weights."""
+    """Decay of the generator's running average per step; 0 uses the newest weights."""
     noise: float = Field(0.1, ge=0)
     """Standard deviation of the noise on all maps at the start; it falls to 0 over the epochs.
     Without it, classes can be lost permanently."""
     clip_gradient: float = Field(1.0, ge=0)
-    """Largest gradient norm of each network; 0 does not clip."""
+    """Norm to which the gradients of each network are clipped; 0 turns clipping off."""
     silhouettes: Literal["exact", "fast"] = "fast"
     """As in `ShapeConfig`."""
 
 
 class GanModel(ModelConfig):
-    """The paper's network with meshes as shapes, which the maps are rendered from."""
+    """The paper's network with meshes as shapes, from which the maps are rendered."""
 
     decoder: TransformerConfig = TransformerConfig()
     shape: ShapeDecoderConfig = ShapeDecoderConfig()
@@ -152,7 +155,7 @@ class GanStage(lightning.LightningModule):
         generator_optimizer, discriminator_optimizer = self.optimizers()  # type: ignore[attr-defined]
         scenes = self.generator.decode(self._latents(len(views.room_index)))
         with full_precision(self.device):
-            # Checked before rendering, which refuses vertices that are not finite.
+            # Checked before rendering, which rejects vertices that are not finite.
             undecided = logit_penalty(scenes)
             check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views)
             real = observed_maps(views, self.classes)
@@ -194,7 +197,7 @@ class GanStage(lightning.LightningModule):
                 group["lr"] = group["initial_lr"] * self._left()
 
     def _left(self) -> float:
-        """Share of the epochs that is left."""
+        """Share of the epochs that remain."""
         return 1 - self.current_epoch / self.settings.epochs
 
     def _latents(self, rooms: int) -> Float[Tensor, "rooms width"]:
@@ -236,9 +239,9 @@ def spread_out(layout: LayoutDecoder, features: Float[Tensor, "rooms objects wid
     """Initialise the layout decoder so that objects differ in position, size and class.
 
     An untrained layout decoder puts all objects at the floor centre with the same class, and the
-    discriminator would move them all alike. This scales and shifts its last layer until each output
-    has the mean and standard deviation of `STARTS` over the objects of random rooms, with the given
-    `features`; class logits get 0 and 1.
+    discriminator would move them all alike. So the decoder's last layer is scaled and shifted until
+    each output, over the objects with the given `features`, has the mean and standard deviation in
+    `STARTS`; class logits get mean 0 and deviation 1.
 
     Source: Salimans and Kingma, "Weight normalization", NeurIPS 2016, section 3.
     """

@@ -18,9 +18,9 @@ from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.layers import mlp
 
 NUMBERS = 8
-"""Numbers of a token beside its class: centre, log extents, cosine and sine of the yaw."""
+"""Numbers of a token in addition to its class: centre, log extents, cosine and sine of the yaw."""
 PARTS = {"position": slice(0, 3), "size": slice(3, 6), "angle": slice(6, 8)}
-"""The parts of the numbers, whose losses are logged apart."""
+"""The parts of the numbers, whose losses are logged separately."""
 WAVE = 4.0
 """Half a period of the slowest Fourier feature, in standard deviations of a number."""
 LEAST_SPREAD = 1e-3
@@ -32,14 +32,14 @@ class SetFlowModel(SetModel):
     """Size of the network."""
 
     class_scale: float = Field(2.0, gt=0)
-    """Value of a one-hot class, in standard deviations of the noise. With a larger one the class of
-    an object is decided before its place."""
+    """Value of a one-hot class, in standard deviations of the noise. With a larger value, sampling
+    decides the class of an object before its position."""
     steps: int = Field(100, ge=1)
     """Steps of Euler's method from noise to a room."""
 
 
 class SetFlow(nn.Module):
-    """Velocities that carry noise to rooms, by a transformer without positional encoding.
+    """A transformer without positional encoding that predicts velocities from noise to rooms.
 
     A room is a set of tokens: `NUMBERS` standardised numbers, then a scaled one-hot class. The
     number of objects is drawn first, with its frequency in the training rooms. `classes` is the
@@ -102,8 +102,8 @@ class SetFlow(nn.Module):
         is_object: Bool[Tensor, "rooms objects"],
     ) -> tuple[Float[Tensor, "rooms objects 8"], Float[Tensor, "rooms objects furniture"]]:
         """Velocity of the numbers of each token at `time`, from 0 (noise) to 1 (a room), and logits
-        of the class it will have; 0 for padding."""
-        # All but the attention runs on the objects alone: half of a batch is padding.
+        of its final class; 0 for padding."""
+        # All layers but attention run on the objects alone, since half of a batch is padding.
         here, counts = tokens[is_object], is_object.sum(dim=1)
         numbers = here[:, :NUMBERS]
         known = self.time(fourier_features(time.unsqueeze(-1))).repeat_interleave(counts, dim=0)
@@ -111,7 +111,8 @@ class SetFlow(nn.Module):
         for block in self.blocks:
             hidden = block(hidden, is_object)
         change, logits = self.out(hidden).split([NUMBERS, self.classes - 1], dim=-1)
-        # The best linear guess of the velocity of standardised numbers, and what it leaves.
+        # The best linear estimate of the velocity of standardised numbers, plus the predicted
+        # residual in units of its standard deviation.
         late = time.repeat_interleave(counts).unsqueeze(-1)
         variance = late**2 + (1 - late) ** 2
         velocity = (2 * late - 1) / variance * numbers + change / variance.sqrt()
@@ -123,7 +124,8 @@ class SetFlow(nn.Module):
         time: Float[Tensor, " rooms"],
         is_object: Bool[Tensor, "rooms objects"],
     ) -> Float[Tensor, "rooms objects token"]:
-        """Velocity of each token at `time` below 1: classes move straight to their mean."""
+        """Velocity of each token at `time` below 1; the class moves straight to its predicted
+        mean."""
         velocity, logits = self.predict(tokens, time, is_object)
         target = self.class_scale * logits.softmax(dim=-1)
         left = (1 - time)[:, None, None]
@@ -146,7 +148,7 @@ class SetFlow(nn.Module):
         return self.to_rooms(torch.cat([self._integrate(*part) for part in parts]), is_object)
 
     def _integrate(self, tokens: Tensor, is_object: Tensor) -> Tensor:
-        """Follow the velocities from time 0 to 1 by Euler's method."""
+        """Follow the velocities from time 0 to 1 with Euler's method."""
         for step in range(self.steps):
             time = tokens.new_full(tokens.shape[:1], step / self.steps)
             tokens = tokens + self.velocity(tokens, time, is_object) / self.steps
@@ -154,7 +156,8 @@ class SetFlow(nn.Module):
 
 
 class Block(nn.Module):
-    """Attention among the objects of each room and a feed-forward layer, both normalised first."""
+    """Attention among the objects of each room, then a feed-forward layer, each after a layer
+    norm."""
 
     def __init__(self, width: int, heads: int, hidden: int):
         super().__init__()

@@ -63,10 +63,10 @@ def matched(
     tokens: Float[Tensor, "rooms objects token"],
     is_object: Bool[Tensor, "rooms objects"],
 ) -> Float[Tensor, "rooms objects token"]:
-    """The noise of each room in the order that makes the way to the objects shortest.
+    """Reorder the noise of each room so that the squared distances to the objects are minimal.
 
-    Objects have no order, so any order of the noise is a valid start, and straight ways that do not
-    cross are learnt sooner (Song et al., "Equivariant Flow Matching with Hybrid Probability
+    Objects have no order, so any order of the noise is a valid start, and straight paths that do
+    not cross are learnt faster (Song et al., "Equivariant Flow Matching with Hybrid Probability
     Transport", NeurIPS 2023).
     """
     counts = is_object.sum(dim=1).tolist()

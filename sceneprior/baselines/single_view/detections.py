@@ -1,8 +1,8 @@
 """Network inputs for each mask of an image, in the image's frame.
 
 That frame is the room's, moved to the camera and turned by quarters until the camera looks along +z
-to within 45 degrees. Inputs and predictions therefore move and turn with the room, and quarter
-turns keep boxes axis-aligned.
+to within 45 degrees. So inputs and predictions do not change if the room is moved or turned by
+quarters, and boxes stay axis-aligned.
 """
 
 import math
@@ -21,12 +21,12 @@ CROP = 32
 MARGIN = 0.25
 """Border of a crop on each side of its 2D box, as a share of the box's width or height."""
 CHANNELS = 6
-"""Channels of a crop: the mask, all other masks with void, the inside of the image, and the pixels'
-rays (3)."""
+"""Channels of a crop: the mask, all other masks (including void), whether the pixel is inside the
+image, and the pixel's ray (3)."""
 NUMBERS = 26
-"""Numbers beside a mask's crop and class, see `Detections.numbers`."""
+"""Number of inputs per mask in addition to its crop and class; see `Detections.numbers`."""
 NEAR_M = 0.1
-"""Least depth of a centre that is projected into the image."""
+"""Minimum depth of a centre that is projected into the image."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Detections:
     boxes: Float[Tensor, "masks 4"]
     """As in `SceneViews`, relative to the image."""
     quarter: Int[Tensor, " masks"]
-    """Quarters that turn the room into the image's frame."""
+    """Number of quarter turns from the room into the image's frame."""
     eye_m: Float[Tensor, "masks 3"]
     """Camera position in the room."""
     frame_to_camera: Float[Tensor, "masks 3 3"]
@@ -112,8 +112,10 @@ class Detections:
     def offsets_and_distances(
         self, centers_m: Float[Tensor, "masks 3"]
     ) -> tuple[Float[Tensor, "masks 2"], Float[Tensor, " masks"], Bool[Tensor, " masks"]]:
-        """The inverse of `centers_at`, and True for centres in front of the camera. The offsets of
-        other centres are 0."""
+        """The inverse of `centers_at`; the third result is True for centres in front of the camera.
+
+        The offsets of centres behind the camera are 0.
+        """
         away = self.to_frame(centers_m - self.eye_m)
         seen = (self.frame_to_camera @ away.unsqueeze(-1))[..., 0]
         ahead = seen[:, 2] > NEAR_M
@@ -132,14 +134,15 @@ class Detections:
         return turn_vectors(vectors, (QUARTERS - self.quarter) % QUARTERS)
 
     def padded(self, values: Float[Tensor, "masks width"]) -> Float[Tensor, "images most width"]:
-        """One row of values per mask of each image, padded with zeros to the most masks."""
+        """Values by image and mask, padded with zeros to the largest number of masks."""
         images = int(self.image.max()) + 1 if len(self) else 0
         most = int(self.slot.max()) + 1 if len(self) else 0
         empty = values.new_zeros(images, most, values.shape[-1])
         return empty.index_put((self.image, self.slot), values)
 
     def of_objects(self, values: Tensor, rooms: int, objects: int) -> Tensor:
-        """Values at the masks' objects, (rooms, objects, ...); one view per room."""
+        """Values by room and object, (rooms, objects, ...), for a single view per room; 0 for
+        objects without a mask."""
         empty = values.new_zeros(rooms, objects, *values.shape[1:])
         return empty.index_put((self.room, self.item), values)
 

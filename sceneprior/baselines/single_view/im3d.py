@@ -50,27 +50,27 @@ from sceneprior.training.steps import full_precision
 STEEP, LEVEL = 10.0, 0.5
 """The occupancy logit of a point is STEEP (f - LEVEL)."""
 FINE = 32
-"""Cells along each side of the grid that a mesh is taken from."""
+"""Cells along each side of the grid from which a mesh is extracted."""
 
 
 class Im3dModel(DetectorModel):
     """Size of the network."""
 
     rounds: int = Field(3, ge=1)
-    """Rounds of messages over the graph."""
+    """Rounds of message passing over the graph."""
     blobs: int = Field(32, ge=1)
     """Gaussians in a shape."""
 
 
 class Im3dTraining(DetectorTraining):
-    """Settings of the training. Box losses count before and after refinement."""
+    """Settings of the training. Box losses apply to the boxes before and after refinement."""
 
     shape: float = Field(1.0, ge=0)
     """Weight of the occupancy of points in the true boxes."""
     overlap: float = Field(0.1, ge=0)
-    """Weight of the depth of an image's objects inside each other."""
+    """Weight of `overlap_loss`, which keeps the objects of an image apart."""
     points: int = Field(128, ge=1)
-    """Cells of each true box that a step compares."""
+    """Number of cells of each true box whose occupancy is compared in a step."""
 
 
 class Im3dConfig(DetectorConfig):
@@ -103,7 +103,7 @@ class SceneGraph(nn.Module):
     def forward(
         self, found: Detections, features: Float[Tensor, "masks width"], start: CameraBoxes
     ) -> tuple[Float[Tensor, "masks width"], CameraBoxes]:
-        """The nodes after the last round, and the refined boxes."""
+        """Features of the nodes after the last round, and the refined boxes."""
         placed = start.in_room(found)
         away = found.to_frame(placed.centers_m - found.eye_m)
         box = torch.cat([away, found.to_frame(placed.sizes_m).abs().log()], dim=-1)
@@ -157,7 +157,7 @@ class Blobs(nn.Module):
 def occupancy_logits(
     blobs: Float[Tensor, "*batch blobs 7"], points: Float[Tensor, "*batch points 3"]
 ) -> Float[Tensor, "*batch points"]:
-    """Logits of points being inside, positive where they are."""
+    """Occupancy logits of points, positive inside the shape."""
     centers, log_radii, log_weights = blobs.split([3, 3, 1], dim=-1)
     # |(x - p) / r|^2 as matrix products, without a tensor of masks x points x blobs x 3.
     inverse = torch.exp(-2 * log_radii)
@@ -188,7 +188,7 @@ class Im3d(ViewNetwork):
     ) -> tuple[Estimate, CameraBoxes, Float[Tensor, "masks blobs 7"]]:
         """The detector's output, the refined boxes, and the shapes."""
         features, estimate = self.detector(found)
-        # The graph refines the likeliest boxes and sends no gradient back through them.
+        # The graph refines the most likely boxes; no gradient flows back through them.
         start = CameraBoxes(*(part.detach() for part in estimate.boxes()))
         features, refined = self.graph(found, features, start)
         return estimate, refined, self.blobs(features)
@@ -203,7 +203,7 @@ class Im3d(ViewNetwork):
 
 
 class Im3dStage(OneStage):
-    """Learns the true boxes and occupied cells behind the masks of all views drawn."""
+    """Learns the true boxes and occupied cells of the masked objects in all sampled views."""
 
     prior: Im3d
     settings: Im3dTraining
@@ -238,7 +238,7 @@ def occupancy_loss(
 def overlap_loss(
     found: Detections, placed: Placed, blobs: Float[Tensor, "masks blobs 7"]
 ) -> Float[Tensor, ""]:
-    """Depth of objects inside each other, which moves boxes apart.
+    """Penalty on objects that intersect, which moves their boxes apart.
 
     It is the mean of max(0, 2 sigmoid(logit) - 1) over ordered pairs of an image's objects and over
     the Gaussians of the first, with the logit of the Gaussian's centre in the second object.

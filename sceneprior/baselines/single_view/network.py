@@ -53,7 +53,7 @@ class SingleViewConfig(OneStageConfig):
     training: SingleViewTraining
 
     dataset: ClassVar[type[ViewDataset]] = ViewDataset
-    """The training rooms' class."""
+    """Class of the training data set."""
 
     @model_validator(mode="after")
     def _nothing_is_without_effect(self) -> "SingleViewConfig":
@@ -94,7 +94,7 @@ class Placed(NamedTuple):
         distances_m: Float[Tensor, " masks"],
         sizes_m: Float[Tensor, "masks 3"],
     ) -> "Placed":
-        """Boxes from a network's numbers: `Detections.centers_at` explains offsets and distances;
+        """Boxes from a network's outputs: `Detections.centers_at` explains offsets and distances;
         sizes are along the axes of the image's frame."""
         return cls(found.centers_at(offsets, distances_m), found.to_room(sizes_m).abs())
 
@@ -125,8 +125,9 @@ class ViewNetwork(nn.Module, ABC):
 
 
 class DetectionEncoder(nn.Module):
-    """Features of each mask alone: a small convolutional network reads its crop, a linear layer its
-    2D box, rays and class. The published networks read colours with a ResNet instead."""
+    """Features of each mask by itself. A small convolutional network reads the mask's crop, and a
+    linear layer its 2D box, rays and class. The published networks read colours with a ResNet
+    instead."""
 
     def __init__(self, classes: int, width: int):
         super().__init__()

@@ -1,4 +1,4 @@
-"""The baseline Total3D: boxes and meshes of single images, learnt from true ones.
+"""The baseline Total3D: boxes and meshes from single images, learnt from true boxes and meshes.
 
 After Nie et al., "Total3DUnderstanding", CVPR 2020; docs/baselines_single_view.md names the
 differences. Im3D builds on the box detector, its losses and the true objects.
@@ -34,12 +34,12 @@ from sceneprior.paper.shape_decoder import ShapeDecoder, ShapeDecoderConfig
 from sceneprior.training.steps import full_precision
 
 NEAREST_M, FURTHEST_M, BINS = 0.5, 10.0, 8
-"""Range of the distance to a centre. Its bins have equal ratios, because a far distance is known
-less exactly than a near one."""
+"""Range in metres of the distance to a centre, and the number of its bins. Bins are equally wide in
+log distance, because far distances are known less exactly than near ones."""
 BIN = math.log(FURTHEST_M / NEAREST_M) / BINS
 """Width of a bin of log distances."""
 GEOMETRY = 64
-"""Sines and cosines of the four numbers that relate two 2D boxes."""
+"""Number of sines and cosines that encode the four numbers by which two 2D boxes are related."""
 
 
 class DetectorModel(SingleViewModel):
@@ -56,7 +56,7 @@ class DetectorModel(SingleViewModel):
 
 
 class DetectorTraining(SingleViewTraining):
-    """Weights of the box losses. Every view drawn from a room is an image."""
+    """Weights of the box losses. Every sampled view of a room is an image."""
 
     epochs: int = Field(100, ge=1)
     box: float = Field(1.0, ge=0)
@@ -65,7 +65,8 @@ class DetectorTraining(SingleViewTraining):
     """Weight of each mean distance between predicted and true box corners, in metres."""
 
     def weights(self, losses: Iterable[str]) -> dict[str, float]:
-        """Weight of each loss: the setting of its name, with or without `refined_`, or `box`."""
+        """Weight of each loss: the setting of the same name, ignoring the prefix `refined_`; `box`
+        if there is none."""
         return {name: getattr(self, name.removeprefix("refined_"), self.box) for name in losses}
 
 
@@ -111,7 +112,7 @@ class Estimate(NamedTuple):
     """For each bin, the distance from its middle, in bins."""
 
     def boxes(self, bins: Int[Tensor, " masks"] | None = None) -> CameraBoxes:
-        """Boxes whose distances lie in the likeliest bins, or in the given ones."""
+        """Boxes whose distances lie in the most likely bins, or in the given `bins`."""
         bins = self.bin_logits.argmax(dim=-1) if bins is None else bins
         place = bins + 0.5 + self.residuals.gather(1, bins.unsqueeze(-1))[:, 0]
         return CameraBoxes(self.offsets, math.log(NEAREST_M) + place * BIN, self.log_sizes)
@@ -181,8 +182,8 @@ class Detector(nn.Module):
     def fit_statistics(
         self, log_sizes: Float[Tensor, "objects 3"], object_class: Int[Tensor, " objects"]
     ) -> None:
-        """Set each class's mean size from training rooms. Its width and depth are equal, because an
-        object can be turned either way."""
+        """Set each class's mean log size from training rooms. Width and depth get the same mean,
+        because an object may be turned by a quarter."""
         level = log_sizes[:, (0, 2)].mean(dim=-1)
         log_sizes = torch.stack([level, log_sizes[:, 1], level], dim=-1)
         self.mean_log_sizes[:] = log_sizes.mean(dim=0)
@@ -207,7 +208,7 @@ class TrueObjects(NamedTuple):
     ahead: Bool[Tensor, " masks"]
     """True where the centre is in front of the camera; only there do `boxes.offsets` count."""
     points: Float[Tensor, "masks points 3"]
-    """Surface points in the image's frame; the box is [-1, 1]^3."""
+    """Points on the surface, along the axes of the image's frame; the object's box is [-1, 1]^3."""
     occupied: Bool[Tensor, "masks x y z"]
     """Occupied cells along the axes of the room."""
 
@@ -244,7 +245,7 @@ def corner_loss(found: Detections, boxes: CameraBoxes, true: TrueObjects) -> Flo
 def estimate_losses(
     found: Detections, estimate: Estimate, true: TrueObjects
 ) -> dict[str, Float[Tensor, ""]]:
-    """Losses of the detector's output; residuals and corners are those of the true bins."""
+    """Losses of the detector's output; residuals and corners are compared for the true bins."""
     place = (true.boxes.log_distances - math.log(NEAREST_M)) / BIN
     bins = place.long().clamp(0, BINS - 1)
     residual = estimate.residuals.gather(1, bins.unsqueeze(-1))[:, 0]
@@ -303,7 +304,7 @@ class Total3d(ViewNetwork):
 
 
 class Total3dStage(OneStage):
-    """Learns the true boxes and surfaces behind the masks of all views drawn."""
+    """Learns the true boxes and surfaces of the masked objects in all sampled views."""
 
     prior: Total3d
     settings: Total3dTraining
@@ -337,5 +338,5 @@ def mesh_losses(
 
 
 def mean_squared_length(vectors: Float[Tensor, "masks *many 3"]) -> Float[Tensor, ""]:
-    """Mean squared length of all vectors, equally over masks."""
+    """Mean squared length of vectors; every mask has the same weight."""
     return mean_of_masks(vectors.square().sum(dim=-1))

@@ -21,11 +21,12 @@ from sceneprior.core.views import SceneViews
 from sceneprior.render.topdown import object_mesh
 
 POINTS = 256
-"""Points on the surface of each object."""
+"""Number of points sampled on the surface of each object."""
 CELLS = 16
 """Cells along each axis of an object's grid."""
 DENSE = 12288
-"""Surface points that mark cells: about eight per cell of a cube's surface."""
+"""Number of surface points by which occupied cells are found: about eight per cell of a cube's
+surface."""
 
 
 class TrueViews(NamedTuple):
@@ -35,7 +36,7 @@ class TrueViews(NamedTuple):
     boxes_m: Float[Tensor, "rooms objects 6"]
     """Centre, then full extents, in the room frame."""
     points: Float[Tensor, "rooms objects points 3"]
-    """Surface points; the box is [-1, 1]^3."""
+    """Points on the surface, in the frame in which the object's box is [-1, 1]^3."""
     occupied: Bool[Tensor, "rooms objects x y z"]
     """Cells of the box inside the object."""
 
@@ -89,9 +90,11 @@ def _read(folder: Path, shard: Any, room_id: str) -> tuple[np.ndarray, np.ndarra
 
 
 def filled(points: Float[np.ndarray, "points 3"], cells: int) -> Bool[np.ndarray, "x y z"]:
-    """Cells of [-1, 1]^3 that hold a point of the surface, or that have such cells on both sides
-    along all three axes. A surface cell without a point then spoils at most the lines through it,
-    where a flood fill would leak.
+    """Cells of [-1, 1]^3 that contain a surface point, or that lie between such cells along all
+    three axes.
+
+    A surface cell that happens to contain no point affects at most the lines through it, whereas a
+    flood fill would leak there.
 
     Example: a sphere's inside is filled.
 

@@ -49,9 +49,11 @@ class UslTraining(SingleViewTraining):
 
     epochs: int = Field(200, ge=1)
     box: float = Field(5.0, ge=0)
-    """Weight of 2D boxes in the other views. Silhouettes that miss their masks have no gradient."""
+    """Weight of 2D boxes in the other views. It is needed because silhouettes that miss their masks
+    have no gradient."""
     frustum: float = Field(1.0, ge=0)
-    """Weight of the rays to objects that another view sees but whose prediction lies outside it."""
+    """Weight of the frustum loss, for objects that are visible in another view while their
+    prediction lies outside it."""
     mask: float = Field(1.0, ge=0)
     """Weight of silhouettes in the other views."""
     occlusion_slack: float = Field(0.15, ge=0, le=1)
@@ -82,8 +84,8 @@ class Usl(ViewNetwork):
         self.shape: ShapeDecoder = config.shape.build(config.width)
 
     def forward(self, found: Detections) -> tuple[Placed, Float[Tensor, "masks vertices 3"]]:
-        """Boxes, and vertices in metres. An output of 0 means `START_M` away and as large as the 2D
-        box."""
+        """Boxes, and vertices in metres. Network outputs of 0 place an object at a distance of
+        `START_M`, with the size that its 2D box has there."""
         features = self.encoder(found)
         offsets, log_distance, log_sizes = self.box(features).split([2, 1, 3], dim=-1)
         distances_m = START_M * log_distance[:, 0].exp()
@@ -130,9 +132,9 @@ def other_view_losses(
     a view, and silhouettes.
 
     Each silhouette is drawn alone. The object may continue behind other objects, so pixels that
-    show one do not count:
+    show another object are left out:
 
-        L_mask = 1 - IoU(silhouette, mask) over the other pixels
+        L_mask = 1 - IoU(silhouette, mask) over the remaining pixels
     """
     rooms, objects = others.is_object.shape
     predicted = found.of_objects(torch.ones_like(found.image, dtype=torch.bool), rooms, objects)

@@ -18,10 +18,10 @@ from sceneprior.paper.layers import mlp
 ATTRIBUTES = 7
 """Numbers of a slot: existence, centre x, y, z, full extents along x, y, z."""
 READS = 4
-"""Groups of inputs connected to each output of a sparse layer."""
+"""Number of input groups connected to each output of a sparse layer."""
 HIDDEN_GROUP = 8
 MOMENTUM = 0.05
-"""Share of the newest batch in the running error of each class."""
+"""Weight of the newest batch in the running error of each class."""
 LEAST_SPREAD_M = 0.05
 LEAST_SIZE_M = 0.02
 
@@ -34,8 +34,8 @@ class Sync2genModel(Section):
     latent: int = Field(20, ge=1)
     """Size of a room's latent."""
     slots: int = Field(8, ge=1, le=1000)
-    """Most objects of one class in a room (released: 4). Others are left out; `train/left_out` logs
-    their share."""
+    """Maximum number of objects of one class in a room (released code: 4). Further objects are left
+    out; `train/left_out` logs their share."""
     refine_steps: int = Field(100, ge=0)
     """Gradient steps that move each new room's objects towards the offsets of training rooms; 0
     keeps rooms as decoded (the paper's Sync2Gen*). Training does not use it."""
@@ -92,7 +92,7 @@ class Sync2Gen(nn.Module):
         self.pairs.fit(rooms, self.seed)
 
     def to_matrix(self, rooms: RoomBoxes) -> Float[Tensor, "rooms classes slots 7"]:
-        """Rooms as matrices, bit for bit independent of the order of objects."""
+        """Rooms as matrices, which are bit-identical for any order of the objects."""
         label = rooms.object_class.where(rooms.is_object, self.classes)
         order = torch.arange(label.shape[1], device=label.device).expand_as(label)
         # The sort is stable, so the last key is the primary one.
@@ -104,7 +104,7 @@ class Sync2Gen(nn.Module):
         row = (label - 1).clamp(max=self.classes - 2)
         unit = (rooms.boxes_m - self.mean_m[row, 0]) / self.spread_m[row, 0]
         cell = torch.cat([torch.ones_like(unit[..., :1]), unit], dim=-1)
-        # Objects without a slot go to one behind the last, which is cut off below.
+        # Objects without a slot go to an extra one after the last, which is cut off below.
         last = (self.classes - 1) * self.slots
         slot = (row * self.slots + rank).where(fits, last)
         matrix = cell.new_zeros(len(label), last + 1, ATTRIBUTES)
@@ -157,14 +157,15 @@ class Sync2Gen(nn.Module):
 
     @torch.no_grad()
     def sample(self, count: int, seed: int) -> RoomBoxes:
-        """New rooms of latents from N(0, 1). The first rooms of a seed do not depend on `count`."""
+        """New rooms, from latents of N(0, 1). The first rooms of a seed do not depend on
+        `count`."""
         generator = torch.Generator().manual_seed(seed)
         z = torch.stack([torch.randn(self.latent, generator=generator) for _ in range(count)])
         rooms = self.to_rooms(self.decode(z.to(self.mean_m)))
         return self.pairs.refine(rooms, self.refine_steps)
 
     def to_rooms(self, decoded: Float[Tensor, "rooms classes slots 7"]) -> RoomBoxes:
-        """Boxes in metres of the slots whose existence is likelier than not."""
+        """Boxes in metres of the slots whose probability of existence is above 0.5."""
         boxes_m = (self.mean_m + self.spread_m * decoded[..., 1:]).flatten(1, 2)
         boxes_m = torch.cat([boxes_m[..., :3], boxes_m[..., 3:].clamp(min=LEAST_SIZE_M)], dim=-1)
         exists = (decoded[..., 0] > 0).flatten(1, 2)

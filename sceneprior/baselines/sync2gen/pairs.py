@@ -1,7 +1,8 @@
 """Offsets between pairs of furniture in training rooms, and their use to refine new rooms.
 
-This is a small form of Sync2Gen's synchronisation: absolute positions have the decoder's
-uncertainty, relative ones that of training rooms. docs/baselines_3d.md names what is left out.
+This is a small form of Sync2Gen's synchronisation. Absolute positions are as uncertain as the
+decoder's errors are large, and relative positions as uncertain as offsets in training rooms vary.
+docs/baselines_3d.md names what is left out.
 """
 
 from dataclasses import replace
@@ -38,8 +39,8 @@ class PairPrior(nn.Module):
         self.register_buffer("error_m2", torch.full((classes,), 0.04))
 
     def fit(self, rooms: RoomBoxes, seed: int) -> None:
-        """Keep `COMPONENTS` offsets per pair from training rooms: a random choice of a frequent
-        pair's, repetitions of a rare pair's."""
+        """Keep `COMPONENTS` offsets per pair of classes from training rooms: a random choice for
+        frequent pairs, with repetitions for rare ones."""
         generator = torch.Generator().manual_seed(seed)
         offsets_m, together = _offsets(rooms)
         room, one, other = together.nonzero(as_tuple=True)
@@ -61,7 +62,7 @@ class PairPrior(nn.Module):
 
             sum_i |p_i - start_i|^2 / (2 error_i) - mean_(j != i) log p(p_j - p_i | classes)
 
-        Pairs that no training room holds do not count.
+        Pairs of classes that occur in no training room are left out.
         """
         error_m2 = self.error_m2[rooms.object_class]
         stray = ((rooms.boxes_m[..., [0, 2]] - start_m) ** 2).sum(dim=-1) / (2 * error_m2)

@@ -20,8 +20,8 @@ class Sync2genTraining(OneStageTraining):
     batch_size: int = Field(64, ge=1)
     learning_rate: float = Field(1e-3, gt=0)
     kl_weight: float = Field(0.1, ge=0)
-    """Weight of the KL divergence from N(0, 1). Larger: new rooms are better and less varied;
-    smaller: training rooms are reconstructed better, and rooms between them are worse."""
+    """Weight of the KL divergence from N(0, 1). A larger weight makes new rooms better but less
+    varied; a smaller one reconstructs training rooms better, but makes new rooms worse."""
 
 
 class Sync2genConfig(BoxConfig):

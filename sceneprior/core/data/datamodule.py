@@ -12,10 +12,10 @@ from sceneprior.core.data.dataset import BLANK
 class DrawSampler(Sampler[list[tuple[int, int]]]):
     """Samples batches of (row, epoch) in a new order each epoch, split over processes.
 
-    `world` processes together draw the batches that a single process would draw with a `batch_size`
-    that is `world` times as large; `rank` is the index of this process. If the last batch has fewer
-    rows than there are processes, the others get a draw of the epoch `BLANK`, for which the data
-    set returns an empty room.
+    In each step, the `world` processes together draw the rows that a single process with a `world`
+    times larger `batch_size` would draw; `rank` is the index of this process. If the last batch has
+    fewer rows than there are processes, each process without a row gets a draw of the epoch
+    `BLANK`, for which the data set returns an empty room.
     """
 
     def __init__(self, rows: int, batch_size: int, seed: int, rank: int = 0, world: int = 1):
@@ -23,7 +23,7 @@ class DrawSampler(Sampler[list[tuple[int, int]]]):
         self.rank, self.world = rank, world
         self.epoch = 0
         # Lightning sets the epoch of a loader's `sampler` and of its `batch_sampler.sampler`, but
-        # not of the batch sampler itself, so this one is its own sampler.
+        # not of the `batch_sampler`, so this batch sampler is also its own `sampler`.
         self.sampler = self
 
     def set_epoch(self, epoch: int) -> None:

@@ -25,9 +25,9 @@ _Room = TypeVar("_Room")
 
 
 class RoomDataset(Dataset):
-    """Rooms of a split of a shard folder, in memory; a row is a room or a rotated copy of one.
+    """Rooms of one split of a shard folder, in memory; a row is a room or its rotated copy.
 
-    `rotations` is 1, or 4 to add each room rotated by 90, 180 and 270 degrees.
+    `rotations` is 1, or 4 to add a copy of each room rotated by 90, 180 and 270 degrees.
     """
 
     max_objects: int
@@ -35,7 +35,7 @@ class RoomDataset(Dataset):
     counted: ClassVar[str]
     """Name of the things that `max_objects` counts, for messages."""
     masks: MaskStore | None = None
-    """Images to read; with None, batches are made in the training process, on its device."""
+    """Images to read; if None, batches are made in the training process, on its device."""
 
     def __init__(self, rotations: int):
         self.rotations, self.label_set = rotations, ""
@@ -50,7 +50,7 @@ class RoomDataset(Dataset):
             if self.label_set and shard.label_set != self.label_set:
                 raise ShardError(
                     f"{shard.path} is labelled '{shard.label_set}' but its neighbours "
-                    f"'{self.label_set}'; keep one label set a folder."
+                    f"'{self.label_set}'; keep one label set per folder."
                 )
             self.label_set = shard.label_set
             self.plain_ids.append(room_id)
@@ -73,9 +73,9 @@ class RoomDataset(Dataset):
 class FlatViews(Batch):
     """All views of a split as flat arrays, without the images.
 
-    A view takes 100 bytes, a sighting 21. A sighting is a pair of a view and a tracked object of
-    its room, visible or not. Sightings are ordered by room, then view, then object. The last object
-    and the last sighting are dummies, to which padding refers.
+    A sighting is a pair of a view and a tracked object of the same room, visible or not. Sightings
+    are ordered by room, then view, then object. The last object and the last sighting are dummies,
+    to which padding refers. A view takes 100 bytes, and a sighting 21.
     """
 
     object_count: Int[Tensor, " rooms"]
@@ -124,10 +124,10 @@ class FlatViews(Batch):
         objects: int,
         blank: Bool[Tensor, " batch"] | None = None,
     ) -> dict[str, Any]:
-        """Gather views of rooms, by their indices within the room, as fields of `SceneViews`.
+        """Gather views of rooms as fields of `SceneViews`.
 
-        Each room is rotated by `quarter` quarter turns about +y, and padded to `objects`; `blank`
-        rooms are returned without objects.
+        `view` holds indices within the room. Each room is rotated by `quarter` quarter turns about
+        +y, and padded to `objects` objects. A room marked in `blank` is returned without objects.
         """
         slot = torch.arange(objects, device=self.boxes.device)
         count = self.object_count[room][:, None]
@@ -157,9 +157,9 @@ class FlatViews(Batch):
 def allowed_views(
     seed: int, room: int, count: int, fraction: float, held_out: bool = False
 ) -> Int64[np.ndarray, " views"]:
-    """Indices of the views of a room that training may use, a seeded random share of all.
+    """Indices of a room's views that training may use: a random share, determined by `seed`.
 
-    With `held_out`, the indices of the other views.
+    If `held_out`, the indices of the other views instead.
     """
     keep = max(1, round(fraction * count))
     order = np.random.default_rng([seed, room]).permutation(count)
@@ -175,8 +175,8 @@ class ViewDataset(RoomDataset):
     Args:
         views_per_room: Number of views sampled each time a room is drawn.
         view_fraction: Share of each room's views that may be sampled, chosen once by `seed`.
-        held_out: Sample the other views instead, which training does not use; every room must have
-            some.
+        held_out: Sample from the remaining views, which training does not use; every room must have
+            at least one.
         mask_step: Downsampling step of the instance ids; None reads no images.
     """
 

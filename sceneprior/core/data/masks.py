@@ -16,9 +16,9 @@ _OPEN_SHARDS = 32
 class MaskStore:
     """Instance-id images of a split, downsampled by `step`, read on first use and kept compressed.
 
-    Images of ids consist of large flat areas: at a quarter of 480 x 360, a view has 10,800 pixels
-    and takes about 400 bytes compressed, so 100,000 views take 40 MB. Decompression takes a
-    twentieth of the time of reading the shard again.
+    Images of ids consist of large uniform areas: a view of 480 x 360 pixels, downsampled by 4, has
+    10,800 pixels and takes about 400 bytes compressed, so 100,000 views take 40 MB. Decompressing a
+    view takes a twentieth of the time of reading it from the shard again.
     """
 
     def __init__(self, rooms: Sequence[tuple[Path, str]], step: int):

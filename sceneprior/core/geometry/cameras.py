@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 MIN_DEPTH_M = 1e-3
-"""Minimum depth, to which points at or behind the camera are moved before the division, as in the
-authors' code."""
+"""Minimum depth. Points at or behind the camera are moved to this depth before the division, as in
+the authors' code."""
 
 
 class Boxes2D(NamedTuple):
@@ -31,7 +31,7 @@ def project(
     _, objects, points, _ = points_m.shape
     rows = (intrinsics @ world_to_camera[..., :3, :3]).reshape(rooms, views * 3, 3)
     offset = (intrinsics @ world_to_camera[..., :3, 3:]).reshape(rooms, views * 3, 1)
-    # Components come first, so that the search for extremes reads points contiguously.
+    # Coordinates are the first axis, so that the search for extremes reads memory contiguously.
     columns = points_m.reshape(rooms, objects * points, 3).transpose(1, 2)
     scaled = torch.baddbmm(offset, rows, columns)
     scaled = scaled.reshape(rooms, views, 3, objects, points)
@@ -48,11 +48,11 @@ def boxes_of_points(
 ) -> Boxes2D:
     """2D bounding box of each object's projected points in every view (paper, section 3.4).
 
-    The points are mesh vertices or box corners in world metres, the intrinsics pixels of an image
-    of `image_size`, (height, width). Boxes x1, y1, x2, y2 are relative to that size, clamped to
-    [0, 1]. `in_frustum` is true if some point is in front of the camera and the unclamped box
-    intersects the image. Outside the frustum, the clamped box has no useful gradient, and the
-    frustum loss is used instead.
+    The points are mesh vertices or box corners, in world metres. The intrinsics are in pixels of an
+    image of `image_size`, (height, width). Boxes x1, y1, x2, y2 are relative to the image size and
+    clamped to [0, 1]. `in_frustum` is true if some point is in front of the camera and the
+    unclamped box intersects the image. Outside the frustum, the clamped box has no useful gradient,
+    so the frustum loss is used there instead of the box loss.
     """
     height, width = image_size
     rooms, views = world_to_camera.shape[:2]

@@ -10,9 +10,9 @@ from torch.autograd.function import once_differentiable
 from sceneprior.core.geometry.cameras import MIN_DEPTH_M, Boxes2D
 
 SERIAL_NUMEL = 32768
-"""Number of elements up to which torch runs an operation on one thread. With more, each of a
-hundred small operations waits for other threads, 1 s per step on busy cores; so tensors are split
-into pieces of this size, which also fit the cache."""
+"""Number of elements up to which torch runs an operation on one thread. Tensors are split into
+pieces of this size. With larger ones, each of a hundred small operations would wait for other
+threads, 1 s per step on busy cores; the pieces also fit the cache."""
 
 
 def boxes_of_ellipsoids(
@@ -35,15 +35,16 @@ def boxes_of_ellipsoids(
     skew.
 
     Returns:
-        Boxes x1, y1, x2, y2 relative to the image size, clamped to [0, 1]; and `in_frustum`. Both
-        equal those of `boxes_of_points` for all points of the solid, except that points behind the
-        camera are clipped here, but moved to `MIN_DEPTH_M` there. An ellipsoid wholly behind the
-        camera is outside the frustum, and its box is that of all its points moved, in both.
-        Differentiable once with respect to every tensor; gradients are finite for finite inputs.
+        Boxes x1, y1, x2, y2 relative to the image size, clamped to [0, 1]; and `in_frustum`. They
+        equal the result of `boxes_of_points` for all points of the solid, except that this function
+        clips points behind the camera, whereas `boxes_of_points` moves them to `MIN_DEPTH_M`. Both
+        functions report an ellipsoid wholly behind the camera as outside the frustum, and return
+        the box of its points moved to `MIN_DEPTH_M`. The boxes are differentiable once with respect
+        to every tensor, and gradients are finite for finite inputs.
 
     Source:
         Rubino et al., "3D Object Localisation from Multi-view Image Detections", TPAMI 2018
-        (dual quadrics and boxes); the cut and the backward are ours.
+        (dual quadrics and boxes); the clipping and the backward pass are ours.
 
     Example: a ball of radius 0.6 m, 1 m ahead, ends at u = tan(asin(0.6)) = 0.75 on both sides.
 
@@ -68,14 +69,14 @@ def boxes_of_ellipsoids(
 
 
 class _Sides(NamedTuple):
-    """Sides of the 2D boxes. The first axis is low and high side, the second u and v."""
+    """Sides of the 2D boxes. The first axis is (low side, high side), the second (u, v)."""
 
     value: Float[Tensor, "2 2 rooms views objects"]
     """Unclamped coordinate of the side."""
     at: Float[Tensor, "2 2 3 rooms views objects"]
     """w of the extreme point, which is centre + half size * w."""
     trade: Float[Tensor, "2 2 rooms views objects"]
-    """dX / dZ along the side: u for a tangent; the drift of the extreme with Z for a cut."""
+    """dX / dZ along the side: u for a tangent; for a cut, how far the extreme moves with Z."""
     depth: Float[Tensor, "2 2 rooms views objects"]
     """Z of the extreme point, the divisor of the projection."""
 
@@ -85,13 +86,13 @@ class _BoxesOfEllipsoids(torch.autograd.Function):
 
     A side is the extreme of X / Z over a ball, so by the envelope theorem the motion of the extreme
     point within the ball does not contribute: d side = (dX - trade dZ) / Z at fixed w. No square
-    root is differentiated, so gradients stay finite where an outline vanishes. The graph has one
-    node, and a step takes two thirds of the time of autograd on the same formulas.
+    root is differentiated, so gradients stay finite where an outline vanishes. Autograd sees one
+    node, and a step takes two thirds of the time that autograd takes for the same formulas.
     """
 
     @staticmethod
     def forward(ctx: Any, center: Tensor, half: Tensor, rows: Tensor, offset: Tensor) -> Any:
-        # Components come first: sums over a short last axis are slow.
+        # Coordinates are the first axes, because sums over a short last axis are slow.
         by_view = rows.permute(2, 3, 0, 1).unsqueeze(-1)
         middle = (by_view * center.permute(2, 0, 1).unsqueeze(2)).sum(dim=1)
         middle = middle + offset.permute(2, 0, 1).unsqueeze(-1)
@@ -164,11 +165,11 @@ def _find_sides(
     sum_of_both = torch.where(b < 0, b - root, b + root)
     far, near = sum_of_both / a, c / sum_of_both
     tangent = torch.where((sign < 0) == (b < 0), far, near)
-    # The tangent point has the depth root * lever / norm, and is invisible behind the plane.
+    # The tangent point has depth root * lever / norm; behind the plane it is not visible.
     lever = z0 * root - sign * x0 * reach_sq
     norm = z0 * z0 * width_sq + x0 * x0 * reach_sq
     touches = in_front | (ahead & (root_sq > 0) & (root * lever >= MIN_DEPTH_M * norm))
-    # Its w is along X' - tangent Z'; this is that vector's squared length, without cancellation.
+    # Squared length of X' - tangent Z', the direction of the tangent point's w; no cancellation.
     length_sq = torch.where(in_front, (tangent * z0) ** 2, width_sq + tangent**2 * reach_sq)
     touch_dx = sign / length_sq.sqrt().clamp(min=tiny)
     touch_dz = -tangent * touch_dx
@@ -181,7 +182,7 @@ def _find_sides(
     cut = (x0 + sign * width * beside) / MIN_DEPTH_M
     cut_dx = sign * beside / width.clamp(min=tiny)
     cut_dz = along / reach.clamp(min=tiny)
-    # The motion of a vanishing cut is unbounded, so its size is clamped to 1e-4 of the ellipsoid.
+    # The derivative at a vanishing cut is unbounded, so the cut's radius is clamped to 1e-4.
     drift = sign * width * along / (reach * beside.clamp(min=1e-4)).clamp(min=tiny)
 
     by_dx = torch.where(touches, touch_dx, cut_dx).unsqueeze(2)

@@ -7,7 +7,7 @@ FIELD_OF_VIEW_DEG = (5.0, 160.0)
 
 
 def odd_field_of_view(focal_px: float, image_size: tuple[int, int]) -> str:
-    """Describe why a focal length is implausible, and guess the cause; "" if it is plausible.
+    """Say why a focal length is implausible and what the cause may be; "" if it is plausible.
 
     Example: a focal length given as a fraction of the width.
 

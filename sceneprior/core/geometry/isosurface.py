@@ -59,7 +59,8 @@ def surface_of(
     inner = logits[np.ix_(*within)]
     if not (inner > 0).any() or (inner > 0).all():
         return CUBE_CORNERS * size_m / 2 + center_m, BOX_FACES.copy()
-    # One layer of padding extends beyond the box; the next, empty one closes the surface there.
+    # The first layer of padding continues the cells beyond the box; the second is empty and closes
+    # the surface.
     beyond = np.pad(without_small_pieces(inner), 1, mode="edge")
     field = np.pad(beyond, 1, constant_values=-SURE).astype(np.float32)
     vertices, faces, *_ = marching_cubes(field, 0.0, gradient_direction="ascent")

@@ -32,8 +32,8 @@ def to_cube(sphere: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
 def beveled_cube(bevels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 32 3"]:
     """Vertices of the cube [-1, 1]^3 with beveled edges; they still touch all six sides.
 
-    Bevels of the vertical and the horizontal edges are in [0, 1] of half a side: (0, 0) is the
-    cube, (1, 0) a prism over a diamond, (1, 1) an octahedron.
+    `bevels` holds the bevel of the vertical edges and that of the horizontal edges, in half sides,
+    [0, 1]: (0, 0) is the cube, (1, 0) a prism over a diamond, and (1, 1) an octahedron.
     """
     upright, level = (1 - bevels).unsqueeze(-2).unbind(dim=-1)
     x, y, z = bevels.new_tensor(CUBE_CORNERS).unbind(dim=-1)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sceneprior.core.geometry.corners import CUBE_CORNERS
-from sceneprior.core.parts import BOWL, BOX, CYLINDER, DOME, Parts, center_and_radii
+from sceneprior.core.parts import BOWL, BOX, CYLINDER, DOME, SQUARE, Parts, center_and_radii
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -25,7 +25,8 @@ MOST_THIN = 0.7
 def surface_of_parts(
     parts: Parts,
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """Vertices, in the frame of the object's box, and outward triangles of the union of all parts.
+    """Vertices, in the frame of the object's box, and outward triangles of the union of all parts
+    within the outline.
 
     The mesh is closed: every edge belongs to two triangles.
     """
@@ -33,19 +34,46 @@ def surface_of_parts(
 
     solids = [_solid(kind, ends) for kind, ends in parts.solids()]
     united: Manifold = Manifold.batch_boolean(solids, OpType.Add)
+    if not np.array_equal(parts.outline, SQUARE):
+        united = united ^ _prism(parts.outline)
     mesh = united.simplify(OVERLAP).to_mesh64()
     vertices = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
     return vertices.clip(-0.5, 0.5), np.asarray(mesh.tri_verts, dtype=np.int64)
 
 
+def convex_surface(
+    points: Float[np.ndarray, "points 3"],
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    """Vertices and outward triangles of the convex hull of points."""
+    from manifold3d import Manifold
+
+    mesh = Manifold.hull_points(points).to_mesh64()
+    vertices = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
+    return vertices, np.asarray(mesh.tri_verts, dtype=np.int64)
+
+
+def _prism(outline: Float[np.ndarray, "corners 2"]) -> "Manifold":
+    """The upright prism over an outline, taller than the object's box."""
+    from manifold3d import CrossSection
+
+    height = 1 + 4 * OVERLAP
+    # Extruded along its third axis, which becomes y.
+    to_room = np.array([[1, 0, 0, 0], [0, 0, 1, -height / 2], [0, 1, 0, 0]])
+    return CrossSection([outline]).extrude(height).transform(to_room)
+
+
 def _solid(kind: int, ends: Float[np.ndarray, "3 2"]) -> "Manifold":
     from manifold3d import Manifold
 
-    grown = ends + np.array([-OVERLAP, OVERLAP])
+    return Manifold.hull_points(solid_points(kind, ends + np.array([-OVERLAP, OVERLAP])))
+
+
+def solid_points(kind: int, ends: Float[np.ndarray, "3 2"]) -> Float[np.ndarray, "points 3"]:
+    """Points whose convex hull is a solid; circles have `SIDES` corners."""
     if kind == BOX:
-        corners = CUBE_CORNERS / 2 * (grown[:, 1] - grown[:, 0]) + grown.mean(axis=1)
+        corners = CUBE_CORNERS / 2 * (ends[:, 1] - ends[:, 0]) + ends.mean(axis=1)
     else:
-        center, radii = center_and_radii(kind, grown)
+        center, radii = center_and_radii(kind, ends)
         turns = np.arange(SIDES) * 2 * np.pi / SIDES
         circle = np.stack([np.cos(turns), np.zeros(SIDES), np.sin(turns)], axis=1)
         if kind == CYLINDER:
@@ -56,7 +84,7 @@ def _solid(kind: int, ends: Float[np.ndarray, "3 2"]) -> "Manifold":
             rises = np.linspace(low, high, steps) * np.pi / 2
             rings = [np.cos(rise) * circle + np.array([0, np.sin(rise), 0]) for rise in rises]
         corners = np.concatenate(rings) * radii + center
-    return Manifold.hull_points(corners)
+    return corners
 
 
 def stretched(

@@ -68,7 +68,7 @@ def chamfer_mean(
 ) -> float:
     """Chamfer distance averaged over both directions, half of `chamfer_of`, in the points' unit.
 
-    `a_tree` is that of `a_points`, for repeated comparisons.
+    `a_tree` is a k-d tree of `a_points`; pass it if `a_points` are compared with several sets.
     """
     there, back = nearest_distances(a_points, b_points, a_tree)
     return float(there.mean() + back.mean()) / 2
@@ -82,6 +82,7 @@ def nearest_distances(
     """Distance of each point to its nearest neighbour in the other set: a to b, and b to a."""
     if not len(a_points) or not len(b_points):
         raise InputError(
-            f"Surfaces are compared by points, but {len(a_points)} and {len(b_points)} came."
+            "Point sets to compare need at least one point each; got "
+            f"{len(a_points)} and {len(b_points)}."
         )
     return cKDTree(b_points).query(a_points)[0], (a_tree or cKDTree(a_points)).query(b_points)[0]

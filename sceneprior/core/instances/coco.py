@@ -14,8 +14,8 @@ from sceneprior.core.instances.tables import LARGEST_ID
 CROWD = "crowd"
 """Class of regions that are not a single object (`iscrowd`)."""
 LARGEST_PIXELS = 64 << 20
-"""Maximum number of pixels of an image, because the masks of a larger one would take gigabytes;
-cameras have half as many."""
+"""Maximum number of pixels of an image, because the masks of a larger one would take gigabytes.
+Photographs have at most about half as many."""
 _PIXELS_AT_ONCE = 1 << 20
 _LONGEST_RUN_BITS = 40
 
@@ -49,7 +49,7 @@ class _Coco(BaseModel):
 def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
     """Read the instance ids and their class names from a COCO JSON of a single image.
 
-    Of overlapping objects, the one with fewer pixels is in front, as for a cup on a table.
+    Where objects overlap, the one with fewer pixels is taken to be in front, like a cup on a table.
 
     Returns:
         (height, width) uint16, k + 1 for the k-th annotation, 0 for background; and class names by
@@ -58,11 +58,11 @@ def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
     data = read_json(path)
     if not isinstance(data, dict):
         raise InputError(
-            f"{path} is {'a list of results' if isinstance(data, list) else shown(data)}, no COCO "
-            "JSON of masks; expected an object with `images` (their sizes), `annotations` and "
+            f"{path} is {'a list of results' if isinstance(data, list) else shown(data)}, not a "
+            "COCO JSON of masks; expected an object with `images` (their sizes), `annotations` and "
             "`categories`: put results under `annotations` and add the other two."
         )
-    coco = checked(_Coco, data, f"{path} is no COCO JSON of masks")
+    coco = checked(_Coco, data, f"{path} is not a COCO JSON of masks")
     if len(coco.images) != 1:
         raise InputError(
             f"{path} describes {len(coco.images)} images; keep one, and its annotations."
@@ -88,7 +88,7 @@ def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
             )
         classes[row + 1] = CROWD if annotation.iscrowd else names[annotation.category_id]
         mask = _decoded(annotation.segmentation, size, where)
-        # Of equally large objects, the later is in front.
+        # Among equally large objects, the later one is in front.
         mask &= (pixels := np.int32(mask.sum())) <= pixels_of_front
         ids[mask], pixels_of_front[mask] = row + 1, pixels
     return ids, classes
@@ -103,14 +103,14 @@ def _decoded(segmentation: Any, size: tuple[int, int], where: str) -> np.ndarray
         if list(said) != list(size):
             told = _size(said) if len(said) == 2 else shown(said)
             raise InputError(
-                f"{where}: its mask is of an image of {told} pixels, but the image has "
+                f"{where}: its mask has {told} pixels, but the image has "
                 f"{_size(size)}; write the masks at the image's size."
             )
         counts = _unpacked(counts) if isinstance(counts, str) else [int(each) for each in counts]
         total, area = sum(counts), size[0] * size[1]
         if min(counts, default=-1) < 0 or total != area:
             came = total if abs(total) < 1 << _LONGEST_RUN_BITS else "too many"
-            raise ValueError(f"its runs are of {came} pixels, not of {area}")
+            raise ValueError(f"its runs cover {came} pixels, not {area}")
         covered = np.arange(len(counts)) % 2 == 1  # the first run is background
         return np.repeat(covered, counts).reshape(size, order="F")
     except InputError:
@@ -150,28 +150,28 @@ def _inside(polygons: list[Any], size: tuple[int, int]) -> np.ndarray:
 def _unpacked(text: str) -> list[int]:
     """Decode COCO's compressed run lengths.
 
-    A number is written in base 32, low digits first; the sixth bit of a digit marks that more
-    follow. From the fourth on, a number is the difference to the last but one. pycocotools is not
-    used because it returns uninitialised memory for damaged texts.
+    A number is written in base 32, lowest digit first; the sixth bit of a character is set if more
+    digits follow. From the fourth number on, the difference to the number two before it is stored.
+    pycocotools is not used, because it returns uninitialised memory for damaged texts.
     """
     counts: list[int] = []
     value = shift = 0
     for character in text:
         digit = ord(character) - 48
         if not 0 <= digit < 64:
-            raise ValueError(f"{character!a} is no digit of packed runs")
+            raise ValueError(f"{character!a} is not a digit of compressed run lengths")
         value |= (digit & 31) << shift
         shift += 5
         if digit & 32:
             if shift > _LONGEST_RUN_BITS:
-                raise ValueError("a number of its packed runs is too long")
+                raise ValueError("a number of its compressed run lengths is too long")
             continue
         if digit & 16:
             value -= 1 << shift
         counts.append(value + (counts[-2] if len(counts) > 2 else 0))
         value = shift = 0
     if shift:
-        raise ValueError("its packed runs end within a number")
+        raise ValueError("its compressed run lengths end within a number")
     return counts
 
 

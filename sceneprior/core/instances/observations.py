@@ -10,10 +10,12 @@ from sceneprior.core.classes import VOID
 from sceneprior.core.shards import RoomViews, Sightings
 
 MIN_BOX_SIDE_PX = 4
-"""Largest box side at which a mask counts as not visible in a view."""
+"""Longest side of a mask's box, in pixels, at which the mask still counts as not visible: an object
+is visible in a view if both sides of its box are longer."""
 
 TOUCH_PX = 4
-"""Distance up to which another object touches the outermost pixels of a mask and may occlude it."""
+"""Distance in pixels up to which another object is taken to touch the outermost pixels of a mask,
+so that it may occlude the masked object."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,10 @@ def pixel_counts(image: np.ndarray, count: int) -> np.ndarray:
 def observe(images: np.ndarray, classes: np.ndarray | Sequence[int]) -> Observations:
     """Measure all masks, and renumber the objects that are visible in at least one view.
 
-    The pixels of a visible object stay in every image, even where its mask is too narrow to count.
-
-    Images are (T, H, W) unsigned ids, k + 1 for given object k. Void furniture is not tracked but
-    may occlude objects, so its pixels get the id after the last object's.
+    Images are (T, H, W) unsigned ids, k + 1 for given object k. An object that is visible in some
+    view keeps its pixels in all images, even where its mask is too narrow to count as visible.
+    Furniture of class void is not tracked but may occlude objects, so its pixels get the id after
+    the last object's.
     """
     views, height, width = images.shape
     classes = np.asarray(classes, dtype=np.int16)
@@ -95,9 +97,9 @@ def observe(images: np.ndarray, classes: np.ndarray | Sequence[int]) -> Observat
 def clear_sides(
     image: np.ndarray, number: int, rows: slice, columns: slice
 ) -> tuple[bool, bool, bool, bool]:
-    """Find the sides of a mask's box that no other object touches: left, upper, right, lower.
+    """Test for each side of a mask's box that no other object touches it.
 
-    `number` is the mask's id in the image of ids.
+    The sides are left, upper, right and lower; `number` is the mask's id in the image of ids.
     """
     top, left = max(rows.start - TOUCH_PX, 0), max(columns.start - TOUCH_PX, 0)
     around = image[top : rows.stop + TOUCH_PX, left : columns.stop + TOUCH_PX]
@@ -112,7 +114,7 @@ def clear_sides(
 
 
 def _clear(mine: np.ndarray, other: np.ndarray, last: int, outwards: int) -> bool:
-    """Test one side; `last` is the outermost line of the mask along the first axis."""
+    """Test one side; `last` is the index of the mask's outermost row along the first axis."""
     if outwards < 0:
         rim, around = slice(last, last + 3), slice(max(last - TOUCH_PX, 0), last + 3)
     else:

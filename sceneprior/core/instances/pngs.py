@@ -14,7 +14,7 @@ _COLORS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 
 
 def png_kind(data: bytes) -> tuple[int, str] | None:
-    """Bits a channel and colours of the PNG that begins with these bytes; None if it is none."""
+    """Bits per channel and colours of a PNG, from its first bytes; None if it is not a PNG."""
     if len(data) < _HEADER_BYTES or not data.startswith(_PNG_START):
         return None
     return data[24], _COLORS.get(data[25], "unknown colours")
@@ -27,7 +27,7 @@ def mask_size(path: Path, rgb: bool = False) -> tuple[int, int]:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Read a mask of tracked ids, (height, width) uint16: one value per object, 0 for none."""
+    """Read a mask of tracked ids, (height, width) uint16: one value per object, 0 for no object."""
     return _pixels(path, rgb=False).astype(np.uint16)
 
 
@@ -51,7 +51,7 @@ def _open(path: Path, rgb: bool) -> Image.Image:
         with path.open("rb") as file:
             kind = png_kind(file.read(_HEADER_BYTES))
         if kind is None:
-            raise InputError(f"{path} is no PNG; ids are kept in PNGs, which lose nothing.")
+            raise InputError(f"{path} is not a PNG; give ids as PNGs, which are lossless.")
         # The indices of a palette are the ids, as in DAVIS and the output of most segmenters.
         # Pillow rescales grey values of fewer than 8 bits, so those are rejected.
         wanted = "8-bit RGB, whose colours are segment ids"
@@ -65,4 +65,4 @@ def _open(path: Path, rgb: bool) -> Image.Image:
     except FileNotFoundError:
         raise InputError(f"{path} is missing.") from None
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path} is no PNG that can be read ({str(error)[:120]}).") from None
+        raise InputError(f"{path} is not a readable PNG ({str(error)[:120]}).") from None

@@ -17,8 +17,8 @@ from sceneprior.core.instances.checked import plain
 SHELL = frozenset(
     ["background", "wall", "floor", "ceiling", "door", "window", "blinds", "mirror", "picture"]
 )
-"""Classes of the room itself, background unless the label set has them: they surround the
-furniture and are taken not to occlude it."""
+"""Classes of parts of the room itself. They become background unless the label set contains them,
+because they surround the furniture and are assumed not to occlude it."""
 LARGEST_ID = 65_535
 
 
@@ -41,11 +41,11 @@ def read_class_table(path: Path) -> dict[int, str]:
     for key, name in pairs:
         if not (key.isascii() and key.isdigit()) or not 0 < int(key[:9]) <= LARGEST_ID:
             raise InputError(
-                f"{path}: '{plain(key)}' is no instance id; expected a number from 1 to "
-                f"{LARGEST_ID} (0 is nothing)."
+                f"{path}: '{plain(key)}' is not an instance id; expected a number from 1 to "
+                f"{LARGEST_ID} (0 means no object)."
             )
         if int(key) in classes:
-            raise InputError(f"{path}: instance id {int(key)} is there twice.")
+            raise InputError(f"{path}: instance id {int(key)} is listed twice.")
         classes[int(key)] = name
     if not classes:
         raise InputError(f"{path} is empty; expected a class for each instance id.")
@@ -77,7 +77,7 @@ def _json_rows(path: Path, content: str) -> Iterable[tuple[str, str]]:
 
 
 class _Pairs(list[tuple[str, Any]]):
-    """A JSON object as pairs, in contrast to a JSON list."""
+    """A JSON object as (key, value) pairs; a type of its own, to tell it from a JSON list."""
 
 
 def _listed_row(row: Any) -> tuple[str, Any]:
@@ -109,9 +109,10 @@ def tidy(name: str) -> str:
 class IdTable:
     """Maps values of masks to consecutive ids for `observe`.
 
-    The k-th instance of the table gets k + 1, and unlisted values get the next id, which is void
-    and may occlude objects. `of_id` is that of `read_class_table`; classes outside the label set
-    become void, and parts of the room background. `where` begins error messages.
+    The k-th instance of the table gets the id k + 1. Values that the table does not list get the id
+    after the last instance's; they are void, and may occlude objects. Classes outside the label set
+    become void, except those of `SHELL`, which become background. `of_id` is the result of
+    `read_class_table`, and `where` is the beginning of error messages.
     """
 
     def __init__(self, of_id: dict[int, str], label_set_name: str, where: str):

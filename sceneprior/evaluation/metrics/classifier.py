@@ -20,7 +20,8 @@ from sceneprior.evaluation.metric import PICTURED, Comparison, Metric, RoomSet, 
 
 FOLDS = 5
 REPEATS = 5
-"""Repetitions with new folds, and a new subset of the larger set of the smaller one's size."""
+"""Repetitions, each with new folds and a new subset of the larger set, as large as the smaller
+set."""
 INVERSE_PENALTY = 0.01
 """scikit-learn's C of the linear classifier, on standardized features. It is small, a strong
 regularisation, because there are often fewer rooms than features."""
@@ -31,7 +32,7 @@ Classify = Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray]
 
 @dataclass(frozen=True)
 class CrossValidated:
-    """Counts of all and of correct predictions for each room, as a held-out room."""
+    """For each room, the numbers of all and of correct predictions made while it was held out."""
 
     right_generated: Int[np.ndarray, " n"]
     asked_generated: Int[np.ndarray, " n"]
@@ -105,7 +106,7 @@ def _linear(rooms: RoomSet, comparison: Comparison) -> Estimate:
 def _alexnet(rooms: RoomSet, comparison: Comparison) -> Estimate:
     assert comparison.alexnet is not None  # the metric is computed only with `--alexnet`
     classify = partial(classify_pictures, comparison.alexnet)
-    # One draw of folds, since each trains AlexNet five times for ten epochs, which takes minutes.
+    # One repetition, since each trains AlexNet five times for ten epochs, which takes minutes.
     return _accuracy("small", rooms, comparison, classify, repeats=1)
 
 
@@ -116,8 +117,8 @@ METRICS = (
         PICTURED, "effnet_lite0",
         protocol={
             "sca_effnet_lite0": f"logistic regression (L2, C = {INVERSE_PENALTY}) on standardized "
-            f"features, {FOLDS}-fold, {REPEATS} draws of folds and of as many rooms of the larger "
-            "set as the smaller one has; interval: over rooms, the classifiers as they are"
+            f"features, {FOLDS}-fold, {REPEATS} repetitions with new folds and as many rooms of "
+            "the larger set as the smaller one has; interval: over rooms, classifiers not retrained"
         },
         column=TableColumn(
             "SCA", 2, "SCA: accuracy of a classifier that tells generated from test rooms"

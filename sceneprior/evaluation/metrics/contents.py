@@ -25,17 +25,18 @@ TYPE_CLASSES: dict[str, tuple[str, ...]] = {
     "front3d_bedroom": ("double_bed", "single_bed", "kids_bed"),
     "front3d_living": ("sofa", "armchair"),
 }
-"""Classes of which a room of a type holds at least one. ScanNet mixes room types: no entry."""
+"""Classes that define a room type: a room of the type holds an object of at least one of them.
+ScanNet has no entry, since its scans mix room types."""
 
 
 def common_label_set(*groups: Sequence[Scene]) -> str:
-    """The label set that all these scenes share."""
+    """The label set that all scenes share; raises InputError if they share none."""
     names = sorted({scene.label_set for scenes in groups for scene in scenes})
     if len(names) != 1:
         came = f"label sets {', '.join(names)}" if names else "no scenes"
         raise InputError(
-            f"Scores compare scenes of one label set, but {came} came; give scenes whose classes "
-            f"are those of the shards ({' or '.join(LABEL_SETS)})."
+            f"Scores compare scenes of one label set, but {came} were given; give scenes whose "
+            f"classes are those of the shards ({' or '.join(LABEL_SETS)})."
         )
     return names[0]
 
@@ -89,8 +90,8 @@ def emptiness(scenes: Sequence[Scene]) -> str | None:
     if 2 * empty <= len(scenes):
         return None
     return (
-        f"{empty} of {len(scenes)} generated rooms are empty, so no other number of theirs can be "
-        "trusted: train longer, and see that `samples/empty_share` falls (docs/cluster.md)."
+        f"{empty} of {len(scenes)} generated rooms are empty, so none of the other scores can be "
+        "trusted: train longer, and check that `samples/empty_share` falls (docs/cluster.md)."
     )
 
 

@@ -1,7 +1,7 @@
 """Metrics of the floor: objects outside its outline, and the walkable area between objects.
 
 An object's footprint is its axis-aligned box on the floor (x, z). Areas are exact (shapely), except
-that round corners are polygons of `ARC_SEGMENTS` sides per quarter turn.
+that rounded corners are polygons of `ARC_SEGMENTS` sides per quarter turn.
 """
 
 from functools import partial
@@ -54,9 +54,9 @@ def outside_count(scene: Scene) -> tuple[int, int]:
 def walkable_share(scene: Scene, within: str = "furniture") -> float | None:
     """Area of the largest connected free region, as a share of the whole free area.
 
-    Free are the positions in which the agent, a cylinder of radius 0.2 m and height 1.5 m,
-    intersects neither a wall nor an object. 1 means that the free area is connected, 0 that the
-    agent fits nowhere. Yang et al., CVPR 2024, in exact areas.
+    A position is free if the agent, a cylinder of radius 0.2 m and height 1.5 m, intersects neither
+    a wall nor an object there. 1 means that the free area is connected, 0 that the agent fits
+    nowhere. The metric is that of Yang et al., CVPR 2024, with exact areas instead of pixels.
 
     Args:
         within: The walls. `furniture`: the rectangle around all furniture, which every scene has,

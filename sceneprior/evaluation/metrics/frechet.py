@@ -67,8 +67,8 @@ def check_features(*sets: np.ndarray) -> None:
     for features in sets:
         if len(features) < 2:
             raise InputError(
-                f"A Frechet distance needs at least 2 images on either side, but {len(features)} "
-                "came; synthesize or keep more rooms."
+                f"A Frechet distance needs at least 2 images in either set, but one set has "
+                f"{len(features)}; synthesize or keep more rooms."
             )
         if not np.isfinite(features).all():
             raise InputError(
@@ -123,7 +123,8 @@ def _gap(network: str, boxes: bool, rooms: RoomSet, comparison: Comparison) -> E
     ours = _distance(network, boxes, rooms, comparison)
     distances = (ours, known[furthest][key], known["train_rooms"][key])
     value = gap_closed(*(distance.value or 0.0 for distance in distances))
-    # Resamples repeat rooms, which raises all distances: each is shifted back to its value.
+    # Resamples repeat rooms, which raises all distances, so each distance's resamples are shifted
+    # until their mean equals its value.
     moved = [
         (d.value or 0.0) + d.resamples - d.resamples.mean() for d in distances if len(d.resamples)
     ]
@@ -134,7 +135,7 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
     """The four metrics of a network's features, in the order of tables."""
     lite = network == "effnet_lite0"
     key, gap = FRECHET[network], "gap_closed" if lite else f"gap_closed_{network}"
-    ends = "0: theirs, 1: as near as real"
+    ends = "0: independent, 1: as near as real"
     return [
         Metric(
             key, title, "", "closer",
@@ -153,8 +154,8 @@ def _metrics_of(network: str, short: str, title: str, boxes_title: str) -> list[
             },
             column=TableColumn(
                 "gap closed", 2,
-                "gap closed: share of the way from independent objects with meshes to real "
-                "training rooms, in FD",
+                "gap closed: share of the FD gap between independent objects with meshes and real "
+                "training rooms that is closed",
             ) if lite else None,
         ),
         Metric(

@@ -1,7 +1,7 @@
 """Accuracy of a classifier that separates a set's layouts from real ones by relations of boxes.
 
 It is 0.5 if the sets are indistinguishable, and 1 if they are always told apart. Copies of real
-rooms pass as real, so read it together with `near_copy_share`.
+rooms pass as real, so read this accuracy together with `near_copy_share`.
 """
 
 from collections.abc import Sequence
@@ -139,10 +139,10 @@ METRICS = (
         _accuracy, AGAINST_TEST,
         protocol={
             "layout_classifier_accuracy": f"gradient boosting ({TREES} trees, depth 3, square root "
-            f"of the features a split), noise of {JITTER_M} m; learns from all real training and "
-            f"val rooms and {FOLDS - 1}/{FOLDS} of the set (at most as many rooms), judged on test "
-            "rooms and the rest of the set; both sides weigh alike; interval: over judged rooms, "
-            "the classifiers as they are"
+            f"of the features per split), noise of {JITTER_M} m; trained on all real training and "
+            f"val rooms and {FOLDS - 1}/{FOLDS} of the set (at most as many rooms), evaluated on "
+            "the test rooms and the rest of the set; equal total weight for real and other rooms; "
+            "interval: over evaluated rooms, classifiers not retrained"
         },
         column=TableColumn(
             "layout classifier", 2,

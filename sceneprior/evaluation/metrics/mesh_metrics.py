@@ -26,7 +26,7 @@ def sample_surface(mesh: Mesh, count: int, seed: int) -> Float[np.ndarray, "coun
     if not len(mesh.faces):
         raise InputError(
             "A mesh without faces has no surface to draw points from; give the object a mesh with "
-            "faces, or none at all: then it is its box."
+            "faces, or no mesh at all: then its box is used."
         )
     surface = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
     points = trimesh.sample.sample_surface(surface, count, seed=seed)[0]
@@ -38,8 +38,13 @@ def f_score(
     back_m: Float[np.ndarray, " m"],
     threshold_m: float = F_THRESHOLD_M,
 ) -> float:
-    """Harmonic mean of precision (share of a near b) and recall (share of b near a), in [0, 1],
-    from the `nearest_distances` of points on both surfaces."""
+    """Harmonic mean of precision and recall, in [0, 1].
+
+    Args:
+        there_m: Distance of each point of surface a to surface b, for precision.
+        back_m: Distance of each point of surface b to surface a, for recall.
+        threshold_m: Distance up to which a point counts as correct.
+    """
     precision, recall = (float((way <= threshold_m).mean()) for way in (there_m, back_m))
     return 2 * precision * recall / max(precision + recall, 1e-12)
 
@@ -57,8 +62,8 @@ class OrientedBox(NamedTuple):
 def oriented_box(mesh: Mesh) -> OrientedBox:
     """The tightest upright box around a mesh, over the footprint's rectangle of least area.
 
-    The yaw is in [0, pi / 2): a mesh does not tell its front, and the IoU does not depend on it.
-    The box of a mesh that is an upright box is that box.
+    The yaw is in [0, pi / 2): the front of a mesh is unknown, and the IoU does not depend on it.
+    For a mesh that is an upright box, the result is that box.
     """
     points = np.asarray(mesh.vertices_m, dtype=np.float64)
     rectangle = shapely.MultiPoint(points[:, [0, 2]]).minimum_rotated_rectangle

@@ -63,8 +63,8 @@ METRICS = (
         },
         column=TableColumn(
             "nearest training room (m)", 2,
-            "nearest training room: mean layout distance; near 0 a method has memorised them, and "
-            "farther than real rooms is no better",
+            "nearest training room: mean layout distance; near 0, a method has memorised training "
+            "rooms, and a distance above that of real rooms is no better",
         ),
     ),
     Metric(
@@ -77,7 +77,8 @@ METRICS = (
         _near_copy_share,
         protocol={
             "near_copy_share": f"under near_copy_m, the {NEAR_COPY_QUANTILE:.0%} quantile of the "
-            f"distances of real training rooms (at most {THRESHOLD_ROOMS}) to the nearest other; "
+            f"distances of real training rooms (at most {THRESHOLD_ROOMS}) to the nearest other "
+            "one; "
             "the same classes, each as often, at most one object added or left out"
         },
         column=TableColumn(

@@ -16,7 +16,7 @@ OVERLAP_SHARE = 0.01
 """Two boxes intersect if they share more than this part of the smaller one's volume, so that
 objects that touch, or overlap by a few millimetres, do not count."""
 DEEP_M = 0.01
-"""Penetration depth, in metres, above which two boxes count as deep pairs."""
+"""Penetration depth, in metres, above which two boxes count as a deep pair."""
 PLAUSIBLE_SHARE = 0.05
 """A pair of classes is plausible if it intersects in at least this share of the real training rooms
 that hold both."""
@@ -44,7 +44,7 @@ def room_overlaps(scene: Scene) -> RoomOverlaps:
     """Compare every pair of objects of a room by their axis-aligned boxes, void objects left out.
 
     A box is larger than its object (a chair pushed under a table, an object at an angle), so real
-    rooms have intersections, too: compare with their number.
+    rooms have intersections, too: compare a result with the number in real rooms.
     """
     known = scene.class_indices != VOID
     classes = scene.class_indices[known]
@@ -66,8 +66,9 @@ def room_overlaps(scene: Scene) -> RoomOverlaps:
 def plausible_pairs(training: Sequence[Scene]) -> Bool[np.ndarray, "classes classes"]:
     """Pairs of classes that intersect in real rooms, such as a chair and its table.
 
-    True if objects of the two classes intersect in at least 5% of the real training rooms that hold
-    both (for a class with itself: that hold two of it); symmetric.
+    An entry is True if objects of the two classes intersect in at least 5% of the real training
+    rooms that hold both classes (on the diagonal: that hold two objects of the class). The matrix
+    is symmetric.
 
     Raises InputError like `class_counts`.
     """
@@ -109,8 +110,8 @@ METRICS = (
                   "training rooms that hold both"},
         column=TableColumn(
             "implausible pairs", 2,
-            "implausible pairs: intersecting pairs a room of classes that seldom intersect in real "
-            "training rooms",
+            "implausible pairs: intersecting pairs per room, of classes that seldom intersect in "
+            "real training rooms",
         ),
     ),
     Metric(

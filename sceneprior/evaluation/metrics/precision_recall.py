@@ -22,8 +22,8 @@ from sceneprior.evaluation.metrics.contents import emptiness
 from sceneprior.evaluation.metrics.frechet import check_features
 
 NEIGHBOUR = 3
-"""k of the k-th nearest neighbour that sets a ball's radius, as in the authors' settings; in a set
-of 3 rows or fewer, the farthest row."""
+"""k of the k-th nearest neighbour, whose distance is a ball's radius; 3 is the authors' setting. In
+a set of 3 rows or fewer, the radius is the distance of the farthest row."""
 
 
 def in_manifold(

@@ -26,10 +26,11 @@ from sceneprior.evaluation.metric import (
 PAIR_SHARE = 0.05
 """Share of the real rooms that must hold an ordered pair of classes for the pair to count."""
 FAR_M = 3.0
-"""Largest gap, InstructScene's limit of a relation between two objects. Larger gaps are cut to it,
-and a set without a pair is treated as having one pair with this gap."""
+"""Largest gap in metres, InstructScene's limit of a relation between two objects. Larger gaps are
+clipped to it, and a set that lacks a pair of classes is treated as having one such pair with this
+gap."""
 NEAR_M = 0.3
-"""The table of pairs lists the share of gaps up to this."""
+"""Gap in metres up to which the table of pairs counts two objects as near."""
 LISTED = 10
 """Number of pairs in the table of pairs."""
 
@@ -102,7 +103,8 @@ def wasserstein(
 
 @dataclass(frozen=True)
 class PairDistances:
-    """Wasserstein distances in metres of a set's gaps from the test rooms', by pair."""
+    """Wasserstein distance in metres between a set's gaps and the test rooms' gaps, per pair of
+    classes."""
 
     pairs: list[Pair]
     """The pairs of `common_pairs` that the test rooms hold."""
@@ -153,7 +155,7 @@ def _ratio(rooms: RoomSet, comparison: Comparison) -> Estimate:
 
 
 def furthest_pairs(rooms: RoomSet, train: RoomSet, comparison: Comparison) -> list[dict[str, Any]]:
-    """The `LISTED` pairs that contribute most to the distance beyond real training rooms'.
+    """The `LISTED` pairs that contribute most to the excess over real training rooms' distance.
 
     Each row holds the pair (`of`, `to`), the distance of the set and of real training rooms
     (`distance_m`, `train_m`), and the share of objects within `NEAR_M` of the nearest one, in the
@@ -188,7 +190,7 @@ METRICS = (
         protocol={
             "relation_distance_m": f"ordered pairs that {PAIR_SHARE:.0%} of the real training and "
             f"val rooms have, gaps between footprints up to {FAR_M} m, Wasserstein-1 distance from "
-            "the test rooms' gaps, mean over pairs weighted by their number there"
+            "the test rooms' gaps, mean over pairs weighted by their number in the test rooms"
         },
         column=TableColumn(
             "relations (m)", 3,

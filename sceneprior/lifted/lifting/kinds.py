@@ -104,7 +104,11 @@ def looks_of(
         ends = np.stack([ends for each in solids for _, ends in each]) * (2 / margin)
         kinds = np.array([kind for each in solids for kind, _ in each])
         first = np.cumsum([0, *map(len, solids)])
-        offered[int(label)] = own, (kinds, *np.ascontiguousarray(np.moveaxis(ends, 2, 0)), first)
+        lows, highs = np.ascontiguousarray(np.moveaxis(ends, 2, 0))
+        outlines = [prototypes.parts[row].outline for row in own]
+        corners = np.concatenate(outlines) * (2 / margin)
+        first_corners = np.cumsum([0, *map(len, outlines)])
+        offered[int(label)] = own, (kinds, lows, highs, first, corners, first_corners)
 
     def ask_some(first: int, last: int) -> None:
         for item in range(first, last):

@@ -23,6 +23,7 @@ from sceneprior.core.parts import (
     Parts,
 )
 from sceneprior.lifted.lifting.lifted import RayPool
+from sceneprior.lifted.lifting.outlines import outline_of
 from sceneprior.lifted.lifting.part_loss import Change, Guess, RayFit
 from sceneprior.lifted.lifting.part_prices import LEVELS
 
@@ -45,21 +46,22 @@ def fit_parts(
     """The parts that explain the rays of one object, or of several that look alike.
 
     Rays lie in the frame that spans [-1, 1] and `margin` boxes, in random order; those without
-    information are left out. `hull`, a grid of the same frame, says where parts may be missing. An
-    object that `hangs` is held from above, others stand.
+    information are left out. `hull`, a grid of the same frame, gives the outline and says where
+    parts may be missing. An object that `hangs` is held from above, others stand.
     Without rays, the object's box is its only part.
     """
     cells = len(hull)
     beyond = round((1 - 1 / margin) / 2 * cells)
     hull = hull[(slice(beyond, cells - beyond),) * 3]
-    every = RayFit(rays, margin, hangs)
+    outline = outline_of(hull)
+    every = RayFit(rays, margin, outline, hangs)
     guess = every.guess(np.array([BOX]), np.array([0]), np.array([[[0, LEVELS]] * 3]))
     if not len(every.hits):
-        return guess.parts()
-    some = RayFit(RayPool(*(part[:SCREENED] for part in rays)), margin, hangs)
+        return guess.parts(outline)
+    some = RayFit(RayPool(*(part[:SCREENED] for part in rays)), margin, outline, hangs)
     while better := _one_more(every, some, guess, hull) or _one_more(every, every, guess, hull):
         guess = better
-    return _joined(every, _needed(every, guess)).parts()
+    return _joined(every, _needed(every, guess)).parts(outline)
 
 
 def _one_more(

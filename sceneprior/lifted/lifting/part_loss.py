@@ -1,33 +1,39 @@
 """The loss of parts on rays. It counts rays and has no gradient:
 
     half the share of hits that meet no part + half the share of misses that meet one
-      + 0.003 (number of parts) + 0.003 (number of planes in which faces lie)
+      + 0.002 (number of parts) + 0.002 (number of planes in which faces lie)
       + 0.002 (number of curved parts) - 0.0005 (volume of the parts, 1 for the box)
       + 0.06 (gap between the parts and the floor, or the ceiling for lamps; 1 for the box's height)
       + 0.005 (connected pieces - 1)
 
-A ray is right if it meets a part exactly when its pixel is the object's. Few parts explain masks
-more cheaply than what a visual hull adds where no view sees past: a headboard and a mattress, not a
-dome. Parts and their mirror images count once, and so do planes and theirs; sides of the box cost
-nothing. So edges line up. The other prices settle what rays leave open: solids are full
-where nobody has looked, stand or hang, and hold together.
+A ray is right if it meets a part exactly when its pixel is the object's. Rays count only within
+the object's outline, which cuts the parts. Upright rays within it are hits as well: cameras rarely
+look down, so without these rays no mask says that a table top reaches the outline.
+
+Few parts explain masks more cheaply than what a visual hull adds where no view sees past: a
+headboard and a mattress, not a dome. Parts and their mirror images count once, and so do planes and
+theirs; sides of the box cost nothing. So edges line up. The other prices settle what rays leave
+open: solids are full where nobody has looked, stand or hang, and hold together.
 """
 
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
-from sceneprior.core.parts import BOX, Parts
+from sceneprior.core.parts import BOX, SQUARE, Parts
 from sceneprior.lifted.lifting.lifted import RayPool
+from sceneprior.lifted.lifting.outlines import cut_rays, points_within
 from sceneprior.lifted.lifting.part_prices import LEVELS, count_planes, gap_and_pieces, volume_of
 from sceneprior.lifted.lifting.part_rays import descend, meets, wrong_rays
 
-PART_PRICE, CURVED_PRICE, PLANE_PRICE = 0.003, 0.002, 0.003
+PART_PRICE, CURVED_PRICE, PLANE_PRICE = 0.002, 0.002, 0.002
 VOLUME_PRICE, GAP_PRICE, PIECE_PRICE = -0.0005, 0.06, 0.005
 FEWEST = 50
 """Added to the numbers of hits and misses, so that few rays do not weigh too much."""
+UPRIGHT = 0.075
+"""Number of upright rays within the outline, as a share of all others."""
 
 Change = dict[int, tuple[int, int, Int[np.ndarray, "3 2"]]]
 """Kind, mirroring and ends of the parts that change, by their number; a number one past the last
@@ -46,26 +52,39 @@ class Guess(NamedTuple):
     met_by: Int[np.ndarray, " rays"]
     """Number of parts that each ray meets."""
 
-    def parts(self) -> Parts:
+    def parts(self, outline: Float[np.ndarray, "corners 2"] = SQUARE) -> Parts:
         """The parts in the frame of the object's box."""
-        return Parts(self.kinds, self.mirrored, self.ends / LEVELS - 0.5)
+        return Parts(self.kinds, self.mirrored, self.ends / LEVELS - 0.5, outline)
 
 
 class RayFit:
-    """The loss of parts on a set of rays, which lie in the frame of the object's box."""
+    """The loss of parts on a set of rays, which lie in the frame of the object's box, and on
+    upright rays through its outline."""
 
-    def __init__(self, rays: RayPool, margin: float, hangs: bool = False):
-        useful = np.abs(rays.spans).sum(axis=1) > 0
+    def __init__(
+        self,
+        rays: RayPool,
+        margin: float,
+        outline: Float[np.ndarray, "corners 2"] = SQUARE,
+        hangs: bool = False,
+    ):
         scale = margin / 2 * LEVELS  # the frame of rays spans [-1, 1], `margin` boxes
-        self.starts = rays.starts[useful].astype(np.float64) * scale + LEVELS / 2
-        spans = rays.spans[useful].astype(np.float64) * scale
+        starts = rays.starts.astype(np.float64) * scale + LEVELS / 2
+        spans = rays.spans.astype(np.float64) * scale
+        cut_rays(starts, spans, (outline + 0.5) * LEVELS)
+        useful = np.abs(spans).sum(axis=1) > 0
+        hits = rays.hits[useful]
+        self.hit_price = 0.5 / (hits.sum() + FEWEST)
+        self.miss_price = 0.5 / ((~hits).sum() + FEWEST)
+        upright = points_within(outline, round(UPRIGHT * len(hits)))
+        above = np.insert((upright + 0.5) * LEVELS, 1, LEVELS, axis=1)
+        down = np.broadcast_to([0.0, -LEVELS, 0.0], above.shape)
+        self.starts = np.concatenate([starts[useful], above])
+        spans = np.concatenate([spans[useful], down])
         self.spans = np.where(np.abs(spans) < 1e-6, 1e-6, spans)  # they are divided by
         self.inverse = 1 / self.spans
-        self.hangs = hangs
-        self.hits = np.ascontiguousarray(rays.hits[useful])
-        hits = int(self.hits.sum())
-        self.hit_price = 0.5 / (hits + FEWEST)
-        self.miss_price = 0.5 / (len(self.hits) - hits + FEWEST)
+        self.hits = np.concatenate([hits, np.ones(len(above), bool)])
+        self.outline, self.hangs = outline, hangs
 
     def loss(self, guess: Guess) -> float:
         """See the module's docstring."""

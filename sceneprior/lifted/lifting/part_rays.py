@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOWL, BOX, CYLINDER, DOME
+from sceneprior.lifted.lifting.outlines import within
 from sceneprior.lifted.lifting.part_prices import LEVELS, planes_of, volume_of
 
 FAR = 1e6
@@ -224,18 +225,28 @@ def descend(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def count_wrong(starts, spans, hits, kinds, lows, highs, first_solids, wrong):
+def count_wrong(
+    starts, spans, hits, kinds, lows, highs, first_solids, corners, first_corners, wrong
+):  # fmt: skip
     """Fill `wrong` with the number of rays that each of several objects explains wrongly. Object i
-    is the union of the solids from `first_solids[i]` up to `first_solids[i + 1]`; rays and solids
-    are in the same units, and rays without a span are skipped."""
+    is the union of the solids from `first_solids[i]` up to `first_solids[i + 1]`, within the
+    outline of the corners from `first_corners[i]` up to `first_corners[i + 1]`; rays, solids and
+    corners are in the same units, and rays without a span are skipped."""
     wrong[:] = 0
+    start, span = np.empty(3), np.empty(3)
     for ray in range(len(hits)):
         if spans[ray, 0] == 0 and spans[ray, 1] == 0 and spans[ray, 2] == 0:
             continue
         for item in range(len(wrong)):
+            outline = corners[first_corners[item] : first_corners[item + 1]]
+            near, far = within(starts[ray], spans[ray], outline)
             met = False
-            for solid in range(first_solids[item], first_solids[item + 1]):
-                if _meets_solid(starts[ray], spans[ray], kinds[solid], lows[solid], highs[solid]):
-                    met = True
-                    break
+            if near <= far:
+                for axis in range(3):
+                    start[axis] = starts[ray, axis] + near * spans[ray, axis]
+                    span[axis] = (far - near) * spans[ray, axis]
+                for solid in range(first_solids[item], first_solids[item + 1]):
+                    if _meets_solid(start, span, kinds[solid], lows[solid], highs[solid]):
+                        met = True
+                        break
             wrong[item] += met != hits[ray]

@@ -1,5 +1,4 @@
-"""Candidates: the objects of a prior's training rooms, among which an image's masks are
-explained."""
+"""Candidates for the objects behind an image's masks: the objects of a prior's training rooms."""
 
 from typing import NamedTuple
 
@@ -23,7 +22,7 @@ POINTS_LEVEL = 1
 """Icosphere level of the 42 directions in which a shape's extreme points are compared."""
 
 UNIT_BOX = np.array([0.0, 0, 0, 1, 1, 1])
-"""A box (centre, extents) of 1 m at the origin."""
+"""Centre and extents of a cube at the origin, with sides of 1 m."""
 
 
 class Candidates(NamedTuple):
@@ -37,7 +36,7 @@ class Candidates(NamedTuple):
     bottom_m: Float[Tensor, " objects"]
     sizes_m: Float[Tensor, "objects 3"]
     points: Float[Tensor, "objects points 3"]
-    """Points of the surface; the box is [-0.5, 0.5]^3."""
+    """Points on the surface, in the frame in which the object's box is [-0.5, 0.5]^3."""
 
     def take(self, rows: Int[Tensor, " rows"]) -> "Candidates":
         """The candidates of these rows."""
@@ -46,8 +45,11 @@ class Candidates(NamedTuple):
 
 @torch.no_grad()
 def candidates_of(trained: TrainedPrior) -> Candidates:
-    """All objects of the training rooms as decoded, with beveled boxes for their shapes; an
-    `InputError` if there are none."""
+    """All objects of the decoded training rooms, with beveled boxes as their shapes.
+
+    Raises:
+        InputError: all training rooms decode into empty rooms.
+    """
     parts = []
     for rows in torch.arange(len(trained.logits)).split(ROOMS):
         decoded = trained.prior(trained.logits[rows], with_shape=False)
@@ -69,7 +71,7 @@ def candidates_of(trained: TrainedPrior) -> Candidates:
     found = Candidates(*(torch.cat(part) for part in zip(*parts, strict=True)))
     if not len(found.room):
         raise InputError(
-            f"All {len(trained.logits)} training rooms of the run are empty as it decodes them, so "
+            f"The run decodes all its {len(trained.logits)} training rooms as empty rooms, so "
             "there are no objects to place where the masks are; train it longer, or fit a latent "
             "instead (--fit paper)."
         )
@@ -78,7 +80,7 @@ def candidates_of(trained: TrainedPrior) -> Candidates:
 
 @torch.no_grad()
 def with_shapes(trained: TrainedPrior, candidates: Candidates) -> Candidates:
-    """The same candidates with points of their decoded shapes; unchanged before the shape stage."""
+    """The candidates with points of their decoded shapes; unchanged before the shape stage."""
     if trained.stage == "layout" or not len(candidates.room):
         return candidates
     directions = icosphere(POINTS_LEVEL)[0].to(candidates.points)

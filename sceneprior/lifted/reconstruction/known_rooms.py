@@ -1,7 +1,7 @@
 """Baselines of reconstruction: the training room with the best masks, and a random training room.
 
-Rooms are matched to images by one fixed cost, whatever method they are compared with; a run's own
-weights have no influence.
+Rooms are matched to images with one fixed cost, which does not depend on the weights of the run
+that they are compared with.
 """
 
 from collections.abc import Sequence
@@ -34,9 +34,9 @@ BOX_WEIGHT, OCCLUSION_SLACK = 5.0, 0.15
 """Weights of the cost by which a room's objects are matched to masks (`match_objects`). The
 occlusion slack is below 1 since boxes of whole objects extend behind their occluders."""
 SHORTLIST = 16
-"""Rooms, best by 2D boxes, whose masks are compared."""
+"""Number of rooms, the best by class and 2D box, whose masks are compared."""
 MASK_COLUMNS = 80
-"""Approximate width of the compared masks in pixels, whatever a run trains with."""
+"""Approximate width of the compared masks in pixels; it does not depend on a run's `mask_step`."""
 CERTAIN_LOGIT = 30.0
 """Logit of a known class: its probability rounds to 1."""
 ABSENT_M = 1e4
@@ -68,7 +68,7 @@ class KnownRooms:
 
 
 class KnownAnswer(NamedTuple):
-    """A known room as the answer to an image."""
+    """A known room as the reconstruction of an image."""
 
     scene: Scene
     objects: tuple[SceneObject | None, ...]
@@ -76,7 +76,7 @@ class KnownAnswer(NamedTuple):
 
 
 def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
-    """The rooms of a split, turned by 0, 90, 180 and 270 degrees."""
+    """The rooms of a split, each turned by 0, 90, 180 and 270 degrees."""
     rooms = [
         (shard.path, reference_scene(shard, room_id, shards, meshes=False))
         for shard, room_id in iterate_rooms(shards, split)
@@ -160,10 +160,10 @@ def _others(rooms: KnownRooms, image: ObservedImage) -> Tensor:
 def _matched(
     known: KnownRooms, rows: Int[Tensor, " rooms"], image: ObservedImage
 ) -> tuple[list[list[int]], Float[Tensor, " rooms"]]:
-    """Index of the object that each room assigns to each mask, beyond its last object for none, and
-    the mean cost of each room."""
+    """For each room, the index of the object that it assigns to each mask (an index beyond its last
+    object means none), and the mean cost of the assignment."""
     view = rows_of(as_views([image], 1), torch.zeros(len(rows), dtype=torch.int64))
-    # As much padding as there are masks, so that every mask can be assigned.
+    # As many padding objects as there are masks, so that every mask gets an index.
     masks = view.is_object.shape[1]
 
     def padded(values: Tensor, value: float = 0.0) -> Tensor:
@@ -181,8 +181,8 @@ def _matched(
 
 
 def mask_overlap(answer: KnownAnswer, image: ObservedImage, renderer: Renderer) -> float:
-    """Mean IoU of an image's masks with those of the objects assigned to them, without void
-    pixels."""
+    """Mean IoU of an image's masks with the rendered masks of the objects assigned to them; void
+    pixels are left out."""
     scene = answer.scene
     observed = image.sampled_ids(max(1, round(image.instance_ids.shape[1] / MASK_COLUMNS)))
     height, width = observed.shape

@@ -31,10 +31,11 @@ from sceneprior.paper.decode import scene_of
 from sceneprior.paper.trained import TrainedPrior
 
 OF_CLASS = 200
-"""Candidates per class, chosen with a fixed seed."""
+"""Number of candidates per class, chosen with a fixed seed."""
 PROMISING = 64
-"""Best guesses per mask, placed in two turns as beveled boxes, whose decoded shapes are then placed
-in all four turns."""
+"""Number of guesses per mask that are refined. All guesses are placed as beveled boxes in two
+quarter turns; the best ones are then placed again with their decoded shapes, and also turned by 180
+degrees."""
 AT_ONCE = 16384
 """Objects placed at a time."""
 
@@ -57,7 +58,7 @@ class ObjectAnswer(NamedTuple):
     scene: Scene
     """One object per mask, in the order of the masks, with the image's classes."""
     energy: float
-    """Mean of `Placed.energy` over the masks' best guesses: ranks camera hypotheses of one
+    """Mean of `Placed.energy` over the masks' best guesses; it ranks camera hypotheses of one
     image."""
     taken_for: dict[str, str]
     """Maps each class of the image that the run never generates to the class of the object used for
@@ -126,7 +127,7 @@ def _of_classes(candidates: Candidates, classes: Int[Tensor, " masks"]) -> Guess
 
 
 def _promising(guesses: Guesses, energy: Float[Tensor, " guesses"], masks: int) -> Guesses:
-    """The guesses of least energy for each mask, and the same turned by 180 degrees."""
+    """The guesses of least energy for each mask, and the same guesses turned by 180 degrees."""
     order = energy.argsort(stable=True)
     order = order[guesses.mask[order].argsort(stable=True)]
     counts = guesses.mask.bincount(minlength=masks)

@@ -10,10 +10,11 @@ from torch import Tensor
 from sceneprior.core.observed_image import ObservedImage
 
 DIRECTIONS = ((-1, 0), (0, -1), (1, 0), (0, 1), (-1, -1), (1, -1), (1, 1), (-1, 1))
-"""Image directions (u, v), right and down: those of a 2D box's sides, in their order, then of its
-corners."""
+"""Image directions (u, v), right and down: towards the sides of a 2D box (left, upper, right,
+lower), then towards its corners."""
 OCCLUSION_SLACK = 0.15
-"""Weight of extending beyond a mask where it may be cut off (not `Outlines.clear`)."""
+"""Weight of the distance by which an object extends beyond its mask where the mask may be cut off
+by an occluder (`Outlines.clear` is false)."""
 NEAR_M = 0.05
 """Smallest depth; points nearer to the camera, or behind it, are moved to this depth."""
 
@@ -25,17 +26,17 @@ class Outlines(NamedTuple):
     """The largest value of u * direction_u + v * direction_v over a mask, u and v relative to the
     image's width and height."""
     clear: Bool[Tensor, "masks 8"]
-    """True if the object itself ends there, since no other object touches the mask, at a corner
-    also at both adjacent sides. At the image's border, sides are clear (there, objects are clipped
-    as masks are), and corners are not."""
+    """True if no other object touches the mask in this direction, so that the object ends there; at
+    a corner, none may touch the two adjacent sides, either. At the image's border, sides are clear,
+    because projected objects are clipped there like masks; corners are not."""
     world_to_camera: Float[Tensor, "masks 4 4"]
     intrinsics: Float[Tensor, "masks 3 3"]
     """Intrinsics relative to the image's size."""
 
 
 def outlines_of(image: ObservedImage) -> Outlines:
-    """The outlines of an image's masks, in their order. The four sides are those of the image's
-    boxes."""
+    """The outlines of an image's masks, in their order; the first four extents are the sides of
+    `image.boxes`."""
     ids = np.asarray(image.instance_ids, dtype=np.int64)
     height, width = ids.shape
     around = np.pad(ids, 1, constant_values=-1)
@@ -55,8 +56,8 @@ def outlines_of(image: ObservedImage) -> Outlines:
                     for x, y in ((right, 0), (0, down), (right, down))
                 ]
             )
-            # Both adjacent sides must be clear, too: an object that goes on beyond one of them may
-            # have its corner there.
+            # Both adjacent sides must be clear, too: if the object continues beyond one of them,
+            # its true corner may be there.
             own = clear[item, [0 if right < 0 else 2, 1 if down < 0 else 3]].all()
             clear[item, at] = own and bool(np.isin(beside, (0, item + 1)).all())
     scale = np.array([[1 / width], [1 / height], [1]])
@@ -70,9 +71,13 @@ def outlines_of(image: ObservedImage) -> Outlines:
 def projected_extents(
     points_m: Float[Tensor, "objects points 3"], cameras: Outlines
 ) -> tuple[Float[Tensor, "objects 8"], Float[Tensor, "objects 8 2"], Float[Tensor, " objects"]]:
-    """Extents of projected objects in their images, the derivative of these by the object's x and z
-    (metres), and the share of each object's points that are not in front of the camera. `points_m`
-    are in the room frame; `cameras` has one entry per object.
+    """Project objects into their images, and measure their extents.
+
+    `points_m` are in the room frame; `cameras` has one entry per object.
+
+    Returns:
+        The extents; their derivatives with respect to the object's x and z (per metre); and the
+        share of each object's points that are not in front of the camera.
     """
     turn, shift = cameras.world_to_camera[:, :3, :3], cameras.world_to_camera[:, None, :3, 3]
     seen = points_m @ turn.transpose(1, 2) + shift
@@ -95,8 +100,7 @@ def beyond(
     extents: Float[Tensor, "objects 8"], observed: Outlines
 ) -> tuple[Float[Tensor, "objects 8"], Float[Tensor, "objects 8"]]:
     """Signed distances by which objects extend beyond their masks, and the weights of these
-    distances. Extents are clipped at the image's sides and corners, outside of which nothing is
-    observed."""
+    distances. Objects are clipped at the image's sides and corners, as masks are."""
     directions = extents.new_tensor(DIRECTIONS)
     border = directions.clamp(min=0).sum(dim=1)
     apart = extents.minimum(border) - observed.extents

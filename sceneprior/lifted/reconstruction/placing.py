@@ -12,21 +12,21 @@ from sceneprior.lifted.reconstruction.outlines import Outlines, beyond, projecte
 STEPS = 12
 """Gauss-Newton steps."""
 SPREAD = 0.012
-"""Scale of a Laplace distribution of the distance between the outlines of correct answers and of
-masks, relative to the image size (5 px of 480)."""
+"""Scale of the Laplace distribution assumed for the distance between the outline of a correct
+reconstruction and that of its mask, relative to the image size (5 px of 480)."""
 BEHIND = 50.0
 """Energy of an object that is entirely behind the camera."""
 ROUND = 0.3
-"""Distances below this many spreads are penalised quadratically, so that Gauss-Newton weights them
-equally."""
+"""Multiple of `SPREAD` below which distances are penalised quadratically; Gauss-Newton gives all of
+these the same weight."""
 DAMPING = 2.0
 """Damping of the Gauss-Newton steps: multiple of the identity added to the normal matrix."""
 LONGEST_STEP_M = 1.0
-"""Longest step."""
+"""Maximum length of a Gauss-Newton step."""
 REACH_M = (0.4, 6.0)
-"""Range of distances from the camera, along the floor, that are accepted for a start."""
+"""Range of distances from the camera, along the floor, within which a starting position must be."""
 USUAL_M = 2.5
-"""Distance of a start outside that range."""
+"""Distance used instead if a starting position is outside that range."""
 
 
 class Placed(NamedTuple):
@@ -46,9 +46,9 @@ def place_objects(
     """Move objects along the floor until their outlines fit those of their masks.
 
     The energy is the sum of absolute differences in eight directions over `SPREAD`. It is minimised
-    by Gauss-Newton steps, reweighted in each step; the best position on the way is kept. Heights
+    by Gauss-Newton steps, reweighted in each step; the best position of all steps is kept. Heights
     are fixed: objects that the prior puts on the floor stay there. `points` lie on each object's
-    surface, whose box is [-0.5, 0.5]^3; `masks` has one entry per object.
+    surface, in the frame in which its box is [-0.5, 0.5]^3; `masks` has one entry per object.
     """
     heights_m = bottom_m + sizes_m[:, 1] / 2
     shape_m = points * sizes_m[:, None]
@@ -64,8 +64,8 @@ def place_objects(
         best, energy = torch.where(better[:, None], place_m, best), cost.minimum(energy)
         if step == STEPS:
             break
-        # An object that extends out of the image is pulled back in, from any distance; where the
-        # mask ends at the image border, too, nothing pulls.
+        # An object that extends out of the image is pulled back in from any distance, unless its
+        # mask ends at the image border, too.
         at_border = (extents > masks.extents + apart) & (apart.abs() < 1e-3)
         apart = torch.where(at_border, 0.0, extents - masks.extents)
         weight = torch.where(at_border, 0.0, slack / apart.abs().clamp(min=ROUND * SPREAD))

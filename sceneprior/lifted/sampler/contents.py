@@ -8,18 +8,18 @@ from torch.nn import functional as F
 from sceneprior.core.mixtures import draw_index
 
 END = 0
-"""Class that ends a room's list: void, which is no furniture."""
+"""Class that ends a room's list: void, which no object of the list has."""
 MANY = 3
 """Counts of a class are also encoded by this many bits, "at least 1", "at least 2" and so on: the
 first object of a class is more informative than the next ones."""
 
 
 class Contents(nn.Module):
-    """Autoregressive model of a room's list of classes: the next class, or the end, from the counts
-    so far.
+    """Autoregressive model of a room's list of classes: it predicts the next class, or the end.
 
-    Its only other input is the size of the rectangle around the furniture. Contents are sampled
-    without seeing placements, so that placement errors do not accumulate.
+    The only inputs are the counts of the classes so far, and the size of the rectangle around the
+    furniture. Contents are sampled without seeing placements, so that placement errors do not
+    accumulate.
 
     Args:
         classes: Size of the label set, void included.
@@ -28,7 +28,7 @@ class Contents(nn.Module):
     """
 
     known: Tensor
-    """True for the classes that may be sampled, `END` among them: those of the training rooms."""
+    """True for the classes that may be sampled: those of the training rooms, and `END`."""
 
     def __init__(self, classes: int, width: int, dropout: float):
         super().__init__()
@@ -55,7 +55,8 @@ class Contents(nn.Module):
         is_object: Bool[Tensor, "rooms objects"],
         extents_m: Float[Tensor, "rooms 2"],
     ) -> Float[Tensor, " rooms"]:
-        """Negative log-likelihood of each room's list in this order, its end included."""
+        """Negative log-likelihood of each room's list of classes, in the given order and including
+        its end."""
         label = F.pad(object_class * is_object, (0, 1), value=END)
         before = self.before(object_class, is_object)
         logits = self(before, extents_m.unsqueeze(1).expand(-1, label.shape[1], -1))

@@ -1,5 +1,6 @@
 """Draw rooms from a trained sampler: whole rooms, or the rest of rooms with given objects."""
 
+from dataclasses import replace
 from operator import itemgetter
 
 import torch
@@ -25,9 +26,9 @@ from sceneprior.lifted.sampler.violations import settled, violation
 PLACES = 16
 """Places sampled for an object in the last attempt, in which it takes the best one."""
 TRIES = 4
-"""Places sampled for an object in each attempt before; it takes the first without a violation. Few,
-since an object whose likely places are taken would end at an unlikely one; the room is furnished
-again instead."""
+"""Places sampled for an object in each earlier attempt, of which it takes the first one without a
+violation. With more places, an object whose likely places are taken would end up at an unlikely
+one; instead, the room is furnished again."""
 LOOKS = 16
 """Looks sampled for a given object, one of which is chosen by the likelihood of its place."""
 OPEN_M = 3 * FRAME_M
@@ -42,20 +43,20 @@ ROUNDS = 16
 PLANS = 3
 """Maximum number of plans of a room."""
 BATCH = 256
-"""Rooms drawn at a time."""
+"""Number of rooms sampled at a time."""
 
 
 @torch.no_grad()
 def draw_rooms(
     sampler: RoomSampler, count: int, seed: int, given: Given | None = None
 ) -> RoomBoxes:
-    """New rooms with looks; given objects come first, with their own boxes.
+    """New rooms with looks and rectangles; given objects come first, with their own boxes.
 
     A room's contents are sampled first (`plan_rooms`), then its objects one by one, each at the
     first of `TRIES` sampled places where it neither intersects an object that it should not
     (`RoomSampler.may_meet`) nor extends beyond the rectangle. A room is furnished again if some
-    object has no such place, or if a side of its sampled rectangle stays empty (`OPEN_M`), as
-    hardly any training room's does. After `ROUNDS` attempts it is planned again.
+    object has no such place, or if a side of its sampled rectangle stays empty (`OPEN_M`), which is
+    rare in training rooms. After `ROUNDS` attempts, the room is planned again.
 
     In the last attempt, `PLACES` places are sampled. Objects without a place are left out; if their
     classes were requested, they take the place with the least violation instead.
@@ -65,13 +66,14 @@ def draw_rooms(
     given = given or nothing_given(count)
     keep = given.coming is not None
     slots, waiting = sampler.max_objects, torch.arange(count)
-    drawn = _nothing_drawn(count, slots)
+    drawn, rectangle_m = _nothing_drawn(count, slots), torch.zeros(count, 4)
     for number in range(PLANS * ROUNDS):
         last = number + 1 == PLANS * ROUNDS
         if number % ROUNDS == 0:
             plan = plan_rooms(sampler, given, count, (seed, number // ROUNDS))
         numbers = uniform_numbers(count, slots * (7 + 4 * PLACES), (seed, PLANS + number))
         numbers = numbers.unflatten(1, (slots, -1))
+        rectangle_m[waiting] = plan.rectangle_m[waiting]
         stuck = []
         for rows in waiting.split(BATCH):
             found, found_stuck = _draw(sampler, numbers[rows], plan.rows(rows), last, keep)
@@ -81,7 +83,7 @@ def draw_rooms(
         waiting = torch.cat(stuck)
         if last or not len(waiting):
             break
-    return drawn
+    return replace(drawn, rectangle_m=rectangle_m)
 
 
 def _nothing_drawn(count: int, slots: int) -> RoomBoxes:
@@ -101,10 +103,13 @@ def _draw(
     last: bool,
     keep: bool,
 ) -> tuple[RoomBoxes, Bool[Tensor, " rooms"]]:
-    """The rooms, and a mask of those to furnish again: some object found no place, or a side of a
-    sampled rectangle stays empty. With `keep`, the last round places objects in any case."""
+    """Furnish rooms once; also returns a mask of the rooms to furnish again, because some object
+    found no place, or a side of a sampled rectangle stays empty.
+
+    With `keep`, the last attempt places objects in any case.
+    """
     number = plan.objects.is_object.sum(dim=1)
-    rooms = _recognised(sampler, uniform, plan)
+    rooms = with_looks(sampler, uniform, plan)
     looks = rooms.looks
     assert looks is not None
     stuck = torch.zeros_like(number, dtype=torch.bool)
@@ -115,7 +120,8 @@ def _draw(
         if not len(rows):
             break
         label, begun = plan.coming[rows, step], rooms.changed(itemgetter(rows))
-        reading = _read(sampler, begun, number[rows], plan.rows(rows), plan.coming[rows, step:])
+        coming, rectangle_m = plan.coming[rows, step:], plan.rectangle_m[rows]
+        reading = read_rooms(sampler, begun, number[rows], rectangle_m, coming)
         tries = PLACES if last else TRIES
         look, box_m, wrong = _placed(sampler, reading, label, chance[rows], tries)
         stuck[rows] |= wrong > 0
@@ -129,11 +135,11 @@ def _draw(
     return rooms, stuck | (added & plan.drawn & side_open)
 
 
-def _read(
+def read_rooms(
     sampler: RoomSampler,
     rooms: RoomBoxes,
     number: Int[Tensor, " rooms"],
-    plan: Plan,
+    rectangle_m: Float[Tensor, "rooms 4"],
     coming: Int[Tensor, "rooms wanted"],
 ) -> Reading:
     """Encode the first `number` objects of each room, and the classes still to come."""
@@ -141,8 +147,8 @@ def _read(
     first = torch.arange(most, device=number.device) < number[:, None]
     before = rooms.changed(lambda part: part[:, :most]).only(first)
     still = sampler.contents.before(coming, coming != END)[:, -1]
-    tokens = sampler.tokens(before, plan.rectangle_m)
-    return sampler.read(before, still, Frame.plain(plan.rectangle_m), tokens)
+    tokens = sampler.tokens(before, rectangle_m)
+    return sampler.read(before, still, Frame.plain(rectangle_m), tokens)
 
 
 def _placed(
@@ -152,8 +158,11 @@ def _placed(
     chance: Float[Tensor, "rooms numbers"],
     tries: int,
 ) -> tuple[Int[Tensor, " rooms"], Float[Tensor, "rooms 6"], Float[Tensor, " rooms"]]:
-    """A look and a box for an object of a class, at the first of `tries` sampled places without a
-    violation, and its violation; if all have one, at the place with the least."""
+    """Sample a look and a box for an object of a class; also returns the violation of the box.
+
+    The box is at the first of `tries` sampled places without a violation, or, if all places have
+    one, at the place with the least violation.
+    """
     look = draw_index(sampler.look_logits(reading, label), chance[:, 1])
     details = sampler.details(reading, label, look).draw(chance[:, 2], chance[:, 3:7])
     off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)
@@ -181,7 +190,7 @@ def _placed(
     return look, boxes_m, wrong
 
 
-def _recognised(
+def with_looks(
     sampler: RoomSampler,
     uniform: Float[Tensor, "rooms slots numbers"],
     plan: Plan,
@@ -200,7 +209,8 @@ def _recognised(
     )  # fmt: skip
     for step in range(known):
         here = rooms.is_object[:, step]
-        reading = _read(sampler, rooms, torch.full((count,), step), plan, still[:, step:])
+        number = torch.full((count,), step)
+        reading = read_rooms(sampler, rooms, number, plan.rectangle_m, still[:, step:])
         label = rooms.object_class[:, step].clamp(min=1)
         centre_m, size_m = rooms.boxes_m[:, step].split(3, dim=-1)
         size_m = size_m.where(here[:, None], 1.0)

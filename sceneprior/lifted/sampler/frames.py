@@ -1,8 +1,8 @@
 """The frame of an object: its room, turned so that the object's back is at low z.
 
-The back of a prototype is its side that is nearest to a side of the room's rectangle on average.
-In such frames the places of beds before any of the four walls are one place, so that each teaches
-all others.
+The back of a prototype is its side that is nearest to a side of the room's rectangle on average. In
+its own frame, a bed stands at the same place whichever of the four walls it stands against, so all
+four cases are learnt as one.
 """
 
 from dataclasses import replace
@@ -17,7 +17,7 @@ from sceneprior.lifted.prototypes import POSES, turned_looks
 from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, rectangles_of
 
 FURTHEST_M = 1.0
-"""Gaps to the sides of the rectangle are cut to this before they are averaged."""
+"""Length to which gaps to the sides of the rectangle are clipped before they are averaged."""
 
 
 def backs_of(
@@ -26,7 +26,7 @@ def backs_of(
     """The side at which each look has its back: 0 to 3 for low z, low x, high z, high x.
 
     Args:
-        backs: The same of each prototype in pose 0.
+        backs: The side at which each prototype has its back in pose 0.
     """
     pose, own = looks % POSES, backs[looks // POSES]
     # Mirroring (x reversed) comes before the turn, and reverses the direction of sides.
@@ -34,7 +34,7 @@ def backs_of(
 
 
 def into_frames(rooms: RoomBoxes, back: Int[Tensor, " rooms"]) -> RoomBoxes:
-    """Turn every room so that its side `back` comes to low z."""
+    """Turn every room so that its side `back` is at low z."""
     assert rooms.looks is not None
     quarters = -back % QUARTERS
     return replace(
@@ -47,7 +47,7 @@ def into_frames(rooms: RoomBoxes, back: Int[Tensor, " rooms"]) -> RoomBoxes:
 def turn_rectangles(
     rectangle_m: Float[Tensor, "rooms 4"], quarters: Int[Tensor, " rooms"]
 ) -> Float[Tensor, "rooms 4"]:
-    """Rectangles (centre x, z, extents x, z) of rooms that are turned by quarters."""
+    """Rectangles (centre x, z, extents x, z) after their rooms are turned by `quarters`."""
     x, z, along_x, along_z = rectangle_m.unbind(dim=-1)
     nothing = torch.zeros_like(x)
     boxes_m = torch.stack([x, nothing, z, along_x, nothing, along_z], dim=-1)
@@ -57,7 +57,7 @@ def turn_rectangles(
 def turn_places(
     place_m: Float[Tensor, "rooms 2"], quarters: Int[Tensor, " rooms"]
 ) -> Float[Tensor, "rooms 2"]:
-    """Places (x, z) in rooms that are turned by quarters."""
+    """Places (x, z) after their rooms are turned by `quarters`."""
     nothing = torch.zeros_like(place_m)
     return turn_rectangles(torch.cat([place_m, nothing], dim=-1), quarters)[:, :2]
 

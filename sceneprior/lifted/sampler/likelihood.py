@@ -19,10 +19,11 @@ def negative_log_likelihood(
     symmetry: Int[Tensor, " rooms"],
     generator: torch.Generator,
 ) -> dict[str, Float[Tensor, " rooms"]]:
-    """Negative log-likelihood of each room given its rectangle, in parts: that of its contents, and
-    that of every object given the previous ones and the classes still to come, in a random order.
+    """Negative log-likelihood of each room given its rectangle, in parts.
 
-    Its mean over orders is an upper bound of the negative log-likelihood of the set.
+    The parts are the room's list of classes (`class`), and the look, size and place of its objects,
+    each given the previous objects and the classes still to come, in a random order. The mean over
+    orders is an upper bound of the negative log-likelihood of the set of objects.
 
     Args:
         symmetry: Symmetry in which each room is presented.
@@ -37,8 +38,8 @@ def negative_log_likelihood(
     still = there[:, -1:] - there
     zeros = tokens.new_zeros(len(counts))
     found = dict.fromkeys(PARTS_OF_OBJECT, zeros)
-    # One call per step, on the rooms that have that many objects: nothing is padded. Rooms without
-    # objects are read in the first call, since the encoder rejects an empty batch.
+    # One call per step, on the rooms with that many objects, so that nothing is padded. Rooms
+    # without objects are read in the first call, since the encoder rejects an empty batch.
     for step in range(max(int(counts.max()), 1)):
         row = (counts.clamp(min=1) > step).nonzero()[:, 0]
         before = _first(rooms, row, step)

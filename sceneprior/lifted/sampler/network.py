@@ -49,8 +49,8 @@ class RoomSampler(nn.Module):
     floor's middle and to the other objects.
 
     Training rooms are presented in all their `SYMMETRIES`. The frequency of each look in each pose
-    depends on the orientation of the data; it is learnt for untransformed rooms and transformed
-    with them.
+    depends on the orientation of the data; it is learnt for untransformed rooms, and transformed
+    together with the room.
 
     Args:
         settings: Size of the network.
@@ -112,13 +112,14 @@ class RoomSampler(nn.Module):
 
     @property
     def looks(self) -> int:
-        """Number of looks: 8 for each prototype found, often far fewer than there may be."""
+        """Number of looks: 8 for each prototype found, often far fewer than the maximum."""
         return 1 + int((self.look_class >= 0).nonzero().max())
 
     def rectangles(
         self, choice: Float[Tensor, "*batch"], noise: Float[Tensor, "*batch 4"]
     ) -> Float[Tensor, "*batch 4"]:
-        """Rectangles (centre x, z, extents x, z) from a uniform number and standard normal ones."""
+        """Sample rectangles (centre x, z, extents x, z) from a uniform number `choice` and standard
+        normal numbers `noise`."""
         which = draw_index(self.rectangle_logits.expand(*choice.shape, -1), choice)
         moved = (self.rectangle_factors[which] @ noise.unsqueeze(-1))[..., 0]
         found = self.rectangle_means[which] + moved
@@ -161,9 +162,9 @@ class RoomSampler(nn.Module):
     def summary(
         self, before: RoomBoxes, coming: Float[Tensor, "rooms classes"], frame: Frame
     ) -> Float[Tensor, "rooms summary"]:
-        """Features that attention would have to count: objects of each class, those to come, and
-        the gaps between the furniture and each side of the rectangle, which are small in a finished
-        room."""
+        """Features that attention could only obtain by counting: the number of objects of each
+        class, placed and still to come, and the gaps between the furniture and each side of the
+        rectangle, which are small in a finished room."""
         counts = self.counts(before)
         furnished = before.is_object.any(dim=1, keepdim=True)
         low, high = rectangle_sides(frame.rectangle_m)
@@ -188,8 +189,8 @@ class RoomSampler(nn.Module):
     def details(
         self, reading: Reading, label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
     ) -> LogisticMixture:
-        """Distribution of the log extents relative to those of the look, and of the height of the
-        bottom."""
+        """Joint distribution of the object's log extents, relative to those of its look, and of the
+        height of its bottom."""
         return LogisticMixture.of(self.details_head(self._known(reading, label, look)), 4)
 
     def place(
@@ -200,7 +201,7 @@ class RoomSampler(nn.Module):
         size_m: Float[Tensor, "rooms 3"],
         bottom_m: Float[Tensor, " rooms"],
     ) -> Places:
-        """Distribution of x and z of the centre."""
+        """Distribution of the x and z of the object's centre."""
         counts = torch.cat([self.counts(reading.before), reading.coming], dim=-1)
         return self.placement(
             label, look, size_m, bottom_m, reading.frame.rectangle_m, reading.before, counts,
@@ -212,8 +213,8 @@ class RoomSampler(nn.Module):
         return self.contents.before(rooms.object_class, rooms.is_object)[:, -1]
 
     def log_prob(self, reading: Reading, coming: RoomBoxes) -> dict[str, Float[Tensor, " rooms"]]:
-        """Log-probability of each room's next object given its class, by part. Every room of
-        `coming` has one object."""
+        """Log-probabilities of the look, size and place of each room's next object, given its
+        class. Every room of `coming` has one object."""
         assert coming.looks is not None
         label, look = coming.object_class[:, 0], coming.looks[:, 0]
         centre_m, size_m = coming.boxes_m[:, 0].split(3, dim=-1)

@@ -1,5 +1,5 @@
 """The distribution of an object's place, as a choice between places relative to the room and to the
-objects that are there."""
+objects already placed."""
 
 import math
 
@@ -27,26 +27,26 @@ from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, shared_extents
 SHOWN = PARTS**3 + 3
 """Numbers that encode a look: its coarse grid and the logarithms of its extents."""
 EMBEDDING = 16
-"""Dimension of the embeddings of classes and of looks. Small, as all inputs here: exact sizes would
-identify a training room."""
+"""Dimension of the embeddings of classes and of looks. All inputs here are small or coarse, because
+exact sizes would identify a training room."""
 WIDTH = 64
 """Width of the hidden layers."""
 NARROW_M, WIDE_M = 0.03, 0.2
-"""Scales of narrow and wide logistics for a network output of 0. The room's second anchors and
-those apart from objects are wide."""
+"""Scales in metres of narrow and wide logistics for a network output of 0. Wide are one of the two
+anchors at each position that the room gives, and the anchors `APART_M` from an object."""
 SHIFT_M = 0.3
-"""Shift of an anchor for a network output of 1."""
+"""Shift of an anchor in metres for a network output of 1."""
 
 
 class Placement(nn.Module):
-    """The distribution of a footprint's centre (x, z) in the object's frame: that of x, times that
-    of z given x.
+    """The distribution of a footprint's centre (x, z) in the object's frame: p(x) p(z | x).
 
-    Each is a mixture of logistics around anchors: positions flush with a side of the rectangle, in
-    its middle or in the floor's, and for every object there adjacent to it, flush with its sides,
-    centred, or apart. So an object can stand flush with a wall along one axis and adjacent to
-    another object along the other. The weight of an anchor is scored by what an object there would
-    stand next to (`AxisScore`).
+    Both factors are mixtures of logistics around anchors. The room gives anchors flush with a side
+    of the rectangle, in the middle of the rectangle, and in the middle of the floor. Every object
+    already placed gives anchors adjacent to it, flush with its sides, centred on it, and apart from
+    it. So an object can stand flush with a wall along one axis and adjacent to another object along
+    the other. The weight of an anchor depends on what an object there would stand next to
+    (`AxisScore`).
 
     Args:
         classes: Size of the label set.
@@ -61,7 +61,7 @@ class Placement(nn.Module):
         self.there = nn.Linear(2 * EMBEDDING + QUARTERS + 4 + 2 * OF_SIDES, WIDTH)
         self.dropout = nn.Dropout(dropout)
         self.along_x = AxisScore(classes, OF_OBJECT, OF_SIDES, dropout)
-        # Given x, both axes are known, and the share of the footprints that overlaps.
+        # Given x, relations along both axes are known, and so is the overlap of the footprints.
         self.along_z = AxisScore(classes, 2 * OF_OBJECT + 1, 2 * OF_SIDES, dropout)
 
     def forward(
@@ -77,7 +77,8 @@ class Placement(nn.Module):
         backs: Int[Tensor, " prototypes"],
     ) -> Places:
         """The distribution for an object of a class, look and size, given the rectangle (centre
-        x, z, extents x, z), the objects there, and the counts of each class there and to come.
+        x, z, extents x, z), the objects already placed, and the counts of each class, placed and
+        still to come.
 
         Args:
             look_shown: Encoding of every look.
@@ -104,7 +105,7 @@ class Placement(nn.Module):
         ], dim=-1)  # fmt: skip
         own_box = torch.cat([centre.new_zeros(len(label), 3), size_m], dim=-1).unsqueeze(1)
         own_box[:, 0, 1] = bottom_m + size_m[:, 1] / 2
-        # Whether the two overlap in height, wherever they stand.
+        # True if the two overlap in height; x and z are set to 0, because they do not matter.
         level = centre * torch.tensor([0.0, 1.0, 0.0]).to(centre)
         meets = shared_extents(own_box, torch.cat([level, extents], dim=-1))[..., 1] > 0
         return Places(
@@ -118,10 +119,10 @@ class Placement(nn.Module):
 class AxisScore(nn.Module):
     """Weights, shifts and scales of the anchors along an axis.
 
-    The score of an anchor is that of a small network, which sums over the objects there, plus a
-    linear function of the same features with tables of coefficients by class and by pair of
-    classes. The tables find within a few steps what the network alone needs ten times as long for:
-    that a nightstand stands adjacent to a bed.
+    The weight logit of an anchor is the output of a small network, which sums over the objects
+    already placed, plus a linear function of the same features, whose coefficients are tables by
+    class and by pair of classes. Within a few steps, the tables learn facts that the network alone
+    would take ten times as long to learn, such as that nightstands stand adjacent to beds.
     """
 
     def __init__(self, classes: int, of_object: int, of_sides: int, dropout: float):

@@ -1,5 +1,5 @@
 """Places of the next object, as mixtures around anchors: positions relative to the room and to the
-objects that are there."""
+objects already placed."""
 
 import math
 from collections.abc import Callable
@@ -14,24 +14,27 @@ from sceneprior.core.mixtures import LogisticMixture
 from sceneprior.lifted.sampler.frames import turn_places
 
 BY_SIDES = 8
-"""Anchors along an axis that the room gives: flush with the lower side of the rectangle, with its
-upper side, in its middle, and at the origin, which is the floor's middle; a narrow one and a wide
-one each."""
+"""Number of anchors along an axis that the room gives: a narrow and a wide one at each of four
+positions. These are flush with the lower side of the rectangle, flush with its upper side, in its
+middle, and at the origin, which is the middle of the floor."""
 BY_OBJECT = 7
-"""Anchors along an axis per object that is there: adjacent before it, flush with its lower side,
-centred, flush with its upper side, adjacent behind it, and `APART_M` before and behind it."""
+"""Number of anchors along an axis per object already placed: adjacent before it, flush with its
+lower side, centred, flush with its upper side, adjacent behind it, and `APART_M` before and behind
+it."""
 APART_M = 0.4
-"""Gap of the anchors apart from an object."""
+"""Gap between an object and the two anchors apart from it."""
 SHARPNESS, SPREAD = 1.5, 0.7
-"""Drawing raises the weights of anchors to this power and multiplies the scales around them by this
-factor: what a network learns from a few hundred rooms is less certain than the rooms are."""
+"""Sampling raises the weights of anchors to the power `SHARPNESS` and multiplies the scales by
+`SPREAD`, because distributions learnt from a few hundred rooms are broader than those of the
+rooms."""
 GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 1.0, 2.0)
 """Knots of `ramps` for gaps; negative gaps are overlaps."""
 OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
 """Knots of `ramps` for offsets of centres and sides."""
 OF_GAP, OF_OFFSET = len(GAPS_M) - 1, len(OFFSETS_M) - 1
 OF_OBJECT, OF_SIDES = OF_GAP + 3 * OF_OFFSET, 2 * OF_GAP
-"""Features of the relation to an object along an axis, and to the two sides of the rectangle."""
+"""Number of features, along an axis, of the relation to an object, and of the relations to the two
+sides of the rectangle."""
 
 
 def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> Tensor:
@@ -48,22 +51,22 @@ def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> T
 
 
 class Anchors(NamedTuple):
-    """Positions along an axis, and what an object there would stand next to."""
+    """Positions along an axis, and features of what an object at each would stand next to."""
 
     at_m: Float[Tensor, "rooms anchors"]
     exists: Bool[Tensor, "rooms anchors"]
     """False for the anchors of padding."""
     kind: Int[Tensor, " anchors"]
-    """0 to 7 for those that the room gives, 8 to 14 for those of an object."""
+    """0 to 7 for anchors that the room gives, 8 to 14 for anchors of an object."""
     relations: tuple[Float[Tensor, "rooms #anchors objects _"], ...]
-    """Features of the relations to the objects, in parts; a part that all anchors share comes
-    once."""
+    """Features of the relations to the objects, in several tensors. A tensor that is the same for
+    all anchors has size 1 along that axis."""
     sides: Float[Tensor, "rooms anchors features"]
 
 
 class Places(NamedTuple):
-    """The distribution of the next object's centre (x, z) in each room; lengths are in the frames
-    of these objects."""
+    """The distribution of the next object's centre (x, z) in each room. Tensors refer to the frame
+    of that object (`frames.py`)."""
 
     along_x: "Callable[[Places, Anchors], LogisticMixture]"
     along_z: "Callable[[Places, Anchors], LogisticMixture]"
@@ -74,7 +77,7 @@ class Places(NamedTuple):
     size_m: Float[Tensor, "rooms 2"]
     rectangle_m: Float[Tensor, "rooms 4"]
     footprints_m: Float[Tensor, "rooms objects 4"]
-    """Centre x, z and extents x, z of the objects there."""
+    """Centre x, z and extents x, z of the objects already placed."""
     is_object: Bool[Tensor, "rooms objects"]
     meets: Bool[Tensor, "rooms objects"]
     """True for objects that overlap with the next object in height."""
@@ -91,13 +94,14 @@ class Places(NamedTuple):
         return self._along_x().log_prob(x) + self._along_z(x[:, 0]).log_prob(z)
 
     def draw_x(self, uniform: Float[Tensor, "rooms tries 2"]) -> Float[Tensor, "rooms tries"]:
-        """Positions along x of the frames from uniform numbers."""
+        """Sample positions along the x axis of the frames, from uniform numbers."""
         return _sharpened(self._along_x()).drawn(uniform[..., 0], uniform[..., 1:])[..., 0]
 
     def draw(
         self, x: Float[Tensor, " rooms"], uniform: Float[Tensor, "rooms 2"]
     ) -> Float[Tensor, "rooms 2"]:
-        """Places in the rooms, given the position along x of the frames, from uniform numbers."""
+        """Sample places in the rooms, given the positions along the x axis of the frames, from
+        uniform numbers."""
         z = _sharpened(self._along_z(x)).draw(uniform[:, 0], uniform[:, 1:])[:, 0]
         return turn_places(torch.stack([x, z], dim=-1), -self.quarters % QUARTERS)
 
@@ -142,8 +146,8 @@ class Places(NamedTuple):
         )
 
     def _relations(self, axis: int, at_m: Float[Tensor, "rooms anchors"]) -> tuple[Tensor, ...]:
-        """Features along an axis of the relations to the objects there and to the sides of the
-        rectangle, and the overlap with each object in metres."""
+        """Features, along an axis, of the relations to the objects already placed and to the sides
+        of the rectangle, and the overlap with each object in metres."""
         size = self.size_m[:, axis].unsqueeze(1)
         offset = self.footprints_m[:, None, :, axis] - at_m.unsqueeze(-1)
         theirs = self.footprints_m[..., 2 + axis]
@@ -162,7 +166,7 @@ class Places(NamedTuple):
 
 
 def _sharpened(mixture: LogisticMixture) -> LogisticMixture:
-    """The mixture as it is drawn from; see `SHARPNESS`."""
+    """The mixture that is sampled from; see `SHARPNESS`."""
     return LogisticMixture(
         SHARPNESS * mixture.weight_logits, mixture.means, mixture.log_scales + math.log(SPREAD)
     )

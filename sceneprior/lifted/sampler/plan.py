@@ -14,7 +14,8 @@ from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.rooms import large_first, rectangle_sides, rectangles_of
 
 RECTANGLES = 16
-"""Rectangles sampled for a room, which takes the first that contains the given objects."""
+"""Number of rectangles sampled for a room; the first one that contains the given objects is
+used."""
 BEYOND_M = 0.01
 """Distance that an object may extend beyond the rectangle."""
 
@@ -28,12 +29,12 @@ class Given:
     rectangle_m: Float[Tensor, "rooms 4"] | None = None
     """Rectangle that the furniture may fill: centre x, z and extents x, z. None samples it."""
     coming: Int[Tensor, "rooms wanted"] | None = None
-    """Classes of the objects to add, and no others, in any order; `END` for none. None samples
-    them."""
+    """Classes of all objects to add, in any order, padded with `END`. None samples the classes."""
 
 
 class Plan(NamedTuple):
-    """Conditions of rooms before they are furnished: those of `Given`, complete."""
+    """Conditions of rooms before they are furnished: those of `Given`, with everything that was
+    missing sampled."""
 
     objects: RoomBoxes
     rectangle_m: Float[Tensor, "rooms 4"]
@@ -61,8 +62,8 @@ def uniform_numbers(count: int, each: int, seed: tuple[int, int]) -> Float[Tenso
 
 
 def plan_rooms(sampler: RoomSampler, given: Given, count: int, seed: tuple[int, int]) -> Plan:
-    """Rectangles and classes, sampled where they are not given; classes with the largest footprints
-    come first, so that chairs find their table."""
+    """Rectangles and classes, sampled where they are not given. Classes with the largest footprints
+    come first, so that tables are placed before their chairs."""
     slots, objects, rectangle_m = sampler.max_objects, given.objects, given.rectangle_m
     numbers = uniform_numbers(count, 5 * RECTANGLES + slots, seed)
     frames, uniform = numbers.split([5 * RECTANGLES, slots], dim=1)

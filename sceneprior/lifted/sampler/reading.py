@@ -13,14 +13,14 @@ from sceneprior.core.views import RoomBoxes
 OCTAVES = 6
 """Frequencies in the encoding of a length."""
 LONGEST_M = 16.0
-"""Longest period of that encoding: sines and cosines of `OCTAVES` periods, this one, its half and
-so on."""
+"""Longest period of that encoding, which has a sine and a cosine for each of `OCTAVES` periods:
+this one, half of it, a quarter and so on."""
 LENGTHS = 1 + 2 * OCTAVES
 """Numbers that encode a length."""
 
 
 class Frame(NamedTuple):
-    """Conditions of rooms that are known before they have any furniture."""
+    """Properties of rooms that are known before they have any furniture."""
 
     rectangle_m: Float[Tensor, "rooms 4"]
     """Rectangle that the furniture may fill: centre x, z and extents x, z."""
@@ -44,7 +44,7 @@ class Reading(NamedTuple):
     before: RoomBoxes
     frame: Frame
     coming: Float[Tensor, "rooms classes"]
-    """Counts of each class still to come."""
+    """Number of objects of each class that are still to be placed."""
     context: Float[Tensor, "rooms width"]
     """Output of the query: the context for the next object."""
 

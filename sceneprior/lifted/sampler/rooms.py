@@ -14,7 +14,8 @@ from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototypes import Prototypes, turned_looks
 
 GRAZE_M = 0.05
-"""Overlap along an axis up to which lifted boxes may overlap only because they are inaccurate."""
+"""Overlap along an axis up to which an intersection of lifted boxes is put down to their
+inaccuracy."""
 SYMMETRIES = 2 * QUARTERS
 """Symmetries of a room: mirrored or not, times the quarter turns; 0 is the untransformed room."""
 LOOSELY = 2.0
@@ -22,15 +23,16 @@ LOOSELY = 2.0
 FRAME_M = 0.15
 """Standard deviation of the normal distribution in `frames_of`."""
 PLAUSIBLE_SHARE = 0.2
-"""Share of the training rooms with both classes from which an intersection of the two is considered
-intended: lifted boxes of chairs intersect each other in a seventh of them, true ones in none."""
+"""Share of the training rooms with both classes in which the two must intersect for this to be
+considered intended. Lifted boxes of chairs intersect each other in a seventh of the rooms, true
+boxes in none."""
 
 
 class SamplerRooms:
-    """Rooms as unordered sets of objects: class, box and look. Rows are rooms without turned
+    """Rooms as unordered sets of objects with class, box and look; one row per room, without turned
     copies.
 
-    Objects without a label, and those that no view shows, are left out.
+    Objects without a label, and objects that are visible in no view, are left out.
 
     Args:
         lifted: A split, with its shapes.
@@ -39,7 +41,7 @@ class SamplerRooms:
     room_ids: tuple[str, ...]
     """Ids of the rows of the prior's latents, turned copies included."""
     masks = None
-    """None: batches are made in the training process, as `ViewDataset` says."""
+    """None, so that batches are made in the training process (see `RoomDataset`)."""
 
     def __init__(self, lifted: LiftedDataset):
         self.room_ids, self.label_set = lifted.room_ids, lifted.label_set
@@ -49,8 +51,10 @@ class SamplerRooms:
         self.rooms: RoomBoxes
 
     def see_looks(self, prototypes: Prototypes) -> "SamplerRooms":
-        """Set `rooms`, in which every object has a look, and return this data set. Only common
-        prototypes are used, since odd ones are often badly lifted."""
+        """Set `rooms`, in which every object has a look, and return this data set.
+
+        Only common prototypes are used, since odd ones are often badly lifted.
+        """
         lifted, prototypes = self._lifted, prototypes.common_alone()
         counts = [len(room.explained) for room in lifted.boxes]
         boxes_m = np.concatenate([np.hstack([b.centers_m, b.sizes_m]) for b in lifted.boxes])
@@ -80,8 +84,8 @@ class SamplerRooms:
         return self
 
     def __getitems__(self, draws: list[tuple[int, int]]) -> RoomBoxes:
-        """A batch of rows; each draw is (row, epoch). A draw of epoch `BLANK` is an empty room;
-        empty rooms add nothing to the loss."""
+        """A batch of rows; each draw is (row, epoch). A draw of epoch `BLANK` gives an empty room,
+        which does not contribute to the loss."""
         shown = torch.tensor([epoch >= 0 for _, epoch in draws])
         rows = [row for row, _ in draws]
         rooms = self.rooms.changed(lambda part: part[rows])
@@ -129,7 +133,7 @@ def rectangles_of(rooms: RoomBoxes) -> Float[Tensor, "rooms 4"]:
 
 
 def frames_of(rooms: RoomBoxes, generator: torch.Generator) -> Float[Tensor, "rooms 4"]:
-    """`rectangles_of` with each side moved outwards by the absolute value of a normal number.
+    """`rectangles_of`, with each side moved outwards by the absolute value of a normal number.
 
     The exact extents would reveal when a room is complete, since the last object touches them, and
     sampled furniture never fits a rectangle exactly. So noise of standard deviation `FRAME_M` is
@@ -169,8 +173,8 @@ def gaps_to_sides_m(
 
 
 def turned_rooms(rooms: RoomBoxes, symmetry: Int[Tensor, " rooms"]) -> RoomBoxes:
-    """Every room in one of its `SYMMETRIES`: from 4 on mirrored, then turned by `symmetry` % 4
-    quarters."""
+    """Every room in one of its `SYMMETRIES`: mirrored if `symmetry` is 4 or more, then turned by
+    `symmetry` % 4 quarter turns."""
     assert rooms.looks is not None
     quarters, mirrored = symmetry % QUARTERS, symmetry >= QUARTERS
     return replace(
@@ -193,8 +197,8 @@ def large_first(
 ) -> Int[Tensor, "rooms objects"]:
     """A random order in which classes with large footprints tend to come first; padding comes last.
 
-    A class precedes one with up to exp(`LOOSELY`) times its footprint now and then, so that the
-    network also learns from rooms in which only small objects are given. `uniform` are random
+    Now and then, a class comes before one with up to exp(`LOOSELY`) times its footprint, so that
+    the network also learns from rooms in which only small objects are given. `uniform` holds random
     numbers in [0, 1).
     """
     tickets = LOOSELY * uniform - footprints_m2.log()[object_class]

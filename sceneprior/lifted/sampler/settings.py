@@ -18,8 +18,8 @@ class SamplerConfig(TrainConfig):
     heads: int = Field(4, ge=1)
     dropout: float = Field(0.1, ge=0, lt=1)
     val_every: int = Field(10, ge=1)
-    """Epochs between evaluations of the val rooms. The network with their highest likelihood is
-    kept; the newest if there are no val rooms."""
+    """Epochs between evaluations on the val rooms. The network that gives them the highest
+    likelihood is kept, or the newest network if there are no val rooms."""
 
     @model_validator(mode="after")
     def _heads_divide_width(self) -> "SamplerConfig":

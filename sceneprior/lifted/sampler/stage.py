@@ -30,15 +30,16 @@ from sceneprior.training.steps import (
 )
 
 ORDERS = 4
-"""Random orders of every val room over which its likelihood is averaged."""
+"""Number of random object orders over which the likelihood of every val room is averaged."""
 TABLES_RATE = 10.0
-"""Learning rate of the tables of `Placement` relative to that of the rest: a pair of classes occurs
-in a few batches of an epoch."""
+"""Learning rate of the tables of `Placement` relative to that of the rest. It is high because a
+pair of classes occurs in only a few batches of an epoch."""
 TABLES_DECAY = 10.0
 """Weight decay of these tables relative to that of the rest."""
 CONTENTS_RATE = 5.0
-"""Learning rate of `Contents` relative to that of the rest. It is small and independent of the
-rest, and its evidence is rare: one in thirty rooms shows whether a bedroom may lack a bed."""
+"""Learning rate of `Contents` relative to that of the rest. `Contents` is small and independent of
+the rest, and has few examples to learn from: only one bedroom in thirty shows that a bedroom may
+lack a bed."""
 FRAMES = 8
 """Noisy rectangles per training room to which the mixture is fitted."""
 LEAST_VARIANCE = 0.01
@@ -62,7 +63,7 @@ class SamplerStage(lightning.LightningModule):
         super().__init__()
         self.prior, self.latents = prior.requires_grad_(False), latents.requires_grad_(False)
         self.learner = sampler
-        # The best learner so far, which is what is loaded from checkpoints.
+        # The best learner so far; this is the network that is loaded from checkpoints.
         self.sampler = copy.deepcopy(sampler).requires_grad_(False)
         self.stage, self.seed = stage, seed
         self.val = val
@@ -70,7 +71,7 @@ class SamplerStage(lightning.LightningModule):
         self.register_buffer("least", torch.tensor(math.inf))
 
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
-        """Negative log-likelihood of a room, averaged over the batch."""
+        """Mean negative log-likelihood of the batch's rooms."""
         generator = torch.Generator().manual_seed(batch_seed(self.seed, self.trainer, batch_idx))
         with full_precision(self.device):
             symmetry = torch.randint(SYMMETRIES, (len(rooms.boxes_m),), generator=generator)
@@ -105,8 +106,8 @@ class SamplerStage(lightning.LightningModule):
 
     @torch.no_grad()
     def val_loss(self) -> Tensor:
-        """Negative log-likelihood of a val room, averaged over rooms and `ORDERS` orders, the same
-        each time."""
+        """Mean negative log-likelihood of the val rooms over `ORDERS` orders, which are the same in
+        every call."""
         assert self.val is not None
         rooms = self.val.to(self.device).rooms
         generator = torch.Generator().manual_seed(self.seed)
@@ -140,9 +141,9 @@ class SamplerStage(lightning.LightningModule):
 
 
 def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
-    """Set the buffers that a fresh sampler takes from the training rooms: the encodings of looks,
-    the mixture of rectangles, the classes that may be sampled and may intersect, mean footprints,
-    and the backs of prototypes."""
+    """Set the buffers of a fresh sampler from the training rooms: the encodings of looks, the
+    mixture of rectangles, the classes that may be sampled, the pairs of classes that may intersect,
+    mean footprints, and the backs of prototypes."""
     prototypes = rooms.prototypes
     looks = torch.from_numpy(prototypes.shown())
     sampler.look_shown[: len(looks)] = looks

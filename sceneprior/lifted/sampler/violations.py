@@ -1,4 +1,4 @@
-"""Violations: boxes that intersect what they should not, or stick out of the rectangle."""
+"""Violations: boxes that intersect objects that they should not, or extend beyond the rectangle."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,14 +9,15 @@ from sceneprior.lifted.sampler.reading import Reading
 from sceneprior.lifted.sampler.rooms import GRAZE_M, shared_extents
 
 INTERSECTING = 0.01
-"""Share of the smaller volume from which two boxes count as intersecting, as in the evaluation."""
+"""Shared volume, relative to the smaller box, above which two boxes count as intersecting; the same
+as in the evaluation."""
 
 
 def settled(
     boxes_m: Float[Tensor, "rooms 6"], reading: Reading, apart: Bool[Tensor, "rooms objects"]
 ) -> Float[Tensor, "rooms 6"]:
-    """Move boxes out of objects that they should stand `apart` from, and into the rectangle, along
-    each axis by at most `GRAZE_M`: sampled places are not accurate to the centimetre."""
+    """Move boxes out of objects marked in `apart`, and into the rectangle, along each axis by at
+    most `GRAZE_M`, because sampled places are not accurate to the centimetre."""
     others_m = reading.before.boxes_m
     shared = shared_extents(boxes_m.unsqueeze(1), others_m)
     grazes = apart & reading.before.is_object & (shared > 0).all(dim=-1)
@@ -36,9 +37,11 @@ def settled(
 def violation(
     boxes_m: Float[Tensor, "rooms 6"], reading: Reading, apart: Bool[Tensor, "rooms objects"]
 ) -> Float[Tensor, " rooms"]:
-    """Violation of a box, 0 if there is none: the intersected shares of the smaller boxes, summed
-    over objects that it should stand `apart` from, plus the metres by which it extends beyond the
-    rectangle."""
+    """Violation of a box; 0 if there is none.
+
+    It is the sum of two terms: the shared volumes with objects marked in `apart`, each relative to
+    the smaller box, and the metres by which the box extends beyond the rectangle.
+    """
     others = reading.before
     here, theirs = boxes_m.unsqueeze(1), others.boxes_m
     shared = shared_extents(here, theirs).prod(dim=-1)

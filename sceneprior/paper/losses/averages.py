@@ -13,8 +13,9 @@ def mean_of_objects(
 ) -> Float[Tensor, "*rooms"]:
     """Mean over the objects for which `counted` is true; 0 if there are none.
 
-    It is one mean over all objects of the batch and of all processes. With `per_room` it is one
-    mean per room, independent of the rest of the batch, for rooms that are fitted separately.
+    By default, one mean is taken over all objects of the batch, in all processes. With `per_room`,
+    one mean is taken per room, independent of the rest of the batch; it is for rooms that are
+    fitted separately.
     """
     weights = counted.to(values.dtype)
     if per_room:
@@ -28,11 +29,12 @@ def share_of_batch(count: Tensor) -> Float[Tensor, ""]:
 
         share = processes * count / (sum of all processes' counts)
 
-    Processes (DDP) average their gradients, and a mean of means is not the overall mean: an object
-    on a rank with few of them would count for more. With each mean times its share, the averaged
-    gradient equals that of a single process on the whole batch. The share is 1 for one process.
+    DDP averages the gradients of all processes, and a mean of means is not the overall mean: an
+    object in a process with few objects would count more. If each process multiplies its mean by
+    its share, the averaged gradient equals that of a single process on the whole batch. The share
+    is 1 for one process.
 
-    Every process must call this, in the same order: it waits for the others.
+    Every process must call this function, in the same order, because it waits for the others.
     """
     mine = count.detach().to(torch.float32)
     if not (dist.is_available() and dist.is_initialized()):

@@ -13,7 +13,7 @@ from sceneprior.paper.losses.matching import Matches, side_distance
 
 
 def take(values: Tensor, index: Int[Tensor, "rooms objects"], dim: int) -> Tensor:
-    """Reorder predictions (axis `dim`, after a room axis) to the order of their matched objects."""
+    """Reorder predictions (axis `dim`; axis 0 is rooms) to the order of their matched objects."""
     shape = [1] * values.dim()
     shape[0], shape[dim] = index.shape
     return torch.take_along_dim(values, index.reshape(shape), dim)
@@ -32,10 +32,10 @@ def layout_losses(
 
         L_L = lambda_l L_l + lambda_box L_box + lambda_p L_p + lambda_f L_f
 
-    Each term is averaged over the objects that it applies to: over all processes
-    (`share_of_batch`), or with `per_room` over each room alone, when rooms are fitted rather than
-    trained on. `boxes_2d` are the predictions' boxes in the views; `occlusion_slack` is that of
-    `side_distance`, `completeness_target` a convention of `paper/losses/completeness.py`.
+    Each term is averaged over the objects that it applies to: in training, over the batches of all
+    processes (`share_of_batch`); with `per_room`, over each room alone, for rooms that are fitted.
+    `boxes_2d` holds the predictions' boxes in the views. `occlusion_slack` is explained in
+    `side_distance`; `completeness_target` is a convention of `paper/losses/completeness.py`.
     """
     predicted = take(boxes_2d.boxes, matches.prediction, dim=2)
     inside = take(boxes_2d.in_frustum, matches.prediction, dim=2)
@@ -86,7 +86,7 @@ def completeness_loss(
     target: str = "first_n",
     per_room: bool = False,
 ) -> Float[Tensor, "*rooms"]:
-    """L_p of Eq. 7: binary cross entropy of all completeness scores with a convention's targets."""
+    """L_p of Eq. 7: binary cross entropy of all completeness scores; `target` is the convention."""
     logits = scenes.completeness_logits
     wanted = completeness_targets(views.is_object.sum(dim=-1), logits.shape[1], target)
     wanted = wanted.to(logits.dtype)
@@ -107,7 +107,8 @@ def frustum_loss(
 
         L_f = 1/|T^o| sum_(q in T^o) 1 - cos(c_k - c_cam^q, ray_q)
 
-    T^o are the views that see the object but not its prediction; no others count (supplement B).
+    T^o are the views in which the object is visible but its prediction is outside the frustum;
+    other views do not count (supplement B).
     """
     height, width = views.image_size
     size = views.boxes.new_tensor([width, height])

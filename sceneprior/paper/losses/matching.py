@@ -14,10 +14,10 @@ class Matches(NamedTuple):
     """The matched prediction of each tracked object."""
 
     prediction: Int[Tensor, "rooms objects"]
-    """Index of the matched prediction; 0 for padding, arbitrary for objects that no drawn view
-    sees."""
+    """Index of the matched prediction; 0 for padding, arbitrary for objects that are visible in no
+    sampled view."""
     valid: Bool[Tensor, "rooms objects"]
-    """False for padding and for objects that no drawn view sees."""
+    """False for padding and for objects that are visible in no sampled view."""
 
 
 @torch.no_grad()
@@ -35,9 +35,9 @@ def match_objects(
         L^l = -p_k(l_j),    L^B = 1/|T_j| sum_p |b_k^p - b_j^p|_1     (Eq. S3)
 
     with 2D boxes b relative to the image size. In a room with n tracked objects, only the first n
-    predictions take part. An object that no drawn view sees has zero cost: its match is arbitrary
-    and enters no loss. Without `first_n`, all predictions take part, for predictions without an
-    order. `box_weight` is lambda_B, `occlusion_slack` that of `side_distance`.
+    predictions take part. If `first_n` is false, all predictions take part, because they have no
+    order. An object that is visible in no sampled view has zero cost: its match is arbitrary and
+    enters no loss. `box_weight` is lambda_B; `occlusion_slack` is explained in `side_distance`.
     """
     cost = matching_cost(scenes, boxes_2d, views, box_weight, occlusion_slack)
     counts = views.is_object.sum(dim=-1)
@@ -59,7 +59,7 @@ def assign(
     """The prediction of each object in the one-to-one assignment of least total cost, room by room.
 
     In each room, the first `predictions[room]` rows and `objects[room]` columns of the cost take
-    part; there are no more objects than predictions. Remaining objects get 0.
+    part, and `objects[room]` is at most `predictions[room]`. Padding gets 0.
     """
     from scipy.optimize import linear_sum_assignment  # takes half a second; training only
 
@@ -78,13 +78,14 @@ def side_distance(
     """Distance between one side of predicted 2D boxes and the same side of observed ones.
 
     Args:
-        predicted, observed, clear: Sides relative to the image size, and whether the observed side
-            is the object's own rather than an occluder's; their shapes broadcast.
+        predicted, observed: Coordinates of the side, relative to the image size.
+        clear: True if the observed side is an edge of the object itself, not of an occluder. The
+            three shapes broadcast.
         side: 0 to 3: left, upper, right, lower.
         occlusion_slack: Weight of the distance where the prediction extends beyond a side that is
-            not clear. 1 takes the absolute difference everywhere (paper). Below 1, an object may
-            extend behind an occluder, and the views that see its own edge determine its size. At
-            0 nothing would bound an object that touches another in every view.
+            not clear. 1 uses the absolute difference everywhere (paper). Below 1, an object may
+            extend behind an occluder, and views in which its own edge is visible determine its
+            size. At 0, nothing would bound an object that touches another one in every view.
     """
     apart = predicted - observed
     distance = apart.abs()

@@ -9,7 +9,7 @@ from sceneprior.paper.losses.averages import mean_of_objects
 from sceneprior.paper.losses.matching import Matches
 
 CERTAIN = 1e-6
-"""Distance from 0 or 1 within which a mask's pixels carry no gradient."""
+"""Pixels of a mask whose value is within this distance of 0 or 1 get no gradient."""
 
 
 def mask_loss(
@@ -29,8 +29,8 @@ def mask_loss(
     A mask whose IoU with its observation is not above `iou_gate` counts as zero, as in the paper.
     Void pixels are left out of BCE and IoU, since the object may or may not extend there.
 
-    `rendered` are the visible soft masks of all predictions, as large as the views' instance ids;
-    `per_room` averages as in `mean_of_objects`.
+    `rendered` holds the visible soft masks of all predictions, at the size of the views' instance
+    ids; `per_room` is explained in `mean_of_objects`.
 
     Returns:
         The loss, and, for logging, `mask_iou` (mean over all visible pairs) and `mask_used` (share
@@ -63,6 +63,6 @@ def mask_loss(
 def soft_iou(
     a: Float[Tensor, "pairs height width"], b: Float[Tensor, "pairs height width"]
 ) -> Float[Tensor, " pairs"]:
-    """Intersection over union of soft masks; two empty masks have 0."""
+    """Intersection over union of soft masks; 0 if both are empty."""
     both = (a * b).sum(dim=(1, 2))
     return both / (a.sum(dim=(1, 2)) + b.sum(dim=(1, 2)) - both).clamp(min=1e-6)

@@ -24,8 +24,9 @@ APT_LINE = "apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mes
 def open_renderer(kind: str = "auto") -> Renderer:
     """Open the renderer of this process.
 
-    It is `pyrender` (GPU or software GL), `software` (the package's z-buffer), or `auto`: pyrender
-    if GL works, else software with a printed note. SCENEPRIOR_RENDERER overrides `auto`.
+    `kind` is `pyrender` (GPU or software GL), `software` (the package's z-buffer), or `auto`, which
+    opens pyrender if GL works, and otherwise prints a note and opens the z-buffer. The environment
+    variable SCENEPRIOR_RENDERER overrides `auto`.
     """
     if kind == "auto":
         kind = os.environ.get(ENVIRONMENT_VARIABLE) or "auto"

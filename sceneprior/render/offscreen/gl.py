@@ -1,4 +1,4 @@
-"""Off-screen instance ids by pyrender, on EGL or OSMesa."""
+"""Off-screen instance ids with pyrender, on EGL or OSMesa."""
 
 import contextlib
 import ctypes
@@ -79,7 +79,7 @@ def _load_triton_before_mesa() -> None:
     # Mesa's software GL and Triton each load an LLVM. A process that loads Triton second, as
     # Lightning does if Triton is installed, crashes with a segmentation fault.
     if importlib.util.find_spec("triton") is not None:
-        with contextlib.suppress(Exception):  # a broken Triton shall fail where it is used
+        with contextlib.suppress(Exception):  # a broken Triton should fail where it is used
             importlib.import_module("triton")
 
 

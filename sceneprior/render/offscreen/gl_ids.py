@@ -27,7 +27,7 @@ def id_renderer_class() -> type:
     from pyrender.renderer import Renderer as PyrenderRenderer
 
     class IdRenderer(PyrenderRenderer):
-        """Renderer without multisampling, culling and depth readback, in a fixed drawing order."""
+        """Renderer without multisampling, culling or depth readback; its drawing order is fixed."""
 
         _main_fb_dims: tuple[Any, Any]
         _ids: Any = None

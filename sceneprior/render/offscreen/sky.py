@@ -6,13 +6,14 @@ from jaxtyping import Float, Int
 from sceneprior.render.offscreen.cameras import Pinhole
 
 DIRECTIONS = 24
-"""Directions towards the sky in which light is blocked or not."""
+"""Number of directions towards the sky in which light is tested for occlusion."""
 MAP_PX = 320
-"""Side of the depth map of each direction."""
+"""Side in pixels of the depth map that is drawn for each direction."""
 BIAS_M = 0.02
-"""Depth by which something must be nearer to the sky to cast a shadow."""
+"""Minimum distance of an occluder from the surface that it shades, so that no surface shades
+itself."""
 DARKEST = 0.45
-"""Brightness where no light from the sky arrives."""
+"""Brightness of a surface that no light from the sky reaches."""
 
 
 def sky_light(
@@ -21,10 +22,10 @@ def sky_light(
     camera: Pinhole,
     depth_m: Float[np.ndarray, "height width"],
 ) -> Float[np.ndarray, "height width"]:
-    """Brightness in [`DARKEST`, 1] of each pixel: the share of the directions towards the sky, more
-    of them upwards, in which nothing stands between. 1 where the picture shows nothing.
+    """Brightness in [`DARKEST`, 1] of each pixel, linear in the share of unoccluded sky directions.
 
-    `depth_m` is that at the middle of each pixel's upper left quarter.
+    Pixels that show nothing have brightness 1. `depth_m` is the depth at the middle of each pixel's
+    upper left quarter.
     """
     from sceneprior.render.offscreen.zbuffer import rasterize
 
@@ -52,15 +53,15 @@ def sky_light(
         _, nearest = rasterize(vertices_m, faces, pose, projection, (MAP_PX, MAP_PX), False)
         seen = points_m @ rotation.T + pose[:3, 3]
         u, v = np.clip(seen[:, :2] * scale + MAP_PX / 2, 0, MAP_PX - 1).astype(int).T
-        # A pixel of the map is as wide as its slope may be high.
+        # Within one pixel of the map, the depth of a slope of 45 degrees varies by 1 / scale.
         open_sky += seen[:, 2] <= nearest[v, u] + BIAS_M + 1 / scale
     light[rows, columns] = DARKEST + (1 - DARKEST) * open_sky / DIRECTIONS
     return light
 
 
 def _directions() -> Float[np.ndarray, "directions 3"]:
-    """Unit vectors of the upper half of a sphere, as many per solid angle as the cosine of their
-    angle with the vertical; on a spiral, always the same."""
+    """Unit vectors of the upper hemisphere, on a spiral, with a density per solid angle that is
+    proportional to the cosine of their angle with the vertical."""
     order = (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
     flat, turn = np.sqrt(order), np.arange(DIRECTIONS) * np.pi * (3 - np.sqrt(5))
     return np.stack([flat * np.cos(turn), np.sqrt(1 - order), flat * np.sin(turn)], axis=1)

@@ -8,8 +8,8 @@ from numba import njit
 NEAR_PLANE_M = 0.01
 """Depth of the near plane, at which triangles are clipped."""
 
-# Tolerance on barycentric weights, so that rounding opens no crack at a pixel centre on the edge of
-# two faces.
+# Tolerance on barycentric weights, so that rounding leaves no gap at a pixel centre on the edge
+# between two faces.
 _SLACK = 1e-9
 
 # Triangles of at most this width, which are most of a furnished room's, are drawn without a branch
@@ -28,8 +28,8 @@ def rasterize(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw triangles into a z-buffer, sampled at pixel centres.
 
-    Both sides of a triangle are drawn. A pixel centre on an edge belongs to the triangle; of
-    equally near faces the one with the lower index is drawn, so the picture is deterministic.
+    Both sides of a triangle are drawn. A pixel centre on an edge belongs to the triangle. Among
+    equally near faces, the one with the lowest index is drawn, so the picture is deterministic.
 
     Args:
         vertices: (V, 3) world positions in metres.
@@ -37,7 +37,7 @@ def rasterize(
         world_to_camera: (4, 4), OpenCV axes (x right, y down, z forward).
         projection: fx, fy, cx, cy with u = fx * x / z + cx (perspective) or u = fx * x + cx
             (orthographic, fx in pixels per metre); v likewise from y.
-        labels: (F,) non-negative label of each triangle; None takes its index.
+        labels: (F,) non-negative label of each triangle; None uses the triangle's index.
 
     Returns:
         label: (height, width) int32, -1 at pixels without a triangle.
@@ -71,7 +71,7 @@ def rasterize(
     return image[:pixels].reshape(image_size), depth[:pixels].reshape(image_size)
 
 
-# error_model: numpy's division does not raise; a NaN fails the test of the area.
+# With numpy's error model, division by zero does not raise; the test of the area rejects the NaN.
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw(
     vertices, faces, labels, world_to_camera, fx, fy, cx, cy, perspective,
@@ -91,7 +91,7 @@ def _draw(
     clipped = np.empty((4, 3))
     corners = np.empty((4, 3))
     for face in range(len(faces)):
-        # Unsigned, since Numba checks every signed index for being negative.
+        # Unsigned, since Numba tests at every signed index whether it is negative.
         a, b, c = np.uint32(faces[face, 0]), np.uint32(faces[face, 1]), np.uint32(faces[face, 2])
         in_front = (
             int(camera[a, 2] >= NEAR_PLANE_M)

@@ -14,16 +14,18 @@ from torch.nn import functional as F
 from sceneprior.render.silhouettes.topology import topology_of
 
 MIN_AREA_PX2 = 1e-12
-"""Doubled area up to which a projected face counts as degenerate and is not drawn."""
+"""Twice the area in px**2 up to which a projected face counts as degenerate and is not drawn."""
 
 PIECE_PX = 4.0
-"""Largest length of the equal pieces into which an edge is cut; each is outline or not."""
+"""Maximum length in pixels of the equal pieces into which an edge is cut. A piece belongs to the
+outline as a whole or not at all."""
 
 ASIDE_PX = 1e-3
-"""Distance from the middle of a piece to the point beside it that is tested for faces."""
+"""Distance in pixels from the middle of a piece to the point beside it at which faces are looked
+for."""
 
 SLACK = 1e-6
-"""Tolerance on barycentric weights for ids and depths, so that rounding opens no crack at a pixel
+"""Tolerance on barycentric weights for ids and depths, so that rounding leaves no gap at a pixel
 centre on the edge between two faces."""
 
 
@@ -156,7 +158,8 @@ def _outline(
 def _outline_pieces(
     pixels: Tensor, faces: Tensor, keep: Tensor, settings: Settings
 ) -> tuple[Int[Tensor, "pieces 2"], Float[Tensor, "2 pieces"]]:
-    """The pieces of the outline near the image: their edges' vertices, and spans [t0, t1]."""
+    """The pieces of the outline near the image: the vertices of their edges, and the span [t0, t1]
+    of each piece on its edge."""
     mesh = topology_of(faces.cpu().numpy())
     corners = pixels[faces]
     side = torch.sign(_twice_area(corners)).long() * keep

@@ -60,9 +60,10 @@ def render_scene(
 
         coverage = 1 - prod_f (1 - sigmoid(s_f * d_f / sigma))
 
-    d_f is the squared distance in pixels from the pixel centre to the nearest edge of the
-    projected face f, s_f is +1 inside the face and -1 outside. Outside, faces farther than
-    the blur radius do not count, as in the authors' code. There is no limit on faces per pixel.
+    d_f is the squared distance in pixels from the pixel centre to the nearest edge of the projected
+    face f, and s_f is +1 inside the face and -1 outside. A face whose distance to an outside pixel
+    exceeds the blur radius is left out of the product, as in the authors' code. There is no limit
+    on faces per pixel.
 
     In `fast` mode the mesh is one shape: coverage = sigmoid(s * d / sigma), d the squared distance
     to its outline. Interior edges do not contribute, so a fine mesh does not fatten the masks, and
@@ -75,14 +76,14 @@ def render_scene(
         intrinsics: Intrinsics in pixels of an image of `image_size`.
         image_size: (height, width) of the masks.
         sigma_px2: Softness of an edge in squared pixels. Larger values blur more, and give more
-            pixels a gradient. None takes `sigma_ndc`.
-        sigma_ndc: Softness in PyTorch3D's squared-NDC units; None takes the paper's 1e-4.
-        blur_ndc: Squared blur radius in squared NDC; None takes the authors' radius, at which the
-            sigmoid is 1e-4: log(1 / 1e-4 - 1) sigma.
+            pixels a gradient. None uses `sigma_ndc`.
+        sigma_ndc: Softness in PyTorch3D's squared-NDC units; None uses the paper's 1e-4.
+        blur_ndc: Squared blur radius in squared NDC; None uses the authors' value, log(1 / 1e-4 -
+            1) * sigma, at which the sigmoid is 1e-4.
         mode: `exact` or `fast`.
         compositing: `layered` or `paper` (visible masks, see `cpu/compositing.py`), or `alone`.
-        drawn: Mask of the objects to draw; others have empty masks and hide nothing. None draws
-            all.
+        drawn: True for the objects to draw; the others get empty masks and occlude nothing. None
+            draws all objects.
         backend: `cpu` (Numba), `cuda` (Triton), `reference` (plain torch), or `auto`: the fast
             backend of the tensors' device.
 

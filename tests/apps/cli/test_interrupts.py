@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-SENTENCE = "Stopped by Ctrl-C. Every file that was written is whole.\n"
+SENTENCE = "Stopped by Ctrl-C. No file is left half-written.\n"
 
 # Stands for a command: it says "on", and does what Ctrl-C is to fall into. The others come after.
 _COMMAND = """

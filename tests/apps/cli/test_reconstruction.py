@@ -77,7 +77,7 @@ def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):
     gif = Image.open(tmp_path / "posed" / "mine_turning.gif")
     assert (gif.n_frames, gif.size, gif.info["duration"]) == (36, (320, 240), 100)
     page = (tmp_path / "posed" / "rooms.html").read_text()
-    assert page.count("<model-viewer ") == 1 and "what was found from the same camera" in page
+    assert page.count("<model-viewer ") == 1 and "the reconstruction from the same camera" in page
     status, _, errors = command(*call, *PAPER, "--out", "level", "--camera-height", 1.4)
     assert status == 0 and "Note: without --pose the camera is level, 1.4 m above" in errors
     extra = json.loads((tmp_path / "level" / "mine.json").read_text())["extra"]
@@ -95,14 +95,14 @@ def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):
 def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, own, tmp_path):
     call = ["reconstruct", "--run", toy_run, "--out", "none"]
     shards = ["--shards", toy_shards]
-    way = "Say what to reconstruct from, in one way"
+    way = "Say what to reconstruct from, in exactly one way"
     before = everything_in(tmp_path)
     for arguments, said in (
         ([], way),
         (shards, way),
         ([*shards, "--room", "toy/test_00", "--split", "test"], way),
         ([*shards, *own], way),
-        (own[:2], "--mask needs --intrinsics beside it, and a PNG --classes, too."),
+        (own[:2], "--mask needs --intrinsics and, for a PNG, --classes."),
         ([*shards, "--room", "attic"], "holds no room 'attic'"),
         ([*shards, "--room", "toy/test_00", "--view", 8], "has no view 8; its 8 views are 0 to 7."),
         ([*shards, "--split", "test", "--fit", "slow"], "No fit is called 'slow'"),
@@ -147,7 +147,7 @@ def test_scenes_that_answer_no_image(command, toy_run, toy_shards, tmp_path):
         return one_sentence(command(*call))
 
     assert "has 0 objects, but view 0 of room toy/test_00 shows" in said(objects=[])
-    assert "does not say which image it answers" in said(extra={})
+    assert "does not say which image it reconstructs" in said(extra={})
     attic = {**whole["extra"], "room_id": "attic"}
     assert "The 'test' split of" in said(extra=attic) and "has no room attic" in said(extra=attic)
     assert "has no view 9" in said(extra={**whole["extra"], "view": 9})

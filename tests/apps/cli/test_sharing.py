@@ -29,11 +29,11 @@ def packed(command, sampler_run, tmp_path):
 
 
 def test_scores_of_a_packed_prior_need_a_file_and_shards(command, packed, toy_shards, tmp_path):
-    assert "mine.prior is no folder to keep scores.json in" in one_sentence(
+    assert "mine.prior is not a folder that scores.json could go to" in one_sentence(
         command("eval-fid", "--run", "mine.prior", "-n", 3)
     )
     call = ["eval-fid", "--run", "procthor-bedroom", "-n", 3, "--out", "s.json"]
-    assert "procthor-bedroom was trained on shards 'front_bedroom_large', which are not" in (
+    assert "procthor-bedroom was trained on shards 'front_bedroom_large', which do not" in (
         one_sentence(command(*call))
     )
     call = ["eval-fid", "--run", "mine.prior", "-n", 3, "--resamples", 0, *SOFT, "--out", "s.json"]
@@ -51,18 +51,18 @@ def test_pack_does_not_write_over_unasked_and_says_what_is_missing(
     command, packed, sampler_run, toy_run, tmp_path
 ):
     call = ["pack", sampler_run, "--out", "mine.prior"]
-    assert "mine.prior is there; name another file" in one_sentence(command(*call))
+    assert "mine.prior already exists; name another file" in one_sentence(command(*call))
     status, _, errors = command(*call, "--overwrite")
-    assert status == 0 and "says nothing of the data's authors and licence" in errors
+    assert status == 0 and "does not state the data's authors and licence" in errors
     call = ["pack", sampler_run, "--out", "b.prior", "--about"]
     os.mkfifo("pipe")
     for about in ("absent.md", "/dev/zero", "pipe"):
-        assert f"{about} cannot be read: it is missing, or no" in one_sentence(
+        assert f"{about} cannot be read: it is missing or not" in one_sentence(
             command(*call, about)
         )
     Path("long.md").write_text("x" * 2**21)
     assert "README.md of b.prior would have" in one_sentence(command(*call, "long.md"))
-    assert "a packed prior is none" in one_sentence(
+    assert "packed priors are not run folders" in one_sentence(
         command("pack", "mine.prior", "--out", "b.prior")
     )
     assert not Path("b.prior").exists()
@@ -72,7 +72,7 @@ def test_pack_does_not_write_over_unasked_and_says_what_is_missing(
     config = run / "config.yaml"
     config.write_text(config.read_text().replace("distribution: paper", "distribution: kernel"))
     _, _, errors = command("pack", run, "--out", "d.prior")
-    assert "draws rooms by 'kernel', which needs --latents" in errors
+    assert "draws rooms from 'kernel', which needs --latents" in errors
     _, _, errors = command("pack", run, "--out", "e.prior", "--latents")
     assert "needs --latents" not in errors
 
@@ -102,6 +102,6 @@ def test_export_goes_both_ways(command, tmp_path):
     assert "atiss is not empty" in one_sentence(
         command("export", "rooms", "--to", "atiss", "--out", "atiss")
     )
-    assert "are of box lists" in one_sentence(
+    assert "apply only with --to scenes" in one_sentence(
         command("export", "rooms", "--to", "obj", "--out", "x", "--label-set", BEDROOM)
     )

@@ -33,8 +33,8 @@ def test_empty_rooms_are_written_with_a_warning(command, toy_run, monkeypatch):
     status, out, errors = command(*call, "--out", "none")
     assert (status, out) == (0, "Wrote 3 rooms to none (from: paper)\n")
     assert errors.strip().splitlines()[-1] == (
-        "Warning: 3 of 3 generated rooms are empty, so no other number of theirs can be trusted: "
-        "train longer, and see that `samples/empty_share` falls (docs/cluster.md)."
+        "Warning: 3 of 3 generated rooms are empty, so none of the other scores can be trusted: "
+        "train longer, and check that `samples/empty_share` falls (docs/cluster.md)."
     )
 
 
@@ -91,7 +91,7 @@ def test_complete(command, toy_run, rooms, tmp_path):
     status, out, errors = command(*call, "-n", 2, "--out", "whole")
     assert (status, out) == (
         0,
-        "Wrote 2 rooms round 1 given objects, of fitted latents, to whole\n",
+        "Wrote 2 rooms around 1 given objects, decoded from fitted latents, to whole\n",
     ), errors
     made = json.loads((tmp_path / "whole" / "complete_01.json").read_text())
     assert made["objects"][0] == scene["objects"][0] and made["extra"]["given"] == [0]
@@ -131,7 +131,7 @@ def test_complete_adds_what_is_asked_for(command, sampler_run, tmp_path):
     (tmp_path / "full.json").write_text(json.dumps(empty | {"objects": [bed], "floor_m": floor}))
     full = ["complete", "--given", "full.json", "-n", 1, "--classes", "double_bed"]
     status, out, errors = command(*full, "--run", sampler_run, "--out", "full", *SOFT)
-    assert status == 0 and out.startswith("Wrote 1 rooms round 1 given objects")
+    assert status == 0 and out.startswith("Wrote 1 rooms around 1 given objects")
     assert "Note: complete_00 has no place for double_bed." in errors
     room = json.loads((tmp_path / "full" / "complete_00.json").read_text())
     assert len(room["objects"]) == 1 and room["extra"]["no_place"] == ["double_bed"]

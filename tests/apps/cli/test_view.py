@@ -33,14 +33,14 @@ def test_what_cannot_be_shown_is_said(command, tmp_path, port):
         taken.bind(("127.0.0.1", port))
         taken.listen()
         said = one_sentence(command("view", "run", "--port", port))
-        assert f"Port {port} of 127.0.0.1 cannot be had (Address already in use)" in said
+        assert f"Port {port} of 127.0.0.1 cannot be used (Address already in use)" in said
         assert f"--port {port + 1}" in said
     call = ["--port", port]
     assert "No prior at nowhere;" in one_sentence(command("view", "nowhere", *call))
     bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
     save_scene(Scene("room", "front3d_bedroom", (bed,)), tmp_path / "rooms" / "room.json")
     said = one_sentence(command("view", "rooms", "--host", "no.such.host.invalid", *call))
-    assert "of no.such.host.invalid cannot be had" in said
+    assert "of no.such.host.invalid cannot be used" in said
 
 
 def test_ctrl_c_ends_it_with_one_sentence(start, tmp_path, port):

@@ -112,7 +112,7 @@ def test_a_part_keeps_the_order_and_names_what_there_is(written):
     ("changes", "message"),
     [
         ({"seed": [0]}, "unknown key 'seed'; the nearest valid key is 'seeds'"),
-        ({"seeds": [1, 1]}, "seeds are numbers from 0 on, each once"),
+        ({"seeds": [1, 1]}, "seeds must be distinct integers of at least 0"),
         (
             {"methods": {"a": {}, "b": {}}},
             "the title 'Paper's method' is given twice; a title names a row, so give methods.a",
@@ -127,7 +127,7 @@ def test_a_part_keeps_the_order_and_names_what_there_is(written):
         ),
         (
             {"methods": {"a": {"scenes": {"toy": "b"}}}},
-            "scenes need a title: no config says what made them",
+            "scenes need a title, since no config names their method",
         ),
         (
             {"methods": {"a": {"config": "baselines/gan.yaml"}}},
@@ -246,8 +246,8 @@ def test_a_run_of_other_settings_is_named_and_left_as_it_is(begun, toy_shards, c
     done = compare(comparison, part_of(comparison, "ours", None, None), begun / "out", SOFTWARE)
     assert done.table is None and calls.names == []
     assert done.failures == [
-        f"toy, ours, seed 0: {begun}/out/toy/ours/seed0 holds a run of other settings than the "
-        "comparison now asks for; delete it to train anew, or name another --out."
+        f"toy, ours, seed 0: {begun}/out/toy/ours/seed0 holds a run with other settings "
+        "than those of the comparison; delete it to train again, or name another --out."
     ]
 
 

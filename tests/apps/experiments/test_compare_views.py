@@ -53,7 +53,7 @@ def test_methods_are_trained_scored_and_tabulated(toy_shards, tmp_path, monkeypa
     assert done.exit_code == 0, done.output
     table = (out / "table.md").read_text()
     assert "4 views of 2 test rooms of shards" in table and "Toys" in table
-    assert "of the objects are models that training rooms hold, too; masks, classes" in table
+    assert "of the objects have a CAD model that training rooms hold, too; masks, classes" in table
     assert "boxes are upright and along the room's axes" in table
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()
              if line.startswith("|")]  # fmt: skip
@@ -64,7 +64,7 @@ def test_methods_are_trained_scored_and_tabulated(toy_shards, tmp_path, monkeypa
         "3D box IoU ↑",
         "CD (m) ↓",
         "F at 5 cm ↑",
-        "s an image ↓",
+        "s per image ↓",
     ]
     rows = {(line[0], line[1]): line[2:] for line in lines[2:] if len(line) == len(head)}
     found, cad = rows["USL", "as found"], rows["USL", "CAD models"]
@@ -151,7 +151,7 @@ def test_rooms_without_a_truth_are_refused_before_anything_is_trained(toy_shards
         ({"task": "new_rooms"}, "unknown key 'views'"),
         (
             {"methods": {"a": {"title": "A", "scenes": {"toy": "b"}}}},
-            "score scenes that are there with `sceneprior eval-svr --scenes`",
+            "score existing scenes with `sceneprior eval-svr --scenes`",
         ),
     ],
 )

@@ -82,7 +82,9 @@ def test_costs_add_up_over_a_stop_and_are_unknown_after_a_kill(ran, tmp_path):
 
     (tmp_path / "run").mkdir()  # begun, but not by the demo: nobody knows what that took
     status["fit"] = 2
-    with pytest.raises(InputError, match="The demo stopped at 'fit'; mend that and run it again"):
+    with pytest.raises(
+        InputError, match="The demo stopped at 'fit'; fix the error and run it again"
+    ):
         run(tmp_path, called)
     assert wall_s() is None
     (tmp_path / "run").rmdir()

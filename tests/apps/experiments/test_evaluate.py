@@ -97,8 +97,8 @@ def test_other_json_among_scenes_is_said(command, scenes, toy_shards, tmp_path):
     assert status == 0
     (said,) = (line for line in errors.splitlines() if "Warning: " in line)
     assert said.endswith(
-        f"4 scenes are read from {folder}; 2 other JSON files there are no scenes ('format' is not "
-        "sceneprior-scene) and are passed over: cameras.json, room_9.json."
+        f"4 scenes are read from {folder}; 2 other JSON files there are not scenes ('format' is "
+        "not sceneprior-scene) and are skipped: cameras.json, room_9.json."
     )
 
 
@@ -138,7 +138,7 @@ def test_a_run_is_evaluated_with_its_own_shards(command, toy_run, tmp_path):
     ("arguments", "sentence"),
     [
         ([], "There is nothing to evaluate; give --run RUN, or --scenes DIR with --shards SHARDS."),
-        (["--run", "a", "--scenes", "b"], "Both --run and --scenes came; give --run"),
+        (["--run", "a", "--scenes", "b"], "Both --run and --scenes were given; give --run"),
         (["--scenes", "b"], "--scenes needs --shards: the folder with the test rooms."),
         (
             ["--scenes", "b", "--shards", "c", "--distribution", "paper"],
@@ -170,9 +170,11 @@ def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
     status, _, errors = command("report", "--run", "run", "--renderer", "software")
     assert status == 0, errors
     page = (tmp_path / "run" / "report.html").read_text()
-    assert "<h2>New rooms</h2>" in page and "No test room of these shards is known in 3D" in page
-    assert "<h2>What training saw</h2>" in page and "Real, test split" not in page
-    assert "<h2>Scores</h2>" not in page and "read back in 3D" not in page
+    assert (
+        "<h2>New rooms</h2>" in page and "The test rooms of these shards have no 3D boxes" in page
+    )
+    assert "<h2>Training input</h2>" in page and "Real, test split" not in page
+    assert "<h2>Scores</h2>" not in page and "<h2>Decoded training rooms<" not in page
     # Scores that are named have to be there.
     status, _, errors = command("report", "--run", "run", "--scores", "missing.json")
     assert status == 2 and errors.startswith("Error: missing.json holds no scores")
@@ -208,7 +210,7 @@ def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
     status, _, errors = command("report", "--run", "run", "--renderer", "software")
     assert status == 0, errors
     page = (tmp_path / "run" / "report.html").read_text()
-    assert "<h2>New rooms</h2>" in page and "read back in 3D" in page
+    assert "<h2>New rooms</h2>" in page and "<h2>Decoded training rooms<" in page
     # Runs whose rooms are known still have to be evaluated first.
     config.write_text(config.read_text().replace(str(tmp_path / "bare"), str(toy_shards)))
     status, _, errors = command("report", "--run", "run", "--renderer", "software")

@@ -14,8 +14,8 @@ from sceneprior.apps.experiments.makers import LIFTED, PAPER, maker_of_answers, 
         (
             "lifted/bedroom",
             "paper",
-            "Paper's sphere, taught by lifted boxes",
-            "the paper's network and latents taught by lifted boxes",
+            "Paper's sphere, trained on lifted boxes",
+            "the paper's network and latents trained on lifted boxes",
         ),
         ("lifted/living", "sampler", "Lifted method: sampler", LIFTED),
         ("baselines/gan", None, "", "baselines"),
@@ -35,8 +35,8 @@ def test_a_config_and_a_distribution_say_what_makes_rooms(name, distribution, ti
         (
             "lifted/bedroom_small",
             "paper",
-            "Fit of a latent, taught by lifted boxes",
-            "the paper's network and latents taught by lifted boxes",
+            "Fit of a latent, trained on lifted boxes",
+            "the paper's network and latents trained on lifted boxes",
         ),
     ],
 )

@@ -121,5 +121,5 @@ def test_a_command_that_failed_is_told_by_its_own_sentence(tmp_path):
     assert failure_reason(log, 1) == "73%"
     assert failure_reason(log, -9) == "killed by SIGKILL; the same command goes on"
     log.write_text("")
-    assert failure_reason(log, 1) == f"it said nothing in {log}"
+    assert failure_reason(log, 1) == f"it printed nothing to {log}"
     assert failure_reason(None, 3) == "exit status 3"

@@ -67,7 +67,7 @@ def test_a_cell_is_the_mean_of_seeds_and_half_their_range(rows):
 def test_each_kind_of_rooms_has_a_table_that_says_what_it_is_of(rows):
     both = markdown([*rows, row("Ours", 0, 40.0, rooms="Living rooms")], NEW_ROOMS)
     assert both.index("### Bedrooms") < both.index("### Living rooms")
-    assert "200 generated rooms a run against 38 test rooms of front; 149 real" in both
+    assert "200 generated rooms per run against 38 test rooms of front; 149 real" in both
     assert "seeds 0, 1." in both and both.count("| method |") == 2
 
 
@@ -91,7 +91,7 @@ def test_a_table_first_says_which_rows_are_the_papers_method_and_which_ours(rows
     said = markdown([*rows, sampled], NEW_ROOMS).removeprefix("### Bedrooms\n\n")
     assert said.startswith(
         "Rows of the paper's method and variations of it: 'Ours', 'GAN_x', 'ATISS'; of the "
-        "lifted method: 'Lifted method: sampler'. 200 generated rooms a run"
+        "lifted method: 'Lifted method: sampler'. 200 generated rooms per run"
     )
     assert "of the lifted method: none." in markdown(rows, NEW_ROOMS)
     made_by = [

@@ -56,7 +56,7 @@ def test_its_classes_are_those_that_can_be_asked_for(trained):
     assert others and {*known, *others} == {*label_set("front3d_bedroom")} - {"void"}
     class_rows(trained, known)
     for label in others:
-        with pytest.raises(InputError, match="is no class of this run's training rooms"):
+        with pytest.raises(InputError, match="is not a class of this run's training rooms"):
             class_rows(trained, [label])
     without = model_card(replace(trained, sampler=None), "tiny")
     assert ", wardrobe." in without and "other classes" not in without

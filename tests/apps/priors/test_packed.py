@@ -182,11 +182,11 @@ def test_pickles_and_checkpoints_are_refused_unopened(sampler_run, sampler_file,
 
     path = tmp_path / "a.prior"
     path.write_bytes(pickle.dumps(Bomb()))
-    assert "is no packed prior" in refused(path)
+    assert "is not a packed prior" in refused(path)
     refused(rewritten(sampler_file, path, weights=pickle.dumps(Bomb())))
     refused(rewritten(sampler_file, path, config=pickle.dumps(Bomb())))
     shutil.copy(sampler_run / "sampler" / "final.ckpt", path)  # a zip, too
-    assert "is no packed prior" in refused(path)
+    assert "is not a packed prior" in refused(path)
     assert not (tmp_path / "ran").exists()
 
 
@@ -218,7 +218,7 @@ def test_settings_that_ask_for_other_networks_are_sentences(
         ({"format": "other"}, "it says format 'other' version 1, not 'sceneprior-prior'"),
         ({"version": 2}, "version 2, not 'sceneprior-prior' version 1"),
         ({"stage": "nothing"}, "no stage of its method is called 'nothing'"),
-        ({"stage": "shape"}, "its weights are not those of its settings"),
+        ({"stage": "shape"}, "its weights do not match its settings"),
         ({"stage": ["shape"]}, "'stage': input should be a valid string"),
         ({"classes": ["void", "throne"]}, "its classes are not those of front3d_bedroom"),
         ({"room_ids": ["a", "b"]}, "latents.weight and 0 others do not fit"),
@@ -256,4 +256,4 @@ def test_other_zips_and_folders_are_sentences(sampler_file, tmp_path):
     assert "is not a run folder" in refused(tmp_path)
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / WEIGHTS).write_bytes(b"")
-    assert "is no packed prior" in refused(tmp_path / "folder")
+    assert "is not a packed prior" in refused(tmp_path / "folder")

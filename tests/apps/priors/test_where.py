@@ -53,7 +53,9 @@ def test_what_the_hub_does_not_give_is_one_sentence(hub):
 
 def test_without_the_hub_s_client_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(InputError, match=r"needs a package more: pip install 'sceneprior\[hub\]'"):
+    with pytest.raises(
+        InputError, match=r"needs one more package: pip install 'sceneprior\[hub\]'"
+    ):
         find_prior("hf://someone/bedrooms")
 
 

@@ -58,7 +58,9 @@ def test_without_a_pose_the_camera_is_level_on_any_of_four_sides(own):
     mask, classes, _ = own
     read = read_own_image(mask, classes, INTRINSICS, LABELS, camera_height_m=1.5)
     assert read.notes[0].startswith("without --pose the camera is level, 1.5 m above the floor")
-    assert "it put objects 34 cm off" in read.notes[1] and "give --gravity x,y,z" in read.notes[1]
+    assert (
+        "it displaced objects by 34 cm" in read.notes[1] and "give --gravity x,y,z" in read.notes[1]
+    )
     eyes = []
     for quarter, image in enumerate(read.images):
         pose = image.world_to_camera
@@ -107,18 +109,21 @@ def test_intrinsics(tmp_path):
         np.testing.assert_array_equal(read_intrinsics(str(path), (72, 96)), expected)
     np.testing.assert_array_equal(read_intrinsics("40, 41,48,36", (72, 96)), expected)
     path.write_text(json.dumps({**same, "width": 640, "height": 480}))
-    with pytest.raises(InputError, match="is of an image of 640 x 480 pixels, but the mask has 96"):
+    with pytest.raises(
+        InputError, match="is for an image of 640 x 480 pixels, but the mask has 96"
+    ):
         read_intrinsics(str(path), (72, 96))
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("40,40,48", "--intrinsics 40,40,48 is no intrinsics; expected fx,fy,cx,cy in pixels"),
-        ("fov=wide", "--intrinsics fov=wide is no intrinsics"),
+        ("40,40,48", "--intrinsics 40,40,48 gives no intrinsics; expected fx,fy,cx,cy in pixels"),
+        ("fov=wide", "--intrinsics fov=wide gives no intrinsics"),
         (
             "fov=1.08",
-            "fov=1.08: no camera sees so few degrees. 1.08: radians? Give degrees: fov=61.9.",
+            "fov=1.08: no camera has so small a field of view. If 1.08 is in radians, give "
+            "degrees: fov=61.9.",
         ),
         (
             "fov=3.5",
@@ -126,10 +131,10 @@ def test_intrinsics(tmp_path):
         ),
         ("0.7,0.7,48,36", "give pixels, not a share of the width or millimetres."),
         ('{"fx": "40", "fy": 40, "cx": 48, "cy": 36}', "holds no intrinsics"),
-        ('{"K": [[1e400, 0, 48], [0, 40, 36], [0, 0, 1]]}', "is no pinhole camera"),
+        ('{"K": [[1e400, 0, 48], [0, 40, 36], [0, 0, 1]]}', "is not a pinhole camera"),
         (f"[[1{'0' * 400}, 0, 48], [0, 40, 36], [0, 0, 1]]", "holds no intrinsics"),
         ("[" * 3000 + "]" * 3000, "camera.json is not JSON"),
-        ("40,nan,48,36", "is no pinhole camera"),
+        ("40,nan,48,36", "is not a pinhole camera"),
         ('{"fx": 40}', "holds no intrinsics"),
         ("[[40, 1, 48], [0, 40, 36], [0, 0, 1]]", "no skew"),
         ("{", "camera.json is not JSON"),
@@ -152,7 +157,7 @@ def test_intrinsics_as_photographers_say_them():
     np.testing.assert_allclose(normal, [[120, 0, 48], [0, 120, 36], [0, 0, 1]], rtol=1e-5)
     phone = read_intrinsics("35mm=26", (240, 360))  # of film's own shape
     assert phone[0, 0] / 360 == pytest.approx(26 / 36)
-    with pytest.raises(InputError, match="--intrinsics 35mm=0 is no pinhole camera"):
+    with pytest.raises(InputError, match="--intrinsics 35mm=0 is not a pinhole camera"):
         read_intrinsics("35mm=0", (72, 96))
 
 
@@ -235,7 +240,7 @@ def test_gravity_tilts_the_camera_where_it_stands(own):
 
 @pytest.mark.parametrize("text", ["down", "0,1", "0,0,0", "0,nan,1", "0,1,0,0"])
 def test_gravity_that_is_no_direction(text):
-    with pytest.raises(InputError, match="is no direction; expected x,y,z in camera axes"):
+    with pytest.raises(InputError, match="is not a direction; expected x,y,z in camera axes"):
         read_gravity(text)
     with pytest.raises(InputError, match="points up in the image: the camera is upside down"):
         read_gravity("0,-1,0")

@@ -90,7 +90,7 @@ def test_options_and_images_that_cannot_be(trained, images):
     with pytest.raises(InputError, match="No fit is called 'long'; choose from objects, paper"):
         reconstruct(trained, images, FitOptions("long"))
     with pytest.raises(
-        InputError, match="restarts are of latents, which the fit `paper` finds; name"
+        InputError, match="restarts apply only to the fit `paper`, which fits latents; name"
     ):
         reconstruct(trained, images, FitOptions(restarts=2))
     with pytest.raises(InputError, match="restarts is 0; an image needs at least one"):
@@ -134,7 +134,5 @@ def test_nearest_starts_are_the_rooms_of_least_layout_loss(trained, toy_shards):
 
 
 def test_more_starts_than_rooms(trained, views):
-    with pytest.raises(
-        InputError, match="13 nearest training rooms were asked for, but the run ha"
-    ):
+    with pytest.raises(InputError, match="13 restarts need as many training rooms, but the run ha"):
         starting_latents(trained, views, 13)

@@ -117,7 +117,7 @@ def test_objects_are_kept_by_a_click_and_the_rest_is_completed(browser, page):
     (row,) = page.shown.kept
     kept = page.shown.scene.objects[row]
     click(browser, "Complete the rest")
-    wait_for(lambda: "completed round 1 kept objects" in words(browser), "it was not completed")
+    wait_for(lambda: "completed around 1 kept objects" in words(browser), "it was not completed")
     assert page.shown.scene.objects[0].center_m == kept.center_m
 
 

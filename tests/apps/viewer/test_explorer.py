@@ -77,7 +77,7 @@ def test_a_path_leads_from_the_room_on_show_to_a_seed(explorer, prior):
     with pytest.raises(InputError, match=r"'nowhere' is neither a training room .* nor here"):
         explorer.draw_path(start, "here", "nowhere")
     drawn = replace(start, scene=replace(start.scene, latent=None))
-    with pytest.raises(InputError, match="comes from no latent"):
+    with pytest.raises(InputError, match="has no latent"):
         explorer.draw_path(drawn, "here", "seed:9")
 
 
@@ -96,7 +96,7 @@ def test_completion_keeps_what_is_kept(explorer):
     assert shown.toggled(1).kept == frozenset() and shown.given().objects == (kept,)
     done = explorer.complete(shown, seed=2)
     assert done.kept == {0} and done.scene.objects[0].center_m == kept.center_m
-    assert done.origin == "completed round 1 kept objects, seed 2"
+    assert done.origin == "completed around 1 kept objects, seed 2"
 
 
 def test_the_nearest_training_room(explorer, prior):
@@ -148,5 +148,5 @@ def test_a_folder_s_rooms():
     assert Folder(scenes).label_set == "front3d_bedroom"
     # It reaches 3 m from the origin.
     assert floor_side_m(scenes) == 6 and floor_side_m([Scene("c", "front3d_bedroom")]) == 4
-    with pytest.raises(InputError, match="label sets front3d_bedroom, front3d_living came"):
+    with pytest.raises(InputError, match="label sets front3d_bedroom, front3d_living were given"):
         _ = Folder([*scenes, Scene("c", "front3d_living")]).label_set

@@ -38,9 +38,11 @@ def test_a_run_answers_each_mask_in_order(baseline_run, toy_shards, method):
 def test_what_it_cannot_do_is_a_sentence(baseline_run, toy_shards, method):
     run = baseline_run(method)
     trained = load_any_run(run)
-    with pytest.raises(InputError, match="answers images and makes no new rooms"):
+    with pytest.raises(InputError, match="reconstructs images and makes no new rooms"):
         sample_rooms(trained, 2, 0)
-    with pytest.raises(InputError, match="with this one, `sceneprior reconstruct` and `eval-svr`"):
+    with pytest.raises(
+        InputError, match="this run works with `sceneprior reconstruct` and `eval-svr`"
+    ):
         load_run(run)
     images, _ = images_of_split(toy_shards, "test", limit=1)
     with pytest.raises(InputError, match="has no latents to fit; leave out the fit paper"):

@@ -103,18 +103,18 @@ def test_what_is_small_is_in_front_and_crowds_are_no_object(read):
     [
         (
             [],
-            "a.json is a list of results, no COCO JSON of masks; expected an object with `images`",
+            "a.json is a list of results, not a COCO JSON of masks; expected an object with",
         ),
         ([{"image_id": 1, "category_id": 1, "segmentation": []}], "add the other two."),
-        (3, "a.json is 3, no COCO JSON of masks"),
-        ({"images": []}, "is no COCO JSON of masks: annotations is {'images': []}; field required"),
+        (3, "a.json is 3, not a COCO JSON of masks"),
+        ({"images": []}, "not a COCO JSON of masks: annotations is {'images': []}; field required"),
         (coco([], images=[]), "describes 0 images; keep one"),
         (coco([]), "has 0 annotations; expected 1 to 65534"),
         (coco([[[1, 1, 2, 2]]]), "annotation 70: its segmentation is neither polygons nor run"),
         (coco([[[1, 1, 2, 2, float("nan"), 3]]]), "a corner is not a finite number"),
-        (coco([{"size": [60, 80], "counts": [4800]}]), "is of an image of 80 x 60 pixels, but the"),
-        (coco([{"size": [30, 40], "counts": "\u00ff"}]), "is no digit of packed runs"),
-        (coco([{"size": [30, 40], "counts": "P"}]), "its packed runs end within a number"),
+        (coco([{"size": [60, 80], "counts": [4800]}]), "its mask has 80 x 60 pixels, but the"),
+        (coco([{"size": [30, 40], "counts": "\u00ff"}]), "is not a digit of compressed run"),
+        (coco([{"size": [30, 40], "counts": "P"}]), "compressed run lengths end within a number"),
         (coco([[[1, 1, 2, 2, 1, 3]]], categories=[]), "category 1 is not among its categories"),
         (
             coco([BOX], categories={"1": "bed"}),
@@ -125,10 +125,13 @@ def test_what_is_small_is_in_front_and_crowds_are_no_object(read):
         (coco([{"counts": [1200]}]), "annotation 70: its segmentation has no 'size'."),
         (
             coco([{"size": [30], "counts": [30]}]),
-            "is of an image of [30] pixels, but the image has",
+            "its mask has [30] pixels, but the image has",
         ),
-        (coco([{"size": [30, 40], "counts": [10**30]}]), "its runs are of too many pixels, not of"),
-        (coco([{"size": [30, 40], "counts": "o" * 9_999}]), "a number of its packed runs is too l"),
+        (coco([{"size": [30, 40], "counts": [10**30]}]), "its runs cover too many pixels, not"),
+        (
+            coco([{"size": [30, 40], "counts": "o" * 9_999}]),
+            "a number of its compressed run lengths",
+        ),
     ],
 )
 def test_what_is_no_image_of_masks(read, data, said):

@@ -45,10 +45,10 @@ def test_what_is_no_png(path):
     with pytest.raises(InputError, match=r"a\.png is missing"):
         read_mask(path)
     Image.fromarray(IDS.astype(np.uint8)).save(path, "JPEG")
-    with pytest.raises(InputError, match="is no PNG; ids are kept in PNGs"):
+    with pytest.raises(InputError, match="is not a PNG; give ids as PNGs"):
         read_mask(path)
     path.write_bytes(b"")
-    with pytest.raises(InputError, match="is no PNG"):
+    with pytest.raises(InputError, match="is not a PNG"):
         mask_size(path)
 
 
@@ -58,9 +58,9 @@ def test_damage_is_a_sentence(path, rng):
     whole = path.read_bytes()
     for end in (30, 60, len(whole) // 2, len(whole) - 30):
         path.write_bytes(whole[:end])
-        with pytest.raises(InputError, match=r"a\.png is (damaged|no PNG that can be read)"):
+        with pytest.raises(InputError, match=r"a\.png is (damaged|not a readable PNG)"):
             read_mask(path)
     path.unlink()
     path.mkdir()
-    with pytest.raises(InputError, match="is no PNG that can be read"):
+    with pytest.raises(InputError, match="is not a readable PNG"):
         read_mask(path)

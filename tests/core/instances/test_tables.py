@@ -14,9 +14,9 @@ from sceneprior.core.instances.tables import IdTable, read_class_table
         ("classes.json", "{}", "classes.json is empty; expected a class for each instance id."),
         ("classes.json", "[[1]]", 'is not an object of ids and class names, as {"1": "bed", "2"'),
         ("classes.json", '"bed"', "is not an object of ids and class names"),
-        ("classes.json", '{"0": "bed"}', "'0' is no instance id; expected a number from 1 to 655"),
-        ("classes.json", '{"1": "bed", "1": "sofa"}', "instance id 1 is there twice."),
-        ("classes.csv", "1,bed\n1,sofa", "instance id 1 is there twice."),
+        ("classes.json", '{"0": "bed"}', "'0' is not an instance id; expected a number from 1 to"),
+        ("classes.json", '{"1": "bed", "1": "sofa"}', "instance id 1 is listed twice."),
+        ("classes.csv", "1,bed\n1,sofa", "instance id 1 is listed twice."),
         ("classes.csv", "1\n", "classes.csv cannot be read (a row '1' has no class)."),
     ],
 )  # fmt: skip

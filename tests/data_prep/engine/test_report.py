@@ -43,7 +43,7 @@ def test_every_room_left_out_is_named_with_the_reason(front, tmp_path):
         "1": "", "2": "", "ghost": "",
         "few": "1 objects, min_objects is 2",
         "many": "15 objects, max_objects is 13",
-        "bedless": "none of double_bed, single_bed, kids_bed, which required_classes asks for",
+        "bedless": "none of double_bed, single_bed, kids_bed, of which required_classes needs one",
         "large": "floor 6.00 x 8.00 m, max_floor_m is 6",
         "scaled": "'stand' is scaled by 1, 9, 1, beyond scale_range",
         "broken": rows["broken"]["reason"],

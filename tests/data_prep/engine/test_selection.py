@@ -89,7 +89,8 @@ def test_splits(front, tmp_path):
 def test_nothing_passes(front, tmp_path):
     front.house("house", room("Bedroom-1", [{"jid": "bed", "pos": (0, 0, 0)}]))
     with pytest.raises(
-        InputError, match=r"No room of .* passes the recipe.*as here: 1 objects, min_objects is 2\)"
+        InputError,
+        match=r"No room of .* passes the recipe.*frequent reason: 1 objects, min_objects is 2\)",
     ):
         build_shards(front_job(front, tmp_path / "shards"))
     assert not (tmp_path / "shards").exists()

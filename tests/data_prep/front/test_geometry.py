@@ -155,8 +155,8 @@ def test_floor_that_is_no_place_is_told(front):
     room_ = only_room(front, front.house("house", written))
     assert room_.floor.area == pytest.approx(16)
     assert room_.notes == (
-        "a Floor mesh has 2 triangles without places",
-        "a Floor mesh is left out: what should be a list of numbers holds something else",
+        "a Floor mesh has 2 triangles without valid corners",
+        "a Floor mesh is left out: a list of numbers holds something else",
     )
 
 

@@ -74,10 +74,10 @@ def test_a_room_without_floor_is_left_out_and_with_a_damaged_one_fails(front):
 @pytest.mark.parametrize(
     ("key", "value", "note"),
     [
-        ("pos", [0, float("nan"), 0], "no places"),
+        ("pos", [0, float("nan"), 0], "implausible numbers"),
         ("rot", [0, 0, 0, 0], "incomplete"),
         ("scale", [1, 1], "incomplete"),
-        ("scale", {}, "list of numbers is none"),
+        ("scale", {}, "expected a list of numbers"),
         ("pos", "here", "holds something else"),
         ("pos", None, "its placement has no pos"),
     ],
@@ -140,7 +140,7 @@ def test_ids_that_are_no_names(front):
     result = read(front, path)
     assert [item.room_id for item in result.rooms] == ["house_good"]
     assert [room_id for room_id, _ in result.failures] == [f"house_room{k}" for k in range(4)]
-    assert all("can be no name" in why and why.isprintable() for _, why in result.failures)
+    assert all("is not a valid name" in why and why.isprintable() for _, why in result.failures)
     pieces = [
         {"jid": jid, "pos": (0, 0, 0)} for jid in ("bed", "../bed", "\ud800", "\0", "y" * 999)
     ]
@@ -161,7 +161,7 @@ def test_entries_that_are_no_objects(front):
     assert [len(item.furniture) for item in result.rooms] == [4]
     assert result.failures == [
         ("house_room1", "its entry is no JSON object"),
-        ("house_B", "its children are no list"),
+        ("house_B", "its children are not a list"),
     ]
 
 

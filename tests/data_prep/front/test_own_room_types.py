@@ -109,7 +109,9 @@ def test_the_models_of_shards_have_the_classes_of_their_recipe(tmp_path):
         "stove": ("hob",), "table": ("board",),
     }  # fmt: skip
     np.testing.assert_allclose(np.ptp(models.load("cold").vertices_m, axis=0), 1)
-    with pytest.raises(InputError, match=f"are labelled '{LABEL_SET}', but the scenes 'scannet'"):
+    with pytest.raises(
+        InputError, match=f"have label set '{LABEL_SET}', but the scenes have 'scannet'"
+    ):
         open_models(tmp_path / "mine", "scannet", tmp_path / "cache", 16)
     shutil.copytree(tmp_path / "mine", tmp_path / "spoilt")
     (tmp_path / "spoilt" / "models" / "hob.ply").write_bytes(b"ply")

@@ -14,7 +14,7 @@ def test_recipes_load_and_say_what_is_wrong():
     assert recipe.of_type("MasterBedroom") and not recipe.of_type("LivingRoom")
     assert load_recipe("living").of_type("LivingDiningRoom")
     with pytest.raises(
-        InputError, match="No recipe is called 'attic'; there are all, atiss_bedroom, atiss_d"
+        InputError, match="No recipe is called 'attic'; choose from all, atiss_bedroom, atiss_d"
     ):
         load_recipe("attic")
     with pytest.raises(
@@ -38,13 +38,13 @@ def test_recipes_load_and_say_what_is_wrong():
         ("scale_range=[1]", r"'scale_range\.1' is missing"),
         (
             "required_classes=[bed]",
-            r"bedroom\.yaml: 'bed' is no class of its label set, which has void, armchair,",
+            r"bedroom\.yaml: 'bed' is not in its label set, which has void, armchair,",
         ),
         ("categories=[crib]", r"'categories': input should be a valid dictionary"),
         ("label_set=attic", "No label set is called 'attic'; there are front3d_bedroom,"),
         (
             "label_set=[bed, bed]",
-            r"'label_set': the class 'bed' is twice in the label set; once is enough .got",
+            r"'label_set': the class 'bed' is in the label set twice; list it once .got",
         ),
         (
             "views.image_size=[0, 0]",
@@ -148,7 +148,7 @@ def test_a_recipe_of_the_users_own(tmp_path):
         ("odd.yaml", "[1, 2]", r"odd\.yaml holds no settings"),
         ("odd.yaml", "label_set: [", r"odd\.yaml is not a YAML file"),
         ("odd.yaml", "room_types: [kitchen]", r"odd\.yaml: 'label_set' is missing"),
-        ("\n.yaml", KITCHEN, r"its name, '.n', can name no shards"),
+        ("\n.yaml", KITCHEN, r"shards cannot be named by its name, '.n'"),
     ],
 )
 def test_files_that_are_no_recipe(tmp_path, name, text, said):
@@ -181,5 +181,5 @@ def test_lists_of_what_is_invalid_are_read_where_the_user_has_them(tmp_path):
     recipe = load_recipe("bedroom", (f"invalid_rooms={path}", "invalid_models=[a, b]"))
     assert recipe.invalid_rooms == ("Bedroom-1", "Bedroom-2")
     assert recipe.invalid_models == ("a", "b")
-    with pytest.raises(InputError, match="invalid_models names no file of ids that can be read"):
+    with pytest.raises(InputError, match="invalid_models names a file of ids that cannot be read"):
         load_recipe("bedroom", (f"invalid_models={tmp_path / 'none.txt'}",))

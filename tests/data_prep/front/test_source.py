@@ -77,7 +77,7 @@ def test_rooms_of_every_type_become_one_data_set(front, tmp_path):
 
 def test_a_type_that_no_room_has(front):
     flat(front)
-    with pytest.raises(InputError, match=r"is about \(attic\); there are .*LivingRoom \(1\)"):
+    with pytest.raises(InputError, match=r"selects \(attic\); the folder has .*LivingRoom \(1\)"):
         survey(front, "bedroom", "room_types=[attic]")
 
 

@@ -29,6 +29,6 @@ def test_a_room_for_which_no_place_is_found_is_an_error():
     hopeless = replace(BEDROOM, place_first=lambda furnisher, groups: None)
     catalog = make_catalog(0, "front3d_bedroom")
     with pytest.raises(
-        RuntimeError, match=r"No bedroom with 5 pieces found room in 400 tries: \['"
+        RuntimeError, match=r"No bedroom could hold these 5 pieces in 400 tries: \['"
     ):
         furnish(hopeless, catalog, np.random.default_rng(0), 0.5)

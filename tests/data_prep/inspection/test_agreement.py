@@ -93,7 +93,7 @@ def test_models_that_are_missing_or_damaged_are_named(made):
     path.unlink()
     bodies, problems = true_bodies(*made)
     assert None in bodies and not compare(bodies, views).judged[:, bodies.index(None)].any()
-    assert ".ply is missing, but a room's ground truth stands on it" in problems[0]
+    assert ".ply is missing, but a room's ground truth refers to it" in problems[0]
 
 
 def test_agreements_add_up():
@@ -113,4 +113,4 @@ def test_a_mirrored_truth_does_not_agree(made):
     tally = compare(bodies, views).agreement.of("mesh")
     assert tally.masks == views.visible.sum() and tally.mean_iou < 0.6
     assert Agreement({"mesh": tally}).failing() == ["mesh"]
-    assert len(problems) >= 2 and "m off the box round its placed mesh" in problems[0]
+    assert len(problems) >= 2 and "m from the box around its placed mesh" in problems[0]

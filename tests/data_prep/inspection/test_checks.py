@@ -42,7 +42,11 @@ def put(place, value):
     [
         ("object_class", put(1, 0), "a class index is outside 1 to 21"),
         ("world_to_camera", put((1, 3, 3), 2.0), "the camera of view 1 is no rotation"),
-        ("intrinsics", put((1, 0, 0), -60.0), "the intrinsics of view 1 are those of no pinhole"),
+        (
+            "intrinsics",
+            put((1, 0, 0), -60.0),
+            "the intrinsics of view 1 are not those of a pinhole",
+        ),
         ("boxes", put((0, 0), (0.2, 0.2, 1.1, 0.9)), "a 2D box reaches beyond the image"),
         ("visible", put(slice(None), False), "an object that is not visible in a view has a box"),
     ],

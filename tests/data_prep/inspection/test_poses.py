@@ -144,7 +144,7 @@ def test_no_better_than_chance_is_said(shards, tmp_path):
     folder = mutated(
         shards("homes"), tmp_path / "wrong", poses=lambda poses: order.permutation(poses)
     )
-    assert "; no better than cameras dealt out at random (" in verify(folder).problems[-1]
+    assert "; no better than randomly shuffled cameras (" in verify(folder).problems[-1]
 
 
 def test_one_room_with_wrong_cameras_is_named_among_right_ones(shards, tmp_path):

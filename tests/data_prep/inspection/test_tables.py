@@ -60,7 +60,7 @@ def test_verify_prints_the_overlap_and_exits_with_3_where_something_is_wrong(sha
     assert wrong.exit_code == 3, wrong.output
     last = wrong.stderr.strip().splitlines()[-1]
     assert (
-        last.startswith(f"Error: {paths[0]}, room ") and "its checksum is not that of its" in last
+        last.startswith(f"Error: {paths[0]}, room ") and "its checksum does not match its" in last
     )
     assert last.endswith("(3 more problems, listed above)")
     assert "mask_pixels says" in wrong.stderr

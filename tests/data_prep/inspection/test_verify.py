@@ -57,7 +57,7 @@ def test_a_changed_number_breaks_the_checksum(shards):
         path, lambda group: group["ground_truth/yaw_rad"].write_direct(np.ones(3, "f4")), seal=False
     )
     assert verify(shards).problems == (
-        f"{path}, room {room_id}: its checksum is not that of its contents: the file was changed "
+        f"{path}, room {room_id}: its checksum does not match its contents: the file was changed "
         "or damaged.",
     )
 

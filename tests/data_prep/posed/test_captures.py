@@ -178,10 +178,14 @@ def test_where_a_colmap_model_may_lie(room):
     path = room.folder / "colmap/sparse/0/images.bin"
     path.write_bytes(path.read_bytes() + b" ")
     assert source.settings(None)["rooms"] != before
-    assert source.assumptions()[0].startswith("1 of 1 rooms give no floor_m: the floor is where")
+    assert source.assumptions()[0].startswith(
+        "1 of 1 rooms give no floor_m: the floor is estimated"
+    )
     (said,) = (said for said in source.assumptions() if "--up" in said)
-    assert said.startswith("1 of 1 rooms say nothing of up: it is taken from the cameras, as if")
-    assert "Where they roll by 5 degrees it is 1.3 degrees off" in said
+    assert said.startswith(
+        "1 of 1 rooms do not state the up direction: it is estimated from the cameras, as if"
+    )
+    assert "If they roll by 5 degrees, the median error is 1.3 degrees" in said
 
 
 def test_colmap_models_that_cannot_be_read(room):
@@ -205,7 +209,9 @@ def test_colmap_models_that_cannot_be_read(room):
 def test_a_colmap_camera_that_is_not_read(tmp_path, binary):
     room = PosedRoom(tmp_path / "room")
     write_colmap(room, "FULL_OPENCV", binary)
-    with pytest.raises(InputError, match=r"its camera model .* is not read; `colmap image_undist"):
+    with pytest.raises(
+        InputError, match=r"its camera model .* is not supported; use `colmap image_undist"
+    ):
         read_recording(room.folder)
 
 
@@ -213,7 +219,7 @@ def test_cameras_that_all_look_one_way_do_not_tell_up(room):
     room.poses = room.poses[:1]
     room.look(room.poses[0][:3, 3] + [0.0, 0.0, 0.1], [0.1, 0.1, 0.4])
     room.write(floor_m=0.0)
-    with pytest.raises(InputError, match=r"all look about the same way, which does not tell"):
+    with pytest.raises(InputError, match=r"all look in about the same direction"):
         prepared(room, up="cameras")
 
 
@@ -262,7 +268,7 @@ def test_frames_of_one_name_have_ids_where_the_frames_lie(room):
         frame["file_path"] = f"./{'train' if k < 3 else 'test'}/r_{k % 3}"
     room.write_transforms(data)
     with pytest.raises(
-        InputError, match=r"put them where the frames lie, in instances/train/r_0\."
+        InputError, match=r"store the ids in the same folders as the frames: instances/train/r_0\."
     ):
         read_recording(room.folder)
     for k, frame in enumerate(data["frames"]):

@@ -28,11 +28,11 @@ def test_tables(tmp_path, name, text):
 
 def test_one_table_a_room(tmp_path):
     with pytest.raises(
-        InputError, match=r"has no classes\.json or .* or panoptic\.json; one table"
+        InputError, match=r"has no classes\.json or .* or panoptic\.json; expected one table"
     ):
         find_table(tmp_path)
     table(table(tmp_path, "{}"), "", "classes.csv")
-    with pytest.raises(InputError, match=r"has classes\.json and classes\.csv; one table says"):
+    with pytest.raises(InputError, match=r"has classes\.json and classes\.csv; expected one table"):
         find_table(tmp_path)
 
 
@@ -52,12 +52,12 @@ def test_label_sets(tmp_path):
         (
             "a.txt",
             "bed\nbed\n",
-            "a.txt: The class 'bed' is twice in the label set; once is enough.",
+            "a.txt: The class 'bed' is in the label set twice; list it once.",
         ),
-        ("a.txt", "# nothing\n", "a.txt: A label set needs a class beside void."),
+        ("a.txt", "# nothing\n", "a.txt: A label set needs at least one class in addition to"),
         ("a.json", "{", "a.json holds no class names (Expecting"),
         ("a.json", '{"1": "bed"}', "a.json holds no list of class names."),
-        ("a.json", '["bed, large"]', "a.json: The class name 'bed, large' holds a comma, which"),
+        ("a.json", '["bed, large"]', "a.json: The class name 'bed, large' has a comma, which"),
     ],
 )
 def test_bad_label_sets(tmp_path, name, text, said):
@@ -65,5 +65,7 @@ def test_bad_label_sets(tmp_path, name, text, said):
     with pytest.raises(InputError) as error:
         read_label_set(str(tmp_path / name))
     assert said in str(error.value)
-    with pytest.raises(InputError, match=r"nowhere is neither a file with a class a line, nor one"):
+    with pytest.raises(
+        InputError, match=r"nowhere is neither a file with one class per line, nor one"
+    ):
         read_label_set("nowhere")

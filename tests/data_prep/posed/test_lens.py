@@ -81,5 +81,5 @@ def test_of_a_lens_that_sees_more_than_half_the_world_the_middle_is_kept():
 
 
 def test_a_lens_that_folds_the_picture_over_is_refused():
-    with pytest.raises(InputError, match=r"its lens \(OPENCV -0.9, 0, 0, 0, 0\) bends so much"):
+    with pytest.raises(InputError, match=r"its lens \(OPENCV -0.9, 0, 0, 0, 0\) distorts so much"):
         straighten(Lens((-0.9, 0.0, 0.0, 0.0, 0.0)), K, SIZE)

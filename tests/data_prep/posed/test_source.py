@@ -87,7 +87,9 @@ def test_rooms_of_another_size_are_left_out_with_the_reason(source, rooms):
     assert left.reason.startswith(
         "its views are 96 x 128 pixels, those of most rooms 128 x 96, and"
     )
-    with pytest.raises(InputError, match=r"for --only room_2 .1 were left out; most often as here"):
+    with pytest.raises(
+        InputError, match=r"for --only room_2 .1 were left out; the most frequent reason"
+    ):
         survey(PosedSource(source.folder, SET, only="room_2"))
     (alone,) = survey(PosedSource(rooms[2].folder, SET)).rooms
     assert alone.room_id == "room_2"
@@ -119,7 +121,7 @@ def test_damaged_rooms_are_named_and_the_rest_goes_on(source, rooms, tmp_path):
 
 
 def test_a_room_that_goes_away_meanwhile(source, tmp_path):
-    with pytest.raises(InputError, match="rooms has lost this room meanwhile; give it back"):
+    with pytest.raises(InputError, match="rooms no longer has this room; restore"):
         source.prepare(RoomTask("attic", "attic", "train"), None)
 
 
@@ -128,8 +130,12 @@ def test_assumptions_are_said_before_the_work(source, rooms):
     rooms[0].write()
     rooms[1].write(floor_m=0.0)
     said = PosedSource(source.folder, SET, PosedSettings(up="y")).assumptions()
-    assert said[0].startswith("1 of 4 rooms give no floor_m: the floor is where the lowest")
-    assert said[1].startswith("2 of 4 rooms give no metres_per_unit: poses are taken as metres;")
+    assert said[0].startswith(
+        "1 of 4 rooms give no floor_m: the floor is estimated from the lowest"
+    )
+    assert said[1].startswith(
+        "2 of 4 rooms give no metres_per_unit: poses are assumed to be in metres,"
+    )
     assert said[2] == (
         "In 4 of 4 rooms the tops of the pictures point along z, but y is taken as up: is it "
         "--up z?"

@@ -89,8 +89,8 @@ def test_a_wrong_key_is_a_sentence(room, changes, said):
     [
         ({"transform_matrix": [[1, 2], [3, 4]]}, "`transform_matrix` is not a list of 4 rows of 4"),
         ({"instance_path": 3}, "instance_path is 3; input should be a valid string."),
-        ({"instance_path": "a\0b"}, "'a\\x00b' can be no file's name."),
-        ({"instance_path": "x" * 300}, "xxx...' can be no file's name."),
+        ({"instance_path": "a\0b"}, "'a\\x00b' is not a valid file name."),
+        ({"instance_path": "x" * 300}, "xxx...' is not a valid file name."),
         ({"file_path": "other/frame_00000.png"}, "would share the ids in "),
     ],
 )

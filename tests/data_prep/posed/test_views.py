@@ -178,7 +178,7 @@ def test_nothing_of_the_label_set(room):
     [
         ({"floor_m": 1.55}, r"lowest camera is at 1\.50 m, below the floor at 1\.55 m; check"),
         ({"metres_per_unit": 100}, r"cameras are spread over 480 m; is metres_per_unit wrong\?"),
-        ({"w": 100}, r"masks are 128 x 96 pixels but the colour frames 100 x 96, another shape"),
+        ({"w": 100}, r"masks are 128 x 96 pixels but the colour frames 100 x 96: with different"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(room, changes, said):

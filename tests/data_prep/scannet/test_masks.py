@@ -43,7 +43,7 @@ def test_names_that_lead_out_are_refused(tmp_path, name):
     path = write_zip(tmp_path / "a.zip", {"instance-filt/1.png": png(mask()), name: b"x"})
     with pytest.raises(InputError) as caught:
         MaskArchive(path)
-    assert f"a.zip holds '{name}', a name that leads out of the archive" in str(caught.value)
+    assert f"a.zip holds '{name}', a path outside of the archive" in str(caught.value)
 
 
 def test_a_frame_may_not_be_there_twice(tmp_path):

@@ -39,9 +39,11 @@ def test_a_class_never_generated_costs_the_epsilon_not_infinity():
 
 def test_scenes_of_different_label_sets_are_not_compared():
     living = Scene("a", "front3d_living", ())
-    with pytest.raises(InputError, match="label sets front3d_bedroom, front3d_living came"):
+    with pytest.raises(
+        InputError, match="but label sets front3d_bedroom, front3d_living were given"
+    ):
         common_label_set([living], [of_classes("desk")])
-    with pytest.raises(InputError, match="no scenes came"):
+    with pytest.raises(InputError, match="no scenes were given"):
         class_frequencies([])
 
 

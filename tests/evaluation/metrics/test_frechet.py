@@ -34,7 +34,7 @@ def test_fewer_images_than_dimensions_is_exact_too():
 
 
 def test_distances_refuse_too_few_images_and_broken_numbers():
-    with pytest.raises(InputError, match="at least 2 images on either side, but 1 came"):
+    with pytest.raises(InputError, match="at least 2 images in either set, but one set has 1"):
         frechet_distance(np.zeros((1, 4)), np.zeros((3, 4)))
     with pytest.raises(InputError, match="not finite"):
         frechet_distance(np.zeros((2, 4)), np.full((3, 4), math.nan))

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import trimesh
 from parts_of_rooms import CORNER, TABLE, boxes, rays_of
 
-from sceneprior.core.parts import BOX, CYLINDER, MOST_PARTS, Parts, filled_cells
+from sceneprior.core.geometry.part_meshes import surface_of_parts
+from sceneprior.core.parts import BOX, CYLINDER, MOST_CORNERS, MOST_PARTS, Parts, filled_cells
 from sceneprior.lifted.lifting.lifted import RayPool
 from sceneprior.lifted.lifting.part_fit import fit_parts
 from sceneprior.lifted.lifting.part_loss import RayFit
@@ -77,9 +79,33 @@ def test_the_loss_is_the_formula_of_the_docstring():
     guess = fit.guess(TABLE.kind, TABLE.mirrored, ends)
     volume = 1 * 8 / 64 + 4 * (8 / 64) * (56 / 64) * (8 / 64)
     # Three planes: below the top, and the inner sides of the legs along x and z.
-    assert fit.loss(guess) == pytest.approx(0.003 * 2 + 0.003 * 3 - 0.0005 * volume)
+    assert fit.loss(guess) == pytest.approx(0.002 * 2 + 0.002 * 3 - 0.0005 * volume)
     upper = fit.guess(TABLE.kind[:1], TABLE.mirrored[:1], ends[:1])
     missed = (fit.hits & (upper.met_by == 0)).sum()
     assert fit.loss(upper) == pytest.approx(
-        0.5 * missed / (fit.hits.sum() + 50) + 0.003 + 0.003 - 0.0005 / 8 + 0.06 * 56 / 64
+        0.5 * missed / (rays.hits.sum() + 50) + 0.002 + 0.002 - 0.0005 / 8 + 0.06 * 56 / 64
     )
+
+
+def test_upright_rays_are_hits_within_the_outline():
+    diamond = np.array([[0, -0.5], [0.5, 0], [0, 0.5], [-0.5, 0]])
+    rays = rays_of(TABLE, 400)
+    plain, cut = RayFit(rays, MARGIN), RayFit(rays, MARGIN, diamond)
+    for fit, share in ((plain, 1.0), (cut, 0.5)):
+        upright = np.abs(fit.spans[:, [0, 2]]).max(axis=1) < 1e-5
+        assert fit.hits[upright].all() and upright.sum() == round(0.075 * (~upright).sum())
+        x, z = (fit.starts[upright][:, [0, 2]] / 64 - 0.5).T
+        assert (np.abs(x) + np.abs(z)).max() <= share
+    assert cut.miss_price > plain.miss_price, "fewer rays pass within the outline"
+    assert len(cut.hits) < len(plain.hits), "some pass beyond it"
+
+
+def test_a_round_bench_keeps_its_outline():
+    """Parts that reach beyond it are cut, in the cells and in the mesh."""
+    ends = np.array([[[-0.5, 0.5]] * 3])
+    bench = Parts(np.array([CYLINDER]), np.array([0]), ends)
+    found, iou = found_again(bench)
+    assert iou > 0.9 and 8 <= len(found.outline) <= MOST_CORNERS
+    vertices, faces = surface_of_parts(found)
+    mesh = trimesh.Trimesh(vertices, faces)
+    assert mesh.is_volume and mesh.volume == pytest.approx(np.pi / 4, rel=0.08)

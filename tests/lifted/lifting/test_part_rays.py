@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from parts_of_rooms import TABLE, rays_of
 
-from sceneprior.core.parts import BOX, Parts, inside
+from sceneprior.core.parts import BOX, SQUARE, Parts, inside
 from sceneprior.lifted.lifting.part_loss import RayFit
 from sceneprior.lifted.lifting.part_prices import (
     LEVELS,
@@ -115,10 +115,21 @@ def test_wrong_rays_of_several_objects_are_counted_at_once():
     solids = [*TABLE.solids(), (BOX, whole[0])]
     kinds = np.array([kind for kind, _ in solids])
     lows, highs = (np.stack([ends[:, side] for _, ends in solids]) * 2 / MARGIN for side in (0, 1))
-    wrong = np.empty(2, np.int64)
-    first = np.array([0, len(solids) - 1, len(solids)])
-    count_wrong(rays.starts, rays.spans, rays.hits, kinds, lows, highs, first, wrong)
+    wrong = np.empty(3, np.int64)
+    solids += [(BOX, whole[0])]
+    kinds, lows, highs = (np.concatenate([part, part[-1:]]) for part in (kinds, lows, highs))
+    first = np.array([0, len(solids) - 2, len(solids) - 1, len(solids)])
+    half = SQUARE.clip(max=[0, 1])  # the half of the box in which x is negative
+    corners = np.concatenate([SQUARE, SQUARE, half]) * 2 / MARGIN
+    count_wrong(
+        rays.starts, rays.spans, rays.hits, kinds, lows, highs, first, corners,
+        np.array([0, 4, 8, 12]), wrong,
+    )  # fmt: skip
     assert wrong[0] == 0
-    fit = RayFit(rays, MARGIN)
-    box = fit.guess(np.array([BOX]), np.array([0]), np.array([[[0, LEVELS]] * 3]))
-    assert wrong[1] == ((box.met_by > 0) != fit.hits).sum() > 50
+    starts, spans = (part * MARGIN / 2 for part in (rays.starts, rays.spans))
+    known = np.abs(spans).sum(axis=1) > 0
+    for item, ends in ((1, whole[0]), (2, whole[0].clip(max=[[0], [1], [1]]))):
+        met = np.empty(len(spans), bool)
+        levels = np.rint((ends + 0.5) * LEVELS).astype(np.int64)
+        meets(starts * LEVELS + LEVELS / 2, spans * LEVELS, BOX, 0, levels, met)
+        assert wrong[item] == ((met != rays.hits) & known).sum() > 30

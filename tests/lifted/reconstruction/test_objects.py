@@ -136,7 +136,7 @@ def test_a_run_whose_rooms_are_all_empty_says_so(trained, images, monkeypatch):
         candidates, "kept_objects", lambda logits, _: torch.zeros_like(logits, dtype=torch.bool)
     )
     with pytest.raises(
-        InputError, match=r"All 12 training rooms .* train it longer, or .*\(--fit paper\)"
+        InputError, match=r"all its 12 training rooms .* train it longer, or .*\(--fit paper\)"
     ):
         answer_images(trained, images)
 

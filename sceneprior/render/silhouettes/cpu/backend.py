@@ -45,5 +45,5 @@ def draw(
     drawn: Bool[Tensor, "images objects"],
     settings: Settings,
 ) -> Drawing:
-    """Draw the result of `reference.draw`."""
+    """Draw as `reference.draw` does, with Numba."""
     return Drawing(*_Draw.apply(pixels, depths, triangles.long(), drawn, settings))

@@ -1,20 +1,20 @@
 """Visible soft masks from the coverage and depth order of single objects, and their gradient.
 
-With coverage_k = 1 - 1 / odds_k of object k alone, the modes are:
+The coverage of object k, drawn alone, is coverage_k = 1 - 1 / odds_k. There are three modes:
 
-`alone`: the coverage itself, without occlusion.
+`alone`: the mask of an object is its coverage, without occlusion.
 
-`paper`: the coverage of the whole scene, assigned to the front-most object of each pixel. Two
-objects that touch in the image do not push each other.
+`paper`: the coverage of the whole scene, assigned to the front-most object of each pixel. The loss
+cannot shift the boundary between two objects that touch in the image.
 
-`layered`: alpha compositing, object k is visible where it covers and no nearer object does,
+`layered`: alpha compositing. Object k is visible where it covers a pixel and no nearer object does,
 
     visible_k = coverage_k * prod_{j nearer than k} (1 - coverage_j),
 
-so the loss at a boundary between two objects moves the front one, which reveals or hides the one
+so a loss at the boundary between two objects moves the front one, which reveals or hides the one
 behind.
 
-The objects are ordered by their depth at the pixel (see faces.py), without a gradient.
+Objects are ordered by their depth at the pixel (see faces.py); the order carries no gradient.
 """
 
 import numpy as np
@@ -28,7 +28,7 @@ ALONE, LAYERED, PAPER = range(3)
 
 @njit(inline="always")
 def _in_row(bounds, origin, objects, row, here):
-    """Write the objects whose window meets an image row to `here`, and return their number."""
+    """Write to `here` the objects whose window meets an image row, and return their number."""
     count = 0
     for k in range(objects):
         if bounds[origin + k, 0] <= row < bounds[origin + k, 1]:
@@ -39,8 +39,8 @@ def _in_row(bounds, origin, objects, row, here):
 
 @njit(inline="always")
 def _in_strip(bounds, starts, origin, row, strip, here, count, who, where):
-    """Write those objects whose window meets a strip to `who`, and the buffer offset of the row to
-    `where`; return their number."""
+    """Write to `who` the objects of `here` whose window meets a strip, and to `where` the offset of
+    the strip's row in their buffers; return their number."""
     found = 0
     for i in range(count):
         mesh = origin + here[i]

@@ -6,9 +6,9 @@ Buffers hold, for each pixel of each window (windows.py),
     order the depth order (larger is nearer): 1 / z of the nearest face that contains the pixel
           centre, else -z of the nearest face whose blur reaches it, else -inf.
 
-The loops over a strip's pixels contain no branches and no calls but arithmetic, so LLVM vectorises
-them to 8 or 16 pixels at a time. Meshes are independent and each is handled by one thread, so the
-result does not depend on the number of threads.
+The loops over a strip's pixels contain only arithmetic, without branches or calls, so LLVM
+vectorises them to 8 or 16 pixels at a time. Meshes are independent, and each is handled by one
+thread, so the result does not depend on the number of threads.
 """
 
 from typing import Any
@@ -27,7 +27,8 @@ _LOOSE: Any = {"contract", "reassoc", "nsz", "arcp"}
 
 @njit(inline="always")
 def _from_edge(px, py, ax, ay, bx, by, over_length2, zero, one):
-    """Vector from edge ab's nearest point to p, that point's parameter, twice area (a, b, p)."""
+    """Vector to p from the nearest point of edge ab, that point's parameter on ab, and twice the
+    signed area of triangle (a, b, p)."""
     ux, uy, x, y = bx - ax, by - ay, px - ax, py - ay
     t = min(max((x * ux + y * uy) * over_length2, zero), one)
     return x - t * ux, y - t * uy, t, ux * y - uy * x
@@ -35,7 +36,8 @@ def _from_edge(px, py, ax, ay, bx, by, over_length2, zero, one):
 
 @njit(inline="always")
 def _at_pixel(k, column, row, face, T):
-    """Vectors from the edges' nearest points to a strip's k-th pixel; its barycentric weights."""
+    """Vectors to a strip's k-th pixel from the nearest point of each edge, the parameters of these
+    points, and the barycentric weights of the pixel."""
     ax, ay, bx, by, cx, cy, over_area, over1, over2, over3 = face
     zero, one = T(0), T(1)
     px = T(column + (np.int32(k) & 7)) + T(0.5)
@@ -87,7 +89,7 @@ def _strip_gradient(upstream, start, count, column, row, face, over_sigma, blur)
         weight = weight if touched else zero
         first = (d1 <= d2) & (d1 <= d3)
         third = (d2 > d3) & (d1 > d3)
-        # d depends on the corners by the nearest point, which interpolates its edge's ends.
+        # d depends on the corners through the nearest point, which interpolates its edge's ends.
         m1 = weight if first else zero
         m3 = weight if third else zero
         m2 = weight - m1 - m3
@@ -116,7 +118,8 @@ def _over_length2(ax, ay, bx, by, one, least):
 
 @njit(inline="always")
 def _region(pixels, depths, corners, bounds, reach, near, T):
-    """Rows and strips of the window that a face reaches (none if it is not drawn); the face."""
+    """Rows and strips of the window that a face reaches (none if it is not drawn), and its corners
+    with precomputed inverses."""
     ia, ib, ic = corners
     one, least = T(1), T(MIN_AREA_PX2)
     za, zb, zc = depths[ia], depths[ib], depths[ic]

@@ -4,11 +4,11 @@ The silhouette of a mesh is treated as one shape instead of many faces:
 
     coverage = sigmoid(+-d / sigma), d the squared distance to the nearest point of its outline,
 
-with + if a face contains the pixel centre. The outline consists of the edges across which the
-number of faces that cover an image point changes (in a closed mesh, edges between a front and a
-back face), except for parts with another face on the far side. Faces are rasterised hard, so the
-cost grows with pixels and outline length, not with faces times blur. docs/silhouettes.md shows the
-difference from the exact formula.
+with + if a face contains the pixel centre. Candidates for the outline are the edges across which
+the number of faces that cover an image point changes (in a closed mesh, edges between a front and a
+back face). The outline consists of the parts of these edges beyond which no face lies. Faces are
+rasterised hard, so the cost grows with pixels and outline length, not with faces times blur.
+docs/silhouettes.md shows the difference from the exact formula.
 """
 
 import numpy as np
@@ -42,7 +42,8 @@ def _depth_strip(
 def _rasterize(
     points, nearness, faces, edge_of, way, row0, row1, strip0, strip1, start, most, order, layers
 ):  # fmt: skip
-    """1 / depth of the nearest face at pixel centres; faces left minus right of each edge."""
+    """Write 1 / depth of the nearest face at pixel centres to `order`, and the number of faces to
+    the left of each edge, minus those to its right, to `layers`."""
     T = points.dtype.type
     one, least, inner, outer = T(1), T(MIN_AREA_PX2), T(0.499), T(0.501)
     low_row, high_row = T(row0), T(row1)
@@ -91,7 +92,7 @@ def _faces_over(x, y, ax, ay, by, slope, falls):
 
 @njit(inline="always")
 def _cut(start, step, low, high, first, last):
-    """Cut the part [first, last] of a line to low <= start + t * step <= high."""
+    """Clip the range [first, last] of t to low <= start + t * step <= high."""
     if step == 0.0:
         return (first, last) if low <= start <= high else (1.0, 0.0)
     t0, t1 = (low - start) / step, (high - start) / step
@@ -116,7 +117,8 @@ def _candidates(points, edges, layers):
 def _trace(
     candidates, layers, row0, row1, strip0, strip1, start, blur, distance, edge, share
 ):  # fmt: skip
-    """Squared distance to the outline, nearest edge, and parameter on it, at pixels near it."""
+    """Write the squared distance to the outline, the nearest edge, and the parameter of the nearest
+    point on that edge, for pixels near the outline."""
     rows = row1 - row0
     reach = np.sqrt(blur)
     which, all_ax, all_ay, all_bx, all_by, slope, falls = candidates
@@ -198,7 +200,7 @@ def _cover_backward(
                         ax, ay = float(pixels[mesh, a, 0]), float(pixels[mesh, a, 1])
                         x = column + 0.5 - ax - t * (pixels[mesh, b, 0] - ax)
                         y = row + 0.5 - ay - t * (pixels[mesh, b, 1] - ay)
-                        # sigmoid(x) = 1 - 1 / odds; d depends on the ends by the nearest point.
+                        # sigmoid(x) = 1 - 1 / odds; d depends on the ends via the nearest point.
                         weight = -2.0 * upstream[j] * (1.0 - 1.0 / odds[j]) / sigma
                         weight = weight if order[j] > 0.0 else -weight
                         gradient[mesh, a, 0] += (1.0 - t) * weight * x

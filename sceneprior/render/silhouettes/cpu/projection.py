@@ -1,6 +1,6 @@
 """Compiled `core.geometry.cameras.project` for the CPU backend, and its gradient.
 
-The dozen small torch operations of `project` would take as long as drawing.
+In torch, the dozen small operations of `project` would take as long as the drawing itself.
 """
 
 import numpy as np

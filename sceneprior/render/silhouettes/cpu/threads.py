@@ -1,8 +1,8 @@
-"""Running a compiled loop over meshes or images on several threads.
+"""Runs a compiled loop over meshes or images on several threads.
 
-Each function takes the first and one past the last of its items, releases the GIL, and writes only
-to its own items, so the result does not depend on the number of threads. Numba's own parallel loops
-would take several times as long to compile.
+The loop is a function that takes the index of its first item and one past the last, releases the
+GIL, and writes only to these items, so the result does not depend on the number of threads. Numba's
+own parallel loops would take several times as long to compile.
 """
 
 import itertools
@@ -21,7 +21,7 @@ CHUNKS = 3
 def in_threads(function: Callable[..., None], items: int, *arguments: Any) -> None:
     """Call function(first, last, *arguments) for parts that cover range(items).
 
-    It uses as many threads as Numba may (`thread_count`).
+    It uses `thread_count()` threads.
     """
     threads = thread_count()
     parts = min(items, threads * CHUNKS if threads > 1 else 1)

@@ -31,7 +31,7 @@ def draw(
     drawn: Bool[Tensor, "images objects"],
     settings: Settings,
 ) -> Drawing:
-    """Draw the result of `reference.draw`.
+    """Draw as `reference.draw` does, with Triton kernels.
 
     Apart from the masks, memory grows with the pixels in the objects' bounding boxes; every face of
     every mesh takes 8 bytes (14 while drawing in fast mode, 24 more for gradients in exact mode).

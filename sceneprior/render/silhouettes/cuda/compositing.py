@@ -27,7 +27,8 @@ def _tile_pixels(height, width):  # pragma: no cover - compiled
 def _missed_before(
     missed, order, windows, first_tiles, mesh, objects, k, z, tile_row, tile_column, row, column
 ):  # pragma: no cover - compiled  # fmt: skip
-    """Product of 1 - coverage of the objects nearer than k; of equal depths the lower id leads."""
+    """Product of 1 - coverage over the objects nearer than k; at equal depth, lower ids are
+    nearer."""
     before = tl.full((TILE * TILE,), 1, missed.dtype.element_ty)
     for other in range(0, objects):
         if (other != k) & holds(windows, mesh - k + other, tile_row, tile_column):
@@ -89,10 +90,10 @@ def composite_backward(
     missed, order, windows, first_tiles, masks, upstream, packed, objects, height, width,
     MODE: tl.constexpr,
 ):  # pragma: no cover - compiled  # fmt: skip
-    """packed = -dL/dlog(missed), which avoids dividing by missed = 0 at fully covered pixels.
+    """Store -dL/dlog(missed) in `packed`; dL/dmissed would divide by 0 at fully covered pixels.
 
-    In `layered`, dmask_k/dlog(missed_k) is -missed_k times the product of `missed` over nearer
-    objects, and each mask behind k is proportional to missed_k.
+    In the mode `layered`, dmask_k/dlog(missed_k) is -missed_k times the product of `missed` over
+    nearer objects, and each mask behind k is proportional to missed_k.
     """
     image, tile_row, tile_column, row, column = _tile_pixels(height, width)
     real = missed.dtype.element_ty

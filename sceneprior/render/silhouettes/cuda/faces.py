@@ -89,8 +89,8 @@ def corner_gradients(
 
             inside = tl.minimum(tl.minimum(wa * turn, wb * turn), wc * turn) > 0
             sign = tl.where(inside, 1.0, -1.0)
-            # dmask/dx_f is `upstream` times the chance that this face covers; dd_f/dcorner is
-            # -2 (p - nearest) times the corner's share of the nearest point.
+            # dL/dx_f is `upstream` times the probability that this face covers the pixel;
+            # dd_f/dcorner is -2 (p - nearest) times the corner's share of the nearest point.
             covers = 1.0 / (1.0 + tl.exp(-sign * distance * inverse_sigma))
             weight = -2.0 * grad * sign * covers * inverse_sigma
             weight = tl.where(inside | (distance < blur), weight, 0.0)

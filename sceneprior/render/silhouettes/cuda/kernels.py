@@ -49,7 +49,7 @@ MIN_AREA, SLACK = tl.constexpr(reference.MIN_AREA_PX2), tl.constexpr(reference.S
 def corners_of(
     pixels, faces, face, first_vertex, mask, real: tl.constexpr
 ):  # pragma: no cover - compiled
-    """The three vertices of each face, numbered through all meshes, and their u and v."""
+    """The three vertices of each face, numbered across all meshes, and their u and v."""
     a = first_vertex + tl.load(faces + face * 3, mask=mask, other=0)
     b = first_vertex + tl.load(faces + face * 3 + 1, mask=mask, other=0)
     c = first_vertex + tl.load(faces + face * 3 + 2, mask=mask, other=0)
@@ -95,7 +95,8 @@ def bits_of(hit, lane):  # pragma: no cover - compiled
 
 @triton.jit
 def tile_pixels(windows, first_tiles, tile_meshes):  # pragma: no cover - compiled
-    """Mesh, top row and left column of this program's tile; its pixels and their packed indices."""
+    """Mesh, top row and left column of this program's tile; rows, columns and packed indices of the
+    tile's pixels."""
     tile = tl.program_id(0).to(tl.int64)
     mesh = tl.load(tile_meshes + tile).to(tl.int64)
     base, stride = window(windows, first_tiles, mesh)
@@ -139,7 +140,8 @@ def first_bit(bits):  # pragma: no cover - compiled
 
 @triton.jit
 def to_edge(px, py, ax, ay, bx, by):  # pragma: no cover - compiled
-    """Vector from edge ab's nearest point to p, that point's parameter, twice area (p, a, b)."""
+    """Vector to p from the nearest point of edge ab, that point's parameter on ab, and twice the
+    signed area of triangle (p, a, b)."""
     ex, ey = bx - ax, by - ay
     qx, qy = px - ax, py - ay
     t = (qx * ex + qy * ey) * (1.0 / tl.maximum(ex * ex + ey * ey, MIN_AREA))

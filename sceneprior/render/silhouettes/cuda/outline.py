@@ -42,7 +42,7 @@ class _Pieces(NamedTuple):
     """(2, pieces): start and end on the edge, from 0 at its first vertex to 1 at its second."""
 
     vertices: Tensor
-    """(pieces, 2): vertices of the edge, numbered through all meshes."""
+    """(pieces, 2): vertices of the edge, numbered across all meshes."""
 
     meshes: Tensor
     clear: Tensor
@@ -137,7 +137,8 @@ def _cut_lines(start: Tensor, end: Tensor, settings: Settings) -> tuple[Tensor, 
     count = (along.norm(dim=1) / PIECE_PX).ceil()
     low, high, reach = torch.zeros_like(count), torch.ones_like(count), reach_of(settings)
     for axis, size in enumerate(reversed(settings.image_size)):
-        # A line without extent on an axis gives infinities, or NaN, with which it is left out.
+        # A line without extent along an axis divides by 0: infinities give the right result, and
+        # NaN leaves the line out.
         t = torch.stack([-reach - start[:, axis], size + reach - start[:, axis]]) / along[:, axis]
         low, high = torch.maximum(low, t.amin(dim=0)), torch.minimum(high, t.amax(dim=0))
     near = low < high
@@ -175,6 +176,6 @@ def cover_backward(
         pieces.meshes, pieces.clear, *seen, missed, order, nearest, upstream, by_end, count,
         settings.sigma_px2, reach_of(settings), num_warps=1,
     )  # fmt: skip
-    # All meshes are summed as one, since their vertices are numbered through.
+    # All meshes are summed as one, since their vertices are numbered consecutively.
     everywhere = torch.ones(1, 4, dtype=torch.int32, device=pixels.device)
     return sum_by_vertex(by_end, pieces.vertices.flatten(), everywhere, pixels)

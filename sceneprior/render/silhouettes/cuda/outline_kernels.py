@@ -28,7 +28,7 @@ PER_PROGRAM, PIXELS = tl.constexpr(8), tl.constexpr(8)
 
 @triton.jit
 def _ends_of(lines, line, count, mask):  # pragma: no cover - compiled
-    """x and y of both ends of lines, which are stored as rows of `count`."""
+    """x and y of both ends of lines, which are stored as four rows of `count` numbers."""
     x0 = tl.load(lines + line, mask=mask, other=0)
     y0 = tl.load(lines + count + line, mask=mask, other=0)
     x1 = tl.load(lines + 2 * count + line, mask=mask, other=0)

@@ -1,0 +1,155 @@
+"""Requests made from test rooms: share of wishes met, plausibility, and time.
+
+    python benchmarks/requested_rooms.py --run procthor-bedroom --shards SHARDS [--doors] [--seed 0]
+
+Each request has the floor of a test room, half of its contents (rounded up) as exact counts of
+their classes, and two relations that hold in the test room, drawn by --seed among those of
+`sceneprior/lifted/requests/relations.py` between these objects; with --doors also a door and a
+window at drawn places. One room is drawn for each. Test rooms are used again, with other halves,
+until there are --requests of them; rooms with classes that the prior does not draw lose these.
+
+`met` is the share of all counts and relations that hold. `classifier` is the accuracy of the
+layout classifier (docs/evaluation.md) on the requested rooms against real ones, and
+`unconditioned` that of as many rooms without a request; 0.5 is best. `seconds` is CPU time a room,
+meshes included, after one room to warm up.
+"""
+
+import argparse
+import json
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+
+import sceneprior
+from sceneprior.apps.api import Prior
+from sceneprior.core.errors import InputError
+from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.scene import Scene
+from sceneprior.evaluation.metrics.layout_classifier import METRICS
+from sceneprior.lifted.requests.holding import Furniture, Relations
+from sceneprior.lifted.requests.relations import OF_ONE, OF_TWO
+from sceneprior.lifted.requests.shape import RoomShape
+from sceneprior.lifted.requests.wishes import RelationWish
+
+RELATIONS = 2
+"""Relations of a request."""
+WITHOUT_FRONT = tuple(name for name in OF_TWO if name not in ("beside", "in front of", "facing"))
+"""Relations that boxes without a known front have."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--run", required=True)
+    parser.add_argument("--shards", type=Path, required=True)
+    parser.add_argument("--requests", type=int, default=200)
+    parser.add_argument("--doors", action="store_true", help="add a door and a window")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    prior = sceneprior.load(arguments.run)
+    test = reference_scenes(arguments.shards, "test", meshes=False)
+    real = [
+        scene
+        for split in ("train", "val")
+        for scene in reference_scenes(arguments.shards, split, meshes=False)
+    ]
+    rng = np.random.default_rng(arguments.seed)
+    requests = requests_of(prior, test, arguments.requests, arguments.doors, rng)
+    prior.sample(1, seed=0, floor="4x4")
+    rooms, refused = [], []
+    start = time.process_time()
+    for number, request in enumerate(requests):
+        try:
+            rooms += prior.sample(1, seed=arguments.seed + number, **request)
+        except InputError as error:
+            refused.append(str(error))
+    seconds = (time.process_time() - start) / len(requests)
+    held = [each["holds"] for room in rooms for each in room.extra["wishes"]]
+    unmet = Counter(
+        each["wish"] for room in rooms for each in room.extra["wishes"] if not each["holds"]
+    )
+    total = sum(len(r["want"]) - 1 + len(r["want"]["relations"]) for r in requests)
+    plain = prior.sample(len(rooms), seed=arguments.seed)
+    result = {
+        "requests": len(requests), "refused": refused, "wishes": total, "met": sum(held),
+        "unmet": dict(unmet), "seconds": round(seconds, 3),
+        "classifier": accuracy(rooms, real, test, arguments.seed),
+        "unconditioned": accuracy(plain, real, test, arguments.seed),
+    }  # fmt: skip
+    print(json.dumps(result, indent=1))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
+
+
+def requests_of(
+    prior: Prior, test: Sequence[Scene], count: int, doors: bool, rng: np.random.Generator
+) -> list[dict[str, Any]]:
+    """Arguments of `Prior.sample` for requests made from test rooms."""
+    trained: Any = prior.trained
+    known = {prior.classes[row] for row in trained.sampler.drawn_classes}
+    requests: list[dict[str, Any]] = []
+    for number in range(20 * count):
+        room = test[number % len(test)]
+        objects = [item for item in room.objects if item.label in known]
+        if len(objects) < 2 or room.floor_m is None:
+            continue
+        rows = rng.permutation(len(objects))[: (len(objects) + 1) // 2]
+        half = [objects[row] for row in rows]
+        found = relations_of(room, half, prior.classes)
+        relations = [found[row] for row in rng.permutation(len(found))[:RELATIONS]]
+        want: dict[str, Any] = dict(Counter(item.label for item in half))
+        want["relations"] = [
+            {"subject": wish.subject, "relation": wish.relation, "target": wish.target}
+            for wish in relations
+        ]
+        request = {"floor": room.floor_m, "want": want}
+        requests.append(request | ({"openings": "door,window"} if doors else {}))
+        if len(requests) == count:
+            break
+    return requests
+
+
+def relations_of(room: Scene, half: Sequence[Any], classes: tuple[str, ...]) -> list[RelationWish]:
+    """Relations between these objects that hold in the room; its boxes have no known front."""
+    labels = sorted({item.label for item in half})
+    wishes = [RelationWish(label, relation) for label in labels for relation in OF_ONE]
+    wishes += [
+        RelationWish(label, relation, other)
+        for label in labels
+        for other in labels
+        if label != other
+        for relation in WITHOUT_FRONT
+    ]
+    assert room.floor_m is not None
+    furniture = Furniture(
+        np.array([[*item.center_m, *item.size_m] for item in half]),
+        np.array([classes.index(item.label) for item in half]),
+        np.zeros(len(half), dtype=np.int64),
+    )
+    held = Relations(wishes, RoomShape(room.floor_m), classes).held(furniture)
+    return [wish for wish, holds in zip(wishes, held, strict=True) if holds]
+
+
+def accuracy(
+    rooms: Sequence[Scene], real: Sequence[Scene], test: Sequence[Scene], seed: int
+) -> float:
+    """`layout_classifier_accuracy` of a set of rooms, without an interval."""
+    # The metric reads no pictures and no nearest rooms.
+    own, others = (
+        SimpleNamespace(scenes=scenes, counts=np.ones((1, len(scenes)), dtype=int))
+        for scenes in (rooms, test)
+    )
+    (metric,) = METRICS
+    found = metric.function(own, SimpleNamespace(test=others, real=real, seed=seed))
+    return round(float(found.value), 3)
+
+
+if __name__ == "__main__":
+    main()

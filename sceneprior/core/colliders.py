@@ -1,0 +1,100 @@
+"""Convex bodies of objects, for physics: their solids, or convex parts of their meshes."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from sceneprior.core.geometry.corners import BOX_FACES, CUBE_CORNERS
+from sceneprior.core.geometry.part_meshes import convex_surface, solid_points
+from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.parts import KIND_NAMES
+from sceneprior.core.scene import Mesh, SceneObject, Solid
+
+HUNG = ("ceiling_lamp", "pendant_lamp")
+"""Classes that hang from the ceiling."""
+MOUNTED = ("cabinet", "shelf", "shelves", "sink", "television", "whiteboard", "wall_shelf")
+"""Classes that hang on a wall if their lower face is above `MOUNTED_M`."""
+MOUNTED_M = 0.4
+CONCAVITY = 0.05
+"""Threshold of CoACD: the largest concavity of a part that is not divided further."""
+_FILL = {
+    "box": 1.0, "cylinder": np.pi / 4, "ellipsoid": np.pi / 6, "dome": np.pi / 6, "bowl": np.pi / 6,
+}  # fmt: skip
+
+
+def is_fixed(item: SceneObject) -> bool:
+    """True for objects that hang: simulators hold them in place."""
+    bottom_m = item.center_m[1] - item.size_m[1] / 2
+    return item.label in HUNG or (item.label in MOUNTED and bottom_m > MOUNTED_M)
+
+
+def colliders(item: SceneObject) -> tuple[Solid | Mesh, ...]:
+    """Convex bodies of an object: its solids; without solids, the convex parts of its mesh
+    (`convex_parts`); without a mesh, its box."""
+    if item.solids:
+        return item.solids
+    if item.mesh is not None:
+        return convex_parts(item.mesh)
+    if item.turned is not None:
+        corners = CUBE_CORNERS / 2 * np.asarray(item.turned.size_m)
+        placed = corners @ yaw_rotation(item.turned.yaw_rad).T + np.asarray(item.center_m)
+        return (Mesh(placed, BOX_FACES),)
+    center, half = np.asarray(item.center_m), np.asarray(item.size_m) / 2
+    return (Solid("box", tuple((center - half).tolist()), tuple((center + half).tolist())),)
+
+
+def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
+    """Convex meshes whose union approximates a mesh; its convex hull if CoACD is not installed."""
+    coacd = _coacd()
+    hull = Mesh(*convex_surface(np.asarray(mesh.vertices_m, dtype=np.float64)))
+    if coacd is None or not len(hull.faces):
+        return (hull,)
+    found = coacd.run_coacd(
+        coacd.Mesh(np.asarray(mesh.vertices_m, dtype=np.float64), np.asarray(mesh.faces)),
+        threshold=CONCAVITY,
+    )
+    return tuple(Mesh(*convex_surface(np.asarray(vertices))) for vertices, _ in found) or (hull,)
+
+
+@cache
+def _coacd() -> Any:
+    """The optional module `coacd`, or None."""
+    try:
+        import coacd
+    except ImportError:
+        return None
+    coacd.set_log_level("error")
+    return coacd
+
+
+def points_of(body: Solid | Mesh) -> Float[np.ndarray, "points 3"]:
+    """Points whose convex hull is a body."""
+    if isinstance(body, Mesh):
+        return np.asarray(body.vertices_m, dtype=np.float64)
+    ends = np.array([body.low_m, body.high_m]).T
+    return solid_points(KIND_NAMES.index(body.kind), ends)
+
+
+def mesh_of(body: Solid | Mesh) -> Mesh:
+    """A body as a closed convex mesh."""
+    return Mesh(*convex_surface(points_of(body)))
+
+
+def volume_and_centroid(body: Solid | Mesh) -> tuple[float, Float[np.ndarray, "3"]]:
+    """Volume in cubic metres, and centroid, of a body."""
+    if isinstance(body, Mesh):
+        corners = np.asarray(body.vertices_m, dtype=np.float64)[body.faces]
+        volumes = np.linalg.det(corners) / 6
+        total = volumes.sum()
+        if total <= 1e-9:
+            return 1e-9, corners.reshape(-1, 3).mean(axis=0)
+        return float(total), (volumes[:, None] * corners.sum(axis=1) / 4).sum(axis=0) / total
+    low, high = np.array(body.low_m), np.array(body.high_m)
+    center = (low + high) / 2
+    # The centroid of half an ellipsoid lies 3/8 of its height from the flat side.
+    if body.kind in ("dome", "bowl"):
+        rise = 3 / 8 * (high[1] - low[1])
+        center[1] = low[1] + rise if body.kind == "dome" else high[1] - rise
+    return float(_FILL[body.kind] * (high - low).prod()), center

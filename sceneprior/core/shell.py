@@ -1,0 +1,310 @@
+"""The shell of a room: floor, walls with doors and windows cut out, and ceiling."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from sceneprior.core.errors import InputError
+from sceneprior.core.floor import floor_rectangle
+from sceneprior.core.scene import Mesh, Opening, Scene
+
+ShellName = Literal["walls", "floor", "none"]
+"""How much of the shell is drawn or written: all of it, the floor alone, or nothing."""
+SHELLS: tuple[ShellName, ...] = ("walls", "floor", "none")
+THICK_M = 0.1
+"""Thickness of walls, floor and ceiling; walls stand outside the outline."""
+HEIGHT_M = 2.6
+"""Height of a room whose ceiling is not known, unless its furniture is higher."""
+ABOVE_M = 0.05
+"""Least distance of such a ceiling from furniture that does not hang from it."""
+LAMPS_FROM_M = 2.2
+"""Height above which the top of a lamp is the height of the ceiling."""
+FLAT_RAD = 1e-3
+"""Corners of the outline that turn by less are left out."""
+
+
+class Wall(NamedTuple):
+    """A wall on one side of the floor; from inside the room it runs from `start_m` to the right
+    or left, as the outline does."""
+
+    start_m: Float[np.ndarray, "2"]
+    end_m: Float[np.ndarray, "2"]
+    """Ends (x, z) of its inner face."""
+    outward: Float[np.ndarray, "2"]
+    """Unit normal (x, z) that points out of the room."""
+    openings: tuple[tuple[float, float, float, float], ...]
+    """Doors and windows: start and end along the wall, bottom and top, in metres."""
+
+
+class Panel(NamedTuple):
+    """A box of a wall between its openings."""
+
+    center_m: Float[np.ndarray, "3"]
+    size_m: tuple[float, float, float]
+    """Length, height and thickness."""
+    yaw_rad: float
+    """Rotation about +y that takes +x to the direction of the wall."""
+
+
+@dataclass(frozen=True)
+class Shell:
+    """Floor, walls and ceiling of a room."""
+
+    outline_m: Float[np.ndarray, "corners 2"]
+    """Outline (x, z) of the floor, on which the inner faces of the walls stand."""
+    height_m: float
+    walls: tuple[Wall, ...]
+    grown_m: float
+    """Distance by which walls were moved outwards, at most, so that none stands in furniture."""
+
+    def meshes(self) -> dict[str, Mesh]:
+        """Closed meshes by name: `floor`, `wall_0` and so on, and `ceiling`."""
+        named = {"floor": slab(self.outline_m, -THICK_M, 0.0)}
+        corners = _outer_corners(self.walls)
+        for row, wall in enumerate(self.walls):
+            outer = (corners[row], corners[(row + 1) % len(corners)])
+            named[f"wall_{row}"] = _wall_mesh(wall, outer, self.height_m)
+        named["ceiling"] = slab(self.outline_m, self.height_m, self.height_m + THICK_M)
+        return named
+
+
+def shell_meshes(scene: Scene, shell: ShellName) -> dict[str, Mesh]:
+    """The meshes of a scene's shell that `shell` asks for, by name."""
+    if shell == "none":
+        return {}
+    meshes = shell_of(scene).meshes()
+    return meshes if shell == "walls" else {"floor": meshes["floor"]}
+
+
+def is_shell(node: str) -> bool:
+    """True for the names of `Shell.meshes`."""
+    return node in ("floor", "ceiling") or node.startswith("wall_")
+
+
+def shell_of(scene: Scene) -> Shell:
+    """The shell of a scene: on its floor, or on the rectangle round its furniture.
+
+    A side that furniture crosses is moved outwards, and its doors and windows with it. Without a
+    known ceiling, its height is the top of the highest lamp, or else 2.6 m.
+    """
+    outline = scene.floor_m
+    if outline is None:
+        outline = rectangle(*floor_rectangle(scene))
+    plain = _corners(outline)
+    grown, grown_m = _grown(plain, scene)
+    walls = _walls(grown)
+    for opening in scene.openings:
+        row, span = _place_of(opening, walls)
+        walls[row] = walls[row]._replace(openings=(*walls[row].openings, span))
+    height = _height(scene)
+    walls = [_within(wall, height) for wall in walls]
+    return Shell(grown, height, tuple(walls), grown_m)
+
+
+def panels(wall: Wall, height_m: float) -> list[Panel]:
+    """Boxes that fill a wall round its openings, from its start to its end."""
+    along = wall.end_m - wall.start_m
+    length = float(np.linalg.norm(along))
+    direction = along / length
+    cuts = sorted({0.0, length, *(x for o in wall.openings for x in o[:2])})
+    found = []
+    for left, right in itertools.pairwise(cuts):
+        middle = (left + right) / 2
+        free = [(0.0, height_m)]
+        for start, end, bottom, top in wall.openings:
+            if start < middle < end:
+                free = [
+                    part
+                    for low, high in free
+                    for part in ((low, min(high, bottom)), (max(low, top), high))
+                    if part[1] - part[0] > 1e-6
+                ]
+        for low, high in free:
+            x, z = wall.start_m + direction * middle + wall.outward * THICK_M / 2
+            found.append(
+                Panel(
+                    np.array([x, (low + high) / 2, z]),
+                    (right - left, high - low, THICK_M),
+                    float(np.arctan2(-direction[1], direction[0])),
+                )
+            )
+    return found
+
+
+def _height(scene: Scene) -> float:
+    if scene.ceiling_m is not None:
+        return scene.ceiling_m
+    tops = scene.centers_m[:, 1] + scene.sizes_m[:, 1] / 2
+    lamps = np.array(["lamp" in item.label for item in scene.objects], dtype=bool)
+    hung = tops[lamps & (tops > LAMPS_FROM_M)]
+    others = tops[~lamps].max(initial=0) + ABOVE_M
+    return float(max(hung.max(initial=0) or HEIGHT_M, others))
+
+
+def rectangle(
+    low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "4 2"]:
+    """Corners (x, z) of a rectangle between two of them."""
+    return np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+
+
+def _corners(outline_m: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "some 2"]:
+    """The outline anticlockwise (x right, z up), without corners that hardly turn."""
+    polygon = shapely.Polygon(outline_m)
+    if not polygon.is_valid:
+        raise InputError(
+            "The outline of a floor (floor_m) crosses or touches itself, so no walls can stand on "
+            "it; list its corners in order, each once."
+        )
+    corners = shapely.get_coordinates(shapely.geometry.polygon.orient(polygon).exterior)[:-1]
+    before, after = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
+    turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    sharp = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    return np.asarray(corners[np.abs(turn) > FLAT_RAD * sharp])
+
+
+def _walls(corners: Float[np.ndarray, "corners 2"]) -> list[Wall]:
+    walls = []
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        x, z = (end - start) / np.linalg.norm(end - start)
+        walls.append(Wall(start, end, np.array([z, -x]), ()))
+    return walls
+
+
+def _grown(
+    corners: Float[np.ndarray, "corners 2"], scene: Scene
+) -> tuple[Float[np.ndarray, "corners 2"], float]:
+    """The outline with its sides moved outwards until it holds all furniture, and how far."""
+    walls = _walls(corners)
+    offsets = np.zeros(len(corners))
+    here = corners
+    for _ in range(4):
+        floor, crossed = shapely.Polygon(here), False
+        for item in scene.objects:
+            center, half = np.array(item.center_m)[::2], np.array(item.size_m)[::2] / 2
+            outside = shapely.box(*(center - half), *(center + half)).difference(floor)
+            if outside.area < 1e-6:
+                continue
+            crossed = True
+            for point in shapely.get_coordinates(outside):
+                _push(point, here, walls, offsets)
+        if not crossed:
+            return here, float(offsets.max())
+        here = _offset(walls, offsets)
+        if not shapely.Polygon(here).is_valid:
+            break
+    # Sides cannot hold it: the rectangle round everything does.
+    low, high = floor_rectangle(replace(scene, floor_m=None))
+    every = np.concatenate([corners, [low, high]])
+    low, high = every.min(axis=0), every.max(axis=0)
+    far = np.concatenate([corners.min(axis=0) - low, high - corners.max(axis=0)]).max()
+    return rectangle(low, high), float(far)
+
+
+def _push(
+    point: Float[np.ndarray, "2"],
+    corners: Float[np.ndarray, "corners 2"],
+    walls: Sequence[Wall],
+    offsets: Float[np.ndarray, " corners"],
+) -> None:
+    """Increase the offsets of the sides that are nearest to a point outside, up to the point."""
+    ends = np.roll(corners, -1, axis=0)
+    apart = [
+        shapely.LineString(pair).distance(shapely.Point(point))
+        for pair in zip(corners, ends, strict=True)
+    ]
+    for row in np.flatnonzero(np.array(apart) <= min(apart) + 1e-9).tolist():
+        beyond = float((point - walls[row].start_m) @ walls[row].outward)
+        offsets[row] = max(offsets[row], beyond)
+
+
+def _offset(
+    walls: Sequence[Wall], offsets: Float[np.ndarray, " corners"]
+) -> Float[np.ndarray, "corners 2"]:
+    """Corners of the outline whose sides are moved outwards, each by its own distance."""
+    corners = []
+    for row, wall in enumerate(walls):
+        before = walls[row - 1]
+        normals = np.array([before.outward, wall.outward])
+        reach = [before.start_m @ before.outward, wall.start_m @ wall.outward]
+        corners.append(np.linalg.solve(normals, np.array(reach) + offsets[[row - 1, row]]))
+    return np.array(corners)
+
+
+def _outer_corners(walls: Sequence[Wall]) -> list[Float[np.ndarray, "2"]]:
+    """Corners of the walls' outer faces; that of a sharp corner is cut at three thicknesses."""
+    corners = _offset(walls, np.full(len(walls), THICK_M))
+    cut = []
+    for wall, corner in zip(walls, corners, strict=True):
+        away = corner - wall.start_m
+        far = float(np.linalg.norm(away))
+        cut.append(wall.start_m + away * min(1.0, 3 * THICK_M / far))
+    return cut
+
+
+def _place_of(
+    opening: Opening, walls: Sequence[Wall]
+) -> tuple[int, tuple[float, float, float, float]]:
+    """The wall nearest to an opening that runs as the opening does, and the opening's span."""
+    start, end = np.array(opening.start_m), np.array(opening.end_m)
+    along = (end - start) / np.linalg.norm(end - start)
+    middle = shapely.Point((start + end) / 2)
+    costs = [
+        shapely.LineString([w.start_m, w.end_m]).distance(middle) + 10 * abs(along @ w.outward)
+        for w in walls
+    ]
+    row = int(np.argmin(costs))
+    wall = walls[row]
+    direction = (wall.end_m - wall.start_m) / np.linalg.norm(wall.end_m - wall.start_m)
+    low, high = sorted(float((point - wall.start_m) @ direction) for point in (start, end))
+    return row, (low, high, opening.bottom_m, opening.top_m)
+
+
+def _within(wall: Wall, height_m: float) -> Wall:
+    """The wall with its openings cut to its length and height."""
+    length = float(np.linalg.norm(wall.end_m - wall.start_m))
+    spans = (
+        (max(start, 0.0), min(end, length), max(bottom, 0.0), min(top, height_m))
+        for start, end, bottom, top in wall.openings
+    )
+    return wall._replace(openings=tuple(s for s in spans if s[0] < s[1] and s[2] < s[3]))
+
+
+def slab(outline_m: Float[np.ndarray, "corners 2"], low_m: float, high_m: float) -> Mesh:
+    """A closed mesh that fills an outline (x, z) between two heights."""
+    from manifold3d import CrossSection, FillRule
+
+    # The cross section lies in x and -z, and is extruded along y. Outlines run either way.
+    flat = CrossSection([np.asarray(outline_m, np.float64) * [1, -1]], FillRule.NonZero)
+    mesh = flat.extrude(high_m - low_m).to_mesh64()
+    points = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
+    placed = np.stack([points[:, 0], points[:, 2] + low_m, -points[:, 1]], axis=1)
+    return Mesh(placed, np.asarray(mesh.tri_verts, dtype=np.int64))
+
+
+def _wall_mesh(
+    wall: Wall,
+    outer: tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]],
+    height_m: float,
+) -> Mesh:
+    """A wall with mitred ends, from the floor slab's lower face to the ceiling, less openings."""
+    from manifold3d import Manifold
+
+    def prism(plan: Sequence[np.ndarray], low: float, high: float) -> Manifold:
+        corners = np.array([(x, y, z) for x, z in plan for y in (low, high)])
+        return Manifold.hull_points(corners)
+
+    solid = prism([wall.start_m, wall.end_m, *outer], -THICK_M, height_m + THICK_M)
+    direction = (wall.end_m - wall.start_m) / np.linalg.norm(wall.end_m - wall.start_m)
+    for start, end, bottom, top in wall.openings:
+        ends = [wall.start_m + direction * at for at in (start, end)]
+        deep = [end + wall.outward * side for end in ends for side in (-0.5, 0.5)]
+        solid = solid - prism(deep, bottom, top)
+    mesh = solid.to_mesh64()
+    vertices = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
+    return Mesh(vertices, np.asarray(mesh.tri_verts, dtype=np.int64))

@@ -1,0 +1,197 @@
+"""Prepares rooms for physics: objects stand on the floor or on other objects, and do not intersect.
+
+Generated rooms almost do: furniture may float by a centimetre, and a lifted chair may lack a leg,
+or reach into its table. Each change is counted.
+"""
+
+import itertools
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float
+
+from sceneprior.core.colliders import colliders, is_fixed, points_of
+from sceneprior.core.feet import with_feet
+from sceneprior.core.floor import floor_polygon
+from sceneprior.core.scene import Mesh, Scene, SceneObject
+
+GAP_M = 2e-3
+"""Distance between objects after they are pushed apart."""
+TOUCHING_M = 5e-4
+"""Largest overlap of two bodies that is left as it is."""
+RESTS_M = 0.15
+"""Largest distance between the lower face of an object and the top of another one on which it is
+then set; for objects above `FLOOR_M`."""
+FLOOR_M = 0.3
+"""Height of the lower face up to which an object is set on the floor."""
+SLABS = 8
+"""Number of slices into which a body that is a mesh is cut."""
+STEP_M, REACH_M = 0.05, 2.0
+"""Spacing and range, along x and z, of the moves that are tried for an object."""
+
+Boxes = Float[np.ndarray, "_ 2 3"]
+"""Lower and upper corners of the boxes around an object's bodies."""
+
+
+def stand(scene: Scene) -> tuple[Scene, Counter[str]]:
+    """Set down a scene's objects, give feet to those that would fall over, and move them apart.
+
+    Objects are set down in the order of their heights. Then, the largest first, each is moved to
+    the nearest place where it overlaps no earlier one, and it stays inside the floor if it was
+    inside. Lamps and pieces that hang on walls keep their heights.
+
+    Returns:
+        The scene, and the number of objects that were `set down`, `given feet`, `moved`, and `left
+        out` because there was no free place.
+    """
+    told: Counter[str] = Counter()
+    # Found once: convex parts of meshes take seconds.
+    bodily = tuple(replace(item, solids=colliders(item)) for item in scene.objects)
+    objects = _set_down(bodily, told)
+    objects = [item if is_fixed(item) else _on_feet(item, told) for item in objects]
+    kept = _apart(scene, objects, told)
+    return replace(scene, objects=tuple(kept)), told
+
+
+def body_boxes(item: SceneObject) -> Boxes:
+    """Boxes around the bodies of an object; bodies that are meshes are cut into slabs along x."""
+    boxes = []
+    for body in colliders(item):
+        if isinstance(body, Mesh):
+            boxes += _slabs(points_of(body))
+        else:
+            boxes.append(np.array([body.low_m, body.high_m]))
+    return np.array(boxes)
+
+
+def _slabs(points: Float[np.ndarray, "points 3"]) -> list[Float[np.ndarray, "2 3"]]:
+    """Boxes around slices of a convex body, which may stand at an angle."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    plan = shapely.convex_hull(shapely.MultiPoint(points[:, ::2]))
+    ends = np.linspace(low[0], high[0], SLABS + 1)
+    boxes = []
+    for start, end in itertools.pairwise(ends):
+        slice_ = shapely.clip_by_rect(plan, start, low[2], end, high[2])
+        if not slice_.is_empty:
+            _, near, _, far = slice_.bounds
+            boxes.append(np.array([[start, low[1], near], [end, high[1], far]]))
+    return boxes or [np.array([low, high])]
+
+
+def _set_down(objects: tuple[SceneObject, ...], told: Counter[str]) -> list[SceneObject]:
+    placed = list(objects)
+    bounds = [body_boxes(item) for item in objects]
+    bottoms = np.array([each[:, 0, 1].min() for each in bounds])
+    for row in np.argsort(bottoms, kind="stable"):
+        item, bottom = objects[row], bottoms[row]
+        if is_fixed(item):
+            continue
+        height = 0.0
+        if bottom > FLOOR_M:
+            tops = [
+                boxes[:, 1, 1].max()
+                for other, boxes in enumerate(bounds)
+                if other != row and _meets_in_plan(boxes, bounds[row])
+            ]
+            height = max((top for top in tops if abs(top - bottom) <= RESTS_M), default=0.0)
+        if abs(bottom - height) > 1e-6:
+            placed[row] = item.moved((0.0, float(height - bottom), 0.0))
+            bounds[row] = bounds[row] + np.array([0.0, height - bottom, 0.0])
+            told["set down"] += bool(abs(bottom - height) > 1e-3)
+    return placed
+
+
+def _meets_in_plan(boxes: Boxes, others: Boxes) -> bool:
+    (low, high), (other_low, other_high) = (
+        (each[:, 0, ::2].min(axis=0), each[:, 1, ::2].max(axis=0)) for each in (boxes, others)
+    )
+    return bool((np.minimum(high, other_high) - np.maximum(low, other_low) > 0).all())
+
+
+def _on_feet(item: SceneObject, told: Counter[str]) -> SceneObject:
+    standing = with_feet(item)
+    told["given feet"] += standing is not item
+    return standing
+
+
+def _apart(scene: Scene, objects: list[SceneObject], told: Counter[str]) -> list[SceneObject]:
+    floor = floor_polygon(scene)
+    kept: dict[int, SceneObject] = {}
+    taken = np.zeros((0, 2, 3))
+    order = np.argsort([-item.size_m[0] * item.size_m[2] for item in objects], kind="stable")
+    for row in order:
+        item = objects[row]
+        boxes = body_boxes(item)
+        offset = free_offset(boxes, taken, floor)
+        if offset is None:
+            told["left out"] += 1
+            continue
+        if offset.any():
+            told["moved"] += 1
+            item = item.moved((float(offset[0]), 0.0, float(offset[1])))
+            boxes = boxes + np.array([offset[0], 0.0, offset[1]])
+        kept[row] = item
+        taken = np.concatenate([taken, boxes])
+    return [kept[row] for row in range(len(objects)) if row in kept]
+
+
+def free_offset(
+    boxes: Boxes, taken: Boxes, floor: shapely.Geometry | None
+) -> Float[np.ndarray, "2"] | None:
+    """The shortest move along x and z after which no box overlaps a taken one; None if there is
+    none within `REACH_M`. The area outside the floor may not grow."""
+    still = np.zeros((1, 2))
+    if not _overlaps(boxes, taken, still, -TOUCHING_M)[0]:
+        return still[0]
+    steps = np.arange(-REACH_M, REACH_M + STEP_M / 2, STEP_M)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    tried = np.concatenate([_flush_moves(boxes, taken), grid])
+    tried = tried[np.argsort(np.abs(tried).sum(axis=1), kind="stable")]
+    outside = _area_outside(boxes, floor, still[0])
+    for some in np.array_split(tried, max(1, len(tried) // 256)):
+        for offset in some[~_overlaps(boxes, taken, some, GAP_M / 2)]:
+            if _area_outside(boxes, floor, offset) <= outside + 1e-4:
+                return np.asarray(offset)
+    return None
+
+
+def _flush_moves(boxes: Boxes, taken: Boxes) -> Float[np.ndarray, "moves 2"]:
+    """Moves along one axis after which a box is flush with a taken one."""
+    moves = []
+    for axis in (0, 2):
+        after = taken[None, :, 1, axis] - boxes[:, None, 0, axis] + GAP_M
+        before = taken[None, :, 0, axis] - boxes[:, None, 1, axis] - GAP_M
+        along = np.concatenate([after.ravel(), before.ravel()])
+        along = np.unique(along[np.abs(along) <= REACH_M].round(4))
+        columns = [along, np.zeros_like(along)]
+        moves.append(np.stack(columns if axis == 0 else columns[::-1], axis=1))
+    return np.concatenate(moves)
+
+
+def _overlaps(
+    boxes: Boxes, taken: Boxes, offsets: Float[np.ndarray, "moves 2"], gap_m: float
+) -> Bool[np.ndarray, " moves"]:
+    """True for moves after which a box is nearer than `gap_m` to a taken one."""
+    level = np.minimum(boxes[:, None, 1, 1], taken[None, :, 1, 1]) - np.maximum(
+        boxes[:, None, 0, 1], taken[None, :, 0, 1]
+    )
+    mine, theirs = np.nonzero(level > TOUCHING_M)
+    found = np.zeros(len(offsets), bool)
+    if not len(mine):
+        return found
+    low, high = boxes[mine, 0][:, ::2], boxes[mine, 1][:, ::2]
+    other_low, other_high = taken[theirs, 0][:, ::2], taken[theirs, 1][:, ::2]
+    moves = offsets[:, None]
+    deep = np.minimum(high + moves, other_high) - np.maximum(low + moves, other_low)
+    return np.asarray((deep > -gap_m).all(axis=2).any(axis=1))
+
+
+def _area_outside(
+    boxes: Boxes, floor: shapely.Geometry | None, offset: Float[np.ndarray, "2"]
+) -> float:
+    if floor is None:
+        return 0.0
+    low, high = boxes[:, 0].min(axis=0)[::2] + offset, boxes[:, 1].max(axis=0)[::2] + offset
+    return float(shapely.box(*low, *high).difference(floor).area)

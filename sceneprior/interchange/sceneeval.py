@@ -1,0 +1,99 @@
+"""Rooms as SceneEval's scene states: z up, metres, with their models and walls."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sceneprior.core.files import write_json, write_whole
+from sceneprior.core.scene import Mesh, Scene
+from sceneprior.core.shell import THICK_M, Shell, shell_of
+from sceneprior.render.scene_files import scene_to_glb
+from sceneprior.render.topdown import node_names, scene_meshes
+
+PREFIX = "sceneprior"
+"""Prefix of model ids, by which SceneEval finds the data set of the models."""
+Z_UP = {"up": [0, 0, 1], "front": [0, 1, 0]}
+
+
+def write_sceneeval(scenes: Sequence[Scene], folder: Path) -> None:
+    """Write `scene_<number>.json` in the order of the scenes, and `assets/<id>/` with the models.
+
+    `<id>.glb` is a model about the centre of its box, y up, and `data.json` its class; SceneEval's
+    data set class `layoutvlm_objathor` reads such folders. Objects are written as they are, without
+    being set down or moved apart.
+
+    Source:
+        github.com/3dlg-hcvc/SceneEval: GUIDE.md, scene_state_template.json and scenes/.
+    """
+    for number, scene in enumerate(scenes):
+        write_json(folder / f"scene_{number}.json", _scene_state(scene))
+        names, meshes = node_names(scene), scene_meshes(scene)
+        for name, item, mesh in zip(names, scene.objects, meshes, strict=True):
+            model = f"{scene.name}_{name}"
+            around = Mesh(mesh.vertices_m - np.asarray(item.center_m), mesh.faces)
+            alone = replace(scene, objects=(replace(item, mesh=around, solids=()),))
+            write_whole(folder / "assets" / model / f"{model}.glb", scene_to_glb(alone))
+            told = {"category": item.label, "description": item.label, "materials": []}
+            write_json(folder / "assets" / model / "data.json", {"annotations": told})
+
+
+def _scene_state(scene: Scene) -> dict[str, Any]:
+    objects = []
+    for index, (name, item) in enumerate(zip(node_names(scene), scene.objects, strict=True)):
+        x, y, z = item.center_m
+        # Column by column: +x stays, +y becomes up, +z becomes -y.
+        columns = [1, 0, 0, 0, 0, 0, 1, 0, 0, -1, 0, 0, x, -z, y, 1]
+        objects.append(
+            {
+                "index": index,
+                "id": name,
+                "modelId": f"{PREFIX}.{scene.name}_{name}",
+                "parentId": "",
+                "transform": {"rows": 4, "cols": 4, "data": [float(value) for value in columns]},
+            }
+        )
+    return {
+        "format": "sceneState",
+        "scene": {
+            "version": "scene@1.0.2", "id": scene.name, "unit": 1.0, **Z_UP,
+            "assetSource": [PREFIX], "arch": _architecture(scene.name, shell_of(scene)),
+            "object": objects, "modifications": [],
+        },
+        "selected": [],
+    }  # fmt: skip
+
+
+def _architecture(name: str, shell: Shell) -> dict[str, Any]:
+    room = {"roomId": "room", "materials": []}
+    floor = [[x, -z, 0.0] for x, z in shell.outline_m[::-1].tolist()]
+    elements: list[dict[str, Any]] = [
+        {"id": "floor", "type": "Floor", "points": floor, "depth": THICK_M, **room}
+    ]
+    for row, wall in enumerate(shell.walls):
+        length = float(np.linalg.norm(wall.end_m - wall.start_m))
+        # Seen with z up the outline runs the other way, so walls go from their ends.
+        points = [[float(x), -float(z), 0.0] for x, z in (wall.end_m, wall.start_m)]
+        holes = [
+            {
+                "id": f"hole_{row}_{number}",
+                "type": "Door" if bottom <= 0 else "Window",
+                "box": {"min": [length - end, bottom], "max": [length - start, top]},
+            }
+            for number, (start, end, bottom, top) in enumerate(wall.openings)
+        ]
+        elements.append(
+            {
+                "id": f"wall_{row}", "type": "Wall", "points": points, "height": shell.height_m,
+                "depth": THICK_M, "holes": holes, **room,
+            }
+        )  # fmt: skip
+    walls = [f"wall_{row}" for row in range(len(shell.walls))]
+    return {
+        "version": "arch@1.0.2", "id": name, "coords2d": [0, 1], "scaleToMeters": 1, **Z_UP,
+        "defaults": {"Wall": {"depth": THICK_M}, "Floor": {"depth": THICK_M}},
+        "elements": elements,
+        "regions": [{"id": "room", "type": "Other", "walls": walls}],
+    }  # fmt: skip

@@ -1,0 +1,99 @@
+"""Requested rooms as scenes, each with the wishes that hold in it."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene
+from sceneprior.core.seeds import check_seed
+from sceneprior.core.threads import single_threaded
+from sceneprior.lifted.requests.draw import Answer, draw_requested
+from sceneprior.lifted.requests.holding import Relations
+from sceneprior.lifted.requests.request import Request, make_request
+from sceneprior.lifted.requests.steps import furniture_of
+from sceneprior.lifted.sampled import drawn_by_sampler, scene_of
+from sceneprior.lifted.trained import TrainedLifted
+from sceneprior.paper.sampling import scene_names
+from sceneprior.paper.trained import TrainedPrior
+
+
+@single_threaded()
+def sample_requested(
+    trained: TrainedPrior,
+    asked: Mapping[str, Any],
+    count: int,
+    seed: int,
+    distribution: str | None = None,
+    name: str | None = None,
+) -> list[Scene]:
+    """New rooms as requested, drawn by a run's sampler.
+
+    Args:
+        asked: Arguments of `make_request`: floor, openings, ceiling_m, want and objects.
+        name: First part of the rooms' names; None names them by the seed.
+
+    Raises:
+        InputError: the run has no sampler, or no room holds the request.
+    """
+    check_seed(seed)
+    with_sampler = drawn_by_sampler(trained, distribution)
+    if with_sampler is None:
+        raise InputError(
+            "Floors and wishes can be asked of a sampler alone, and these rooms come from latents; "
+            "leave them out, or take a prior with a sampler."
+        )
+    assert with_sampler.sampler is not None, "drawn_by_sampler has asked"
+    classes = label_set(with_sampler.config.label_set)
+    request = _parsed(with_sampler, asked)
+    for item in request.objects:
+        if item.label not in classes[1:]:
+            raise InputError(
+                f"A given object is a '{item.label}', which this run does not know; its classes "
+                f"are {', '.join(classes[1:])}."
+            )
+    answers = draw_requested(with_sampler.sampler, request, classes, count, seed)
+    names = scene_names(count, seed)
+    if name is not None:
+        names = [f"{name}_{row:02d}" for row in range(count)]
+    return [
+        _scene(with_sampler, name, answer, request)
+        for name, answer in zip(names, answers, strict=True)
+    ]
+
+
+def _parsed(trained: TrainedLifted, asked: Mapping[str, Any]) -> Request:
+    assert trained.sampler is not None, "drawn_by_sampler has asked"
+    classes = label_set(trained.config.label_set)
+    known = [classes[row] for row in trained.sampler.drawn_classes]
+    return make_request(known, trained.config.label_set, **asked)
+
+
+def _scene(trained: TrainedLifted, name: str, answer: Answer, request: Request) -> Scene:
+    scene = scene_of(trained, name, answer.room, 0)
+    counts = Counter(item.label for item in scene.objects)
+    shape, asked = answer.plan.shape, request.wishes
+    relations = Relations(asked.relations, shape, label_set(scene.label_set))
+    assert trained.sampler is not None, "which drew the answer"
+    held = relations.held(furniture_of(trained.sampler, answer.room, 0))
+    wishes = [{"wish": str(wish), "holds": wish.holds(counts[wish.label])} for wish in asked.counts]
+    wishes += [
+        {"wish": str(wish), "holds": holds}
+        for wish, holds in zip(asked.relations, held, strict=True)
+    ]
+    given = request.objects
+    return replace(
+        scene,
+        objects=tuple(
+            # Given objects as they were, with the mesh of a look if they had none.
+            replace(own, mesh=drawn.mesh, solids=drawn.solids) if own.mesh is None else own
+            for own, drawn in zip(given, scene.objects, strict=False)
+        )
+        + scene.objects[len(given) :],
+        floor_m=shape.outline_m,
+        openings=shape.openings,
+        ceiling_m=shape.ceiling_m,
+        extra={"wishes": wishes, **({"given": list(range(len(given)))} if given else {})},
+    )

@@ -1,0 +1,99 @@
+"""Which wished relations hold in a room, and which can still hold in a partly furnished one."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sceneprior.lifted.requests.relations import (
+    FRONTS,
+    OPENINGS,
+    Items,
+    opening_items,
+    related,
+    related_to_room,
+)
+from sceneprior.lifted.requests.shape import RoomShape
+from sceneprior.lifted.requests.wishes import RelationWish
+
+
+class Furniture(NamedTuple):
+    """Objects of a room, with their classes; all arrays have a row per object."""
+
+    boxes_m: Float[np.ndarray, "objects 6"]
+    """Centre and full extents."""
+    object_class: Int[np.ndarray, " objects"]
+    back: Int[np.ndarray, " objects"]
+    """Side of the back: 0 to 3 for low z, low x, high z, high x."""
+
+    def items(self, classes: Sequence[str]) -> Items:
+        """The objects as things that relations hold between."""
+        is_lamp = np.array(["lamp" in classes[index] for index in self.object_class], dtype=bool)
+        return Items(self.boxes_m, FRONTS[self.back], is_lamp)
+
+
+class Relations:
+    """Wished relations of one room.
+
+    Args:
+        wishes: The wishes.
+        shape: Floor, doors and windows.
+        classes: Names of the classes by index.
+    """
+
+    def __init__(self, wishes: Sequence[RelationWish], shape: RoomShape, classes: Sequence[str]):
+        self.wishes, self.shape, self.classes = wishes, shape, classes
+        self.openings = {kind: opening_items(shape, kind) for kind in OPENINGS}
+
+    def held(self, furniture: Furniture) -> list[bool]:
+        """Whether each wish holds in a furnished room."""
+        items = furniture.items(self.classes)
+        return [
+            int(self._met(wish, items, furniture.object_class).sum()) >= wish.count
+            for wish in self.wishes
+        ]
+
+    def can_hold(
+        self, label: int, candidates: Furniture, standing: Furniture, coming: Sequence[int]
+    ) -> Bool[np.ndarray, " candidates"]:
+        """Which places of the next object leave every wish possible.
+
+        A wish is possible while objects that come later could still meet it; which of them find
+        such a place is not known yet.
+        """
+        possible = np.ones(len(candidates.back), dtype=bool)
+        name = self.classes[label]
+        for wish in self.wishes:
+            if name not in (wish.subject, wish.target):
+                continue
+            later = [self.classes[index] for index in coming]
+            if wish.target in later:
+                continue
+            needed = wish.count - later.count(wish.subject)
+            for row in np.flatnonzero(possible):
+                joined = Furniture(*(
+                    np.concatenate([part, own[row : row + 1]])
+                    for part, own in zip(standing, candidates, strict=True)
+                ))  # fmt: skip
+                met = self._met(wish, joined.items(self.classes), joined.object_class)
+                possible[row] = met.sum() >= needed
+        return possible
+
+    def _met(
+        self, wish: RelationWish, items: Items, object_class: Int[np.ndarray, " objects"]
+    ) -> Bool[np.ndarray, " subjects"]:
+        """Which objects of the subject's class meet a wish."""
+        names = np.array([self.classes[index] for index in object_class], dtype=object)
+        own = np.flatnonzero(names == wish.subject)
+        subjects = items.rows(own)
+        if wish.target is None:
+            return related_to_room(wish.relation, subjects, self.shape)
+        if wish.target in OPENINGS:
+            there = self.openings[wish.target]
+            found = related(wish.relation, subjects, there, wish.target == "window")
+        else:
+            theirs = np.flatnonzero(names == wish.target)
+            found = related(wish.relation, subjects, items.rows(theirs))
+            found &= own[:, None] != theirs[None]
+        return np.asarray(found.any(axis=1))

@@ -1,0 +1,217 @@
+"""Doors and windows of requests: where they are, and what must stay free before them."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Opening
+from sceneprior.core.scene_json import check_openings
+from sceneprior.lifted.requests.shape import RoomShape, Side, sides_of
+
+DOOR_M = (0.9, 0.0, 2.0)
+"""Width, lower edge and upper edge of a door that is given without them."""
+WINDOW_M = (1.2, 0.9, 2.1)
+MARGIN_M = 0.1
+"""Distance of drawn doors and windows from the ends of their wall and from each other."""
+BEFORE_WINDOW_M = 0.4
+"""Depth of the floor before a window on which nothing is taller than its sill."""
+MOST_OPENINGS = 50
+PLACES = 50
+"""Places drawn for a door or a window."""
+COMPASS = {"north": (0.0, -1.0), "east": (1.0, 0.0), "south": (0.0, 1.0), "west": (-1.0, 0.0)}
+"""Names of walls, by the direction (x, z) out of the room: north is the upper side of a top-down
+picture."""
+_TEXT = re.compile(r"\s*(door|window)s?(?:\s*@\s*(\w+)(?:\s*:\s*(\d+\.?\d*))?)?\s*")
+
+Openings = str | Sequence[Any]
+
+
+@dataclass(frozen=True)
+class WantedOpening:
+    """A door or a window whose place is drawn, as far as it is not requested."""
+
+    kind: Literal["door", "window"]
+    wall: str | int | None = None
+    """A name of `COMPASS`, the number of a side of the floor, or None for any."""
+    at_m: float | None = None
+    """Distance of its middle from the wall's first end: the western or northern one of a named
+    wall."""
+
+
+def read_openings(openings: Openings) -> tuple[Opening | WantedOpening, ...]:
+    """Doors and windows from text or a list.
+
+    Text is `door`, `door@north`, `door@2` (the side from corner 2 of the floor) or
+    `window@south:1.5` (its middle 1.5 m from the wall's western or northern end), several with
+    commas between. Entries of a list are such texts, `Opening`s, or mappings with the keys of a
+    scene's JSON.
+
+    Raises:
+        InputError: an entry is none of these.
+    """
+    entries = openings.split(",") if isinstance(openings, str) else list(openings)
+    if len(entries) > MOST_OPENINGS:
+        raise InputError(
+            f"The request has {len(entries)} openings; expected at most {MOST_OPENINGS}."
+        )
+    return tuple(_read_opening(entry) for entry in entries)
+
+
+def _read_opening(entry: Any) -> Opening | WantedOpening:
+    if isinstance(entry, Opening):
+        return entry
+    if isinstance(entry, Mapping):
+        try:
+            start, end = (tuple(map(float, entry[key])) for key in ("start_m", "end_m"))
+            _, bottom, top = DOOR_M if entry["kind"] == "door" else WINDOW_M
+            bottom, top = float(entry.get("bottom_m", bottom)), float(entry.get("top_m", top))
+            if entry["kind"] in ("door", "window") and len(start) == len(end) == 2:
+                return Opening(entry["kind"], start, end, bottom, top)
+        except (KeyError, TypeError, ValueError):
+            pass
+        raise InputError(
+            f"An opening is {str(dict(entry))[:80]}; expected kind (door or window), start_m and "
+            "end_m as [x, z], and bottom_m and top_m where they differ from the usual."
+        )
+    found = _TEXT.fullmatch(entry) if isinstance(entry, str) else None
+    if found is None or not (found[2] is None or found[2] in COMPASS or found[2].isdecimal()):
+        raise InputError(
+            f"An opening is {str(entry)[:40]!r}; expected door, window@north or door@south:1.5 (a "
+            f"wall is {', '.join(COMPASS)} or a number; then metres along it)."
+        )
+    wall = int(found[2]) if found[2] and found[2].isdecimal() else found[2]
+    at_m = None if found[3] is None else float(found[3])
+    kind: Literal["door", "window"] = "door" if found[1] == "door" else "window"
+    return WantedOpening(kind, wall, at_m)
+
+
+def moved(
+    openings: Sequence[Opening | WantedOpening], by_m: Float[np.ndarray, "2"]
+) -> tuple[Opening | WantedOpening, ...]:
+    """Openings of a floor that is moved (x, z)."""
+    return tuple(
+        each._replace(
+            start_m=(each.start_m[0] + by_m[0], each.start_m[1] + by_m[1]),
+            end_m=(each.end_m[0] + by_m[0], each.end_m[1] + by_m[1]),
+        )
+        if isinstance(each, Opening)
+        else each
+        for each in openings
+    )
+
+
+def place_openings(
+    outline_m: Float[np.ndarray, "corners 2"],
+    wanted: Sequence[Opening | WantedOpening],
+    draws: np.random.Generator,
+) -> tuple[Opening, ...]:
+    """Doors and windows of one room; those without a place are drawn, longer walls more often.
+
+    Raises:
+        InputError: one lies on no side of the floor, or finds no free wall.
+    """
+    sides = sides_of(outline_m)
+    placed = [each for each in wanted if isinstance(each, Opening)]
+    check_openings("The request", outline_m, placed)
+    for each in sorted(
+        (each for each in wanted if isinstance(each, WantedOpening)),
+        key=lambda each: (each.at_m is None, each.wall is None),
+    ):
+        placed.append(_placed(each, sides, placed, draws))
+    return tuple(placed)
+
+
+def _placed(
+    wanted: WantedOpening, sides: list[Side], there: list[Opening], draws: np.random.Generator
+) -> Opening:
+    width_m, bottom_m, top_m = DOOR_M if wanted.kind == "door" else WINDOW_M
+    choice = _walls(wanted, sides)
+    room_m = np.array([max(side.length_m - width_m - 2 * MARGIN_M, 0.0) for side in choice])
+    taken = [shapely.LineString([each.start_m, each.end_m]) for each in there]
+    where = f"on {wanted.wall} " if wanted.wall is not None else ""
+    for _ in range(PLACES):
+        if wanted.at_m is not None:
+            side, at_m = choice[0], wanted.at_m
+            if not width_m / 2 <= at_m <= side.length_m - width_m / 2:
+                raise InputError(
+                    f"A {wanted.kind} {where}is {at_m:g} m along a wall of {side.length_m:.2f} m; "
+                    f"it is {width_m:g} m wide and must lie in the wall."
+                )
+        elif room_m.sum() > 0:
+            row = draws.choice(len(choice), p=room_m / room_m.sum())
+            side = choice[row]
+            at_m = width_m / 2 + MARGIN_M + room_m[row] * draws.random()
+        else:
+            break
+        along = (side.end_m - side.start_m) / side.length_m
+        first, last = (side.start_m + along * (at_m + s * width_m / 2) for s in (-1, 1))
+        line = shapely.LineString([first, last])
+        if all(line.distance(other) >= MARGIN_M for other in taken):
+            return Opening(wanted.kind, _pair(first), _pair(last), bottom_m, top_m)
+        if wanted.at_m is not None:
+            break
+    raise InputError(
+        f"A {wanted.kind} {where}finds no free wall of {width_m + 2 * MARGIN_M:g} m; the floor is "
+        "too small for its doors and windows, or they are in each other's way."
+    )
+
+
+def _walls(wanted: WantedOpening, sides: list[Side]) -> list[Side]:
+    """Sides that an opening may lie on; a named wall runs from west to east or north to south."""
+    if wanted.wall is None:
+        return sides if wanted.at_m is None else sides[:1]
+    if isinstance(wanted.wall, int):
+        if wanted.wall >= len(sides):
+            raise InputError(
+                f"A {wanted.kind} is on side {wanted.wall}, but the floor has sides 0 to "
+                f"{len(sides) - 1}."
+            )
+        return [sides[wanted.wall]]
+    outwards = np.array(COMPASS[wanted.wall])
+    facing = [side for side in sides if -side.inward @ outwards > np.cos(np.pi / 4) - 1e-6]
+    if not facing:
+        raise InputError(f"The floor has no wall in the {wanted.wall}; name it by its number.")
+    longest = max(facing, key=lambda side: side.length_m)
+    backwards = (longest.end_m - longest.start_m).sum() < 0
+    return [Side(longest.end_m, longest.start_m, longest.inward) if backwards else longest]
+
+
+def _pair(point: Float[np.ndarray, "2"]) -> tuple[float, float]:
+    return float(point[0]), float(point[1])
+
+
+class Zone(NamedTuple):
+    """Floor before an opening, over which furniture must not reach into a range of heights."""
+
+    polygon: shapely.Polygon
+    from_m: float
+    to_m: float
+
+
+def zones_of(shape: RoomShape) -> dict[str, list[Zone]]:
+    """What must stay free, by kind: the volume that a door swings through, which is as deep as it
+    is wide, and the space before a window above its sill."""
+    zones: dict[str, list[Zone]] = {"door": [], "window": []}
+    for each in shape.openings:
+        start, end = np.array(each.start_m), np.array(each.end_m)
+        depth = np.linalg.norm(end - start) if each.kind == "door" else BEFORE_WINDOW_M
+        into = depth * inward_of(shape, each)
+        # 1 cm less on all sides, so that furniture may touch it.
+        polygon = shapely.Polygon([start, end, end + into, start + into]).buffer(-0.01)
+        low_m = 0.0 if each.kind == "door" else each.bottom_m
+        zones[each.kind].append(Zone(polygon, low_m, each.top_m))
+    return zones
+
+
+def inward_of(shape: RoomShape, opening: Opening) -> Float[np.ndarray, "2"]:
+    """Unit normal into the room of the side that a door or window is in."""
+    middle = shapely.Point(np.mean([opening.start_m, opening.end_m], axis=0))
+    sides = sides_of(shape.outline_m)
+    lines = [shapely.LineString([side.start_m, side.end_m]) for side in sides]
+    return sides[int(np.argmin(shapely.distance(lines, middle)))].inward

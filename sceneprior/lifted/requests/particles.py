@@ -1,0 +1,98 @@
+"""Partly furnished rooms, several for each requested room: the particles of sequential Monte
+Carlo."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.requests.plans import RoomPlan
+from sceneprior.lifted.sampler.draw import read_rooms
+from sceneprior.lifted.sampler.network import RoomSampler
+from sceneprior.lifted.sampler.reading import Reading
+
+PARTICLES = 6
+"""Particles of a room. More meet rarer wishes in one attempt, in proportionally more time."""
+
+
+@dataclass
+class Particles:
+    """Particles of several rooms; those of room r are rows r * `PARTICLES` and following."""
+
+    plans: Sequence[RoomPlan]
+    rooms: RoomBoxes
+    number: Int[Tensor, " rows"]
+    """Objects placed so far."""
+    coming: Int[Tensor, "rows slots"]
+    """Classes to place, one a step; 0 for none."""
+    rectangle_m: Float[Tensor, "rows 4"]
+    """Bounding rectangle of each room's floor."""
+    alive: Bool[np.ndarray, " rows"]
+    """False for particles without a place for an object, until they are replaced."""
+
+    @property
+    def looks(self) -> Int[Tensor, "rows slots"]:
+        """Look of each object."""
+        assert self.rooms.looks is not None
+        return self.rooms.looks
+
+    def plan(self, row: int) -> RoomPlan:
+        """The plan of a particle's room."""
+        return self.plans[row // PARTICLES]
+
+    def rows_of(self, room: int) -> np.ndarray:
+        """Rows of a room's particles."""
+        return np.arange(room * PARTICLES, (room + 1) * PARTICLES)
+
+    def read(self, sampler: RoomSampler, rows: Int[Tensor, " some"], step: int) -> Reading:
+        """The encoder's outputs for some particles before a step."""
+        return read_rooms(
+            sampler, self.rooms.changed(lambda part: part[rows]), self.number[rows],
+            self.rectangle_m[rows], self.coming[rows, step:],
+        )  # fmt: skip
+
+    def place(self, row: int, label: int, look: int, box_m: Float[Tensor, "6"]) -> None:
+        """Add an object to a particle."""
+        at = row, int(self.number[row])
+        self.rooms.object_class[at], self.rooms.is_object[at] = label, True
+        self.rooms.boxes_m[at], self.looks[at] = box_m, look
+        self.number[row] += 1
+
+    def replace_dead(self, room: int, draws: np.random.Generator) -> None:
+        """Resample a room's particles: each dead one becomes a copy of a random living one."""
+        rows = self.rows_of(room)
+        dead, living = rows[~self.alive[rows]], rows[self.alive[rows]]
+        chosen = living[draws.integers(len(living), size=PARTICLES)[: len(dead)]]
+        for part in (
+            self.rooms.object_class, self.rooms.is_object, self.rooms.boxes_m, self.looks,
+            self.number,
+        ):  # fmt: skip
+            part[torch.from_numpy(dead)] = part[torch.from_numpy(chosen)]
+        self.alive[dead] = True
+
+
+def begin(sampler: RoomSampler, plans: Sequence[RoomPlan], given: RoomBoxes) -> Particles:
+    """Particles with the given objects alone.
+
+    Args:
+        given: One room with looks, in as many slots as rooms have.
+    """
+    rows = len(plans) * PARTICLES
+    assert given.looks is not None and given.is_object.shape == (1, sampler.max_objects)
+    rooms = given.changed(lambda part: part.repeat_interleave(rows, dim=0))
+    coming = [
+        F.pad(torch.tensor(plan.coming).long(), (0, sampler.max_objects - len(plan.coming)))
+        for plan in plans
+    ]
+    rectangles = [torch.from_numpy(plan.shape.rectangle_m).float() for plan in plans]
+    return Particles(
+        plans, rooms, rooms.is_object.sum(dim=1),
+        torch.stack(coming).repeat_interleave(PARTICLES, dim=0),
+        torch.stack(rectangles).repeat_interleave(PARTICLES, dim=0),
+        np.ones(rows, dtype=bool),
+    )  # fmt: skip

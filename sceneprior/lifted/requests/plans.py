@@ -1,0 +1,106 @@
+"""Plans of requested rooms: shape, classes to add and their order, drawn before any object."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from sceneprior.core.errors import InputError
+from sceneprior.lifted.requests.contents import draw_contents, wanted_rows
+from sceneprior.lifted.requests.openings import place_openings
+from sceneprior.lifted.requests.request import Request
+from sceneprior.lifted.requests.shape import RoomShape
+from sceneprior.lifted.sampler.network import RoomSampler
+
+RECTANGLES = 16
+"""Rectangles drawn for a room without a requested floor; it takes the first that is large enough
+for the wanted objects, or else the largest."""
+FULL_SHARE = 0.5
+"""Largest share of a drawn floor that the mean footprints of wanted and given objects may cover."""
+CROWDED_SHARE = 1.2
+"""Share of a requested floor above which the smallest footprints of these objects are taken not to
+fit. It is above 1, because some objects may intersect, such as a chair and its table."""
+
+
+class RoomPlan(NamedTuple):
+    """Conditions of one room."""
+
+    shape: RoomShape
+    coming: list[int]
+    """Indices of the classes to add, in the order in which they are placed."""
+    wanted: list[bool]
+    """Whether the wishes need the object."""
+
+
+def plan_room(
+    sampler: RoomSampler,
+    request: Request,
+    classes: tuple[str, ...],
+    draws: tuple[np.random.Generator, np.random.Generator],
+    wanted_first: bool,
+) -> RoomPlan:
+    """Draw a room's shape, as far as it is not requested, and its contents.
+
+    Classes with large footprints come first, as in training; with `wanted_first`, all others come
+    after those that the wishes need.
+
+    Args:
+        draws: Random numbers of the shape, the same in all attempts at a room, and of the contents.
+    """
+    given = [classes.index(item.label) for item in request.objects]
+    wanted = wanted_rows(request.wishes, classes, given)
+    shape = _shape(sampler, request, [*given, *wanted], draws[0])
+    uniform = draws[1].random(sampler.max_objects)
+    coming = draw_contents(sampler, request.wishes, classes, given, shape.extents_m, uniform)
+    is_wanted = np.arange(len(coming)) < len(wanted)
+    footprints_m2 = sampler.footprints_m2.numpy()[coming] if coming else np.zeros(0)
+    order = np.lexsort([-footprints_m2, ~is_wanted & wanted_first])
+    return RoomPlan(shape, [coming[k] for k in order], [bool(is_wanted[k]) for k in order])
+
+
+def _shape(
+    sampler: RoomSampler, request: Request, needed: list[int], draws: np.random.Generator
+) -> RoomShape:
+    if request.outline_m is not None:
+        return _with_openings(request.outline_m, request, draws)
+    needed_m2 = float(sampler.footprints_m2[needed].sum()) / FULL_SHARE
+    numbers = torch.from_numpy(draws.random((RECTANGLES, 5))).float()
+    noise = torch.special.ndtri(numbers[:, 1:].clamp(1e-6, 1 - 1e-6))
+    rectangles_m = sampler.rectangles(numbers[:, 0], noise).double().numpy()
+    areas_m2 = rectangles_m[:, 2:].prod(axis=1)
+    enough = areas_m2 >= needed_m2
+    x, z = rectangles_m[int(enough.argmax() if enough.any() else areas_m2.argmax()), 2:] / 2
+    if request.objects:  # no wall runs through what is there
+        boxes_m = np.array([[*item.center_m, *item.size_m] for item in request.objects])
+        reach = (np.abs(boxes_m[:, [0, 2]]) + boxes_m[:, [3, 5]] / 2).max(axis=0)
+        x, z = max(x, reach[0]), max(z, reach[1])
+    return _with_openings(np.array([[-x, -z], [x, -z], [x, z], [-x, z]]), request, draws)
+
+
+def _with_openings(
+    outline_m: np.ndarray, request: Request, draws: np.random.Generator
+) -> RoomShape:
+    openings = place_openings(outline_m, request.openings, draws)
+    return RoomShape(outline_m, openings, request.ceiling_m)
+
+
+def check_area(sampler: RoomSampler, request: Request, classes: tuple[str, ...]) -> None:
+    """Refuse wishes that need more floor than the request has.
+
+    Raises:
+        InputError: the smallest looks of the wanted objects cover `CROWDED_SHARE` of the floor.
+    """
+    if request.outline_m is None:
+        return
+    area_m2 = RoomShape(request.outline_m).polygon.area
+    given = [classes.index(item.label) for item in request.objects]
+    least_m2 = 0.0
+    for index in wanted_rows(request.wishes, classes, given):
+        sizes = sampler.look_shown[sampler.look_class == index, -3:].exp()
+        on_floor = sizes[:, [0, 2]].prod(dim=-1)
+        least_m2 += float(on_floor.min()) if len(on_floor) else 0.0
+    if least_m2 > CROWDED_SHARE * area_m2:
+        raise InputError(
+            f"The wanted objects cover {least_m2:.1f} square metres at their smallest, but the "
+            f"floor has {area_m2:.1f}; ask for fewer, or for a larger floor."
+        )

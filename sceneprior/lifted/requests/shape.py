@@ -1,0 +1,191 @@
+"""The shape of a requested room: the outline of its floor, and the rectangles that fit into it."""
+
+import re
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Opening
+from sceneprior.core.scene_json import check_floor
+
+NARROWEST_M = 0.3
+"""Minimum side of a rectangle in which furniture is placed."""
+SPACING_M = 0.25
+"""Distance between the points on slanted sides at which rectangles may end."""
+NEW_SHARE = 0.01
+"""Share of the floor that a rectangle must cover beyond the larger ones to be kept."""
+LEAST_AREA_M2 = 1.0
+"""Smallest floor that can be requested."""
+_SIZE = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(?:m\s*)?[xX×]\s*(\d+\.?\d*|\.\d+)\s*m?\s*")
+
+
+class RoomShape:
+    """A floor with its doors and windows, in metres (x, z); walls stand on the floor's sides.
+
+    Args:
+        outline_m: Corners of the floor.
+        openings: Doors and windows, each on one side of the outline.
+        ceiling_m: Height of the ceiling; None if unknown.
+    """
+
+    def __init__(
+        self,
+        outline_m: Float[np.ndarray, "corners 2"],
+        openings: Sequence[Opening] = (),
+        ceiling_m: float | None = None,
+    ):
+        self.outline_m, self.openings, self.ceiling_m = outline_m, tuple(openings), ceiling_m
+        self.polygon = shapely.Polygon(outline_m)
+        shapely.prepare(self.polygon)
+
+    @cached_property
+    def rectangles_m(self) -> Float[np.ndarray, "rectangles 4"]:
+        """Axis-aligned rectangles in the floor (centre x, z and extents x, z), largest first,
+        each with floor that the larger ones lack (`NEW_SHARE`)."""
+        return inner_rectangles(self.polygon)
+
+    @property
+    def is_rectangle(self) -> bool:
+        """Whether the floor is one rectangle along the axes."""
+        low_x, low_z, high_x, high_z = self.polygon.bounds
+        whole = (high_x - low_x) * (high_z - low_z)
+        return bool(abs(whole - self.polygon.area) < 1e-6 * whole)
+
+    @property
+    def rectangle_m(self) -> Float[np.ndarray, "4"]:
+        """The floor's bounding rectangle: centre x, z and extents x, z."""
+        low_x, low_z, high_x, high_z = self.polygon.bounds
+        return np.array(
+            [(low_x + high_x) / 2, (low_z + high_z) / 2, high_x - low_x, high_z - low_z]
+        )
+
+    @property
+    def extents_m(self) -> Float[np.ndarray, "2"]:
+        """Extents of the bounding rectangle, scaled to the area of the floor; the room's contents
+        are drawn given these."""
+        extents_m = self.rectangle_m[2:]
+        return np.asarray(extents_m * np.sqrt(self.polygon.area / extents_m.prod()))
+
+
+class Side(NamedTuple):
+    """A side of a floor."""
+
+    start_m: Float[np.ndarray, "2"]
+    end_m: Float[np.ndarray, "2"]
+    inward: Float[np.ndarray, "2"]
+    """Unit normal towards the room."""
+
+    @property
+    def length_m(self) -> float:
+        """Its length."""
+        return float(np.linalg.norm(self.end_m - self.start_m))
+
+
+def sides_of(outline_m: Float[np.ndarray, "corners 2"]) -> list[Side]:
+    """The sides of an outline, in its order: the first leads from corner 0 to corner 1."""
+    following = np.roll(outline_m, -1, axis=0)
+    x, z = outline_m.T
+    area = (x * following[:, 1] - following[:, 0] * z).sum()
+    sides = []
+    for start, end in zip(outline_m, following, strict=True):
+        along = (end - start) / max(np.linalg.norm(end - start), 1e-9)
+        sides.append(Side(start, end, np.array([-along[1], along[0]]) * np.sign(area)))
+    return sides
+
+
+def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
+    """The outline (corners, 2) of a requested floor: `4x3` (metres along x and z, the origin at its
+    centre), or a list of corners [x, z] in order.
+
+    Example:
+
+        >>> read_floor("4x3").tolist()
+        [[-2.0, -1.5], [2.0, -1.5], [2.0, 1.5], [-2.0, 1.5]]
+
+    Raises:
+        InputError: it is neither, intersects itself, or has less than `LEAST_AREA_M2`.
+    """
+    if isinstance(floor, str):
+        found = _SIZE.fullmatch(floor)
+        if found is None:
+            raise InputError(
+                f"The floor is '{floor[:60]}'; expected its size in metres, such as 4x3, a list of "
+                "corners [x, z], or a file with a floor."
+            )
+        x, z = (float(side) / 2 for side in found.groups())
+        floor = [(-x, -z), (x, -z), (x, z), (-x, z)]
+    try:
+        outline_m = np.array(floor, dtype=np.float64)
+    except (TypeError, ValueError):
+        outline_m = np.zeros(0)
+    if outline_m.ndim != 2 or len(outline_m) < 3 or outline_m.shape[1] != 2:
+        raise InputError(
+            "The floor is no polygon; expected at least 3 corners [x, z] in metres, in order."
+        )
+    check_floor("The request", outline_m)
+    if (outline_m[0] == outline_m[-1]).all():
+        outline_m = outline_m[:-1]
+    polygon = shapely.Polygon(outline_m)
+    if not polygon.is_valid:
+        raise InputError(
+            f"The floor's outline intersects itself ({shapely.is_valid_reason(polygon)}); list "
+            "its corners in order round the room."
+        )
+    if polygon.area < LEAST_AREA_M2:
+        raise InputError(
+            f"The floor has {polygon.area:.2g} square metres; expected at least "
+            f"{LEAST_AREA_M2:g}. Sides are in metres."
+        )
+    return outline_m
+
+
+def inner_rectangles(polygon: shapely.Polygon) -> Float[np.ndarray, "rectangles 4"]:
+    """See `RoomShape.rectangles_m`. Rectangles end at corners and, on slanted sides, every
+    `SPACING_M`."""
+    lines = shapely.segmentize(polygon, SPACING_M).exterior.coords
+    points = np.array([*polygon.exterior.coords, *lines])
+    slanted = ~_axis_aligned(polygon)
+    corners = points if slanted else np.array(polygon.exterior.coords)
+    x, z = (np.unique(corners[:, axis].round(3)) for axis in (0, 1))
+    room = polygon.buffer(2e-3, join_style="mitre")  # coordinates were rounded
+    shapely.prepare(room)
+    cells = shapely.box(x[:-1, None], z[None, :-1], x[1:, None], z[None, 1:])
+    free = shapely.covers(room, cells)
+    covered = np.pad(free, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
+    x0, x1 = np.triu_indices(len(x), 1)
+    z0, z1 = np.triu_indices(len(z), 1)
+    inside = (
+        covered[x1[:, None], z1] - covered[x0[:, None], z1]
+        - covered[x1[:, None], z0] + covered[x0[:, None], z0]
+    )  # fmt: skip
+    full = np.zeros((len(x) + 2,) * 2 + (len(z) + 2,) * 2, dtype=bool)  # from x, to x, z and z
+    cells_within = (x1 - x0)[:, None] * (z1 - z0)
+    full[x0[:, None] + 1, x1[:, None] + 1, z0 + 1, z1 + 1] = inside == cells_within
+    inner = full[1:-1, 1:-1, 1:-1, 1:-1]
+    larger = full[:-2, 1:-1, 1:-1, 1:-1] | full[1:-1, 2:, 1:-1, 1:-1]
+    larger |= full[1:-1, 1:-1, :-2, 1:-1] | full[1:-1, 1:-1, 1:-1, 2:]
+    x0, x1, z0, z1 = np.nonzero(inner & ~larger)
+    low, high = np.stack([x[x0], z[z0]], axis=1), np.stack([x[x1], z[z1]], axis=1)
+    areas = np.diff(x)[:, None] * np.diff(z)
+    kept: list[int] = []
+    for row in np.argsort(-(high - low).prod(axis=1), kind="stable"):
+        own = np.s_[x0[row] : x1[row], z0[row] : z1[row]]
+        new = (areas[own] * free[own]).sum() >= NEW_SHARE * polygon.area
+        if new and (high[row] - low[row]).min() >= NARROWEST_M:
+            kept.append(int(row))
+            free[own] = False
+    if not kept:
+        raise InputError(
+            f"The floor is nowhere {NARROWEST_M:g} m wide along both axes; furniture has no place."
+        )
+    return np.concatenate([(low + high) / 2, high - low], axis=1)[kept]
+
+
+def _axis_aligned(polygon: shapely.Polygon) -> bool:
+    along = np.abs(np.diff(np.array(polygon.exterior.coords), axis=0))
+    return bool((along.min(axis=1) < 1e-3).all())

@@ -1,0 +1,189 @@
+"""One step of sequential Monte Carlo: the next object of each particle takes a place that the
+request allows."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sceneprior.core.mixtures import draw_index
+from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.requests.holding import Furniture
+from sceneprior.lifted.requests.judge import Judge
+from sceneprior.lifted.requests.particles import PARTICLES, Particles
+from sceneprior.lifted.requests.search import Piece, search
+from sceneprior.lifted.sampler.draw import SIZE_RANGE
+from sceneprior.lifted.sampler.frames import backs_of
+from sceneprior.lifted.sampler.network import RoomSampler
+from sceneprior.lifted.sampler.places import Places
+from sceneprior.lifted.sampler.reading import Frame, Reading
+from sceneprior.lifted.sampler.violations import settled, violation
+
+TRIES = 4
+"""Places drawn for an object in each particle, which takes the first that fits."""
+HANGING = ("ceiling_lamp", "pendant_lamp")
+"""Classes that hang from the ceiling, where its height is known."""
+
+Hurdles = Counter[tuple[int, str]]
+"""How often an object of a class found no place, by what was in the way."""
+
+
+class Proposal(NamedTuple):
+    """Next objects of particles, and the distributions of their places."""
+
+    rows: Int[Tensor, " some"]
+    label: Int[Tensor, " some"]
+    look: Int[Tensor, " some"]
+    size_m: Float[Tensor, "some 3"]
+    bottom_m: Float[Tensor, " some"]
+    reading: Reading
+    """The encoder's outputs, with the rectangle in the floor that each object stands in as the
+    frame."""
+    places: Places
+
+
+def place_next(
+    sampler: RoomSampler,
+    particles: Particles,
+    judges: Sequence[Judge],
+    step: int,
+    draws: Sequence[np.random.Generator],
+    hanging: Sequence[int],
+    hurdles: Hurdles,
+) -> None:
+    """Place the next object in all living particles; those without a place die.
+
+    Args:
+        judges, draws: One a room.
+        hanging: Indices of `HANGING`.
+        hurdles: What was in the way, added to.
+    """
+    chance = np.concatenate([each.random((PARTICLES, 7 + 4 * TRIES)) for each in draws])
+    going = particles.alive & (particles.coming[:, step] != 0).numpy()
+    rows = torch.from_numpy(np.flatnonzero(going))
+    if not len(rows):
+        return
+    found = _propose(sampler, particles, rows, step, chance, hanging)
+    waiting = _draw_places(sampler, particles, judges, found, step, chance, hurdles)
+    for at in waiting:
+        row = int(found.rows[at])
+        label = int(found.label[at])
+        placed: tuple[int, Tensor] | str = "free floor"
+        if particles.plan(row).wanted[step]:
+            piece = Piece(label, int(found.look[at]), found.size_m[at], float(found.bottom_m[at]))
+            room = row // PARTICLES
+            placed = search(
+                sampler, found.reading.rows(torch.tensor([at])), piece, judges[room],
+                furniture_of(sampler, particles.rooms, row),
+                particles.plan(row).coming[step + 1 :], draws[room],
+            )  # fmt: skip
+        if isinstance(placed, str):
+            hurdles[label, placed] += 1
+            particles.alive[row] = False
+        else:
+            particles.place(row, label, *placed)
+
+
+def furniture_of(sampler: RoomSampler, rooms: RoomBoxes, row: int) -> Furniture:
+    """The objects of a room."""
+    assert rooms.looks is not None
+    here = rooms.is_object[row]
+    return Furniture(
+        rooms.boxes_m[row, here].double().numpy(), rooms.object_class[row, here].numpy(),
+        backs_of(rooms.looks[row, here], sampler.backs).numpy(),
+    )  # fmt: skip
+
+
+def _propose(
+    sampler: RoomSampler,
+    particles: Particles,
+    rows: Int[Tensor, " some"],
+    step: int,
+    chance: Float[np.ndarray, "rows numbers"],
+    hanging: Sequence[int],
+) -> Proposal:
+    label = particles.coming[rows, step]
+    reading = particles.read(sampler, rows, step)
+    numbers = torch.from_numpy(chance)[rows].float()
+    look = draw_index(sampler.look_logits(reading, label), numbers[:, 0])
+    details = sampler.details(reading, label, look).draw(numbers[:, 1], numbers[:, 2:6])
+    off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)
+    size_m = (sampler.look_shown[look, -3:] + off).exp()
+    bottom_m = details[:, 3].clamp(min=0)
+    shapes = [particles.plan(row).shape for row in rows.tolist()]
+    for at, shape in enumerate(shapes):
+        if shape.ceiling_m is not None:
+            highest_m = max(shape.ceiling_m - float(size_m[at, 1]), 0.0)
+            hangs = int(label[at]) in hanging
+            bottom_m[at] = highest_m if hangs else min(float(bottom_m[at]), highest_m)
+    rectangle_m = torch.stack([
+        torch.from_numpy(_rectangle(shape.rectangles_m, size_m[at, ::2].numpy(), chance[row, 6]))
+        for at, (row, shape) in enumerate(zip(rows.tolist(), shapes, strict=True))
+    ]).float()  # fmt: skip
+    reading = reading._replace(frame=Frame.plain(rectangle_m))
+    places = sampler.place(reading, label, look, size_m, bottom_m)
+    return Proposal(rows, label, look, size_m, bottom_m, reading, places)
+
+
+def _rectangle(
+    rectangles_m: Float[np.ndarray, "rectangles 4"], size_m: Float[np.ndarray, "2"], chance: float
+) -> Float[np.ndarray, "4"]:
+    """A random rectangle into which a footprint fits, in proportion to its area."""
+    fits = (rectangles_m[:, 2:] >= size_m).all(axis=1)
+    if not fits.any():
+        return rectangles_m[0]
+    areas = rectangles_m[:, 2:].prod(axis=1) * fits
+    return rectangles_m[np.searchsorted(areas.cumsum() / areas.sum(), chance, side="right")]
+
+
+def _draw_places(
+    sampler: RoomSampler,
+    particles: Particles,
+    judges: Sequence[Judge],
+    found: Proposal,
+    step: int,
+    chance: Float[np.ndarray, "rows numbers"],
+    hurdles: Hurdles,
+) -> list[int]:
+    """Place objects at the first of `TRIES` drawn places that fits; returns the rows of `found`
+    without a place."""
+    numbers = torch.from_numpy(chance[found.rows.numpy(), 7:]).float().unflatten(1, (TRIES, 4))
+    x = found.places.draw_x(numbers[..., :2])
+    waiting = torch.arange(len(found.rows))
+    for number in range(TRIES):
+        label, some = found.label[waiting], found.reading.rows(waiting)
+        drawn = found.places.rows(waiting).draw(x[waiting, number], numbers[waiting, number, 2:])
+        size_m = found.size_m[waiting]
+        height_m = found.bottom_m[waiting] + size_m[:, 1] / 2
+        boxes_m = torch.stack([drawn[:, 0], height_m, drawn[:, 1], *size_m.unbind(dim=1)], dim=1)
+        apart = ~sampler.may_meet[label[:, None], some.before.object_class]
+        boxes_m = settled(boxes_m, some, apart)
+        free = violation(boxes_m, some, apart) == 0
+        left = []
+        for at, box_m, is_free, rectangle_m in zip(
+            waiting.tolist(), boxes_m, free.tolist(), some.frame.rectangle_m, strict=True
+        ):
+            row, look = int(found.rows[at]), int(found.look[at])
+            if is_free:
+                back = backs_of(found.look[at : at + 1], sampler.backs).numpy()
+                candidates = Furniture(
+                    box_m[None].double().numpy(), found.label[at : at + 1].numpy(), back
+                )
+                allowed, hurdle = judges[row // PARTICLES].allows(
+                    int(found.label[at]), candidates,
+                    furniture_of(sampler, particles.rooms, row),
+                    particles.plan(row).coming[step + 1 :], rectangle_m[None].double().numpy(), 1,
+                )  # fmt: skip
+                if allowed[0]:
+                    particles.place(row, int(found.label[at]), look, box_m)
+                    continue
+                hurdles[int(found.label[at]), hurdle] += 1
+            left.append(at)
+        waiting = torch.tensor(left, dtype=torch.int64)
+        if not left:
+            break
+    return waiting.tolist()

@@ -1,0 +1,123 @@
+"""Requests: files, options of the commands, and given objects."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli_helpers import one_sentence
+
+import sceneprior
+from sceneprior.apps.requests import RequestFile, load_request, merged
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Opening, Scene, SceneObject
+
+BED = {"class": "double_bed", "center_m": [0.0, 0.3, -0.4], "size_m": [1.8, 0.6, 2.0]}
+REQUEST = {
+    "format": "sceneprior-request", "version": 1, "floor": "4x3", "openings": ["door@south"],
+    "ceiling_m": 2.6, "objects": [BED],
+    "want": {
+        "nightstand": 1,
+        "relations": [{"subject": "nightstand", "relation": "near", "target": "double_bed"}],
+    },
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return sceneprior.load("procthor-bedroom")
+
+
+def written(folder: Path, **changes: Any) -> Path:
+    path = folder / "request.json"
+    path.write_text(json.dumps({**REQUEST, **changes}))
+    return path
+
+
+def test_a_file_asks_what_its_keys_say(prior, tmp_path):
+    (room,) = prior.sample(1, seed=0, **load_request(written(tmp_path)))
+    bed = room.objects[0]
+    assert (bed.label, bed.center_m, bed.size_m) == (
+        "double_bed", (0.0, 0.3, -0.4), (1.8, 0.6, 2.0),
+    )  # fmt: skip
+    assert bed.mesh is not None and room.extra["given"] == [0]
+    assert all(each["holds"] for each in room.extra["wishes"]) and len(room.extra["wishes"]) == 2
+    assert room.ceiling_m == 2.6 and room.openings[0].start_m[1] == pytest.approx(1.5)
+    assert "want" in RequestFile.model_json_schema()["properties"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"objects": [{**BED, "size_m": [180, 60, 200]}]},
+            "20 m long.*Are these centimetres",
+        ),
+        ({"floor": [[0, 0], [1, 2]]}, "floor.*at least 3 items"),
+        ({"doors": 1}, "doors is 1; extra inputs are not permitted"),
+        ({"version": 2}, "version is 2; input should be 1"),
+        ({"ceiling_m": "high"}, "ceiling_m is 'high'"),
+        ({"want": {"relations": [{"subject": "desk"}]}}, "is not a request"),
+    ],
+)
+def test_other_files_are_a_sentence(changes, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        load_request(written(tmp_path, **changes))
+
+
+def test_a_given_piece_that_the_prior_does_not_know_is_a_sentence(prior, tmp_path):
+    path = written(tmp_path, objects=[{**BED, "class": "piano"}])
+    with pytest.raises(InputError, match="A given object is a 'piano', which this run does not"):
+        prior.sample(1, **load_request(path))
+
+
+def test_a_part_is_in_the_file_or_in_the_options():
+    assert merged({"floor": "4x3", "want": None}, {"want": "a bed"}) == {
+        "floor": "4x3", "want": "a bed",
+    }  # fmt: skip
+    with pytest.raises(InputError, match="the request's file and the options have floor"):
+        merged({"floor": "4x3"}, {"floor": "5x3"})
+
+
+def test_a_floor_of_a_file_brings_its_door(prior, tmp_path):
+    outline = np.array([[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]])
+    door = Opening("door", (-0.5, -1.5), (0.4, -1.5), 0.0, 2.0)
+    Scene("plan", "front3d_bedroom", (), outline, openings=(door,)).save(tmp_path / "plan.json")
+    (room,) = prior.sample(1, floor=f"{tmp_path}/plan.json")
+    assert room.openings == (door,) and (room.floor_m == outline).all()
+    (room,) = prior.sample(1, floor=f"{tmp_path}/plan.json", openings="window@north")
+    assert [each.kind for each in room.openings] == ["window"]
+
+
+def test_a_sentence_and_an_option_do_not_both_have_a_floor(prior):
+    with pytest.raises(InputError, match="and the sentence asks for 4x3 m; leave one out"):
+        prior.sample(1, floor="5x3", want="a 4 x 3 m bedroom")
+    with pytest.raises(InputError, match=r"An opening has corners.*give the floor, too"):
+        prior.sample(1, openings=[Opening("door", (0, 0), (1, 0), 0.0, 2.0)])
+
+
+def test_a_room_with_walls_is_completed_between_them(prior):
+    outline = np.array([[-2, -2], [2, -2], [2, 2], [-2, 2]], dtype=float)
+    door = Opening("door", (-0.5, 2.0), (0.4, 2.0), 0.0, 2.0)
+    bed = SceneObject("double_bed", (0.0, 0.3, -1.0), (1.8, 0.6, 2.0))
+    scene = Scene("mine", "front3d_bedroom", (bed,), outline, openings=(door,))
+    for room in prior.complete(scene, 2, want={"nightstand": 1}):
+        assert room.objects[0].center_m == bed.center_m and room.openings == (door,)
+        assert [item.label for item in room.objects].count("nightstand") == 1
+        for item in room.objects:
+            low, high = (np.array(item.center_m) + s * np.array(item.size_m) / 2 for s in (-1, 1))
+            in_swing = high[2] > 1.15 and low[0] < 0.35 and high[0] > -0.45 and low[1] < 1.95
+            assert not in_swing
+
+
+def test_commands_take_requests(command, tmp_path):
+    make = ["synthesize", "--run", "procthor-bedroom", "-n", "1", "--out", tmp_path / "rooms"]
+    want = "a 4 x 3 m bedroom with a door and two nightstands"
+    status, told, errors = command(*make, "--want", want)
+    assert status == 0 and "Wrote 1 rooms" in told, errors
+    room = sceneprior.load_scene(tmp_path / "rooms" / "seed0_0000.json")
+    assert [item.label for item in room.objects].count("nightstand") == 2
+    assert [each.kind for each in room.openings] == ["door"]
+    said = one_sentence(command(*make, "--overwrite", "--want", "a purple bed"))
+    assert "not understood: 'purple'" in said

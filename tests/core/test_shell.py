@@ -1,0 +1,136 @@
+"""Walls on any outline: closed, outside the room, with holes, and not through furniture."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+import trimesh
+from rooms_of_solids import solid_box
+
+from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.scene import Opening, Scene
+from sceneprior.core.shell import THICK_M, Shell, panels, shell_meshes, shell_of
+
+SQUARE = np.array([[-2.0, -1.5], [2.0, -1.5], [2.0, 1.5], [-2.0, 1.5]])
+L = np.array([[-2.5, -2], [2.5, -2], [2.5, 0.5], [0.5, 0.5], [0.5, 2.2], [-2.5, 2.2]])
+SLANTED = np.array([[-2.5, -2], [2.5, -2], [2.5, 0.5], [0.5, 2.2], [-2.5, 2.2]])
+DOOR = Opening("door", (1.0, -2.0), (1.9, -2.0), 0.0, 2.0)
+WINDOW = Opening("window", (-2.5, -1.0), (-2.5, 1.0), 0.9, 2.1)
+
+
+def room(outline=None, *objects, **more) -> Scene:
+    return Scene("room", "front3d_bedroom", objects, outline, **more)
+
+
+def solid(shell: Shell, name: str) -> trimesh.Trimesh:
+    mesh = shell.meshes()[name]
+    return trimesh.Trimesh(mesh.vertices_m, mesh.faces)
+
+
+@pytest.mark.parametrize("outline", [SQUARE, SQUARE[::-1], L, SLANTED, SLANTED[::-1]])
+def test_every_mesh_is_closed_and_outside_the_room(outline):
+    shell = shell_of(room(outline, openings=()))
+    floor = shapely.Polygon(outline)
+    for name in shell.meshes():
+        mesh = solid(shell, name)
+        assert mesh.is_volume and mesh.volume > 0, name
+    assert solid(shell, "floor").volume == pytest.approx(floor.area * THICK_M)
+    assert solid(shell, "floor").bounds[:, 1].tolist() == [-THICK_M, 0]
+    assert solid(shell, "ceiling").bounds[0, 1] == shell.height_m == 2.6
+    whole = floor.buffer(THICK_M, join_style="mitre")
+    walls = [solid(shell, f"wall_{row}") for row in range(len(outline))]
+    plan = [shapely.convex_hull(shapely.MultiPoint(wall.vertices[:, ::2])) for wall in walls]
+    assert shapely.union_all(plan).symmetric_difference(whole - floor).area < 1e-6
+    assert sum(each.area for each in plan) == pytest.approx((whole - floor).area)
+
+
+def test_doors_and_windows_are_holes():
+    shell = shell_of(room(L, openings=(DOOR, WINDOW), ceiling_m=2.5))
+    bare = shell_of(room(L, ceiling_m=2.5))
+    cut = {"wall_0": 0.9 * 2.0, "wall_5": 2.0 * 1.2}
+    for row in range(6):
+        name = f"wall_{row}"
+        lost = solid(bare, name).volume - solid(shell, name).volume
+        assert lost == pytest.approx(cut.get(name, 0) * THICK_M, abs=1e-9)
+        assert solid(shell, name).is_volume
+
+
+def test_panels_fill_the_walls_round_their_openings():
+    """Panels as boxes lie in the wall's mesh, and their areas add up."""
+    shell = shell_of(room(SLANTED, openings=(DOOR, WINDOW)))
+    for row, wall in enumerate(shell.walls):
+        length = np.linalg.norm(wall.end_m - wall.start_m)
+        holes = sum((end - start) * (top - bottom) for start, end, bottom, top in wall.openings)
+        boxes = panels(wall, shell.height_m)
+        area = sum(box.size_m[0] * box.size_m[1] for box in boxes)
+        assert area == pytest.approx(length * shell.height_m - holes)
+        mesh = solid(shell, f"wall_{row}")
+        for box in boxes:
+            turned = np.eye(4)
+            turned[:3, :3], turned[:3, 3] = yaw_rotation(box.yaw_rad), box.center_m
+            there = trimesh.creation.box(box.size_m, turned)
+            inside = trimesh.boolean.intersection([mesh, there])
+            assert inside.volume == pytest.approx(np.prod(box.size_m), rel=1e-5)
+
+
+def test_overlapping_openings_are_cut_once():
+    twice = Opening("door", (1.5, -2.0), (2.2, -2.0), 0.0, 2.1)
+    shell = shell_of(room(L, openings=(DOOR, twice)))
+    (wall,) = (wall for wall in shell.walls if wall.openings)
+    area = sum(box.size_m[0] * box.size_m[1] for box in panels(wall, shell.height_m))
+    assert area == pytest.approx(5 * 2.6 - (0.9 * 2.0 + 0.7 * 2.1 - 0.4 * 2.0))
+
+
+@pytest.mark.parametrize("outline", [SQUARE, L, SLANTED])
+def test_walls_stand_clear_of_furniture(outline):
+    """A desk through the wall at +x: that wall alone moves, and its window with it."""
+    desk = solid_box("desk", (2.4, 0.4, -0.5), (1.0, 0.8, 0.6))
+    far = float(outline[:, 0].max())
+    window = Opening("window", (far, -1.0), (far, 0.0), 0.9, 2.1)
+    shell = shell_of(room(outline, desk, openings=(window,)))
+    assert shell.grown_m == pytest.approx(2.9 - far)
+    floor = shapely.Polygon(shell.outline_m)
+    assert floor.covers(shapely.box(1.9, -0.8, 2.9, -0.2).buffer(-1e-9))
+    assert floor.covers(shapely.Polygon(outline).buffer(-1e-9))
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    np.testing.assert_allclose(shell.outline_m.min(axis=0), low)
+    np.testing.assert_allclose(shell.outline_m.max(axis=0), [2.9, high[1]])
+    (wall,) = (wall for wall in shell.walls if wall.openings)
+    assert wall.outward.tolist() == [1, 0] and wall.start_m[0] == pytest.approx(2.9)
+
+
+def test_furniture_across_a_corner_moves_both_walls():
+    corner = solid_box("desk", (2.0, 0.4, 1.5), (1.0, 0.8, 0.6))
+    shell = shell_of(room(SQUARE, corner))
+    np.testing.assert_allclose(shell.outline_m.max(axis=0), [2.5, 1.8])
+    np.testing.assert_allclose(shell.outline_m.min(axis=0), [-2, -1.5])
+
+
+def test_an_unknown_floor_is_a_rectangle_round_the_furniture():
+    shell = shell_of(room(None, solid_box("desk", (1, 0.4, 0), (1, 0.8, 0.6))))
+    np.testing.assert_allclose(shell.outline_m.min(axis=0), [0.3, -0.5])
+    assert shell.grown_m == 0 and len(shell.walls) == 4
+
+
+def test_the_ceiling_is_given_or_above_the_furniture():
+    lamp = solid_box("ceiling_lamp", (0, 2.7, 0), (0.4, 0.2, 0.4))
+    tall = solid_box("wardrobe", (0, 1.4, 0), (1, 2.8, 0.6))
+    assert shell_of(room(SQUARE, lamp)).height_m == pytest.approx(2.8)
+    assert shell_of(room(SQUARE, tall)).height_m == pytest.approx(2.85)
+    assert shell_of(room(SQUARE, tall, ceiling_m=2.5)).height_m == 2.5
+
+
+def test_corners_that_do_not_turn_are_no_corners():
+    more = np.insert(SQUARE, 1, [[0.0, -1.5], [1.0, -1.5]], axis=0)
+    assert len(shell_of(room(more)).walls) == 4
+
+
+def test_a_part_of_the_shell_and_a_crossed_outline():
+    scene = room(SQUARE)
+    assert [*shell_meshes(scene, "none")] == []
+    assert [*shell_meshes(scene, "floor")] == ["floor"]
+    assert [*shell_meshes(scene, "walls")][-1] == "ceiling"
+    with pytest.raises(InputError, match="crosses or touches itself"):
+        shell_of(replace(scene, floor_m=SQUARE[[0, 2, 1, 3]]))

@@ -1,0 +1,122 @@
+"""Requested rooms of a shipped prior: floors, counts, and what stays as it was."""
+
+import numpy as np
+import pytest
+import shapely
+
+import sceneprior
+from sceneprior.apps.sample import sample_rooms
+from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene
+from sceneprior.lifted.requests.holding import Furniture
+from sceneprior.lifted.requests.judge import backed_by_walls
+from sceneprior.lifted.requests.shape import RoomShape, read_floor
+from sceneprior.lifted.sampled import scene_of
+from sceneprior.lifted.sampler.draw import draw_rooms
+
+L_SHAPE = [[0, 0], [5, 0], [5, 3], [2.5, 3], [2.5, 6], [0, 6]]
+EDGE_M = 0.015
+"""Furniture may extend beyond the floor by a centimetre."""
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return sceneprior.load("procthor-bedroom")
+
+
+def labels(room: Scene) -> list[str]:
+    return [item.label for item in room.objects]
+
+
+def footprints(room: Scene) -> np.ndarray:
+    low, high = room.centers_m - room.sizes_m / 2, room.centers_m + room.sizes_m / 2
+    return shapely.box(low[:, 0], low[:, 2], high[:, 0], high[:, 2])
+
+
+def same(a: Scene, b: Scene) -> bool:
+    alike = labels(a) == labels(b) and (a.centers_m == b.centers_m).all()
+    return bool(alike and (a.sizes_m == b.sizes_m).all())
+
+
+def test_rooms_without_a_request_are_those_of_the_sampler_to_the_bit(prior):
+    drawn = draw_rooms(prior.trained.sampler, 4, 3)
+    prior.sample(2, seed=3, floor="4x3")  # leaves nothing behind
+    for row, room in enumerate(prior.sample(4, seed=3)):
+        assert same(room, scene_of(prior.trained, room.name, drawn, row))
+    assert all(map(same, prior.sample(4, seed=3), sample_rooms(prior.trained, 4, 3)))
+
+
+def test_a_seed_draws_the_same_rooms_the_first_however_many_follow(prior):
+    some = prior.sample(2, seed=1, floor="4x3", want={"desk": 1})
+    more = prior.sample(5, seed=1, floor="4x3", want={"desk": 1})
+    for a, b in zip(some, more[:2], strict=True):
+        assert labels(a) == labels(b)
+        np.testing.assert_allclose(a.centers_m, b.centers_m, atol=1e-4)
+    assert not same(more[0], more[1])
+
+
+@pytest.mark.parametrize("floor", ["4x3", L_SHAPE, [[0, 0], [4, 0], [5, 3], [2, 4], [0, 3]]])
+def test_furniture_stays_on_the_floor(prior, floor):
+    for room in prior.sample(4, seed=0, floor=floor):
+        assert room.objects and room.floor_m is not None
+        assert np.allclose(room.floor_m.min(axis=0) + room.floor_m.max(axis=0), 0)
+        on = shapely.Polygon(room.floor_m).buffer(EDGE_M, join_style="mitre")
+        assert on.covers(footprints(room)).all()
+
+
+def test_counts_hold_exactly(prior):
+    want = {"double_bed": 1, "single_bed": 0, "nightstand": 2, "desk": ">=1", "cabinet": "<=1"}
+    for room in prior.sample(6, seed=0, floor="5x4", want=want):
+        found = labels(room)
+        assert [found.count(label) for label in list(want)[:3]] == [1, 0, 2]
+        assert found.count("desk") >= 1 and found.count("cabinet") <= 1
+        assert room.extra["wishes"][2] == {"wish": "2 nightstand", "holds": True}
+
+
+def test_small_rooms_hold_less(prior):
+    small, large = (prior.sample(12, seed=0, floor=floor) for floor in ("3x3", "6x6"))
+    assert sum(map(len, map(labels, small))) < sum(map(len, map(labels, large)))
+
+
+def test_without_a_floor_a_rectangle_is_drawn(prior):
+    rooms = prior.sample(3, seed=2, want={"double_bed": 2})
+    assert [labels(room).count("double_bed") for room in rooms] == [2, 2, 2]
+    assert len({room.floor_m.max() for room in rooms}) == 3
+    for room in rooms:
+        on = shapely.Polygon(room.floor_m).buffer(EDGE_M, join_style="mitre")
+        assert on.covers(footprints(room)).all()
+
+
+def test_nothing_reaches_through_the_ceiling_and_lamps_hang_from_it(prior):
+    rooms = prior.sample(4, seed=0, floor="4x4", ceiling_m=2.2, want={"ceiling_lamp": 1})
+    for room in rooms:
+        tops = room.centers_m[:, 1] + room.sizes_m[:, 1] / 2
+        assert room.ceiling_m == 2.2 and tops.max() <= 2.211
+        assert tops[labels(room).index("ceiling_lamp")] == pytest.approx(2.2, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        ({"floor": "3x2", "want": {"double_bed": 4}}, r"cover .* square metres at their smallest"),
+        (
+            {"floor": "0.6x6", "want": {"double_bed": 1}},
+            "No room holds the request: in 8 attempts .* double bed found no place; most places "
+            "lacked free floor",
+        ),
+        ({"want": {"piano": 1}}, "'piano' is no class of this run's training rooms"),
+        ({"floor": "4x3", "distribution": "paper"}, "can be asked of a sampler alone"),
+    ],
+)
+def test_impossible_requests_are_a_sentence(prior, request_, message):
+    with pytest.raises(InputError, match=message):
+        prior.sample(1, **request_)
+
+
+def test_backs_at_the_inner_side_of_an_l_are_no_backs_at_walls():
+    """A box at z = 3 of the lower arm: where the upper arm goes on, there is no wall."""
+    shape = RoomShape(read_floor(L_SHAPE))
+    arm = np.array([[2.5, 1.5, 5.0, 3.0]] * 3)
+    boxes = np.array([[1.0, 0.5, 2.5, 1, 1, 1], [4.0, 0.5, 2.5, 1, 1, 1], [1.0, 0.5, 1.5, 1, 1, 1]])
+    at_high_z = Furniture(boxes, np.array([1, 1, 1]), np.array([2, 2, 2]))
+    assert backed_by_walls(shape, at_high_z, arm).tolist() == [False, True, True]
