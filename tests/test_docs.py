@@ -22,6 +22,7 @@ from data_prep.front.recipe import load_recipe
 from sceneprior.apps.cli.commands import app
 from sceneprior.apps.config import load_config
 from sceneprior.apps.experiments.comparison import load_comparison
+from sceneprior.apps.requests import load_request
 from sceneprior.core.scene_json import read_scene
 
 LONGEST_LINE = 110
@@ -108,7 +109,11 @@ def check_python(block: Block, folder: Path) -> None:
 
 
 def check_json(block: Block, folder: Path) -> None:
-    """JSON of a scene is read as one."""
+    """JSON of a scene, or of a request, is read as one."""
+    if json.loads(block.text)["format"] == "sceneprior-request":
+        (folder / "request.json").write_text(block.text)
+        assert load_request(folder / "request.json")["want"]
+        return
     assert json.loads(block.text)["format"] == "sceneprior-scene"
     path = folder / "scene.json"
     path.write_text(block.text)

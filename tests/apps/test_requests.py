@@ -1,6 +1,7 @@
 """Requests: files, options of the commands, and given objects."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -121,3 +122,12 @@ def test_commands_take_requests(command, tmp_path):
     assert [each.kind for each in room.openings] == ["door"]
     said = one_sentence(command(*make, "--overwrite", "--want", "a purple bed"))
     assert "not understood: 'purple'" in said
+
+
+def test_the_file_of_the_guide_is_a_request(prior, tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "requests.md").read_text()
+    (block,) = re.findall(r"```json\n(.*?)```", page, flags=re.S)
+    (tmp_path / "request.json").write_text(block)
+    (room,) = prior.sample(1, seed=0, **load_request(tmp_path / "request.json"))
+    assert [each["holds"] for each in room.extra["wishes"]] == [True] * 3
+    assert [each.kind for each in room.openings] == ["window", "door"]

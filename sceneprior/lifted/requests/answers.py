@@ -59,7 +59,7 @@ def sample_requested(
     if name is not None:
         names = [f"{name}_{row:02d}" for row in range(count)]
     return [
-        _scene(with_sampler, name, answer, request)
+        _scene(with_sampler, name, answer, request, asked)
         for name, answer in zip(names, answers, strict=True)
     ]
 
@@ -71,17 +71,21 @@ def _parsed(trained: TrainedLifted, asked: Mapping[str, Any]) -> Request:
     return make_request(known, trained.config.label_set, **asked)
 
 
-def _scene(trained: TrainedLifted, name: str, answer: Answer, request: Request) -> Scene:
+def _scene(
+    trained: TrainedLifted, name: str, answer: Answer, request: Request, asked: Mapping[str, Any]
+) -> Scene:
     scene = scene_of(trained, name, answer.room, 0)
     counts = Counter(item.label for item in scene.objects)
-    shape, asked = answer.plan.shape, request.wishes
-    relations = Relations(asked.relations, shape, label_set(scene.label_set))
+    shape, wanted = answer.plan.shape, request.wishes
+    relations = Relations(wanted.relations, shape, label_set(scene.label_set))
     assert trained.sampler is not None, "which drew the answer"
     held = relations.held(furniture_of(trained.sampler, answer.room, 0))
-    wishes = [{"wish": str(wish), "holds": wish.holds(counts[wish.label])} for wish in asked.counts]
+    wishes = [
+        {"wish": str(wish), "holds": wish.holds(counts[wish.label])} for wish in wanted.counts
+    ]
     wishes += [
         {"wish": str(wish), "holds": holds}
-        for wish, holds in zip(asked.relations, held, strict=True)
+        for wish, holds in zip(wanted.relations, held, strict=True)
     ]
     given = request.objects
     return replace(
@@ -95,5 +99,9 @@ def _scene(trained: TrainedLifted, name: str, answer: Answer, request: Request) 
         floor_m=shape.outline_m,
         openings=shape.openings,
         ceiling_m=shape.ceiling_m,
-        extra={"wishes": wishes, **({"given": list(range(len(given)))} if given else {})},
+        extra={
+            "request": {k: v for k, v in asked.items() if isinstance(v, str | float | dict)},
+            "wishes": wishes,
+            **({"given": list(range(len(given)))} if given else {}),
+        },
     )

@@ -257,7 +257,7 @@ class _Reader:
         """Add the doors or windows of a group, on a named wall if one follows."""
         wall = ""
         for direction in WALLS:
-            words = [f"{word} the {direction}" for word in ("in", "on", "to")]
+            words = [f"{word} the {direction}" for word in ("in", "on", "to", "at")]
             if self._phrase([f"{each} wall" for each in words] + words) is not None:
                 wall = f"@{direction}"
         if group.new and group.bound != "<=":

@@ -16,7 +16,6 @@ from sceneprior.lifted.requests.holding import Furniture
 from sceneprior.lifted.requests.judge import Judge
 from sceneprior.lifted.requests.particles import PARTICLES, Particles
 from sceneprior.lifted.requests.search import Piece, search
-from sceneprior.lifted.sampler.draw import SIZE_RANGE
 from sceneprior.lifted.sampler.frames import backs_of
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.places import Places
@@ -25,6 +24,13 @@ from sceneprior.lifted.sampler.violations import settled, violation
 
 TRIES = 4
 """Places drawn for an object in each particle, which takes the first that fits."""
+SIZE_RANGE = 0.35
+"""Largest difference between the log extents of an object and of its look. Smaller than that of
+rooms without a request: where floor is scarce, particles with the smallest pieces survive."""
+LOW_M = 0.15
+STANDING = 0.75
+"""An object whose bottom is below `LOW_M` with at least this probability stands on the floor: a bed
+drawn in mid-air would survive where floor is scarce."""
 HANGING = ("ceiling_lamp", "pendant_lamp")
 """Classes that hang from the ceiling, where its height is known."""
 
@@ -110,10 +116,13 @@ def _propose(
     reading = particles.read(sampler, rows, step)
     numbers = torch.from_numpy(chance)[rows].float()
     look = draw_index(sampler.look_logits(reading, label), numbers[:, 0])
-    details = sampler.details(reading, label, look).draw(numbers[:, 1], numbers[:, 2:6])
+    mixture = sampler.details(reading, label, look)
+    details = mixture.draw(numbers[:, 1], numbers[:, 2:6])
     off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)
     size_m = (sampler.look_shown[look, -3:] + off).exp()
-    bottom_m = details[:, 3].clamp(min=0)
+    standing = mixture.weight_logits.softmax(dim=-1) * (mixture.means[..., 3] < LOW_M)
+    on_floor = (standing.sum(dim=-1) > STANDING) & (details[:, 3] > LOW_M)
+    bottom_m = details[:, 3].clamp(min=0).masked_fill(on_floor, 0.0)
     shapes = [particles.plan(row).shape for row in rows.tolist()]
     for at, shape in enumerate(shapes):
         if shape.ceiling_m is not None:

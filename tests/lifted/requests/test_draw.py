@@ -120,3 +120,12 @@ def test_backs_at_the_inner_side_of_an_l_are_no_backs_at_walls():
     boxes = np.array([[1.0, 0.5, 2.5, 1, 1, 1], [4.0, 0.5, 2.5, 1, 1, 1], [1.0, 0.5, 1.5, 1, 1, 1]])
     at_high_z = Furniture(boxes, np.array([1, 1, 1]), np.array([2, 2, 2]))
     assert backed_by_walls(shape, at_high_z, arm).tolist() == [False, True, True]
+
+
+def test_where_floor_is_scarce_beds_stand_on_it_and_keep_their_size(prior):
+    want = {"double_bed": 1, "single_bed": 1, "desk": 2, "sofa": 1}
+    for room in prior.sample(2, seed=0, floor="3x3", openings="door", want=want):
+        for item in room.objects:
+            if "bed" in item.label:
+                assert item.center_m[1] - item.size_m[1] / 2 <= 0.151
+                assert item.size_m[0] * item.size_m[2] > 1.1  # m2
