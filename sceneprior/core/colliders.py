@@ -19,6 +19,8 @@ MOUNTED = ("cabinet", "shelf", "shelves", "sink", "television", "whiteboard", "w
 MOUNTED_M = 0.4
 CONCAVITY = 0.05
 """Threshold of CoACD: the largest concavity of a part that is not divided further."""
+SEARCH = {"mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000}
+"""A shorter search than CoACD's own: 0.5 s of CPU time an object for 1.3, with as many parts."""
 _FILL = {
     "box": 1.0, "cylinder": np.pi / 4, "ellipsoid": np.pi / 6, "dome": np.pi / 6, "bowl": np.pi / 6,
 }  # fmt: skip
@@ -54,6 +56,7 @@ def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
     found = coacd.run_coacd(
         coacd.Mesh(np.asarray(mesh.vertices_m, dtype=np.float64), np.asarray(mesh.faces)),
         threshold=CONCAVITY,
+        **SEARCH,
     )
     return tuple(Mesh(*convex_surface(np.asarray(vertices))) for vertices, _ in found) or (hull,)
 
