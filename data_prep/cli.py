@@ -178,6 +178,13 @@ def prep_posed(
             "cameras; `auto` is z, or `cameras` for COLMAP's models."
         ),
     ] = "auto",
+    tracks: Annotated[
+        str,
+        typer.Option(
+            help="given: an object has the same id in all frames. auto: ids mean nothing across "
+            "frames, and objects are found from poses, masks and classes."
+        ),
+    ] = "given",
     floor_m: Annotated[
         float | None, typer.Option(help="Height of the floor in rooms whose file has no floor_m.")
     ] = None,
@@ -201,7 +208,7 @@ def prep_posed(
     only: Annotated[str | None, typer.Option(help="A room, or a prefix of rooms' names.")] = None,
     strict: StrictOption = False,
 ) -> None:
-    """Turn posed pictures with tracked instance masks into view shards (docs/posed_data.md).
+    """Turn posed pictures with instance masks into view shards (docs/posed_data.md).
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
@@ -210,7 +217,9 @@ def prep_posed(
     from data_prep.posed.source import PosedSource
     from data_prep.posed.views import PosedSettings
 
-    settings = PosedSettings(up, floor_m, camera_height_m, metres_per_unit, max_side, max_views)
+    settings = PosedSettings(
+        up, floor_m, camera_height_m, metres_per_unit, max_side, tracks, max_views
+    )
     classes = read_label_set(label_set)
     source = PosedSource(rooms, classes, settings, test_share, seed, only)
     for sentence in source.assumptions():

@@ -26,7 +26,8 @@ _BAR_M = 0.3
 _LARGEST_GRID_M = 15.0
 
 LEGEND = (
-    "Filled: instance masks in class colours. Coloured frames: their 2D boxes. Black wires: 3D "
+    "Filled: instance masks in class colours. Coloured frames: their 2D boxes, with the object's "
+    "number, the same in all views. Black wires: 3D "
     "boxes of the ground truth, with a bar ahead of the piece's front. Grid: the floor y = 0, "
     "metres, with the room's axes x, y, z."
 )
@@ -127,7 +128,7 @@ def draw_view(
         x1, y1, x2, y2 = (room.boxes[view, k] * np.array([*size, *size])).tolist()
         dark = _dark(palette[k])
         draw.rectangle((x1, y1, max(x2 - 1, x1), max(y2 - 1, y1)), outline=dark, width=2)
-        _tag(draw, (x1 + 2, y1 + 2), names[int(room.object_class[k])], dark)
+        _tag(draw, (x1 + 2, y1 + 2), f"{names[int(room.object_class[k])]} {k + 1}", dark)
     return picture
 
 

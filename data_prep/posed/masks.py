@@ -1,5 +1,6 @@
 """Reads a room's masks of instance ids, undistorts and downsamples them."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,42 +19,33 @@ from sceneprior.core.instances.tables import IdTable, read_class_table
 
 def png_size(folder: Path, frame: PosedFrame) -> tuple[int, int]:
     """Size, (height, width), of a frame's PNG of ids."""
-    return mask_size(frame.instances, rgb=find_table(folder).name == PANOPTIC)
+    return mask_size(frame.instances, rgb=(folder / PANOPTIC).is_file())
 
 
-class RoomMasks:
-    """Masks of one room, all of one size, and notes about them.
+class MaskPixels:
+    """Reads the values of masks, all of one size, undistorted and downsampled.
 
-    `size` is that of every PNG, and `stored` that of the downsampled images: (height, width).
+    `read` reads a PNG; `size` is that of every PNG, and `stored` that of the downsampled images:
+    (height, width).
     """
 
     def __init__(
-        self, folder: Path, label_set_name: str, size: tuple[int, int], stored: tuple[int, int]
+        self, read: Callable[[Path], np.ndarray], size: tuple[int, int], stored: tuple[int, int]
     ):
-        table = find_table(folder)
-        if table.name == PANOPTIC:
-            panoptic = read_panoptic(table, label_set_name)
-            of_id, self._read = panoptic.classes, panoptic.read
-        else:
-            of_id, self._read = read_class_table(table), read_mask
-        self.table = IdTable(of_id, label_set_name, str(folder))
-        self._size, self._stored = size, stored
+        self._read, self._size, self._stored = read, size, stored
         self._views: dict[tuple[Lens, bytes], Straightened] = {}
 
     @property
     def notes(self) -> list[str]:
-        """Notes on everything left out or changed so far."""
-        notes = list(self.table.notes)
-        if self.table.unlisted:
-            listed = ", ".join(map(str, sorted(self.table.unlisted)[:20]))
-            notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
+        """Notes on the lenses straightened so far."""
+        notes = []
         for lens in dict.fromkeys(lens for lens, _ in self._views):
             cut = max(view.cut_share for (other, _), view in self._views.items() if other == lens)
             notes.append(f"the lens {lens} is undistorted; {cut:.0%} of its pictures is cut away")
         return notes
 
     def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray]:
-        """Read a frame's uint32 ids for `observe`, at the stored size, and their intrinsics."""
+        """Read a frame's values, int32 with -1 where unknown, and their intrinsics."""
         values = self._values(frame)
         K, picture = frame_intrinsics(frame, self._size)
         K = mask_intrinsics(K, picture, self._size, self._size)
@@ -68,7 +60,7 @@ class RoomMasks:
             K, values = view.intrinsics, values[view.rows, view.columns]
         lines = [sampled_lines(*sides) for sides in zip(self._size, self._stored, strict=True)]
         sampled = mask_intrinsics(K, self._size, self._size, self._stored)
-        return self.table.ids(values[np.ix_(*lines)]), sampled
+        return values[np.ix_(*lines)], sampled
 
     def _values(self, frame: PosedFrame) -> np.ndarray:
         """Read the ids of one frame, int32; -1 where they are unknown."""
@@ -88,3 +80,33 @@ class RoomMasks:
                 )
             ids[known == 0] = -1
         return ids
+
+
+class RoomMasks:
+    """Masks of one room with tracked ids, and notes about them; see `MaskPixels`."""
+
+    def __init__(
+        self, folder: Path, label_set_name: str, size: tuple[int, int], stored: tuple[int, int]
+    ):
+        table = find_table(folder)
+        if table.name == PANOPTIC:
+            panoptic = read_panoptic(table, label_set_name)
+            of_id, read = panoptic.classes, panoptic.read
+        else:
+            of_id, read = read_class_table(table), read_mask
+        self.table = IdTable(of_id, label_set_name, str(folder))
+        self._pixels = MaskPixels(read, size, stored)
+
+    @property
+    def notes(self) -> list[str]:
+        """Notes on everything left out or changed so far."""
+        notes = list(self.table.notes)
+        if self.table.unlisted:
+            listed = ", ".join(map(str, sorted(self.table.unlisted)[:20]))
+            notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
+        return notes + self._pixels.notes
+
+    def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray]:
+        """Read a frame's uint32 ids for `observe`, at the stored size, and their intrinsics."""
+        values, intrinsics = self._pixels.read(frame)
+        return self.table.ids(values), intrinsics

@@ -60,6 +60,8 @@ class PanopticIds:
     """(n,) segment ids, ascending."""
     classes: dict[int, str]
     """Class by new id: k + 1 for the k-th segment; "background" for stuff (walls, floors)."""
+    of_frame: dict[str, dict[int, str]]
+    """The same for the segments of each frame alone, by the stem of its PNG."""
 
     def read(self, path: Path) -> np.ndarray:
         """Read a PNG as new ids, (height, width) int32.
@@ -74,8 +76,11 @@ class PanopticIds:
         return np.where(ids == 0, 0, numbers).astype(np.int32)
 
 
-def read_panoptic(path: Path, label_set_name: str) -> PanopticIds:
-    """Read a room's annotations. Stuff is background, unless the label set has its class."""
+def read_panoptic(path: Path, label_set_name: str, tracked: bool = True) -> PanopticIds:
+    """Read a room's annotations. Stuff is background, unless the label set has its class.
+
+    Segments that are not `tracked` may have another class in each frame.
+    """
     room = checked(_Panoptic, read_json(path), str(path))
     names = {
         item.id: item.name
@@ -84,6 +89,7 @@ def read_panoptic(path: Path, label_set_name: str) -> PanopticIds:
         for item in room.categories
     }
     of_id: dict[int, tuple[str, str]] = {}
+    by_frame: dict[str, dict[int, str]] = {}
     for frame in room.annotations:
         for segment in frame.segments_info:
             if segment.category_id not in names:
@@ -92,16 +98,22 @@ def read_panoptic(path: Path, label_set_name: str) -> PanopticIds:
                     f"{segment.id} is not among its categories."
                 )
             name = _CROWD if segment.iscrowd else names[segment.category_id]
+            by_frame.setdefault(Path(frame.file_name).stem, {})[segment.id] = name
             before, where = of_id.setdefault(segment.id, (name, frame.file_name))
-            if before != name:
+            if tracked and before != name:
                 raise InputError(
                     f"{path}: segment {segment.id} is {before} in '{where}', but {name} in "
                     f"'{frame.file_name}'. Ids must be tracked: the same object has the same id "
-                    "in all frames, as video segmenters write them."
+                    "in all frames, as video segmenters write them; else pass --tracks auto."
                 )
     of_id.pop(0, None)
     if not of_id or len(of_id) >= LARGEST_ID:
         raise InputError(f"{path} has {len(of_id)} segments; expected 1 to {LARGEST_ID - 1}.")
     segments = sorted(of_id)
     classes = {k + 1: of_id[segment][0] for k, segment in enumerate(segments)}
-    return PanopticIds(np.array(segments), classes)
+    number = {segment: k + 1 for k, segment in enumerate(segments)}
+    of_frame = {
+        stem: {number[segment]: name for segment, name in names.items() if segment}
+        for stem, names in by_frame.items()
+    }
+    return PanopticIds(np.array(segments), classes, of_frame)

@@ -55,6 +55,7 @@ class PosedSource:
                 room_files(room)
                 + [room / name for name in TABLES if (room / name).is_file()]
                 + sorted((room / INSTANCES).rglob("*.png"))
+                + sorted((room / INSTANCES).rglob("*.json"))
             )
             for room in rooms
         }

@@ -11,9 +11,14 @@ from data_prep.posed.cameras import UP, cameras_in_room, upright_cameras
 from data_prep.posed.floor import find_floor
 from data_prep.posed.masks import RoomMasks, png_size
 from data_prep.posed.recording import PosedFrame, Recording, room_name
+from data_prep.posed.untracked import UntrackedMasks, track
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import shown
 from sceneprior.core.instances.observations import Observations, observe
+
+TRACKS = ("given", "auto")
+_MANY_IDS, _MANY_FRAMES, _ONCE = 12, 5, 0.8
+"""Ids and frames from which ids are refused of which more than this share is in one frame only."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +36,17 @@ class PosedSettings:
     """Scale in rooms whose file has none. Poses from pictures alone (COLMAP) have no unit."""
     max_side: int | None = None
     """Maximum side in pixels; larger masks are downsampled."""
+    tracks: str = "given"
+    """One of `TRACKS`: ids are `given` for all frames, or `auto` finds objects from masks whose ids
+    have no meaning across frames."""
     max_views: int = 100
     """Maximum number of views; more frames are thinned evenly (paper: 100)."""
 
     def __post_init__(self) -> None:
         if self.up not in UP:
             raise InputError(f"up is '{self.up}'; choose from {', '.join(UP)}.")
+        if self.tracks not in TRACKS:
+            raise InputError(f"tracks is '{self.tracks}'; choose from {', '.join(TRACKS)}.")
         for name in ("max_side", "max_views"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -83,18 +93,31 @@ def prepare_posed(
             f"{fault}."
         )
     notes = choice.notes("PNG")
-    masks = RoomMasks(recording.folder, label_set_name, size, stored_size(recording, settings))
-    try:
-        read = [masks.read(recording.frames[i]) for i in choice.frames]
-    except InputError as error:
-        raise InputError(f"{recording.path}: {str(error).removesuffix('.')}.") from None
-    images, intrinsics = (np.stack(arrays) for arrays in zip(*read, strict=True))
-    notes += masks.notes
-    seen = observe(images, masks.table.classes)
-    if not len(seen.tracked):
-        return None
+    stored = stored_size(recording, settings)
+    frames = [recording.frames[i] for i in choice.frames]
     unit = settings.metres_per_unit
     upright, turn = upright_cameras(recording, [*choice.frames], settings.up, unit)
+    try:
+        if settings.tracks == "auto":
+            untracked = UntrackedMasks(recording.folder, label_set_name, size, stored)
+            given, ids, intrinsics = untracked.read(frames)
+            cameras = room_cameras(upright, np.eye(4))
+            images, classes, said = track(given, ids, cameras, intrinsics)
+            notes += [*untracked.notes, said]
+        else:
+            masks = RoomMasks(recording.folder, label_set_name, size, stored)
+            images, intrinsics = (
+                np.stack(arrays)
+                for arrays in zip(*(masks.read(frame) for frame in frames), strict=True)
+            )
+            notes += masks.notes
+            classes = masks.table.classes
+            _check_tracked(images, len(classes))
+    except InputError as error:
+        raise InputError(f"{recording.path}: {str(error).removesuffix('.')}.") from None
+    seen = observe(images, classes)
+    if not len(seen.tracked):
+        return None
     floor = recording.floor_m if recording.floor_m is not None else settings.floor_m
     if floor is None:
         floor, said = _unsaid_floor(seen, upright, intrinsics, settings)
@@ -102,6 +125,20 @@ def prepare_posed(
     world_to_camera = cameras_in_room(recording, upright, turn, floor)
     views = seen.room_views(room_name(recording.folder), world_to_camera, intrinsics)
     return PreparedRoom(views, notes=tuple(notes))
+
+
+def _check_tracked(images: np.ndarray, void: int) -> None:
+    """Raise an `InputError` if most ids are in one frame only, as where each frame has its own."""
+    frames_of = np.zeros(void + 1, dtype=np.int64)
+    for image in images:
+        frames_of[np.unique(image)] += 1
+    frames_of = frames_of[1:void]  # neither the background nor what has no class
+    count, once = int((frames_of > 0).sum()), int((frames_of == 1).sum())
+    if len(images) >= _MANY_FRAMES and count >= _MANY_IDS and once > _ONCE * count:
+        raise InputError(
+            f"{once} of its {count} ids are in one of {len(images)} frames only, expected the same "
+            "id for an object in all frames; --tracks auto finds the objects of such masks."
+        )
 
 
 def _unsaid_floor(

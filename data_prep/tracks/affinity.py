@@ -13,6 +13,9 @@ CLASS_ERROR = 0.05
 """Assumed share of wrong classes."""
 ONE_VIEW = -4.0
 """Weight of two masks of one view: an object has one mask, unless the mask is split."""
+ID_MEANS = 0.3
+"""Ids mean something if this share of the pairs in a cluster has equal ids, and unequal clusters
+have less than this part of that."""
 
 
 def pair_weights(
@@ -51,3 +54,22 @@ def class_odds(mask_class: Int[np.ndarray, " masks"]) -> Float[np.ndarray, "clas
     unequal = np.log(2 * CLASS_ERROR / (1 - agree + 1e-3))
     equal = np.log((1 - 2 * CLASS_ERROR) / agree)
     return np.where(np.eye(len(share), dtype=bool), equal, unequal)
+
+
+def id_odds(
+    given: Int[np.ndarray, " masks"],
+    labels: Int[np.ndarray, " masks"],
+    mask_view: Int[np.ndarray, " masks"],
+) -> Float[np.ndarray, "masks masks"] | None:
+    """Log-odds that masks show one object by their ids, whose error rates are counted in clusters
+    found without them; None if ids mean nothing across views."""
+    apart = mask_view[:, None] != mask_view
+    same_id, same = given[:, None] == given, labels[:, None] == labels
+    if not (apart & same).any() or not (apart & ~same).any():
+        return None
+    within, between = same_id[apart & same].mean(), same_id[apart & ~same].mean()
+    if within < ID_MEANS or between > ID_MEANS * within:
+        return None
+    within, between = np.clip([within, between], 0.02, 0.98)
+    odds = np.where(same_id, np.log(within / between), np.log((1 - within) / (1 - between)))
+    return np.where(apart, odds, 0.0)

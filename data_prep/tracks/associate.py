@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from data_prep.tracks.affinity import pair_weights
+from data_prep.tracks.affinity import id_odds, pair_weights
 from data_prep.tracks.clusters import cluster
 from data_prep.tracks.explained import explained
 from data_prep.tracks.leftovers import join_leftovers
@@ -62,17 +62,26 @@ def associate(
     masks: FrameMasks,
     world_to_camera: Float[np.ndarray, "views 4 4"],
     intrinsics: Float[np.ndarray, "views 3 3"],
+    given: Int[np.ndarray, " masks"] | None = None,
 ) -> Tracks:
     """Find the object that each mask shows.
 
-    Poses have OpenCV axes and metres; which way is up does not matter.
+    Poses have OpenCV axes and metres; which way is up does not matter. `given` are the ids that the
+    masks had. Where they turn out to mean something across views, they are evidence, too, and no
+    mask is split: right ids stay as they are, broken and mixed ones are mended.
     """
     if not len(masks.mask_class):
         return Tracks(np.minimum(masks.ids, 0), masks.mask_class)
     parts, labels = _labels(masks, world_to_camera, intrinsics)
+    speck = SPECK
+    if given is not None:
+        odds = id_odds(given, labels[: len(given)], masks.mask_view)
+        if odds is not None:
+            parts, labels = _labels(masks, world_to_camera, intrinsics, odds)
+            speck = 0.0
     pixels = np.bincount(parts.ids[parts.ids > 0], minlength=len(labels) + 1)[1:]
     size, area = np.bincount(labels), np.bincount(labels, pixels)
-    kept = (area > 0) & ((size > 1) | (area > SPECK * parts.ids[0].size))
+    kept = (area > 0) & ((size > 1) | (area > speck * parts.ids[0].size))
     number = np.where(kept, np.cumsum(kept), UNKNOWN)
     of_id = np.concatenate([[0], number[labels]])
     ids = np.where(parts.ids < 0, UNKNOWN, of_id[np.maximum(parts.ids, 0)]).astype(np.int32)
@@ -81,9 +90,16 @@ def associate(
 
 
 def _labels(
-    masks: FrameMasks, world_to_camera: np.ndarray, intrinsics: np.ndarray
+    masks: FrameMasks,
+    world_to_camera: np.ndarray,
+    intrinsics: np.ndarray,
+    odds: np.ndarray | None = None,
 ) -> tuple[FrameMasks, Int[np.ndarray, " masks"]]:
-    """The masks, merged ones split, and the number of the object, from 0, that each shows."""
+    """The masks, merged ones split, and the number of the object, from 0, that each shows.
+
+    `odds`, (masks, masks), are further weights of pairs, from ids that mean something: then masks
+    are neither split nor joined by hulls.
+    """
     step = max(1, round(STEP * max(masks.ids.shape[1:]) / 480))
     cameras = cameras_of(world_to_camera, intrinsics, step)
     ids = np.ascontiguousarray(masks.ids[:, ::step, ::step])
@@ -92,10 +108,10 @@ def _labels(
     for number in range(ROUNDS):
         depth = first_hits(ids, cameras, grid)
         cells, shown = surface(near, cameras, grid, depth)
-        weights = pair_weights(shown, view, classes)
+        weights = pair_weights(shown, view, classes) + (0.0 if odds is None else odds)
         labels = cluster(weights)
         split: Split = []
-        if number in SPLIT:
+        if odds is None and number in SPLIT:
             full, split = split_merged(masks.ids, step, cells, shown, labels, view, cameras, grid)
         if split:
             main = [np.bincount(classes[labels == other]).argmax() for _, other in split]
@@ -105,7 +121,7 @@ def _labels(
             view = np.concatenate([view, view[[mask for mask, _ in split]]])
         elif number < ROUNDS - 1:
             _carve(grid, cells, owners(shown, labels), shown, number >= STRICT)
-    for _ in range(JOINS):
+    for _ in range(JOINS if odds is None else 0):
         share = explained(ids, near, labels, cameras, grid)
         joined = join_leftovers(labels, share, weights, view, classes)
         if np.array_equal(joined, labels):

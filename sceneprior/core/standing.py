@@ -117,7 +117,7 @@ def _on_feet(item: SceneObject, told: Counter[str]) -> SceneObject:
 
 
 def _apart(scene: Scene, objects: list[SceneObject], told: Counter[str]) -> list[SceneObject]:
-    floor = floor_polygon(scene)
+    floor = _free_floor(scene)
     kept: dict[int, SceneObject] = {}
     taken = np.zeros((0, 2, 3))
     order = np.argsort([-item.size_m[0] * item.size_m[2] for item in objects], kind="stable")
@@ -135,6 +135,16 @@ def _apart(scene: Scene, objects: list[SceneObject], told: Counter[str]) -> list
         kept[row] = item
         taken = np.concatenate([taken, boxes])
     return [kept[row] for row in range(len(objects)) if row in kept]
+
+
+def _free_floor(scene: Scene) -> shapely.Geometry | None:
+    """The floor without the squares through which its doors swing; None if it is not known."""
+    floor = floor_polygon(scene)
+    if floor is None:
+        return None
+    doors = [o for o in scene.openings if o.kind == "door"]
+    lines = [shapely.LineString([door.start_m, door.end_m]) for door in doors]
+    return floor - shapely.union_all([line.buffer(line.length, cap_style="flat") for line in lines])
 
 
 def free_offset(

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 import trimesh
 from rooms_of_solids import solid_box
 
 from sceneprior.core.colliders import colliders, convex_parts, mesh_of, volume_and_centroid
 from sceneprior.core.feet import stands_safely, with_feet
-from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, Turned
+from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject, Solid, Turned
 from sceneprior.core.standing import body_boxes, stand
 
 KINDS = ("box", "cylinder", "ellipsoid", "dome", "bowl")
@@ -100,6 +101,22 @@ def test_pushed_objects_stay_on_the_floor():
     scene, _ = standing(bed, desk, floor=floor)
     low, high = body_boxes(scene.objects[1])[0]
     assert high[0] <= 1.3 + 1e-9 and low[2] >= -2 and deepest_overlap(scene) == 0
+
+
+def test_pushed_objects_leave_doors_free():
+    """The nightstand would go to +x, where a door swings; without the door it does."""
+    floor = np.array([[-1.0, -2.0], [2.0, -2.0], [2.0, 2.0], [-1.0, 2.0]])
+    door = Opening("door", (2.0, 0.4), (2.0, 1.1), 0.0, 2.0)
+    bed = solid_box("double_bed", (0, 0.3, 0), (1.8, 0.6, 2))
+    nightstand = solid_box("nightstand", (1.0, 0.25, 0.8), (0.5, 0.5, 0.4))
+    for openings, free in (((), False), ((door,), True)):
+        scene = Scene("room", "front3d_bedroom", (bed, nightstand), floor, openings=openings)
+        moved, told = stand(scene)
+        low, high = body_boxes(moved.objects[1])[0]
+        swing = shapely.box(1.3, 0.4, 2.0, 1.1)
+        shared = swing.intersection(shapely.box(*low[::2], *high[::2])).area
+        assert told["moved"] == 1 and (shared < 1e-3) == free
+    assert deepest_overlap(moved) == 0
 
 
 def test_without_a_free_place_an_object_is_left_out():

@@ -89,9 +89,9 @@ def _one_more(
 
 
 def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Iterator[Change]:
-    """What may be better: parts of another kind, parts made narrow and mirrored, parts split in two
-    with the hull's extents in each half, parts below others, and new parts around pieces of the
-    hull that no part fills."""
+    """Changes that may be better: parts of another kind, parts mirrored as they are or narrow,
+    parts split in two with the hull's extents in each half, parts below others, and new parts
+    around pieces of the hull that no part fills."""
     new = len(guess.kinds)
     room = new < MOST_PARTS
     for row in range(new):
@@ -107,6 +107,7 @@ def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Ite
                 narrow = ends.copy()
                 narrow[axis, 1] = low + (high - low) // 4
                 yield {row: (BOX, across | bit, narrow)}
+                yield {row: (int(guess.kinds[row]), across | bit, ends)}
             for share in PLACES if room else ():
                 one, other = ends.copy(), ends.copy()
                 one[axis, 1] = other[axis, 0] = low + round(share * (high - low))

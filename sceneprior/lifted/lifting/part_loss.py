@@ -5,6 +5,7 @@
       + 0.002 (number of curved parts) - 0.0005 (volume of the parts, 1 for the box)
       + 0.06 (gap between the parts and the floor, or the ceiling for lamps; 1 for the box's height)
       + 0.005 (connected pieces - 1)
+      + 0.1 (overhang of the centre beyond the feet, unless the object hangs; 1 for the box's width)
 
 A ray is right if it meets a part exactly when its pixel is the object's. Rays count only within
 the object's outline, which cuts the parts. Upright rays within it are hits as well: cameras rarely
@@ -13,7 +14,8 @@ look down, so without these rays no mask says that a table top reaches the outli
 Few parts explain masks more cheaply than what a visual hull adds where no view sees past: a
 headboard and a mattress, not a dome. Parts and their mirror images count once, and so do planes and
 theirs; sides of the box cost nothing. So edges line up. The other prices settle what rays leave
-open: solids are full where nobody has looked, stand or hang, and hold together.
+open: solids are full where nobody has looked, stand without tipping over or hang, and hold
+together.
 """
 
 from collections.abc import Iterable
@@ -25,11 +27,17 @@ from jaxtyping import Bool, Float, Int
 from sceneprior.core.parts import BOX, SQUARE, Parts
 from sceneprior.lifted.lifting.lifted import RayPool
 from sceneprior.lifted.lifting.outlines import cut_rays, points_within
-from sceneprior.lifted.lifting.part_prices import LEVELS, count_planes, gap_and_pieces, volume_of
+from sceneprior.lifted.lifting.part_prices import (
+    LEVELS,
+    count_planes,
+    gap_and_pieces,
+    overhang,
+    volume_of,
+)
 from sceneprior.lifted.lifting.part_rays import descend, meets, wrong_rays
 
 PART_PRICE, CURVED_PRICE, PLANE_PRICE = 0.002, 0.002, 0.002
-VOLUME_PRICE, GAP_PRICE, PIECE_PRICE = -0.0005, 0.06, 0.005
+VOLUME_PRICE, GAP_PRICE, PIECE_PRICE, OVERHANG_PRICE = -0.0005, 0.06, 0.005, 0.1
 FEWEST = 50
 """Added to the numbers of hits and misses, so that few rays do not weigh too much."""
 UPRIGHT = 0.075
@@ -100,6 +108,7 @@ class RayFit:
             + VOLUME_PRICE * volume
             + GAP_PRICE * gap / LEVELS
             + PIECE_PRICE * (pieces - 1)
+            + (0 if self.hangs else OVERHANG_PRICE * overhang(guess.mirrored, guess.ends) / LEVELS)
         )
 
     def guess(

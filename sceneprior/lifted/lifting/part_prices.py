@@ -1,5 +1,5 @@
-"""Prices of parts that hang on the parts alone: volume, planes of faces, pieces, and the
-gap to what they stand on or hang from.
+"""Prices of parts that hang on the parts alone: volume, planes of faces, pieces, the gap
+to what they stand on or hang from, and whether they would tip over.
 
 Faces lie on `LEVELS` + 1 evenly spaced levels between the sides of the object's box.
 """
@@ -64,10 +64,8 @@ def count_planes(ends):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def gap_and_pieces(mirrored, ends, hangs):
-    """The gap, in levels, between the floor of the object's box, or its ceiling for an object that
-    hangs, and the connected piece that comes nearest to it; and the number of pieces. Parts within
-    a level touch."""
+def solids_of(mirrored, ends):
+    """The ends, in levels, of all parts and their mirror images."""
     solids = np.empty((4 * len(ends), 3, 2), np.int64)
     count = 0
     for part in range(len(ends)):
@@ -80,6 +78,43 @@ def gap_and_pieces(mirrored, ends, hangs):
                     solids[count, axis, 0] = LEVELS - ends[part, axis, 1]
                     solids[count, axis, 1] = LEVELS - ends[part, axis, 0]
             count += 1
+    return solids[:count]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def overhang(mirrored, ends):
+    """How far, in levels along x and z together, the centre of the parts' volume lies beyond the
+    rectangle around the parts that reach lowest. Above 0, the object would tip over."""
+    solids = solids_of(mirrored, ends)
+    lowest = solids[:, 1, 0].min()
+    center, volume = np.zeros(3), 0.0
+    low, high = np.full(3, float(LEVELS)), np.zeros(3)
+    for solid in solids:
+        share = 1.0
+        for axis in range(3):
+            share *= solid[axis, 1] - solid[axis, 0]
+        volume += share
+        for axis in range(3):
+            center[axis] += share * (solid[axis, 0] + solid[axis, 1]) / 2
+            if solid[1, 0] <= lowest + 1:
+                low[axis] = min(low[axis], solid[axis, 0])
+                high[axis] = max(high[axis], solid[axis, 1])
+    beyond = 0.0
+    for axis in (0, 2):
+        middle = center[axis] / volume
+        beyond += max(low[axis] - middle, middle - high[axis], 0.0)
+    return beyond
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def gap_and_pieces(mirrored, ends, hangs):
+    """The gap, in levels, between the floor of the object's box, or its ceiling for an object that
+    hangs, and the connected piece that comes nearest to it; and the number of pieces. Parts within
+    a level touch."""
+    solids = solids_of(mirrored, ends)
+    count = len(solids)
     piece = np.arange(count)
     pieces = count
     for one in range(count):

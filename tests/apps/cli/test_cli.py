@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import trimesh
 from cli_helpers import everything_in, one_sentence
 from tiny_runs import write_tiny_config
 
@@ -77,6 +78,18 @@ def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
     assert page.count("<model-viewer ") == 3 and "seed 5 · from: paper" in page
     assert command(*call, "--out", "made", "--overwrite")[0] == 0
     assert everything_in(tmp_path) == before
+
+
+def test_synthesize_writes_walls_if_asked(command, toy_run, tmp_path):
+    call = ["synthesize", "--run", toy_run, "-n", 1, "--renderer", "software", "--out"]
+    for shell, nodes in (("walls", {"floor", "wall_0", "ceiling"}), ("none", set())):
+        assert command(*call, shell, "--shell", shell)[0] == 0
+        found = set(trimesh.load_scene(tmp_path / shell / "seed0_0000.glb").graph.nodes_geometry)
+        assert found & {"floor", "wall_0", "ceiling"} == nodes
+    pictures = [(tmp_path / shell / "overview.png").read_bytes() for shell in ("walls", "none")]
+    assert pictures[0] != pictures[1]
+    said = one_sentence(command(*call, "other", "--shell", "roof"))
+    assert "--shell roof is not known; choose from walls, floor, none." in said
 
 
 def test_unforeseen_errors_are_one_line_and_status_1(command, monkeypatch):

@@ -10,6 +10,7 @@ from sceneprior.core.parts import BOX, CYLINDER, MOST_CORNERS, MOST_PARTS, Parts
 from sceneprior.lifted.lifting.lifted import RayPool
 from sceneprior.lifted.lifting.part_fit import fit_parts
 from sceneprior.lifted.lifting.part_loss import RayFit
+from sceneprior.lifted.lifting.part_prices import overhang
 
 MARGIN, CELLS = 1.1, 32
 
@@ -50,6 +51,18 @@ def test_what_hangs_reaches_the_ceiling_and_what_stands_the_floor():
         found = fit_parts(rays_of(shade, 4000), hull, MARGIN, hangs)
         heights = np.stack([ends[1] for _, ends in found.solids()])
         assert heights.max() == 0.5 if hangs else heights.min() == -0.5
+
+
+def test_furniture_that_stands_does_not_tip_over():
+    """Masks show one leg of a table alone; an object that hangs may have one."""
+    shown = boxes((0, 64, 56, 64, 0, 64), (0, 8, 0, 56, 0, 8))
+    hull = filled_cells(shown, CELLS, MARGIN)
+    legs = []
+    for hangs in (False, True):
+        found = fit_parts(rays_of(shown, 4000), hull, MARGIN, hangs)
+        levels = np.rint((found.ends + 0.5) * 64).astype(np.int64)
+        legs.append(overhang(found.mirrored, levels))
+    assert legs[0] < 4 < legs[1]
 
 
 def test_objects_without_rays_are_their_box():

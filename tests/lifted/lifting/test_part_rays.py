@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from parts_of_rooms import TABLE, rays_of
 
-from sceneprior.core.parts import BOX, SQUARE, Parts, inside
+from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, SQUARE, Parts, inside
 from sceneprior.lifted.lifting.part_loss import RayFit
 from sceneprior.lifted.lifting.part_prices import (
     LEVELS,
     count_planes,
     gap_and_pieces,
+    overhang,
     planes_of,
     volume_of,
 )
@@ -106,6 +107,21 @@ def test_gaps_are_those_to_the_floor_or_the_ceiling():
     apart = np.concatenate([legs, top])
     assert gap_and_pieces(np.array([3, 0]), apart, False) == (0, 5)
     assert gap_and_pieces(np.zeros(1, int), top, False) == (42, 1)
+
+
+def test_a_table_on_one_leg_would_tip_over():
+    top = [[0, 64], [56, 64], [0, 64]]
+    leg = [[0, 8], [0, 56], [0, 8]]
+    ends = np.array([top, leg])
+    assert overhang(np.array([0, ACROSS_X | ACROSS_Z]), ends) == 0
+    volumes = np.array([8 * 64 * 64, 8 * 8 * 56])
+    middle = (volumes * [32, 4]).sum() / volumes.sum()
+    assert overhang(np.array([0, 0]), ends) == pytest.approx(2 * (middle - 8))
+    assert overhang(np.array([0, ACROSS_Z]), ends) == pytest.approx(
+        (np.array([volumes[0], 2 * volumes[1]]) * [32, 4]).sum() / (volumes[0] + 2 * volumes[1]) - 8
+    )
+    ends[1, [0, 2]] = 28, 36  # a pedestal
+    assert overhang(np.array([0, 0]), ends) == 0
 
 
 def test_wrong_rays_of_several_objects_are_counted_at_once():
