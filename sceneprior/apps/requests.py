@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.instances.checked import checked
-from sceneprior.core.scene_json import MOST_OBJECTS, ObjectEntry, OpeningEntry, read_object
+from sceneprior.core.scene_json import MOST_OBJECTS, ObjectEntry, read_object
 from sceneprior.interchange.floors import read_floor_file
 
 FORMAT = "sceneprior-request"
@@ -28,6 +28,18 @@ class RelationEntry(BaseModel):
     count: Annotated[int, Field(ge=1)] = 1
 
 
+class OpeningEntry(BaseModel):
+    """A door or a window of a request, with both ends."""
+
+    model_config = _STRICT
+
+    kind: Literal["door", "window"]
+    start_m: _Pair
+    end_m: _Pair
+    bottom_m: float | None = None
+    top_m: float | None = None
+
+
 class RequestFile(BaseModel):
     """The JSON of a request; `RequestFile.model_json_schema()` is its JSON Schema."""
 
@@ -36,7 +48,7 @@ class RequestFile(BaseModel):
     format: Literal["sceneprior-request"]
     version: Literal[1]
     floor: Annotated[list[_Pair], Field(min_length=3)] | str | None = None
-    openings: list[str | OpeningEntry] = []
+    openings: list[OpeningEntry | str] = []
     ceiling_m: float | None = None
     want: dict[str, list[RelationEntry] | int | str] | str | None = None
     objects: Annotated[list[ObjectEntry], Field(max_length=MOST_OBJECTS)] = []
@@ -56,7 +68,8 @@ def load_request(path: str | Path) -> dict[str, Any]:
     if isinstance(entry.floor, str):
         asked["floor"] = entry.floor
     asked["openings"] = [
-        each if isinstance(each, str) else each.model_dump() for each in entry.openings
+        each if isinstance(each, str) else each.model_dump(exclude_none=True)
+        for each in entry.openings
     ]
     asked["want"] = entry.want
     if isinstance(entry.want, dict):

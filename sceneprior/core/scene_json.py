@@ -100,9 +100,7 @@ class ObjectEntry(BaseModel):
     solids: Annotated[list[_SolidEntry], Field(max_length=MOST_SOLIDS)] = []
 
 
-class OpeningEntry(BaseModel):
-    """A door or a window of a file."""
-
+class _OpeningEntry(BaseModel):
     model_config = _STRICT
 
     kind: Literal["door", "window"]
@@ -119,7 +117,7 @@ class _SceneEntry(BaseModel):
     label_set: str
     objects: Annotated[list[ObjectEntry], Field(max_length=MOST_OBJECTS)]
     floor_m: Annotated[list[_Pair], Field(min_length=3)] | None = None
-    openings: list[OpeningEntry] = []
+    openings: list[_OpeningEntry] = []
     ceiling_m: Annotated[float, Field(gt=0, le=FARTHEST_M)] | None = None
     extra: dict[str, Any] = {}
 
