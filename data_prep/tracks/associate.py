@@ -104,7 +104,7 @@ def _labels(
     cameras = cameras_of(world_to_camera, intrinsics, step)
     ids = np.ascontiguousarray(masks.ids[:, ::step, ::step])
     near, view, classes = widened(ids), masks.mask_view, masks.mask_class
-    grid = fill(ids, cameras)
+    grid = fill(near, cameras)
     for number in range(ROUNDS):
         depth = first_hits(ids, cameras, grid)
         cells, shown = surface(near, cameras, grid, depth)
