@@ -251,4 +251,4 @@ def _box_m(decoded: DecodedScenes, room: int, item: int) -> Float[np.ndarray, "6
 def _padded(outline: Float[np.ndarray, "corners 2"]) -> Float[Tensor, "most 2"]:
     """An outline of `MOST_CORNERS` corners, its last one repeated."""
     missing = MOST_CORNERS - len(outline)
-    return torch.from_numpy(np.pad(outline, ((0, missing), (0, 0)), mode="edge")).float()
+    return torch.tensor(np.pad(outline, ((0, missing), (0, 0)), mode="edge"), dtype=torch.float32)

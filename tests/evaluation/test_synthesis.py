@@ -242,7 +242,7 @@ def test_what_cannot_be_scored_is_refused_before_anything_is_drawn(
 ):
     renderer = open_renderer("software")
     monkeypatch.setattr(renderer, "instance_ids", None, raising=True)
-    with pytest.raises(InputError, match="at least 2 generated rooms, but 1 came"):
+    with pytest.raises(InputError, match="at least 2 generated rooms, but there are 1"):
         evaluate_synthesis(generated[:1], shards, EvalOptions(renderer=renderer))
     with pytest.raises(InputError, match="scenes of one label set"):
         evaluate_synthesis([Scene("a", "scannet")] * 2, shards, EvalOptions(renderer=renderer))

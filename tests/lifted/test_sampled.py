@@ -75,7 +75,7 @@ def test_classes_and_floor_are_kept_to(trained):
     (answers,) = complete(trained, [room], count=4, seed=0, classes=wanted)
     for answer in answers:
         assert sorted(item.label for item in answer.objects) == wanted
-    with pytest.raises(InputError, match="'piano' is no class"):
+    with pytest.raises(InputError, match="'piano' is not a class"):
         complete(trained, [room], classes=["piano"])
 
 

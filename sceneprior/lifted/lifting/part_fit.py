@@ -139,7 +139,7 @@ def _below(ends: Int[np.ndarray, "3 2"]) -> Iterator[tuple[int, Int[np.ndarray, 
     for axes, across in (((0, 2), ACROSS_X | ACROSS_Z), ((0,), ACROSS_X), ((2,), ACROSS_Z)):
         leg = under.copy()
         for axis in axes:
-            leg[axis, 1] = leg[axis, 0] + SHORTEST
+            leg[axis, 1] = min(leg[axis, 0] + SHORTEST, ends[axis, 1])
         yield across, leg
 
 

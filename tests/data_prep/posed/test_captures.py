@@ -67,7 +67,7 @@ def test_things_are_where_they_are_through_a_distorted_lens(room, model):
 
 def test_a_lens_that_folds_the_picture_over_names_the_frame(room):
     room.write(floor_m=0.0, k1=-0.9)
-    with pytest.raises(InputError, match=r"frame 'images/frame_00000.jpg': its lens .* bends"):
+    with pytest.raises(InputError, match=r"frame 'images/frame_00000.jpg': its lens .* distorts"):
         prepared(room)
 
 

@@ -74,7 +74,7 @@ def test_the_message_says_where(write):
     [
         ({"version": 3}, "header, byte 0: version 3, expected 4"),
         ({"kind": 7}, "compressions 7 .colour. and 1 .depth., expected 0, 1 or 2"),
-        ({"size": (0, 32)}, "colour pictures of 32 x 0 .* cannot be"),
+        ({"size": (0, 32)}, "colour pictures of 32 x 0 .* are implausible"),
         ({"K": np.full((4, 4), np.nan)}, "focal lengths are nan and nan"),
     ],
 )

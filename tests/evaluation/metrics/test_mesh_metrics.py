@@ -61,7 +61,7 @@ def test_chamfer_and_f_score_are_the_definition(rng):
 
 
 def test_empty_surfaces_are_refused():
-    with pytest.raises(InputError, match="0 and 1 came"):
+    with pytest.raises(InputError, match="got 0 and 1"):
         nearest_distances(np.zeros((0, 3)), np.zeros((1, 3)))
 
 

@@ -8,7 +8,7 @@ from parts_of_rooms import CORNER, TABLE, boxes, rays_of
 from sceneprior.core.geometry.part_meshes import surface_of_parts
 from sceneprior.core.parts import BOX, CYLINDER, MOST_CORNERS, MOST_PARTS, Parts, filled_cells
 from sceneprior.lifted.lifting.lifted import RayPool
-from sceneprior.lifted.lifting.part_fit import fit_parts
+from sceneprior.lifted.lifting.part_fit import _below, fit_parts
 from sceneprior.lifted.lifting.part_loss import RayFit
 from sceneprior.lifted.lifting.part_prices import overhang
 
@@ -122,3 +122,12 @@ def test_a_round_bench_keeps_its_outline():
     vertices, faces = surface_of_parts(found)
     mesh = trimesh.Trimesh(vertices, faces)
     assert mesh.is_volume and mesh.volume == pytest.approx(np.pi / 4, rel=0.08)
+
+
+@pytest.mark.parametrize("first", [0, 30, 62])
+def test_what_stands_below_a_part_is_no_wider(first):
+    """Compiled code checks no index: an end beyond the last level would be read from elsewhere."""
+    ends = np.array([[first, first + 2], [20, 40], [first, first + 2]])
+    for _, below in _below(ends):
+        assert (below[[0, 2], 0] >= first).all() and (below[[0, 2], 1] <= first + 2).all()
+        assert (below[:, 0] < below[:, 1]).all() and below[1].tolist() == [0, 20]
