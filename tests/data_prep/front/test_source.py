@@ -88,7 +88,11 @@ def test_a_type_that_no_room_has(front):
         ({"pieces": 14}, "max_objects", "14 objects, max_objects is 13"),
         ({"bounds": (-3.1, -2, 3.1, 2)}, "max_floor_m", "floor 6.20 x 4.00 m, max_floor_m is 6"),
         ({"wall_m": 4.2}, "max_height_m", "height 4.20 m, max_height_m is 4"),
-        ({"jid": "stand"}, "required_classes", "none of double_bed, single_bed, kids_bed, of which"),
+        (
+            {"jid": "stand"},
+            "required_classes",
+            "none of double_bed, single_bed, kids_bed, of which",
+        ),
         ({"scale": [9, 1, 1]}, "scale_range", "'bed' is scaled by 9, 1, 1, beyond scale_range"),
     ],
 )
