@@ -18,7 +18,6 @@ from sceneprior.core.parts import (
     KIND_NAMES,
     MOST_CORNERS,
     MOST_PARTS,
-    SQUARE,
     Parts,
     filled_cells,
     whole_box,
@@ -94,7 +93,7 @@ class LookDecoder(ShapeModule):
         self.register_buffer("part_kind", torch.full(slots, self.unknown, dtype=torch.int8))
         self.register_buffer("part_mirrored", torch.zeros(slots, dtype=torch.int8))
         self.register_buffer("part_ends", torch.zeros(*slots, 3, 2))
-        self.register_buffer("outlines", _padded(SQUARE).repeat(most, 1, 1))
+        self.register_buffer("outlines", torch.zeros(most, MOST_CORNERS, 2))
         self.register_buffer("filled", torch.ones(most))
         self.register_buffer("sizes_m", torch.ones(most, 3))
         self.register_buffer("object_class", torch.full((most,), self.unknown))
@@ -251,4 +250,4 @@ def _box_m(decoded: DecodedScenes, room: int, item: int) -> Float[np.ndarray, "6
 def _padded(outline: Float[np.ndarray, "corners 2"]) -> Float[Tensor, "most 2"]:
     """An outline of `MOST_CORNERS` corners, its last one repeated."""
     missing = MOST_CORNERS - len(outline)
-    return torch.tensor(np.pad(outline, ((0, missing), (0, 0)), mode="edge"), dtype=torch.float32)
+    return torch.from_numpy(np.pad(outline, ((0, missing), (0, 0)), mode="edge")).float()
