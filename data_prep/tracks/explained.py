@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
-from data_prep.tracks.voxels import MIN_DEPTH_M, Cameras, Grid
+from data_prep.tracks.voxels import Cameras, Grid, pixel_of
 
 VIEWS_AT_LEAST = 2
 """Smallest number of views, other than the mask's own, that show the cluster in a cell of its
@@ -57,15 +57,10 @@ def _count(cells, shown, to_image, low_m, cell_m, own, past):
         y = low_m[1] + (cells[i, 1] + 0.5) * cell_m
         z = low_m[2] + (cells[i, 2] + 0.5) * cell_m
         for view in range(views):
-            m = to_image[view]
-            far = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-            if far < MIN_DEPTH_M:
+            line, column, _ = pixel_of(to_image[view], x, y, z, height, width)
+            if line < 0:
                 continue
-            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / far
-            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / far
-            if not (0 <= u < width and 0 <= v < height):
-                continue
-            label = shown[view, int(v), int(u)]
+            label = shown[view, line, column]
             if label == -1:
                 past[i] += 1
             elif label >= 0:

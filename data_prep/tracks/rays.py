@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from numba import njit
 from scipy import ndimage
 
-from data_prep.tracks.voxels import MIN_DEPTH_M, Cameras, Grid
+from data_prep.tracks.voxels import Cameras, Grid, pixel_of
 
 WIDEN_PX = 1.5
 """Sampled pixels by which masks are widened where views are compared: outlines, cells and poses
@@ -125,15 +125,9 @@ def _look(cells, ids, to_image, low_m, cell_m, depth, shown):
         y = low_m[1] + (cells[i, 1] + 0.5) * cell_m
         z = low_m[2] + (cells[i, 2] + 0.5) * cell_m
         for view in range(views):
-            m = to_image[view]
-            far = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-            if far < MIN_DEPTH_M:
+            row, column, far = pixel_of(to_image[view], x, y, z, height, width)
+            if row < 0:
                 continue
-            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / far
-            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / far
-            if not (0 <= u < width and 0 <= v < height):
-                continue
-            column, row = int(u), int(v)
             number = ids[view, row, column]
             if number < 0 or (number > 0 and far > depth[view, row, column] + BEHIND * cell_m):
                 continue

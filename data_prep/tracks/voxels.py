@@ -127,6 +127,21 @@ def _count(table, x1, y1, x2, y2):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
+def pixel_of(matrix, x, y, z, height, width):
+    """Row, column and depth in metres of a point in a view, whose `matrix` (3, 4) takes points to
+    the image. The row is -1 for a point behind the camera or beyond the image."""
+    depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+    if depth < MIN_DEPTH_M:
+        return -1, -1, depth
+    u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / depth
+    v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / depth
+    if not (0 <= u < width and 0 <= v < height):
+        return -1, -1, depth
+    return int(v), int(u), depth
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def _score(cells, low_m, cell_m, eyes_m, to_image, focal_px, masks, anything, any_mask, kept):
     views, height, width = masks.shape[0], masks.shape[1] - 1, masks.shape[2] - 1
     for_it = np.log((1 - MISSED) / (1 - BACKGROUND))
@@ -137,20 +152,14 @@ def _score(cells, low_m, cell_m, eyes_m, to_image, focal_px, masks, anything, an
         z = low_m[2] + (cells[i, 2] + 0.5) * cell_m
         odds, seen = PRIOR, 0
         for view in range(views):
-            m = to_image[view]
             if not any_mask:
                 a, b, c = x - eyes_m[view, 0], y - eyes_m[view, 1], z - eyes_m[view, 2]
                 if a * a + b * b + c * c < CLEAR_M * CLEAR_M:
                     odds = -1e9
                     break
-            depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-            if depth < MIN_DEPTH_M:
+            row, column, depth = pixel_of(to_image[view], x, y, z, height, width)
+            if row < 0:
                 continue
-            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
-            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
-            if not (0 <= u < width and 0 <= v < height):
-                continue
-            column, row = int(u), int(v)
             # A coarse cell's corner is 0.87 edges from its centre.
             reach = 0.87 if any_mask else 0.5
             radius = int(reach * cell_m * focal_px[view] / depth + 0.5)

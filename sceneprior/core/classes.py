@@ -99,3 +99,10 @@ def class_colors(count: int) -> np.ndarray:
         rgb = colorsys.hls_to_rgb(hue, (0.42, 0.56, 0.70)[index % 3], 0.72)
         colors[index] = [round(255 * channel) for channel in rgb]
     return colors
+
+
+def unknown_class(label: str, known: Sequence[str]) -> InputError:
+    """The error that a class was asked for which the training rooms of a run do not have."""
+    return InputError(
+        f"'{label}' is not a class of this run's training rooms; choose from {', '.join(known)}."
+    )

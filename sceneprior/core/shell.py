@@ -11,10 +11,11 @@ from jaxtyping import Float
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.floor import floor_rectangle
+from sceneprior.core.geometry.part_meshes import prism
 from sceneprior.core.scene import Mesh, Opening, Scene
 
 ShellName = Literal["walls", "floor", "none"]
-"""How much of the shell is drawn or written: all of it, the floor alone, or nothing."""
+"""The drawn or written share of the shell: all of it, the floor alone, or nothing."""
 SHELLS: tuple[ShellName, ...] = ("walls", "floor", "none")
 THICK_M = 0.1
 """Thickness of walls, floor and ceiling; walls stand outside the outline."""
@@ -277,14 +278,9 @@ def _within(wall: Wall, height_m: float) -> Wall:
 
 def slab(outline_m: Float[np.ndarray, "corners 2"], low_m: float, high_m: float) -> Mesh:
     """A closed mesh that fills an outline (x, z) between two heights."""
-    from manifold3d import CrossSection, FillRule
-
-    # The cross section lies in x and -z, and is extruded along y. Outlines run either way.
-    flat = CrossSection([np.asarray(outline_m, np.float64) * [1, -1]], FillRule.NonZero)
-    mesh = flat.extrude(high_m - low_m).to_mesh64()
+    mesh = prism(outline_m, low_m, high_m).to_mesh64()
     points = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
-    placed = np.stack([points[:, 0], points[:, 2] + low_m, -points[:, 1]], axis=1)
-    return Mesh(placed, np.asarray(mesh.tri_verts, dtype=np.int64))
+    return Mesh(points, np.asarray(mesh.tri_verts, dtype=np.int64))
 
 
 def _wall_mesh(

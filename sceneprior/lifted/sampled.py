@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sceneprior.core.classes import label_set
+from sceneprior.core.classes import label_set, unknown_class
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.threads import single_threaded
@@ -87,10 +87,7 @@ def class_rows(trained: TrainedLifted, labels: Sequence[str]) -> Int[Tensor, "1 
     known = [classes[row] for row in trained.sampler.drawn_classes]
     for label in labels:
         if label not in known:
-            raise InputError(
-                f"'{label}' is not a class of this run's training rooms; choose from "
-                f"{', '.join(known)}."
-            )
+            raise unknown_class(label, known)
     return torch.tensor([[classes.index(label) for label in labels]], dtype=torch.int64)
 
 

@@ -35,7 +35,7 @@ def surface_of_parts(
     solids = [_solid(kind, ends) for kind, ends in parts.solids()]
     united: Manifold = Manifold.batch_boolean(solids, OpType.Add)
     if not np.array_equal(parts.outline, SQUARE):
-        united = united ^ _prism(parts.outline)
+        united = united ^ prism(parts.outline, -1.0, 1.0)
     mesh = united.simplify(OVERLAP).to_mesh64()
     vertices = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
     return vertices.clip(-0.5, 0.5), np.asarray(mesh.tri_verts, dtype=np.int64)
@@ -52,14 +52,14 @@ def convex_surface(
     return vertices, np.asarray(mesh.tri_verts, dtype=np.int64)
 
 
-def _prism(outline: Float[np.ndarray, "corners 2"]) -> "Manifold":
-    """The upright prism over an outline, taller than the object's box."""
-    from manifold3d import CrossSection
+def prism(outline: Float[np.ndarray, "corners 2"], low: float, high: float) -> "Manifold":
+    """The upright solid over an outline (x, z), which may run either way, between two heights."""
+    from manifold3d import CrossSection, FillRule
 
-    height = 1 + 4 * OVERLAP
+    flat = CrossSection([np.asarray(outline, np.float64)], FillRule.NonZero)
     # Extruded along its third axis, which becomes y.
-    to_room = np.array([[1, 0, 0, 0], [0, 0, 1, -height / 2], [0, 1, 0, 0]])
-    return CrossSection([outline]).extrude(height).transform(to_room)
+    to_room = np.array([[1, 0, 0, 0], [0, 0, 1, low], [0, 1, 0, 0]])
+    return flat.extrude(high - low).transform(to_room)
 
 
 def _solid(kind: int, ends: Float[np.ndarray, "3 2"]) -> "Manifold":

@@ -42,8 +42,9 @@ def outline_of(hull: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "corners 2"
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def within(start, span, outline):
-    """Where a segment, from `start` to `start` + `span`, first enters the prism over an outline and
-    last leaves it, as shares of its length; the first is above the second if it never meets it."""
+    """The points at which a segment, from `start` to `start` + `span`, first enters the prism over
+    an outline and last leaves it, as shares of the segment's length; the first is above the second
+    if the segment never meets the prism."""
     near, far = 1.0, 0.0
     first, last = False, False  # whether the segment's ends lie inside
     corners = len(outline)

@@ -84,7 +84,7 @@ def solids_of(mirrored, ends):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def overhang(mirrored, ends):
-    """How far, in levels along x and z together, the centre of the parts' volume lies beyond the
+    """The distance, in levels along x and z together, of the centre of the parts' volume from the
     rectangle around the parts that reach lowest. Above 0, the object would tip over."""
     solids = solids_of(mirrored, ends)
     lowest = solids[:, 1, 0].min()

@@ -47,7 +47,7 @@ class Relations:
         self.openings = {kind: opening_items(shape, kind) for kind in OPENINGS}
 
     def held(self, furniture: Furniture) -> list[bool]:
-        """Whether each wish holds in a furnished room."""
+        """True for each wish that holds in a furnished room."""
         items = furniture.items(self.classes)
         return [
             int(self._met(wish, items, furniture.object_class).sum()) >= wish.count

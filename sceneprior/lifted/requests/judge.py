@@ -24,7 +24,7 @@ Check = Callable[[], Bool[np.ndarray, " candidates"]]
 
 
 class Judge:
-    """What one requested room allows.
+    """The places that one requested room allows.
 
     Args:
         shape: Floor, doors, windows and ceiling.
@@ -106,7 +106,7 @@ class Judge:
     def _leaves_free(
         self, kind: str, label: int, candidates: Furniture
     ) -> Bool[np.ndarray, " candidates"]:
-        """Whether the space before doors or windows stays free."""
+        """True for places that leave the space before doors or windows free."""
         free = np.ones(len(candidates.back), dtype=bool)
         may = any(word in self.classes[label] for word in BEFORE_WINDOWS)
         if not self._zones[kind] or (kind == "window" and may):
@@ -133,8 +133,7 @@ def _narrowed(
 def backed_by_walls(
     shape: RoomShape, candidates: Furniture, rectangles_m: Float[np.ndarray, "candidates 4"]
 ) -> Bool[np.ndarray, " candidates"]:
-    """Whether backs that stand at a side of a rectangle in the floor stand at a wall; backs
-    elsewhere are free."""
+    """True for places whose back is at a wall, or not at a side of their rectangle in the floor."""
     if shape.is_rectangle:
         return np.ones(len(candidates.back), dtype=bool)
     inward = FRONTS[candidates.back]

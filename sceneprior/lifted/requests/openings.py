@@ -195,8 +195,8 @@ class Zone(NamedTuple):
 
 
 def zones_of(shape: RoomShape) -> dict[str, list[Zone]]:
-    """What must stay free, by kind: the volume that a door swings through, which is as deep as it
-    is wide, and the space before a window above its sill."""
+    """The spaces that must stay free, by kind: the volume that a door swings through, which is as
+    deep as the door is wide, and the space before a window above its sill."""
     zones: dict[str, list[Zone]] = {"door": [], "window": []}
     for each in shape.openings:
         start, end = np.array(each.start_m), np.array(each.end_m)

@@ -29,7 +29,7 @@ class RoomPlan(NamedTuple):
     coming: list[int]
     """Indices of the classes to add, in the order in which they are placed."""
     wanted: list[bool]
-    """Whether the wishes need the object."""
+    """True for objects that the wishes need."""
 
 
 def plan_room(

@@ -34,7 +34,7 @@ _TOKEN = re.compile(r"[a-z_']+|\d+(?:\.\d+)?|\S")
 
 @dataclass
 class Sentence:
-    """What a sentence asks for."""
+    """The wishes, the floor and the openings that a sentence names."""
 
     wishes: Wishes
     floor: str | None = None
@@ -241,7 +241,7 @@ class _Reader:
         return True
 
     def _noun(self) -> tuple[bool, str | None]:
-        """Whether the next noun is in the plural, and its class; None if there is none."""
+        """The next noun: True for a plural, and its class; None if there is no noun."""
         names = {noun: (False, noun) for noun in (*self.nouns, "door", "window")}
         names |= {plural: (True, noun) for noun in list(names) for plural in _plurals(noun)}
         found = self._phrase(list(names))

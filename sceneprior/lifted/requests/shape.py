@@ -51,7 +51,7 @@ class RoomShape:
 
     @property
     def is_rectangle(self) -> bool:
-        """Whether the floor is one rectangle along the axes."""
+        """True if the floor is one rectangle along the axes."""
         low_x, low_z, high_x, high_z = self.polygon.bounds
         whole = (high_x - low_x) * (high_z - low_z)
         return bool(abs(whole - self.polygon.area) < 1e-6 * whole)

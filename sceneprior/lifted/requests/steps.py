@@ -35,7 +35,7 @@ HANGING = ("ceiling_lamp", "pendant_lamp")
 """Classes that hang from the ceiling, where its height is known."""
 
 Hurdles = Counter[tuple[int, str]]
-"""How often an object of a class found no place, by what was in the way."""
+"""The number of times that an object of a class found no place, by the obstacle."""
 
 
 class Proposal(NamedTuple):

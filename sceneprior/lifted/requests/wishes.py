@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sceneprior.core.classes import unknown_class
 from sceneprior.core.errors import InputError
 from sceneprior.lifted.requests.relations import OF_ONE, OPENINGS, RELATIONS
 
@@ -28,7 +29,7 @@ class CountWish:
         return f"at most {self.most} {self.label}"
 
     def holds(self, count: int) -> bool:
-        """Whether a room with this many objects of the class meets the wish."""
+        """True if a room with this many objects of the class meets the wish."""
         return self.least <= count and (self.most is None or count <= self.most)
 
 
@@ -147,10 +148,7 @@ def check_wishes(wishes: Wishes, known: Sequence[str], given: Mapping[str, int],
         least, largest = wishes.bounds(label)
         here = given.get(label, 0)
         if label not in known and (least > here or label not in given):
-            raise InputError(
-                f"'{label}' is no class of this run's training rooms; choose from "
-                f"{', '.join(known)}."
-            )
+            raise unknown_class(label, known)
         if largest is not None and least > largest:
             raise InputError(
                 f"The wishes need {least} {label} and allow {largest}; change one of them."

@@ -104,7 +104,7 @@ def test_nothing_reaches_through_the_ceiling_and_lamps_hang_from_it(prior):
             "No room holds the request: in 8 attempts .* double bed found no place; most places "
             "lacked free floor",
         ),
-        ({"want": {"piano": 1}}, "'piano' is no class of this run's training rooms"),
+        ({"want": {"piano": 1}}, "'piano' is not a class of this run's training rooms"),
         ({"floor": "4x3", "distribution": "paper"}, "can be asked of a sampler alone"),
     ],
 )

@@ -58,7 +58,7 @@ def test_relations_need_their_objects():
 @pytest.mark.parametrize(
     ("want", "given", "message"),
     [
-        ({"piano": 1}, {}, "'piano' is no class of this run's training rooms; choose from bed"),
+        ({"piano": 1}, {}, "'piano' is not a class of this run's training rooms; choose from bed"),
         ({"bed": 6}, {}, "need 6 objects, but rooms of this run hold at most 5"),
         ({"bed": 1}, {"bed": 2}, "given with 2 bed, and the wishes allow 1"),
         (
