@@ -34,7 +34,7 @@ class TopDownProtocol:
     camera_height_m: float = 10.0
     """The camera's height above the floor; nothing above it is drawn."""
     background: tuple[int, int, int] = BACKGROUND
-    """RGB of pixels without an object. The floor is not drawn: a generated room has none."""
+    """RGB of pixels without an object. The floor is not drawn: not all methods make one."""
 
     @property
     def metres_per_pixel(self) -> float:
