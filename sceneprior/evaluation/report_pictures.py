@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from sceneprior.core.classes import class_colors, label_set
+from sceneprior.core.classes import label_set
+from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.evaluation.page import data_uri, glb_of, png_uri
@@ -30,7 +31,7 @@ class RoomPictures:
     contents: str
     """The scene's objects in words: "double bed, nightstand ×2"."""
     topdown: str
-    """Data URI of the flat top-down picture that metrics compare, with borders, at half size."""
+    """Data URI of the flat top-down picture, with borders and in quiet colours, at half size."""
     perspective: str
     """Data URI of the shaded view from above a corner."""
     glb: str
@@ -60,7 +61,7 @@ def legend(scenes: Sequence[Scene]) -> list[tuple[str, str]]:
     if not scenes:
         return []
     names = label_set(scenes[0].label_set)
-    colors = class_colors(len(names))
+    colors = quiet_colors(names)
     present = {item.label for scene in scenes for item in scene.objects}
     return [
         (name.replace("_", " "), f"#{bytes(color.tolist()).hex()}")
@@ -86,7 +87,7 @@ def _input_view(shard: Shard, room_id: str, view: int) -> tuple[str, str]:
     room = shard.read_room(room_id)
     ids = shard.read_instance_ids(room_id, [view])[0].astype(np.int64)
     names = label_set(shard.label_set)
-    colors = class_colors(len(names))[room.object_class]
+    colors = quiet_colors(names)[room.object_class]
     picture = Image.fromarray(paint_ids(ids, colors, _EMPTY))
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size=11)
     height, width = ids.shape

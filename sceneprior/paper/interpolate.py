@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from sceneprior.core.classes import VOID, class_colors
+from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
+from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene
 from sceneprior.paper.decode import DecodedRoom, decode_rooms
 from sceneprior.paper.sampling import Point, latent_of
@@ -79,7 +80,7 @@ def mixed_colors(room: DecodedRoom) -> UInt8[np.ndarray, "objects 3"]:
     share = room.class_logits.softmax(dim=-1).double().numpy()
     share[:, VOID] = 0
     # The most likely class of a decoded object is not void, so the sum is not 0.
-    mixed = share @ class_colors(share.shape[1]).astype(np.float64)
+    mixed = share @ quiet_colors(label_set(room.scene.label_set)).astype(np.float64)
     return np.rint(mixed / share.sum(axis=-1, keepdims=True)).astype(np.uint8)
 
 

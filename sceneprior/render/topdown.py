@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.floor import floor_rectangle
 from sceneprior.core.geometry.corners import BOX_FACES, box_corners
+from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shell import rectangle, shell_of, slab
 from sceneprior.render.offscreen import Orthographic, Pinhole, Renderer
@@ -72,8 +73,8 @@ def scene_meshes(scene: Scene) -> list[Mesh]:
 
 
 def object_colors(scene: Scene) -> UInt8[np.ndarray, "objects 3"]:
-    """The flat RGB class colour of each object."""
-    return class_colors(len(label_set(scene.label_set)))[scene.class_indices]
+    """The quiet RGB colour of each object's class, for pictures and files that people look at."""
+    return quiet_colors([item.label for item in scene.objects])
 
 
 def shell_color(node: str) -> UInt8[np.ndarray, "3"]:
@@ -103,8 +104,8 @@ def topdown(
 
     Image right is +x, image down is +z, and the room's origin is the centre of the image. Where
     objects overlap, the highest surface is drawn. If `protocol` is None, the protocol of the
-    scene's label set is used. `outlines` darkens the borders between objects; such pictures are for
-    readers, not for metrics.
+    scene's label set is used. `outlines` darkens the borders between objects and takes quiet
+    colours; such pictures are for readers, not for metrics.
 
     Source:
         The paper, section 4.2: 512 x 512, orthographic, a colour per category.
@@ -116,9 +117,9 @@ def topdown(
         world_to_camera = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, height], [0, 0, 0, 1]])
         camera = Orthographic(world_to_camera, protocol.metres_per_pixel)
         ids = renderer.instance_ids(scene_meshes(scene), camera, protocol.image_size)
-    colors = object_colors(scene)
     if outlines:
-        return paint_ids(ids, colors, protocol.background)
+        return paint_ids(ids, object_colors(scene), protocol.background)
+    colors = class_colors(len(label_set(scene.label_set)))[scene.class_indices]
     return np.concatenate([[protocol.background], colors]).astype(np.uint8)[ids]
 
 

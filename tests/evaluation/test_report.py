@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprior.core.classes import class_colors
 from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.evaluation.report import write_report
 from sceneprior.evaluation.report_pictures import input_views, legend, room_pictures
@@ -126,7 +126,7 @@ def test_input_views_show_masks_in_class_colours_inside_their_boxes(shards):
         "house/train_1, view 0: 2 objects",
     ]
     image = decode(views[0][1])
-    desk, bed = class_colors(22)[[8, 9]]
+    desk, bed = quiet_colors(["desk", "double_bed"])
     assert image.shape == (60, 80, 3)
     np.testing.assert_allclose(image[36, 20], desk, atol=4)  # quantised to 128 colours
     np.testing.assert_allclose(image[46, 55], bed, atol=4)
@@ -142,7 +142,7 @@ def test_room_pictures_count_in_words(renderer):
     assert room_pictures(room, renderer).contents == "double bed, stool ×2"
     assert room_pictures(replace(room, objects=()), renderer).contents == "nothing"
     assert [name for name, _ in legend([room])] == ["double bed", "stool"]
-    assert legend([room])[0][1] == "#" + bytes(class_colors(22)[9].tolist()).hex()
+    assert legend([room])[0][1] == "#" + bytes(quiet_colors(["double_bed"])[0].tolist()).hex()
 
 
 def test_a_page_of_a_stranger_s_rooms_runs_nothing(renderer, tmp_path):

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
-from sceneprior.core.classes import class_colors, label_set
+from sceneprior.core.classes import label_set
+from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.render.floor_plans import DOOR, LEGEND_PX, PLAN_PX, WALL, WINDOW, floor_plan
 from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.topdown import FLOOR_COLOR
 
 BEDROOM = "front3d_bedroom"
-COLORS = dict(zip(label_set(BEDROOM), class_colors(len(label_set(BEDROOM))).tolist(), strict=True))
+COLORS = dict(zip(label_set(BEDROOM), quiet_colors(label_set(BEDROOM)).tolist(), strict=True))
 
 
 def box(label: str, center_m, size_m) -> SceneObject:

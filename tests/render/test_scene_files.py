@@ -13,8 +13,9 @@ import trimesh
 from PIL import Image
 
 from sceneprior.apps.rooms import write_scene, write_scenes
-from sceneprior.core.classes import class_colors
+from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m, mesh_of_file
 from sceneprior.core.scene_json import scene_to_json
 from sceneprior.render.floor_plans import floor_plan
@@ -72,7 +73,9 @@ def test_the_glb_has_named_nodes_in_metres_and_class_colours(scene):
         linear = np.array(material["pbrMetallicRoughness"]["baseColorFactor"][:3])
         srgb = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
         # trimesh keeps 8 bits of linear light: up to 6 of 255 steps in a dark channel.
-        np.testing.assert_allclose(srgb * 255, class_colors(22)[label], atol=6)
+        np.testing.assert_allclose(
+            srgb * 255, quiet_colors(label_set("front3d_bedroom"))[label], atol=6
+        )
 
 
 def test_what_is_written_comes_back(scene, tmp_path, renderer):

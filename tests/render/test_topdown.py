@@ -7,6 +7,7 @@ import pytest
 
 from sceneprior.core.classes import class_colors
 from sceneprior.core.errors import InputError
+from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.render.offscreen import open_renderer
 from sceneprior.render.topdown import (
@@ -48,10 +49,12 @@ def test_what_is_nearest_to_the_ceiling_wins_whatever_the_order(renderer):
     assert (image == class_colors(22)[BED]).all(-1).sum() == 160**2 - 40**2
 
 
-def test_outlines_only_darken_borders(renderer):
+def test_outlines_darken_borders_and_readers_see_quiet_colours(renderer):
     scene = bedroom(SceneObject("desk", (0.0, 0.4, 0.0), (1.0, 0.8, 1.0)))
     plain, lined = topdown(scene, renderer), topdown(scene, renderer, outlines=True)
-    changed = (plain != lined).any(-1)
+    quiet = quiet_colors(["desk"])[0]
+    recolored = np.where((plain == class_colors(22)[8]).all(-1, keepdims=True), quiet, plain)
+    changed = (recolored != lined).any(-1)
     # Four sides of 80 pixels: above and left inside the desk, where they share a corner, below
     # and right just outside, where they do not meet.
     assert changed.sum() == 4 * 80 - 1

@@ -10,9 +10,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.apps.reconstruction.reconstruct import Reconstruction
 from sceneprior.apps.rooms import PAGE_FILE, clear_scenes, write_scene
-from sceneprior.core.classes import class_colors, label_set
+from sceneprior.core.classes import label_set
 from sceneprior.core.files import write_whole
 from sceneprior.core.observed_image import ObservedImage
+from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.page import png_uri
 from sceneprior.evaluation.rooms_page import write_rooms_page
@@ -108,7 +109,7 @@ def picture(found: Reconstruction, renderer: Renderer) -> UInt8[np.ndarray, "hei
 
 def masks_of(image: ObservedImage) -> UInt8[np.ndarray, "height width 3"]:
     """Picture of an image's masks, in the colours of their classes."""
-    colors = class_colors(len(label_set(image.label_set)))[image.object_class]
+    colors = quiet_colors(label_set(image.label_set))[image.object_class]
     return paint_ids(image.instance_ids.astype(np.int64), colors, PAPER)
 
 
@@ -133,7 +134,7 @@ def _legend_rows(
     shown = {names[index] for index in found.image.object_class} | {
         item.label for item in found.scene.objects
     }
-    colors, font = class_colors(len(names)), ImageFont.load_default(14)
+    colors, font = quiet_colors(names), ImageFont.load_default(14)
     rows: list[list[tuple[int, str, tuple[int, int, int]]]] = [[]]
     x = 2
     for index, name in enumerate(names):

@@ -1,0 +1,47 @@
+"""Quiet colours of classes for pictures that people look at: beds blue, wood brown, seats green.
+
+Metrics and pictures of masks use `classes.class_colors`, which differ as clearly as possible.
+"""
+
+import colorsys
+from collections.abc import Sequence
+from zlib import crc32
+
+import numpy as np
+from jaxtyping import UInt8
+
+_COLORS = {
+    # beds and sofas: cloth
+    "double_bed": "7d93ad", "single_bed": "93aac0", "kids_bed": "a4b9b8", "bed": "8499b2",
+    "sofa": "8d9d84", "armchair": "a9b598",
+    # seats
+    "chair": "b97c68", "dressing_chair": "c99787", "stool": "d9ab98", "toilet": "e6e9eb",
+    # tables: light wood
+    "table": "c6a477", "desk": "ba9160", "coffee_table": "a98358", "dressing_table": "dcc6a0",
+    "counter": "b5ab9d", "bar": "9c7653",
+    # storage: dark and painted wood
+    "wardrobe": "b09378", "cabinet": "9f8268", "bookshelf": "bba187", "shelf": "c8b39c",
+    "shelves": "c8b39c", "nightstand": "97704f", "night stand": "97704f", "dresser": "a8927f",
+    "tv_stand": "8f8177", "children_cabinet": "d6c8b1",
+    # lamps
+    "pendant_lamp": "d9bd68", "ceiling_lamp": "e3cf93", "lamp": "dcc47d",
+    # the rest
+    "television": "565b63", "whiteboard": "d9dcdc", "bathtub": "c3d2d8", "sink": "a3bfcb",
+    "refridgerator": "b9bec3", "void": "808080",
+}  # fmt: skip
+
+
+def quiet_colors(names: Sequence[str]) -> UInt8[np.ndarray, "classes 3"]:
+    """One RGB colour for each class name, the same in every label set.
+
+    A name without a colour of its own gets a muted one that depends only on the name.
+    """
+    return np.array([_color(name) for name in names], dtype=np.uint8).reshape(-1, 3)
+
+
+def _color(name: str) -> tuple[int, ...]:
+    if name in _COLORS:
+        return tuple(bytes.fromhex(_COLORS[name]))
+    mixed = crc32(name.encode())
+    hue, lightness = mixed % 360 / 360, (0.52, 0.6, 0.68)[mixed // 360 % 3]
+    return tuple(round(255 * channel) for channel in colorsys.hls_to_rgb(hue, lightness, 0.24))
