@@ -11,6 +11,7 @@ from torch import Tensor
 from sceneprior.apps.config import load_any_run, with_latents
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
 from sceneprior.core.observed_image import ObservedImage
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import DecodedScenes
@@ -158,14 +159,21 @@ class Prior:
         distribution: str | None = None,
         classes: Sequence[str] | None = None,
         want: "Want | None" = None,
+        floor: "Floor | None" = None,
+        openings: "Openings | None" = None,
+        ceiling_m: float | None = None,
     ) -> list[Scene]:
         """Complete a partly furnished room; the given objects stay unchanged.
 
         Args:
             scene: The given objects and, optionally, the floor, doors, windows and ceiling.
             count: Number of completions.
-            want: Wishes for the whole room, as in `sample`.
             classes: Classes of the objects to add, and no others; only for priors with a sampler.
+            want: Wishes for the whole room, as in `sample`.
+            floor: Requested floor, as in `sample`, in the coordinates of the given objects. It
+                replaces the scene's floor with its doors, windows and ceiling.
+            openings: Requested doors and windows, in place of the scene's.
+            ceiling_m: Requested height of the ceiling, in place of the scene's.
 
         Raises:
             InputError: an object cannot be used, or there are more objects than the prior
@@ -179,12 +187,20 @@ class Prior:
             >>> [item.label for item in room.objects]
             ['double_bed', 'nightstand']
         """
-        if want is not None or (classes is None and _has_walls(scene)):
-            asked: dict[str, Any] = {"objects": scene.objects, "want": want}
-            asked |= {"ceiling_m": scene.ceiling_m}
-            asked |= {"floor": scene.floor_m, "openings": scene.openings or None}
-            asked = {key: value for key, value in asked.items() if value is not None}
-            return self._requested(asked, count, seed, distribution, "complete")
+        asked = {"want": want, "floor": floor, "openings": openings, "ceiling_m": ceiling_m}
+        asked = {key: value for key, value in asked.items() if value is not None}
+        if asked and classes is not None:
+            raise InputError(
+                f"The classes to add are listed, and the request has {', '.join(sorted(asked))}; "
+                "name the classes among its wishes (want) instead."
+            )
+        if asked or (classes is None and _has_walls(scene)):
+            own: dict[str, Any] = {"objects": scene.objects}
+            if floor is None:
+                own |= {"floor": scene.floor_m, "openings": scene.openings or None}
+                own |= {"ceiling_m": scene.ceiling_m}
+            own = {key: value for key, value in own.items() if value is not None}
+            return self._requested({**own, **asked}, count, seed, distribution, "complete")
         from sceneprior.lifted.complete import complete
 
         return complete(self.with_latents, [scene], count, seed, distribution, classes=classes)[0]

@@ -182,7 +182,7 @@ def check_box(
     if max(size_m) > LARGEST_M or np.abs(center_m).max() > FARTHEST_M:
         raise InputError(
             f"{said}; no furniture is above {LARGEST_M:g} m long, or further than "
-            f"{FARTHEST_M:g} m from the floor's centre. {_unit_guess([*center_m, *size_m])}"
+            f"{FARTHEST_M:g} m from the floor's centre. {unit_guess([*center_m, *size_m])}"
         )
 
 
@@ -212,7 +212,7 @@ def check_floor(path: Path | str, outline_m: np.ndarray) -> None:
     if not far <= FARTHEST_M:
         raise InputError(
             f"{path}: the floor reaches {far:g} m from its centre; expected finite metres, at most "
-            f"{FARTHEST_M:g}. {_unit_guess(far)}"
+            f"{FARTHEST_M:g}. {unit_guess(far)}"
         )
     if np.linalg.matrix_rank(outline_m - outline_m[0]) < 2:
         raise InputError(f"{path}: all corners of the floor lie on one line, so it has no area.")
@@ -240,7 +240,8 @@ def check_openings(
             )
 
 
-def _unit_guess(numbers: Any) -> str:
+def unit_guess(numbers: Any) -> str:
+    """A question about the unit of lengths that are too large for metres."""
     unit = "millimetres" if np.abs(numbers).max() > 1000 else "centimetres"
     return f"Are these {unit}? Give metres."
 

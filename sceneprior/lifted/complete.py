@@ -16,7 +16,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,6 +24,7 @@ from torch.nn import functional as F
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
+from sceneprior.core.scene_json import check_box
 from sceneprior.core.seeds import check_seed
 from sceneprior.core.views import DecodedScenes, RoomBoxes
 from sceneprior.lifted.insert import insert
@@ -163,14 +163,9 @@ def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> RoomBoxes:
                     f"{scene.name}: object {column} is a '{item.label}', which this run does not "
                     f"know; its classes are {', '.join(names[1:])}."
                 )
-            box = np.array([*item.center_m, *item.size_m], dtype=np.float64)
-            if not np.isfinite(box).all() or (box[3:] <= 0).any():
-                raise InputError(
-                    f"{scene.name}: the box of object {column} ({item.label}) is {box.tolist()}; "
-                    "expected a finite centre and three sides above 0 (metres)."
-                )
+            check_box(scene.name, item.label, item.center_m, item.size_m)
             labels[row, column] = names.index(item.label)
-            boxes_m[row, column] = torch.from_numpy(box)
+            boxes_m[row, column] = torch.tensor([*item.center_m, *item.size_m])
     return RoomBoxes(labels, is_object, boxes_m)
 
 

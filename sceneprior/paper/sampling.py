@@ -177,7 +177,8 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
     The text is one of three:
 
     - the id of a training room;
-    - `seed:7`, for the room that `synthesize -n 1 --seed 7` makes;
+    - `seed:7`, for the room that `synthesize -n 1 --seed 7` makes from latents; `paper:7` and
+      `kernel:7` name the distribution, too;
     - a file of latents: `FILE` (its first latent), `FILE:3` (counted from 0) or `FILE:NAME`. A file
       is a `latents.npz`, an .npy of (D,) or (n, D) numbers, or a .json of such lists.
     """
@@ -197,20 +198,22 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
 
 
 def named_latent(trained: TrainedPrior, name: str, or_else: str) -> Float[Tensor, " dimension"]:
-    """The latent of a training room, named by its id, or of the room that `seed:7` names.
+    """The latent of a training room, named by its id, or of the room that `seed:7` names: that of
+    the run's distribution of latents, where `paper:7` and `kernel:7` name the distribution.
 
     The error for any other name lists what is valid; `or_else` is the last item of that list.
     """
     if name in trained.room_ids:
         row = trained.room_ids.index(name)
         return trained.prior.latent_space(trained.logits[row : row + 1])[0]
-    if re.fullmatch(r"seed:\d+", name):
-        check_seed(int(name[5:]))
-        return draw_latents(trained, 1, int(name[5:]))[0][0]
+    if (found := re.fullmatch(rf"(seed|{'|'.join(DISTRIBUTIONS)}):(\d+)", name)) is not None:
+        distribution, seed = None if found[1] == "seed" else found[1], int(found[2])
+        check_seed(seed)
+        return draw_latents(trained, 1, seed, distribution)[0][0]
     known = f"such as {trained.room_ids[0]}" if trained.room_ids else "which keeps none"
     raise InputError(
-        f"'{name}' is neither a training room of this run ({known}), nor seed:NUMBER, nor "
-        f"{or_else}."
+        f"'{name}' is neither a training room of this run ({known}), nor seed:NUMBER "
+        f"({', '.join(f'{each}:NUMBER' for each in DISTRIBUTIONS)}), nor {or_else}."
     )
 
 

@@ -112,6 +112,53 @@ def test_a_room_with_walls_is_completed_between_them(prior):
             assert not in_swing
 
 
+def test_a_floor_in_its_place_replaces_that_of_the_scene(prior):
+    bed = SceneObject("double_bed", (0.0, 0.3, -0.4), (1.8, 0.6, 2.0))
+    door = Opening("door", (-0.5, 3.0), (0.4, 3.0), 0.0, 2.0)
+    outline = np.array([[-3, -3], [3, -3], [3, 3], [-3, 3]], dtype=float)
+    scene = Scene("mine", "front3d_bedroom", (bed,), outline, openings=(door,), ceiling_m=3.0)
+    (room,) = prior.complete(scene, 1, floor="4x3", openings="window@north", want="a nightstand")
+    assert np.ptp(room.floor_m, axis=0).tolist() == [4, 3] and room.ceiling_m is None
+    assert [each.kind for each in room.openings] == ["window"]
+    assert all(each["holds"] for each in room.extra["wishes"])
+    (room,) = prior.complete(scene, 1, ceiling_m=2.5)
+    assert (room.floor_m == outline).all() and room.openings == (door,) and room.ceiling_m == 2.5
+    with pytest.raises(InputError, match="The classes to add are listed, and the request has want"):
+        prior.complete(scene, 1, classes=["nightstand"], want="a nightstand")
+
+
+def test_objects_in_centimetres_are_a_sentence(prior):
+    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (180.0, 60.0, 200.0))
+    scene = Scene("mine", "front3d_bedroom", (bed,))
+    for ask in (
+        lambda: prior.sample(1, objects=[bed]),
+        lambda: prior.complete(scene, 1),
+        lambda: prior.complete(scene, 1, want="a nightstand"),
+    ):
+        with pytest.raises(InputError, match=r"20 m long.*Are these centimetres\? Give metres"):
+            ask()
+    with pytest.raises(InputError, match=r"ceiling is 260 m high.*Are these centimetres"):
+        prior.sample(1, ceiling_m=260.0)
+
+
+def test_complete_takes_requests(command, tmp_path):
+    bed = SceneObject("double_bed", (0.0, 0.3, -0.4), (1.8, 0.6, 2.0))
+    Scene("mine", "front3d_bedroom", (bed,)).save(tmp_path / "given.json")
+    lamp = {"class": "nightstand", "center_m": [1.3, 0.25, -1.2], "size_m": [0.4, 0.5, 0.4]}
+    path = written(tmp_path, floor=None, openings=[], want=None, objects=[lamp])
+    status, told, errors = command(
+        "complete", "--run", "procthor-bedroom", "--given", tmp_path / "given.json", "-n", 1,
+        "--floor", "-2,-1.5 2,-1.5 2,1.5 -2,1.5", "--openings", "door@south", "--request", path,
+        "--want", "nightstand: 2", "--shell", "walls", "--out", tmp_path / "rooms",
+    )  # fmt: skip
+    assert status == 0 and "around 2 given objects" in told, errors
+    room = sceneprior.load_scene(tmp_path / "rooms" / "complete_00.json")
+    labels = [item.label for item in room.objects]
+    assert labels[:2] == ["double_bed", "nightstand"] and labels.count("nightstand") == 2
+    assert room.ceiling_m == 2.6 and [each.kind for each in room.openings] == ["door"]
+    assert b"wall_0" in (tmp_path / "rooms" / "complete_00.glb").read_bytes()
+
+
 def test_commands_take_requests(command, tmp_path):
     make = ["synthesize", "--run", "procthor-bedroom", "-n", "1", "--out", tmp_path / "rooms"]
     want = "a 4 x 3 m bedroom with a door and two nightstands"
@@ -122,6 +169,8 @@ def test_commands_take_requests(command, tmp_path):
     assert [each.kind for each in room.openings] == ["door"]
     said = one_sentence(command(*make, "--overwrite", "--want", "a purple bed"))
     assert "not understood: 'purple'" in said
+    said = one_sentence(command(*make, "--overwrite", "--floor", "0,0 4,0 4"))
+    assert "The floor is '0,0 4,0 4'; expected its size in metres, such as 4x3" in said
 
 
 def test_the_file_of_the_guide_is_a_request(prior, tmp_path):

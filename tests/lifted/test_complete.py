@@ -189,8 +189,9 @@ def test_what_cannot_be_given_is_a_sentence(trained):
         BED, replace(BED, label="toilet")
     )
     assert "object 0 is a 'void'" in said(replace(BED, label="void"))
-    assert "three sides above 0" in said(replace(BED, size_m=(1.0, 0.0, 1.0)))
-    assert "expected a finite centre" in said(replace(BED, center_m=(0.0, np.inf, 1.0)))
+    assert "sizes above 0" in said(replace(BED, size_m=(1.0, 0.0, 1.0)))
+    assert "Are these centimetres? Give metres." in said(replace(BED, size_m=(180.0, 60.0, 200.0)))
+    assert "expected finite metres" in said(replace(BED, center_m=(0.0, np.inf, 1.0)))
     # As many as fit are no trouble.
     (rooms,) = complete(trained, [scene(*[BED] * 6)], count=1, steps=FEW)
     assert len(rooms[0].objects) >= 6

@@ -111,6 +111,9 @@ def test_rooms_and_seeds(toy_prior):
     drawn, _ = draw_latents(toy_prior, 1, seed=7)
     assert torch.equal(read_latent(toy_prior, "seed:7"), drawn[0])
     assert not torch.equal(read_latent(toy_prior, "seed:8"), drawn[0])
+    for distribution in ("paper", "kernel"):
+        drawn, _ = draw_latents(toy_prior, 1, 7, distribution)
+        assert torch.equal(read_latent(toy_prior, f"{distribution}:7"), drawn[0])
 
 
 def rooms_of(z, names):
@@ -142,7 +145,7 @@ def test_what_is_no_latent_is_a_sentence(toy_prior, tmp_path):
 
     assert said("house/room") == (
         "'house/room' is neither a training room of this run (such as toy/train_00), nor "
-        "seed:NUMBER, nor a file of latents (.npz, .npy, .json)."
+        "seed:NUMBER (kernel:NUMBER, paper:NUMBER), nor a file of latents (.npz, .npy, .json)."
     )
     assert "neither a training room" in said("seed:-1") and "neither" in said(tmp_path)
     write_latents(tmp_path, rooms_of(torch.eye(16)[:2], "ab"))

@@ -111,23 +111,37 @@ def complete(
         str | None,
         typer.Option(help="Classes of the objects to add: double_bed,nightstand (samplers only)."),
     ] = None,
+    floor: FloorOption = None,
+    openings: OpeningsOption = None,
+    ceiling: CeilingOption = None,
     want: WantOption = None,
+    request: RequestOption = None,
     distribution: DistributionOption = None,
+    shell: ShellOption = None,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
 ) -> None:
-    """Complete a room, given some objects and optionally the floor."""
+    """Complete a room, given some objects and optionally the floor.
+
+    A requested floor, door, window or ceiling replaces that of the scene; objects of a request are
+    added to the scene's. Without --shell, GLBs hold furniture only.
+    """
+    from dataclasses import replace
+
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.render.offscreen import open_renderer
     from sceneprior.render.scene_files import load_scene
 
     check_free(out, overwrite)
+    drawn = checked_shell(shell or "none")
+    asked = request_of(floor, openings, ceiling, want, request)
     scene = load_scene(given)
+    scene = replace(scene, objects=(*scene.objects, *asked.pop("objects", ())))
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
     prior = load(run)
-    scenes = prior.complete(scene, count, seed, distribution, wanted, want)
-    write_scenes(scenes, out, open_renderer(renderer))
+    scenes = prior.complete(scene, count, seed, distribution, wanted, **asked)
+    write_scenes(scenes, out, open_renderer(renderer), drawn)
     note_unmet(scenes)
     how = "drawn by the sampler" if scenes[0].latent is None else "decoded from fitted latents"
     typer.echo(f"Wrote {count} rooms around {len(scene.objects)} given objects, {how}, to {out}")

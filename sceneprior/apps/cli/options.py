@@ -40,8 +40,8 @@ SeedOption = Annotated[
 FloorOption = Annotated[
     str | None,
     typer.Option(
-        help="Floor of the rooms: 4x3 (metres along x and z), or a file with a floor (FILE, or "
-        "FILE:ROOM of a 3D-FRONT house); samplers only."
+        help="Floor of the rooms: 4x3 (metres along x and z), corners '0,0 5,0 5,3 2,3 2,5 0,5', "
+        "or a file with a floor (FILE, or FILE:ROOM of a 3D-FRONT house); samplers only."
     ),
 ]
 OpeningsOption = Annotated[
@@ -54,7 +54,8 @@ CeilingOption = Annotated[
 WantOption = Annotated[
     str | None,
     typer.Option(
-        help="Wishes, as a sentence: 'a double bed and two nightstands beside it' (samplers only)."
+        help="Wishes: 'a double bed and two nightstands beside it', or numbers of objects: "
+        "'nightstand: 2, desk: 0' (samplers only)."
     ),
 ]
 RequestOption = Annotated[

@@ -9,6 +9,7 @@ import numpy as np
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, SceneObject
+from sceneprior.core.scene_json import check_box, unit_guess
 from sceneprior.lifted.requests.openings import Openings, WantedOpening, moved, read_openings
 from sceneprior.lifted.requests.relations import OPENINGS
 from sceneprior.lifted.requests.sentence import read_sentence
@@ -18,6 +19,7 @@ from sceneprior.lifted.requests.wishes import (
     RelationWish,
     Wishes,
     count_wish,
+    counts_of_text,
     relation_wish,
 )
 
@@ -63,13 +65,16 @@ def make_request(
             centre of its bounding box is the origin.
         openings: Doors and windows; see `read_openings`.
         ceiling_m: Height of the ceiling.
-        want: A sentence (`read_sentence`) or a mapping (`read_wishes`).
+        want: A sentence (`read_sentence`), a mapping (`read_wishes`), or numbers of objects by
+            class as text (`counts_of_text`).
         objects: Given objects, in the coordinates of the floor.
 
     Raises:
         InputError: a part cannot be used.
     """
     placed = () if openings is None else read_openings(openings)
+    if isinstance(want, str) and (counts := counts_of_text(want)) is not None:
+        want = counts
     if isinstance(want, str):
         sentence = read_sentence(want, known, label_set)
         if floor is not None and sentence.floor is not None:
@@ -81,6 +86,8 @@ def make_request(
         wishes = sentence.wishes
     else:
         wishes = Wishes() if want is None else read_wishes(want)
+    for item in objects:
+        check_box("The request", item.label, item.center_m, item.size_m)
     targets = {wish.target for wish in wishes.relations}
     for kind in OPENINGS:  # what a relation needs is there
         if kind in targets and all(each.kind != kind for each in placed):
@@ -95,8 +102,10 @@ def make_request(
             "write door or window@north."
         )
     if ceiling_m is not None and not 1.0 <= ceiling_m <= HIGHEST_M:
+        guess = f" {unit_guess(ceiling_m)}" if ceiling_m > HIGHEST_M else ""
         raise InputError(
             f"The ceiling is {ceiling_m:g} m high; expected 1 to {HIGHEST_M:g} m above the floor."
+            f"{guess}"
         )
     return Request(outline_m, placed, ceiling_m, wishes, tuple(objects))
 

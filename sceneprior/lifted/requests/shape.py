@@ -19,8 +19,12 @@ SPACING_M = 0.25
 """Distance between the points on slanted sides at which rectangles may end."""
 NEW_SHARE = 0.01
 """Share of the floor that a rectangle must cover beyond the larger ones to be kept."""
+MOST_CELLS = 130**2
+"""Largest number of cells between the coordinates at which rectangles may end; the search needs
+the square of it in bytes."""
 LEAST_AREA_M2 = 1.0
 """Smallest floor that can be requested."""
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)")
 _SIZE = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(?:m\s*)?[xX×]\s*(\d+\.?\d*|\.\d+)\s*m?\s*")
 
 
@@ -100,25 +104,20 @@ def sides_of(outline_m: Float[np.ndarray, "corners 2"]) -> list[Side]:
 
 def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
     """The outline (corners, 2) of a requested floor: `4x3` (metres along x and z, the origin at its
-    centre), or a list of corners [x, z] in order.
+    centre), or a list of corners x, z in order, as numbers or text (`0,0 4,0 4,3`).
 
     Example:
 
         >>> read_floor("4x3").tolist()
         [[-2.0, -1.5], [2.0, -1.5], [2.0, 1.5], [-2.0, 1.5]]
+        >>> read_floor("0,0 4,0 4,3").tolist()
+        [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]]
 
     Raises:
         InputError: it is neither, intersects itself, or has less than `LEAST_AREA_M2`.
     """
     if isinstance(floor, str):
-        found = _SIZE.fullmatch(floor)
-        if found is None:
-            raise InputError(
-                f"The floor is '{floor[:60]}'; expected its size in metres, such as 4x3, a list of "
-                "corners [x, z], or a file with a floor."
-            )
-        x, z = (float(side) / 2 for side in found.groups())
-        floor = [(-x, -z), (x, -z), (x, z), (-x, z)]
+        floor = _floor_of_text(floor)
     try:
         outline_m = np.array(floor, dtype=np.float64)
     except (TypeError, ValueError):
@@ -144,6 +143,20 @@ def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
     return outline_m
 
 
+def _floor_of_text(text: str) -> list[tuple[float, float]]:
+    """Corners that a text names by the floor's size, or one by one."""
+    if (found := _SIZE.fullmatch(text)) is not None:
+        x, z = (float(side) / 2 for side in found.groups())
+        return [(-x, -z), (x, -z), (x, z), (-x, z)]
+    numbers = [float(number) for number in _NUMBER.findall(text)]
+    if _NUMBER.sub("", text).strip(" ,;[]()\n\t") or len(numbers) < 6 or len(numbers) % 2:
+        raise InputError(
+            f"The floor is '{text[:60]}'; expected its size in metres, such as 4x3, at least 3 "
+            "corners x,z in order, such as '0,0 5,0 5,3 2,3 2,5 0,5', or a file with a floor."
+        )
+    return list(zip(numbers[::2], numbers[1::2], strict=True))
+
+
 def inner_rectangles(polygon: shapely.Polygon) -> Float[np.ndarray, "rectangles 4"]:
     """See `RoomShape.rectangles_m`. Rectangles end at corners and, on slanted sides, every
     `SPACING_M`."""
@@ -152,6 +165,11 @@ def inner_rectangles(polygon: shapely.Polygon) -> Float[np.ndarray, "rectangles 
     slanted = ~_axis_aligned(polygon)
     corners = points if slanted else np.array(polygon.exterior.coords)
     x, z = (np.unique(corners[:, axis].round(3)) for axis in (0, 1))
+    if len(x) * len(z) > MOST_CELLS:
+        raise InputError(
+            f"The sides of the floor have {len(corners)} points at which furniture may begin, too "
+            "many to search; give fewer corners, or a smaller floor without slanted sides."
+        )
     room = polygon.buffer(2e-3, join_style="mitre")  # coordinates were rounded
     shapely.prepare(room)
     cells = shapely.box(x[:-1, None], z[None, :-1], x[1:, None], z[None, 1:])

@@ -10,6 +10,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.lifted.requests.relations import OF_ONE, OPENINGS, RELATIONS
 
 _COUNT = re.compile(r"\s*(>=|<=|=|)\s*(\d+)\s*")
+_ENTRY = re.compile(r"(\w+)\s*:\s*((?:>=|<=|=)?\d+)")
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,26 @@ def count_wish(label: str, value: Any) -> CountWish:
     if sign == ">=":
         return CountWish(label, number)
     return CountWish(label, 0 if sign == "<=" else number, number)
+
+
+def counts_of_text(text: str) -> dict[str, str] | None:
+    """Numbers of objects by class from text such as `double_bed: 1, desk: 0`; None for other text.
+
+    >>> counts_of_text("double_bed: 1, nightstand: >=2")
+    {'double_bed': '1', 'nightstand': '>=2'}
+
+    Raises:
+        InputError: a class is listed twice.
+    """
+    counts: dict[str, str] = {}
+    for part in re.split("[,;]", text):
+        if (entry := _ENTRY.fullmatch(part.strip())) is None:
+            return None
+        label, number = entry.groups()
+        if label in counts:
+            raise InputError(f"The wishes list {label} twice; name each class once.")
+        counts[label] = number
+    return counts
 
 
 def relation_wish(entry: Mapping[str, Any]) -> RelationWish:

@@ -18,12 +18,16 @@ def test_a_size_is_a_rectangle_round_the_origin(text):
 
 def test_a_closed_outline_loses_its_last_corner():
     assert len(read_floor([*L_SHAPE, L_SHAPE[0]])) == 6
+    for text in ("0,0 5,0 5,3 2,3", " [[0, 0], [5, 0.0],\n[5, 3.], [+2, 3]]", "0 0; 5 0; 5 3; 2 3"):
+        assert read_floor(text).tolist() == [[0, 0], [5, 0], [5, 3], [2, 3]]
 
 
 @pytest.mark.parametrize(
     ("floor", "message"),
     [
         ("wide", "The floor is 'wide'; expected its size in metres, such as 4x3"),
+        ("0,0 4,0 4", "The floor is '0,0 4,0 4'; expected"),
+        ("0,0 4,0 x,3", "at least 3 corners x,z in order"),
         ("400x300", "reaches 200 m from its centre.*Are these centimetres"),
         ([[0, 0], [4000, 0], [4000, 3000]], "Are these millimetres"),
         ([[0, 0], [1, 0]], "at least 3 corners"),
@@ -51,6 +55,12 @@ def test_rectangles_lie_in_the_floor_and_cover_most_of_it(floor):
     boxes = shapely.box(x - width / 2, z - depth / 2, x + width / 2, z + depth / 2)
     assert shape.polygon.buffer(0.005).covers(shapely.union_all(boxes))
     assert shapely.union_all(boxes).area > 0.85 * shape.polygon.area
+
+
+def test_a_floor_that_takes_too_long_is_refused():
+    slanted = RoomShape(read_floor([[0, 0], [90, 10], [80, 90]]))
+    with pytest.raises(InputError, match="too many to search; give fewer corners, or a smaller"):
+        _ = slanted.rectangles_m
 
 
 def test_a_floor_without_width_is_refused():

@@ -9,6 +9,7 @@ from sceneprior.lifted.requests.wishes import (
     Wishes,
     check_wishes,
     count_wish,
+    counts_of_text,
     relation_wish,
 )
 
@@ -86,3 +87,13 @@ def test_a_floor_is_moved_to_its_middle_unless_objects_stand_on_it():
     floor = [[0, 0], [4, 0], [4, 2], [0, 2]]
     outline = make_request(KNOWN, "toy", floor).outline_m
     assert outline is not None and outline.tolist() == [[-2, -1], [2, -1], [2, 1], [-2, 1]]
+
+
+def test_counts_as_text_are_those_of_a_mapping():
+    assert counts_of_text(" double_bed: 1; desk:0, stool : >=2") == {
+        "double_bed": "1", "desk": "0", "stool": ">=2",
+    }  # fmt: skip
+    for other in ("a bed", "two beds: 1", "bed: 1,", "bed 1", ""):
+        assert counts_of_text(other) is None
+    with pytest.raises(InputError, match="list bed twice"):
+        counts_of_text("bed: 1, bed: 2")
