@@ -16,17 +16,18 @@ FILES = sorted(path for name in ("sceneprior", "data_prep") for path in (ROOT / 
 
 ALLOWED = {
     "core": {"core"},
+    "furniture": {"core", "furniture"},
     "render": {"core", "render"},
     "training": {"core", "render", "training"},
-    "data_prep": {"core", "render", "data_prep"},
+    "data_prep": {"core", "furniture", "render", "data_prep"},
     "paper": {"core", "render", "training", "paper"},
     "lifted": {"core", "render", "training", "paper", "lifted"},
     "baselines": {"core", "render", "training", "paper", "baselines"},
     "evaluation": {"core", "render", "evaluation"},
     "interchange": {"core", "render", "interchange"},
     "apps": {
-        "core", "render", "training", "paper", "lifted", "baselines", "evaluation", "interchange",
-        "apps",
+        "core", "furniture", "render", "training", "paper", "lifted", "baselines", "evaluation",
+        "interchange", "apps",
     },
     "__main__": {"apps"},
 }  # fmt: skip
@@ -54,7 +55,7 @@ OWNERS = {
     "safetensors": ["sceneprior/apps/priors/"],
     "huggingface_hub": ["sceneprior/apps/priors/"],
     "pxr": ["sceneprior/render/scene_usd.py"],
-    "yaml": ["sceneprior/core/settings.py", "data_prep/homes/furniture.py"],
+    "yaml": ["sceneprior/core/settings.py", "sceneprior/furniture/tables.py"],
     "pydantic": [
         "sceneprior/core/", "sceneprior/training/", "sceneprior/paper/", "sceneprior/lifted/",
         "sceneprior/baselines/", "sceneprior/apps/decoders.py", "sceneprior/apps/experiments/",

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_prep.homes.catalog import Catalog
 from data_prep.homes.layout import Piece, Plan
 from data_prep.homes.placement import Furnisher
 from data_prep.homes.rooms import empty_room, is_liveable
+from sceneprior.furniture.catalog import Catalog
 
 Offers = dict[str, tuple[int, float]]
 """Number of pieces and sampling weight per group of pieces, such as "desk and chair"."""

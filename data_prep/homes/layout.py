@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from data_prep.homes.catalog import Model
-from data_prep.homes.solids import Vector
+from sceneprior.furniture.catalog import Model
+from sceneprior.furniture.solids import Vector
 
 Rect = tuple[float, float, float, float]
 """Rectangle on the floor: x0, z0, x1, z1."""

@@ -10,13 +10,13 @@ from rich.console import Console
 from rich.progress import track
 
 from data_prep.homes.bedroom import BEDROOM, BEDS
-from data_prep.homes.catalog import Catalog, make_catalog
 from data_prep.homes.furnish import furnish
 from data_prep.homes.layout import Plan
 from data_prep.homes.living import LIVING_ROOM
 from data_prep.homes.write import PlacedRoom, house_json, model_record, write_json, write_model
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import only_writer
+from sceneprior.furniture.catalog import Catalog, make_catalog
 
 ROOM_TYPES = {"bedroom": BEDROOM, "living": LIVING_ROOM}
 

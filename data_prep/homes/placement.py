@@ -6,9 +6,9 @@ from math import inf
 
 import numpy as np
 
-from data_prep.homes.catalog import Catalog, Model
 from data_prep.homes.layout import Piece, Plan, Wall
-from data_prep.homes.solids import Vector
+from sceneprior.furniture.catalog import Catalog, Model
+from sceneprior.furniture.solids import Vector
 
 
 def random_scale(rng: np.random.Generator) -> Vector:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from data_prep.homes.catalog import Model
 from data_prep.homes.layout import Piece, Plan, Rect
+from sceneprior.furniture.catalog import Model
 
 WALL_M = 0.12
 """Thickness of a wall."""

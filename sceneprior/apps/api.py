@@ -82,6 +82,7 @@ class Prior:
         ceiling_m: float | None = None,
         want: "Want | None" = None,
         objects: Sequence[SceneObject] | None = None,
+        cad: bool = False,
     ) -> list[Scene]:
         """Sample new rooms; the same seed gives the same rooms.
 
@@ -94,6 +95,8 @@ class Prior:
             want: Wishes: a sentence, or numbers of objects by class, such as
                 `{"nightstand": 2, "desk": 0}`.
             objects: Objects that are already in the room, in the coordinates of the floor.
+            cad: Replace decoded meshes by the most similar models of the package's own furniture
+                (docs/uses.md); given objects with a mesh keep it.
 
         Requests need a prior with a sampler; see docs/requests.md. `extra["wishes"]` of a room
         lists each wish, and whether the room fulfils it.
@@ -108,15 +111,20 @@ class Prior:
             >>> (room,) = prior.sample(floor="4x3", want={"nightstand": 2})
             >>> [item.label for item in room.objects].count("nightstand"), room.floor_m.shape
             (2, (4, 2))
+            >>> (room,) = prior.sample(seed=1, cad=True)
+            >>> room.objects[0].label, room.extra["retrieval"][0]["model_id"]
+            ('chair', 'chair_00')
         """
         asked = {
             "floor": floor, "openings": openings, "ceiling_m": ceiling_m, "want": want,
             "objects": objects,
         }  # fmt: skip
         asked = {key: value for key, value in asked.items() if value is not None}
-        if not asked:
-            return sample_rooms(self.trained, count, seed, distribution)
-        return self._requested(asked, count, seed, distribution)
+        if asked:
+            rooms = self._requested(asked, count, seed, distribution)
+        else:
+            rooms = sample_rooms(self.trained, count, seed, distribution)
+        return _with_models(rooms, objects or ()) if cad else rooms
 
     def _requested(
         self,
@@ -162,6 +170,7 @@ class Prior:
         floor: "Floor | None" = None,
         openings: "Openings | None" = None,
         ceiling_m: float | None = None,
+        cad: bool = False,
     ) -> list[Scene]:
         """Complete a partly furnished room; the given objects stay unchanged.
 
@@ -174,6 +183,7 @@ class Prior:
                 replaces the scene's floor with its doors, windows and ceiling.
             openings: Requested doors and windows, in place of the scene's.
             ceiling_m: Requested height of the ceiling, in place of the scene's.
+            cad: Replace decoded meshes by models of the package's own furniture, as in `sample`.
 
         Raises:
             InputError: an object cannot be used, or there are more objects than the prior
@@ -200,10 +210,13 @@ class Prior:
                 own |= {"floor": scene.floor_m, "openings": scene.openings or None}
                 own |= {"ceiling_m": scene.ceiling_m}
             own = {key: value for key, value in own.items() if value is not None}
-            return self._requested({**own, **asked}, count, seed, distribution, "complete")
-        from sceneprior.lifted.complete import complete
+            rooms = self._requested({**own, **asked}, count, seed, distribution, "complete")
+        else:
+            from sceneprior.lifted.complete import complete
 
-        return complete(self.with_latents, [scene], count, seed, distribution, classes=classes)[0]
+            trained = self.with_latents
+            rooms = complete(trained, [scene], count, seed, distribution, classes=classes)[0]
+        return _with_models(rooms, scene.objects) if cad else rooms
 
     def reconstruct(
         self, images: Sequence[ObservedImage], fit: str = "objects", restarts: int = 1
@@ -258,6 +271,12 @@ class Prior:
     def with_latents(self) -> TrainedPrior:
         """`trained`, with an InputError if it has no latent space."""
         return with_latents(self.trained, self.where)
+
+
+def _with_models(rooms: list[Scene], given: Sequence[SceneObject]) -> list[Scene]:
+    from sceneprior.apps.retrieval.made_models import with_models
+
+    return with_models(rooms, given)
 
 
 def _has_walls(scene: Scene) -> bool:

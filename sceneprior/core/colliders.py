@@ -19,8 +19,12 @@ MOUNTED = ("cabinet", "shelf", "shelves", "sink", "television", "whiteboard", "w
 MOUNTED_M = 0.4
 CONCAVITY = 0.05
 """Threshold of CoACD: the largest concavity of a part that is not divided further."""
+MOST_COMPONENTS = 200
+"""Largest number of closed components of a mesh that become bodies of their own."""
 SEARCH = {"mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000}
 """A shorter search than CoACD's own: 0.5 s of CPU time an object for 1.3, with as many parts."""
+LEAST_M3 = 1e-9
+"""Volume of a flat body, which has none."""
 _FILL = {
     "box": 1.0, "cylinder": np.pi / 4, "ellipsoid": np.pi / 6, "dome": np.pi / 6, "bowl": np.pi / 6,
 }  # fmt: skip
@@ -48,10 +52,48 @@ def colliders(item: SceneObject) -> tuple[Solid | Mesh, ...]:
 
 
 def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
-    """Convex meshes whose union approximates a mesh; its convex hull if CoACD is not installed."""
+    """Convex meshes whose union approximates a mesh.
+
+    A mesh of at most `MOST_COMPONENTS` closed components, as furniture made of parts is, is divided
+    into them first: a component that is nearly convex is replaced by its convex hull. CoACD divides
+    the others; if it is not installed, they are replaced by their hulls, too.
+    """
+    return tuple(part for piece in closed_components(mesh) for part in _divided(piece))
+
+
+def closed_components(mesh: Mesh) -> list[Mesh]:
+    """The connected components of a mesh if all are closed, face outwards and are few; else the
+    mesh alone."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    faces = np.asarray(mesh.faces)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges, sharing = np.unique(edges, axis=0, return_counts=True)
+    if (sharing != 2).any():
+        return [mesh]
+    links = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(mesh.vertices_m),) * 2)
+    of_vertex = connected_components(links, directed=False)[1]
+    of_face = of_vertex[faces[:, 0]] if len(faces) else of_vertex[:0]
+    names = np.unique(of_face)
+    if len(names) > MOST_COMPONENTS:
+        return [mesh]
+    pieces = []
+    for name in names:
+        used, corners = np.unique(faces[of_face == name], return_inverse=True)
+        pieces.append(Mesh(mesh.vertices_m[used], corners.reshape(-1, 3)))
+    # A component that faces inwards is a cavity of another.
+    outward = all(volume_and_centroid(piece)[0] > LEAST_M3 for piece in pieces)
+    return pieces if pieces and outward else [mesh]
+
+
+def _divided(mesh: Mesh) -> tuple[Mesh, ...]:
+    """The convex hull of a connected mesh that is nearly convex; else CoACD's parts of it."""
     coacd = _coacd()
     hull = Mesh(*convex_surface(np.asarray(mesh.vertices_m, dtype=np.float64)))
     if coacd is None or not len(hull.faces):
+        return (hull,)
+    if volume_and_centroid(mesh)[0] >= (1 - CONCAVITY) * volume_and_centroid(hull)[0]:
         return (hull,)
     found = coacd.run_coacd(
         coacd.Mesh(np.asarray(mesh.vertices_m, dtype=np.float64), np.asarray(mesh.faces)),
@@ -91,8 +133,8 @@ def volume_and_centroid(body: Solid | Mesh) -> tuple[float, Float[np.ndarray, "3
         corners = np.asarray(body.vertices_m, dtype=np.float64)[body.faces]
         volumes = np.linalg.det(corners) / 6
         total = volumes.sum()
-        if total <= 1e-9:
-            return 1e-9, corners.reshape(-1, 3).mean(axis=0)
+        if total <= LEAST_M3:
+            return LEAST_M3, corners.reshape(-1, 3).mean(axis=0)
         return float(total), (volumes[:, None] * corners.sum(axis=1) / 4).sum(axis=0) / total
     low, high = np.array(body.low_m), np.array(body.high_m)
     center = (low + high) / 2

@@ -18,13 +18,14 @@ from sceneprior.core.files import read_json
 from sceneprior.core.scene import Mesh
 
 MODEL_FILE = "raw_model.obj"
+INFO_FILES = ("model_info.json", "model_info_revised.json")
 
 
 def model_info_path(folder: Path, option: str = "--future") -> Path:
     """Path of 3D-FUTURE's list of models; `option` is the command-line option named in errors."""
     if not folder.is_dir():
         raise InputError(f"No folder at {folder}; {option} names the folder of 3D-FUTURE models.")
-    for name in ("model_info.json", "model_info_revised.json"):
+    for name in INFO_FILES:
         if (folder / name).is_file():
             return folder / name
     raise InputError(

@@ -151,25 +151,30 @@ def _empty_glb() -> bytes:
 
 def read_glb_meshes(path: Path) -> dict[str, Mesh]:
     """Meshes of a GLB by node name, without the room's shell; vertices in the room frame."""
-    import trimesh
-
     try:
-        # process=False keeps vertices and faces as written. Materials depend on the class alone.
-        loaded = trimesh.load_scene(Path(path), file_type="glb", process=False, skip_materials=True)
-        meshes = {}
-        for node in loaded.graph.nodes_geometry:
-            transform, name = loaded.graph[node]
-            mesh = loaded.geometry[name]
-            vertices = np.asarray(mesh.vertices, dtype=np.float64)
-            placed = vertices @ transform[:3, :3].T + transform[:3, 3]
-            meshes[node] = mesh_of_file(placed, mesh.faces)
-        return {node: mesh for node, mesh in meshes.items() if not is_shell(node)}
+        return {node: mesh for node, mesh in glb_meshes(path).items() if not is_shell(node)}
     except Exception as error:  # a damaged file raises almost anything in trimesh
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         raise InputError(
             f"{path} cannot be read as a GLB ({reason.rstrip('.')}); write the scene again with "
             "`sceneprior synthesize`, or delete the file to use the boxes alone."
         ) from None
+
+
+def glb_meshes(path: Path) -> dict[str, Mesh]:
+    """Meshes of a GLB by node name, placed by their nodes; a damaged file raises any exception."""
+    import trimesh
+
+    # process=False keeps vertices and faces as written. Materials depend on the class alone.
+    loaded = trimesh.load_scene(Path(path), file_type="glb", process=False, skip_materials=True)
+    meshes = {}
+    for node in loaded.graph.nodes_geometry:
+        transform, name = loaded.graph[node]
+        mesh = loaded.geometry[name]
+        vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        placed = vertices @ transform[:3, :3].T + transform[:3, 3]
+        meshes[node] = mesh_of_file(placed, mesh.faces)
+    return meshes
 
 
 def load_scene(path: Path) -> Scene:

@@ -166,6 +166,29 @@ def test_coacd_cuts_a_mesh_into_convex_parts():
     assert total == pytest.approx(corner.volume, rel=0.02)
 
 
+def test_closed_components_are_bodies_of_their_own(monkeypatch):
+    """A table of five boxes that meet, without CoACD."""
+    monkeypatch.setattr("sceneprior.core.colliders._coacd", lambda: None)
+    boxes = [trimesh.creation.box((1.2, 0.04, 0.8), transform=at(0, 0.7, 0))]
+    boxes += [
+        trimesh.creation.box((0.06, 0.7, 0.06), transform=at(x, 0.35, z))
+        for x in (-0.5, 0.5)
+        for z in (-0.3, 0.3)
+    ]
+    table = trimesh.util.concatenate(boxes)
+    parts = convex_parts(Mesh(table.vertices, table.faces))
+    volumes = sorted(volume_and_centroid(part)[0] for part in parts)
+    assert volumes == pytest.approx(sorted(box.volume for box in boxes))
+    # An open mesh and a cavity have no components of their own: one hull.
+    for faces in (table.faces[1:], np.vstack([table.faces[:12], table.faces[12:, ::-1]])):
+        (hull,) = convex_parts(Mesh(table.vertices, faces))
+        assert volume_and_centroid(hull)[0] > 0.5
+
+
+def at(x: float, y: float, z: float) -> np.ndarray:
+    return trimesh.transformations.translation_matrix([x, y, z])
+
+
 def test_without_coacd_a_mesh_is_its_convex_hull(monkeypatch):
     monkeypatch.setattr("sceneprior.core.colliders._coacd", lambda: None)
     ball = trimesh.creation.icosphere(subdivisions=1)

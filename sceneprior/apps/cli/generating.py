@@ -10,7 +10,9 @@ import typer
 
 from sceneprior.apps.cli.options import (
     MODELS_HELP,
+    OWN_HELP,
     CacheOption,
+    CadOption,
     CeilingOption,
     CountOption,
     DistributionOption,
@@ -28,6 +30,9 @@ from sceneprior.apps.cli.options import (
     request_of,
 )
 
+BROKEN_TOLD = 5
+"""Largest number of broken models of which `retrieve` prints the reasons."""
+
 
 def synthesize(
     run: RunOption,
@@ -40,6 +45,7 @@ def synthesize(
     ceiling: CeilingOption = None,
     want: WantOption = None,
     request: RequestOption = None,
+    cad: CadOption = False,
     html: Annotated[
         bool, typer.Option("--html", help="Write rooms.html, too: one page of 3D models.")
     ] = False,
@@ -62,7 +68,7 @@ def synthesize(
     asked = request_of(floor, openings, ceiling, want, request)
     prior = load(run)
     artist = open_renderer(renderer)
-    scenes = prior.sample(count, seed, distribution, **asked)
+    scenes = prior.sample(count, seed, distribution, **asked, cad=cad)
     write_scenes(scenes, out, artist, drawn)
     note_unmet(scenes)
     origin = distribution or prior.distribution
@@ -116,6 +122,7 @@ def complete(
     ceiling: CeilingOption = None,
     want: WantOption = None,
     request: RequestOption = None,
+    cad: CadOption = False,
     distribution: DistributionOption = None,
     shell: ShellOption = None,
     overwrite: OverwriteOption = False,
@@ -140,7 +147,7 @@ def complete(
     scene = replace(scene, objects=(*scene.objects, *asked.pop("objects", ())))
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
     prior = load(run)
-    scenes = prior.complete(scene, count, seed, distribution, wanted, **asked)
+    scenes = prior.complete(scene, count, seed, distribution, wanted, **asked, cad=cad)
     write_scenes(scenes, out, open_renderer(renderer), drawn)
     note_unmet(scenes)
     how = "drawn by the sampler" if scenes[0].latent is None else "decoded from fitted latents"
@@ -152,8 +159,10 @@ def complete(
 
 def retrieve(
     scenes: Annotated[Path, typer.Option(help="Folder of scene JSONs, with their GLBs.")],
-    models: Annotated[Path, typer.Option(help=f"CAD models: {MODELS_HELP}")],
     out: Annotated[Path, typer.Option(help="Folder for the scenes with CAD models.")],
+    models: Annotated[
+        Path | None, typer.Option(help=f"CAD models: {MODELS_HELP} {OWN_HELP}")
+    ] = None,
     cache: CacheOption = None,
     overwrite: OverwriteOption = False,
     renderer: RendererOption = "software",
@@ -163,6 +172,7 @@ def retrieve(
     from rich.progress import track
 
     from sceneprior.apps.retrieval.cad_models import open_models
+    from sceneprior.apps.retrieval.made_models import made_models
     from sceneprior.apps.retrieval.retrieve import retrieval_report, retrieve_all
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.core.files import write_json
@@ -173,10 +183,13 @@ def retrieve(
     check_free(out, overwrite)
     console = Console(stderr=True)
     rooms = load_scene_folder(scenes)
-    cad_models = open_models(
-        models, common_label_set(rooms), cache,
-        track=lambda ids: track(ids, "Reading models", console=console, transient=True),
-    )  # fmt: skip
+    if models is None:
+        cad_models = made_models()
+    else:
+        cad_models = open_models(
+            models, common_label_set(rooms), cache,
+            track=lambda ids: track(ids, "Reading models", console=console, transient=True),
+        )  # fmt: skip
     chosen = retrieve_all(rooms, cad_models)
     made = list(track(chosen, "Choosing models", total=len(rooms), console=console))
     report = retrieval_report(made, cad_models)
@@ -186,6 +199,9 @@ def retrieve(
     if report["classes_without_models"]:
         kept = ", ".join(report["classes_without_models"])
         typer.echo(f"No model of these classes, so objects keep their own meshes: {kept}")
-    if report["broken_models"]:
-        typer.echo(f"{len(report['broken_models'])} models are broken; see retrieval.json")
+    broken = report["broken_models"]
+    if broken:
+        typer.echo(f"{len(broken)} models are broken; see retrieval.json")
+    for reason in [*broken.values()][:BROKEN_TOLD]:
+        typer.echo(f"Note: {reason}.", err=True)
     typer.echo(f"Wrote {len(made)} rooms to {out}")

@@ -77,7 +77,14 @@ AcceleratorOption = Annotated[
 ScenesOption = Annotated[
     Path | None, typer.Option(help="A folder of scene JSONs of any method, in place of --run.")
 ]
-MODELS_HELP = "a 3D-FUTURE-model folder, a folder like it, or shards."
+MODELS_HELP = (
+    "a 3D-FUTURE-model folder, shards, or a folder with GLBs or OBJs in sub-folders by class."
+)
+OWN_HELP = "Default: the package's own furniture."
+CadOption = Annotated[
+    bool,
+    typer.Option("--cad", help="Replace decoded meshes by models of the package's own furniture."),
+]
 CacheOption = Annotated[
     Path | None,
     typer.Option(help="Folder that keeps the CAD models' points (default: ~/.cache/sceneprior)."),

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.apps.cli.options import MODELS_HELP, CacheOption
+from sceneprior.apps.cli.options import MODELS_HELP, OWN_HELP, CacheOption
 
 
 def view(
@@ -15,7 +15,7 @@ def view(
     ],
     models: Annotated[
         Path | None,
-        typer.Option(help=f"CAD models to replace objects with: {MODELS_HELP}"),
+        typer.Option(help=f"Models that the page may show: {MODELS_HELP} {OWN_HELP}"),
     ] = None,
     host: Annotated[
         str, typer.Option(help="Address to serve on; 0.0.0.0 opens the page to your network.")

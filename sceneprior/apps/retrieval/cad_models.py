@@ -1,4 +1,4 @@
-"""CAD models by class, from a 3D-FUTURE folder or from shards, with points on their surfaces.
+"""CAD models by class, from the files of a folder, with points on their surfaces.
 
 Points are sampled once per model and cached in one file; they are sampled again when the model's
 file changes.
@@ -15,14 +15,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from sceneprior.apps.retrieval.model_folders import ModelFiles, find_models
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import file_stamp, is_name, write_whole
-from sceneprior.core.furniture import MODEL_FILE, class_of_category, model_categories, read_obj
+from sceneprior.core.files import file_stamp, write_whole
 from sceneprior.core.geometry.surfaces import surface_points
-from sceneprior.core.ground_truth import model_path, read_model
 from sceneprior.core.scene import Mesh
-from sceneprior.core.shards import INDEX_NAME, iterate_rooms
 
 POINTS = 1024
 """Points per surface; on a surface of 2 m2, one every 4 to 5 cm."""
@@ -72,23 +70,15 @@ def open_models(
     """Open the models of a label set's classes, with points on their surfaces.
 
     Args:
-        folder: The models of 3D-FUTURE, or shards of `prep-front` with this label set.
+        folder: The models of 3D-FUTURE, shards of `prep-front` with this label set, or GLBs and
+            OBJs in sub-folders by class; see `model_folders.py`.
         cache: Folder for the cache file of points, by default `default_cache()`.
     """
     folder = Path(folder)
-    of_shards = (folder / INDEX_NAME).is_file()
-    if of_shards:
-        labels = _labels_of_shards(folder, label_set_name)
-    else:
-        categories = model_categories(folder, "--models")
-        labels = {m: class_of_category(name, label_set_name) for m, name in categories.items()}
-    read: Callable[[Path], Mesh] = read_model if of_shards else read_obj
-    files = {
-        model_id: model_path(folder, model_id) if of_shards else folder / model_id / MODEL_FILE
-        for model_id, label in sorted(labels.items())
-        if label != "void"
-    }
-    drawn, broken = _points_of_models(folder, files, read, cache or default_cache(), points, track)
+    found = find_models(folder, label_set_name)
+    files, labels = found.paths, found.labels
+    drawn, unread = _points_of_models(folder, found, cache or default_cache(), points, track)
+    broken = {**found.broken, **unread}
     by_class = {}
     for label in label_set(label_set_name):
         if of_class := [m for m in files if labels[m] == label and m not in broken]:
@@ -101,37 +91,19 @@ def open_models(
         )
 
     def load(model_id: str) -> Mesh:
-        return unit_mesh(read(files[model_id]))
+        return unit_mesh(found.read(files[model_id]))
 
     return CadModels(by_class, lru_cache(_MESHES_KEPT)(load), broken)
-
-
-def _labels_of_shards(folder: Path, label_set_name: str) -> dict[str, str]:
-    """Classes of the models in training rooms, as assigned by the recipe of the shards."""
-    labels: dict[str, str] = {}
-    for shard, room_id in iterate_rooms(folder, "train"):
-        if shard.label_set != label_set_name:
-            raise InputError(
-                f"The rooms of {folder} have label set '{shard.label_set}', but the scenes have "
-                f"'{label_set_name}'; give --models shards with the scenes' label set."
-            )
-        truth = shard.read_ground_truth(room_id)
-        names = label_set(label_set_name)
-        labels |= {
-            model_id: names[label]
-            for model_id, label in zip(truth.model_ids, truth.object_class, strict=True)
-            if model_id  # ScanNet's objects have none
-        }
-    return labels
 
 
 def unit_mesh(mesh: Mesh) -> Mesh:
     """Move and scale a mesh to fill [-0.5, 0.5]^3; a flat side becomes 0."""
     vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
-    return Mesh(_into_unit_box(vertices, vertices), mesh.faces)
+    return Mesh(unit_points(vertices, vertices), mesh.faces)
 
 
-def _into_unit_box(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+def unit_points(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Points of a mesh, moved and scaled with it; see `unit_mesh`."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     sides = high - low
     scale = np.where(sides > _FLAT * sides.max(), 1 / np.maximum(sides, 1e-300), 0.0)
@@ -139,12 +111,7 @@ def _into_unit_box(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 
 def _points_of_models(
-    folder: Path,
-    files: Mapping[str, Path],
-    read: Callable[[Path], Mesh],
-    cache: Path,
-    count: int,
-    track: Track,
+    folder: Path, found: ModelFiles, cache: Path, count: int, track: Track
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Sample `count` points of each model; returns them, and the reasons for broken models.
 
@@ -154,10 +121,8 @@ def _points_of_models(
     kept = cache / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
     points, stamps = _read_points(kept, count)
     before, todo, broken = dict(stamps), dict[str, tuple[int, int]](), dict[str, str]()
-    for model_id, path in files.items():
+    for model_id, path in found.paths.items():
         try:
-            if not is_name(model_id):
-                raise InputError(f"{ascii(model_id)[:60]} cannot be a folder's name")
             stamp = file_stamp(path)
             if stamps.get(model_id) != stamp:
                 todo[model_id] = stamp
@@ -166,11 +131,11 @@ def _points_of_models(
     try:
         for model_id in track(list(todo)):
             try:
-                mesh = read(files[model_id])
+                mesh = found.read(found.paths[model_id])
                 vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
                 # Sampled before scaling to the unit box, which would enlarge thin sides.
                 drawn = surface_points(vertices, mesh.faces, count, SEED)
-                points[model_id] = _into_unit_box(drawn, vertices).astype(np.float32)
+                points[model_id] = unit_points(drawn, vertices).astype(np.float32)
                 stamps[model_id] = todo[model_id]
             except (InputError, ValueError) as error:
                 broken[model_id] = str(error)

@@ -9,7 +9,7 @@ All models and turns are first compared by few points, and the best candidates b
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from torch import Tensor
 from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels
 from sceneprior.core.geometry.surfaces import chamfer_mean, surface_points
 from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
-from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned
 from sceneprior.render.topdown import box_mesh
 
 STANDS_M = 1.0
@@ -47,21 +47,26 @@ class Retrieved(NamedTuple):
     """Chamfer distance of `chamfer_mean`."""
 
 
-def retrieve(scene: Scene, models: CadModels) -> Scene:
+def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Scene:
     """The scene with the mesh of the most similar CAD model in every box.
 
-    `extra["retrieval"]` holds {"model_id", "turn_deg", "distance_m"} for each object, in the order
-    of the objects. The entry is None for a class without models; such an object keeps its mesh,
-    extruded together with its box.
+    Objects have the turn of their model as their yaw (`SceneObject.turned`). `extra["retrieval"]`
+    holds {"model_id", "turn_deg", "distance_m"} for each object, in the order of the objects. The
+    entry is None for a class without models; such an object keeps its mesh, extruded together with
+    its box.
+
+    Args:
+        keep: Indices of objects that stay as they are; their entries are None.
     """
     objects: list[SceneObject] = []
     found: list[dict[str, object] | None] = []
-    for item in scene.objects:
-        box, told = extruded(item), None
-        if of_class := models.by_class.get(item.label):
+    for row, item in enumerate(scene.objects):
+        box, told = item if row in keep else extruded(item), None
+        if row not in keep and (of_class := models.by_class.get(item.label)):
             best = most_similar(box, of_class)
             mesh = placed(models.load(best.model_id), box, best.turn_deg)
-            objects.append(replace(box, mesh=mesh, turned=None, solids=()))
+            yaw = yaw_of(box, best.turn_deg)
+            objects.append(replace(box, mesh=mesh, turned=yaw, solids=()))
             told = best._asdict() | {"distance_m": round(best.distance_m, 5)}
         else:
             objects.append(item if box is item else item.in_box(box.center_m, box.size_m))
@@ -69,11 +74,13 @@ def retrieve(scene: Scene, models: CadModels) -> Scene:
     return replace(scene, objects=tuple(objects), extra={**scene.extra, "retrieval": found})
 
 
-def retrieve_all(scenes: Sequence[Scene], models: CadModels) -> Iterator[Scene]:
+def retrieve_all(
+    scenes: Sequence[Scene], models: CadModels, keep: Collection[int] = ()
+) -> Iterator[Scene]:
     """Apply `retrieve` to many scenes on all cores; yields the results in the scenes' order."""
     # One thread per core, each with one torch thread, since the matrix products are small.
     with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as p:
-        yield from p.map(lambda scene: retrieve(scene, models), scenes)
+        yield from p.map(lambda scene: retrieve(scene, models, keep), scenes)
 
 
 def retrieval_report(scenes: Sequence[Scene], models: CadModels) -> dict[str, Any]:
@@ -119,6 +126,13 @@ def placed(unit: Mesh, item: SceneObject, turn_deg: int) -> Mesh:
     """A mesh that fills [-0.5, 0.5]^3, turned and scaled into an object's box."""
     turned = unit.vertices_m @ quarter_rotation(turn_deg // 90).T
     return Mesh(turned * np.asarray(item.size_m) + np.asarray(item.center_m), unit.faces)
+
+
+def yaw_of(item: SceneObject, turn_deg: int) -> Turned:
+    """The box of an object as that of a model at this turn, with the model's own size."""
+    width, height, depth = item.size_m
+    own = (width, height, depth) if turn_deg % 180 == 0 else (depth, height, width)
+    return Turned(float(np.deg2rad(turn_deg if turn_deg <= 180 else turn_deg - 360)), own)
 
 
 def most_similar(item: SceneObject, models: ClassModels, keep: int | None = KEEP) -> Retrieved:

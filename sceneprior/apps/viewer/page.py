@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sceneprior.apps.retrieval.cad_models import CadModels
+from sceneprior.apps.retrieval.made_models import made_models
 from sceneprior.apps.retrieval.retrieve import retrieve
 from sceneprior.apps.viewer.board import Board, BoardPlane, Point
 from sceneprior.apps.viewer.explorer import HERE, PATH_STEPS, Explorer, Folder, Shown, floor_side_m
@@ -25,13 +26,15 @@ FOV_RAD = 0.75
 """Vertical field of view of the camera."""
 GAP = 0.06
 """Gap between the room and its neighbours, relative to the width of the room's floor."""
+FURNITURE = DECODED, MODELS = "decoded", "models"
+"""The choices of `Furniture`: meshes of the prior or the files, or CAD models."""
 _TEXT = Markup('<div style="padding: 0 0.8em 0.8em; font-size: 0.875em">{}</div>')
 
 
 class Page:
     """The page, whose single room is shared by all connected browsers.
 
-    The checkbox `CAD models` is hidden without `models`.
+    Without `models`, the package's own furniture is the other choice of `Furniture`.
     """
 
     def __init__(
@@ -41,11 +44,11 @@ class Page:
         title: str,
         models: CadModels | None = None,
     ):
-        self.server, self.source, self.models = server, source, models
+        self.server, self.source, self.models = server, source, models or made_models()
         self.explorer = source if isinstance(source, Explorer) else None
         self.shown = source.room(0) if isinstance(source, Folder) else source.sample(0)
         self.scene = self.shown.scene
-        """The displayed scene: the scene of `shown`, with CAD models if they are switched on."""
+        """The displayed scene: the scene of `shown`, with CAD models if they are chosen."""
         # Callbacks come from many threads, and a callback may trigger another in its own thread.
         self._lock = threading.RLock()
         self._newest: Callable[[], None] | None = None
@@ -78,7 +81,7 @@ class Page:
         with self._lock:
             self.shown = shown
             self.scene = shown.scene
-            if settled and self.models is not None and self._cad.value:
+            if settled and self._furniture.value == MODELS:
                 self.scene = retrieve(shown.scene, self.models)
             with self.server.atomic():
                 self._room.show(self.scene, shown.kept, self._names.value, self._boxes.value)
@@ -170,15 +173,16 @@ class Page:
         with gui.add_folder("Show"):
             self._names = self._box("Names and sizes", False)
             self._boxes = self._box("Boxes", False)
-            self._cad = self._box("CAD models", False, visible=self.models is not None)
+            self._furniture: Any = gui.add_dropdown("Furniture", FURNITURE, initial_value=DECODED)
+            self._furniture.on_update(lambda _: self._safely(lambda: self.show(self.shown)))
             self._nearest: Any = None
             if self.board is not None:
                 self._nearest = self._box("Nearest training room", False)
                 self._nearest_said = gui.add_html("")
         self._buttons({"Download GLB": self._download})
 
-    def _box(self, name: str, value: bool, visible: bool = True) -> Any:
-        box = self.server.gui.add_checkbox(name, value, visible=visible)
+    def _box(self, name: str, value: bool) -> Any:
+        box = self.server.gui.add_checkbox(name, value)
         box.on_update(lambda _: self._safely(lambda: self.show(self.shown)))
         return box
 

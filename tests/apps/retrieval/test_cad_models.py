@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from model_folder import blocks, corner_sofa, write_model, write_models
 
-from sceneprior.apps.retrieval import cad_models
+from sceneprior.apps.retrieval import model_folders
 from sceneprior.apps.retrieval.cad_models import open_models
 from sceneprior.core.errors import InputError
 
@@ -41,9 +41,9 @@ def folder(tmp_path):
 def drawn(monkeypatch):
     """Names of the folders whose OBJ was read."""
     reads = []
-    read = cad_models.read_obj
+    read = model_folders.read_obj
     monkeypatch.setattr(
-        cad_models, "read_obj", lambda path: reads.append(path.parent.name) or read(path)
+        model_folders, "read_obj", lambda path: reads.append(path.parent.name) or read(path)
     )
     return reads
 

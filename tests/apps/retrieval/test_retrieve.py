@@ -156,10 +156,12 @@ def test_rooms_without_objects_and_objects_without_volume_have_defined_answers(m
     assert made.extra["retrieval"][2]["model_id"] == "plain"  # by its box
 
 
-def test_a_model_fills_the_axis_aligned_box_so_the_turned_one_goes(models):
+def test_a_model_fills_the_axis_aligned_box_and_its_turn_is_the_yaw(models):
     turned = Turned(np.pi / 6, (1.0, 1.0, 2.0))
     item = SceneObject("sofa", (0.0, 0.5, 0.0), bound_m(turned), turned=turned)
-    assert retrieve(room(item), models).objects[0].turned is None
+    (made,), found = (made := retrieve(room(item), models)).objects, made.extra["retrieval"][0]
+    assert np.rad2deg(made.turned.yaw_rad) % 360 == pytest.approx(found["turn_deg"])
+    assert bound_m(made.turned) == pytest.approx(item.size_m)
 
 
 def test_many_scenes_are_the_same_as_one_by_one(models, rng):

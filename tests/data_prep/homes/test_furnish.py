@@ -7,9 +7,9 @@ import pytest
 
 from data_prep.homes.bedroom import BEDROOM
 from data_prep.homes.bedroom import COUNTS as BEDROOM_COUNTS
-from data_prep.homes.catalog import make_catalog
 from data_prep.homes.furnish import furnish
 from data_prep.homes.living import COUNTS as LIVING_COUNTS
+from sceneprior.furniture.catalog import make_catalog
 
 
 @pytest.mark.parametrize(

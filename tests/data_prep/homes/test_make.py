@@ -8,10 +8,11 @@ from collections import Counter
 import pytest
 from homes_on_disk import TYPES
 
-from data_prep.homes.catalog import make_catalog
 from data_prep.homes.make import make_homes
+from sceneprior.core.classes import LABEL_SETS
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import only_writer
+from sceneprior.furniture.catalog import make_catalog
 
 
 @pytest.mark.parametrize("room_type", TYPES)
@@ -87,3 +88,14 @@ def test_a_full_disk_is_an_error_that_names_the_folder_and_leaves_nothing(tmp_pa
     with pytest.raises(OSError, match="No space left") as error:
         make_homes(tmp_path / "new", 2, "living", 0)
     assert error.value.filename == str(tmp_path / "new") and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("room_type", "label_set"), TYPES.items())
+def test_every_class_occurs_in_five_variants_or_more(rooms, room_type, label_set):
+    jids: dict[str, set] = {}
+    for room in rooms[room_type]:
+        for piece in room["pieces"]:
+            jids.setdefault(piece["class"], set()).add(piece["jid"])
+    assert set(jids) == set(LABEL_SETS[label_set][1:])
+    catalog = make_catalog(0, label_set)
+    assert all(len({model.jid for model in models}) >= 5 for models in catalog.values())

@@ -6,7 +6,7 @@ import trimesh
 from homes_on_disk import TYPES
 from shapely.geometry import Point
 
-from data_prep.homes.catalog import make_catalog
+from sceneprior.furniture.catalog import make_catalog
 
 
 def test_models_on_disk_load_as_they_were_built(homes):

@@ -33,7 +33,7 @@ import numpy as np
 import trimesh
 import yaml
 
-from data_prep.homes.solids import PARTS, Parts, Vector, box
+from sceneprior.furniture.solids import PARTS, Number, Parts, Vector, box
 
 DEEP_SOFA_M = 1.3
 """Depth from which on a sofa has a chaise; sofas with a single row of seats are less deep."""
@@ -42,7 +42,7 @@ DINING_WIDTH_M = 1.0
 """Width from which on a table is a dining table; narrower ones are side tables."""
 
 
-def _around(count: int, x: float, z: float) -> list[tuple[float, float]]:
+def _around(count: int, x: Number, z: Number) -> list[tuple[Number, Number]]:
     turns = np.arange(count) * 2 * np.pi / count
     return [(x * np.sin(turn), z * np.cos(turn)) for turn in turns]
 
@@ -89,7 +89,7 @@ class Table:
 def furniture_tables() -> dict[str, Table]:
     """Load all tables, by name."""
     found: dict[str, Table] = {}
-    for file in files("data_prep.homes").iterdir():
+    for file in files("sceneprior.furniture").iterdir():
         if file.name.endswith(".yaml"):
             tables = [Table.parse(*item) for item in yaml.safe_load(file.read_text()).items()]
             found |= {table.name: table for table in tables}
@@ -155,7 +155,9 @@ def _compiled(expression: str) -> CodeType:
     return compile(expression, "<furniture table>", "eval")
 
 
-def _books(rng: np.random.Generator, w: float, h: float, d: float, x: float, y: float) -> Parts:
+def _books(
+    rng: np.random.Generator, w: Number, h: Number, d: Number, x: Number, y: Number
+) -> Parts:
     """Fill a shelf from the left with runs of books of unequal heights; the rest stays empty."""
     parts, edge = [], x - w / 2 + 0.01
     limit = x + w / 2 - rng.uniform(0.05, 0.4) * w

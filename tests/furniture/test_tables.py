@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from data_prep.homes.catalog import make_catalog
-from data_prep.homes.furniture import Table, build, furniture_tables
 from sceneprior.core.classes import LABEL_SETS
+from sceneprior.furniture.catalog import make_catalog
+from sceneprior.furniture.tables import Table, build, furniture_tables
 
 
 def build_from(tables: dict, size_m=(1.0, 2.0, 0.5), style: int = 0):

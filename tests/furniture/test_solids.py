@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from data_prep.homes import solids
+from sceneprior.furniture import solids
 
 
 @pytest.mark.parametrize(

@@ -4,17 +4,25 @@ The `y` of a solid is its bottom, since furniture is described from the floor up
 lofts: rings with equal numbers of points, joined ring to ring and capped at both ends.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike
 
 Parts = list[trimesh.Trimesh]
 """A piece of furniture: closed solids, which may intersect."""
 
+Number = float | int | np.number
+"""A length in metres, or an angle, as the expressions of the tables have it."""
+
+Numbers = Number | np.ndarray | Sequence[Any]
+"""A number, or an array of them in any form."""
+
 Vector = tuple[float, float, float]
 
 
-def loft(rings: ArrayLike) -> trimesh.Trimesh:
+def loft(rings: Numbers) -> trimesh.Trimesh:
     """Join (rings, points, 3) into one closed solid; both end rings must be convex."""
     rings = np.asarray(rings, dtype=float)
     count, points = rings.shape[:2]
@@ -35,21 +43,21 @@ def loft(rings: ArrayLike) -> trimesh.Trimesh:
 
 
 def box(
-    w: float, h: float, d: float, x: float = 0.0, y: float = 0.0, z: float = 0.0
+    w: Number, h: Number, d: Number, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0
 ) -> trimesh.Trimesh:
     """Make a w x h x d box with the centre of its bottom at (x, y, z)."""
-    bounds = [[x - w / 2, y, z - d / 2], [x + w / 2, y + h, z + d / 2]]
+    bounds = np.array([[x - w / 2, y, z - d / 2], [x + w / 2, y + h, z + d / 2]], dtype=float)
     return trimesh.creation.box(bounds=bounds)
 
 
 def beveled_box(
-    w: float,
-    h: float,
-    d: float,
-    x: float = 0.0,
-    y: float = 0.0,
-    z: float = 0.0,
-    bevel: float = 0.05,
+    w: Number,
+    h: Number,
+    d: Number,
+    x: Number = 0.0,
+    y: Number = 0.0,
+    z: Number = 0.0,
+    bevel: Number = 0.05,
     steps: int = 2,
 ) -> trimesh.Trimesh:
     """Make a box with edges rounded by `bevel` (60 triangles for steps = 2)."""
@@ -65,7 +73,7 @@ def beveled_box(
     return shifted(loft(rings), x, y, z)
 
 
-def _rounded_rectangle(half_x: float, half_z: float, radius: float, steps: int) -> np.ndarray:
+def _rounded_rectangle(half_x: Number, half_z: Number, radius: Number, steps: int) -> np.ndarray:
     corners = []
     for quarter, (sx, sz) in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)]):
         turn = np.linspace(0, np.pi / 2, steps) + quarter * np.pi / 2
@@ -75,7 +83,7 @@ def _rounded_rectangle(half_x: float, half_z: float, radius: float, steps: int) 
 
 
 def lathe(
-    profile: list[tuple[float, float]], x: float = 0.0, z: float = 0.0, segments: int = 20
+    profile: list[tuple[Number, Number]], x: Number = 0.0, z: Number = 0.0, segments: int = 20
 ) -> trimesh.Trimesh:
     """Rotate a profile of (radius, height) pairs about the vertical axis through (x, z)."""
     turn = np.linspace(0, 2 * np.pi, segments, endpoint=False)
@@ -87,14 +95,14 @@ def lathe(
 
 
 def cylinder(
-    radius: float, h: float, x: float = 0.0, y: float = 0.0, z: float = 0.0, segments: int = 20
+    radius: Number, h: Number, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0, segments: int = 20
 ) -> trimesh.Trimesh:
     """Make a vertical cylinder with the centre of its bottom at (x, y, z)."""
     return lathe([(radius, y), (radius, y + h)], x, z, segments)
 
 
 def sphere(
-    radius: float, x: float = 0.0, y: float = 0.0, z: float = 0.0, rows: int = 8
+    radius: Number, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0, rows: int = 8
 ) -> trimesh.Trimesh:
     """Make a sphere with its lowest point at (x, y, z)."""
     polar = np.linspace(0.08, np.pi - 0.08, rows)
@@ -102,26 +110,26 @@ def sphere(
     return lathe(profile, x, z, 2 * rows)
 
 
-def torus(radius: float, thickness: float, y: float = 0.0) -> trimesh.Trimesh:
+def torus(radius: Number, thickness: Number, y: Number = 0.0) -> trimesh.Trimesh:
     """Make a horizontal torus with its bottom at y and outer radius `radius`."""
     sections = {"major_sections": 28, "minor_sections": 8}
     part = trimesh.creation.torus(radius - thickness / 2, thickness / 2, **sections)
     return shifted(tilted(part, np.pi / 2), y=y + thickness / 2)
 
 
-def panel(outline_xy: ArrayLike, thickness: float, z: float = 0.0) -> trimesh.Trimesh:
+def panel(outline_xy: Numbers, thickness: Number, z: Number = 0.0) -> trimesh.Trimesh:
     """Extrude a convex outline in the x-y plane by `thickness` along z, centred at z."""
     outline = np.asarray(outline_xy, dtype=float)
     return loft([np.insert(outline, 2, z + side * thickness / 2, axis=1) for side in (-1, 1)])
 
 
-def slab(outline_xz: ArrayLike, h: float, y: float = 0.0) -> trimesh.Trimesh:
+def slab(outline_xz: Numbers, h: Number, y: Number = 0.0) -> trimesh.Trimesh:
     """Extrude a convex outline in the x-z plane by `h` upwards, from y."""
     outline = np.asarray(outline_xz, dtype=float)
     return loft([np.insert(outline, 1, level, axis=1) for level in (y, y + h)])
 
 
-def tube(points: ArrayLike, radius: float, segments: int = 8) -> trimesh.Trimesh:
+def tube(points: Numbers, radius: Number, segments: int = 8) -> trimesh.Trimesh:
     """Make a round bar along a path (points, 3) without sharp reversals."""
     points = np.asarray(points, dtype=float)
     along = _directions(points)
@@ -134,7 +142,7 @@ def tube(points: ArrayLike, radius: float, segments: int = 8) -> trimesh.Trimesh
 
 
 def rod(
-    start: ArrayLike, end: ArrayLike, radius: float, end_radius: float | None = None
+    start: Numbers, end: Numbers, radius: Number, end_radius: Number | None = None
 ) -> trimesh.Trimesh:
     """Make a straight bar with 6 sides, tapering to `end_radius`."""
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
@@ -156,7 +164,7 @@ def _directions(points: np.ndarray) -> np.ndarray:
     return along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
-def ribbon(path_xz: ArrayLike, y0: float, y1: ArrayLike, thickness: float) -> trimesh.Trimesh:
+def ribbon(path_xz: Numbers, y0: Number, y1: Numbers, thickness: Number) -> trimesh.Trimesh:
     """Make a wall along a path (points, 2) in x and z, from y0 to y1 (one value or per point)."""
     path = np.asarray(path_xz, dtype=float)
     along = _directions(path)
@@ -165,12 +173,12 @@ def ribbon(path_xz: ArrayLike, y0: float, y1: ArrayLike, thickness: float) -> tr
     return loft(np.stack([curve(at[:, 0], y, at[:, 1]) for at, y in sides], axis=1))
 
 
-def curve(*coordinates: ArrayLike) -> np.ndarray:
+def curve(*coordinates: Numbers) -> np.ndarray:
     """Stack coordinates to points, (points, 2 or 3); a single number is broadcast."""
     return np.stack(np.broadcast_arrays(*coordinates), axis=1)
 
 
-def oval(w: float, d: float, segments: int = 24, power: float = 2.0) -> np.ndarray:
+def oval(w: Number, d: Number, segments: int = 24, power: Number = 2.0) -> np.ndarray:
     """Outline of a (super)ellipse, (segments, 2); a power above 2 makes it more rectangular."""
     turn = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     cos, sin = np.cos(turn), np.sin(turn)
@@ -178,14 +186,14 @@ def oval(w: float, d: float, segments: int = 24, power: float = 2.0) -> np.ndarr
     return curve(x, d / 2 * np.sign(sin) * np.abs(sin) ** (2 / power))
 
 
-def arch(w: float, h: float, shoulder: float, steps: int = 10) -> np.ndarray:
+def arch(w: Number, h: Number, shoulder: Number, steps: int = 10) -> np.ndarray:
     """Outline of a panel of width w, (steps + 2, 2), whose top curves from `shoulder` up to h."""
     turn = np.linspace(0, np.pi, steps)
     top = curve(w / 2 * np.cos(turn), shoulder + (h - shoulder) * np.sin(turn))
     return np.concatenate([top, [[-w / 2, 0.0], [w / 2, 0.0]]])
 
 
-def shifted(part: trimesh.Trimesh, x: float = 0.0, y: float = 0.0, z: float = 0.0):
+def shifted(part: Any, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0):
     """Translate a part, or each part of a list, in place."""
     for each in part if isinstance(part, list) else [part]:
         each.apply_translation([x, y, z])
@@ -193,7 +201,7 @@ def shifted(part: trimesh.Trimesh, x: float = 0.0, y: float = 0.0, z: float = 0.
 
 
 def tilted(
-    part: trimesh.Trimesh, angle_rad: float, about: ArrayLike = (0.0, 0.0, 0.0)
+    part: trimesh.Trimesh, angle_rad: Number, about: Numbers = (0.0, 0.0, 0.0)
 ) -> trimesh.Trimesh:
     """Rotate the part in place about the x axis through a point."""
     return part.apply_transform(
@@ -201,12 +209,12 @@ def tilted(
     )
 
 
-def scaled(part: trimesh.Trimesh, factors: ArrayLike) -> trimesh.Trimesh:
+def scaled(part: trimesh.Trimesh, factors: Numbers) -> trimesh.Trimesh:
     """Scale the part in place along x, y and z."""
     return part.apply_scale(factors)
 
 
-def fit_to(parts: Parts, size_m: ArrayLike) -> Parts:
+def fit_to(parts: Parts, size_m: Numbers) -> Parts:
     """Scale the parts together to a bounding box of this size, centred, bottom at y = 0."""
     low = np.min([part.vertices.min(axis=0) for part in parts], axis=0)
     high = np.max([part.vertices.max(axis=0) for part in parts], axis=0)

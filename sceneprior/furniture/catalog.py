@@ -11,9 +11,9 @@ from zlib import crc32
 import numpy as np
 import trimesh
 
-from data_prep.homes.furniture import DEEP_SOFA_M, DINING_WIDTH_M, build
-from data_prep.homes.solids import Parts, Vector, fit_to
 from sceneprior.core.classes import label_set
+from sceneprior.furniture.solids import Parts, Vector, fit_to
+from sceneprior.furniture.tables import DEEP_SOFA_M, DINING_WIDTH_M, build
 
 VARIANTS = 12
 """Models per class in one data set; the demo promises at least five."""
@@ -102,10 +102,16 @@ Catalog = dict[str, list[Model]]
 @lru_cache(maxsize=4)  # meshes are built once per process
 def make_catalog(seed: int, label_set_name: str) -> Catalog:
     """Make `VARIANTS` models of every class but void; a class has the same in all label sets."""
-    return {name: _variants(seed, name) for name in label_set(label_set_name)[1:]}
+    return {name: make_variants(seed, name) for name in label_set(label_set_name)[1:]}
 
 
-def _variants(seed: int, name: str) -> list[Model]:
+def furniture_classes() -> frozenset[str]:
+    """Classes of which `make_variants` makes models."""
+    return frozenset(_CATEGORIES) | {"sofa", "table"}
+
+
+def make_variants(seed: int, name: str) -> list[Model]:
+    """Make `VARIANTS` models of a class, in sizes of real furniture (`real_sizes`)."""
     own = (seed, crc32(name.encode()))
     rng = np.random.default_rng(np.random.SeedSequence(own))
     models = []
@@ -162,7 +168,7 @@ def at_score(low: float, middle: float, high: float, score: float) -> float:
 @lru_cache(maxsize=1)
 def real_sizes() -> dict[str, Percentiles]:
     """Percentiles of the sizes of every class."""
-    text = files("data_prep.recipes").joinpath("furniture_sizes.csv").read_text()
+    text = files("sceneprior.furniture").joinpath("furniture_sizes.csv").read_text()
     sizes: dict[str, Percentiles] = {}
     for row in csv.DictReader(text.splitlines()):
         sizes[row["class"]] = tuple(

@@ -1,0 +1,1 @@
+"""Furniture made of tables of parts: solids, the tables of each class, and models of all sizes."""

@@ -1,0 +1,118 @@
+"""The package's own furniture: every class of the shipped priors, closed, its front at +z."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+import sceneprior
+from sceneprior.apps.priors.packed import read_packed
+from sceneprior.apps.priors.where import shipped_priors
+from sceneprior.apps.retrieval.made_models import made_models, with_models
+from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.scene_json import scene_to_json
+from sceneprior.furniture.catalog import furniture_classes, make_variants
+from sceneprior.interchange.export import export_scenes
+from sceneprior.render.scene_files import load_scene, save_scene
+from sceneprior.render.topdown import box_mesh
+
+
+def closed(mesh: Mesh) -> bool:
+    return trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False).is_watertight
+
+
+@pytest.mark.parametrize("name", shipped_priors())
+def test_every_class_of_a_shipped_prior_has_models(name):
+    classes = read_packed(shipped_priors()[name]).said.classes
+    assert set(classes[1:]) <= set(made_models().by_class)
+
+
+@pytest.mark.parametrize("label", sorted(furniture_classes()))
+def test_models_are_closed_fill_their_box_and_have_three_styles(label):
+    models = made_models()
+    of_class = models.by_class[label]
+    shapes = set()
+    for model_id, points in zip(of_class.model_ids, of_class.points, strict=True):
+        mesh = models.load(model_id)
+        assert closed(mesh), model_id
+        np.testing.assert_allclose(mesh.vertices_m.min(axis=0), -0.5, atol=1e-12)
+        np.testing.assert_allclose(mesh.vertices_m.max(axis=0), 0.5, atol=1e-12)
+        assert np.abs(points).max() <= 0.5
+        shapes.add(mesh.faces.tobytes())
+    assert len(of_class.model_ids) == len(make_variants(0, label))
+    assert len(shapes) >= 3
+
+
+@pytest.mark.parametrize("label", ["armchair", "chair", "double_bed", "single_bed", "sofa"])
+def test_backs_are_at_low_z(label):
+    """What rises above seat or mattress is behind it."""
+    for points in made_models().by_class[label].points:
+        assert np.mean(points[points[:, 1] > 0.3][:, 2]) < -0.1
+
+
+def test_a_class_without_tables_has_no_models():
+    bathtub = SceneObject("bathtub", (0.0, 0.3, 0.0), (1.6, 0.6, 0.7))
+    (made,) = with_models([Scene("room", "scannet", (bathtub,))])
+    assert made.objects == (bathtub,) and made.extra["retrieval"] == [None]
+    assert "bathtub" not in made_models().by_class
+
+
+def test_objects_given_with_a_mesh_keep_it():
+    box = (0.0, 0.5, 0.0), (2.0, 1.0, 1.0)
+    own = SceneObject("sofa", *box, box_mesh(*box))
+    bare = replace(own, mesh=None)
+    room = Scene("room", "front3d_living", (own, bare, own))
+    (made,) = with_models([room], (own, bare))
+    assert made.objects[0] == own
+    for item, found in zip(made.objects[1:], made.extra["retrieval"][1:], strict=True):
+        assert found["model_id"].startswith("sofa_") and closed(item.mesh)
+    assert made.extra["retrieval"][0] is None
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return sceneprior.load("demo-bedroom")
+
+
+def test_sampled_rooms_get_models_in_their_boxes(prior):
+    (plain,), (made,) = prior.sample(seed=1), prior.sample(seed=1, cad=True)
+    assert [item.label for item in plain.objects] == [item.label for item in made.objects]
+    for item, found in zip(made.objects, made.extra["retrieval"], strict=True):
+        assert found["model_id"].startswith(item.label) and closed(item.mesh)
+        low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
+        np.testing.assert_allclose((low + high) / 2, item.center_m, atol=1e-9)
+        np.testing.assert_allclose(high - low, item.size_m, atol=1e-9)
+        assert np.rad2deg(item.turned.yaw_rad) % 360 == pytest.approx(found["turn_deg"])
+    (again,) = prior.sample(seed=1, cad=True)
+    assert scene_to_json(made) == scene_to_json(again)
+
+
+def test_a_completed_room_keeps_what_was_given(prior):
+    box = (0.0, 0.3, -1.0), (1.8, 0.6, 2.0)
+    bed = SceneObject("double_bed", *box, box_mesh(*box))
+    given = Scene("mine", "front3d_bedroom", (bed,))
+    (room,) = prior.complete(given, count=1, classes=["nightstand"], cad=True)
+    assert room.objects[0] == bed and room.objects[1].label == "nightstand"
+    assert [found and found["model_id"][:-3] for found in room.extra["retrieval"]] == [
+        None, "nightstand",
+    ]  # fmt: skip
+
+
+def test_files_hold_the_models_and_simulators_get_them(prior, tmp_path):
+    pytest.importorskip("coacd", reason="the extra `sim` is not installed")
+    mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+    (room,) = prior.sample(seed=1, cad=True)
+    room = replace(room, objects=room.objects[:3])
+    for ending in (".glb", ".json"):
+        save_scene(room, tmp_path / f"room{ending}")
+    read = load_scene(tmp_path / "room.json")
+    assert all(closed(item.mesh) for item in read.objects)
+    assert [item.turned.yaw_rad for item in read.objects] == pytest.approx(
+        [item.turned.yaw_rad for item in room.objects]
+    )
+    export_scenes([read], "mujoco", tmp_path / "mujoco")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "mujoco" / f"{read.name}.xml"))
+    assert model.nmesh >= len(read.objects)
+    export_scenes([read], "habitat", tmp_path / "habitat")
+    assert len(list((tmp_path / "habitat" / "objects").glob("*.collider.glb"))) == 3
