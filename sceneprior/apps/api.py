@@ -113,7 +113,7 @@ class Prior:
             (2, (4, 2))
             >>> (room,) = prior.sample(seed=1, cad=True)
             >>> room.objects[0].label, room.extra["retrieval"][0]["model_id"]
-            ('chair', 'chair_00')
+            ('double_bed', 'double_bed_06')
         """
         asked = {
             "floor": floor, "openings": openings, "ceiling_m": ceiling_m, "want": want,
