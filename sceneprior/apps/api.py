@@ -1,14 +1,17 @@
 """The Python API, on which the commands are built: load a trained prior and make rooms with it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneprior.apps.config import load_any_run, with_latents
+from sceneprior import __version__
+from sceneprior.apps.config import load_any_run, weights_of, with_latents
+from sceneprior.apps.priors.where import name_of, version_of
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
@@ -53,6 +56,27 @@ class Prior:
     """The trained networks, with their configuration."""
     where: str
     """The path or name from which the prior was loaded."""
+
+    @cached_property
+    def origin(self) -> dict[str, str]:
+        """What the rooms of the prior say of it in their `extra`: its name (`prior`), its version
+        (`prior_version`, if its file is known; see `version_of`) and the version of the package
+        (`sceneprior`).
+
+        Examples:
+            >>> origin = load("procthor-bedroom").origin
+            >>> origin["prior"], len(origin["prior_version"])
+            ('procthor-bedroom', 12)
+        """
+        try:
+            version = {"prior_version": version_of(weights_of(self.where))}
+        except (InputError, OSError):  # deleted since, or never in a file
+            version = {}
+        return {"prior": name_of(self.where), **version, "sceneprior": __version__}
+
+    def _told(self, rooms: Sequence[Scene], **more: Any) -> list[Scene]:
+        """The rooms with their origin in `extra`, before what is there."""
+        return [replace(room, extra={**self.origin, **more, **room.extra}) for room in rooms]
 
     def __repr__(self) -> str:
         return f"Prior({self.where!r}, {self.label_set}, rooms from: {self.distribution})"
@@ -124,6 +148,7 @@ class Prior:
             rooms = self._requested(asked, count, seed, distribution)
         else:
             rooms = sample_rooms(self.trained, count, seed, distribution)
+        rooms = self._told(rooms, seed=seed, distribution=distribution or self.distribution)
         return _with_models(rooms, objects or ()) if cad else rooms
 
     def _requested(
@@ -157,7 +182,7 @@ class Prior:
         """
         from sceneprior.paper.interpolate import interpolate
 
-        return interpolate(self.with_latents, start, end, steps)
+        return self._told(interpolate(self.with_latents, start, end, steps))
 
     def complete(
         self,
@@ -216,6 +241,7 @@ class Prior:
 
             trained = self.with_latents
             rooms = complete(trained, [scene], count, seed, distribution, classes=classes)[0]
+        rooms = self._told(rooms, seed=seed)
         return _with_models(rooms, scene.objects) if cad else rooms
 
     def reconstruct(

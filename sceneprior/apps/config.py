@@ -76,6 +76,12 @@ def check_config(data: dict[str, Any], source: str) -> RunConfig:
     return check_settings(config, data, source)
 
 
+def weights_of(run: Path | str) -> Path:
+    """The packed prior (a file or a folder) or the checkpoint that `load_any_run` reads."""
+    path = find_prior(run)
+    return path if is_packed(path) else find_checkpoint(path, run_config(path).stage_names)[1]
+
+
 def load_any_run(run: Path | str) -> Trained:
     """Load the networks of a run of any method, which `find_prior` finds, in evaluation mode."""
     path = find_prior(run)

@@ -115,6 +115,17 @@ class SceneObject:
         return replace(self.in_box(center, self.size_m), turned=self.turned)
 
 
+def quarter_turned(size_m: Sequence[float], quarters: int) -> Turned:
+    """The axis-aligned box of extents `size_m` as a box that is turned by quarters.
+
+    >>> quarter_turned((2.0, 0.5, 1.0), 3)
+    Turned(yaw_rad=-1.5707963267948966, size_m=(1.0, 0.5, 2.0))
+    """
+    width, height, depth = _triple(size_m)
+    own = (width, height, depth) if quarters % 2 == 0 else (depth, height, width)
+    return Turned((0.0, np.pi / 2, np.pi, -np.pi / 2)[quarters % 4], own)
+
+
 def bound_m(turned: Turned) -> tuple[float, float, float]:
     """Extents of the axis-aligned bounding box of an oriented box.
 

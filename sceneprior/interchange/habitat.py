@@ -73,7 +73,7 @@ def _write_object(
     def glb(meshes: Sequence[Mesh]) -> bytes:
         alone = (Mesh((each.vertices_m - center) @ back, each.faces) for each in meshes)
         objects = tuple(replace(item, mesh=each, solids=()) for each in alone)
-        return scene_to_glb(replace(scene, objects=objects))
+        return scene_to_glb(replace(scene, objects=objects, extra={}))
 
     write_whole(folder / f"{name}.glb", glb([mesh]))
     write_whole(folder / f"{name}.collider.glb", glb([mesh_of(b) for b in colliders(item)]))

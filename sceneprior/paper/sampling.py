@@ -18,7 +18,7 @@ from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Scene
 from sceneprior.core.seeds import check_seed
 from sceneprior.paper.latents import LatentSpace
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.trained import SHIPPED_WITH_LATENTS, TrainedPrior
 
 BANDWIDTH = 0.15
 """Bandwidth of the kernel distribution, in standard deviations of the training rooms' logits: 0
@@ -64,7 +64,7 @@ def sample_latents(
         raise InputError(
             f"The {distribution} distribution needs the latents of at least 2 training rooms, and "
             f"this prior keeps {len(trained)} (a packed one keeps them if packed with --latents); "
-            "use --distribution paper, or leave it out."
+            f"use --distribution paper, leave it out, or take {SHIPPED_WITH_LATENTS}."
         )
     return space(sample_logits(trained, count, seed, distribution, space.shift_free))
 
@@ -210,11 +210,14 @@ def named_latent(trained: TrainedPrior, name: str, or_else: str) -> Float[Tensor
         distribution, seed = None if found[1] == "seed" else found[1], int(found[2])
         check_seed(seed)
         return draw_latents(trained, 1, seed, distribution)[0][0]
+    others = f"seed:NUMBER ({', '.join(f'{each}:NUMBER' for each in DISTRIBUTIONS)}), nor {or_else}"
+    if not trained.room_ids and trained.config.remembers_rooms:
+        raise InputError(
+            f"'{name}' is neither {others}; training rooms cannot be named, because this prior was "
+            f"packed without their latents: for them, take {SHIPPED_WITH_LATENTS}."
+        )
     known = f"such as {trained.room_ids[0]}" if trained.room_ids else "which keeps none"
-    raise InputError(
-        f"'{name}' is neither a training room of this run ({known}), nor seed:NUMBER "
-        f"({', '.join(f'{each}:NUMBER' for each in DISTRIBUTIONS)}), nor {or_else}."
-    )
+    raise InputError(f"'{name}' is neither a training room of this run ({known}), nor {others}.")
 
 
 def _read_latents(path: Path) -> tuple[np.ndarray, list[str]]:

@@ -115,6 +115,10 @@ class TrainedPrior:
         return self.config.distribution if self.remembers_rooms else "paper"
 
 
+SHIPPED_WITH_LATENTS = "`demo-bedroom`, which comes with the package and has them"
+"""The shipped prior that keeps the latents of its training rooms, for messages."""
+
+
 def with_training_latents(trained: Trained, purpose: str) -> TrainedPrior:
     """Return `trained` if it keeps the latents of its training rooms.
 
@@ -127,7 +131,7 @@ def with_training_latents(trained: Trained, purpose: str) -> TrainedPrior:
         raise InputError(
             f"{purpose} needs the latents of training rooms, and this prior was packed without "
             "them; take the run that it was packed from, a prior packed with `sceneprior pack "
-            "--latents`, or `demo-bedroom`, which comes with the package and has them."
+            f"--latents`, or {SHIPPED_WITH_LATENTS}."
         )
     raise InputError(
         f"{purpose} needs the latents of training rooms, and a run of `method: "

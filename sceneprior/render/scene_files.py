@@ -77,14 +77,32 @@ def save_scene(
 def scene_to_glb(scene: Scene, shell: Mapping[str, Mesh] = NO_SHELL) -> bytes:
     """The scene as binary glTF 2.0: a named node, mesh and material per object; no cameras.
 
+    The `extras` of its glTF scene have the entry `sceneprior`; see `glb_extras`.
+
     Args:
         shell: Meshes of the room by the names of their nodes (`core/shell.py`).
     """
     if not scene.objects and not shell:
-        return _empty_glb()
+        return _empty_glb(glb_extras(scene))
     room = _trimesh_of(scene, shell)
+    room.metadata.update(glb_extras(scene))
     # Without normals, viewers use flat shading, and boxes keep sharp edges.
     return bytes(room.export(file_type="glb", include_normals=False))
+
+
+def glb_extras(scene: Scene) -> dict[str, Any]:
+    """What a GLB says of its scene: name, label set, `extra`, and each object's node and class,
+    with its yaw where it is known (docs/conventions.md)."""
+    objects = [
+        {
+            "node": node,
+            "class": item.label,
+            **({} if item.turned is None else {"yaw_rad": round(item.turned.yaw_rad, 7)}),
+        }
+        for node, item in zip(node_names(scene), scene.objects, strict=True)
+    ]
+    told = {"name": scene.name, "label_set": scene.label_set, "extra": scene.extra}
+    return {"sceneprior": {**told, "objects": objects}}
 
 
 def scene_to_obj(
@@ -141,9 +159,10 @@ def _add(room: Any, node: str, material: str, mesh: Mesh, color: np.ndarray) -> 
     room.add_geometry(geometry, node_name=node, geom_name=node)
 
 
-def _empty_glb() -> bytes:
+def _empty_glb(extras: dict[str, Any]) -> bytes:
     # trimesh does not export a scene without geometry, but an empty room is valid.
-    text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{}]}).encode()
+    scenes = [{"extras": extras}]
+    text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, "scenes": scenes}).encode()
     text += b" " * (-len(text) % 4)
     header = np.array([0x46546C67, 2, 20 + len(text), len(text), 0x4E4F534A], dtype="<u4")
     return header.tobytes() + text

@@ -16,7 +16,15 @@ from sceneprior.apps.rooms import write_scene, write_scenes
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.palette import quiet_colors
-from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m, mesh_of_file
+from sceneprior.core.scene import (
+    Mesh,
+    Scene,
+    SceneObject,
+    Turned,
+    bound_m,
+    mesh_of_file,
+    quarter_turned,
+)
 from sceneprior.core.scene_json import scene_to_json
 from sceneprior.render.floor_plans import floor_plan
 from sceneprior.render.offscreen import open_renderer
@@ -60,6 +68,24 @@ def glb_json(data: bytes) -> dict:
 def test_boxes_are_plain_floats_whatever_they_were():
     item = SceneObject("desk", tuple(np.array([0, 0.5, 0])), tuple(np.ones(3)))
     assert repr(item.center_m + item.size_m) == "(0.0, 0.5, 0.0, 1.0, 1.0, 1.0)"
+
+
+def test_the_glb_says_what_it_shows(scene):
+    """The origin of the scene and the yaw of each object, where it is known."""
+    turned = replace(scene.objects[1], turned=quarter_turned(scene.objects[1].size_m, 1))
+    scene = replace(scene, objects=(scene.objects[0], turned))
+    told = {
+        "name": "room",
+        "label_set": "front3d_bedroom",
+        "extra": {"seed": 3},
+        "objects": [
+            {"node": "0_double_bed", "class": "double_bed"},
+            {"node": "1_nightstand", "class": "nightstand", "yaw_rad": 1.5707963},
+        ],
+    }
+    assert glb_json(scene_to_glb(scene))["scenes"][0]["extras"] == {"sceneprior": told}
+    empty = glb_json(scene_to_glb(replace(scene, objects=())))
+    assert empty["scenes"][0]["extras"] == {"sceneprior": {**told, "objects": []}}
 
 
 def test_the_glb_has_named_nodes_in_metres_and_class_colours(scene):

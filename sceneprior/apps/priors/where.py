@@ -1,8 +1,9 @@
 """Find a prior by path, by the name of a shipped prior, or by a repository of the Hub."""
 
+import hashlib
 from pathlib import Path
 
-from sceneprior.apps.priors.packed import FILES
+from sceneprior.apps.priors.packed import FILES, WEIGHTS
 from sceneprior.core.errors import InputError
 
 HUB = "hf://"
@@ -32,6 +33,24 @@ def find_prior(where: str | Path) -> Path:
         f"No prior at {text}; give a run's folder (`sceneprior fit`), a file of `sceneprior pack`, "
         f"{HUB}OWNER/NAME, or a name: {', '.join(shipped)}."
     )
+
+
+def name_of(where: str | Path) -> str:
+    """The name of a prior for the files that it makes, without the folders of the machine.
+
+    >>> name_of("runs/bedroom.prior"), name_of("hf://owner/rooms"), name_of("out/demo/run")
+    ('bedroom', 'hf://owner/rooms', 'run')
+    """
+    text = str(where)
+    return text if text.startswith(HUB) else Path(text).resolve().name.removesuffix(".prior")
+
+
+def version_of(weights: Path) -> str:
+    """The version of a prior: the first 12 digits of the SHA-256 of its packed file, of the weights
+    in a packed folder, or of a run's checkpoint."""
+    path = weights / WEIGHTS if weights.is_dir() else weights
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:12]
 
 
 def _fetch(where: str) -> Path:

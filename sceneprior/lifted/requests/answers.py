@@ -1,13 +1,15 @@
 """Requested rooms as scenes, each with the wishes that hold in it."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Scene
+from sceneprior.core.scene import Opening, Scene
 from sceneprior.core.seeds import check_seed
 from sceneprior.core.threads import single_threaded
 from sceneprior.lifted.requests.draw import Answer, draw_requested
@@ -64,6 +66,19 @@ def sample_requested(
     ]
 
 
+def _told(value: Any) -> Any:
+    """A part of a request as plain data for a file: corners, openings and wishes as they came."""
+    if isinstance(value, Opening):
+        return _told(value._asdict())
+    if isinstance(value, Mapping):
+        return {str(key): _told(each) for key, each in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_told(each) for each in value]
+    return value if isinstance(value, str | float | int | bool | None) else str(value)
+
+
 def _parsed(trained: TrainedLifted, asked: Mapping[str, Any]) -> Request:
     assert trained.sampler is not None, "drawn_by_sampler has asked"
     classes = label_set(trained.config.label_set)
@@ -100,7 +115,7 @@ def _scene(
         openings=shape.openings,
         ceiling_m=shape.ceiling_m,
         extra={
-            "request": {k: v for k, v in asked.items() if isinstance(v, str | float | dict)},
+            "request": {key: _told(value) for key, value in asked.items() if key != "objects"},
             "wishes": wishes,
             **({"given": list(range(len(given)))} if given else {}),
         },

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from model_folder import blocks, corner_sofa
 
 from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels, unit_mesh
@@ -16,7 +17,7 @@ from sceneprior.apps.retrieval.retrieve import (
     retrieve_all,
 )
 from sceneprior.core.geometry.surfaces import surface_points
-from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m, quarter_turned
 
 POINTS = 256
 
@@ -162,6 +163,25 @@ def test_a_model_fills_the_axis_aligned_box_and_its_turn_is_the_yaw(models):
     (made,), found = (made := retrieve(room(item), models)).objects, made.extra["retrieval"][0]
     assert np.rad2deg(made.turned.yaw_rad) % 360 == pytest.approx(found["turn_deg"])
     assert bound_m(made.turned) == pytest.approx(item.size_m)
+
+
+def test_a_known_yaw_decides_between_turns_that_fit_alike():
+    """A cupboard whose doors stand out by 1 cm, decoded as a box; a corner sofa."""
+    cupboard = blocks(((0, 0.5, 0), (1, 1, 0.5)), ((0, 0.5, 0.255), (0.9, 0.9, 0.01)))
+    models = cad_models(wardrobe={"cupboard": cupboard}, sofa={"corner": corner_sofa()})
+    size = (1.0, 1.0, 1.0)
+    # Other triangles than the models', so that no points coincide.
+    plain = trimesh.creation.box(size).subdivide().apply_translation([0, 0.5, 0])
+    box = SceneObject("wardrobe", (0.0, 0.5, 0.0), size, Mesh(plain.vertices, plain.faces))
+    for quarters in range(4):
+        item = replace(box, turned=quarter_turned(size, quarters))
+        (made,) = retrieve(room(item), models).objects
+        assert made.turned == item.turned
+    sofa = SceneObject("sofa", (0.0, 0.5, 0.0), size)
+    sofa = replace(sofa, mesh=placed(models.load("corner"), sofa, 90))
+    for turned in (quarter_turned(size, 3), Turned(0.3, (0.8, 1.0, 0.8)), None):
+        best = most_similar(replace(sofa, turned=turned), models.by_class["sofa"])
+        assert best.turn_deg == 90
 
 
 def test_many_scenes_are_the_same_as_one_by_one(models, rng):
