@@ -59,8 +59,8 @@ def test_distributions_that_cannot_be_followed_are_sentences(sphere, trained):
         sample_latents(sphere, trained[:1], 3, 0, "kernel")
     assert str(error.value) == (
         "The kernel distribution needs the latents of at least 2 training rooms, and this prior "
-        "keeps 1 (a packed one keeps them if packed with --latents); use --distribution paper, or "
-        "leave it out."
+        "keeps 1 (a packed one keeps them if packed with --latents); use --distribution paper, "
+        "leave it out, or take `demo-bedroom`, which comes with the package and has them."
     )
     assert sample_latents(sphere, trained[:1], 3, 0, "paper").shape == (3, 12)
 
