@@ -72,7 +72,7 @@ OWNERS = {
         "sceneprior/core/overlaps.py", "sceneprior/paper/losses/matching.py",
         "sceneprior/evaluation/", "data_prep/inspection/causes.py",
     ],
-    "cv2": ["data_prep/posed/lens.py"],
+    "cv2": ["data_prep/posed/lens.py", "sceneprior/evaluation/metrics/"],
     "viser": ["sceneprior/apps/viewer/"],
     "mujoco": ["sceneprior/evaluation/metrics/stability.py"],
     "coacd": ["sceneprior/core/colliders.py"],

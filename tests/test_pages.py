@@ -171,7 +171,7 @@ def cut_short(words: list[str], toys: Toys) -> list[str]:
             data = config.model_dump(by_alias=True)
             kept = {key: value for key, value in TINY.items() if has(data, key.split("."))}
             return [word for key, value in kept.items() for word in ("--set", f"{key}={value}")]
-        case "eval-fid":
+        case "eval-fid" | "evaluate":
             return ["--resamples", "2"] + (["-n", "8"] if "--run" in words else [])
         case "prep-front":
             return ["--views-per-m2", "0.5", "--workers", "1"]

@@ -3,7 +3,6 @@
 import hashlib
 import json
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -65,7 +64,8 @@ def independent_rooms(
     of all real rooms, and keeps its class, box and position. So every single object is real, but
     the objects of a room are independent of each other.
 
-    `with_meshes` keeps the real meshes, a stronger baseline; otherwise objects are boxes.
+    `with_meshes` keeps the real meshes, a stronger baseline; otherwise objects are boxes. A room
+    has the floor and the ceiling of the real room whose number of objects it has.
     """
     pool = [item for scene in real for item in scene.objects]
     if not pool:
@@ -74,23 +74,28 @@ def independent_rooms(
             f"{len(real)} rooms given holds any; give the training rooms of prepared shards."
         )
     generator = np.random.default_rng(seed)
-    sizes = generator.choice([len(scene.objects) for scene in real], size=count)
+    chosen = [real[row] for row in generator.choice(len(real), size=count)]
     rooms = [
         Scene(
             f"independent_{index:04d}",
             real[0].label_set,
-            tuple(pool[pick] for pick in generator.integers(len(pool), size=size)),
+            tuple(pool[pick] for pick in generator.integers(len(pool), size=len(like.objects))),
+            like.floor_m,
+            ceiling_m=like.ceiling_m,
         )
-        for index, size in enumerate(sizes)
+        for index, like in enumerate(chosen)
     ]
     return rooms if with_meshes else [room.without_meshes() for room in rooms]
 
 
-def shuffled_rooms(real: Sequence[Scene], count: int, seed: int) -> list[Scene]:
+def shuffled_rooms(
+    real: Sequence[Scene], count: int, seed: int, with_meshes: bool = False
+) -> list[Scene]:
     """Real rooms with shuffled positions: a baseline with real contents but random layouts.
 
-    Each object, as a box, takes the x and z of an object drawn at random from all rooms, and keeps
-    its own height. The rooms are drawn without replacement.
+    Each object takes the x and z of an object drawn at random from all rooms, and keeps its own
+    height; the room keeps its floor and ceiling. The rooms are drawn without replacement.
+    `with_meshes` keeps the real meshes; otherwise objects are boxes.
     """
     generator = np.random.default_rng(seed)
     places = [item.center_m for scene in real for item in scene.objects]
@@ -98,11 +103,23 @@ def shuffled_rooms(real: Sequence[Scene], count: int, seed: int) -> list[Scene]:
     for row in generator.permutation(len(real))[:count]:
         chosen = generator.integers(len(places), size=len(real[row].objects))
         objects = tuple(
-            replace(item, center_m=(places[pick][0], item.center_m[1], places[pick][2]), mesh=None)
+            _at(item, *places[pick][::2])
             for item, pick in zip(real[row].objects, chosen, strict=True)
         )
-        rooms.append(Scene(f"shuffled_{len(rooms):04d}", real[row].label_set, objects))
-    return rooms
+        rooms.append(
+            Scene(
+                f"shuffled_{len(rooms):04d}",
+                real[row].label_set,
+                objects,
+                real[row].floor_m,
+                ceiling_m=real[row].ceiling_m,
+            )
+        )
+    return rooms if with_meshes else [room.without_meshes() for room in rooms]
+
+
+def _at(item: SceneObject, x: float, z: float) -> SceneObject:
+    return replace(item.in_box((x, item.center_m[1], z), item.size_m), turned=item.turned)
 
 
 def split_fingerprint(shards: Path, split: str) -> str:
@@ -138,7 +155,9 @@ def reference_scene(
         objects.append(SceneObject(label, *box, mesh))
     floor = np.asarray(truth.floor_m, dtype=np.float64)
     extra = {"room_id": room_id, "height_m": truth.height_m}
-    return Scene(room_id, shard.label_set, tuple(objects), floor, extra)
+    return Scene(
+        room_id, shard.label_set, tuple(objects), floor, extra, ceiling_m=float(truth.height_m)
+    )
 
 
 def _placed(shards: Path, model_id: str, model_to_room: np.ndarray) -> Mesh | None:

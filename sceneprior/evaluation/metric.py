@@ -26,6 +26,11 @@ PICTURED = ("train_rooms", "independent", "independent_meshes", *AGAINST_TEST[2:
 with the real meshes (the same layouts, other pictures)."""
 EACH_SET = ("test", *AGAINST_TEST)
 GENERATED = ("generated",)
+USED = ("test", "shuffled", "independent", "generated")
+"""Sets for which metrics of use are computed."""
+Counts = Mapping[str, tuple[float | int, float | int]]
+"""For one room, the numerator and denominator of metrics of use, by key. A metric of a set is the
+ratio of their sums over rooms; a denominator of 0 leaves a room out."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +111,8 @@ class Metric:
     function: Callable[..., Any]
     """Computes an `Estimate` from a `RoomSet` and a `Comparison`; None if it needs decoded training
     rooms and there are none, and the result then leaves the metric out. (The metrics of
-    metrics/decoded_rooms.py compute a number from a list of `SceneMatch` instead.)"""
+    metrics/decoded_rooms.py compute a number from a list of `SceneMatch` instead, and metrics of
+    use, `USE` of the registry, compute the `Counts` of a scene.)"""
     sets: tuple[str, ...] = EACH_SET
     """Sets of rooms for which the metric is computed; the value of test rooms is `<key>_test`."""
     network: str | None = None

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sceneprior.evaluation.registry import METRICS
+from sceneprior.evaluation.registry import METRICS, USE
 
 WIDTH = 150
 """Width in characters of a table written to a file; narrower tables fold intervals."""
@@ -36,7 +36,7 @@ def score_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
             metric.subtitle,
             *(_cell(scores, name, metric.key) for name in _sets(scores)),
         )
-        for metric in METRICS
+        for metric in (*METRICS, *USE)
         if metric.key in scores
     ]
 
@@ -94,8 +94,9 @@ def wide_console() -> Console:
 def print_scores(scores: dict[str, Any], console: Console | None = None) -> None:
     """Print the table of a result, and the protocol's main entries below it."""
     console = console or wide_console()
+    split = scores.get("protocol", {}).get("split")
     table = Table(
-        title=f"Synthesis against {scores.get('protocol', {}).get('split', 'test')} rooms",
+        title="Rooms for use" if split is None else f"Synthesis against {split} rooms",
         box=box.SIMPLE_HEAD,
         caption=_caption(scores),
     )

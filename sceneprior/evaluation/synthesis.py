@@ -201,7 +201,7 @@ def result_of(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
         "format": FORMAT,
         "version": VERSION,
         **values.pop("generated"),
-        **{f"{key}_test": value for key, value in values.pop("test").items()},
+        **{f"{key}_test": value for key, value in values.pop("test", {}).items()},
         **values,
         "intervals": {
             name: {key: estimate.interval() for key, estimate in estimates.items()}

@@ -32,7 +32,7 @@ for command in (
     generating.synthesize, generating.interpolate, generating.complete, generating.retrieve,
     reconstruction.reconstruct, reconstruction.eval_svr,
     sharing.pack, sharing.priors, sharing.export,
-    evaluating.eval_fid,
+    evaluating.evaluate, evaluating.eval_fid,
     experiments.compare, experiments.demo, viewing.view,
 ):  # fmt: skip
     app.command()(command)

@@ -1,28 +1,57 @@
-"""The command eval-fid; it imports its dependencies when called."""
+"""The commands evaluate and eval-fid; they import their dependencies when called."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from sceneprior.apps.cli.options import (
+    CeilingOption,
     DistributionOption,
+    FloorOption,
     InceptionOption,
+    OpeningsOption,
     RendererOption,
+    RequestOption,
     ScenesOption,
     SeedOption,
+    WantOption,
     checked_target,
+    request_of,
     result_file,
 )
 from sceneprior.core.errors import InputError
 
-GENERATED = 1000
+GENERATED, MEASURED = 1000, 200
+
+SomeRunOption = Annotated[
+    str | None, typer.Option(help="The run or prior that makes the rooms, as in `synthesize`.")
+]
+AlexnetOption = Annotated[
+    Path | None, typer.Option(help="The file alexnet-owt-7be5be79.pth, for the paper's SCA.")
+]
+ReferenceOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="File (.npz) that keeps the features of real rooms' pictures; read if it exists."
+    ),
+]
+SplitOption = Annotated[
+    str, typer.Option(help="Rooms to compare with: test to report, val to choose settings.")
+]
+BoxesOption = Annotated[
+    bool, typer.Option("--boxes", help="Compare layouts alone, too: all rooms as boxes.")
+]
+ResamplesOption = Annotated[
+    int, typer.Option(min=0, help="Number of bootstrap resamples; 0 leaves intervals out.")
+]
+OutOption = Annotated[
+    Path | None, typer.Option(help="JSON file (default: scores.json in RUN or SCENES).")
+]
 
 
 def eval_fid(
-    run: Annotated[
-        str | None, typer.Option(help="The run or prior that makes the rooms, as in `synthesize`.")
-    ] = None,
+    run: SomeRunOption = None,
     scenes: ScenesOption = None,
     count: Annotated[
         int | None,
@@ -32,62 +61,135 @@ def eval_fid(
     ] = None,
     seed: SeedOption = 0,
     inception: InceptionOption = None,
-    alexnet: Annotated[
-        Path | None, typer.Option(help="The file alexnet-owt-7be5be79.pth, for the paper's SCA.")
-    ] = None,
+    alexnet: AlexnetOption = None,
     shards: Annotated[
         Path | None, typer.Option(help="Shards with the test rooms (default: those of the run).")
     ] = None,
-    reference: Annotated[
-        Path | None,
-        typer.Option(
-            help="File (.npz) that keeps the features of real rooms' pictures; read if it exists."
-        ),
-    ] = None,
-    split: Annotated[
-        str, typer.Option(help="Rooms to compare with: test to report, val to choose settings.")
-    ] = "test",
-    boxes: Annotated[
-        bool, typer.Option("--boxes", help="Compare layouts alone, too: all rooms as boxes.")
-    ] = False,
-    resamples: Annotated[
-        int, typer.Option(min=0, help="Number of bootstrap resamples; 0 leaves intervals out.")
-    ] = 200,
-    out: Annotated[
-        Path | None, typer.Option(help="JSON file (default: scores.json in RUN or SCENES).")
-    ] = None,
+    reference: ReferenceOption = None,
+    split: SplitOption = "test",
+    boxes: BoxesOption = False,
+    resamples: ResamplesOption = 200,
+    out: OutOption = None,
     distribution: DistributionOption = None,
     renderer: RendererOption = "auto",
 ) -> None:
-    """Compare generated rooms with test rooms, by all metrics of docs/evaluation.md.
+    """Compare generated rooms with test rooms, by the distributions of docs/evaluation.md.
 
     FID and KID are computed only with --inception, the user's Inception network. Without it, the
     Frechet and kernel distances use EfficientNet-Lite0 features; they are not FID or KID, and their
-    values cannot be compared with FID or KID. The protocol is written with the scores.
+    values cannot be compared with FID or KID. The protocol is written with the scores. `evaluate`
+    measures the use of the rooms, too.
     """
     from sceneprior.apps.experiments.evaluate import evaluate_folder, evaluate_run
-    from sceneprior.evaluation.score_table import print_scores
     from sceneprior.evaluation.synthesis import EvalOptions
 
+    _check_source(run, scenes, distribution)
+    options = EvalOptions(seed, inception, alexnet, reference, split, boxes, resamples, renderer)
+    if run is not None:
+        target = result_file(run, out, "scores.json")
+        found = evaluate_run(run, count or GENERATED, options, target, shards, distribution)
+    elif scenes is not None and shards is not None:
+        target = checked_target(out or scenes / "scores.json")
+        found = evaluate_folder(scenes, count, options, target, shards)
+    elif scenes is not None:
+        raise InputError("--scenes needs --shards: the folder with the test rooms.")
+    else:
+        raise InputError(
+            "There is nothing to evaluate; give --run RUN, or --scenes DIR with --shards SHARDS."
+        )
+    _print(found, target)
+
+
+def evaluate(
+    run: SomeRunOption = None,
+    scenes: ScenesOption = None,
+    count: Annotated[
+        int | None,
+        typer.Option(
+            "-n", "--count", min=1, help=f"Rooms (default: {MEASURED} of a run, or all scenes)."
+        ),
+    ] = None,
+    seed: SeedOption = 0,
+    shards: Annotated[
+        Path | None,
+        typer.Option(
+            help="Shards with real rooms to compare with (default: those of the run, if they are "
+            "there); without shards the rooms are measured alone."
+        ),
+    ] = None,
+    only_use: Annotated[
+        bool,
+        typer.Option("--only-use", help="Leave out what eval-fid measures; no picture is drawn."),
+    ] = False,
+    standing: Annotated[
+        bool,
+        typer.Option(
+            "--stand", help="Measure the use of rooms as `export --to mujoco` writes them."
+        ),
+    ] = False,
+    settle: Annotated[
+        str,
+        typer.Option(
+            help="Rooms to simulate: solids (whose objects have solids, or are boxes), all "
+            "(divides meshes, a minute or two each), or none."
+        ),
+    ] = "solids",
+    inception: InceptionOption = None,
+    alexnet: AlexnetOption = None,
+    reference: ReferenceOption = None,
+    split: SplitOption = "test",
+    boxes: BoxesOption = False,
+    resamples: ResamplesOption = 200,
+    out: OutOption = None,
+    distribution: DistributionOption = None,
+    floor: FloorOption = None,
+    openings: OpeningsOption = None,
+    ceiling: CeilingOption = None,
+    want: WantOption = None,
+    request: RequestOption = None,
+    renderer: RendererOption = "auto",
+) -> None:
+    """Measure whether rooms can be used, and compare them with real rooms, as eval-fid does.
+
+    Metrics of use need scenes alone: collisions, support, free floor, doors (SceneEval, PhyScene,
+    ReSpace), and stability in MuJoCo. With shards, real, shuffled and random rooms stand beside,
+    and all metrics of eval-fid are computed; without, only the metrics of use.
+    """
+    from sceneprior.apps.experiments.evaluate import evaluate_folder, evaluate_run
+    from sceneprior.evaluation.synthesis import EvalOptions
+    from sceneprior.evaluation.use import UseOptions
+
+    _check_source(run, scenes, distribution)
+    asked: dict[str, Any] = request_of(floor, openings, ceiling, want, request)
+    options = EvalOptions(seed, inception, alexnet, reference, split, boxes, resamples, renderer)
+    use = UseOptions(settle, only_use, standing)
+    if run is not None:
+        target = result_file(run, out, "scores.json")
+        found = evaluate_run(
+            run, count or MEASURED, options, target, shards, distribution, use, asked
+        )
+    elif scenes is not None:
+        if asked:
+            raise InputError("Requests belong to --run; scenes are evaluated as they are.")
+        target = checked_target(out or scenes / "scores.json")
+        found = evaluate_folder(scenes, count, options, target, shards, use)
+    else:
+        raise InputError("There is nothing to evaluate; give --run RUN, or --scenes DIR.")
+    _print(found, target)
+
+
+def _check_source(run: str | None, scenes: Path | None, distribution: str | None) -> None:
     if run is not None and scenes is not None:
         raise InputError(
             "Both --run and --scenes were given; give --run to evaluate rooms that a run "
             "generates, or --scenes to evaluate existing scenes."
         )
-    options = EvalOptions(seed, inception, alexnet, reference, split, boxes, resamples, renderer)
-    if run is not None:
-        target = result_file(run, out, "scores.json")
-        found = evaluate_run(run, count or GENERATED, options, target, shards, distribution)
-    elif scenes is not None:
-        if shards is None:
-            raise InputError("--scenes needs --shards: the folder with the test rooms.")
-        if distribution is not None:
-            raise InputError("--distribution belongs to --run; scenes are evaluated as they are.")
-        target = checked_target(out or scenes / "scores.json")
-        found = evaluate_folder(scenes, count, options, target, shards)
-    else:
-        raise InputError(
-            "There is nothing to evaluate; give --run RUN, or --scenes DIR with --shards SHARDS."
-        )
+    if scenes is not None and distribution is not None:
+        raise InputError("--distribution belongs to --run; scenes are evaluated as they are.")
+
+
+def _print(found: dict[str, Any], target: Path) -> None:
+    from sceneprior.evaluation.score_table import print_scores
+
     print_scores(found)
     typer.echo(f"Wrote {target}")

@@ -23,6 +23,7 @@ from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.evaluation.report import ROOMS_SHOWN, write_report
 from sceneprior.evaluation.room_sets import seeded_rows
 from sceneprior.evaluation.synthesis import FORMAT, EvalOptions, evaluate_synthesis
+from sceneprior.evaluation.use import UseOptions, evaluate_use
 from sceneprior.paper.decode import decode_latents, decode_training_rooms
 from sceneprior.paper.sampling import marked
 from sceneprior.paper.trained import TrainedPrior
@@ -44,6 +45,8 @@ def evaluate_run(
     out: Path,
     shards: Path | None = None,
     distribution: str | None = None,
+    use: UseOptions | None = None,
+    asked: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Score generated rooms against test rooms, and write the scores.
 
@@ -51,27 +54,48 @@ def evaluate_run(
     against their 3D ground truth or, if the shards have none, against the observed masks.
 
     The options' seed also draws the latents; `shards` and `distribution` default to the run's.
+
+    Args:
+        use: Measure the use of the rooms, too; if there are no shards, only this.
+        asked: Request that the rooms fulfil, as of `Prior.sample`; with `use` only.
     """
     trained = load_any_run(run)
     folder = shards or Path(trained.config.data.shards)
-    if shards is None and not folder.is_dir():
+    there = folder.is_dir()
+    if shards is None and not there and use is None:
         raise InputError(
             f"{run} was trained on shards '{folder}', which do not exist; name the shards to "
             "compare with: --shards."
         )
-    if known_from_views_alone(folder, options.split):
+
+    def make() -> list[Scene]:
+        if asked:
+            from sceneprior.apps.api import load
+
+            return load(run).sample(count, options.seed, distribution, **asked)
+        return sample_rooms(trained, count, options.seed, distribution)
+
+    if use is not None and (use.alone or not (there or shards)):
+        generated = make()
+        known = there and not known_from_views_alone(folder, options.split)
+        scores = evaluate_use(generated, options, use, folder if known else None)
+    elif known_from_views_alone(folder, options.split):
         masks: dict[str, float] = {}
         if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
             masks = mask_scores(trained, folder)
-        generated = sample_rooms(trained, count, options.seed, distribution)
+        generated = make()
         scores = evaluate_from_views(generated, folder, options) | masks
+        if use is not None:
+            scores = evaluate_use(generated, options, use, scores=scores)
     else:
         # This comes first, because it refuses shards that are not the run's.
         pairs = decoded_and_true(trained, folder) if trained.remembers_rooms else []
-        generated = sample_rooms(trained, count, options.seed, distribution)
+        generated = make()
         scores = evaluate_synthesis(generated, folder, options, [decoded for decoded, _ in pairs])
         if pairs:
             scores |= reconstruction_scores(pairs)
+        if use is not None:
+            scores = evaluate_use(generated, options, use, folder, scores)
     scores["protocol"] |= {"run": Path(run).name, "stage": trained.stage}
     with_latents = isinstance(trained, TrainedPrior)
     latents = marked(distribution or trained.distribution) if with_latents else "its own"
@@ -81,10 +105,15 @@ def evaluate_run(
 
 
 def evaluate_folder(
-    folder: Path, count: int | None, options: EvalOptions, out: Path, shards: Path
+    folder: Path,
+    count: int | None,
+    options: EvalOptions,
+    out: Path,
+    shards: Path | None,
+    use: UseOptions | None = None,
 ) -> dict[str, Any]:
     """Score `count` of the user's scenes (None: all), of any method, against test rooms, and write
-    the scores."""
+    the scores; `use` measures their use, too, and does not need `shards`."""
     scenes = load_scene_folder(folder)
     if count is not None and count > len(scenes):
         raise InputError(
@@ -93,8 +122,15 @@ def evaluate_folder(
         )
     rows = seeded_rows(len(scenes), count or len(scenes), options.seed)
     chosen = [scenes[row] for row in rows]
-    alone = known_from_views_alone(shards, options.split)
-    scores = (evaluate_from_views if alone else evaluate_synthesis)(chosen, shards, options)
+    scores, real = None, None
+    if shards is not None:
+        alone = known_from_views_alone(shards, options.split)
+        real = None if alone else shards
+        if use is None or not use.alone:
+            scores = (evaluate_from_views if alone else evaluate_synthesis)(chosen, shards, options)
+    if use is not None:
+        scores = evaluate_use(chosen, options, use, real, scores)
+    assert scores is not None  # without `use`, there are shards
     scores["protocol"] |= {"scenes": folder.resolve().name, "n_scenes_available": len(scenes)}
     write_json(out, scores)
     return scores

@@ -1,0 +1,180 @@
+"""Free floor in pixels: SceneEval's NAV, and PhyScene's R_out, R_reach and walkable area."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from sceneprior.core.floor import floor_polygon
+from sceneprior.core.scene import Scene
+from sceneprior.evaluation.metric import USED, Counts, Metric
+from sceneprior.evaluation.surfaces import footprint
+
+PIXELS = 256
+"""Width and height of the picture of the floor."""
+MARGIN_M = 0.2
+"""Distance of the picture's edge from the floor's farthest corner, along an axis."""
+SCENEEVAL_ROBOT_M, SCENEEVAL_HEIGHT_M = 0.2, 2.0
+"""Width of the robot, and the height of an object's centre above which it is no obstacle."""
+PHYSCENE_ROBOT_M, PHYSCENE_HEIGHT_M = 0.3, 1.5
+
+
+@dataclass(frozen=True)
+class FloorMap:
+    """The picture of a room's floor, and what a robot of one width can reach in it."""
+
+    floor: Bool[np.ndarray, "pixels pixels"]
+    boxes: Bool[np.ndarray, "objects pixels pixels"]
+    """Each object's own box."""
+    grown: Bool[np.ndarray, "objects pixels pixels"]
+    """The boxes with a margin of half the robot's width."""
+    eroded: Bool[np.ndarray, "pixels pixels"]
+    """The floor without a margin of half the robot's width along its edge."""
+
+    def free(self, obstacles: Bool[np.ndarray, " objects"]) -> Int[np.ndarray, "pixels pixels"]:
+        """Numbers, from 1, of the connected areas where the middle of the robot can be, by
+        8-connectivity; 0 elsewhere."""
+        from scipy.ndimage import label
+
+        walkable = self.eroded & ~self.grown[obstacles].any(axis=0)
+        areas, _ = label(walkable, structure=np.ones((3, 3), dtype=int))
+        return np.asarray(areas, dtype=np.int64)
+
+
+def floor_map(scene: Scene, robot_m: float) -> FloorMap | None:
+    """Draw a room's floor and the boxes of its objects, 256 x 256 pixels; None without a floor.
+
+    The picture is centred at the middle of the floor's bounding rectangle; its half width is the
+    largest distance of a corner along an axis, and 0.2 m. Half the robot's width is taken off the
+    floor's edge (a square), and added around each box (a line as wide as the robot).
+    """
+    import cv2
+
+    outline = floor_polygon(scene)
+    if outline is None:
+        return None
+    corners = np.asarray(scene.floor_m, dtype=np.float64)
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    scale = PIXELS / 2 / (np.abs(corners - middle).max() + MARGIN_M)
+    width = int(robot_m * scale)
+
+    def drawn(points: np.ndarray, line: int = 0) -> np.ndarray:
+        image = np.zeros((PIXELS, PIXELS), dtype=np.uint8)
+        pixels = np.trunc((points - middle) * scale).astype(np.int32) + PIXELS // 2
+        if line:
+            cv2.drawContours(image, [pixels], 0, 1, line)
+        return np.asarray(cv2.fillPoly(image, [pixels], 1))
+
+    floor = drawn(corners)
+    places = [footprint(item) for item in scene.objects]
+    none = np.zeros((0, PIXELS, PIXELS), dtype=bool)
+    boxes = np.array([drawn(place) for place in places], dtype=bool)
+    grown = np.array([drawn(place, width) for place in places], dtype=bool)
+    eroded = cv2.erode(floor, np.ones((width, width))) if width else floor
+    if not places:
+        boxes = grown = none
+    return FloorMap(floor.astype(bool), boxes, grown, np.asarray(eroded).astype(bool))
+
+
+def largest_share(areas: Int[np.ndarray, "pixels pixels"]) -> float:
+    """Pixels of the largest area as a share of those of all areas; 0 if there is none."""
+    sizes = np.bincount(areas.ravel())[1:]
+    return float(sizes.max() / sizes.sum()) if len(sizes) else 0.0
+
+
+def navigability(scene: Scene) -> float | None:
+    """The largest connected area of free floor, as a share of all free floor: SceneEval's NAV.
+
+    The robot is 0.2 m wide, and objects whose centre is above 2 m are no obstacles. 0 if no floor
+    is free; None without a floor outline.
+
+    Source:
+        3dlg-hcvc/SceneEval, metrics/navigability.py, with the default settings of its configs.
+        Corners of boxes may fall one pixel (about 3 cm) apart from those of its picture.
+    """
+    found = floor_map(scene, SCENEEVAL_ROBOT_M)
+    if found is None:
+        return None
+    return largest_share(found.free(scene.centers_m[:, 1] <= SCENEEVAL_HEIGHT_M))
+
+
+@dataclass(frozen=True)
+class Reach:
+    """PhyScene's metrics of the floor of one room."""
+
+    outside: int
+    """Number of objects whose box covers a pixel outside the floor: R_out."""
+    reached: float
+    """R_reach."""
+    walkable: float
+
+
+def reach(scene: Scene) -> Reach | None:
+    """PhyScene's R_out, R_reach and walkable area, for a robot of 0.3 m; None without a floor.
+
+    R_out counts objects whose box covers a pixel outside the floor. R_reach is the expected share
+    of objects next to an area of free floor, if the area is chosen in proportion to its size; an
+    object is next to it if its box, grown by half the robot's width and one pixel, touches it, and
+    all objects are obstacles, lamps on the ceiling, too. The walkable area is the largest connected
+    area of free floor as a share of all free floor, where objects whose centre is at 1.5 m or above
+    are no obstacles. Both are 0 if no floor is free.
+
+    Source:
+        PhyScene/PhyScene, utils/overlap.py and scripts/eval/walkable_metric.py (Yang et al.,
+        CVPR 2024). The published `cal_walkable_metric` returns inside its loop over areas, and so
+        gives the share of the first area (in the order of the picture's rows), not of the largest;
+        the largest, which its variables name, is computed here. Its variant for doors, which takes
+        the areas beside doors, is not used by the published evaluation and is left out.
+    """
+    from scipy.ndimage import binary_dilation
+
+    found = floor_map(scene, PHYSCENE_ROBOT_M)
+    if found is None:
+        return None
+    outside = (found.boxes & ~found.floor).any(axis=(1, 2))
+    everything = np.ones(len(scene.objects), dtype=bool)
+    areas = found.free(everything)
+    sizes = np.bincount(areas.ravel())[1:]
+    reached = 0.0
+    for box in found.grown:
+        touched = np.unique(areas[binary_dilation(box, np.ones((3, 3)))])
+        reached += sizes[touched[touched > 0] - 1].sum() / max(sizes.sum(), 1)
+    low = scene.centers_m[:, 1] < PHYSCENE_HEIGHT_M
+    walkable = largest_share(found.free(low))
+    return Reach(int(outside.sum()), reached / max(len(everything), 1), walkable)
+
+
+def _nav(scene: Scene) -> Counts:
+    share = navigability(scene)
+    return {"sceneeval_navigability": (0.0, 0.0) if share is None else (share, 1.0)}
+
+
+def _reach(scene: Scene) -> Counts:
+    found, count = reach(scene), len(scene.objects)
+    if found is None:
+        return {}
+    return {
+        "physcene_out": (float(found.outside), float(count)),
+        "physcene_reach": (found.reached, float(count > 0)),
+        "physcene_walkable": (found.walkable, 1.0),
+    }
+
+
+METRICS = (
+    Metric(
+        "sceneeval_navigability", "NAV: navigable in one piece (SceneEval)",
+        "share of free floor; known floors alone", "higher", _nav, USED,
+    ),
+    Metric(
+        "physcene_out", "R_out: objects beyond the floor (PhyScene)", "share; known floors alone",
+        "lower", _reach, USED,
+    ),
+    Metric(
+        "physcene_reach", "R_reach: objects within reach (PhyScene)", "share; known floors alone",
+        "higher", _reach, USED,
+    ),
+    Metric(
+        "physcene_walkable", "Walkable in one piece (PhyScene)",
+        "share of free floor; known floors alone", "higher", _reach, USED,
+    ),
+)  # fmt: skip

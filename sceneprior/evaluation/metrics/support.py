@@ -1,0 +1,190 @@
+"""Objects that rest on something: SceneEval's SUPPORT, with a table of classes."""
+
+from typing import Literal
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float
+
+from sceneprior.core.colliders import HUNG, MOUNTED, MOUNTED_M
+from sceneprior.core.floor import floor_rectangle
+from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.core.shell import rectangle
+from sceneprior.evaluation.metric import USED, Counts, Metric
+from sceneprior.evaluation.surfaces import (
+    Points,
+    Triangles,
+    area_centroid,
+    bounds,
+    triangles_of,
+    vertical_crossings,
+)
+
+NEAR_M = 0.01
+"""Length of the rays, and height of the layer of vertices in which they start."""
+LIFT_M = 0.005
+"""Distance by which an object is moved against gravity before rays are cast."""
+FACING = 0.9
+"""Smallest cosine between gravity and the normals of faces on which rays start."""
+PER_M2, FEWEST, MOST = 256, 32, 100_000
+"""Rays per square metre of the largest such face, per face at least, and per object at most."""
+HIGH_M = 100.0
+"""Height of walls whose ceiling is not known."""
+
+Support = Literal["ground", "wall", "ceiling"]
+
+
+def support_of(item: SceneObject) -> Support:
+    """What an object is expected to rest on, by its class: lamps of the classes `HUNG` on the
+    ceiling, pieces of the classes `MOUNTED` on a wall if their lower face is above 0.4 m, and all
+    others on the ground or on an object."""
+    if item.label in HUNG:
+        return "ceiling"
+    bottom_m = item.center_m[1] - item.size_m[1] / 2
+    return "wall" if item.label in MOUNTED and bottom_m > MOUNTED_M else "ground"
+
+
+def supported(scene: Scene) -> Float[np.ndarray, " objects"]:
+    """1 for supported objects, 0 for others, and NaN where the scene cannot tell: SceneEval's
+    SUPPORT.
+
+    The object is moved by 5 mm against its gravity (down, up for the ceiling, backwards for walls).
+    Rays of 1 cm are cast along gravity from its vertices within 1 cm of its outermost one, and from
+    `max(32, 256 * area of the largest face in m2)` points of each face among them that faces
+    gravity. A contact is the nearest point of the floor, a wall, the ceiling, or another object on
+    a ray. Objects on the ceiling and on walls need one contact. All others need four, and their
+    centroid (mean of triangles by area) above the convex hull of the contacts.
+
+    A ceiling or wall that the scene does not know leaves pieces that need it out (NaN). Without a
+    floor outline, the rectangle around all furniture is the floor.
+
+    Source:
+        3dlg-hcvc/SceneEval, metrics/support.py; the largest number of rays from nepfaff/SceneEval.
+        There a vision-language model says what an object rests on, and here its class
+        (`support_of`). There the floor is at the lowest point of all objects, and here at height 0.
+        A piece for walls whose yaw is unknown is tested in four directions, and as an object on
+        the ground, too, such as a television on its stand.
+    """
+    surfaces = [triangles_of(item) for item in scene.objects]
+    rooms = _planes(scene)
+    found = np.zeros(len(surfaces))
+    for row, item in enumerate(scene.objects):
+        kind = support_of(item)
+        others = np.concatenate([*surfaces[:row], *surfaces[row + 1 :], *rooms.values()])
+        if kind == "ceiling":
+            known = scene.ceiling_m is not None
+            up = np.array([0.0, 1.0, 0.0])
+            found[row] = len(_contacts(surfaces[row], others, up, row)) > 0 if known else np.nan
+            continue
+        found[row] = _stands(surfaces[row], others, row)
+        if kind == "wall" and not found[row]:
+            known = scene.floor_m is not None
+            found[row] = _on_wall(item, surfaces[row], others, row) if known else np.nan
+    return found
+
+
+def _on_wall(item: SceneObject, surface: Triangles, others: Triangles, seed: int) -> bool:
+    backwards = [np.array([0.0, 0.0, -1.0])]
+    yaw_rad = 0.0 if item.turned is None else item.turned.yaw_rad
+    if item.turned is None:
+        backwards += [yaw_rotation(quarter * np.pi / 2) @ backwards[0] for quarter in (1, 2, 3)]
+    return any(
+        len(_contacts(surface, others, yaw_rotation(yaw_rad) @ each, seed)) > 0
+        for each in backwards
+    )
+
+
+def _stands(surface: Triangles, others: Triangles, seed: int) -> bool:
+    contacts = _contacts(surface, others, np.array([0.0, -1.0, 0.0]), seed)
+    if len(contacts) < 4 or len(np.unique(contacts, axis=0)) < 3:
+        return False
+    hull = shapely.convex_hull(shapely.MultiPoint(contacts[:, ::2]))
+    center = area_centroid(surface)
+    return bool(hull.area > 0 and shapely.intersects_xy(hull, center[0], center[2]))
+
+
+def _contacts(
+    surface: Triangles, others: Triangles, gravity: Float[np.ndarray, "3"], seed: int
+) -> Points:
+    """Nearest points of other surfaces on the rays of an object, in a frame in which gravity is
+    -y."""
+    turn = _downwards(gravity)
+    surface = surface @ turn.T + np.array([0.0, LIFT_M, 0.0])
+    starts = _ray_starts(surface, seed)
+    others = others @ turn.T
+    low, high = starts.min(axis=0), starts.max(axis=0)
+    low[1] -= NEAR_M
+    reached = (others.max(axis=1) >= low) & (others.min(axis=1) <= high)
+    hits = vertical_crossings(starts, others[reached.all(axis=1)])
+    distance = starts[hits.point, 1] - hits.height_m
+    near = (distance >= 0) & (distance < NEAR_M)
+    contacts = starts[hits.point[near]]
+    contacts[:, 1] = hits.height_m[near]
+    return contacts
+
+
+def _ray_starts(surface: Triangles, seed: int) -> Points:
+    level = surface[:, :, 1] <= bounds(surface)[0, 1] + NEAR_M
+    vertices = np.unique(surface[level], axis=0)
+    normals = np.cross(surface[:, 1] - surface[:, 0], surface[:, 2] - surface[:, 0])
+    areas = np.linalg.norm(normals, axis=1) / 2
+    facing = level.all(axis=1) & (np.abs(normals[:, 1]) > FACING * 2 * areas)
+    faces = surface[facing]
+    if not len(faces):
+        return np.asarray(vertices)
+    count = max(FEWEST, int(areas[facing].max() * PER_M2))
+    count = max(min(count, MOST // len(faces)), 1)
+    u, v = np.random.default_rng(seed).random((2, len(faces), count, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    sides = faces[:, 1:] - faces[:, :1]
+    points = faces[:, :1] + u * sides[:, :1] + v * sides[:, 1:]
+    return np.concatenate([vertices, points.reshape(-1, 3)])
+
+
+def _downwards(gravity: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """A rotation that takes a vertical or horizontal direction to -y."""
+    if gravity[1]:
+        return np.diag([1.0, -1.0, -1.0]) if gravity[1] > 0 else np.eye(3)
+    up = np.array([0.0, 1.0, 0.0])
+    return np.array([np.cross(-gravity, up), -gravity, up])
+
+
+def _planes(scene: Scene) -> dict[str, Triangles]:
+    """Triangles of the floor, the walls and the ceiling, as far as the scene knows them."""
+    outline = scene.floor_m if scene.floor_m is not None else rectangle(*floor_rectangle(scene))
+    outline = np.asarray(outline, dtype=np.float64)
+    pieces = shapely.get_parts(
+        shapely.constrained_delaunay_triangles(shapely.make_valid(shapely.Polygon(outline)))
+    )
+    flat = np.array([shapely.get_coordinates(piece)[:3] for piece in pieces])
+    floor = np.insert(flat, 1, 0.0, axis=2)
+    found = {"floor": floor}
+    if scene.ceiling_m is not None:
+        found["ceiling"] = floor + np.array([0.0, scene.ceiling_m, 0.0])
+    if scene.floor_m is not None:
+        top = HIGH_M if scene.ceiling_m is None else scene.ceiling_m
+        starts, ends = (
+            np.insert(each, 1, 0.0, axis=1) for each in (outline, np.roll(outline, -1, axis=0))
+        )
+        up = np.array([0.0, top, 0.0])
+        lower, upper = (
+            np.stack([starts, ends, ends + up], 1),
+            np.stack([starts, ends + up, starts + up], 1),
+        )
+        found["walls"] = np.concatenate([lower, upper])
+    return found
+
+
+def _support(scene: Scene) -> Counts:
+    found = supported(scene)
+    known: Bool[np.ndarray, " objects"] = ~np.isnan(found)
+    return {"sceneeval_supported": (float(found[known].sum()), float(known.sum()))}
+
+
+METRICS = (
+    Metric(
+        "sceneeval_supported", "SUPPORT: objects that rest on something (SceneEval)", "share",
+        "higher", _support, USED,
+    ),
+)  # fmt: skip

@@ -1,0 +1,146 @@
+"""Volume out of the room, and shared by objects, in voxels: ReSpace's OOB, MBL and PBL."""
+
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Int
+
+from sceneprior.core.floor import floor_polygon
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.core.shell import shell_of
+from sceneprior.evaluation.metric import USED, Counts, Metric
+from sceneprior.evaluation.surfaces import Voxels, footprint, triangles_of, voxelize
+
+PITCH_M = 0.05
+VALID_M3 = 0.1
+"""Largest PBL of a valid room."""
+LEAST = 1e-7
+"""Areas and volumes below this are 0."""
+
+
+class VoxelLoss(NamedTuple):
+    """ReSpace's losses of a room, in cubic metres."""
+
+    oob_m3: float
+    mbl_m3: float
+
+    @property
+    def pbl_m3(self) -> float:
+        """The sum of both."""
+        return self.oob_m3 + self.mbl_m3
+
+
+def voxel_loss(scene: Scene) -> VoxelLoss | None:
+    """Volume of objects outside the room (OOB), and shared by pairs of objects (MBL, mesh-based
+    loss), whose sum is ReSpace's PBL (VBL in its paper); None without a floor.
+
+    Volumes are counted in voxels of 5 cm: all that a surface passes through, and those enclosed.
+    An object is voxelized around the middle of its lower face, which is then put at a whole number
+    of voxels, rounded down. The room is the prism over its floor. Voxels are counted only for
+    objects whose box leaves the room, and for pairs whose boxes share volume.
+
+    Since surfaces fill the voxels that they touch, an object counts as up to one voxel larger, and
+    objects that overlap by a millimetre may share a layer of voxels.
+
+    Source:
+        GradientSpaces/respace, src/eval.py, read in a copy of the file, since the repository's own
+        is not in the index that was searched (Bucher and Armeni, arXiv 2506.02459). There a room
+        is the voxelized mesh of its outline; here a voxel is in the room if the outline meets it.
+        The height is the ceiling's, or, if that is not known, as in `shell_of`.
+    """
+    floor = floor_polygon(scene)
+    if floor is None:
+        return None
+    top_m = shell_of(scene).height_m
+    plans = [shapely.Polygon(footprint(item)) for item in scene.objects]
+    spans = [_span(item) for item in scene.objects]
+    cells: dict[int, Voxels] = {}
+
+    def voxels(row: int) -> Voxels:
+        if row not in cells:
+            cells[row] = _placed(scene.objects[row])
+        return cells[row]
+
+    outside = shared = 0
+    for row, (plan, (low, high)) in enumerate(zip(plans, spans, strict=True)):
+        kept = _area(plan, floor) * max(min(high, top_m) - max(low, 0.0), 0.0)
+        if plan.area * (high - low) - kept >= LEAST:
+            outside += _outside(voxels(row), floor, top_m)
+        for other in range(row + 1, len(plans)):
+            height = min(high, spans[other][1]) - max(low, spans[other][0])
+            if height > 0 and _area(plan, plans[other]) * height >= LEAST:
+                shared += _shared(voxels(row), voxels(other))
+    return VoxelLoss(outside * PITCH_M**3, shared * PITCH_M**3)
+
+
+def _area(a: shapely.Geometry, b: shapely.Geometry) -> float:
+    area = float(shapely.intersection(a, b).area)
+    return area if area >= LEAST else 0.0
+
+
+def _span(item: SceneObject) -> tuple[float, float]:
+    return item.center_m[1] - item.size_m[1] / 2, item.center_m[1] + item.size_m[1] / 2
+
+
+def _placed(item: SceneObject) -> Voxels:
+    """An object's voxels in the room's grid."""
+    foot = np.array([item.center_m[0], _span(item)[0], item.center_m[2]])
+    own = voxelize(triangles_of(item) - foot, PITCH_M)
+    at = np.floor(foot / PITCH_M + 1e-9).astype(np.int64)
+    half = np.array(own.cells.shape) // 2
+    return Voxels(own.cells, at - np.array([half[0], 0, half[2]]))
+
+
+def _outside(voxels: Voxels, floor: shapely.Geometry, top_m: float) -> int:
+    x, y, z = (
+        start + np.arange(n) for start, n in zip(voxels.first, voxels.cells.shape, strict=True)
+    )
+    grid_x, grid_z = np.meshgrid(x * PITCH_M, z * PITCH_M, indexing="ij")
+    half = PITCH_M / 2
+    squares = shapely.box(grid_x - half, grid_z - half, grid_x + half, grid_z + half)
+    within: Bool[np.ndarray, "x z"] = shapely.intersects(floor, squares)
+    level = (y >= 0) & (y <= round(top_m / PITCH_M))
+    return int((voxels.cells & ~(within[:, None] & level[None, :, None])).sum())
+
+
+def _shared(a: Voxels, b: Voxels) -> int:
+    low: Int[np.ndarray, 3] = np.maximum(a.first, b.first)
+    high = np.minimum(a.first + a.cells.shape, b.first + b.cells.shape)
+    if (high <= low).any():
+        return 0
+    parts = [
+        each.cells[
+            tuple(slice(s, e) for s, e in zip(low - each.first, high - each.first, strict=True))
+        ]
+        for each in (a, b)
+    ]
+    return int((parts[0] & parts[1]).sum())
+
+
+def _respace(scene: Scene) -> Counts:
+    found = voxel_loss(scene)
+    if found is None:
+        return {}
+    return {
+        "respace_oob_litres": (1000 * found.oob_m3, 1.0),
+        "respace_mbl_litres": (1000 * found.mbl_m3, 1.0),
+        "respace_pbl_litres": (1000 * found.pbl_m3, 1.0),
+        "respace_valid": (float(found.pbl_m3 <= VALID_M3), 1.0),
+    }
+
+
+METRICS = (
+    *(
+        Metric(key, title, "mean, litres; known floors alone", "lower", _respace, USED)
+        for key, title in (
+            ("respace_oob_litres", "OOB: volume out of the room (ReSpace)"),
+            ("respace_mbl_litres", "MBL: volume shared by objects (ReSpace)"),
+            ("respace_pbl_litres", "PBL: the sum of both (ReSpace)"),
+        )
+    ),
+    Metric(
+        "respace_valid", "Rooms with a PBL of at most 100 litres (ReSpace)",
+        "share; known floors alone", "higher", _respace, USED,
+    ),
+)  # fmt: skip

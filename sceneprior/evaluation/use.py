@@ -1,0 +1,208 @@
+"""Metrics of use of sets of rooms: collisions, support, free floor, doors, volumes, stability."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from sceneprior.core.errors import InputError
+from sceneprior.core.ground_truth import independent_rooms, reference_scenes, shuffled_rooms
+from sceneprior.core.scene import Scene
+from sceneprior.core.standing import stand
+from sceneprior.evaluation.bootstrap import METHOD, Estimate, ratio, resample_counts
+from sceneprior.evaluation.metric import Counts
+from sceneprior.evaluation.metrics import clearance, stability
+from sceneprior.evaluation.metrics.contents import common_label_set
+from sceneprior.evaluation.registry import USE, use_definitions
+from sceneprior.evaluation.room_sets import without_void
+from sceneprior.evaluation.synthesis import FORMAT, VERSION, EvalOptions, result_of
+
+SETTLED = ("solids", "all", "none")
+"""Rooms that are simulated: those whose objects have solids or no meshes, all, or none."""
+
+
+@dataclass(frozen=True)
+class UseOptions:
+    """Settings of the metrics of use."""
+
+    settle: str = "solids"
+    """Rooms that are simulated, one of `SETTLED`. A mesh without solids is divided into convex
+    parts first, which takes up to two minutes for one object with 3,000 triangles."""
+    alone: bool = False
+    """Compute no other metrics."""
+    stand: bool = False
+    """Set down, give feet to and move apart the objects of generated rooms first (`stand`)."""
+
+    def __post_init__(self) -> None:
+        if self.settle not in SETTLED:
+            raise InputError(
+                f"--settle {self.settle} is not known; choose from {', '.join(SETTLED)}."
+            )
+
+
+@dataclass(frozen=True)
+class Used:
+    """Metrics of use by set of rooms and key, and why others are left out."""
+
+    columns: dict[str, dict[str, Estimate]]
+    left_out: dict[str, str]
+    """What generated rooms lack, by key."""
+    counts: dict[str, int] = field(default_factory=dict)
+    """Rooms of each set."""
+
+
+def measure_use(
+    sets: Mapping[str, Sequence[Scene]], seed: int, resamples: int, options: UseOptions
+) -> Used:
+    """Compute all metrics of use for sets of rooms, with intervals over rooms.
+
+    A metric that no generated room has what it needs for (a floor, doors or windows) is left out of
+    all sets, with the reason.
+    """
+    columns = {}
+    total = sum(map(len, sets.values()))
+    with Progress(console=Console(stderr=True)) as bars:
+        bar = bars.add_task("Measuring rooms", total=total)
+        for number, (name, scenes) in enumerate(sets.items()):
+            measured = []
+            for scene in scenes:
+                measured.append(measure_room(scene, options))
+                bars.advance(bar)
+            # Far from the numbers of the sets that `room_sets` resamples.
+            counts = resample_counts(len(scenes), resamples, (seed, 100 + number))
+            columns[name] = {metric.key: _estimate(metric.key, measured, counts) for metric in USE}
+    missing = [key for key, found in columns["generated"].items() if found.value is None]
+    reasons = {key: _reason(key, sets["generated"], options) for key in missing}
+    for found in columns.values():
+        for key in missing:
+            del found[key]
+    return Used(columns, reasons, {name: len(scenes) for name, scenes in sets.items()})
+
+
+def measure_room(scene: Scene, options: UseOptions) -> Counts:
+    """Numerators and denominators of all metrics of use of one room."""
+    found: dict[str, tuple[float | int, float | int]] = {}
+    functions: dict[Callable[..., Any], None] = dict.fromkeys(metric.function for metric in USE)
+    for function in functions:
+        if function is not stability.stable_count or _simulated(scene, options):
+            found |= function(scene)
+    return found
+
+
+def _simulated(scene: Scene, options: UseOptions) -> bool:
+    if options.settle == "none" or find_spec("mujoco") is None:
+        return False
+    ready = all(item.solids or item.mesh is None for item in scene.objects)
+    return ready or options.settle == "all"
+
+
+def _estimate(key: str, measured: Sequence[Counts], counts: np.ndarray) -> Estimate:
+    pairs = np.array([each.get(key, (0.0, 0.0)) for each in measured], dtype=float).reshape(-1, 2)
+    litres = key.endswith("litres")
+    return ratio(pairs[:, 0], pairs[:, 1], counts, np.inf if litres else 1.0)
+
+
+def _reason(key: str, scenes: Sequence[Scene], options: UseOptions) -> str:
+    if key in {metric.key for metric in stability.METRICS}:
+        if options.settle == "none":
+            return "--settle solids"
+        if find_spec("mujoco") is None:
+            return "mujoco (pip install 'sceneprior[sim]')"
+        return "solids of the objects (--settle all divides meshes, a minute or two each)"
+    if not any(scene.objects for scene in scenes):
+        return "objects in the scenes"
+    if key in {metric.key for metric in clearance.METRICS}:
+        return "doors or windows (openings) in the scenes"
+    return "a floor (floor_m) in the scenes"
+
+
+def real_and_random(shards: Path, split: str, count: int, seed: int) -> dict[str, Sequence[Scene]]:
+    """The real rooms of a split, and `count` shuffled and independent rooms, with meshes, floors
+    and ceilings; the layouts are those of `evaluate_synthesis`."""
+    every_train = reference_scenes(shards, "train")
+    count = min(count, len(every_train))
+    return {
+        "test": reference_scenes(shards, split),
+        "shuffled": shuffled_rooms(every_train, count, seed, with_meshes=True),
+        "independent": independent_rooms(every_train, count, seed, with_meshes=True),
+    }
+
+
+def evaluate_use(
+    generated: Sequence[Scene],
+    options: EvalOptions,
+    use: UseOptions,
+    shards: Path | None = None,
+    scores: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Measure the use of generated rooms and, with shards, of real, shuffled and random rooms.
+
+    Args:
+        shards: Shards with 3D ground truth; None measures the generated rooms alone.
+        scores: A result of the same rooms that is to be extended; a new one if None.
+
+    Returns:
+        A result as of `evaluate_synthesis`, with the metrics of use.
+    """
+    generated = [without_void(scene) for scene in generated]
+    if not generated:
+        raise InputError("There are no scenes to evaluate; give at least one.")
+    names = common_label_set(generated)
+    if use.stand:
+        generated = [stand(scene)[0] for scene in generated]
+    sets: dict[str, Sequence[Scene]] = {"generated": generated}
+    if shards is not None:
+        sets |= real_and_random(shards, options.split, len(generated), options.seed)
+        common_label_set(generated, sets["test"])
+    found = measure_use(sets, options.seed, options.resamples, use)
+    measured = result_of(found.columns)
+    if scores is None:
+        scores = {
+            "format": FORMAT,
+            "version": VERSION,
+            "protocol": {
+                "label_set": names,
+                "seed": options.seed,
+                "resamples": options.resamples,
+                "intervals": METHOD,
+            },
+        }
+    result = merged(dict(scores), measured)
+    floors = sum(scene.floor_m is not None for scene in generated)
+    result["protocol"] = {
+        **scores["protocol"],
+        **{f"n_{name}": count for name, count in found.counts.items()},
+        "left_out": {**scores["protocol"].get("left_out", {}), **found.left_out},
+        "use": {
+            **use_definitions(),
+            "settle": use.settle,
+            "stand": use.stand,
+            "n_with_floor": floors,
+            "n_with_openings": sum(bool(scene.openings) for scene in generated),
+        },
+    }
+    if 0 < floors < len(generated):
+        result["note"] = " ".join(
+            filter(
+                None,
+                (
+                    f"{len(generated) - floors} of {len(generated)} generated rooms have no floor, "
+                    "and are left out of the metrics that need one.",
+                    scores.get("note"),
+                ),
+            )
+        )
+    return result
+
+
+def merged(first: dict[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Two nested results as one; values of the second replace those of the first."""
+    for key, value in second.items():
+        both = isinstance(value, Mapping) and isinstance(first.get(key), Mapping)
+        first[key] = merged(dict(first[key]), value) if both else value
+    return first
