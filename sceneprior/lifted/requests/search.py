@@ -14,7 +14,7 @@ from sceneprior.core.mixtures import draw_index
 from sceneprior.lifted.prototypes import turned_looks
 from sceneprior.lifted.requests.holding import Furniture
 from sceneprior.lifted.requests.judge import Judge
-from sceneprior.lifted.sampler.frames import backs_of
+from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.reading import Frame, Reading
 from sceneprior.lifted.sampler.violations import violation
@@ -74,7 +74,7 @@ def search(
     free = (violation(boxes_m, many, apart) == 0).nonzero()[:, 0]
     if not len(free):
         return "free floor"
-    back = backs_of(looks[free], sampler.backs)
+    back = side_of(looks[free], sampler.backs)
     candidates = Furniture(
         boxes_m[free].double().numpy(), np.full(len(free), piece.label), back.numpy()
     )

@@ -16,7 +16,7 @@ from sceneprior.lifted.requests.holding import Furniture
 from sceneprior.lifted.requests.judge import Judge
 from sceneprior.lifted.requests.particles import PARTICLES, Particles
 from sceneprior.lifted.requests.search import Piece, search
-from sceneprior.lifted.sampler.frames import backs_of
+from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.places import Places
 from sceneprior.lifted.sampler.reading import Frame, Reading
@@ -100,7 +100,7 @@ def furniture_of(sampler: RoomSampler, rooms: RoomBoxes, row: int) -> Furniture:
     here = rooms.is_object[row]
     return Furniture(
         rooms.boxes_m[row, here].double().numpy(), rooms.object_class[row, here].numpy(),
-        backs_of(rooms.looks[row, here], sampler.backs).numpy(),
+        side_of(rooms.looks[row, here], sampler.backs).numpy(),
     )  # fmt: skip
 
 
@@ -178,7 +178,7 @@ def _draw_places(
         ):
             row, look = int(found.rows[at]), int(found.look[at])
             if is_free:
-                back = backs_of(found.look[at : at + 1], sampler.backs).numpy()
+                back = side_of(found.look[at : at + 1], sampler.backs).numpy()
                 candidates = Furniture(
                     box_m[None].double().numpy(), found.label[at : at + 1].numpy(), back
                 )

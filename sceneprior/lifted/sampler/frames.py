@@ -8,7 +8,7 @@ four cases are learnt as one.
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
@@ -20,17 +20,23 @@ FURTHEST_M = 1.0
 """Length to which gaps to the sides of the rectangle are clipped before they are averaged."""
 
 
-def backs_of(
-    looks: Int[Tensor, "*batch"], backs: Int[Tensor, " prototypes"]
-) -> Int[Tensor, "*batch"]:
-    """The side at which each look has its back: 0 to 3 for low z, low x, high z, high x.
-
-    Args:
-        backs: The side at which each prototype has its back in pose 0.
-    """
-    pose, own = looks % POSES, backs[looks // POSES]
+def own_sides(looks: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch 4"]:
+    """The side of the room at which each of the four sides of a look's prototype is; sides are 0 to
+    3 for low z, low x, high z, high x."""
+    pose, own = (looks % POSES).unsqueeze(-1), torch.arange(QUARTERS, device=looks.device)
     # Mirroring (x reversed) comes before the turn, and reverses the direction of sides.
     return (pose % QUARTERS + torch.where(pose >= QUARTERS, -own, own)) % QUARTERS
+
+
+def side_of(
+    looks: Int[Tensor, "*batch"], sides: Int[Tensor, " prototypes"]
+) -> Int[Tensor, "*batch"]:
+    """The side of the room at which each look has one side of its prototype, such as its back.
+
+    Args:
+        sides: This side of each prototype in pose 0.
+    """
+    return own_sides(looks).gather(-1, sides[looks // POSES].unsqueeze(-1))[..., 0]
 
 
 def into_frames(rooms: RoomBoxes, back: Int[Tensor, " rooms"]) -> RoomBoxes:
@@ -62,21 +68,27 @@ def turn_places(
     return turn_rectangles(torch.cat([place_m, nothing], dim=-1), quarters)[:, :2]
 
 
+def gaps_by_side(rooms: RoomBoxes) -> Float[Tensor, "rooms objects 4"]:
+    """Gaps in metres from each object to the four sides of its room's rectangle: low z, low x, high
+    z, high x."""
+    low, high = gaps_to_sides_m(rooms.boxes_m, rectangles_of(rooms))
+    return torch.stack([low[..., 1], low[..., 0], high[..., 1], high[..., 0]], dim=-1)
+
+
+def mean_by_prototype(
+    values: Float[Tensor, "rooms objects 4"], rooms: RoomBoxes, prototypes: int
+) -> tuple[Float[Tensor, "prototypes 4"], Bool[Tensor, " prototypes"]]:
+    """Mean of the objects' values over the objects of each prototype, and whether it occurs."""
+    assert rooms.looks is not None
+    which = rooms.looks[rooms.is_object] // POSES
+    total = torch.zeros(prototypes, QUARTERS).index_add_(0, which, values[rooms.is_object])
+    number = torch.bincount(which, minlength=prototypes)
+    return total / number.clamp(min=1).unsqueeze(-1), number > 0
+
+
 def find_backs(rooms: RoomBoxes, prototypes: int) -> Int[Tensor, " prototypes"]:
     """The side of each prototype, in pose 0, with the smallest mean gap to the sides of its rooms'
     rectangles; 0 for unused prototypes."""
     assert rooms.looks is not None
-    rectangle_m = rectangles_of(rooms)
-    total = torch.zeros(prototypes, QUARTERS)
-    plain = torch.zeros(prototypes, dtype=torch.int64)
-    for slot in range(rooms.is_object.shape[1]):
-        here, looks = rooms.is_object[:, slot], rooms.looks[:, slot]
-        quarters = -backs_of(looks, plain) % QUARTERS
-        box_m = turn_boxes(rooms.boxes_m[:, slot, None], quarters)
-        low, high = gaps_to_sides_m(box_m, turn_rectangles(rectangle_m, quarters))
-        mirrored = looks % POSES >= QUARTERS
-        along_x = torch.stack([low[:, 0, 0], high[:, 0, 0]], dim=-1)
-        along_x = torch.where(mirrored[:, None], along_x.flip(-1), along_x)
-        gaps_m = torch.stack([low[:, 0, 1], along_x[:, 0], high[:, 0, 1], along_x[:, 1]], dim=-1)
-        total.index_add_(0, looks[here] // POSES, gaps_m[here].clamp(max=FURTHEST_M))
-    return total.argmin(dim=1)
+    gaps_m = gaps_by_side(rooms).clamp(max=FURTHEST_M).gather(-1, own_sides(rooms.looks))
+    return mean_by_prototype(gaps_m, rooms, prototypes)[0].argmin(dim=1)

@@ -11,7 +11,7 @@ from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.mixtures import FIRST_SCALE, LogisticMixture
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import PARTS
-from sceneprior.lifted.sampler.frames import backs_of, into_frames, turn_rectangles
+from sceneprior.lifted.sampler.frames import into_frames, side_of, turn_rectangles
 from sceneprior.lifted.sampler.places import (
     BY_OBJECT,
     BY_SIDES,
@@ -82,9 +82,9 @@ class Placement(nn.Module):
 
         Args:
             look_shown: Encoding of every look.
-            backs: Side of every prototype's back; see `backs_of`.
+            backs: Side of every prototype's back; see `side_of`.
         """
-        back = backs_of(look, backs)
+        back = side_of(look, backs)
         quarters = -back % QUARTERS
         before, rectangle_m = into_frames(before, back), turn_rectangles(rectangle_m, quarters)
         looks = before.looks
@@ -97,7 +97,7 @@ class Placement(nn.Module):
         to_sides = ramps(torch.cat(gaps_to_sides_m(before.boxes_m, rectangle_m), dim=-1), GAPS_M)
         there = torch.cat([
             self.class_embedding(before.object_class), self.look_embedding(look_shown[looks]),
-            torch.eye(QUARTERS).to(extents)[backs_of(looks, backs)], extents, bottoms_m, to_sides,
+            torch.eye(QUARTERS).to(extents)[side_of(looks, backs)], extents, bottoms_m, to_sides,
         ], dim=-1)  # fmt: skip
         own = torch.cat([
             self.class_embedding(label), self.look_embedding(look_shown[own_look[:, 0]]),

@@ -10,9 +10,9 @@ from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turned_looks
 from sceneprior.lifted.sampler import places as module
 from sceneprior.lifted.sampler.frames import (
-    backs_of,
     find_backs,
     into_frames,
+    side_of,
     turn_places,
     turn_rectangles,
 )
@@ -195,7 +195,7 @@ def test_the_back_is_the_side_at_the_wall():
     backs = find_backs(rooms, 2)
     assert backs.tolist() == [0, 1]  # the rug in the middle is at no side; the first counts
     assert rooms.looks is not None
-    back = backs_of(rooms.looks[:, 0], backs)
+    back = side_of(rooms.looks[:, 0], backs)
     turned = into_frames(rooms, back)
     assert_close(turned.boxes_m[:, 0, 2], torch.full((8,), -2.0))
 
