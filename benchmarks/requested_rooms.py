@@ -131,7 +131,7 @@ def relations_of(room: Scene, half: Sequence[Any], classes: tuple[str, ...]) -> 
     furniture = Furniture(
         np.array([[*item.center_m, *item.size_m] for item in half]),
         np.array([classes.index(item.label) for item in half]),
-        np.zeros(len(half), dtype=np.int64),
+        *np.zeros((2, len(half)), dtype=np.int64),
     )
     held = Relations(wishes, RoomShape(room.floor_m), classes).held(furniture)
     return [wish for wish, holds in zip(wishes, held, strict=True) if holds]

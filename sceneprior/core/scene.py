@@ -63,6 +63,8 @@ class Turned(NamedTuple):
     yaw_rad: float
     size_m: tuple[float, float, float]
     """Full extents in the box's own frame."""
+    confidence: float = 1.0
+    """Probability that the object's front really points along +z of this frame."""
 
 
 class Solid(NamedTuple):
@@ -119,7 +121,7 @@ def quarter_turned(size_m: Sequence[float], quarters: int) -> Turned:
     """The axis-aligned box of extents `size_m` as a box that is turned by quarters.
 
     >>> quarter_turned((2.0, 0.5, 1.0), 3)
-    Turned(yaw_rad=-1.5707963267948966, size_m=(1.0, 0.5, 2.0))
+    Turned(yaw_rad=-1.5707963267948966, size_m=(1.0, 0.5, 2.0), confidence=1.0)
     """
     width, height, depth = _triple(size_m)
     own = (width, height, depth) if quarters % 2 == 0 else (depth, height, width)

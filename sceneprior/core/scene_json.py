@@ -42,6 +42,8 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
         if item.turned is not None:
             entry["yaw_rad"] = round(item.turned.yaw_rad, 7)
             entry["own_size_m"] = _rounded_size(item.turned.size_m)
+            if item.turned.confidence < 1:
+                entry["yaw_confidence"] = round(item.turned.confidence, 3)
         solids = [solid for solid in item.solids if isinstance(solid, Solid)]
         if solids and len(solids) == len(item.solids):  # the file holds no meshes
             entry["solids"] = [
@@ -97,6 +99,7 @@ class ObjectEntry(BaseModel):
     size_m: _Triple
     yaw_rad: float | None = None
     own_size_m: _Triple | None = None
+    yaw_confidence: Annotated[float, Field(ge=0, le=1)] = 1.0
     solids: Annotated[list[_SolidEntry], Field(max_length=MOST_SOLIDS)] = []
 
 
@@ -252,7 +255,7 @@ def _turned_of(path: Path, item: ObjectEntry) -> Turned | None:
         return None
     if item.yaw_rad is not None and item.own_size_m is not None:
         check_box(path, item.label, item.center_m, item.own_size_m)
-        turned = Turned(item.yaw_rad, item.own_size_m)
+        turned = Turned(item.yaw_rad, item.own_size_m, item.yaw_confidence)
         if np.allclose(bound_m(turned), item.size_m, rtol=0, atol=1e-3):
             return turned
     raise InputError(

@@ -23,7 +23,7 @@ def own_box(item: SceneObject) -> Turned:
 
 def footprint(item: SceneObject) -> Float[np.ndarray, "4 2"]:
     """Corners (x, z) of the object's own box on the floor, in order."""
-    yaw_rad, size_m = own_box(item)
+    yaw_rad, size_m, _ = own_box(item)
     corners = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) / 2 * np.asarray(size_m)
     return np.asarray((corners @ yaw_rotation(yaw_rad).T + np.asarray(item.center_m))[:, ::2])
 
@@ -32,7 +32,7 @@ def triangles_of(item: SceneObject) -> Triangles:
     """Triangles of the object's mesh; without a mesh, of its own box."""
     if item.mesh is not None:
         return np.asarray(item.mesh.vertices_m, dtype=np.float64)[item.mesh.faces]
-    yaw_rad, size_m = own_box(item)
+    yaw_rad, size_m, _ = own_box(item)
     corners = CUBE_CORNERS / 2 * np.asarray(size_m)
     return np.asarray((corners @ yaw_rotation(yaw_rad).T + np.asarray(item.center_m))[BOX_FACES])
 

@@ -13,8 +13,9 @@ from sceneprior.core.scene import Scene, SceneObject, quarter_turned
 from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.looks import LookDecoder
+from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.sampler.draw import draw_rooms
-from sceneprior.lifted.sampler.frames import backs_of
+from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.plan import Given
 from sceneprior.lifted.trained import SAMPLER, TrainedLifted
 from sceneprior.paper.trained import TrainedPrior
@@ -51,15 +52,15 @@ def sample_scenes(
 def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> Scene:
     """A drawn room as a scene with meshes; its floor is the rectangle of the room, if known.
 
-    The yaws of objects are those of their looks, whose backs are the sides that training rooms have
-    at walls (`lifted/sampler/frames.py`).
+    The yaws of objects are those of their looks' fronts (`lifted/sampler/fronts.py`).
     """
     sampler, shapes = trained.sampler, trained.prior.shape
     assert sampler is not None, "callers ask trained.sampler first"
     assert isinstance(shapes, LookDecoder), "whose looks the sampler draws"
     assert rooms.looks is not None
     classes = label_set(trained.config.label_set)
-    backs = backs_of(rooms.looks[row], sampler.backs)
+    fronts = side_of(rooms.looks[row], sampler.fronts)
+    confidence = sampler.front_confidence[rooms.looks[row] // POSES]
     objects = []
     for item in rooms.is_object[row].nonzero()[:, 0].tolist():
         box = rooms.boxes_m[row, item].double().numpy()
@@ -70,9 +71,11 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
         solids = shapes.solids(look, box) if known else ()
         label = classes[index]
         center, size = tuple(box[:3]), tuple(box[3:])
-        # A back at low z, low x, high z or high x: the front is turned by 0, 1, 2 or 3 quarters.
-        turned = quarter_turned(size, int(backs[item])) if known else None
-        objects.append(SceneObject(label, center, size, mesh, turned, solids))
+        # A front at high z, high x, low z or low x is turned by 0, 1, 2 or 3 quarters.
+        turned = quarter_turned(size, int(fronts[item]) + 2)._replace(
+            confidence=float(confidence[item])
+        )
+        objects.append(SceneObject(label, center, size, mesh, turned if known else None, solids))
     floor_m = None if rooms.rectangle_m is None else _outline(rooms.rectangle_m[row])
     return Scene(name, trained.config.label_set, tuple(objects), floor_m)
 

@@ -90,16 +90,17 @@ def scene_to_glb(scene: Scene, shell: Mapping[str, Mesh] = NO_SHELL) -> bytes:
     return bytes(room.export(file_type="glb", include_normals=False))
 
 
+FACING = ("class", "yaw_rad", "yaw_confidence")
+"""Keys of an object's entry in the scene JSON that a GLB repeats."""
+
+
 def glb_extras(scene: Scene) -> dict[str, Any]:
     """What a GLB says of its scene: name, label set, `extra`, and each object's node and class,
     with its yaw where it is known (docs/conventions.md)."""
+    entries = scene_to_json(scene)["objects"]
     objects = [
-        {
-            "node": node,
-            "class": item.label,
-            **({} if item.turned is None else {"yaw_rad": round(item.turned.yaw_rad, 7)}),
-        }
-        for node, item in zip(node_names(scene), scene.objects, strict=True)
+        {"node": node} | {key: entry[key] for key in FACING if key in entry}
+        for node, entry in zip(node_names(scene), entries, strict=True)
     ]
     told = {"name": scene.name, "label_set": scene.label_set, "extra": scene.extra}
     return {"sceneprior": {**told, "objects": objects}}

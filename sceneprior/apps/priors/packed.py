@@ -26,6 +26,7 @@ from torch.overrides import TorchFunctionMode
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, write_whole
+from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.parts import KINDS
 from sceneprior.core.settings import Section, check_settings
 from sceneprior.lifted.trained import TrainedLifted
@@ -165,6 +166,8 @@ def _check(name: str, tensor: Tensor, classes: int) -> None:
         raise ValueError(f"{name} names classes that are not there")
     elif name.endswith("part_kind") and not ((tensor >= -1) & (tensor < KINDS)).all():
         raise ValueError(f"{name} names kinds of parts that are not there")
+    elif name.endswith(("backs", "fronts")) and not ((tensor >= 0) & (tensor < QUARTERS)).all():
+        raise ValueError(f"{name} names sides that are not there")
 
 
 def write_packed(packed: PackedPrior, path: Path) -> None:

@@ -36,6 +36,8 @@ KEEP = 16
 OTHER_TURN = 1.2
 """Factor on the distance of models that are not turned as the object, if its yaw is known. The
 distance of a cupboard from behind is 1.0 to 1.1 times that from the front, of a chair 1.5 times."""
+SURE = 0.5
+"""Least confidence at which a yaw counts as known."""
 _BLOCK = 2**16
 """Squared distances computed at a time, as many as fit in a core's cache."""
 
@@ -163,8 +165,8 @@ def most_similar(item: SceneObject, models: ClassModels, keep: int | None = KEEP
 
 
 def _known_turn(item: SceneObject) -> int | None:
-    """Quarters by which an object's yaw turns it; None if it is unknown, or between two of them."""
-    if item.turned is None:
+    """Quarters by which an object's yaw turns it; None if it is not known, or between two."""
+    if item.turned is None or item.turned.confidence < SURE:
         return None
     quarters = item.turned.yaw_rad / (np.pi / 2)
     return round(quarters) % QUARTERS if abs(quarters - round(quarters)) < 1e-3 else None

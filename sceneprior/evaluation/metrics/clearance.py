@@ -50,7 +50,7 @@ def clearances(scene: Scene) -> list[Clearance]:
     draws = np.random.default_rng(0)
     points = []
     for item in scene.objects:
-        yaw_rad, size_m = own_box(item)
+        yaw_rad, size_m, _ = own_box(item)
         count = max(int(np.prod(size_m) * POINTS_PER_M3), FEWEST_POINTS)
         inner = draws.uniform(-0.5, 0.5, (count, 3)) * np.asarray(size_m)
         points.append(inner @ yaw_rotation(yaw_rad).T + np.asarray(item.center_m))

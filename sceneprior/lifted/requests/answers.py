@@ -13,9 +13,8 @@ from sceneprior.core.scene import Opening, Scene
 from sceneprior.core.seeds import check_seed
 from sceneprior.core.threads import single_threaded
 from sceneprior.lifted.requests.draw import Answer, draw_requested
-from sceneprior.lifted.requests.holding import Relations
+from sceneprior.lifted.requests.holding import Relations, furniture_in
 from sceneprior.lifted.requests.request import Request, make_request
-from sceneprior.lifted.requests.steps import furniture_of
 from sceneprior.lifted.sampled import drawn_by_sampler, scene_of
 from sceneprior.lifted.trained import TrainedLifted
 from sceneprior.paper.sampling import scene_names
@@ -94,7 +93,7 @@ def _scene(
     shape, wanted = answer.plan.shape, request.wishes
     relations = Relations(wanted.relations, shape, label_set(scene.label_set))
     assert trained.sampler is not None, "which drew the answer"
-    held = relations.held(furniture_of(trained.sampler, answer.room, 0))
+    held = relations.held(furniture_in(trained.sampler, answer.room, 0))
     wishes = [
         {"wish": str(wish), "holds": wish.holds(counts[wish.label])} for wish in wanted.counts
     ]

@@ -9,11 +9,12 @@ import torch
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.requests.holding import furniture_in
 from sceneprior.lifted.requests.judge import Judge
 from sceneprior.lifted.requests.particles import PARTICLES, Particles, begin
 from sceneprior.lifted.requests.plans import RoomPlan, check_area, plan_room
 from sceneprior.lifted.requests.request import Request
-from sceneprior.lifted.requests.steps import HANGING, Hurdles, furniture_of, place_next
+from sceneprior.lifted.requests.steps import HANGING, Hurdles, place_next
 from sceneprior.lifted.requests.wishes import RelationWish, check_wishes
 from sceneprior.lifted.sampler.draw import LOOKS, with_looks
 from sceneprior.lifted.sampler.network import RoomSampler
@@ -122,7 +123,7 @@ def _furnish(
 ) -> list[Answer | None]:
     """One attempt at each room; None where an object found no place."""
     particles = begin(sampler, plans, given)
-    objects = furniture_of(sampler, given, 0)
+    objects = furniture_in(sampler, given, 0)
     judges = [Judge(plan.shape, relations, classes, objects) for plan in plans]
     hanging = [classes.index(label) for label in HANGING if label in classes]
     failed = [False] * len(plans)

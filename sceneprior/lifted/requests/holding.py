@@ -5,10 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
+from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.requests.relations import (
-    FRONTS,
     OPENINGS,
+    OUTWARD,
     Items,
     opening_items,
     related,
@@ -16,6 +18,8 @@ from sceneprior.lifted.requests.relations import (
 )
 from sceneprior.lifted.requests.shape import RoomShape
 from sceneprior.lifted.requests.wishes import RelationWish
+from sceneprior.lifted.sampler.frames import side_of
+from sceneprior.lifted.sampler.network import RoomSampler
 
 
 class Furniture(NamedTuple):
@@ -25,12 +29,33 @@ class Furniture(NamedTuple):
     """Centre and full extents."""
     object_class: Int[np.ndarray, " objects"]
     back: Int[np.ndarray, " objects"]
-    """Side of the back: 0 to 3 for low z, low x, high z, high x."""
+    """Side of the back, which is nearest to walls: 0 to 3 for low z, low x, high z, high x."""
+    front: Int[np.ndarray, " objects"]
+    """Side of the front, in the same numbers; it need not be opposite to `back`."""
 
     def items(self, classes: Sequence[str]) -> Items:
         """The objects as things that relations hold between."""
         is_lamp = np.array(["lamp" in classes[index] for index in self.object_class], dtype=bool)
-        return Items(self.boxes_m, FRONTS[self.back], is_lamp)
+        return Items(self.boxes_m, OUTWARD[self.front], is_lamp)
+
+
+def furniture_of(
+    sampler: RoomSampler,
+    boxes_m: Float[Tensor, "objects 6"],
+    object_class: Int[Tensor, " objects"],
+    looks: Int[Tensor, " objects"],
+) -> Furniture:
+    """Objects with the sides at which their looks have back and front."""
+    back, front = (side_of(looks, sides).numpy() for sides in (sampler.backs, sampler.fronts))
+    return Furniture(boxes_m.double().numpy(), object_class.numpy(), back, front)
+
+
+def furniture_in(sampler: RoomSampler, rooms: RoomBoxes, row: int) -> Furniture:
+    """The objects of a room."""
+    assert rooms.looks is not None
+    here = rooms.is_object[row]
+    parts = (part[row, here] for part in (rooms.boxes_m, rooms.object_class, rooms.looks))
+    return furniture_of(sampler, *parts)
 
 
 class Relations:

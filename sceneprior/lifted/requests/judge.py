@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from sceneprior.lifted.requests.holding import Furniture, Relations
 from sceneprior.lifted.requests.openings import zones_of
-from sceneprior.lifted.requests.relations import FRONTS
+from sceneprior.lifted.requests.relations import OUTWARD
 from sceneprior.lifted.requests.shape import RoomShape
 from sceneprior.lifted.requests.ways import Ways, is_functional
 from sceneprior.lifted.requests.wishes import RelationWish
@@ -136,7 +136,7 @@ def backed_by_walls(
     """True for places whose back is at a wall, or not at a side of their rectangle in the floor."""
     if shape.is_rectangle:
         return np.ones(len(candidates.back), dtype=bool)
-    inward = FRONTS[candidates.back]
+    inward = -OUTWARD[candidates.back]
     middles_m = candidates.boxes_m[:, [0, 2]] - inward * candidates.boxes_m[:, [3, 5]] / 2
     sides_m = rectangles_m[:, :2] - inward * rectangles_m[:, 2:] / 2
     gaps_m = np.abs(((middles_m - sides_m) * inward).sum(axis=1))

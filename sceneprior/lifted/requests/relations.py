@@ -47,8 +47,8 @@ SECTOR_RAD = np.pi / 4
 """Half the angle of a sector."""
 REACH_M = 0.5
 """Depth of the floor that counts as under a window."""
-FRONTS = np.array([(0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0)])
-"""Direction (x, z) of the front for a back at low z, low x, high z and high x (`side_of`)."""
+OUTWARD = np.array([(0.0, -1.0), (-1.0, 0.0), (0.0, 1.0), (1.0, 0.0)])
+"""Direction (x, z) towards the sides low z, low x, high z and high x (`side_of`)."""
 
 
 class Items(NamedTuple):

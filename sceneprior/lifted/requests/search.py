@@ -12,9 +12,8 @@ from torch import Tensor
 from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.mixtures import draw_index
 from sceneprior.lifted.prototypes import turned_looks
-from sceneprior.lifted.requests.holding import Furniture
+from sceneprior.lifted.requests.holding import Furniture, furniture_of
 from sceneprior.lifted.requests.judge import Judge
-from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.reading import Frame, Reading
 from sceneprior.lifted.sampler.violations import violation
@@ -74,9 +73,8 @@ def search(
     free = (violation(boxes_m, many, apart) == 0).nonzero()[:, 0]
     if not len(free):
         return "free floor"
-    back = side_of(looks[free], sampler.backs)
-    candidates = Furniture(
-        boxes_m[free].double().numpy(), np.full(len(free), piece.label), back.numpy()
+    candidates = furniture_of(
+        sampler, boxes_m[free], torch.full((len(free),), piece.label), looks[free]
     )
     allowed, hurdle = judge.allows(
         piece.label, candidates, standing, coming, rectangle_m[free].double().numpy(), COMPARED

@@ -11,12 +11,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.core.mixtures import draw_index
-from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.requests.holding import Furniture
+from sceneprior.lifted.requests.holding import furniture_in, furniture_of
 from sceneprior.lifted.requests.judge import Judge
 from sceneprior.lifted.requests.particles import PARTICLES, Particles
 from sceneprior.lifted.requests.search import Piece, search
-from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.places import Places
 from sceneprior.lifted.sampler.reading import Frame, Reading
@@ -84,7 +82,7 @@ def place_next(
             room = row // PARTICLES
             placed = search(
                 sampler, found.reading.rows(torch.tensor([at])), piece, judges[room],
-                furniture_of(sampler, particles.rooms, row),
+                furniture_in(sampler, particles.rooms, row),
                 particles.plan(row).coming[step + 1 :], draws[room],
             )  # fmt: skip
         if isinstance(placed, str):
@@ -92,16 +90,6 @@ def place_next(
             particles.alive[row] = False
         else:
             particles.place(row, label, *placed)
-
-
-def furniture_of(sampler: RoomSampler, rooms: RoomBoxes, row: int) -> Furniture:
-    """The objects of a room."""
-    assert rooms.looks is not None
-    here = rooms.is_object[row]
-    return Furniture(
-        rooms.boxes_m[row, here].double().numpy(), rooms.object_class[row, here].numpy(),
-        side_of(rooms.looks[row, here], sampler.backs).numpy(),
-    )  # fmt: skip
 
 
 def _propose(
@@ -178,13 +166,11 @@ def _draw_places(
         ):
             row, look = int(found.rows[at]), int(found.look[at])
             if is_free:
-                back = side_of(found.look[at : at + 1], sampler.backs).numpy()
-                candidates = Furniture(
-                    box_m[None].double().numpy(), found.label[at : at + 1].numpy(), back
-                )
+                one = slice(at, at + 1)
+                candidates = furniture_of(sampler, box_m[None], found.label[one], found.look[one])
                 allowed, hurdle = judges[row // PARTICLES].allows(
                     int(found.label[at]), candidates,
-                    furniture_of(sampler, particles.rooms, row),
+                    furniture_in(sampler, particles.rooms, row),
                     particles.plan(row).coming[step + 1 :], rectangle_m[None].double().numpy(), 1,
                 )  # fmt: skip
                 if allowed[0]:

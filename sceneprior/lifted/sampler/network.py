@@ -67,6 +67,8 @@ class RoomSampler(nn.Module):
     may_meet: Tensor
     footprints_m2: Tensor
     backs: Tensor
+    fronts: Tensor
+    front_confidence: Tensor
 
     def __init__(self, settings: SamplerConfig, classes: int, prototypes: int, max_objects: int):
         super().__init__()
@@ -82,6 +84,8 @@ class RoomSampler(nn.Module):
         self.register_buffer("may_meet", torch.zeros(classes, classes, dtype=torch.bool))
         self.register_buffer("footprints_m2", torch.ones(classes))
         self.register_buffer("backs", torch.zeros(prototypes, dtype=torch.int64))
+        self.register_buffer("fronts", torch.zeros(prototypes, dtype=torch.int64))
+        self.register_buffer("front_confidence", torch.zeros(prototypes))
         # Contents and places overfit first: they get twice the dropout, at most 0.5.
         self.contents = Contents(classes, width // 2, min(2 * dropout, 0.5))
         self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)

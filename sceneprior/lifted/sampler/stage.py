@@ -15,6 +15,7 @@ from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.frames import find_backs
+from sceneprior.lifted.sampler.fronts import find_fronts
 from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
 from sceneprior.lifted.sampler.network import RECTANGLES, RoomSampler
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, SamplerRooms, frames_of, turned_rooms
@@ -143,7 +144,7 @@ class SamplerStage(lightning.LightningModule):
 def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     """Set the buffers of a fresh sampler from the training rooms: the encodings of looks, the
     mixture of rectangles, the classes that may be sampled, the pairs of classes that may intersect,
-    mean footprints, and the backs of prototypes."""
+    mean footprints, and the backs and fronts of prototypes."""
     prototypes = rooms.prototypes
     looks = torch.from_numpy(prototypes.shown())
     sampler.look_shown[: len(looks)] = looks
@@ -157,6 +158,9 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     labels = rooms.rooms.object_class[here]
     sampler.footprints_m2.scatter_reduce_(0, labels, areas_m2, "mean", include_self=False)
     sampler.backs.copy_(find_backs(rooms.rooms, len(sampler.backs)))
+    fronts, confidence = find_fronts(rooms.rooms, prototypes, len(sampler.fronts))
+    sampler.fronts.copy_(fronts)
+    sampler.front_confidence.copy_(confidence)
     generator = torch.Generator().manual_seed(0)
     furnished = here.any(dim=1)
     frames = torch.cat([frames_of(rooms.rooms, generator) for _ in range(FRAMES)])

@@ -118,7 +118,7 @@ def test_backs_at_the_inner_side_of_an_l_are_no_backs_at_walls():
     shape = RoomShape(read_floor(L_SHAPE))
     arm = np.array([[2.5, 1.5, 5.0, 3.0]] * 3)
     boxes = np.array([[1.0, 0.5, 2.5, 1, 1, 1], [4.0, 0.5, 2.5, 1, 1, 1], [1.0, 0.5, 1.5, 1, 1, 1]])
-    at_high_z = Furniture(boxes, np.array([1, 1, 1]), np.array([2, 2, 2]))
+    at_high_z = Furniture(boxes, np.array([1, 1, 1]), np.array([2, 2, 2]), np.zeros(3, int))
     assert backed_by_walls(shape, at_high_z, arm).tolist() == [False, True, True]
 
 

@@ -6,7 +6,7 @@ import pytest
 from sceneprior.core.scene import Opening
 from sceneprior.lifted.requests.holding import Furniture, Relations
 from sceneprior.lifted.requests.relations import (
-    FRONTS,
+    OUTWARD,
     Items,
     opening_items,
     related,
@@ -21,7 +21,7 @@ CLASSES = ("void", "bed", "nightstand", "ceiling_lamp")
 
 
 def items(*boxes: list[float], back: int = 0, lamp: bool = False) -> Items:
-    return Items(np.array(boxes), FRONTS[[back] * len(boxes)], np.array([lamp] * len(boxes)))
+    return Items(np.array(boxes), -OUTWARD[[back] * len(boxes)], np.array([lamp] * len(boxes)))
 
 
 def at(x: float, z: float, y: float = 0.25) -> list[float]:
@@ -54,8 +54,8 @@ def test_relations_turn_with_the_room(relation, quarters):
         x, z = turned[:, 0].copy(), turned[:, 2].copy()
         turned[:, 0], turned[:, 2] = z, -x
         turned = turned[:, [0, 1, 2, 5, 4, 3]]
-    plain = Items(boxes, FRONTS[back], np.zeros(50, dtype=bool))
-    other = Items(turned, FRONTS[(back + quarters) % 4], np.zeros(50, dtype=bool))
+    plain = Items(boxes, -OUTWARD[back], np.zeros(50, dtype=bool))
+    other = Items(turned, -OUTWARD[(back + quarters) % 4], np.zeros(50, dtype=bool))
     found = related(relation, plain, plain)
     assert found.any() and not found.all()
     assert (related(relation, other, other) == found).all()
@@ -95,8 +95,8 @@ def test_a_wish_can_hold_while_objects_come_that_may_meet_it():
         return Furniture(
             np.array([row for _, row in placed]).reshape(-1, 6),
             np.array([label for label, _ in placed], dtype=np.int64),
-            np.zeros(len(placed), dtype=np.int64),
-        )
+            np.zeros(len(placed), dtype=np.int64), np.full(len(placed), 2),
+        )  # fmt: skip
 
     near, far = at(1.2, -3.0), at(3.5, 3.0)
     both = furniture((2, near), (2, far))
