@@ -1,0 +1,156 @@
+"""Quality of new rooms against the number of training rooms.
+
+    python benchmarks/rooms_needed.py OUT [--sizes 150 500 1500] [--seed 0]
+
+For each size, this makes homes, prepares views, and trains `configs/demo.yaml` on the lifted boxes
+and shapes of as many training rooms, always for the same number of steps. Homes of all sizes come
+from one seed, so the rooms of a smaller set are among those of a larger one. All priors are judged
+on the test rooms of the largest set, and the layout classifier learns from that set's training and
+val rooms: 0.5 is best. `relations` is the Wasserstein distance of gaps between classes in metres.
+Both are printed for the sampler, for rooms from anywhere on the sphere (`paper`), and for real
+training rooms. CPU minutes are those of `fit`, lifting included, and of preparation.
+
+Steps that have their result in OUT are not repeated.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from requested_rooms import accuracy
+
+import sceneprior
+from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.scene import Scene
+from sceneprior.evaluation.metrics.relations import METRICS
+
+TRAIN_SHARE = 0.7
+"""Share of made homes in the train split."""
+STEPS = {"shape": 3000, "sampler": 2000}
+"""Training steps of the sphere and of the sampler, at every size."""
+BATCH = {"shape": 28, "sampler": 24}
+DISTRIBUTIONS = ("sampler", "paper")
+DRAWN = 600
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[150, 500, 1500])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--plot", type=Path)
+    arguments = parser.parse_args()
+    out, sizes = arguments.out, sorted(arguments.sizes)
+    torch.set_num_threads(1)
+    for size in sizes:
+        train(out / str(size), size, arguments.seed)
+    shards = out / str(sizes[-1]) / "shards"
+    real = scenes_of(shards, "train") + scenes_of(shards, "val")
+    test = scenes_of(shards, "test")
+    few = np.random.default_rng(arguments.seed).permutation(len(real))[:DRAWN]
+    print(f"{len(test)} test rooms; {DRAWN} rooms drawn with seed {arguments.seed}")
+    print(f"real training rooms: relations {relations([real[k] for k in few], real, test):.2f} m")
+    rows = []
+    for size in sizes:
+        folder = out / str(size)
+        prior = sceneprior.load(folder / "run")
+        spent = json.loads((folder / "cpu_minutes.json").read_text())
+        for distribution in DISTRIBUTIONS:
+            rooms = prior.sample(DRAWN, seed=arguments.seed, distribution=distribution)
+            rooms = [room.without_meshes() for room in rooms]
+            row = {
+                "rooms": size, "distribution": distribution,
+                "classifier": accuracy(rooms, real, test, arguments.seed),
+                "relations_m": round(relations(rooms, real, test), 3),
+                "prepare_cpu_min": round(spent["prepare"], 1),
+                "fit_cpu_min": round(spent["fit"], 1),
+            }
+            print(json.dumps(row), flush=True)
+            rows.append(row)
+    (out / "rooms_needed.json").write_text(json.dumps(rows, indent=1) + "\n")
+    if arguments.plot:
+        plot(rows, arguments.plot)
+
+
+def train(folder: Path, size: int, seed: int) -> None:
+    """Make homes, shards and a run with `size` training rooms, and note the CPU minutes spent."""
+    done = folder / "cpu_minutes.json"
+    if done.exists():
+        return
+    homes, shards = folder / "homes", folder / "shards"
+    rooms = round(size / TRAIN_SHARE)
+    spent = 0.0
+    if not homes.exists():
+        spent += command("make-homes", homes, "--rooms", str(rooms), "--seed", str(seed))
+    spent += command(
+        "prep-front", "--front", homes / "3D-FRONT", "--future", homes / "3D-FUTURE-model",
+        "--splits", homes / "splits" / "bedroom.csv", "--recipe", "bedroom", "--workers", "1",
+        "--out", shards,
+    )  # fmt: skip
+    taught = len(scenes_of(shards, "train"))
+    sets = [f"data.shards={shards}", f"seed={seed}"]
+    sets += [f"{name}.epochs={-(-STEPS[name] * BATCH[name] // taught)}" for name in STEPS]
+    fit = ["fit", "--config", "demo.yaml", "--run", folder / "run", "--resume"]
+    minutes = command(*fit, *(word for each in sets for word in ("--set", each)))
+    done.write_text(json.dumps({"prepare": spent, "fit": minutes, "train_rooms": taught}) + "\n")
+
+
+def command(*words: str | Path) -> float:
+    """Run a command of the package and return its CPU minutes."""
+    start = os.times()
+    subprocess.run([sys.executable, "-m", "sceneprior", *map(str, words)], check=True)
+    end = os.times()
+    return (
+        end.children_user + end.children_system - start.children_user - start.children_system
+    ) / 60
+
+
+def scenes_of(shards: Path, split: str) -> list[Scene]:
+    """True boxes of a split's rooms."""
+    return list(reference_scenes(shards, split, meshes=False))
+
+
+def relations(rooms: Sequence[Scene], real: Sequence[Scene], test: Sequence[Scene]) -> float:
+    """`relation_distance_m` of a set of rooms, without an interval."""
+    # The metric reads no pictures and no nearest rooms.
+    own, others = (
+        SimpleNamespace(scenes=scenes, counts=np.ones((1, len(scenes)), dtype=int))
+        for scenes in (rooms, test)
+    )
+    found = METRICS[0].function(own, SimpleNamespace(test=others, real=real))
+    return float(found.value)
+
+
+def plot(rows: Sequence[dict[str, object]], path: Path) -> None:
+    """Draw both metrics against the number of rooms, with a line for each distribution."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    FigureCanvasAgg(figure)
+    for column, (key, title) in enumerate(
+        (("classifier", "layout classifier (0.5 is best)"), ("relations_m", "gaps, m (0 is best)"))
+    ):
+        axes = figure.add_subplot(1, 2, column + 1)
+        for distribution in DISTRIBUTIONS:
+            mine = [row for row in rows if row["distribution"] == distribution]
+            name = "sampler" if distribution == "sampler" else "sphere"
+            axes.plot([r["rooms"] for r in mine], [r[key] for r in mine], marker="o", label=name)
+        axes.set_xscale("log")
+        axes.set_xticks(sizes := sorted({row["rooms"] for row in rows}), map(str, sizes))
+        axes.set_xlabel("training rooms")
+        axes.set_title(title, fontsize=10)
+        axes.grid(alpha=0.3)
+        axes.legend()
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main()
