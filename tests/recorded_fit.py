@@ -20,7 +20,7 @@ from sceneprior.training.slurm import first_process
 
 
 class Recorder(Callback):
-    """What every step of every stage saw and did, in `steps`."""
+    """Records the inputs and results of every step of every stage in `steps`."""
 
     def __init__(self) -> None:
         self.steps: list[dict[str, torch.Tensor]] = []

@@ -42,9 +42,8 @@ def outline_of(hull: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "corners 2"
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def within(start, span, outline):
-    """Where a segment, from `start` to `start` + `span`, first enters the prism over an outline and
-    where it last leaves it, as shares of the segment's length: (1, 0) if it never meets the
-    prism."""
+    """Shares of a segment's length, from `start` to `start` + `span`, at which the segment first
+    enters and last leaves the prism over an outline; (1, 0) if it never meets the prism."""
     near, far = 1.0, 0.0
     first, last = False, False  # whether the segment's ends lie inside
     corners = len(outline)

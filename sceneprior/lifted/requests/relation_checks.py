@@ -1,4 +1,4 @@
-"""Which wished relations hold in a room, and which can still hold in a partly furnished one."""
+"""Checks of requested relations, in furnished rooms and in partly furnished ones."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -27,17 +27,25 @@ class Furniture(NamedTuple):
     back: Int[np.ndarray, " objects"]
     """Side of the back: 0 to 3 for low z, low x, high z, high x."""
 
+    def rows(self, rows: Int[np.ndarray, " some"] | slice) -> "Furniture":
+        """The objects of these rows."""
+        return Furniture(*(part[rows] for part in self))
+
+    def joined(self, others: "Furniture") -> "Furniture":
+        """These objects, followed by others."""
+        return Furniture(*map(np.concatenate, zip(self, others, strict=True)))
+
     def items(self, classes: Sequence[str]) -> Items:
-        """The objects as things that relations hold between."""
+        """The objects in the form that relations are computed from."""
         is_lamp = np.array(["lamp" in classes[index] for index in self.object_class], dtype=bool)
         return Items(self.boxes_m, FRONTS[self.back], is_lamp)
 
 
-class Relations:
-    """Wished relations of one room.
+class RelationChecks:
+    """Checks of the requested relations of one room.
 
     Args:
-        wishes: The wishes.
+        wishes: The requested relations.
         shape: Floor, doors and windows.
         classes: Names of the classes by index.
     """
@@ -47,7 +55,7 @@ class Relations:
         self.openings = {kind: opening_items(shape, kind) for kind in OPENINGS}
 
     def held(self, furniture: Furniture) -> list[bool]:
-        """True for each wish that holds in a furnished room."""
+        """True for each relation that holds in a furnished room."""
         items = furniture.items(self.classes)
         return [
             int(self._met(wish, items, furniture.object_class).sum()) >= wish.count
@@ -55,27 +63,21 @@ class Relations:
         ]
 
     def can_hold(
-        self, label: int, candidates: Furniture, standing: Furniture, coming: Sequence[int]
+        self, label: int, candidates: Furniture, placed: Furniture, upcoming: Sequence[int]
     ) -> Bool[np.ndarray, " candidates"]:
-        """Which places of the next object leave every wish possible.
-
-        A wish is possible while objects that come later could still meet it; which of them find
-        such a place is not known yet.
-        """
+        """True for places of the next object, of class `label`, after which every relation is still
+        possible. Upcoming objects are assumed to find places in which their relations hold."""
         possible = np.ones(len(candidates.back), dtype=bool)
         name = self.classes[label]
         for wish in self.wishes:
             if name not in (wish.subject, wish.target):
                 continue
-            later = [self.classes[index] for index in coming]
+            later = [self.classes[index] for index in upcoming]
             if wish.target in later:
                 continue
             needed = wish.count - later.count(wish.subject)
             for row in np.flatnonzero(possible):
-                joined = Furniture(*(
-                    np.concatenate([part, own[row : row + 1]])
-                    for part, own in zip(standing, candidates, strict=True)
-                ))  # fmt: skip
+                joined = placed.joined(candidates.rows(slice(row, row + 1)))
                 met = self._met(wish, joined.items(self.classes), joined.object_class)
                 possible[row] = met.sum() >= needed
         return possible
@@ -83,7 +85,7 @@ class Relations:
     def _met(
         self, wish: RelationWish, items: Items, object_class: Int[np.ndarray, " objects"]
     ) -> Bool[np.ndarray, " subjects"]:
-        """Which objects of the subject's class meet a wish."""
+        """True for each object of the subject's class for which the relation holds."""
         names = np.array([self.classes[index] for index in object_class], dtype=object)
         own = np.flatnonzero(names == wish.subject)
         subjects = items.rows(own)
