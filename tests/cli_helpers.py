@@ -1,4 +1,4 @@
-"""Helpers for tests of commands: sentences on the error stream, and folders compared with before."""
+"""Helpers for tests of commands: sentences on the error stream, and unchanged folders."""
 
 from pathlib import Path
 

@@ -100,7 +100,7 @@ def torch_rng() -> torch.Generator:
 
 @pytest.fixture(scope="session")
 def toy_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
-    """A run with both stages, trained on the toy rooms for a few epochs. Tests must not change it."""
+    """A run with both stages, trained on the toy rooms for a few epochs. Tests only read it."""
     from sceneprior.training.fit import fit
 
     config = tiny_config(toy_shards, layout__epochs=20)

@@ -269,7 +269,7 @@ def test_commands_run_as_printed(page: str, toys: Toys, tmp_path: Path, monkeypa
 
 
 def assert_pictures_of_the_page(drawn: Path) -> None:
-    """The picture on the page is the script's output, except for fonts and rounding, and is small."""
+    """The pictures are the script's output, except for fonts and rounding, and are small."""
     shown = sorted((ROOT / "docs/images/concepts").glob("*.png"))
     assert len(shown) == 6 and [path.name for path in shown] == sorted(
         path.name for path in drawn.iterdir()

@@ -167,7 +167,7 @@ def test_answers_have_one_object_a_mask_of_its_class_with_its_mesh_in_its_box(tr
 
 
 def test_one_object_and_one_at_the_border(trained, images):
-    """The answer is finite for a single object, and for an object with only a corner in the image."""
+    """The answer is finite for a single object, also if only a corner of it is in the image."""
     image = painted((40, 30, 60, 50))
     classes = images[0].object_class[:1]
     border = painted((90, 60, 96, 72))
