@@ -1,17 +1,17 @@
-"""Requests made from test rooms: share of wishes met, plausibility, and time.
+"""Rooms sampled for requests that are made from test rooms: wishes met, plausibility, and time.
 
     python benchmarks/requested_rooms.py --run procthor-bedroom --shards SHARDS [--doors] [--seed 0]
 
-Each request has the floor of a test room, half of its contents (rounded up) as exact counts of
-their classes, and two relations that hold in the test room, drawn by --seed among those of
-`sceneprior/lifted/requests/relations.py` between these objects; with --doors also a door and a
-window at drawn places. One room is drawn for each. Test rooms are used again, with other halves,
-until there are --requests of them; rooms with classes that the prior does not draw lose these.
+Each request has the floor of a test room, half of the room's objects (rounded up) as exact counts
+of their classes, and two relations that hold between these objects, drawn by --seed from those of
+`sceneprior/lifted/requests/relations.py`. With --doors, it also has a door and a window at random
+places. One room is sampled for each request. Test rooms are reused with other halves until there
+are --requests requests. Objects of classes that the prior does not draw are ignored.
 
 `met` is the share of all counts and relations that hold. `classifier` is the accuracy of the
-layout classifier (docs/evaluation.md) on the requested rooms against real ones, and
-`unconditioned` that of as many rooms without a request; 0.5 is best. `seconds` is CPU time a room,
-meshes included, after one room to warm up.
+layout classifier (docs/evaluation.md) between requested and real rooms, and `unconditioned` its
+accuracy between as many rooms without a request and real ones; 0.5 is best. `seconds` is the CPU
+time per room, including meshes, after one room to warm up.
 """
 
 import argparse
@@ -32,14 +32,14 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metrics.layout_classifier import METRICS
-from sceneprior.lifted.requests.holding import Furniture, Relations
-from sceneprior.lifted.requests.relations import OF_ONE, OF_TWO
+from sceneprior.lifted.requests.relation_checks import Furniture, RelationChecks
+from sceneprior.lifted.requests.relations import TO_ROOM, TO_TARGET
 from sceneprior.lifted.requests.shape import RoomShape
 from sceneprior.lifted.requests.wishes import RelationWish
 
 RELATIONS = 2
 """Relations of a request."""
-WITHOUT_FRONT = tuple(name for name in OF_TWO if name not in ("beside", "in front of", "facing"))
+WITHOUT_FRONT = tuple(name for name in TO_TARGET if name not in ("beside", "in front of", "facing"))
 """Relations that boxes without a known front have."""
 
 
@@ -119,7 +119,7 @@ def requests_of(
 def relations_of(room: Scene, half: Sequence[Any], classes: tuple[str, ...]) -> list[RelationWish]:
     """Relations between these objects that hold in the room; its boxes have no known front."""
     labels = sorted({item.label for item in half})
-    wishes = [RelationWish(label, relation) for label in labels for relation in OF_ONE]
+    wishes = [RelationWish(label, relation) for label in labels for relation in TO_ROOM]
     wishes += [
         RelationWish(label, relation, other)
         for label in labels
@@ -133,7 +133,7 @@ def relations_of(room: Scene, half: Sequence[Any], classes: tuple[str, ...]) -> 
         np.array([classes.index(item.label) for item in half]),
         *np.zeros((2, len(half)), dtype=np.int64),
     )
-    held = Relations(wishes, RoomShape(room.floor_m), classes).held(furniture)
+    held = RelationChecks(wishes, RoomShape(room.floor_m), classes).held(furniture)
     return [wish for wish, holds in zip(wishes, held, strict=True) if holds]
 
 

@@ -21,6 +21,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
@@ -57,7 +58,7 @@ def main() -> None:
     few = np.random.default_rng(arguments.seed).permutation(len(real))[:DRAWN]
     print(f"{len(test)} test rooms; {DRAWN} rooms drawn with seed {arguments.seed}")
     print(f"real training rooms: relations {relations([real[k] for k in few], real, test):.2f} m")
-    rows = []
+    rows: list[dict[str, Any]] = []
     for size in sizes:
         folder = out / str(size)
         prior = sceneprior.load(folder / "run")
@@ -66,7 +67,8 @@ def main() -> None:
             rooms = prior.sample(DRAWN, seed=arguments.seed, distribution=distribution)
             rooms = [room.without_meshes() for room in rooms]
             row = {
-                "rooms": size, "distribution": distribution,
+                "rooms": size,
+                "distribution": distribution,
                 "classifier": accuracy(rooms, real, test, arguments.seed),
                 "relations_m": round(relations(rooms, real, test), 3),
                 "prepare_cpu_min": round(spent["prepare"], 1),
@@ -97,7 +99,7 @@ def train(folder: Path, size: int, seed: int) -> None:
     taught = len(scenes_of(shards, "train"))
     sets = [f"data.shards={shards}", f"seed={seed}"]
     sets += [f"{name}.epochs={-(-STEPS[name] * BATCH[name] // taught)}" for name in STEPS]
-    fit = ["fit", "--config", "demo.yaml", "--run", folder / "run", "--resume"]
+    fit: list[str | Path] = ["fit", "--config", "demo.yaml", "--run", folder / "run", "--resume"]
     minutes = command(*fit, *(word for each in sets for word in ("--set", each)))
     done.write_text(json.dumps({"prepare": spent, "fit": minutes, "train_rooms": taught}) + "\n")
 
@@ -128,7 +130,7 @@ def relations(rooms: Sequence[Scene], real: Sequence[Scene], test: Sequence[Scen
     return float(found.value)
 
 
-def plot(rows: Sequence[dict[str, object]], path: Path) -> None:
+def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Draw both metrics against the number of rooms, with a line for each distribution."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -1,7 +1,7 @@
-"""Objects found from masks whose ids mean nothing across frames, against the true ones.
+"""Accuracy of the objects found from masks whose ids are not consistent across frames.
 
 Run `python benchmarks/tracks.py SHARDS ... [--noise 0 1]`. The shards must hold 3D ground truth,
-as those of `make-homes` with `prep-front` do. Every frame gets random new ids. The noise, drawn by
+as those of `make-homes` with `prep-front` do. Every frame gets new random ids. The noise, drawn by
 the seed, removes 10% of the masks, merges 5% with the nearest mask of the same view, cuts 5% in
 two, gives 5% the class of another object, and displaces each pose by 1 cm and 0.5 degrees.
 """
@@ -28,14 +28,14 @@ UNKNOWN = -1
 
 
 class Frames(NamedTuple):
-    """Masks of single frames and the poses given with them."""
+    """Masks of single frames, and the poses given with them."""
 
     masks: FrameMasks
     world_to_camera: np.ndarray
 
 
 def shuffled(views: RoomViews, noisy: bool, seed: int) -> Frames:
-    """Give every mask an id of its own, in random order, spoilt by noise or not."""
+    """Give every mask of every view a unique id, in random order; with noise on request."""
     assert views.instance_ids is not None, "read with images"
     rng = np.random.default_rng(seed)
     void = len(views.object_class) + 1
@@ -58,7 +58,7 @@ def shuffled(views: RoomViews, noisy: bool, seed: int) -> Frames:
 def _spoilt(
     image: np.ndarray, class_of: dict[int, int], void: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, dict[int, int]]:
-    """One image with masks missing, merged and cut, and wrong classes."""
+    """An image of ids after masks are removed, merged and cut, and the ids' classes, some wrong."""
     image, class_of = image.copy(), dict(class_of)
     for k in _numbers(image, void):
         if rng.random() < MISSING:
@@ -111,12 +111,12 @@ class Score(NamedTuple):
     iou: float
     """Mean 3D IoU of the lifted boxes of the objects found with the true boxes."""
     iou_true_ids: float
-    """Mean 3D IoU if each given mask gets the id of the true object with most of its pixels."""
+    """The same with ideal ids: each mask gets the id of the object with most of its pixels."""
     seconds: float
 
 
 def score(views: RoomViews, truth: RoomGroundTruth, noisy: bool, seed: int) -> Score:
-    """Associate the masks of one room, and compare."""
+    """Find the objects of one room from its masks, and compare them with the true objects."""
     assert views.instance_ids is not None
     frames = shuffled(views, noisy, seed)
     start = time.process_time()

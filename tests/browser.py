@@ -32,7 +32,7 @@ def wait_for(condition: Callable[[], object], said: str, seconds: float = 120) -
 
 
 def picture(take: Callable[[], bytes]) -> Image.Image:
-    """What a PNG of the browser shows; Chromium gives up on one after 10 s."""
+    """The image in a PNG of the browser; Chromium gives up on a screenshot after 10 s."""
     from selenium.common.exceptions import TimeoutException
 
     for _ in range(6):
@@ -43,10 +43,9 @@ def picture(take: Callable[[], bytes]) -> Image.Image:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator["webdriver.Chrome"]:
-    """One chromium for all tests of a process, for it starts slowly; WebGL is drawn in software.
-
-    Its log (`browser.get_log("browser")`) holds what pages wrote and which requests were refused.
-    """
+    """A Chromium that all tests of a process share, since it starts slowly; WebGL is drawn in
+    software. Its log (`browser.get_log("browser")`) lists what pages wrote and which requests were
+    refused."""
     programs = {name: shutil.which(name) for name in ("chromium", "chromedriver")}
     if None in programs.values():
         pytest.skip("no chromium here: apt-get install chromium chromium-driver")

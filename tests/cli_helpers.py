@@ -1,4 +1,4 @@
-"""What tests of commands share: sentences on the error stream, and folders as they were."""
+"""Helpers for tests of commands: sentences on the error stream, and unchanged folders."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What every test may use: toy rooms on disk, and a number generator."""
+"""Fixtures of all tests: toy rooms on disk, and a generator of random numbers."""
 
 import contextlib
 import fcntl
@@ -100,7 +100,7 @@ def torch_rng() -> torch.Generator:
 
 @pytest.fixture(scope="session")
 def toy_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
-    """Both stages trained on the toy rooms for a few epochs. Tests read it and change nothing."""
+    """A run with both stages, trained on the toy rooms for a few epochs. Tests only read it."""
     from sceneprior.training.fit import fit
 
     config = tiny_config(toy_shards, layout__epochs=20)

@@ -24,7 +24,7 @@ JUNK: list[Any] = [
     [], {}, [None], [[]], {"a": 1}, ["1", "x"], [1e300] * 3, [float("nan")] * 4, 20_000, 2**31,
     2**63, 180.0, ["desk"] * 3, "Floor", DEEP, [DEEP], {"id": DEEP},
 ]  # fmt: skip
-"""What may stand where something else should."""
+"""Values that replace others in files."""
 
 _READER = """
 import importlib.util, json, resource, sys

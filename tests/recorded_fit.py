@@ -20,7 +20,7 @@ from sceneprior.training.slurm import first_process
 
 
 class Recorder(Callback):
-    """What every step of every stage saw and did, in `steps`."""
+    """Records the inputs and results of every step of every stage in `steps`."""
 
     def __init__(self) -> None:
         self.steps: list[dict[str, torch.Tensor]] = []
@@ -52,7 +52,7 @@ class Poison(Callback):
 
 
 def record(config, run: Path, devices: int, **options) -> list[dict[str, torch.Tensor]]:
-    """The steps of a run, both stages in one list; of several processes, the first's."""
+    """Train, and return the steps of all stages in one list; of several processes, the first's."""
     recorder = Recorder()
     options = {"accelerator": "cpu", "devices": devices, "callbacks": [recorder], **options}
     fit(config, run, trainer_options=options, loggers=("csv",))
@@ -60,7 +60,7 @@ def record(config, run: Path, devices: int, **options) -> list[dict[str, torch.T
 
 
 def poison(config, run: Path, row: int) -> str:
-    """Resume a run by two processes with a spoilt latent; what is said then."""
+    """Resume a run with two processes after a latent is spoilt, and return the error message."""
     options = {"accelerator": "cpu", "devices": 2, "callbacks": [Poison(row)]}
     try:
         fit(config, run, True, ("csv",), options)

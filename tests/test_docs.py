@@ -32,7 +32,7 @@ RUN_ELSEWHERE = {("docs/posed_data.md", "python"): "tests/data_prep/posed/test_d
 BASES = [
     ROOT / name for name in ("", "sceneprior", "docs", "configs", "benchmarks", "data_prep/engine")
 ]
-"""What the paths in pages are relative to."""
+"""Folders to which paths in pages are relative."""
 MADE_BY_USERS = {"config.yaml"}
 """Names of YAML files that are no part of the repository."""
 
@@ -101,7 +101,8 @@ def check_shell(block: Block, folder: Path) -> None:
 
 
 def check_python(block: Block, folder: Path) -> None:
-    """It runs, in a folder where `out/demo/shards` are toy rooms, and `out/demo/run` a tiny run."""
+    """The block runs in a folder where `out/demo/shards` are toy rooms, and `out/demo/run` a tiny
+    run."""
     if (other := RUN_ELSEWHERE.get((name_of(block.page), "python"))) is not None:
         assert block.page.name in (ROOT / other).read_text()
         return
@@ -198,7 +199,7 @@ def find(path: str) -> Path | None:
 
 
 def is_ours(path: str) -> bool:
-    """Whether a path names a file of the repository, rather than one that users have."""
+    """True if a path names a file of the repository, rather than one of the user's."""
     return path.endswith((".py", ".yaml")) or path.split("/")[0] in (
         "sceneprior", "data_prep", "configs", "tests", "docs", "benchmarks", "baselines",
         "evaluation", "training", "models", "losses", "silhouettes", "cli",
@@ -332,7 +333,7 @@ def test_links_lead_somewhere(page: Path):
 
 
 def anchors_of(page: Path) -> set[str]:
-    """Of a page's headings, as GitHub makes them."""
+    """Anchors of a page's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 

@@ -189,7 +189,7 @@ def test_importing_the_package_loads_nothing_heavy():
 
 
 TRAINING = {"lightning", "torchmetrics", "h5py", "sklearn", "matplotlib", "pandas"}
-"""What trains and evaluates; making rooms has nothing to do with it."""
+"""Modules for training and evaluation, which sampling rooms must not import."""
 
 
 def test_making_rooms_loads_nothing_that_trains():

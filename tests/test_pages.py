@@ -58,9 +58,9 @@ ELSEWHERE = {
     "--devices 4 --resume": "tests/training/test_slurm.py is stopped and queued again as there",
     "python benchmarks/": "a measurement, of runs that take hours",
 }
-"""What a command holds -> why it is not run here."""
+"""Part of a command -> the reason why such commands are not run here."""
 ROOM = "toy/test_00"
-"""What `ROOM` is on a page."""
+"""Value of `ROOM` on a page."""
 
 
 class Toys(NamedTuple):
@@ -269,7 +269,7 @@ def test_commands_run_as_printed(page: str, toys: Toys, tmp_path: Path, monkeypa
 
 
 def assert_pictures_of_the_page(drawn: Path) -> None:
-    """What the script draws is what the page shows, but for fonts and rounding; and it is small."""
+    """The pictures are the script's output, except for fonts and rounding, and are small."""
     shown = sorted((ROOT / "docs/images/concepts").glob("*.png"))
     assert len(shown) == 6 and [path.name for path in shown] == sorted(
         path.name for path in drawn.iterdir()

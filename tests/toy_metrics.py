@@ -1,4 +1,4 @@
-"""What tests of metrics share: torchmetrics' side of a comparison, and rooms of unit boxes."""
+"""Helpers for tests of metrics: torchmetrics' side of a comparison, and rooms of unit boxes."""
 
 from collections.abc import Sequence
 
@@ -56,7 +56,8 @@ def room_set(
 
 
 def without_classifiers(patch: pytest.MonkeyPatch) -> None:
-    """Where scores are not about classifiers, which are most of the time of an evaluation."""
+    """Replace the classifiers, which take most of the time of an evaluation, in tests of other
+    things."""
 
     def answer_one(features, labels, others, seed):
         return np.ones(len(others), dtype=int)

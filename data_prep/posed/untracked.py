@@ -1,4 +1,4 @@
-"""Reads masks whose ids have no meaning across frames, and finds the objects that they show."""
+"""Reads masks whose ids are not consistent across frames, and finds the objects that they show."""
 
 from pathlib import Path
 
@@ -17,10 +17,10 @@ from sceneprior.core.instances.tables import LARGEST_ID, IdTable, read_class_tab
 
 
 class UntrackedMasks:
-    """Masks of one room with ids and classes of single frames, and notes about them.
+    """Reads the masks of one room, whose ids and classes belong to single frames.
 
-    A frame's classes are in a JSON of the same stem beside its PNG, in any form of
-    `read_class_table`, or else in the room's table.
+    The classes of a frame's ids are read from a JSON beside the PNG with the same stem, in any form
+    of `read_class_table`, or else from the room's table.
     """
 
     def __init__(
@@ -36,14 +36,14 @@ class UntrackedMasks:
         self._pixels = MaskPixels(read, size, stored)
 
     def read(self, frames: list[PosedFrame]) -> tuple[FrameMasks, np.ndarray, np.ndarray]:
-        """Masks of all frames, the ids that they had, (masks,), and intrinsics, (frames, 3, 3)."""
-        images, lenses = (
+        """Masks of all frames, their original ids, (masks,), and intrinsics, (frames, 3, 3)."""
+        images, intrinsics = (
             np.stack(arrays)
             for arrays in zip(*(self._pixels.read(frame) for frame in frames), strict=True)
         )
         numbers = np.where(images < 0, -1, 0)
-        of_number: dict[int, str] = {}
-        had, unlisted = [0], 0
+        class_names: dict[int, str] = {}
+        original_ids, unlisted = [0], 0
         for image, number, frame in zip(images, numbers, frames, strict=True):
             names = self._classes(frame)
             for k in np.unique(image[image > 0]).tolist():
@@ -51,29 +51,29 @@ class UntrackedMasks:
                     number[image == k] = -1
                     unlisted += 1
                     continue
-                of_number[len(had)] = names[k]
-                number[image == k] = len(had)
-                had.append(k)
-        if len(had) > LARGEST_ID:
+                class_names[len(original_ids)] = names[k]
+                number[image == k] = len(original_ids)
+                original_ids.append(k)
+        if (count := len(original_ids)) > LARGEST_ID:
             raise InputError(
-                f"{self._folder} has {len(had) - 1} masks, expected at most {LARGEST_ID - 1}; use "
+                f"{self._folder} has {count - 1} masks, expected at most {LARGEST_ID - 1}; use "
                 "fewer frames (--max-views)."
             )
-        table = IdTable(of_number, self._label_set, str(self._folder))
+        table = IdTable(class_names, self._label_set, str(self._folder))
         ids = table.ids(numbers).astype(np.int32)
-        # The table's last entry is what has no class: unknown, but something may be there.
+        # The table's last id is that of masks without a class. Their content is unknown.
         ids[ids == len(table.classes)] = UNKNOWN
         kept = np.unique(ids[ids > 0])
-        back = np.zeros(len(table.classes) + 1, dtype=np.int32)
-        back[kept] = np.arange(1, len(kept) + 1)
-        of_mask = np.zeros(len(kept) + 1, dtype=np.int64)
-        of_mask[back[ids[ids > 0]]] = numbers[ids > 0]
-        ids = np.where(ids > 0, back[np.maximum(ids, 0)], ids)
+        new_id = np.zeros(len(table.classes) + 1, dtype=np.int32)
+        new_id[kept] = np.arange(1, len(kept) + 1)
+        number_of_id = np.zeros(len(kept) + 1, dtype=np.int64)
+        number_of_id[new_id[ids[ids > 0]]] = numbers[ids > 0]
+        ids = np.where(ids > 0, new_id[np.maximum(ids, 0)], ids)
         self.notes += table.notes + self._pixels.notes
         if unlisted:
             self.notes.append(f"{unlisted} masks have no class in their frame's table: void")
         masks = FrameMasks(ids, table.classes[kept - 1].astype(np.int64))
-        return masks, np.array(had)[of_mask[1:]], lenses
+        return masks, np.array(original_ids)[number_of_id[1:]], intrinsics
 
     def _classes(self, frame: PosedFrame) -> dict[int, str]:
         """Class of each id of a frame."""
@@ -87,7 +87,8 @@ class UntrackedMasks:
                 self._table = read_class_table(find_table(self._folder))
             except InputError as error:
                 raise InputError(
-                    f"{str(error).removesuffix('.')}, or {own.name} beside a PNG that of a frame."
+                    f"{str(error).removesuffix('.')}; or put the classes of a frame's ids into "
+                    f"{own.name} beside its PNG."
                 ) from None
         return self._table
 
@@ -95,7 +96,8 @@ class UntrackedMasks:
 def track(
     masks: FrameMasks, given: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Images of object ids and classes for `observe`, and a note on the objects found."""
+    """Images of object ids and the objects' classes, as `observe` reads them, and a note on the
+    number of objects found."""
     tracks: Tracks = associate(masks, world_to_camera, intrinsics, given)
     count = len(tracks.object_class)
     images = np.where(tracks.ids < 0, count + 1, tracks.ids).astype(np.uint32)

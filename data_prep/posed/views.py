@@ -18,7 +18,8 @@ from sceneprior.core.instances.observations import Observations, observe
 
 TRACKS = ("given", "auto")
 _MANY_IDS, _MANY_FRAMES, _ONCE = 12, 5, 0.8
-"""Ids and frames from which ids are refused of which more than this share is in one frame only."""
+"""A room with at least this many ids and frames is refused if more than this share of the ids
+occurs in a single frame only."""
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ STRENGTH, ENOUGH = 4.0, 10.0
 cells of a surface are not independent observations."""
 CLASS_ERROR = 0.05
 """Assumed share of wrong classes."""
-ONE_VIEW = -4.0
-"""Weight of two masks of one view: an object has one mask, unless the mask is split."""
+SAME_VIEW = -4.0
+"""Weight of two masks of one view: an object has one mask in a view, unless the mask is split."""
 ID_MEANS = 0.3
-"""Ids mean something if this share of the pairs in a cluster has equal ids, and unequal clusters
-have less than this part of that."""
+"""Ids are used if this share of the pairs in a cluster has equal ids, and the share among pairs of
+different clusters is below this part of it."""
 
 
 def pair_weights(
@@ -23,12 +23,12 @@ def pair_weights(
     mask_view: Int[np.ndarray, " masks"],
     mask_class: Int[np.ndarray, " masks"],
 ) -> Float[np.ndarray, "masks masks"]:
-    """Weigh each pair of masks by the cells that both of their views see.
+    """Weight of each pair of masks, from the cells that the views of both masks see.
 
     Of the n cells that mask a shows and the view of b sees, the share q is shown by b. The
-    log-odds q log(SAME / OTHER) + (1 - q) log((1 - SAME) / (1 - OTHER)) are taken both ways,
-    averaged, and weighed by STRENGTH (1 - exp(-n / ENOUGH)), as are the log-odds of equal or
-    unequal classes (without STRENGTH). `shown` is that of `rays.surface`.
+    log-odds q log(SAME / OTHER) + (1 - q) log((1 - SAME) / (1 - OTHER)) are computed in both
+    directions, averaged, and weighted by STRENGTH (1 - exp(-n / ENOUGH)). The log-odds of equal or
+    unequal classes are added, with the same weight but for STRENGTH. `shown` is that of `Surface`.
     """
     count = len(mask_view)
     member = np.zeros((len(shown), count + 1), dtype=np.float32)
@@ -42,18 +42,19 @@ def pair_weights(
     odds = share * np.log(SAME / OTHER) + (1 - share) * np.log((1 - SAME) / (1 - OTHER))
     weights = STRENGTH * odds * known
     weights = (weights + weights.T) / 2
-    weights += class_odds(mask_class)[mask_class[:, None], mask_class] * np.minimum(known, known.T)
-    weights[mask_view[:, None] == mask_view] = ONE_VIEW
+    equal, unequal = class_odds(mask_class, 2 * CLASS_ERROR)
+    same_class = mask_class[:, None] == mask_class
+    weights += np.where(same_class, equal, unequal) * np.minimum(known, known.T)
+    weights[mask_view[:, None] == mask_view] = SAME_VIEW
     return weights
 
 
-def class_odds(mask_class: Int[np.ndarray, " masks"]) -> Float[np.ndarray, "classes classes"]:
-    """Log-odds that masks of two classes show one object, at an error rate of `CLASS_ERROR`."""
-    share = np.bincount(mask_class) / len(mask_class)
-    agree = (share**2).sum()
-    unequal = np.log(2 * CLASS_ERROR / (1 - agree + 1e-3))
-    equal = np.log((1 - 2 * CLASS_ERROR) / agree)
-    return np.where(np.eye(len(share), dtype=bool), equal, unequal)
+def class_odds(mask_class: Int[np.ndarray, " masks"], error: float) -> tuple[float, float]:
+    """Log-odds that two things show one object, if their classes are equal and if they are not;
+    `error` is the probability that the classes of one object differ."""
+    frequency = np.bincount(mask_class) / len(mask_class)
+    agree = float((frequency**2).sum())
+    return float(np.log((1 - error) / agree)), float(np.log(error / (1 - agree + 1e-3)))
 
 
 def id_odds(
@@ -61,15 +62,15 @@ def id_odds(
     labels: Int[np.ndarray, " masks"],
     mask_view: Int[np.ndarray, " masks"],
 ) -> Float[np.ndarray, "masks masks"] | None:
-    """Log-odds that masks show one object by their ids, whose error rates are counted in clusters
-    found without them; None if ids mean nothing across views."""
-    apart = mask_view[:, None] != mask_view
+    """Log-odds that masks show one object, from their given ids; None if ids are not consistent
+    across views. The error rates of ids are measured in clusters that were found without them."""
+    other_view = mask_view[:, None] != mask_view
     same_id, same = given[:, None] == given, labels[:, None] == labels
-    if not (apart & same).any() or not (apart & ~same).any():
+    if not (other_view & same).any() or not (other_view & ~same).any():
         return None
-    within, between = same_id[apart & same].mean(), same_id[apart & ~same].mean()
+    within, between = same_id[other_view & same].mean(), same_id[other_view & ~same].mean()
     if within < ID_MEANS or between > ID_MEANS * within:
         return None
     within, between = np.clip([within, between], 0.02, 0.98)
     odds = np.where(same_id, np.log(within / between), np.log((1 - within) / (1 - between)))
-    return np.where(apart, odds, 0.0)
+    return np.where(other_view, odds, 0.0)

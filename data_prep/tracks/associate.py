@@ -1,11 +1,11 @@
 """Finds the objects that masks of single frames show, from cameras, masks and classes alone.
 
-The objective is that of `clusters.py`: the sum, over pairs of masks in one cluster, of the
-log-odds that they show one object (`affinity.py`), judged at the cells of a grid that both views
-see. Which cells are filled is found in turns with the clusters, as in space carving (Kutulakos and
-Seitz, "A theory of shape by space carving", IJCV 2000), with clusters in place of colours: a cell
-in which views see different objects, or background, is empty. Last, masks that share few cells
-with others join the cluster whose visual hull explains them (`leftovers.py`).
+Masks are clustered by correlation clustering (`clusters.py`): it maximises the sum, over pairs of
+masks in one cluster, of the log-odds that both show one object (`affinity.py`), measured at the
+grid cells that both views see. Clustering alternates with space carving (Kutulakos and Seitz, "A
+theory of shape by space carving", IJCV 2000), which compares clusters in place of colours: a cell
+in which views see different clusters, or background, is emptied. At the end, masks that share few
+cells with others join the cluster whose visual hull explains them (`leftovers.py`).
 """
 
 from typing import NamedTuple
@@ -14,15 +14,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from data_prep.tracks.affinity import id_odds, pair_weights
-from data_prep.tracks.clusters import cluster
+from data_prep.tracks.clusters import cluster, main_classes
 from data_prep.tracks.explained import explained
 from data_prep.tracks.leftovers import join_leftovers
-from data_prep.tracks.merged import SPECK, Split, owners, split_merged
-from data_prep.tracks.rays import first_hits, surface, widened
+from data_prep.tracks.merged import SPECK, Split, split_merged
+from data_prep.tracks.rays import Surface, first_hits, surface, votes_of, widened
 from data_prep.tracks.voxels import Grid, cameras_of, fill
 
 STEP = 3
-"""Step between the rows and columns that are used, for a picture of 480 pixels."""
+"""Step between the rows and columns that are used, for an image whose longer side is 480 pixels;
+proportional to that side."""
 ROUNDS, STRICT = 7, 2
 """Rounds of clustering and carving; from round STRICT on, cells need two views that agree."""
 AGREE = 0.45
@@ -30,7 +31,9 @@ AGREE = 0.45
 SPLIT = (3, 5)
 """Rounds in which merged masks are split."""
 JOINS = 4
+"""Largest number of passes in which small clusters join larger ones."""
 UNKNOWN = -1
+"""Pixel value where the content is unknown."""
 
 
 class FrameMasks(NamedTuple):
@@ -66,9 +69,10 @@ def associate(
 ) -> Tracks:
     """Find the object that each mask shows.
 
-    Poses have OpenCV axes and metres; which way is up does not matter. `given` are the ids that the
-    masks had. Where they turn out to mean something across views, they are evidence, too, and no
-    mask is split: right ids stay as they are, broken and mixed ones are mended.
+    Args:
+        world_to_camera: Poses with OpenCV axes, in metres; the direction of up does not matter.
+        given: The masks' original ids. If they are consistent across views (`id_odds`), they are
+            used as evidence, and no mask is split: right ids stay as they are, others are repaired.
     """
     if not len(masks.mask_class):
         return Tracks(np.minimum(masks.ids, 0), masks.mask_class)
@@ -83,10 +87,9 @@ def associate(
     size, area = np.bincount(labels), np.bincount(labels, pixels)
     kept = (area > 0) & ((size > 1) | (area > speck * parts.ids[0].size))
     number = np.where(kept, np.cumsum(kept), UNKNOWN)
-    of_id = np.concatenate([[0], number[labels]])
-    ids = np.where(parts.ids < 0, UNKNOWN, of_id[np.maximum(parts.ids, 0)]).astype(np.int32)
-    classes = [np.bincount(parts.mask_class[labels == k]).argmax() for k in np.flatnonzero(kept)]
-    return Tracks(ids, np.array(classes, dtype=np.int64))
+    object_of_id = np.concatenate([[0], number[labels]])
+    ids = np.where(parts.ids < 0, UNKNOWN, object_of_id[np.maximum(parts.ids, 0)]).astype(np.int32)
+    return Tracks(ids, main_classes(labels, parts.mask_class)[kept])
 
 
 def _labels(
@@ -95,10 +98,10 @@ def _labels(
     intrinsics: np.ndarray,
     odds: np.ndarray | None = None,
 ) -> tuple[FrameMasks, Int[np.ndarray, " masks"]]:
-    """The masks, merged ones split, and the number of the object, from 0, that each shows.
+    """The masks after merged ones are split, and the cluster of each.
 
-    `odds`, (masks, masks), are further weights of pairs, from ids that mean something: then masks
-    are neither split nor joined by hulls.
+    `odds`, (masks, masks), are the log-odds of `id_odds`, added to the weights of pairs. With them,
+    masks are neither split nor joined by hulls.
     """
     step = max(1, round(STEP * max(masks.ids.shape[1:]) / 480))
     cameras = cameras_of(world_to_camera, intrinsics, step)
@@ -107,20 +110,20 @@ def _labels(
     grid = fill(near, cameras)
     for number in range(ROUNDS):
         depth = first_hits(ids, cameras, grid)
-        cells, shown = surface(near, cameras, grid, depth)
-        weights = pair_weights(shown, view, classes) + (0.0 if odds is None else odds)
+        seen = surface(near, cameras, grid, depth)
+        weights = pair_weights(seen.shown, view, classes) + (0.0 if odds is None else odds)
         labels = cluster(weights)
         split: Split = []
         if odds is None and number in SPLIT:
-            full, split = split_merged(masks.ids, step, cells, shown, labels, view, cameras, grid)
+            full, split = split_merged(masks.ids, step, seen, labels, view, cameras, grid)
         if split:
-            main = [np.bincount(classes[labels == other]).argmax() for _, other in split]
+            main = main_classes(labels, classes)[[other for _, other in split]]
             masks = FrameMasks(full, np.concatenate([classes, main]))
             ids = np.ascontiguousarray(masks.ids[:, ::step, ::step])
             near, classes = widened(ids), masks.mask_class
             view = np.concatenate([view, view[[mask for mask, _ in split]]])
         elif number < ROUNDS - 1:
-            _carve(grid, cells, owners(shown, labels), shown, number >= STRICT)
+            _carve(grid, seen, labels, number >= STRICT)
     for _ in range(JOINS if odds is None else 0):
         share = explained(ids, near, labels, cameras, grid)
         joined = join_leftovers(labels, share, weights, view, classes)
@@ -130,12 +133,10 @@ def _labels(
     return masks, labels
 
 
-def _carve(
-    grid: Grid, cells: np.ndarray, votes: np.ndarray, shown: np.ndarray, strict: bool
-) -> None:
+def _carve(grid: Grid, seen: Surface, labels: np.ndarray, strict: bool) -> None:
     """Empty the cells whose views show different clusters, or background."""
-    most, seen = votes.max(axis=1), (shown >= 0).sum(axis=1)
-    wrong = (seen >= 3) & (most < AGREE * seen)
+    most, views = votes_of(seen.shown, labels).max(axis=1), (seen.shown >= 0).sum(axis=1)
+    wrong = (views >= 3) & (most < AGREE * views)
     if strict:
         wrong |= most < 2
-    grid.filled[tuple(cells[wrong].T)] = False
+    grid.filled[tuple(seen.cells[wrong].T)] = False

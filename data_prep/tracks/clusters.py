@@ -1,9 +1,9 @@
-"""Clusters masks so that the sum of the weights of pairs in one cluster is greatest.
+"""Clusters of masks with the greatest sum of the weights of all pairs in one cluster.
 
 Correlation clustering (Bansal et al., "Correlation clustering", Machine Learning 2004): a positive
 weight says that two masks show one object, a negative one that they do not. The number of clusters
-is not given. Greedy contraction of pairs comes first, then moves of single masks, in turns until
-neither gains (Keuper et al., "Efficient decomposition of image and mesh graphs by lifted
+is not given. Greedy contraction of pairs and moves of single masks alternate until neither
+increases the sum (Keuper et al., "Efficient decomposition of image and mesh graphs by lifted
 multicuts", ICCV 2015).
 """
 
@@ -27,16 +27,16 @@ def cluster(weights: Float[np.ndarray, "masks masks"]) -> Int[np.ndarray, " mask
     return labels
 
 
-def total_weight(
-    weights: Float[np.ndarray, "masks masks"], labels: Int[np.ndarray, " masks"]
-) -> float:
-    """The objective: the sum of the weights of all pairs of different masks in one cluster."""
-    same = labels[:, None] == labels
-    return float(np.triu(weights * same, 1).sum())
+def main_classes(
+    labels: Int[np.ndarray, " masks"], mask_class: Int[np.ndarray, " masks"]
+) -> Int[np.ndarray, " clusters"]:
+    """The most frequent class among the masks of each cluster."""
+    clusters = range(int(labels.max()) + 1)
+    return np.array([np.bincount(mask_class[labels == k]).argmax() for k in clusters])
 
 
 def _contract(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Join the two clusters whose pairs weigh most, as long as that is above zero."""
+    """Join the two clusters with the largest weight between them, as long as it is positive."""
     member = np.eye(labels.max() + 1)[labels] if len(labels) else np.zeros((0, 0))
     between = member.T @ weights @ member
     np.fill_diagonal(between, -np.inf)
@@ -62,7 +62,7 @@ def _contract(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def _move(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Move single masks to the cluster, or to one of their own, that gains most."""
+    """Move each mask to the cluster that gains most, or to a new one if all others lose."""
     count = len(labels)
     labels = labels.copy()
     gains = np.zeros((count, count + 1))
@@ -76,7 +76,7 @@ def _move(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
             if gains[k, best] <= max(gains[k, own], 0.0) + 1e-9:
                 if gains[k, own] >= -1e-9:
                     continue
-                # Alone it gains nothing, which is more than in its cluster.
+                # A new cluster gains 0, which is more than staying.
                 best = int(np.setdiff1d(np.arange(count + 1), labels)[0])
             gains[:, own] -= weights[:, k]
             gains[:, best] += weights[:, k]

@@ -1,14 +1,15 @@
-"""The share of each mask whose rays pass through the visual hull of each cluster of masks."""
+"""Share of each mask's rays that pass through the visual hull of each cluster of masks."""
 
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numba import njit
 
-from data_prep.tracks.voxels import Cameras, Grid, pixel_of
+from data_prep.tracks.rays import cell_at, direction_of, ids_at, span_of, votes_of
+from data_prep.tracks.voxels import Cameras, Grid
 
-VIEWS_AT_LEAST = 2
+LEAST_VIEWS = 2
 """Smallest number of views, other than the mask's own, that show the cluster in a cell of its
 hull."""
 PAST = 0.3
@@ -28,90 +29,60 @@ def explained(
 
     A cell is in the hull if at least two views show the cluster there and few see background.
     Masks of other clusters are no evidence, since they may be in front. The hull of a mask's own
-    cluster is computed without the mask's view. `near` are the ids with masks widened by a pixel.
+    cluster is computed without the mask's view. `near` are the ids after `widened`.
     """
-    clusters = int(labels.max()) + 1
-    full = np.concatenate([[-1], labels]).astype(np.int32)
-    shown = np.where(ids < 0, -2, full[np.maximum(near, 0)]).astype(np.int32)
     cells = np.argwhere(grid.filled)
-    row = np.full(grid.filled.shape, -1, dtype=np.int32)
-    row[tuple(cells.T)] = np.arange(len(cells))
-    own = np.zeros((len(cells), clusters), dtype=np.int16)
-    past = np.zeros(len(cells), dtype=np.int16)
-    _count(cells, shown, cameras.to_image, grid.low_m, grid.cell_m, own, past)
-    met = np.zeros((len(labels), clusters))
-    rays = np.zeros(len(labels))
-    _follow(
-        ids, shown, cameras.eyes_m, cameras.rays, grid.low_m, grid.cell_m, row, own, past, met, rays
-    )
+    row_of_cell = np.full(grid.filled.shape, -1, dtype=np.int32)
+    row_of_cell[tuple(cells.T)] = np.arange(len(cells))
+    anywhere = np.full(ids.shape, np.inf, dtype=np.float32)
+    shown = ids_at(cells, near, cameras, grid, anywhere)
+    votes, past = votes_of(shown, labels), (shown == 0).sum(axis=1)
+    met, rays = _follow(
+        ids, labels, cameras.eyes_m, cameras.rays, grid.low_m, grid.cell_m, row_of_cell,
+        _in_hull(votes, past), _in_hull(votes - 1, past),
+    )  # fmt: skip
     return met / np.maximum(rays, 1)[:, None]
 
 
-# no_type_check: what Numba compiles has no annotations.
-@njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
-def _count(cells, shown, to_image, low_m, cell_m, own, past):
-    views, height, width = shown.shape
-    for i in range(len(cells)):
-        x = low_m[0] + (cells[i, 0] + 0.5) * cell_m
-        y = low_m[1] + (cells[i, 1] + 0.5) * cell_m
-        z = low_m[2] + (cells[i, 2] + 0.5) * cell_m
-        for view in range(views):
-            line, column, _ = pixel_of(to_image[view], x, y, z, height, width)
-            if line < 0:
-                continue
-            label = shown[view, line, column]
-            if label == -1:
-                past[i] += 1
-            elif label >= 0:
-                own[i, label] += 1
+def _in_hull(
+    votes: Int[np.ndarray, "cells clusters"], past: Int[np.ndarray, " cells"]
+) -> Bool[np.ndarray, "cells clusters"]:
+    """True for cells in a cluster's hull, by the views that show it there or see past it."""
+    few = past[:, None] <= PAST * (votes + past[:, None]) + 0.5
+    return np.asarray((votes >= LEAST_VIEWS) & few)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+# no_type_check: functions compiled by Numba have no annotations.
+@njit(cache=True, nogil=True)
 @no_type_check
-def _follow(ids, shown, eyes_m, rays, low_m, cell_m, row, own, past, met, count):
+def _follow(ids, labels, eyes_m, rays, low_m, cell_m, row_of_cell, hulls, hulls_without):
+    """Rays of each mask that meet each cluster's hull, and all rays of each mask;
+    `hulls_without` are the hulls with a view less."""
     views, height, width = ids.shape
-    shape, clusters = row.shape, own.shape[1]
+    clusters = hulls.shape[1]
+    met, count = np.zeros((len(labels), clusters)), np.zeros(len(labels))
     passed = np.zeros(clusters, np.bool_)
-    d = np.empty(3)
-    for view in range(views):
-        eye, r = eyes_m[view], rays[view]
-        for y in range(0, height, EVERY):
-            for x in range(0, width, EVERY):
-                mask = ids[view, y, x] - 1
-                if mask < 0:
-                    continue
-                label = shown[view, y, x]
-                count[mask] += 1
-                passed[:] = False
-                length = 0.0
-                near, far = 0.0, 1e9
-                for axis in range(3):
-                    d[axis] = r[axis, 0] * (x + 0.5) + r[axis, 1] * (y + 0.5) + r[axis, 2]
-                    length += d[axis] * d[axis]
-                    one = (low_m[axis] - eye[axis]) / d[axis]
-                    two = one + shape[axis] * cell_m / d[axis]
-                    near, far = max(near, min(one, two)), min(far, max(one, two))
-                stride = 0.7 * cell_m / np.sqrt(length)
-                t = near + 0.5 * stride
-                last = -1
-                while t < far:
-                    i = int((eye[0] + t * d[0] - low_m[0]) / cell_m)
-                    j = int((eye[1] + t * d[1] - low_m[1]) / cell_m)
-                    k = int((eye[2] + t * d[2] - low_m[2]) / cell_m)
-                    t += stride
-                    if not (0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]):
-                        continue
-                    cell = row[i, j, k]
-                    if cell < 0 or cell == last:
-                        continue
-                    last = cell
-                    for other in range(clusters):
-                        views_for = own[cell, other] - (1 if other == label else 0)
-                        if views_for < VIEWS_AT_LEAST:
-                            continue
-                        if past[cell] <= PAST * (views_for + past[cell]) + 0.5:
-                            passed[other] = True
-                for other in range(clusters):
-                    if passed[other]:
-                        met[mask, other] += 1
+    for view, half_y, half_x in np.ndindex((views, -(-height // EVERY), -(-width // EVERY))):
+        y, x = half_y * EVERY, half_x * EVERY
+        mask = ids[view, y, x] - 1
+        if mask < 0:
+            continue
+        count[mask] += 1
+        passed[:] = False
+        eye, direction = eyes_m[view], direction_of(rays[view], y, x)
+        near, far, length = span_of(eye, direction, low_m, cell_m, row_of_cell.shape)
+        stride = 0.7 * cell_m / length
+        t = near + 0.5 * stride
+        last = -1
+        while t < far:
+            cell = cell_at(eye, direction, t, low_m, cell_m, row_of_cell.shape)
+            t += stride
+            row = row_of_cell[cell] if cell[0] >= 0 else -1
+            if row < 0 or row == last:
+                continue
+            last = row
+            for other in range(clusters):
+                own = other == labels[mask]
+                passed[other] |= hulls_without[row, other] if own else hulls[row, other]
+        met[mask] += passed
+    return met, count

@@ -3,15 +3,16 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from data_prep.tracks.affinity import CLASS_ERROR
+from data_prep.tracks.affinity import CLASS_ERROR, class_odds
+from data_prep.tracks.clusters import main_classes
 
 ENOUGH = 0.6
-"""Share of a mask's rays that must meet a cluster's hull for the hull to speak for joining."""
-HULL, CLASS, PAIRS, ONE_VIEW = 4.0, 1.0, 2.0, -2.0
+"""Share of a mask's rays that must meet a cluster's hull for the hull to favour joining."""
+HULL, CLASS, PAIRS, SAME_VIEWS = 4.0, 1.0, 2.0, -2.0
 """Weights of hulls, of classes, of the mean weight of pairs, and of common views."""
 FEW = 6.0
-"""Gain of joining a cluster of one mask, whatever the other: most objects are seen more often. It
-is divided by the number of masks."""
+"""Gain of joining a cluster of one mask to any other, since most objects are seen more often; a
+cluster of n masks gains a part n of it."""
 
 
 def join_leftovers(
@@ -21,13 +22,17 @@ def join_leftovers(
     mask_view: Int[np.ndarray, " masks"],
     mask_class: Int[np.ndarray, " masks"],
 ) -> Int[np.ndarray, " masks"]:
-    """Join each cluster, the smallest first, to the larger one that gains most, if any gains.
+    """Join each cluster, the smallest first, to the larger cluster with the largest gain, if that
+    is positive.
 
-    The gain is HULL times the excess over `ENOUGH` of the mean share of the smaller cluster's rays
-    that meet the larger one's hull (scaled to 0 to 1; three times as steep below), plus CLASS times
-    the log-odds of the classes, plus PAIRS times the mean weight of pairs of different views, plus
-    ONE_VIEW times the share of the smaller cluster's views that show both clusters, plus FEW over
-    the number of its masks.
+    The gain is the sum of
+
+    - HULL times the excess over `ENOUGH` of the mean share of the smaller cluster's rays that meet
+      the larger one's hull (scaled to 0 to 1; three times as steep below),
+    - CLASS times the log-odds of the classes,
+    - PAIRS times the mean weight of pairs of different views,
+    - SAME_VIEWS times the share of the smaller cluster's views that show both clusters, and
+    - FEW divided by the number of the smaller cluster's masks.
     """
     count = int(labels.max()) + 1
     size = np.bincount(labels, minlength=count)
@@ -36,11 +41,8 @@ def join_leftovers(
     member = np.eye(count)[labels]
     between = np.where(mask_view[:, None] == mask_view, 0.0, weights)
     mean = member.T @ between @ member / np.maximum(size[:, None] * size, 1)
-    main = np.array([np.bincount(mask_class[labels == k]).argmax() for k in range(count)])
-    frequency = np.bincount(mask_class) / len(mask_class)
-    agree = float((frequency**2).sum())
-    equal = np.log((1 - CLASS_ERROR) / agree)
-    unequal = np.log(CLASS_ERROR / (1 - agree + 1e-3))
+    main = main_classes(labels, mask_class)
+    equal, unequal = class_odds(mask_class, CLASS_ERROR)
     into = np.arange(count)
     for k in np.argsort(size, kind="stable").tolist():
         own = labels == k
@@ -48,12 +50,12 @@ def join_leftovers(
         open_to[k] = False
         above = (share[own].mean(axis=0) - ENOUGH) / (1 - ENOUGH)
         alike = (mask_class[own][:, None] == main).mean(axis=0)
-        shared = ((masks_in[k] > 0) & (masks_in > 0)).sum(axis=1) / (masks_in[k] > 0).sum()
+        common = ((masks_in[k] > 0) & (masks_in > 0)).sum(axis=1) / (masks_in[k] > 0).sum()
         gain = (
             HULL * np.where(above > 0, above, 3 * above * (1 - ENOUGH))
             + CLASS * (alike * equal + (1 - alike) * unequal)
             + PAIRS * mean[k]
-            + ONE_VIEW * shared
+            + SAME_VIEWS * common
             + FEW / size[k]
         )
         gain[~open_to] = -np.inf

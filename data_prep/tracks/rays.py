@@ -1,19 +1,28 @@
-"""The cells that each view sees first, and what the other views show in their place."""
+"""First filled cells on the rays of masks, and the ids that the views show at cells."""
 
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 from scipy import ndimage
 
-from data_prep.tracks.voxels import Cameras, Grid, pixel_of
+from data_prep.tracks.voxels import Cameras, Grid, centre_of, pixel_of
 
 WIDEN_PX = 1.5
-"""Sampled pixels by which masks are widened where views are compared: outlines, cells and poses
-are not exact."""
+"""Sampled pixels by which masks are widened before views are compared, since outlines, cells and
+poses are not exact."""
 BEHIND = 1.5
 """Cells by which a cell may lie behind the first one of a ray and still count as seen."""
+
+
+class Surface(NamedTuple):
+    """Cells that are the first filled one on some ray."""
+
+    cells: Int[np.ndarray, "cells 3"]
+    shown: Int[np.ndarray, "cells views"]
+    """The id that each view shows at the cell: 0 for background, -1 if the view does not see the
+    cell, because it lies outside the image, in unknown pixels, or behind other filled cells."""
 
 
 def widened(ids: Int[np.ndarray, "views height width"]) -> Int[np.ndarray, "views height width"]:
@@ -30,11 +39,9 @@ def widened(ids: Int[np.ndarray, "views height width"]) -> Int[np.ndarray, "view
 def first_hits(
     ids: Int[np.ndarray, "views height width"], cameras: Cameras, grid: Grid
 ) -> Float[np.ndarray, "views height width"]:
-    """Depth in metres of the first filled cell along the ray of each pixel of a mask; inf without
-    one."""
-    depth = np.full(ids.shape, np.inf, dtype=np.float32)
-    _march(ids, cameras.eyes_m, cameras.rays, grid.low_m, grid.cell_m, grid.filled, depth)
-    return depth
+    """Depth in metres of the first filled cell along the ray of each mask pixel; inf if there is
+    none."""
+    return _first_hits(ids, cameras.eyes_m, cameras.rays, *grid)
 
 
 def surface(
@@ -42,93 +49,123 @@ def surface(
     cameras: Cameras,
     grid: Grid,
     depth: Float[np.ndarray, "views height width"],
-) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, "cells views"]]:
-    """Cells that some view sees first, and the id that each view shows there.
-
-    The id is 0 for background, and -1 where a view sees nothing of the cell: out of the image, in
-    unknown pixels, or behind other filled cells.
-    """
-    hit = np.zeros_like(grid.filled)
-    _mark(ids, cameras.eyes_m, cameras.rays, grid.low_m, grid.cell_m, depth, hit)
+) -> Surface:
+    """Find the cells at the depths of `first_hits`, and the ids that all views show there."""
+    hit = _cells_at(depth, cameras.eyes_m, cameras.rays, *grid)
     cells = np.argwhere(hit & grid.filled)
-    shown = np.full((len(cells), len(ids)), -1, dtype=np.int32)
-    _look(cells, ids, cameras.to_image, grid.low_m, grid.cell_m, depth, shown)
-    return cells, shown
+    return Surface(cells, ids_at(cells, ids, cameras, grid, depth))
 
 
-# no_type_check: what Numba compiles has no annotations.
+def ids_at(
+    cells: Int[np.ndarray, "cells 3"],
+    ids: Int[np.ndarray, "views height width"],
+    cameras: Cameras,
+    grid: Grid,
+    depth: Float[np.ndarray, "views height width"],
+) -> Int[np.ndarray, "cells views"]:
+    """The id that each view shows at each cell, as in `Surface.shown`. `depth` is that of the first
+    filled cells; inf ignores occlusion."""
+    return _ids_at(cells, ids, cameras.to_image, grid.low_m, grid.cell_m, depth)
+
+
+def votes_of(
+    shown: Int[np.ndarray, "cells views"], labels: Int[np.ndarray, " masks"]
+) -> Int[np.ndarray, "cells clusters"]:
+    """Number of views that show each cluster of masks at each cell."""
+    clusters = int(labels.max()) + 1
+    rows, views = np.nonzero(shown > 0)
+    index = rows * clusters + labels[shown[rows, views] - 1]
+    return np.bincount(index, minlength=len(shown) * clusters).reshape(-1, clusters)
+
+
+# no_type_check: functions compiled by Numba have no annotations.
 @njit(cache=True, nogil=True)
 @no_type_check
-def _march(ids, eyes_m, rays, low_m, cell_m, filled, found):
-    views, height, width = ids.shape
-    shape = filled.shape
-    for view in range(views):
-        eye, r = eyes_m[view], rays[view]
-        for row in range(height):
-            for column in range(width):
-                if ids[view, row, column] <= 0:
-                    continue
-                u, v = column + 0.5, row + 0.5
-                d = np.empty(3)
-                length = 0.0
-                for axis in range(3):
-                    d[axis] = r[axis, 0] * u + r[axis, 1] * v + r[axis, 2]
-                    length += d[axis] * d[axis]
-                near, far = 0.0, 1e9
-                for axis in range(3):
-                    one = low_m[axis] - eye[axis]
-                    two = one + shape[axis] * cell_m
-                    if abs(d[axis]) < 1e-12:
-                        if one > 0 or two < 0:
-                            far = -1.0
-                        continue
-                    a, b = one / d[axis], two / d[axis]
-                    near, far = max(near, min(a, b)), min(far, max(a, b))
-                stride = 0.5 * cell_m / np.sqrt(length)
-                t = near + 0.5 * stride
-                while t < far:
-                    i = int((eye[0] + t * d[0] - low_m[0]) / cell_m)
-                    j = int((eye[1] + t * d[1] - low_m[1]) / cell_m)
-                    k = int((eye[2] + t * d[2] - low_m[2]) / cell_m)
-                    inside = 0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]
-                    if inside and filled[i, j, k]:
-                        found[view, row, column] = t
-                        break
-                    t += stride
+def direction_of(rays, row, column):
+    """World direction, of depth 1, of the ray of a pixel's centre."""
+    u, v = column + 0.5, row + 0.5
+    x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
+    y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
+    z = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
+    return x, y, z
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _mark(ids, eyes_m, rays, low_m, cell_m, depth, hit):
-    views, height, width = ids.shape
-    for view in range(views):
-        eye, r = eyes_m[view], rays[view]
-        for row in range(height):
-            for column in range(width):
-                t = depth[view, row, column]
-                if not t < 1e9:
-                    continue
-                u, v = column + 0.5, row + 0.5
-                i = int((eye[0] + t * (r[0, 0] * u + r[0, 1] * v + r[0, 2]) - low_m[0]) / cell_m)
-                j = int((eye[1] + t * (r[1, 0] * u + r[1, 1] * v + r[1, 2]) - low_m[1]) / cell_m)
-                k = int((eye[2] + t * (r[2, 0] * u + r[2, 1] * v + r[2, 2]) - low_m[2]) / cell_m)
-                if 0 <= i < hit.shape[0] and 0 <= j < hit.shape[1] and 0 <= k < hit.shape[2]:
-                    hit[i, j, k] = True
+def span_of(eye_m, direction, low_m, cell_m, shape):
+    """Depths at which a ray enters and leaves a grid, and the ray's length per metre of depth."""
+    near, far, squared = 0.0, 1e9, 0.0
+    for axis in range(3):
+        squared += direction[axis] * direction[axis]
+        low = low_m[axis] - eye_m[axis]
+        high = low + shape[axis] * cell_m
+        if abs(direction[axis]) < 1e-12:
+            if low > 0 or high < 0:
+                far = -1.0
+            continue
+        a, b = low / direction[axis], high / direction[axis]
+        near, far = max(near, min(a, b)), min(far, max(a, b))
+    return near, far, np.sqrt(squared)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def cell_at(eye_m, direction, depth, low_m, cell_m, shape):
+    """The cell (i, j, k) at a depth along a ray; (-1, -1, -1) outside the grid."""
+    i = int((eye_m[0] + depth * direction[0] - low_m[0]) / cell_m)
+    j = int((eye_m[1] + depth * direction[1] - low_m[1]) / cell_m)
+    k = int((eye_m[2] + depth * direction[2] - low_m[2]) / cell_m)
+    if 0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]:
+        return i, j, k
+    return -1, -1, -1
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _first_hits(ids, eyes_m, rays, low_m, cell_m, filled):
+    depth = np.full(ids.shape, np.inf, np.float32)
+    for view, row, column in np.ndindex(ids.shape):
+        if ids[view, row, column] <= 0:
+            continue
+        eye, direction = eyes_m[view], direction_of(rays[view], row, column)
+        near, far, length = span_of(eye, direction, low_m, cell_m, filled.shape)
+        stride = 0.5 * cell_m / length
+        t = near + 0.5 * stride
+        while t < far:
+            cell = cell_at(eye, direction, t, low_m, cell_m, filled.shape)
+            if cell[0] >= 0 and filled[cell]:
+                depth[view, row, column] = t
+                break
+            t += stride
+    return depth
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _cells_at(depth, eyes_m, rays, low_m, cell_m, filled):
+    hit = np.zeros_like(filled)
+    for view, row, column in np.ndindex(depth.shape):
+        t = depth[view, row, column]
+        if t < 1e9:
+            direction = direction_of(rays[view], row, column)
+            cell = cell_at(eyes_m[view], direction, t, low_m, cell_m, filled.shape)
+            if cell[0] >= 0:
+                hit[cell] = True
+    return hit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _look(cells, ids, to_image, low_m, cell_m, depth, shown):
+def _ids_at(cells, ids, to_image, low_m, cell_m, depth):
     views, height, width = ids.shape
+    shown = np.full((len(cells), views), -1, np.int32)
     for i in range(len(cells)):
-        x = low_m[0] + (cells[i, 0] + 0.5) * cell_m
-        y = low_m[1] + (cells[i, 1] + 0.5) * cell_m
-        z = low_m[2] + (cells[i, 2] + 0.5) * cell_m
+        centre = centre_of(cells[i], low_m, cell_m)
         for view in range(views):
-            row, column, far = pixel_of(to_image[view], x, y, z, height, width)
+            row, column, far = pixel_of(to_image[view], centre, height, width)
             if row < 0:
                 continue
             number = ids[view, row, column]
-            if number < 0 or (number > 0 and far > depth[view, row, column] + BEHIND * cell_m):
-                continue
-            shown[i, view] = number
+            if number >= 0 and (number == 0 or far <= depth[view, row, column] + BEHIND * cell_m):
+                shown[i, view] = number
+    return shown

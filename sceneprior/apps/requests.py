@@ -1,4 +1,4 @@
-"""Requests for rooms as files, and floors in files of other programs."""
+"""Files of requests, and requests whose floor is in a file of another program."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,7 +18,7 @@ _Pair = Annotated[tuple[float, float], Field(strict=False)]
 
 
 class RelationEntry(BaseModel):
-    """A relation of a request."""
+    """Entry of a relation in a request's JSON."""
 
     model_config = _STRICT
 
@@ -29,7 +29,7 @@ class RelationEntry(BaseModel):
 
 
 class OpeningEntry(BaseModel):
-    """A door or a window of a request, with both ends."""
+    """Entry of a door or a window, with both ends, in a request's JSON."""
 
     model_config = _STRICT
 
@@ -55,7 +55,7 @@ class RequestFile(BaseModel):
 
 
 def load_request(path: str | Path) -> dict[str, Any]:
-    """A request's file as arguments of `Prior.sample`: `prior.sample(4, **load_request(path))`.
+    """Read a request from JSON, as arguments for `prior.sample(4, **load_request(path))`.
 
     Raises:
         InputError: the file is no request.
@@ -82,8 +82,8 @@ def load_request(path: str | Path) -> dict[str, Any]:
 
 
 def with_floor_of_file(asked: dict[str, Any]) -> dict[str, Any]:
-    """A request whose floor, if it names a file, is read from there, with its doors, windows and
-    ceiling unless the request has its own.
+    """Replace the name of a file in a request by the floor that the file holds. Doors, windows and
+    ceiling are taken from the file, too, unless the request has its own.
 
     Raises:
         InputError: the file has no floor.
@@ -105,10 +105,10 @@ def _is_file(floor: str) -> bool:
 
 
 def merged(asked: dict[str, Any], file: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of a request and of a request's file, of which each part may be in one alone.
+    """Merge the arguments of a request with those of a request's file.
 
     Raises:
-        InputError: both have a part.
+        InputError: an argument is in both.
     """
     own = {key: value for key, value in asked.items() if value is not None}
     if both := sorted(own.keys() & file.keys()):

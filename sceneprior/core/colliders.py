@@ -20,18 +20,19 @@ MOUNTED_M = 0.4
 CONCAVITY = 0.05
 """Threshold of CoACD: the largest concavity of a part that is not divided further."""
 MOST_COMPONENTS = 200
-"""Largest number of closed components of a mesh that become bodies of their own."""
+"""Largest number of closed components into which a mesh is divided."""
 SEARCH = {"mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000}
-"""A shorter search than CoACD's own: 0.5 s of CPU time an object for 1.3, with as many parts."""
+"""A shorter search than CoACD's default: 0.5 s of CPU time per object in place of 1.3 s, with the
+same number of parts."""
 LEAST_M3 = 1e-9
-"""Volume of a flat body, which has none."""
+"""Volume assumed for flat bodies."""
 _FILL = {
     "box": 1.0, "cylinder": np.pi / 4, "ellipsoid": np.pi / 6, "dome": np.pi / 6, "bowl": np.pi / 6,
 }  # fmt: skip
 
 
 def is_fixed(item: SceneObject) -> bool:
-    """True for objects that hang: simulators hold them in place."""
+    """True for objects that hang, which simulators hold in place."""
     bottom_m = item.center_m[1] - item.size_m[1] / 2
     return item.label in HUNG or (item.label in MOUNTED and bottom_m > MOUNTED_M)
 
@@ -54,16 +55,16 @@ def colliders(item: SceneObject) -> tuple[Solid | Mesh, ...]:
 def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
     """Convex meshes whose union approximates a mesh.
 
-    A mesh of at most `MOST_COMPONENTS` closed components, as furniture made of parts is, is divided
-    into them first: a component that is nearly convex is replaced by its convex hull. CoACD divides
-    the others; if it is not installed, they are replaced by their hulls, too.
+    A mesh that consists of at most `MOST_COMPONENTS` closed components, such as furniture made of
+    parts, is first divided into these. Nearly convex components are replaced by their convex hulls.
+    CoACD decomposes the others; if it is not installed, they are replaced by their hulls, too.
     """
     return tuple(part for piece in closed_components(mesh) for part in _divided(piece))
 
 
 def closed_components(mesh: Mesh) -> list[Mesh]:
-    """The connected components of a mesh if all are closed, face outwards and are few; else the
-    mesh alone."""
+    """The connected components of a mesh, if all are closed, with outward faces, and there are few;
+    else the whole mesh."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -82,13 +83,13 @@ def closed_components(mesh: Mesh) -> list[Mesh]:
     for name in names:
         used, corners = np.unique(faces[of_face == name], return_inverse=True)
         pieces.append(Mesh(mesh.vertices_m[used], corners.reshape(-1, 3)))
-    # A component that faces inwards is a cavity of another.
+    # A component with inward faces is a cavity of another component.
     outward = all(volume_and_centroid(piece)[0] > LEAST_M3 for piece in pieces)
     return pieces if pieces and outward else [mesh]
 
 
 def _divided(mesh: Mesh) -> tuple[Mesh, ...]:
-    """The convex hull of a connected mesh that is nearly convex; else CoACD's parts of it."""
+    """The convex hull of a mesh that is nearly convex, else the mesh's decomposition by CoACD."""
     coacd = _coacd()
     hull = Mesh(*convex_surface(np.asarray(mesh.vertices_m, dtype=np.float64)))
     if coacd is None or not len(hull.faces):

@@ -1,4 +1,4 @@
-"""Feet for furniture whose centre of mass does not lie above what it stands on."""
+"""Feet for furniture that would fall over: its centre of mass lies outside its support polygon."""
 
 from dataclasses import replace
 
@@ -17,19 +17,19 @@ distance from the outline of the object seen from above."""
 WIDE_M = 0.05
 """Width of a foot."""
 LOWER = 0.2
-"""Share of a body's height, from below, within which a foot may end."""
+"""Lower part of a body, as a share of its height, that a foot may support."""
 HIGH = 0.3
-"""Cost of a metre of height between floor and body, relative to a metre of distance from the
-corner, when a foot chooses the body that it supports."""
+"""Cost of a metre between the floor and a body, relative to a metre between the corner and the
+foot, in the choice of the body that a foot supports."""
 INTO_M = 0.01
 """Length by which a foot reaches into the body above it."""
 
 
 def with_feet(item: SceneObject) -> SceneObject:
-    """The object, with feet near its four corners if it would fall over otherwise.
+    """The object, with feet near its four corners if it would fall over without them.
 
-    Feet are boxes, which are added to the object's solids and mesh. A corner where a body already
-    stands on the floor gets none.
+    Feet are boxes, added to the object's solids and mesh. A corner near which a body already stands
+    on the floor gets none.
     """
     if stands_safely(item):
         return item
@@ -40,8 +40,8 @@ def with_feet(item: SceneObject) -> SceneObject:
 
 
 def stands_safely(item: SceneObject) -> bool:
-    """True if the centre of mass lies well inside (`MARGIN`) the convex hull of the object's
-    contacts with the floor, seen from above."""
+    """True if the centre of mass lies inside the object's support polygon, which is the convex hull
+    of its contacts with the floor seen from above, with a margin (`MARGIN`)."""
     bodies = colliders(item)
     points = np.concatenate([points_of(body) for body in bodies])
     low = points[points[:, 1] <= points[:, 1].min() + CONTACT_M][:, ::2]
@@ -80,8 +80,8 @@ def _feet(bodies: tuple[Solid | Mesh, ...]) -> tuple[Solid, ...]:
 def _under(
     clouds: list[Float[np.ndarray, "_ 3"]], at: Float[np.ndarray, "2"], floor_m: float
 ) -> tuple[Float[np.ndarray, "2"], float]:
-    """The place near a corner where a foot meets a body from below, and the height of the foot's
-    top. Places near the corner, under low bodies, are preferred."""
+    """Position (x, z) and top of the foot of a corner, `at`: it supports the body with the lowest
+    cost, which prefers low bodies near the corner."""
     found = []
     for points in clouds:
         # Only the lower part, because the rim of a round body may be as high as the object.

@@ -7,11 +7,11 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 
 MARGIN_M = 0.2
-"""Distance between furniture and the floor's edge where no floor is known."""
+"""Distance between furniture and the edge of the assumed floor of scenes without one."""
 
 
 def floor_polygon(scene: Scene) -> shapely.Geometry | None:
-    """Polygon of a scene's floor; None if the scene has no outline."""
+    """The floor of a scene as a polygon; None if the scene has no outline."""
     if scene.floor_m is None:
         return None
     outline = np.asarray(scene.floor_m, dtype=np.float64)
@@ -26,10 +26,8 @@ def floor_polygon(scene: Scene) -> shapely.Geometry | None:
 
 
 def floor_rectangle(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper (x, z) of the rectangle around the floor.
-
-    Without a known floor, it is the rectangle around the objects with a margin of 20 cm.
-    """
+    """Lower and upper corner (x, z) of the rectangle around the floor; without a known floor, of
+    the rectangle around the objects with a margin of 20 cm."""
     if scene.floor_m is not None and len(scene.floor_m):
         outline = np.asarray(scene.floor_m, dtype=np.float64)
         return outline.min(0), outline.max(0)

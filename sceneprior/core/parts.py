@@ -1,11 +1,10 @@
-"""Furniture as a few solid parts, cut to an outline: boxes, upright cylinders, ellipsoids and their
-halves.
+"""Furniture as a few solid parts cut to an outline: boxes, upright cylinders, ellipsoids and half
+ellipsoids.
 
 Parts lie in the frame of their object's box, which spans [-0.5, 0.5] along each axis. A part may be
-mirrored to the other side of the frame along x, along z, or along both, so one part can be all four
-legs of a table. Every part is convex. An object is the union of its parts within its outline, a
-polygon that limits it as seen from above: the side of a sofa may be curved though its parts are
-boxes.
+mirrored to the other side of the frame along x, along z, or along both, so that one part can be all
+four legs of a table. Every part is convex. An object is the union of its parts, cut to its outline,
+which is a polygon seen from above: a sofa may have a curved side although its parts are boxes.
 """
 
 from collections.abc import Iterator
@@ -17,22 +16,20 @@ from jaxtyping import Bool, Float, Int
 
 KINDS = 5
 BOX, CYLINDER, ELLIPSOID, DOME, BOWL = range(KINDS)
-"""Kinds of parts: each fills its own box as far as its kind can. A cylinder stands upright; a dome
-is the upper half of an ellipsoid, a bowl the lower half."""
+"""Kinds of parts. A part is inscribed in its box. Cylinders are upright; a dome is the upper half
+of an ellipsoid, and a bowl the lower half."""
 KIND_NAMES: tuple[Literal["box", "cylinder", "ellipsoid", "dome", "bowl"], ...] = (
     "box", "cylinder", "ellipsoid", "dome", "bowl"
 )  # fmt: skip
-"""Names of the kinds, in their order."""
+"""Names of the kinds, in the order of their numbers."""
 ACROSS_X, ACROSS_Z = 1, 2
-"""Bits of `Parts.mirrored`: the part also stands on the other side along this axis."""
-
-
+"""Bits of `Parts.mirrored`: the part has a mirror image along this axis."""
 MOST_PARTS = 10
-"""Maximum number of parts of an object, mirror images not counted."""
+"""Maximum number of parts of an object, without mirror images."""
 MOST_CORNERS = 24
 """Maximum number of corners of an outline."""
 SQUARE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-"""The outline of an object that fills its box as seen from above; it cuts nothing off."""
+"""Outline that is the whole box seen from above, so that it cuts nothing off."""
 
 
 class Parts(NamedTuple):
@@ -44,12 +41,11 @@ class Parts(NamedTuple):
     ends: Float[np.ndarray, "parts 3 2"]
     """Lower and upper end of each part along x, y and z."""
     outline: Float[np.ndarray, "corners 2"] = SQUARE
-    """Corners (x, z) of the outline, a simple polygon; counter-clockwise with x to the right and z
-    up."""
+    """Corners (x, z) of a simple polygon, counter-clockwise with x to the right and z up."""
 
     def solids(self) -> Iterator[tuple[int, Float[np.ndarray, "3 2"]]]:
-        """Kind and ends of every part and its mirror images, which may touch or overlap; they are
-        not cut to the outline."""
+        """Kind and ends of all parts and mirror images, which may touch or overlap. They are not
+        cut to the outline."""
         for kind, mirrored, ends in zip(self.kind, self.mirrored, self.ends, strict=True):
             copies = [ends]
             for bit, axis in ((ACROSS_X, 0), (ACROSS_Z, 2)):
@@ -88,7 +84,8 @@ def inside(
 def center_and_radii(
     kind: int, ends: Float[np.ndarray, "3 2"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Centre and radii of the ellipsoid, or of the cylinder's ellipse, that a part is cut from."""
+    """Centre and radii of the ellipsoid that a part is, or is half of; for a cylinder, those along
+    x and z are the ellipse's."""
     center, radii = ends.mean(axis=1), (ends[:, 1] - ends[:, 0]) / 2
     if kind in (DOME, BOWL):
         center[1], radii[1] = ends[1, 0 if kind == DOME else 1], 2 * radii[1]
@@ -96,8 +93,8 @@ def center_and_radii(
 
 
 def filled_cells(parts: Parts, cells: int, margin: float) -> Bool[np.ndarray, "x y z"]:
-    """True for the cells of a grid whose centres lie in a part and within the outline; the grid
-    spans `margin` boxes."""
+    """True for the cells, of a grid that spans `margin` boxes, whose centres lie in a part and
+    within the outline."""
     middles = ((np.arange(cells) + 0.5) / cells - 0.5) * margin
     points = np.stack(np.meshgrid(middles, middles, middles, indexing="ij"), axis=-1)
     found = np.zeros(points.shape[:3], bool)

@@ -71,7 +71,8 @@ class Solid(NamedTuple):
     """A convex solid in the room frame that fills its axis-aligned box as far as its kind can."""
 
     kind: Literal["box", "cylinder", "ellipsoid", "dome", "bowl"]
-    """As in `core/parts.py`: cylinders stand upright; domes and bowls are halves of ellipsoids."""
+    """A kind of `core/parts.py`: cylinders stand upright; domes and bowls are halves of ellipsoids.
+    """
     low_m: tuple[float, float, float]
     high_m: tuple[float, float, float]
 
@@ -149,7 +150,7 @@ class Opening(NamedTuple):
 
     kind: Literal["door", "window"]
     start_m: tuple[float, float]
-    """One lower corner as x, z; `end_m` is the other."""
+    """A lower corner as x, z; `end_m` is the other."""
     end_m: tuple[float, float]
     bottom_m: float
     """Height of its lower edge above the floor: 0 for a door, the sill of a window."""

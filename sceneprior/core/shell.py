@@ -11,39 +11,48 @@ from jaxtyping import Float
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.floor import floor_rectangle
-from sceneprior.core.geometry.part_meshes import prism
+from sceneprior.core.geometry.part_meshes import prism, triangles_of
 from sceneprior.core.scene import Mesh, Opening, Scene
 
 ShellName = Literal["walls", "floor", "none"]
-"""The drawn or written share of the shell: all of it, the floor alone, or nothing."""
+"""Parts of the shell to draw or write: all of them, the floor alone, or none."""
 SHELLS: tuple[ShellName, ...] = ("walls", "floor", "none")
 THICK_M = 0.1
 """Thickness of walls, floor and ceiling; walls stand outside the outline."""
 HEIGHT_M = 2.6
-"""Height of a room whose ceiling is not known, unless its furniture is higher."""
+"""Height of the ceiling if it is unknown, unless furniture is higher."""
 ABOVE_M = 0.05
-"""Least distance of such a ceiling from furniture that does not hang from it."""
+"""Minimum distance of an unknown ceiling from furniture that does not hang from it."""
 LAMPS_FROM_M = 2.2
-"""Height above which the top of a lamp is the height of the ceiling."""
+"""Height above which the top of a lamp is taken as the height of an unknown ceiling."""
 FLAT_RAD = 1e-3
-"""Corners of the outline that turn by less are left out."""
+"""Angle between two sides of the outline below which their corner is left out."""
 
 
 class Wall(NamedTuple):
-    """A wall on one side of the floor; from inside the room it runs from `start_m` to the right
-    or left, as the outline does."""
+    """A wall on one side of the floor, in the direction of the outline."""
 
     start_m: Float[np.ndarray, "2"]
     end_m: Float[np.ndarray, "2"]
-    """Ends (x, z) of its inner face."""
+    """End (x, z) of the inner face."""
     outward: Float[np.ndarray, "2"]
     """Unit normal (x, z) that points out of the room."""
     openings: tuple[tuple[float, float, float, float], ...]
     """Doors and windows: start and end along the wall, bottom and top, in metres."""
 
+    @property
+    def length_m(self) -> float:
+        """Length of the inner face."""
+        return float(np.linalg.norm(self.end_m - self.start_m))
+
+    @property
+    def direction(self) -> Float[np.ndarray, "2"]:
+        """Unit vector (x, z) from the start to the end."""
+        return np.asarray((self.end_m - self.start_m) / self.length_m)
+
 
 class Panel(NamedTuple):
-    """A box of a wall between its openings."""
+    """A solid box of a wall, beside, below or above its openings."""
 
     center_m: Float[np.ndarray, "3"]
     size_m: tuple[float, float, float]
@@ -61,7 +70,7 @@ class Shell:
     height_m: float
     walls: tuple[Wall, ...]
     grown_m: float
-    """Distance by which walls were moved outwards, at most, so that none stands in furniture."""
+    """Largest distance by which a wall was moved outwards to make space for furniture."""
 
     def meshes(self) -> dict[str, Mesh]:
         """Closed meshes by name: `floor`, `wall_0` and so on, and `ceiling`."""
@@ -75,7 +84,7 @@ class Shell:
 
 
 def shell_meshes(scene: Scene, shell: ShellName) -> dict[str, Mesh]:
-    """The meshes of a scene's shell that `shell` asks for, by name."""
+    """The meshes of a scene's shell that `shell` selects, by name."""
     if shell == "none":
         return {}
     meshes = shell_of(scene).meshes()
@@ -88,10 +97,10 @@ def is_shell(node: str) -> bool:
 
 
 def shell_of(scene: Scene) -> Shell:
-    """The shell of a scene: on its floor, or on the rectangle round its furniture.
+    """The shell of a scene: on its floor, or on the rectangle around its furniture.
 
-    A side that furniture crosses is moved outwards, and its doors and windows with it. Without a
-    known ceiling, its height is the top of the highest lamp, or else 2.6 m.
+    A side that furniture crosses is moved outwards, together with its doors and windows. An unknown
+    ceiling is at the top of the highest lamp, or else at 2.6 m.
     """
     outline = scene.floor_m
     if outline is None:
@@ -108,11 +117,9 @@ def shell_of(scene: Scene) -> Shell:
 
 
 def panels(wall: Wall, height_m: float) -> list[Panel]:
-    """Boxes that fill a wall round its openings, from its start to its end."""
-    along = wall.end_m - wall.start_m
-    length = float(np.linalg.norm(along))
-    direction = along / length
-    cuts = sorted({0.0, length, *(x for o in wall.openings for x in o[:2])})
+    """Boxes that fill a wall around its openings, from its start to its end."""
+    direction = wall.direction
+    cuts = sorted({0.0, wall.length_m, *(x for o in wall.openings for x in o[:2])})
     found = []
     for left, right in itertools.pairwise(cuts):
         middle = (left + right) / 2
@@ -150,12 +157,12 @@ def _height(scene: Scene) -> float:
 def rectangle(
     low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "4 2"]:
-    """Corners (x, z) of a rectangle between two of them."""
+    """Corners (x, z) of an axis-aligned rectangle between two opposite corners."""
     return np.array([low, (high[0], low[1]), high, (low[0], high[1])])
 
 
 def _corners(outline_m: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "some 2"]:
-    """The outline anticlockwise (x right, z up), without corners that hardly turn."""
+    """The outline in anticlockwise order (x right, z up), without corners on straight sides."""
     polygon = shapely.Polygon(outline_m)
     if not polygon.is_valid:
         raise InputError(
@@ -180,7 +187,8 @@ def _walls(corners: Float[np.ndarray, "corners 2"]) -> list[Wall]:
 def _grown(
     corners: Float[np.ndarray, "corners 2"], scene: Scene
 ) -> tuple[Float[np.ndarray, "corners 2"], float]:
-    """The outline with its sides moved outwards until it holds all furniture, and how far."""
+    """The outline after its sides are moved outwards until it contains all furniture, and the
+    largest distance of a side from its old place."""
     walls = _walls(corners)
     offsets = np.zeros(len(corners))
     here = corners
@@ -199,7 +207,7 @@ def _grown(
         here = _offset(walls, offsets)
         if not shapely.Polygon(here).is_valid:
             break
-    # Sides cannot hold it: the rectangle round everything does.
+    # If moving sides does not help, the outline becomes the rectangle around everything.
     low, high = floor_rectangle(replace(scene, floor_m=None))
     every = np.concatenate([corners, [low, high]])
     low, high = every.min(axis=0), every.max(axis=0)
@@ -213,7 +221,7 @@ def _push(
     walls: Sequence[Wall],
     offsets: Float[np.ndarray, " corners"],
 ) -> None:
-    """Increase the offsets of the sides that are nearest to a point outside, up to the point."""
+    """Increase the offsets of the sides nearest to a point outside until they reach it."""
     ends = np.roll(corners, -1, axis=0)
     apart = [
         shapely.LineString(pair).distance(shapely.Point(point))
@@ -227,7 +235,7 @@ def _push(
 def _offset(
     walls: Sequence[Wall], offsets: Float[np.ndarray, " corners"]
 ) -> Float[np.ndarray, "corners 2"]:
-    """Corners of the outline whose sides are moved outwards, each by its own distance."""
+    """Corners of the outline after each side is moved outwards by its offset."""
     corners = []
     for row, wall in enumerate(walls):
         before = walls[row - 1]
@@ -238,7 +246,7 @@ def _offset(
 
 
 def _outer_corners(walls: Sequence[Wall]) -> list[Float[np.ndarray, "2"]]:
-    """Corners of the walls' outer faces; that of a sharp corner is cut at three thicknesses."""
+    """Corners of the walls' outer faces, at most three thicknesses away from the inner corner."""
     corners = _offset(walls, np.full(len(walls), THICK_M))
     cut = []
     for wall, corner in zip(walls, corners, strict=True):
@@ -251,7 +259,7 @@ def _outer_corners(walls: Sequence[Wall]) -> list[Float[np.ndarray, "2"]]:
 def _place_of(
     opening: Opening, walls: Sequence[Wall]
 ) -> tuple[int, tuple[float, float, float, float]]:
-    """The wall nearest to an opening that runs as the opening does, and the opening's span."""
+    """Index of the nearest wall parallel to an opening, and the opening as in `Wall.openings`."""
     start, end = np.array(opening.start_m), np.array(opening.end_m)
     along = (end - start) / np.linalg.norm(end - start)
     middle = shapely.Point((start + end) / 2)
@@ -261,16 +269,14 @@ def _place_of(
     ]
     row = int(np.argmin(costs))
     wall = walls[row]
-    direction = (wall.end_m - wall.start_m) / np.linalg.norm(wall.end_m - wall.start_m)
-    low, high = sorted(float((point - wall.start_m) @ direction) for point in (start, end))
+    low, high = sorted(float((point - wall.start_m) @ wall.direction) for point in (start, end))
     return row, (low, high, opening.bottom_m, opening.top_m)
 
 
 def _within(wall: Wall, height_m: float) -> Wall:
-    """The wall with its openings cut to its length and height."""
-    length = float(np.linalg.norm(wall.end_m - wall.start_m))
+    """The wall with openings cut to the wall's length and height."""
     spans = (
-        (max(start, 0.0), min(end, length), max(bottom, 0.0), min(top, height_m))
+        (max(start, 0.0), min(end, wall.length_m), max(bottom, 0.0), min(top, height_m))
         for start, end, bottom, top in wall.openings
     )
     return wall._replace(openings=tuple(s for s in spans if s[0] < s[1] and s[2] < s[3]))
@@ -278,9 +284,7 @@ def _within(wall: Wall, height_m: float) -> Wall:
 
 def slab(outline_m: Float[np.ndarray, "corners 2"], low_m: float, high_m: float) -> Mesh:
     """A closed mesh that fills an outline (x, z) between two heights."""
-    mesh = prism(outline_m, low_m, high_m).to_mesh64()
-    points = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
-    return Mesh(points, np.asarray(mesh.tri_verts, dtype=np.int64))
+    return Mesh(*triangles_of(prism(outline_m, low_m, high_m)))
 
 
 def _wall_mesh(
@@ -288,19 +292,17 @@ def _wall_mesh(
     outer: tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]],
     height_m: float,
 ) -> Mesh:
-    """A wall with mitred ends, from the floor slab's lower face to the ceiling, less openings."""
+    """A wall with mitred ends, from the lower face of the floor slab to the upper face of the
+    ceiling slab, with its openings cut out."""
     from manifold3d import Manifold
 
-    def prism(plan: Sequence[np.ndarray], low: float, high: float) -> Manifold:
+    def hull(plan: Sequence[np.ndarray], low: float, high: float) -> Manifold:
         corners = np.array([(x, y, z) for x, z in plan for y in (low, high)])
         return Manifold.hull_points(corners)
 
-    solid = prism([wall.start_m, wall.end_m, *outer], -THICK_M, height_m + THICK_M)
-    direction = (wall.end_m - wall.start_m) / np.linalg.norm(wall.end_m - wall.start_m)
+    solid = hull([wall.start_m, wall.end_m, *outer], -THICK_M, height_m + THICK_M)
     for start, end, bottom, top in wall.openings:
-        ends = [wall.start_m + direction * at for at in (start, end)]
+        ends = [wall.start_m + wall.direction * at for at in (start, end)]
         deep = [end + wall.outward * side for end in ends for side in (-0.5, 0.5)]
-        solid = solid - prism(deep, bottom, top)
-    mesh = solid.to_mesh64()
-    vertices = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
-    return Mesh(vertices, np.asarray(mesh.tri_verts, dtype=np.int64))
+        solid = solid - hull(deep, bottom, top)
+    return Mesh(*triangles_of(solid))

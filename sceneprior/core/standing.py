@@ -1,7 +1,7 @@
-"""Prepares rooms for physics: objects stand on the floor or on other objects, and do not intersect.
+"""Rooms made ready for physics: objects stand on the floor or on other objects, and do not overlap.
 
-Generated rooms almost do: furniture may float by a centimetre, and a lifted chair may lack a leg,
-or reach into its table. Each change is counted.
+Generated rooms come close to this, but furniture may float by a centimetre, and a lifted chair may
+lack a leg or reach into a table. The changes are counted.
 """
 
 import itertools
@@ -20,39 +20,39 @@ from sceneprior.core.scene import Mesh, Scene, SceneObject
 GAP_M = 2e-3
 """Distance between objects after they are pushed apart."""
 TOUCHING_M = 5e-4
-"""Largest overlap of two bodies that is left as it is."""
-RESTS_M = 0.15
-"""Largest distance between the lower face of an object and the top of another one on which it is
-then set; for objects above `FLOOR_M`."""
+"""Largest overlap of two bodies that is tolerated."""
 FLOOR_M = 0.3
-"""Height of the lower face up to which an object is set on the floor."""
+"""Largest height of the lower face of an object that is set on the floor."""
+RESTS_M = 0.15
+"""Largest distance between the lower face of a higher object and the top of another object on which
+it is set. Without such an object, it is set on the floor, too."""
 SLABS = 8
-"""Number of slices into which a body that is a mesh is cut."""
+"""Number of slabs into which a body that is a mesh is cut."""
 STEP_M, REACH_M = 0.05, 2.0
 """Spacing and range, along x and z, of the moves that are tried for an object."""
 
 Boxes = Float[np.ndarray, "_ 2 3"]
-"""Lower and upper corners of the boxes around an object's bodies."""
+"""Lower and upper corners of the boxes around the bodies of objects."""
 
 
 def stand(scene: Scene) -> tuple[Scene, Counter[str]]:
     """Set down a scene's objects, give feet to those that would fall over, and move them apart.
 
-    Objects are set down in the order of their heights. Then, the largest first, each is moved to
-    the nearest place where it overlaps no earlier one, and it stays inside the floor if it was
-    inside. Lamps and pieces that hang on walls keep their heights.
+    Objects are set down in the order of their heights, except lamps and objects that hang on walls.
+    Then each object, the largest first, is moved to the nearest place where it overlaps no earlier
+    object and lies no further outside the floor than before.
 
     Returns:
         The scene, and the number of objects that were `set down`, `given feet`, `moved`, and `left
         out` because there was no free place.
     """
-    told: Counter[str] = Counter()
-    # Found once: convex parts of meshes take seconds.
-    bodily = tuple(replace(item, solids=colliders(item)) for item in scene.objects)
-    objects = _set_down(bodily, told)
-    objects = [item if is_fixed(item) else _on_feet(item, told) for item in objects]
-    kept = _apart(scene, objects, told)
-    return replace(scene, objects=tuple(kept)), told
+    changes: Counter[str] = Counter()
+    # Convex parts of meshes take seconds, so they are computed once and kept as solids.
+    with_bodies = tuple(replace(item, solids=colliders(item)) for item in scene.objects)
+    objects = _set_down(with_bodies, changes)
+    objects = [item if is_fixed(item) else _on_feet(item, changes) for item in objects]
+    kept = _apart(scene, objects, changes)
+    return replace(scene, objects=tuple(kept)), changes
 
 
 def body_boxes(item: SceneObject) -> Boxes:
@@ -67,7 +67,7 @@ def body_boxes(item: SceneObject) -> Boxes:
 
 
 def _slabs(points: Float[np.ndarray, "points 3"]) -> list[Float[np.ndarray, "2 3"]]:
-    """Boxes around slices of a convex body, which may stand at an angle."""
+    """Boxes around slabs of a convex body, which follow a rotated body better than one box."""
     low, high = points.min(axis=0), points.max(axis=0)
     plan = shapely.convex_hull(shapely.MultiPoint(points[:, ::2]))
     ends = np.linspace(low[0], high[0], SLABS + 1)
@@ -80,7 +80,8 @@ def _slabs(points: Float[np.ndarray, "points 3"]) -> list[Float[np.ndarray, "2 3
     return boxes or [np.array([low, high])]
 
 
-def _set_down(objects: tuple[SceneObject, ...], told: Counter[str]) -> list[SceneObject]:
+def _set_down(objects: tuple[SceneObject, ...], changes: Counter[str]) -> list[SceneObject]:
+    """The objects after each is set on the floor, or on the object below it; lowest first."""
     placed = list(objects)
     bounds = [body_boxes(item) for item in objects]
     bottoms = np.array([each[:, 0, 1].min() for each in bounds])
@@ -99,24 +100,26 @@ def _set_down(objects: tuple[SceneObject, ...], told: Counter[str]) -> list[Scen
         if abs(bottom - height) > 1e-6:
             placed[row] = item.moved((0.0, float(height - bottom), 0.0))
             bounds[row] = bounds[row] + np.array([0.0, height - bottom, 0.0])
-            told["set down"] += bool(abs(bottom - height) > 1e-3)
+            changes["set down"] += bool(abs(bottom - height) > 1e-3)
     return placed
 
 
 def _meets_in_plan(boxes: Boxes, others: Boxes) -> bool:
+    """True if the bounding rectangles of two objects overlap, seen from above."""
     (low, high), (other_low, other_high) = (
         (each[:, 0, ::2].min(axis=0), each[:, 1, ::2].max(axis=0)) for each in (boxes, others)
     )
     return bool((np.minimum(high, other_high) - np.maximum(low, other_low) > 0).all())
 
 
-def _on_feet(item: SceneObject, told: Counter[str]) -> SceneObject:
+def _on_feet(item: SceneObject, changes: Counter[str]) -> SceneObject:
     standing = with_feet(item)
-    told["given feet"] += standing is not item
+    changes["given feet"] += standing is not item
     return standing
 
 
-def _apart(scene: Scene, objects: list[SceneObject], told: Counter[str]) -> list[SceneObject]:
+def _apart(scene: Scene, objects: list[SceneObject], changes: Counter[str]) -> list[SceneObject]:
+    """The objects moved apart, the largest first; those without a free place are left out."""
     floor = _free_floor(scene)
     kept: dict[int, SceneObject] = {}
     taken = np.zeros((0, 2, 3))
@@ -126,10 +129,10 @@ def _apart(scene: Scene, objects: list[SceneObject], told: Counter[str]) -> list
         boxes = body_boxes(item)
         offset = free_offset(boxes, taken, floor)
         if offset is None:
-            told["left out"] += 1
+            changes["left out"] += 1
             continue
         if offset.any():
-            told["moved"] += 1
+            changes["moved"] += 1
             item = item.moved((float(offset[0]), 0.0, float(offset[1])))
             boxes = boxes + np.array([offset[0], 0.0, offset[1]])
         kept[row] = item
@@ -138,7 +141,7 @@ def _apart(scene: Scene, objects: list[SceneObject], told: Counter[str]) -> list
 
 
 def _free_floor(scene: Scene) -> shapely.Geometry | None:
-    """The floor without the squares through which its doors swing; None if it is not known."""
+    """The floor without the squares into which doors swing; None if the floor is unknown."""
     floor = floor_polygon(scene)
     if floor is None:
         return None
@@ -150,8 +153,8 @@ def _free_floor(scene: Scene) -> shapely.Geometry | None:
 def free_offset(
     boxes: Boxes, taken: Boxes, floor: shapely.Geometry | None
 ) -> Float[np.ndarray, "2"] | None:
-    """The shortest move along x and z after which no box overlaps a taken one; None if there is
-    none within `REACH_M`. The area outside the floor may not grow."""
+    """The shortest move along x and z after which no box overlaps a taken box, and no larger area
+    lies outside the floor; None if there is no such move within `REACH_M`."""
     still = np.zeros((1, 2))
     if not _overlaps(boxes, taken, still, -TOUCHING_M)[0]:
         return still[0]
@@ -168,7 +171,7 @@ def free_offset(
 
 
 def _flush_moves(boxes: Boxes, taken: Boxes) -> Float[np.ndarray, "moves 2"]:
-    """Moves along one axis after which a box is flush with a taken one."""
+    """Moves along one axis after which a box is flush with a taken box."""
     moves = []
     for axis in (0, 2):
         after = taken[None, :, 1, axis] - boxes[:, None, 0, axis] + GAP_M
@@ -183,7 +186,7 @@ def _flush_moves(boxes: Boxes, taken: Boxes) -> Float[np.ndarray, "moves 2"]:
 def _overlaps(
     boxes: Boxes, taken: Boxes, offsets: Float[np.ndarray, "moves 2"], gap_m: float
 ) -> Bool[np.ndarray, " moves"]:
-    """True for moves after which a box is nearer than `gap_m` to a taken one."""
+    """True for moves after which some box is nearer than `gap_m` to a taken box."""
     level = np.minimum(boxes[:, None, 1, 1], taken[None, :, 1, 1]) - np.maximum(
         boxes[:, None, 0, 1], taken[None, :, 0, 1]
     )
@@ -201,6 +204,7 @@ def _overlaps(
 def _area_outside(
     boxes: Boxes, floor: shapely.Geometry | None, offset: Float[np.ndarray, "2"]
 ) -> float:
+    """Area of the object's bounding rectangle, after a move, that lies outside the floor."""
     if floor is None:
         return 0.0
     low, high = boxes[:, 0].min(axis=0)[::2] + offset, boxes[:, 1].max(axis=0)[::2] + offset

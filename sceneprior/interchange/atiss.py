@@ -1,4 +1,4 @@
-"""Write rooms in ATISS's format: one box list per room, which `box_lists.py` reads back."""
+"""Export in ATISS's format: one box list per room, which `box_lists.py` reads back."""
 
 import io
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Read scenes from other methods' box lists (docs/evaluation.md, "Scenes of other methods")."""
+"""Import of other methods' box lists as scenes (docs/evaluation.md, "Scenes of other methods")."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -67,7 +67,8 @@ def read_boxes(
     columns: Sequence[str] | None = None,
     size_factor: float = 2.0,
 ) -> list[Scene]:
-    """Read the rooms of one file; see `read_box_lists`. Several rooms are named with a number.
+    """Read the rooms of one file; see `read_box_lists`. If there are several, a number is appended
+    to their name.
 
     Args:
         path: `.npz` with one room (arrays over objects) or several (one more leading axis), or

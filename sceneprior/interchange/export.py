@@ -17,30 +17,34 @@ from sceneprior.interchange.sceneeval import write_sceneeval
 from sceneprior.interchange.usd import write_usd
 from sceneprior.render.scene_files import check_names, save_scene
 
-OF_CLASSES: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
+CLASS_FORMATS: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
     "atiss": write_atiss,
     "threed-front": write_front,
 }
-"""Formats in which every object needs a furniture class, so that void objects are left out."""
+"""Formats that require a furniture class for each object, so that void objects are left out."""
 SIMULATORS: Mapping[str, Callable[[Sequence[Scene], Path, ShellName], None]] = {
     "mujoco": write_mujoco,
     "usd": write_usd,
     "habitat": write_habitat,
 }
-"""Formats of simulators, for which objects stand first (`core/standing.py`)."""
-FORMATS = (*OF_CLASSES, *SIMULATORS, "sceneeval", "obj")
+"""Formats of simulators; objects are made to stand before they are written (`core/standing.py`)."""
+FORMATS = (*CLASS_FORMATS, *SIMULATORS, "sceneeval", "obj")
 GROWN_M = 0.01
-"""Smallest displacement of walls, in metres, of which a note informs the user."""
+"""Smallest displacement of walls, in metres, that the notes mention."""
 
 
 def export_scenes(
     scenes: Sequence[Scene], to: str, folder: Path, shell: ShellName | None = None
 ) -> list[str]:
-    """Write rooms to a folder in one of `FORMATS`, in metres.
+    """Write rooms to a folder in one of `FORMATS`, in metres, with y up (z in `mujoco` and
+    `sceneeval`).
 
-    y is up; in `mujoco` and `sceneeval`, z is. `shell` names the parts of the room itself to write;
-    None writes walls for simulators, and nothing in other formats. Returns notes for the user on
-    omissions and changes.
+    Args:
+        shell: The parts of the shell to write; None writes walls for simulators, and nothing in
+            other formats.
+
+    Returns:
+        Notes for the user on omissions and changes.
     """
     if to not in FORMATS:
         raise InputError(f"No format '{to}'; choose from {', '.join(FORMATS)}, or scenes.")
@@ -54,7 +58,7 @@ def export_scenes(
         SIMULATORS[to](standing, Path(folder), shell or "walls")
         return notes if shell in ("floor", "none") else [*notes, *_moved_walls(standing)]
     if shell is not None:
-        raise InputError(f"What {to} has of a room is fixed; leave out --shell.")
+        raise InputError(f"The format {to} has no choice of walls and floors; leave out --shell.")
     if to == "sceneeval":
         write_sceneeval(scenes, Path(folder))
         return []
@@ -62,7 +66,7 @@ def export_scenes(
         replace(scene, objects=tuple(o for o in scene.objects if o.label != "void"))
         for scene in scenes
     ]
-    OF_CLASSES[to](named, Path(folder))
+    CLASS_FORMATS[to](named, Path(folder))
     left_out = sum(len(a.objects) - len(b.objects) for a, b in zip(scenes, named, strict=True))
     if left_out:
         return [f"Objects of class void are left out ({left_out}): {to} has no such class."]
@@ -70,14 +74,15 @@ def export_scenes(
 
 
 def stand_all(scenes: Sequence[Scene]) -> tuple[list[Scene], list[str]]:
-    """The scenes with all objects made to stand, and a note on the changes, if there are any."""
+    """Scenes in which all objects stand, and a note on the changes, if there are any."""
     pairs = [stand(scene) for scene in scenes]
-    changes = sum((told for _, told in pairs), Counter[str]())
+    changes = sum((counts for _, counts in pairs), Counter[str]())
     standing = [scene for scene, _ in pairs]
-    if not (said := ", ".join(f"{count} {change}" for change, count in changes.items() if count)):
+    listed = ", ".join(f"{count} {change}" for change, count in changes.items() if count)
+    if not listed:
         return standing, []
     total = sum(len(scene.objects) for scene in scenes)
-    return standing, [f"So that nothing falls over or overlaps, of {total} objects: {said}."]
+    return standing, [f"So that nothing falls over or overlaps, of {total} objects: {listed}."]
 
 
 def _moved_walls(scenes: Sequence[Scene]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Read the floor of a room from files: polygons, scenes, ATISS's boxes and 3D-FRONT's houses."""
+"""Import of floors from files: polygons, scenes, ATISS's boxes and 3D-FRONT's houses."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,11 +14,11 @@ from sceneprior.core.scene_json import FORMAT, check_floor, read_scene
 from sceneprior.interchange.box_lists import FLOOR, floor_outline
 
 FINEST_M = 0.02
-"""Corners of a floor made of triangles may move by this much, so that walls are straight."""
+"""Tolerance of the simplification of floors made of triangles, so that walls are straight."""
 
 
 class FloorPlan(NamedTuple):
-    """A floor, in metres."""
+    """Outline, openings and ceiling of a room, in metres."""
 
     outline_m: np.ndarray
     """Corners (x, z)."""
@@ -75,13 +75,14 @@ def _atiss_floor(path: Path) -> np.ndarray:
 
 
 def _front_floor(path: Path, house: dict[str, Any], room_id: str) -> np.ndarray:
-    """The outline of a room of a house: the largest part of its floor meshes."""
+    """Outline of the floor of a room in a house: the largest polygon in the union of its floor
+    meshes."""
     try:
         rooms = {str(room["instanceid"]): room for room in house["scene"]["room"]}
         if room_id not in rooms and (room_id or len(rooms) != 1):
-            told = ", ".join(rooms)
+            listed = ", ".join(rooms)
             raise InputError(
-                f"{path} has the rooms {told[:300]}; name one of them as {path.name}:ROOM."
+                f"{path} has the rooms {listed[:300]}; name one of them as {path.name}:ROOM."
             )
         room = rooms[room_id] if room_id else next(iter(rooms.values()))
         meshes = {mesh["uid"]: mesh for mesh in house["mesh"] if mesh["type"] == "Floor"}

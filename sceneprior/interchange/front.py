@@ -1,4 +1,4 @@
-"""Write rooms in the formats of 3D-FRONT and 3D-FUTURE: one house per room, one model per object.
+"""Export in the formats of 3D-FRONT and 3D-FUTURE: one house per room, one model per object.
 
     <folder>/3D-FRONT/<room>.json
     <folder>/3D-FUTURE-model/model_info.json, <model id>/raw_model.obj

@@ -1,4 +1,4 @@
-"""Rooms as a scene dataset of habitat-sim: JSON configs and GLBs; y up, metres."""
+"""Export as a scene dataset of habitat-sim: JSON configs and GLBs; y up, metres."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,16 +18,17 @@ from sceneprior.render.topdown import node_names, scene_meshes
 
 DATASET_FILE = "rooms.scene_dataset_config.json"
 UP, FRONT = [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]
-"""Habitat's axes of an asset; our furniture has its front at +z in its own frame."""
+"""Axes of an asset in habitat-sim. A `SceneObject` faces +z in its own frame."""
 
 
 def write_habitat(scenes: Sequence[Scene], folder: Path, shell: ShellName) -> None:
     """Write `rooms.scene_dataset_config.json` with the folders `stages`, `objects` and `scenes`.
 
-    A stage is the shell of a room. An object has a GLB to draw, a GLB of its convex bodies to
-    collide, its mass and its class (as `semantic_id`, its index in the label set). Objects that
-    hang do not move, the others do. Where the yaw of an object is known (`SceneObject.turned`), its
-    asset faces -z, and the scene turns it; the other assets keep the axes of the room.
+    A stage is the shell of a room. An object has a GLB for rendering, a GLB of its convex bodies
+    for collisions, a mass and a class (`semantic_id` is the index of the class in the label set).
+    Objects that hang are static, the others dynamic. If the yaw of an object is known
+    (`SceneObject.turned`), its asset faces -z and the scene instance rotates it; other assets keep
+    the axes of the room.
 
     Source:
         The JSON attributes that aihabitat.org/docs/habitat-sim/attributesJSON documents, with the
@@ -66,7 +67,7 @@ def write_habitat(scenes: Sequence[Scene], folder: Path, shell: ShellName) -> No
 def _write_object(
     scene: Scene, item: SceneObject, mesh: Mesh, index: int, name: str, folder: Path
 ) -> dict[str, Any]:
-    """Write an object's config and GLBs; its entry in the scene is returned."""
+    """Write an object's config and GLBs, and return its entry in the scene instance."""
     yaw_rad = 0.0 if item.turned is None else item.turned.yaw_rad + np.pi
     back, center = yaw_rotation(yaw_rad), np.asarray(item.center_m)
 

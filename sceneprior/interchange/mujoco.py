@@ -1,4 +1,4 @@
-"""Rooms as MuJoCo's MJCF."""
+"""Export as MuJoCo's MJCF."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Rooms as SceneEval's scene states: z up, metres, with their models and walls."""
+"""Export as SceneEval's scene states, with models and walls: z up, metres."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,16 +14,16 @@ from sceneprior.render.scene_files import scene_to_glb
 from sceneprior.render.topdown import node_names, scene_meshes
 
 PREFIX = "sceneprior"
-"""Prefix of model ids, by which SceneEval finds the data set of the models."""
+"""Prefix of model ids, from which SceneEval knows the data set of a model."""
 Z_UP = {"up": [0, 0, 1], "front": [0, 1, 0]}
 
 
 def write_sceneeval(scenes: Sequence[Scene], folder: Path) -> None:
-    """Write `scene_<number>.json` in the order of the scenes, and `assets/<id>/` with the models.
+    """Write `scene_<number>.json` in the order of the scenes, and a folder `assets/<id>` per model.
 
-    `<id>.glb` is a model about the centre of its box, y up, and `data.json` its class; SceneEval's
-    data set class `layoutvlm_objathor` reads such folders. Objects are written as they are, without
-    being set down or moved apart.
+    The folder holds `<id>.glb`, the mesh with y up and the centre of the model's box as origin, and
+    `data.json`, its class; SceneEval's data set class `layoutvlm_objathor` reads such folders.
+    Objects are neither set down nor moved apart.
 
     Source:
         github.com/3dlg-hcvc/SceneEval: GUIDE.md, scene_state_template.json and scenes/.
@@ -36,8 +36,8 @@ def write_sceneeval(scenes: Sequence[Scene], folder: Path) -> None:
             around = Mesh(mesh.vertices_m - np.asarray(item.center_m), mesh.faces)
             alone = replace(scene, objects=(replace(item, mesh=around, solids=()),))
             write_whole(folder / "assets" / model / f"{model}.glb", scene_to_glb(alone))
-            told = {"category": item.label, "description": item.label, "materials": []}
-            write_json(folder / "assets" / model / "data.json", {"annotations": told})
+            annotations = {"category": item.label, "description": item.label, "materials": []}
+            write_json(folder / "assets" / model / "data.json", {"annotations": annotations})
 
 
 def _scene_state(scene: Scene) -> dict[str, Any]:
@@ -73,8 +73,8 @@ def _architecture(name: str, shell: Shell) -> dict[str, Any]:
         {"id": "floor", "type": "Floor", "points": floor, "depth": THICK_M, **room}
     ]
     for row, wall in enumerate(shell.walls):
-        length = float(np.linalg.norm(wall.end_m - wall.start_m))
-        # Seen with z up the outline runs the other way, so walls go from their ends.
+        length = wall.length_m
+        # With z up the outline runs the other way, so that each wall is written from its end.
         points = [[float(x), -float(z), 0.0] for x, z in (wall.end_m, wall.start_m)]
         holes = [
             {

@@ -1,4 +1,4 @@
-"""Rooms as USD stages with rigid bodies."""
+"""Export as USD stages with rigid bodies."""
 
 from collections.abc import Sequence
 from pathlib import Path

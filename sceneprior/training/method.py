@@ -221,7 +221,7 @@ class TrainedReconstructor:
 
     remembers_rooms = False
     distribution = "none"
-    """It generates no new rooms."""
+    """The method generates no new rooms."""
 
 
 def ready_copy(network: Any) -> Any:

@@ -71,7 +71,7 @@ def test_the_slow_twin_says_the_same(torch_rng, norm_first):
 
 
 def encode(layer, tokens, norm_first):
-    """One layer of the ATISS encoder over a list of tokens."""
+    """A layer of the ATISS encoder, over a list of tokens."""
 
     def before(token, norm):
         return normalise(token, norm) if norm_first else token

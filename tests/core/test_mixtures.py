@@ -1,4 +1,4 @@
-"""Mixtures of logistics against scipy's, and draws against their densities."""
+"""Mixtures of logistics, compared with scipy's, and samples, compared with their densities."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""Which frames are views, their poses and their lens."""
+"""Selection of the frames that become views, with poses and intrinsics."""
 
 import numpy as np
 import pytest

@@ -61,7 +61,8 @@ def test_the_antialiased_resize_is_pillows_triangle_filter():
 
 
 class StandIn(torch.nn.Module):
-    """What NVIDIA's file takes and gives, at two numbers an image: mean of red, mean of blue."""
+    """Stand-in for NVIDIA's network with the same interface and two features: mean of red and of
+    blue."""
 
     def forward(self, img: torch.Tensor, return_features: bool = False) -> torch.Tensor:
         assert img.dtype == torch.uint8

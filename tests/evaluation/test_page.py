@@ -52,7 +52,7 @@ def page(renderer, tmp_path_factory) -> Path:
 
 
 def picture_of(browser) -> np.ndarray:
-    """What the browser shows of the first room."""
+    """The browser's picture of the first room."""
     room = browser.find_element("css selector", "model-viewer")
     return np.asarray(picture(lambda: room.screenshot_as_png)).astype(int)
 

@@ -72,7 +72,8 @@ class Tags(HTMLParser):
 
 
 def test_the_page_needs_nothing_outside_itself(page, shards):
-    """Its one script is the viewer, which tests/evaluation/test_page.py opens in a browser."""
+    """The only script of the page is the viewer, which tests/evaluation/test_page.py opens in a
+    browser."""
     parsed = Tags(page)
     assert parsed.open == []
     assert [tag for tag, _ in parsed.tags].count("script") == 1

@@ -1,4 +1,4 @@
-"""Which rooms the sets of an evaluation hold."""
+"""Sets of rooms that an evaluation compares."""
 
 from dataclasses import replace
 

@@ -198,7 +198,7 @@ def test_the_printed_table_holds_a_column_a_set(result):
     assert "without decoded training rooms: nearest_decoded_m." in told
     rows = {row[0]: row[2:] for row in score_rows(scores)}
     assert rows["Objects in a room"] == ("2.000", "3.000", "3.000", "3.000", "3.000")
-    assert rows["Pieces out of the floor's bounds"] == ("0.000", "0.000", "–", "–", "0.000")
+    assert rows["Pieces out of the floor's bounds"] == ("0.000",) * 5
     value, interval = rows["Frechet distance, EfficientNet-Lite0 (not FID)"][0].split("\n")
     low, high = map(float, interval.split(" to "))
     assert low <= float(value) <= high

@@ -77,8 +77,8 @@ def test_every_object_weighs_the_same_and_nothing_found_is_no_number():
 
 
 def test_a_box_is_no_surface():
-    """Where truth has a box alone, what is found is compared by its box and its class, with None
-    for the rest; the other objects' figures do not change."""
+    """A true object without a mesh is compared by box and class; its other scores are None, and the
+    scores of other objects stay the same."""
     score = score_pair(ObjectPair(replace(DESK, mesh=None), moved(DESK, 0.5)), POINTS)
     assert (score.box_iou_3d, score.class_right) == (pytest.approx(1 / 3), True)
     unknown = ("oriented_box_iou_3d", "chamfer_l2_m", "chamfer_squared_m2", "f_score")

@@ -37,7 +37,7 @@ def read_all(path: Path) -> None:
 
 
 def check(path: Path) -> None:
-    """What `inspect --verify` does with a shard."""
+    """Result of `inspect --verify` for a shard."""
     from data_prep.inspection.verify import verify
 
     verify(path.parent.parent)

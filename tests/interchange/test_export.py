@@ -134,7 +134,7 @@ def test_what_cannot_be_exported_is_a_sentence(scenes, tmp_path, monkeypatch):
         export_scenes(scenes, "max", tmp_path)
     with pytest.raises(InputError, match="2 rooms are called 'first'"):
         export_scenes([scenes[0], scenes[0]], "obj", tmp_path)
-    with pytest.raises(InputError, match="What atiss has of a room is fixed; leave out --shell"):
+    with pytest.raises(InputError, match="The format atiss has no choice of walls"):
         export_scenes(scenes, "atiss", tmp_path, "walls")
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)
     with pytest.raises(InputError, match=r"USD needs another package: pip install 'sceneprior\[us"):

@@ -1,4 +1,4 @@
-"""Which bevels an object has, and what learns from them."""
+"""Bevels of objects, and the losses from which they are learnt."""
 
 import torch
 from torch.testing import assert_close

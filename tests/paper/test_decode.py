@@ -36,7 +36,7 @@ def decoded(torch_rng) -> DecodedScenes:
 
 @pytest.fixture
 def prior(tmp_path) -> ScenePrior:
-    """Whose meshes have two triangles."""
+    """A prior whose meshes have two triangles."""
     prior = tiny_config(tmp_path).build_prior()
     prior.shape.faces = torch.tensor([[0, 1, 2], [3, 4, 5]])
     return prior

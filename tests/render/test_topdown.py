@@ -1,4 +1,4 @@
-"""Where a metre lands in the picture, and in which colour."""
+"""Scale, position and colours of top-down pictures."""
 
 from dataclasses import replace
 

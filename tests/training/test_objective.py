@@ -1,4 +1,4 @@
-"""What stands for an object in 2D before it has a mesh."""
+"""2D proxies of objects before they have meshes."""
 
 from dataclasses import replace
 

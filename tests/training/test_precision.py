@@ -11,7 +11,7 @@ from sceneprior.paper import stages
 
 @pytest.fixture
 def watched(monkeypatch) -> list[tuple]:
-    """What every loss and every silhouette of a run was made of."""
+    """Types of the tensors that enter every loss and every silhouette of a run."""
     seen = []
 
     def watch(module, name, tensors):

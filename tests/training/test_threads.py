@@ -1,4 +1,4 @@
-"""What the number of torch's threads changes: the last bits of gradients, and nothing else."""
+"""Effect of the number of torch's threads: the last bits of gradients, and nothing else."""
 
 import os
 import subprocess

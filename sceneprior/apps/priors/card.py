@@ -16,8 +16,8 @@ from sceneprior.paper.trained import TrainedPrior
 from sceneprior.training.method import Trained
 
 UNSTATED = (
-    "Not stated when this was packed. Ask where the data come from, and what their licence allows, "
-    "before you pass this on."
+    "The origin and licence of the training data were not stated when this file was packed. Find "
+    "them out before you redistribute it."
 )
 SHOWN = ("generated", "real training", "independent")
 """Columns of the table of scores, besides the column of the test rooms."""
@@ -41,12 +41,12 @@ def model_card(
         # Metadata for the Hugging Face Hub.
         "---\nlibrary_name: sceneprior\ntags: [3d, scene-synthesis, indoor-scenes]\n---",
         f"# {name}",
-        f"A prior of rooms that `sceneprior` {__version__} learnt from {len(trained.room_ids)} "
-        f"training rooms. New rooms come from: {packed.distribution}.",
+        f"A generative prior of rooms, trained by `sceneprior` {__version__} on "
+        f"{len(trained.room_ids)} rooms. Rooms are sampled from: {packed.distribution}.",
         f'```python\nimport sceneprior\n\nprior = sceneprior.load("{name}.prior")\n'
         'prior.sample(4, seed=0)[0].save("room.glb")\n```',
         _classes(trained),
-        "Boxes and meshes in metres, y up, the floor at y = 0.",
+        "Boxes and meshes are in metres, with y up and the floor at y = 0.",
         "## Data, authors and licence",
         (about or UNSTATED).strip(),
         *_splits(shards),
@@ -67,9 +67,9 @@ def _classes(trained: Trained) -> str:
     sampler = trained.sampler if isinstance(trained, TrainedLifted) else None
     made = names[VOID + 1 :] if sampler is None else [names[row] for row in sampler.drawn_classes]
     lacking = [label for label in names[VOID + 1 :] if label not in made]
-    said = f"Classes that it makes (label set {name}): {', '.join(made)}."
+    said = f"Classes of generated objects (label set {name}): {', '.join(made)}."
     if lacking:
-        said += f" It makes none of the label set's other classes: {', '.join(lacking)}."
+        said += f" The label set's other classes are never generated: {', '.join(lacking)}."
     return said
 
 
@@ -104,30 +104,31 @@ def _scores(scores: dict[str, Any] | None) -> list[str]:
     ]
     return [
         f"`sceneprior eval-fid`, seed {protocol.get('seed')}, against {protocol.get('split')} "
-        "rooms, which training did not use; each value is followed by its 95% interval, from "
-        f"{protocol.get('resamples')} resamples. Definitions: docs/evaluation.md of the package.",
+        "rooms, which were not used in training. Each value is followed by its 95% confidence "
+        f"interval, from {protocol.get('resamples')} bootstrap resamples. Definitions: "
+        "docs/evaluation.md of the package.",
         "\n".join(table),
     ]
 
 
 def _limits(trained: Trained, latents: bool, half: bool) -> list[str]:
-    limits = ["The prior makes rooms like its training rooms, with objects of these classes only."]
+    limits = ["Rooms are similar to the training rooms, and contain only the classes listed above."]
     if isinstance(trained, TrainedPrior):
         limits.append(
-            "Latents of the training rooms and their ids are in it: training rooms can be decoded "
-            "from it."
+            "The file contains the latents and ids of the training rooms, so these rooms can be "
+            "decoded from it."
             if latents
-            else "Latents of the training rooms are not in it: rooms cannot be drawn from the "
-            "distribution `kernel`, and single images cannot be reconstructed."
+            else "The file does not contain the latents of the training rooms, so rooms cannot be "
+            "sampled from the distribution `kernel`, nor reconstructed from single images."
         )
         if isinstance(trained, TrainedLifted) and trained.sampler is not None:
             limits.append(
-                "Shapes were lifted from training masks, and are part of the weights: an object is "
-                "drawn as one of a few hundred shapes. Objects stand in quarter turns."
+                "The shape of an object is one of a few hundred, which were found in training "
+                "masks and are part of the weights. Objects are turned by multiples of 90 degrees."
             )
     if half:
         limits.append(
-            "Large tensors are in half precision: rooms differ a little from those of the run, for "
-            "which the scores were computed."
+            "Large tensors are stored in half precision, so rooms differ slightly from those of "
+            "the run, for which the scores were computed."
         )
     return ["\n".join(f"- {limit}" for limit in limits)]

@@ -97,7 +97,7 @@ class GanTraining(TrainConfig):
     clip_gradient: float = Field(1.0, ge=0)
     """Norm to which the gradients of each network are clipped; 0 turns clipping off."""
     silhouettes: Literal["exact", "fast"] = "fast"
-    """As in `ShapeConfig`."""
+    """See `ShapeConfig`."""
 
 
 class GanModel(ModelConfig):

@@ -18,12 +18,14 @@ from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.layers import mlp
 
 NUMBERS = 8
-"""Numbers of a token in addition to its class: centre, log extents, cosine and sine of the yaw."""
+"""Continuous values of a token, before the class: centre, log extents, cosine and sine of the yaw.
+"""
 PARTS = {"position": slice(0, 3), "size": slice(3, 6), "angle": slice(6, 8)}
-"""The parts of the numbers, whose losses are logged separately."""
+"""Slices of these values whose losses are logged separately."""
 WAVE = 4.0
-"""Half a period of the slowest Fourier feature, in standard deviations of a number."""
+"""Half a period of the slowest Fourier feature, in standard deviations of a value."""
 LEAST_SPREAD = 1e-3
+"""Minimum standard deviation by which values are divided."""
 BATCH = 256
 """Rooms per batch in sampling."""
 
@@ -41,15 +43,15 @@ class SetFlowModel(SetModel):
 class SetFlow(nn.Module):
     """A transformer without positional encoding that predicts velocities from noise to rooms.
 
-    A room is a set of tokens: `NUMBERS` standardised numbers, then a scaled one-hot class. The
-    number of objects is drawn first, with its frequency in the training rooms. `classes` is the
-    size of the label set with void.
+    A room is a set of tokens, each `NUMBERS` standardised values followed by a scaled one-hot
+    class. The number of objects is sampled first, from its distribution in the training rooms.
+    `classes` is the size of the label set with void.
     """
 
     mean: Tensor
     spread: Tensor
     counts: Tensor
-    """Number of training rooms by their number of objects."""
+    """Number of training rooms with each number of objects."""
 
     def __init__(self, config: SetFlowModel, classes: int):
         super().__init__()
@@ -67,15 +69,15 @@ class SetFlow(nn.Module):
         self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, token))
 
     def fit_statistics(self, rooms: RoomBoxes) -> None:
-        """Set the means and spreads of numbers, and the frequencies of numbers of objects."""
+        """Set the means and standard deviations of values, and the histogram of object counts."""
         numbers = _numbers(rooms)[rooms.is_object]
         self.mean.copy_(numbers.mean(dim=0))
-        # A number that is the same in all rooms would have a spread of 0.
+        # A value that is the same in all rooms would have a standard deviation of 0.
         self.spread.copy_(numbers.std(dim=0, correction=0).clamp(min=LEAST_SPREAD))
         self.counts.copy_(torch.bincount(rooms.is_object.sum(dim=1), minlength=len(self.counts)))
 
     def to_tokens(self, rooms: RoomBoxes) -> Float[Tensor, "rooms objects token"]:
-        """The tokens of rooms; those of padding have no meaning."""
+        """The tokens of rooms; the values of padding tokens are undefined."""
         one_hot = F.one_hot(rooms.object_class, self.classes)[..., 1:]
         return torch.cat([self._unit(_numbers(rooms)), self.class_scale * one_hot], dim=-1)
 
@@ -85,7 +87,7 @@ class SetFlow(nn.Module):
     def to_rooms(
         self, tokens: Float[Tensor, "rooms objects token"], is_object: Bool[Tensor, "rooms objects"]
     ) -> RoomBoxes:
-        """The rooms of tokens: each object has the class with the largest value."""
+        """The rooms that tokens describe: each object has the class with the largest value."""
         numbers = self.mean + self.spread * tokens[..., :NUMBERS]
         centers_m, log_sizes, cosine, sine = numbers.split([3, 3, 1, 1], dim=-1)
         return RoomBoxes(
@@ -101,9 +103,9 @@ class SetFlow(nn.Module):
         time: Float[Tensor, " rooms"],
         is_object: Bool[Tensor, "rooms objects"],
     ) -> tuple[Float[Tensor, "rooms objects 8"], Float[Tensor, "rooms objects furniture"]]:
-        """Velocity of the numbers of each token at `time`, from 0 (noise) to 1 (a room), and logits
-        of its final class; 0 for padding."""
-        # All layers but attention run on the objects alone, since half of a batch is padding.
+        """Velocity of the continuous values of each token at `time`, from 0 (noise) to 1 (a room),
+        and logits of the token's final class; both are 0 for padding."""
+        # Half of a batch is padding, so all layers but attention run on the objects alone.
         here, counts = tokens[is_object], is_object.sum(dim=1)
         numbers = here[:, :NUMBERS]
         known = self.time(fourier_features(time.unsqueeze(-1))).repeat_interleave(counts, dim=0)
@@ -111,8 +113,8 @@ class SetFlow(nn.Module):
         for block in self.blocks:
             hidden = block(hidden, is_object)
         change, logits = self.out(hidden).split([NUMBERS, self.classes - 1], dim=-1)
-        # The best linear estimate of the velocity of standardised numbers, plus the predicted
-        # residual in units of its standard deviation.
+        # The best linear estimate of the velocity of standardised values, plus the predicted
+        # residual in units of the residual's standard deviation.
         late = time.repeat_interleave(counts).unsqueeze(-1)
         variance = late**2 + (1 - late) ** 2
         velocity = (2 * late - 1) / variance * numbers + change / variance.sqrt()
@@ -124,8 +126,8 @@ class SetFlow(nn.Module):
         time: Float[Tensor, " rooms"],
         is_object: Bool[Tensor, "rooms objects"],
     ) -> Float[Tensor, "rooms objects token"]:
-        """Velocity of each token at `time` below 1; the class moves straight to its predicted
-        mean."""
+        """Velocity of each token at a `time` below 1. The class moves on a straight line to its
+        predicted mean."""
         velocity, logits = self.predict(tokens, time, is_object)
         target = self.class_scale * logits.softmax(dim=-1)
         left = (1 - time)[:, None, None]
@@ -133,7 +135,7 @@ class SetFlow(nn.Module):
 
     @torch.no_grad()
     def sample(self, count: int, seed: int) -> RoomBoxes:
-        """New rooms. The first rooms of a seed do not depend on `count`."""
+        """Sample rooms. The first rooms of a seed do not depend on `count`."""
         generator = torch.Generator().manual_seed(seed)
         shape = self.max_objects, NUMBERS + self.classes - 1
         choices, noise = [], []
@@ -148,7 +150,7 @@ class SetFlow(nn.Module):
         return self.to_rooms(torch.cat([self._integrate(*part) for part in parts]), is_object)
 
     def _integrate(self, tokens: Tensor, is_object: Tensor) -> Tensor:
-        """Follow the velocities from time 0 to 1 with Euler's method."""
+        """Integrate the velocities from time 0 to 1 with Euler's method."""
         for step in range(self.steps):
             time = tokens.new_full(tokens.shape[:1], step / self.steps)
             tokens = tokens + self.velocity(tokens, time, is_object) / self.steps
@@ -170,7 +172,7 @@ class Block(nn.Module):
     def forward(
         self, hidden: Float[Tensor, "all width"], is_object: Bool[Tensor, "rooms objects"]
     ) -> Float[Tensor, "all width"]:
-        """The features of all objects of a batch, room by room, after the block."""
+        """Apply the block to the features of all objects of a batch, room by room."""
         projected = _padded(self.queries_keys_values(self.before_attention(hidden)), is_object)
         query, key, value = projected.unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         seen = F.scaled_dot_product_attention(query, key, value, is_object[:, None, None])
@@ -181,7 +183,7 @@ class Block(nn.Module):
 def _padded(
     values: Float[Tensor, "all numbers"], is_object: Bool[Tensor, "rooms objects"]
 ) -> Float[Tensor, "rooms objects numbers"]:
-    """The values of all objects, room by room, with zeros for padding."""
+    """The features of all objects, arranged by room and padded with zeros."""
     padded = values.new_zeros(*is_object.shape, values.shape[-1])
     padded[is_object] = values
     return padded

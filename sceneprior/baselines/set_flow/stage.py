@@ -16,7 +16,7 @@ from sceneprior.training.steps import full_precision
 
 
 class SetFlowTraining(OneStageTraining):
-    """Settings of the only stage."""
+    """Training settings of the set flow."""
 
     epochs: int = Field(500, ge=1)
     batch_size: int = Field(64, ge=1)
@@ -24,7 +24,7 @@ class SetFlowTraining(OneStageTraining):
 
 
 class SetFlowConfig(BoxConfig):
-    """A run of the set flow."""
+    """Config of a run of the set flow."""
 
     method: Literal["set_flow"] = "set_flow"
     model: SetFlowModel
@@ -35,15 +35,15 @@ class SetFlowConfig(BoxConfig):
 
 
 class SetFlowStage(OneStage):
-    """Flow matching: half the squared error of the numbers' velocities between noise and training
-    rooms, and the cross-entropy of classes, summed over the objects of a room."""
+    """Training by flow matching. The loss of a room sums, over its objects, half the squared error
+    of the velocity from noise to the training room, and the cross-entropy of the class."""
 
     prior: SetFlow
 
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
         is_object = rooms.is_object
         tokens = self.prior.to_tokens(rooms)
-        # `StepSeed` seeds noise and times by the step, so that a resumed run draws the same.
+        # `StepSeed` seeds noise and times by the step, so that a resumed run draws the same ones.
         noise = matched(torch.randn_like(tokens), tokens, is_object)
         time = torch.rand_like(tokens[:, 0, 0])
         between = torch.lerp(noise, tokens, time[:, None, None])
@@ -63,10 +63,10 @@ def matched(
     tokens: Float[Tensor, "rooms objects token"],
     is_object: Bool[Tensor, "rooms objects"],
 ) -> Float[Tensor, "rooms objects token"]:
-    """Reorder the noise of each room so that the squared distances to the objects are minimal.
+    """Reorder the noise of each room so that the summed squared distance to the objects is minimal.
 
-    Objects have no order, so any order of the noise is a valid start, and straight paths that do
-    not cross are learnt faster (Song et al., "Equivariant Flow Matching with Hybrid Probability
+    Rooms are sets, so that any order of the noise is a valid start, and straight paths that do not
+    cross are learnt faster (Song et al., "Equivariant Flow Matching with Hybrid Probability
     Transport", NeurIPS 2023).
     """
     counts = is_object.sum(dim=1).tolist()

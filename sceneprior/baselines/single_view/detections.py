@@ -46,7 +46,7 @@ class Detections:
     """Index of its object in the room."""
     object_class: Int[Tensor, " masks"]
     boxes: Float[Tensor, "masks 4"]
-    """As in `SceneViews`, relative to the image."""
+    """2D boxes in the format of `SceneViews`, relative to the image."""
     quarter: Int[Tensor, " masks"]
     """Number of quarter turns from the room into the image's frame."""
     eye_m: Float[Tensor, "masks 3"]

@@ -42,7 +42,7 @@ class SingleViewTraining(OneStageTraining):
 
     learning_rate: float = Field(1e-3, gt=0)
     schedule: Literal["constant", "cosine"] = "cosine"
-    """As in `OneStageTraining`."""
+    """See `OneStageTraining`."""
 
 
 class SingleViewConfig(OneStageConfig):

@@ -57,9 +57,9 @@ class UslTraining(SingleViewTraining):
     mask: float = Field(1.0, ge=0)
     """Weight of silhouettes in the other views."""
     occlusion_slack: float = Field(0.15, ge=0, le=1)
-    """As in `LossConfig`."""
+    """See `LossConfig`."""
     silhouettes: Literal["exact", "fast"] = "fast"
-    """As in `ShapeConfig`."""
+    """See `ShapeConfig`."""
 
 
 class UslConfig(SingleViewConfig):

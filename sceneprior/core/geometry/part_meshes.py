@@ -36,9 +36,8 @@ def surface_of_parts(
     united: Manifold = Manifold.batch_boolean(solids, OpType.Add)
     if not np.array_equal(parts.outline, SQUARE):
         united = united ^ prism(parts.outline, -1.0, 1.0)
-    mesh = united.simplify(OVERLAP).to_mesh64()
-    vertices = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
-    return vertices.clip(-0.5, 0.5), np.asarray(mesh.tri_verts, dtype=np.int64)
+    vertices, faces = triangles_of(united.simplify(OVERLAP))
+    return vertices.clip(-0.5, 0.5), faces
 
 
 def convex_surface(
@@ -47,7 +46,14 @@ def convex_surface(
     """Vertices and outward triangles of the convex hull of points."""
     from manifold3d import Manifold
 
-    mesh = Manifold.hull_points(points).to_mesh64()
+    return triangles_of(Manifold.hull_points(points))
+
+
+def triangles_of(
+    solid: "Manifold",
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    """Vertices and outward triangles of a solid."""
+    mesh = solid.to_mesh64()
     vertices = np.asarray(mesh.vert_properties[:, :3], dtype=np.float64)
     return vertices, np.asarray(mesh.tri_verts, dtype=np.int64)
 

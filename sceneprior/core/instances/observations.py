@@ -97,7 +97,7 @@ def observe(images: np.ndarray, classes: np.ndarray | Sequence[int]) -> Observat
 def clear_sides(
     image: np.ndarray, number: int, rows: slice, columns: slice
 ) -> tuple[bool, bool, bool, bool]:
-    """Test for each side of a mask's box that no other object touches it.
+    """True for each side of a mask's box that no other object touches.
 
     The sides are left, upper, right and lower; `number` is the mask's id in the image of ids.
     """

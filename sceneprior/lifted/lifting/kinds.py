@@ -1,4 +1,4 @@
-"""Kinds of furniture: the parts of each prototype, and the look that each object's rays support."""
+"""Kinds of furniture: the parts of each prototype, and the look that best explains each object."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -25,12 +25,12 @@ from sceneprior.render.silhouettes.cpu.threads import in_threads, thread_count
 RAYS = 4096
 """Rays to which the parts of a kind are fitted."""
 MOST = 16
-"""Maximum number of objects, in one pose each, whose rays are taken."""
+"""Maximum number of pairs of an object and a pose whose rays are used for a kind."""
 SYMMETRIC = 0.05
-"""Distance by which an object may be further from a prototype in other poses than in its best, if
-its rays are to be taken in these, too."""
+"""Margin over an object's smallest distance to the prototype within which other poses are used,
+too, as for symmetric objects."""
 ASKED = 128
-"""Rays of an object by which its look is found."""
+"""Number of an object's rays from which its look is found."""
 SIZE_WEIGHT = 0.1
 """Weight of the difference in log extents; see `looks_of`."""
 
@@ -45,9 +45,12 @@ def fit_kinds(
     hangs: Bool[np.ndarray, " objects"],
     margin: float,
 ) -> tuple[Parts, ...]:
-    """Parts of the prototypes, which are the objects `items`: fitted to the rays of all objects of
-    their class that look like them, in the pose in which each does best and, for symmetric ones, in
-    those that are as good. Objects that `hang` are held from above."""
+    """Parts of the prototypes, which are the objects `items`.
+
+    The parts of a prototype are fitted to the rays of all objects of its class that are similar to
+    it (`ALIKE`), each in its most similar pose and, for symmetric objects, in other poses that are
+    nearly as similar (`SYMMETRIC`). Objects with `hangs` are held from above.
+    """
 
     def fit_one(item: int) -> Parts:
         rows = np.flatnonzero((object_class == object_class[item]) & usable)
@@ -77,7 +80,7 @@ def fit_kinds(
 
 
 def as_prototype(rays: RayPool, pose: int) -> RayPool:
-    """Rays of an object that is a prototype in this pose, in the prototype's own frame."""
+    """Rays of an object whose look is a prototype in this pose, in the prototype's frame."""
     quarters, mirrored = turn_of(pose)
     back = quarter_rotation(quarters) * [-1 if mirrored else 1, 1, 1]
     starts, spans = (part.astype(np.float64) @ back for part in rays[:2])
@@ -91,11 +94,12 @@ def looks_of(
     object_class: Int[np.ndarray, " objects"],
     margin: float,
 ) -> Int[np.ndarray, " objects"]:
-    """The look of each object: the prototype of its class, in the pose, for which
+    """The look of each object: the prototype of its class and the pose that minimise
 
-        share of the object's rays explained wrongly + `SIZE_WEIGHT` (L1 distance of log extents)
+        share of the object's rays explained wrongly + `SIZE_WEIGHT` (L1 distance of log extents).
 
-    is least, the first of equal ones; -1 if its class has no prototype."""
+    Of equal looks, the first is taken; -1 if the object's class has no prototype.
+    """
     looks = np.full(len(object_class), -1, dtype=np.int64)
     offered = {}
     for label in np.unique(prototypes.object_class):

@@ -1,4 +1,4 @@
-"""Outlines of furniture as seen from above: found in visual hulls, and what they leave of rays."""
+"""Outlines of furniture seen from above: extraction from visual hulls, and rays cut to them."""
 
 from typing import no_type_check
 
@@ -10,17 +10,17 @@ from numba import njit
 from sceneprior.core.parts import MOST_CORNERS, SQUARE
 
 SMOOTHED = 0.3
-"""Distance in cells by which an outline, which cuts the corners of cells, may be simplified. More
-would slant the sides of rectangles: a side would end at either end of such a cut."""
+"""Tolerance in cells of the simplification of outlines. Contours cut the corners of cells
+diagonally, and with a larger tolerance these cuts would slant the sides of rectangles."""
 FULL = 0.97
-"""Share of its box from which an outline counts as filling it."""
+"""Share of the box's area above which an outline is replaced by the whole box."""
 
 
 def outline_of(hull: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "corners 2"]:
-    """The outline, as seen from above, of the largest piece of a visual hull, whose grid spans the
-    object's box. It touches all four sides of the box; `SQUARE` for a hull that nearly fills it, or
-    is empty."""
-    from skimage.measure import find_contours  # imported here: recognising looks needs none
+    """Outline of the largest piece of a visual hull seen from above, scaled to touch all four sides
+    of the object's box; `SQUARE` if the hull nearly fills the box, or is empty. The hull's grid
+    spans the box."""
+    from skimage.measure import find_contours  # imported here, since `looks_of` does not need it
 
     seen = np.pad(hull.any(axis=1), 1).astype(np.float64)
     found = [shapely.Polygon(line) for line in find_contours(seen, 0.5) if len(line) > 3]
@@ -42,9 +42,8 @@ def outline_of(hull: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "corners 2"
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def within(start, span, outline):
-    """The points at which a segment, from `start` to `start` + `span`, first enters the prism over
-    an outline and last leaves it, as shares of the segment's length; the first is above the second
-    if the segment never meets the prism."""
+    """Shares of a segment's length, from `start` to `start` + `span`, at which the segment first
+    enters and last leaves the prism over an outline; (1, 0) if it never meets the prism."""
     near, far = 1.0, 0.0
     first, last = False, False  # whether the segment's ends lie inside
     corners = len(outline)
@@ -73,9 +72,9 @@ def within(start, span, outline):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def cut_rays(starts, spans, outline):
-    """Shorten segments, in place, to where they may meet an object of this outline: from the first
-    point within it to the last. Those that never are get a span of 0. A segment that leaves an
-    outline with a notch and enters it again keeps what lies between."""
+    """Shorten segments, in place, to the range between their first and last point within an
+    outline. Segments without such a point get a span of 0. In an outline with a notch, this range
+    may include points outside."""
     for ray in range(len(starts)):
         near, far = within(starts[ray], spans[ray], outline)
         for axis in range(3):
@@ -86,7 +85,7 @@ def cut_rays(starts, spans, outline):
 def points_within(
     outline: Float[np.ndarray, "corners 2"], count: int
 ) -> Float[np.ndarray, "count 2"]:
-    """Random points within an outline, always the same ones."""
+    """Random points within an outline, from a fixed seed."""
     rng = np.random.default_rng(0)
     polygon = shapely.Polygon(outline)
     found = np.empty((0, 2))

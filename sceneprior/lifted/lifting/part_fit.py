@@ -1,7 +1,7 @@
-"""Fit a few parts to the rays of one kind of furniture: a greedy search, one part more at a time.
+"""Greedy search for the few parts that explain the rays of one kind of furniture.
 
-`part_loss.py` has the loss. Every step tries all changes on some of the rays, the best of them on
-all rays, and keeps the best one as long as the loss falls.
+Each step tries all changes on a subset of the rays and the best of these changes on all rays. The
+best one is kept; the search ends when no change lowers the loss (`part_loss.py`).
 """
 
 import itertools
@@ -29,26 +29,29 @@ from sceneprior.lifted.lifting.part_prices import LEVELS
 
 CURVED = (CYLINDER, ELLIPSOID, DOME, BOWL)
 LEAST_GAIN = 1e-4
-"""Loss by which a change must be better."""
+"""Smallest decrease of the loss for which a change is kept."""
 PLACES = (0.25, 0.5, 0.75)
-"""Where a part is split, as shares of its length."""
+"""Positions at which parts are split, as shares of their length."""
 SHORTEST = 4
 """Length in levels below which a part is not split."""
 PIECES = 4
-"""Pieces of the hull without parts, the largest ones, in which new parts are tried."""
+"""Number of uncovered pieces of the hull, the largest first, in which new parts are tried."""
 SCREENED, FINALISTS = 768, 6
-"""Rays on which all changes are tried; the best of them (`FINALISTS`) are tried on all rays."""
+"""Number of rays on which all changes are tried, and of the best changes that are then tried on all
+rays."""
 
 
 def fit_parts(
     rays: RayPool, hull: Bool[np.ndarray, "x y z"], margin: float, hangs: bool = False
 ) -> Parts:
-    """The parts that explain the rays of one object, or of several that look alike.
+    """Fit parts to the rays of one object, or of several similar objects.
 
-    Rays lie in the frame that spans [-1, 1] and `margin` boxes, in random order; those without
-    information are left out. `hull`, a grid of the same frame, gives the outline and says where
-    parts may be missing. An object that `hangs` is held from above, others stand.
-    Without rays, the object's box is its only part.
+    Args:
+        rays: Rays in random order, in the frame that spans [-1, 1], which is `margin` boxes wide.
+            Rays that miss the outline are ignored. Without any others, the box is the only part.
+        hull: Visual hull on a grid of the same frame. It gives the outline and shows where parts
+            may be missing.
+        hangs: True for an object that is held from above; others stand.
     """
     cells = len(hull)
     beyond = round((1 - 1 / margin) / 2 * cells)
@@ -67,10 +70,11 @@ def fit_parts(
 def _one_more(
     every: RayFit, some: RayFit, guess: Guess, hull: Bool[np.ndarray, "x y z"]
 ) -> Guess | None:
-    """The guess after its best change, which often adds a part; None if no change is better."""
+    """The guess after the change that lowers the loss most; None if no change lowers it."""
     rough = some.guess(*guess[:3])
     tried = []
-    curved = len(guess.kinds) > 1 or some is every  # not at first: a chair is no bowl
+    # A first part is not curved unless all else fails, or chairs would begin as bowls.
+    curved = len(guess.kinds) > 1 or some is every
     for change in _changes(guess, hull, curved):
         trial = some.changed(rough, change)
         if all(
@@ -89,9 +93,9 @@ def _one_more(
 
 
 def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Iterator[Change]:
-    """Changes that may be better: parts of another kind, parts mirrored as they are or narrow,
-    parts split in two with the hull's extents in each half, parts below others, and new parts
-    around pieces of the hull that no part fills."""
+    """Changes to try: another kind of a part; a part mirrored with its own or a quarter of its
+    width; a part split in two, each fitted to the hull; a part extended to the floor; legs or
+    panels below a part; a new part around an uncovered piece of the hull."""
     new = len(guess.kinds)
     room = new < MOST_PARTS
     for row in range(new):
@@ -132,8 +136,8 @@ def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Ite
 
 
 def _below(ends: Int[np.ndarray, "3 2"]) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
-    """Four legs, and panels at two or one of the sides, between a part and the floor; with their
-    mirroring."""
+    """Supports between a part and the floor, each as mirroring and ends: four legs, two side
+    panels, or a front and a back panel."""
     under = ends.copy()
     under[1] = 0, ends[1, 0]
     for axes, across in (((0, 2), ACROSS_X | ACROSS_Z), ((0,), ACROSS_X), ((2,), ACROSS_Z)):
@@ -146,7 +150,7 @@ def _below(ends: Int[np.ndarray, "3 2"]) -> Iterator[tuple[int, Int[np.ndarray, 
 def _extents_of(
     hull: Bool[np.ndarray, "x y z"], ends: Int[np.ndarray, "3 2"]
 ) -> Int[np.ndarray, "3 2"]:
-    """The smallest box around the hull's cells in a box; the box itself if there are none."""
+    """The bounding box of the hull's cells in a box; the box itself if it has none."""
     cells = len(hull)
     first, last = ends[:, 0] * cells // LEVELS, -(-ends[:, 1] * cells // LEVELS)
     inner = hull[first[0] : last[0], first[1] : last[1], first[2] : last[2]]
@@ -161,7 +165,7 @@ def _extents_of(
 
 
 def _cells_in(guess: Guess, cells: int) -> Bool[np.ndarray, "x y z"]:
-    """The cells of a grid over the object's box that lie in the boxes of parts."""
+    """True for cells, of a grid over the object's box, in the box of some part."""
     found = np.zeros((cells,) * 3, bool)
     for _, ends in guess.parts().solids():
         first, last = np.rint((ends.T + 0.5) * cells).astype(int)
@@ -170,7 +174,7 @@ def _cells_in(guess: Guess, cells: int) -> Bool[np.ndarray, "x y z"]:
 
 
 def _needed(every: RayFit, guess: Guess) -> Guess:
-    """The guess without the parts that cost more than they explain."""
+    """The guess without the parts whose removal lowers the loss."""
     row = 0
     while row < len(guess.kinds) > 1:
         trial = every.without(guess, row)
@@ -182,8 +186,8 @@ def _needed(every: RayFit, guess: Guess) -> Guess:
 
 
 def _joined(every: RayFit, guess: Guess) -> Guess:
-    """The guess with bars between its pieces, and to what it stands on or hangs from, where that
-    costs less than gaps: cords are often too thin for masks."""
+    """The guess with bars that connect its pieces to each other and to the floor or the ceiling,
+    where a bar costs less than the gap. Masks often miss cords, which are thin."""
     while len(guess.kinds) < MOST_PARTS:
         new = len(guess.kinds)
         trials = [
@@ -198,8 +202,9 @@ def _joined(every: RayFit, guess: Guess) -> Guess:
 
 
 def _bars(guess: Guess, hangs: bool) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
-    """Boxes from each part to each other and to the floor, or to the ceiling for an object that
-    hangs, as wide as both together allow and two levels wide; with their mirroring."""
+    """Boxes that connect each part to each other part, and to the floor or, for an object that
+    hangs, the ceiling: as wide as the overlap of the two, and two levels wide. Each comes with its
+    mirroring."""
     support = np.array([[0, LEVELS]] * 3)
     support[1] = LEVELS if hangs else 0
     both = ACROSS_X | ACROSS_Z

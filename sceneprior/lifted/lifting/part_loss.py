@@ -1,4 +1,4 @@
-"""The loss of parts on rays. It counts rays and has no gradient:
+"""The loss of parts on rays. It counts rays, and has no gradient:
 
     half the share of hits that meet no part + half the share of misses that meet one
       + 0.002 (number of parts) + 0.002 (number of planes in which faces lie)
@@ -7,15 +7,16 @@
       + 0.005 (connected pieces - 1)
       + 0.1 (overhang of the centre beyond the feet, unless the object hangs; 1 for the box's width)
 
-A ray is right if it meets a part exactly when its pixel is the object's. Rays count only within
-the object's outline, which cuts the parts. Upright rays within it are hits as well: cameras rarely
-look down, so without these rays no mask says that a table top reaches the outline.
+A ray is a hit if its pixel belongs to the object, else a miss; it is explained if it meets a part
+exactly when it is a hit. Rays are cut to the object's outline, as the parts are. Vertical rays
+within the outline are added as hits: cameras rarely look down, so that without them nothing would
+make a table top reach the outline.
 
-Few parts explain masks more cheaply than what a visual hull adds where no view sees past: a
-headboard and a mattress, not a dome. Parts and their mirror images count once, and so do planes and
-theirs; sides of the box cost nothing. So edges line up. The other prices settle what rays leave
-open: solids are full where nobody has looked, stand without tipping over or hang, and hold
-together.
+The price of parts prevents the loss from modelling the volume that a visual hull adds where no view
+sees past the object: a headboard and a mattress cost less than a dome. A part and its mirror images
+count once, and so does a plane and its mirror image; the sides of the box are free, so that edges
+line up. The other prices decide what the rays leave open: unobserved volume is filled, and objects
+are connected, and stand without tipping over or hang.
 """
 
 from collections.abc import Iterable
@@ -39,24 +40,24 @@ from sceneprior.lifted.lifting.part_rays import descend, meets, wrong_rays
 PART_PRICE, CURVED_PRICE, PLANE_PRICE = 0.002, 0.002, 0.002
 VOLUME_PRICE, GAP_PRICE, PIECE_PRICE, OVERHANG_PRICE = -0.0005, 0.06, 0.005, 0.1
 FEWEST = 50
-"""Added to the numbers of hits and misses, so that few rays do not weigh too much."""
+"""Added to the numbers of hits and misses, which limits the weight of a ray where there are few."""
 UPRIGHT = 0.075
-"""Number of upright rays within the outline, as a share of all others."""
+"""Number of vertical rays within the outline, as a share of all others."""
 
 Change = dict[int, tuple[int, int, Int[np.ndarray, "3 2"]]]
-"""Kind, mirroring and ends of the parts that change, by their number; a number one past the last
-adds a part."""
+"""Kind, mirroring and ends of the parts that change, by their index; the index after the last adds
+a part."""
 
 
 class Guess(NamedTuple):
-    """Parts under way."""
+    """Candidate parts, with the rays that meet them."""
 
     kinds: Int[np.ndarray, " parts"]
     mirrored: Int[np.ndarray, " parts"]
     ends: Int[np.ndarray, "parts 3 2"]
-    """On the levels of `part_rays.py`."""
+    """Lower and upper end along each axis, in levels (`part_prices.py`)."""
     covered: Bool[np.ndarray, "parts rays"]
-    """Which rays each part meets."""
+    """True if the part meets the ray."""
     met_by: Int[np.ndarray, " rays"]
     """Number of parts that each ray meets."""
 
@@ -66,8 +67,8 @@ class Guess(NamedTuple):
 
 
 class RayFit:
-    """The loss of parts on a set of rays, which lie in the frame of the object's box, and on
-    upright rays through its outline."""
+    """The loss of parts on a set of rays, in the frame of the object's box, and on vertical rays
+    through its outline. The arguments are those of `fit_parts`."""
 
     def __init__(
         self,
@@ -95,7 +96,7 @@ class RayFit:
         self.outline, self.hangs = outline, hangs
 
     def loss(self, guess: Guess) -> float:
-        """See the module's docstring."""
+        """The loss that the module's docstring defines."""
         missed, wrongly_met = wrong_rays(guess.met_by, self.hits)
         volume = sum(map(volume_of, guess.kinds, guess.mirrored, guess.ends))
         gap, pieces = gap_and_pieces(guess.mirrored, guess.ends, self.hangs)
@@ -117,14 +118,14 @@ class RayFit:
         mirrored: Int[np.ndarray, " parts"],
         ends: Int[np.ndarray, "parts 3 2"],
     ) -> Guess:
-        """Parts, and the rays that they meet."""
+        """A guess of these parts; the rays that they meet are computed."""
         none = np.zeros((0, len(self.hits)), bool)
         empty = Guess(kinds[:0], mirrored[:0], ends[:0], none, np.zeros(len(self.hits), np.int16))
         rows = zip(kinds.tolist(), mirrored.tolist(), ends, strict=True)
         return self.changed(empty, dict(enumerate(rows)))
 
     def changed(self, guess: Guess, change: Change) -> Guess:
-        """A copy in which some parts are others, or new."""
+        """A copy with some parts replaced or added."""
         more = max(0, max(change) + 1 - len(guess.kinds))
         kinds, mirrored, ends, covered = (
             np.concatenate([part, np.zeros((more, *part.shape[1:]), part.dtype)])
@@ -145,8 +146,8 @@ class RayFit:
         return Guess(kinds, mirrored, ends, covered, guess.met_by - guess.covered[row])
 
     def settled(self, guess: Guess, rows: Iterable[int], sweeps: int) -> Guess:
-        """The guess after the faces of some parts have moved to where fewest rays are wrong, or as
-        it was if that is better, since moving knows nothing of gaps and pieces."""
+        """The guess after coordinate descent of the faces of some parts (`descend`), or the guess
+        itself if its loss is lower: the descent ignores gaps and pieces."""
         moved = Guess(*(part.copy() for part in guess))
         descend(
             self.starts, self.spans, self.inverse, self.hits, moved.kinds, moved.mirrored,

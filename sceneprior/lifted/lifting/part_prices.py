@@ -1,5 +1,5 @@
-"""Prices of parts that hang on the parts alone: volume, planes of faces, pieces, the gap
-to what they stand on or hang from, and whether they would tip over.
+"""Terms of the loss that depend on the parts alone: volume, planes of faces, connected pieces, the
+gap to the floor or the ceiling, and the overhang, for which an object tips over.
 
 Faces lie on `LEVELS` + 1 evenly spaced levels between the sides of the object's box.
 """
@@ -19,7 +19,7 @@ LEVELS = 64
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def volume_of(kind, mirrored, ends):
-    """Volume of a part and its mirror images, as a share of the object's box; 1 for the box."""
+    """Volume of a part and its mirror images, as a share of the object's box."""
     copies = (2 if mirrored & ACROSS_X else 1) * (2 if mirrored & ACROSS_Z else 1)
     share = 1.0
     for axis in range(3):
@@ -34,8 +34,8 @@ def volume_of(kind, mirrored, ends):
 @njit(cache=True, nogil=True)
 @no_type_check
 def planes_of(ends, skipped):
-    """Mark the planes, by axis and level, in which faces of all parts but one lie; the sides of the
-    box are always marked, and across x and z a plane counts as its mirror image, too."""
+    """True for the planes, by axis and level, that contain a face of any part but `skipped`, and
+    across x and z for their mirror images. The sides of the box are always true."""
     used = np.zeros((3, LEVELS + 1), np.bool_)
     used[:, 0] = True
     used[:, LEVELS] = True
@@ -52,8 +52,8 @@ def planes_of(ends, skipped):
 @njit(cache=True, nogil=True)
 @no_type_check
 def count_planes(ends):
-    """The number of planes in which faces lie; sides of the box do not count, and across x and z a
-    plane and its mirror image count once."""
+    """Number of planes that contain faces, without the sides of the box. Across x and z, a plane
+    and its mirror image count once."""
     used = planes_of(ends, -1)
     return (
         used[1, 1:LEVELS].sum()
@@ -65,7 +65,7 @@ def count_planes(ends):
 @njit(cache=True, nogil=True)
 @no_type_check
 def solids_of(mirrored, ends):
-    """The ends, in levels, of all parts and their mirror images."""
+    """Ends, in levels, of all parts and their mirror images."""
     solids = np.empty((4 * len(ends), 3, 2), np.int64)
     count = 0
     for part in range(len(ends)):
@@ -84,8 +84,8 @@ def solids_of(mirrored, ends):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def overhang(mirrored, ends):
-    """The distance, in levels along x and z together, of the centre of the parts' volume from the
-    rectangle around the parts that reach lowest. Above 0, the object would tip over."""
+    """Distance in levels, along x plus along z, of the parts' centre of volume from the rectangle
+    around the lowest parts. An object with a positive overhang tips over."""
     solids = solids_of(mirrored, ends)
     lowest = solids[:, 1, 0].min()
     center, volume = np.zeros(3), 0.0
@@ -110,9 +110,8 @@ def overhang(mirrored, ends):
 @njit(cache=True, nogil=True)
 @no_type_check
 def gap_and_pieces(mirrored, ends, hangs):
-    """The gap, in levels, between the floor of the object's box, or its ceiling for an object that
-    hangs, and the connected piece that comes nearest to it; and the number of pieces. Parts within
-    a level touch."""
+    """Gap in levels between the parts and the bottom of the object's box (the top, if the object
+    hangs), and the number of connected pieces. Parts at most one level apart are connected."""
     solids = solids_of(mirrored, ends)
     count = len(solids)
     piece = np.arange(count)

@@ -1,7 +1,7 @@
-"""Which rays meet a part, and where a part's face stands best, given all other faces.
+"""Intersections of rays with parts, and coordinate descent of the faces of parts.
 
-Faces lie on `LEVELS` + 1 evenly spaced levels between the sides of the object's box, so that the
-cost of all places of a face is counted in one pass over the rays, exactly and in integers.
+Faces lie on `LEVELS` + 1 evenly spaced levels between the sides of the object's box, so that one
+pass over the rays computes the costs of all levels of a face, exactly and in integers.
 """
 
 from typing import no_type_check
@@ -16,14 +16,14 @@ from sceneprior.lifted.lifting.part_prices import LEVELS, planes_of, volume_of
 FAR = 1e6
 """A level beyond all rays."""
 NEVER = 1 << 20
-"""Level of a face from which no ray is met."""
+"""Threshold of a ray that meets the box at no level of the face."""
 
 
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _meets_solid(start, span, kind, low, high):
-    """Whether a segment, from `start` to `start` + `span`, meets a solid."""
+    """True if a segment, from `start` to `start` + `span`, meets a solid."""
     near, far = 0.0, 1.0
     for axis in range(3):
         one = (low[axis] - start[axis]) / span[axis]
@@ -47,7 +47,7 @@ def _meets_solid(start, span, kind, low, high):
         a += slope * slope
         b += slope * offset
         c += offset * offset
-    # The least value on [near, far].
+    # The minimum on [near, far].
     best = min(max(-b / a, near), far) if a > 1e-12 else near
     return a * best * best + 2 * b * best + c <= 0
 
@@ -55,8 +55,8 @@ def _meets_solid(start, span, kind, low, high):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def meets(starts, spans, kind, mirrored, ends, met):
-    """Fill `met` with whether each ray meets a part or one of its mirror images. `ends` are levels,
-    (3, 2); starts and spans are in levels, too."""
+    """Set `met` to true for rays that meet a part or one of its mirror images. The ends, (3, 2),
+    starts and spans are in levels."""
     low, high = ends[:, 0].astype(np.float64), ends[:, 1].astype(np.float64)
     start, span = np.empty(3), np.empty(3)
     for ray in range(len(met)):
@@ -80,10 +80,12 @@ def meets(starts, spans, kind, mirrored, ends, met):
 def _face_costs(
     starts, inverse, hits, others, mirrored, ends, axis, upper, hit_price, miss_price, costs
 ):  # fmt: skip
-    """Fill `costs` with the change of the price of wrong rays, for each level at which the box's
-    face may lie, against a box that no ray meets. A ray meets the box if the face lies beyond a
-    threshold: the first point along the axis at which the ray is between the other five faces.
-    `inverse` are the reciprocals of the rays' spans."""
+    """Set `costs` to the price of wrong rays for each level of one face of a box, relative to a box
+    that no ray meets.
+
+    A ray meets the box if the face lies beyond a threshold: the first point along the axis at which
+    the ray is between the other five faces. `inverse` are the reciprocals of the rays' spans.
+    """
     costs[:] = 0
     low, high = ends[:, 0].astype(np.float64), ends[:, 1].astype(np.float64)
     if upper:
@@ -139,8 +141,7 @@ def _face_costs(
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def wrong_rays(count, hits):
-    """The numbers of rays that meet no part though their pixel is the object's, and of those that
-    meet one though it is not."""
+    """Number of hits that meet no part, and of misses that meet one."""
     missed, wrongly_met = 0, 0
     for ray in range(len(hits)):
         if hits[ray]:
@@ -156,12 +157,12 @@ def descend(
     starts, spans, inverse, hits, kinds, mirrored, ends, covered, count, chosen, sweeps,
     hit_price, miss_price, volume_price, plane_price,
 ):  # fmt: skip
-    """Move the faces of the chosen parts, one after another, each to its best level; in place.
+    """Move each face of the chosen parts, one after another, to its best level, in place.
 
-    `covered` says which rays each part meets, and `count` how many parts each ray meets; both are
-    kept up to date. The prices are those of a hit that no part meets, of a miss that one meets, of
-    filling the whole box, and of a face in a plane of its own (`count_planes`). Boxes try all
-    levels; curved parts, whose faces hang together, try those nearby.
+    `covered` is true where a part meets a ray, and `count` is the number of parts that each ray
+    meets; both are updated. The prices are those of a hit that no part meets, of a miss that one
+    meets, of filling the whole box, and of a face in a new plane (`count_planes`). A box tries all
+    levels of a face, a curved part only those nearby: its faces are not independent.
     """
     costs = np.empty(LEVELS + 1)
     others = np.empty(len(hits), np.int16)
@@ -190,7 +191,7 @@ def descend(
                         cost = costs[place] + volume_price * volume_of(kind, mirror, own)
                         if not used[axis, place]:
                             cost += plane_price
-                        # Equal costs: the place where the face is already, then the larger part.
+                        # Ties: the current level first, then the first level tried.
                         if cost < least - 1e-12 or (cost < least + 1e-12 and place == before):
                             least, best = cost, place
                 else:
@@ -228,10 +229,12 @@ def descend(
 def count_wrong(
     starts, spans, hits, kinds, lows, highs, first_solids, corners, first_corners, wrong
 ):  # fmt: skip
-    """Fill `wrong` with the number of rays that each of several objects explains wrongly. Object i
-    is the union of the solids from `first_solids[i]` up to `first_solids[i + 1]`, within the
-    outline of the corners from `first_corners[i]` up to `first_corners[i + 1]`; rays, solids and
-    corners are in the same units, and rays without a span are skipped."""
+    """Set `wrong` to the number of rays that each of several objects explains wrongly.
+
+    Object i is the union of the solids `first_solids[i]` to `first_solids[i + 1]`, cut to the
+    outline of the corners `first_corners[i]` to `first_corners[i + 1]` (one past the last). Rays,
+    solids and corners have the same units; rays without a span are skipped.
+    """
     wrong[:] = 0
     start, span = np.empty(3), np.empty(3)
     for ray in range(len(hits)):

@@ -1,2 +1,2 @@
-"""Rooms on request: the sampler is conditioned on a floor, doors, windows and wishes. Conditions
-that are not inputs of its network are met by sequential Monte Carlo over partly furnished rooms."""
+"""Rooms on request: floor, doors, windows and wishes condition the sampler. Conditions that are not
+inputs of its network are enforced by sequential Monte Carlo over partly furnished rooms."""

@@ -1,4 +1,4 @@
-"""Requested rooms as scenes, each with the wishes that hold in it."""
+"""Requested rooms as scenes; each lists the wishes, and whether they hold."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from sceneprior.core.scene import Opening, Scene
 from sceneprior.core.seeds import check_seed
 from sceneprior.core.threads import single_threaded
 from sceneprior.lifted.requests.draw import Answer, draw_requested
-from sceneprior.lifted.requests.holding import Relations, furniture_in
+from sceneprior.lifted.requests.relation_checks import RelationChecks, furniture_in
 from sceneprior.lifted.requests.request import Request, make_request
 from sceneprior.lifted.sampled import drawn_by_sampler, scene_of
 from sceneprior.lifted.trained import TrainedLifted
@@ -30,11 +30,11 @@ def sample_requested(
     distribution: str | None = None,
     name: str | None = None,
 ) -> list[Scene]:
-    """New rooms as requested, drawn by a run's sampler.
+    """Sample rooms that meet a request, with a run's sampler.
 
     Args:
         asked: Arguments of `make_request`: floor, openings, ceiling_m, want and objects.
-        name: First part of the rooms' names; None names them by the seed.
+        name: Prefix of the rooms' names; None names the rooms by the seed.
 
     Raises:
         InputError: the run has no sampler, or no room holds the request.
@@ -43,10 +43,10 @@ def sample_requested(
     with_sampler = drawn_by_sampler(trained, distribution)
     if with_sampler is None:
         raise InputError(
-            "Floors and wishes can be asked of a sampler alone, and these rooms come from latents; "
+            "Requests for floors and wishes need a sampler, but these rooms come from latents; "
             "leave them out, or take a prior with a sampler."
         )
-    assert with_sampler.sampler is not None, "drawn_by_sampler has asked"
+    assert with_sampler.sampler is not None, "checked by drawn_by_sampler"
     classes = label_set(with_sampler.config.label_set)
     request = _parsed(with_sampler, asked)
     for item in request.objects:
@@ -79,7 +79,7 @@ def _told(value: Any) -> Any:
 
 
 def _parsed(trained: TrainedLifted, asked: Mapping[str, Any]) -> Request:
-    assert trained.sampler is not None, "drawn_by_sampler has asked"
+    assert trained.sampler is not None, "checked by drawn_by_sampler"
     classes = label_set(trained.config.label_set)
     known = [classes[row] for row in trained.sampler.drawn_classes]
     return make_request(known, trained.config.label_set, **asked)
@@ -90,22 +90,23 @@ def _scene(
 ) -> Scene:
     scene = scene_of(trained, name, answer.room, 0)
     counts = Counter(item.label for item in scene.objects)
-    shape, wanted = answer.plan.shape, request.wishes
-    relations = Relations(wanted.relations, shape, label_set(scene.label_set))
-    assert trained.sampler is not None, "which drew the answer"
+    shape = answer.plan.shape
+    relations = RelationChecks(request.wishes.relations, shape, label_set(scene.label_set))
+    assert trained.sampler is not None, "the sampler drew the answer"
     held = relations.held(furniture_in(trained.sampler, answer.room, 0))
     wishes = [
-        {"wish": str(wish), "holds": wish.holds(counts[wish.label])} for wish in wanted.counts
+        {"wish": str(wish), "holds": wish.holds(counts[wish.label])}
+        for wish in request.wishes.counts
     ]
     wishes += [
         {"wish": str(wish), "holds": holds}
-        for wish, holds in zip(wanted.relations, held, strict=True)
+        for wish, holds in zip(request.wishes.relations, held, strict=True)
     ]
     given = request.objects
     return replace(
         scene,
         objects=tuple(
-            # Given objects as they were, with the mesh of a look if they had none.
+            # Given objects stay as they are; those without a mesh get the mesh of their look.
             replace(own, mesh=drawn.mesh, solids=drawn.solids) if own.mesh is None else own
             for own, drawn in zip(given, scene.objects, strict=False)
         )

@@ -1,4 +1,4 @@
-"""Contents of a requested room: the sampler's distribution of class lists, given counts."""
+"""Contents of a requested room, drawn from the sampler's distribution given counts of classes."""
 
 import numpy as np
 import torch
@@ -10,13 +10,13 @@ from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.network import RoomSampler
 
 
-def wanted_rows(wishes: Wishes, classes: tuple[str, ...], given: list[int]) -> list[int]:
-    """Classes, by index, of the objects that the wishes need in addition to the given ones."""
-    wanted = []
+def required_rows(wishes: Wishes, classes: tuple[str, ...], given: list[int]) -> list[int]:
+    """Indices of the classes of objects that the wishes require in addition to the given ones."""
+    required = []
     for label in wishes.labels:
         index = classes.index(label)
-        wanted += [index] * max(0, wishes.bounds(label)[0] - given.count(index))
-    return wanted
+        required += [index] * max(0, wishes.bounds(label)[0] - given.count(index))
+    return required
 
 
 def draw_contents(
@@ -27,12 +27,12 @@ def draw_contents(
     extents_m: Float[np.ndarray, "2"],
     uniform: Float[np.ndarray, " slots"],
 ) -> list[int]:
-    """Classes to add to the given objects: those that the wishes need, then others by the network.
+    """Classes to add to the given objects: first those that the wishes require, then others.
 
-    The network has learnt to continue any part of a room's list, so it draws the other classes
-    given the wanted ones. A class that has reached its largest wanted number is ruled out.
+    The network was trained to continue any subset of a room's classes, so it draws the others given
+    the required ones. A class that has reached its largest allowed number is excluded.
     """
-    added = wanted_rows(wishes, classes, given)
+    added = required_rows(wishes, classes, given)
     counts = torch.zeros(1, len(sampler.contents.known))
     for index in (*given, *added):
         counts[0, index] += 1

@@ -1,4 +1,4 @@
-"""Draw requested rooms: attempts of sequential Monte Carlo until every wish holds."""
+"""Sampling of requested rooms: sequential Monte Carlo, repeated until every wish holds."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,52 +9,53 @@ import torch
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.requests.holding import furniture_in
-from sceneprior.lifted.requests.judge import Judge
-from sceneprior.lifted.requests.particles import PARTICLES, Particles, begin
+from sceneprior.lifted.requests.particles import PARTICLES, Particles, start_particles
+from sceneprior.lifted.requests.placement_rules import PlacementRules
 from sceneprior.lifted.requests.plans import RoomPlan, check_area, plan_room
+from sceneprior.lifted.requests.relation_checks import furniture_in
 from sceneprior.lifted.requests.request import Request
-from sceneprior.lifted.requests.steps import HANGING, Hurdles, place_next
+from sceneprior.lifted.requests.steps import HANGING, Rejections, place_next
 from sceneprior.lifted.requests.wishes import RelationWish, check_wishes
 from sceneprior.lifted.sampler.draw import LOOKS, with_looks
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.plan import Plan
 
-ROUNDS = 8
-"""Attempts at a room."""
-LATE = 4
-"""Attempt from which wanted objects come first, and others without a place are left out."""
+ATTEMPTS = 8
+"""Maximum number of attempts at a room."""
+REQUIRED_FIRST = 4
+"""Number of the attempt, from 0, from which required objects come first, and other objects are left
+out if they find no place."""
 BATCH = 32
 """Rooms drawn at a time."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A drawn room."""
+    """A sampled room."""
 
     plan: RoomPlan
     room: RoomBoxes
-    """The room, alone in its batch."""
-    lacking: tuple[int, ...] = ()
-    """Classes of wanted objects without a place."""
+    """The room, as a batch of one."""
+    missing: tuple[int, ...] = ()
+    """Classes of required objects that found no place."""
 
 
 @torch.no_grad()
 def draw_requested(
     sampler: RoomSampler, request: Request, classes: tuple[str, ...], count: int, seed: int
 ) -> list[Answer]:
-    """New rooms as requested.
+    """Sample rooms that meet a request.
 
-    A room's floor and contents are drawn first, as far as the request leaves them open. Its
-    objects are then placed in `PARTICLES` copies of the room at once: in each step every copy takes
-    a place that the request allows, drawn by the sampler, and copies without such a place are
-    replaced by others. An attempt fails if no copy is left; there are at most `ROUNDS`. In the last
-    one, wanted objects without a place are left out, too.
+    The parts of a room's floor and contents that the request leaves open are drawn first. Then the
+    objects are placed in `PARTICLES` copies of the room at once: in each step, every copy draws a
+    place for the next object from the sampler, among those that the request allows, and copies
+    without such a place are replaced by others. An attempt fails if no copy is left; there are at
+    most `ATTEMPTS`. The last attempt leaves out required objects without a place, too.
 
-    The same seed draws the same rooms, and the first ones do not depend on `count`.
+    A seed always draws the same rooms, and the first ones do not depend on `count`.
 
     Raises:
-        InputError: no room can hold the request, or none was found; it says what is in the way.
+        InputError: no room can meet the request, or none was found; the message gives the reason.
     """
     check_wishes(
         request.wishes, [classes[row] for row in sampler.drawn_classes], request.given,
@@ -63,8 +64,8 @@ def draw_requested(
     check_area(sampler, request, classes)
     given = _given(sampler, request, classes, seed)
     answers: list[Answer | None] = [None] * count
-    hurdles: Hurdles = Counter()
-    for number in range(ROUNDS):
+    rejections: Rejections = Counter()
+    for number in range(ATTEMPTS):
         waiting = [row for row, answer in enumerate(answers) if answer is None]
         for start in range(0, len(waiting), BATCH):
             rows = waiting[start : start + BATCH]
@@ -72,19 +73,19 @@ def draw_requested(
             plans = [
                 plan_room(
                     sampler, request, classes, (np.random.default_rng([seed, row, 0]), own),
-                    number >= LATE,
+                    number >= REQUIRED_FIRST,
                 )
                 for row, own in zip(rows, draws, strict=True)
             ]  # fmt: skip
             found = _furnish(
-                sampler, plans, given, draws, request.wishes.relations, classes, number, hurdles
+                sampler, plans, given, draws, request.wishes.relations, classes, number, rejections
             )
             for row, answer in zip(rows, found, strict=True):
                 answers[row] = answer
     drawn = [answer for answer in answers if answer is not None]
     assert len(drawn) == count, "the last round leaves out what has no place"
-    if all(answer.lacking for answer in drawn):
-        raise InputError(_in_the_way(hurdles, drawn[0].lacking, classes))
+    if all(answer.missing for answer in drawn):
+        raise InputError(_in_the_way(rejections, drawn[0].missing, classes))
     return drawn
 
 
@@ -119,48 +120,48 @@ def _furnish(
     relations: Sequence[RelationWish],
     classes: tuple[str, ...],
     number: int,
-    hurdles: Hurdles,
+    rejections: Rejections,
 ) -> list[Answer | None]:
-    """One attempt at each room; None where an object found no place."""
-    particles = begin(sampler, plans, given)
+    """Make one attempt at each room; None for rooms in which an object found no place."""
+    particles = start_particles(sampler, plans, given)
     objects = furniture_in(sampler, given, 0)
-    judges = [Judge(plan.shape, relations, classes, objects) for plan in plans]
+    rules = [PlacementRules(plan.shape, relations, classes, objects) for plan in plans]
     hanging = [classes.index(label) for label in HANGING if label in classes]
     failed = [False] * len(plans)
-    lacking: list[list[int]] = [[] for _ in plans]
-    for step in range(max((len(plan.coming) for plan in plans), default=0)):
-        place_next(sampler, particles, judges, step, draws, hanging, hurdles)
+    missing: list[list[int]] = [[] for _ in plans]
+    for step in range(max((len(plan.upcoming) for plan in plans), default=0)):
+        place_next(sampler, particles, rules, step, draws, hanging, rejections)
         for room, plan in enumerate(plans):
             rows = particles.rows_of(room)
-            if step >= len(plan.coming) or failed[room] or particles.alive[rows].all():
+            if step >= len(plan.upcoming) or failed[room] or particles.alive[rows].all():
                 continue
             if particles.alive[rows].any():
                 particles.replace_dead(room, draws[room])
-            elif number < LATE or (plan.wanted[step] and number + 1 < ROUNDS):
+            elif number < REQUIRED_FIRST or (plan.required[step] and number + 1 < ATTEMPTS):
                 failed[room] = True
             else:  # left out
                 particles.alive[rows] = True
-                lacking[room] += [plan.coming[step]] if plan.wanted[step] else []
+                missing[room] += [plan.upcoming[step]] if plan.required[step] else []
     return [
-        None if failed[room] else _answer(particles, room, lacking[room])
+        None if failed[room] else _answer(particles, room, missing[room])
         for room in range(len(plans))
     ]
 
 
-def _answer(particles: Particles, room: int, lacking: list[int]) -> Answer:
-    """The first of a room's particles: all of them met what was asked."""
+def _answer(particles: Particles, room: int, missing: list[int]) -> Answer:
+    """The first particle of a room; all particles left meet the request."""
     row = room * PARTICLES
     drawn = particles.rooms.changed(lambda part: part[row : row + 1].clone())
-    return Answer(particles.plans[room], drawn, tuple(lacking))
+    return Answer(particles.plans[room], drawn, tuple(missing))
 
 
-def _in_the_way(hurdles: Hurdles, lacking: Sequence[int], classes: tuple[str, ...]) -> str:
-    """The sentence for a request that no attempt met."""
-    label = lacking[0]
-    own = Counter({what: times for (index, what), times in hurdles.items() if index == label})
+def _in_the_way(rejections: Rejections, missing: Sequence[int], classes: tuple[str, ...]) -> str:
+    """The error message for a request that no attempt met."""
+    label = missing[0]
+    own = Counter({what: times for (index, what), times in rejections.items() if index == label})
     what = own.most_common(1)[0][0] if own else "free floor"
     return (
-        f"No room holds the request: in {ROUNDS} attempts with {PARTICLES} partial rooms each, a "
+        f"No room holds the request: in {ATTEMPTS} attempts with {PARTICLES} partial rooms each, a "
         f"{classes[label].replace('_', ' ')} found no place; most places lacked {what}. Ask for "
         "less, or for a larger floor."
     )

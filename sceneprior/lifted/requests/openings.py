@@ -1,4 +1,4 @@
-"""Doors and windows of requests: where they are, and what must stay free before them."""
+"""Doors and windows of requests: their places, and the space before them that must stay free."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -15,18 +15,18 @@ from sceneprior.core.scene_json import check_openings
 from sceneprior.lifted.requests.shape import RoomShape, Side, sides_of
 
 DOOR_M = (0.9, 0.0, 2.0)
-"""Width, lower edge and upper edge of a door that is given without them."""
+"""Default width, lower edge and upper edge of a door."""
 WINDOW_M = (1.2, 0.9, 2.1)
+"""Default width, lower edge and upper edge of a window."""
 MARGIN_M = 0.1
 """Distance of drawn doors and windows from the ends of their wall and from each other."""
 BEFORE_WINDOW_M = 0.4
-"""Depth of the floor before a window on which nothing is taller than its sill."""
+"""Depth of the floor before a window on which objects must not be higher than the sill."""
 MOST_OPENINGS = 50
 PLACES = 50
-"""Places drawn for a door or a window."""
+"""Maximum number of places drawn for a door or a window."""
 COMPASS = {"north": (0.0, -1.0), "east": (1.0, 0.0), "south": (0.0, 1.0), "west": (-1.0, 0.0)}
-"""Names of walls, by the direction (x, z) out of the room: north is the upper side of a top-down
-picture."""
+"""Directions (x, z) out of the room by the names of walls. North is up in top-down pictures."""
 _TEXT = re.compile(r"\s*(door|window)s?(?:\s*@\s*(\w+)(?:\s*:\s*(\d+\.?\d*))?)?\s*")
 
 Openings = str | Sequence[Any]
@@ -34,26 +34,25 @@ Openings = str | Sequence[Any]
 
 @dataclass(frozen=True)
 class WantedOpening:
-    """A door or a window whose place is drawn, as far as it is not requested."""
+    """A requested door or window; the unspecified part of its place is drawn."""
 
     kind: Literal["door", "window"]
     wall: str | int | None = None
     """A name of `COMPASS`, the number of a side of the floor, or None for any."""
     at_m: float | None = None
-    """Distance of its middle from the wall's first end: the western or northern one of a named
-    wall."""
+    """Distance of the middle from the wall's first end, which is the western or northern one for a
+    wall of `COMPASS`."""
 
 
 def read_openings(openings: Openings) -> tuple[Opening | WantedOpening, ...]:
     """Doors and windows from text or a list.
 
-    Text is `door`, `door@north`, `door@2` (the side from corner 2 of the floor) or
-    `window@south:1.5` (its middle 1.5 m from the wall's western or northern end), several with
-    commas between. Entries of a list are such texts, `Opening`s, or mappings with the keys of a
-    scene's JSON.
+    A text has entries `door`, `door@north`, `door@2` (the side from corner 2 of the floor) or
+    `window@south:1.5` (its middle 1.5 m from the wall's western or northern end), separated by
+    commas. A list may have such entries, `Opening`s, or mappings with the keys of a scene's JSON.
 
     Raises:
-        InputError: an entry is none of these.
+        InputError: an entry has another form.
     """
     entries = openings.split(",") if isinstance(openings, str) else list(openings)
     if len(entries) > MOST_OPENINGS:
@@ -94,7 +93,7 @@ def _read_opening(entry: Any) -> Opening | WantedOpening:
 def moved(
     openings: Sequence[Opening | WantedOpening], by_m: Float[np.ndarray, "2"]
 ) -> tuple[Opening | WantedOpening, ...]:
-    """Openings of a floor that is moved (x, z)."""
+    """Openings after their floor is moved by (x, z)."""
     return tuple(
         each._replace(
             start_m=(each.start_m[0] + by_m[0], each.start_m[1] + by_m[1]),
@@ -111,10 +110,10 @@ def place_openings(
     wanted: Sequence[Opening | WantedOpening],
     draws: np.random.Generator,
 ) -> tuple[Opening, ...]:
-    """Doors and windows of one room; those without a place are drawn, longer walls more often.
+    """Doors and windows of one room. Places that are not given are drawn uniformly along the walls.
 
     Raises:
-        InputError: one lies on no side of the floor, or finds no free wall.
+        InputError: an opening lies on no side of the floor, or there is no free wall for it.
     """
     sides = sides_of(outline_m)
     placed = [each for each in wanted if isinstance(each, Opening)]
@@ -163,7 +162,8 @@ def _placed(
 
 
 def _walls(wanted: WantedOpening, sides: list[Side]) -> list[Side]:
-    """Sides that an opening may lie on; a named wall runs from west to east or north to south."""
+    """Sides on which an opening may lie. Walls of `COMPASS` run from west to east or from north to
+    south."""
     if wanted.wall is None:
         return sides if wanted.at_m is None else sides[:1]
     if isinstance(wanted.wall, int):
@@ -187,7 +187,7 @@ def _pair(point: Float[np.ndarray, "2"]) -> tuple[float, float]:
 
 
 class Zone(NamedTuple):
-    """Floor before an opening, over which furniture must not reach into a range of heights."""
+    """Space before an opening that must stay free: a polygon (x, z) and a range of heights."""
 
     polygon: shapely.Polygon
     from_m: float
@@ -195,14 +195,14 @@ class Zone(NamedTuple):
 
 
 def zones_of(shape: RoomShape) -> dict[str, list[Zone]]:
-    """The spaces that must stay free, by kind: the volume that a door swings through, which is as
-    deep as the door is wide, and the space before a window above its sill."""
+    """The spaces that must stay free, by kind of opening: before a door, the volume through which
+    it swings, as deep as the door is wide; before a window, the space above the sill."""
     zones: dict[str, list[Zone]] = {"door": [], "window": []}
     for each in shape.openings:
         start, end = np.array(each.start_m), np.array(each.end_m)
         depth = np.linalg.norm(end - start) if each.kind == "door" else BEFORE_WINDOW_M
         into = depth * inward_of(shape, each)
-        # 1 cm less on all sides, so that furniture may touch it.
+        # 1 cm less on all sides, so that furniture may touch the zone.
         polygon = shapely.Polygon([start, end, end + into, start + into]).buffer(-0.01)
         low_m = 0.0 if each.kind == "door" else each.bottom_m
         zones[each.kind].append(Zone(polygon, low_m, each.top_m))
@@ -210,7 +210,7 @@ def zones_of(shape: RoomShape) -> dict[str, list[Zone]]:
 
 
 def inward_of(shape: RoomShape, opening: Opening) -> Float[np.ndarray, "2"]:
-    """Unit normal into the room of the side that a door or window is in."""
+    """Unit normal, into the room, of the wall that has a door or window."""
     middle = shapely.Point(np.mean([opening.start_m, opening.end_m], axis=0))
     sides = sides_of(shape.outline_m)
     lines = [shapely.LineString([side.start_m, side.end_m]) for side in sides]

@@ -1,5 +1,4 @@
-"""Partly furnished rooms, several for each requested room: the particles of sequential Monte
-Carlo."""
+"""Particles of sequential Monte Carlo: partly furnished rooms, several for each requested room."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,23 +16,24 @@ from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.reading import Reading
 
 PARTICLES = 6
-"""Particles of a room. More meet rarer wishes in one attempt, in proportionally more time."""
+"""Particles per room. With more, an attempt meets rarer wishes, in proportionally more time."""
 
 
 @dataclass
 class Particles:
-    """Particles of several rooms; those of room r are rows r * `PARTICLES` and following."""
+    """Particles of several rooms; room r has `PARTICLES` rows, the first of which is row
+    r * `PARTICLES`."""
 
     plans: Sequence[RoomPlan]
     rooms: RoomBoxes
     number: Int[Tensor, " rows"]
     """Objects placed so far."""
-    coming: Int[Tensor, "rows slots"]
-    """Classes to place, one a step; 0 for none."""
+    upcoming: Int[Tensor, "rows slots"]
+    """Class to place in each step; 0 for none."""
     rectangle_m: Float[Tensor, "rows 4"]
     """Bounding rectangle of each room's floor."""
     alive: Bool[np.ndarray, " rows"]
-    """False for particles without a place for an object, until they are replaced."""
+    """False for particles in which an object found no place, until they are replaced."""
 
     @property
     def looks(self) -> Int[Tensor, "rows slots"]:
@@ -50,10 +50,10 @@ class Particles:
         return np.arange(room * PARTICLES, (room + 1) * PARTICLES)
 
     def read(self, sampler: RoomSampler, rows: Int[Tensor, " some"], step: int) -> Reading:
-        """The encoder's outputs for some particles before a step."""
+        """The outputs of the sampler's encoder for some particles before a step."""
         return read_rooms(
             sampler, self.rooms.changed(lambda part: part[rows]), self.number[rows],
-            self.rectangle_m[rows], self.coming[rows, step:],
+            self.rectangle_m[rows], self.upcoming[rows, step:],
         )  # fmt: skip
 
     def place(self, row: int, label: int, look: int, box_m: Float[Tensor, "6"]) -> None:
@@ -64,7 +64,7 @@ class Particles:
         self.number[row] += 1
 
     def replace_dead(self, room: int, draws: np.random.Generator) -> None:
-        """Resample a room's particles: each dead one becomes a copy of a random living one."""
+        """Replace each dead particle of a room by a copy of a random living one."""
         rows = self.rows_of(room)
         dead, living = rows[~self.alive[rows]], rows[self.alive[rows]]
         chosen = living[draws.integers(len(living), size=PARTICLES)[: len(dead)]]
@@ -76,23 +76,23 @@ class Particles:
         self.alive[dead] = True
 
 
-def begin(sampler: RoomSampler, plans: Sequence[RoomPlan], given: RoomBoxes) -> Particles:
-    """Particles with the given objects alone.
+def start_particles(sampler: RoomSampler, plans: Sequence[RoomPlan], given: RoomBoxes) -> Particles:
+    """Particles that contain the given objects alone.
 
     Args:
-        given: One room with looks, in as many slots as rooms have.
+        given: One room with looks, padded to `sampler.max_objects`.
     """
     rows = len(plans) * PARTICLES
     assert given.looks is not None and given.is_object.shape == (1, sampler.max_objects)
     rooms = given.changed(lambda part: part.repeat_interleave(rows, dim=0))
-    coming = [
-        F.pad(torch.tensor(plan.coming).long(), (0, sampler.max_objects - len(plan.coming)))
+    upcoming = [
+        F.pad(torch.tensor(plan.upcoming).long(), (0, sampler.max_objects - len(plan.upcoming)))
         for plan in plans
     ]
     rectangles = [torch.from_numpy(plan.shape.rectangle_m).float() for plan in plans]
     return Particles(
         plans, rooms, rooms.is_object.sum(dim=1),
-        torch.stack(coming).repeat_interleave(PARTICLES, dim=0),
+        torch.stack(upcoming).repeat_interleave(PARTICLES, dim=0),
         torch.stack(rectangles).repeat_interleave(PARTICLES, dim=0),
         np.ones(rows, dtype=bool),
     )  # fmt: skip

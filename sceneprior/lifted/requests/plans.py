@@ -6,30 +6,31 @@ import numpy as np
 import torch
 
 from sceneprior.core.errors import InputError
-from sceneprior.lifted.requests.contents import draw_contents, wanted_rows
+from sceneprior.core.shell import rectangle
+from sceneprior.lifted.requests.contents import draw_contents, required_rows
 from sceneprior.lifted.requests.openings import place_openings
 from sceneprior.lifted.requests.request import Request
 from sceneprior.lifted.requests.shape import RoomShape
 from sceneprior.lifted.sampler.network import RoomSampler
 
 RECTANGLES = 16
-"""Rectangles drawn for a room without a requested floor; it takes the first that is large enough
-for the wanted objects, or else the largest."""
+"""Number of rectangles drawn for a room without a requested floor. The first that is large enough
+for the required objects is taken, or else the largest."""
 FULL_SHARE = 0.5
-"""Largest share of a drawn floor that the mean footprints of wanted and given objects may cover."""
+"""Largest share of a drawn floor that the mean footprints of given and required objects cover."""
 CROWDED_SHARE = 1.2
-"""Share of a requested floor above which the smallest footprints of these objects are taken not to
-fit. It is above 1, because some objects may intersect, such as a chair and its table."""
+"""Share of a requested floor above which the smallest footprints of required objects are assumed
+not to fit. It is above 1, because some objects may overlap, such as a chair and a table."""
 
 
 class RoomPlan(NamedTuple):
-    """Conditions of one room."""
+    """Shape and contents of one room."""
 
     shape: RoomShape
-    coming: list[int]
+    upcoming: list[int]
     """Indices of the classes to add, in the order in which they are placed."""
-    wanted: list[bool]
-    """True for objects that the wishes need."""
+    required: list[bool]
+    """True for objects that the wishes require."""
 
 
 def plan_room(
@@ -37,25 +38,25 @@ def plan_room(
     request: Request,
     classes: tuple[str, ...],
     draws: tuple[np.random.Generator, np.random.Generator],
-    wanted_first: bool,
+    required_first: bool,
 ) -> RoomPlan:
-    """Draw a room's shape, as far as it is not requested, and its contents.
+    """Draw the parts of a room's shape that are not requested, and the room's contents.
 
-    Classes with large footprints come first, as in training; with `wanted_first`, all others come
-    after those that the wishes need.
+    Classes with large footprints come first, as in training; with `required_first`, required
+    objects come before all others.
 
     Args:
-        draws: Random numbers of the shape, the same in all attempts at a room, and of the contents.
+        draws: Generators of the shape, which is the same in all attempts, and of the contents.
     """
     given = [classes.index(item.label) for item in request.objects]
-    wanted = wanted_rows(request.wishes, classes, given)
-    shape = _shape(sampler, request, [*given, *wanted], draws[0])
+    required = required_rows(request.wishes, classes, given)
+    shape = _shape(sampler, request, [*given, *required], draws[0])
     uniform = draws[1].random(sampler.max_objects)
-    coming = draw_contents(sampler, request.wishes, classes, given, shape.extents_m, uniform)
-    is_wanted = np.arange(len(coming)) < len(wanted)
-    footprints_m2 = sampler.footprints_m2.numpy()[coming] if coming else np.zeros(0)
-    order = np.lexsort([-footprints_m2, ~is_wanted & wanted_first])
-    return RoomPlan(shape, [coming[k] for k in order], [bool(is_wanted[k]) for k in order])
+    upcoming = draw_contents(sampler, request.wishes, classes, given, shape.extents_m, uniform)
+    is_required = np.arange(len(upcoming)) < len(required)
+    footprints_m2 = sampler.footprints_m2.numpy()[upcoming] if upcoming else np.zeros(0)
+    order = np.lexsort([-footprints_m2, ~is_required & required_first])
+    return RoomPlan(shape, [upcoming[k] for k in order], [bool(is_required[k]) for k in order])
 
 
 def _shape(
@@ -70,11 +71,12 @@ def _shape(
     areas_m2 = rectangles_m[:, 2:].prod(axis=1)
     enough = areas_m2 >= needed_m2
     x, z = rectangles_m[int(enough.argmax() if enough.any() else areas_m2.argmax()), 2:] / 2
-    if request.objects:  # no wall runs through what is there
+    if request.objects:  # no wall may cross them
         boxes_m = np.array([[*item.center_m, *item.size_m] for item in request.objects])
         reach = (np.abs(boxes_m[:, [0, 2]]) + boxes_m[:, [3, 5]] / 2).max(axis=0)
         x, z = max(x, reach[0]), max(z, reach[1])
-    return _with_openings(np.array([[-x, -z], [x, -z], [x, z], [-x, z]]), request, draws)
+    half = np.array([x, z])
+    return _with_openings(rectangle(-half, half), request, draws)
 
 
 def _with_openings(
@@ -88,19 +90,19 @@ def check_area(sampler: RoomSampler, request: Request, classes: tuple[str, ...])
     """Refuse wishes that need more floor than the request has.
 
     Raises:
-        InputError: the smallest looks of the wanted objects cover `CROWDED_SHARE` of the floor.
+        InputError: the required objects at their smallest cover `CROWDED_SHARE` of the floor.
     """
     if request.outline_m is None:
         return
     area_m2 = RoomShape(request.outline_m).polygon.area
     given = [classes.index(item.label) for item in request.objects]
     least_m2 = 0.0
-    for index in wanted_rows(request.wishes, classes, given):
+    for index in required_rows(request.wishes, classes, given):
         sizes = sampler.look_shown[sampler.look_class == index, -3:].exp()
         on_floor = sizes[:, [0, 2]].prod(dim=-1)
         least_m2 += float(on_floor.min()) if len(on_floor) else 0.0
     if least_m2 > CROWDED_SHARE * area_m2:
         raise InputError(
-            f"The wanted objects cover {least_m2:.1f} square metres at their smallest, but the "
+            f"The required objects cover {least_m2:.1f} square metres at their smallest, but the "
             f"floor has {area_m2:.1f}; ask for fewer, or for a larger floor."
         )

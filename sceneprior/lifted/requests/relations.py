@@ -1,22 +1,23 @@
-"""Relations that can be wished for: a closed list, on axis-aligned boxes with a front.
+"""Relations that can be requested: a closed list, on axis-aligned boxes with a front.
 
 InstructScene (Lin and Mu, ICLR 2024; its `compute_loc_rel`) knows left, right, front and behind as
 sectors of 90 degrees between centres on the floor, up to 3 m, "closely" below 1 m, and above and
-below for footprints that hold the other's centre. Its sectors are those of the world's axes; here
-they are those of an object's own front, since "in front of the bed" means where the bed faces.
+below for an object whose footprint contains the other's centre. InstructScene's sectors follow the
+world's axes; here they follow the front of an object, since "in front of the bed" depends on the
+direction in which the bed faces.
 
-| relation | it holds where |
+| relation | condition |
 | --- | --- |
-| beside | the object is level with the target, along the direction in which the target faces, and \
-at most `BESIDE_M` away across it |
+| beside | the object overlaps the target along the target's front, and is at most `BESIDE_M` away \
+across it |
 | in front of | the centre lies in the front sector of the target, at most `FAR_M` from its centre |
 | facing | the target's centre lies in the front sector of the object |
 | at a wall | the footprint is at most `AT_WALL_M` from a side of the floor |
 | in a corner | the footprint is at most `CORNER_M` from a convex corner of the floor |
-| under | one centre lies in the other's footprint, and the object ends below the target's bottom \
-or the target is a lamp; under a window: before it, and ending below it |
+| under | one centre lies in the other's footprint, and the object's top is below the target's \
+bottom or the target is a lamp; under a window: at most `REACH_M` before it, and below its sill |
 | near | the footprints are less than `NEAR_M` apart |
-| far from | the centres are more than `FAR_M` apart, where InstructScene sees no relation |
+| far from | the centres are more than `FAR_M` apart, beyond which InstructScene has no relation |
 """
 
 from typing import NamedTuple
@@ -29,16 +30,17 @@ from sceneprior.core.scene import Opening
 from sceneprior.lifted.requests.openings import inward_of
 from sceneprior.lifted.requests.shape import RoomShape, sides_of
 
-OF_ONE = ("at a wall", "in a corner")
-"""Relations to the room; the others need a target."""
-OF_TWO = ("beside", "in front of", "facing", "under", "near", "far from")
-RELATIONS = (*OF_TWO, *OF_ONE)
+TO_ROOM = ("at a wall", "in a corner")
+"""Relations to the room, which have no target."""
+TO_TARGET = ("beside", "in front of", "facing", "under", "near", "far from")
+"""Relations to another object, a door or a window."""
+RELATIONS = (*TO_TARGET, *TO_ROOM)
 OPENINGS = ("door", "window")
-"""Targets that are no furniture."""
+"""Targets that are not furniture."""
 BESIDE_M = 0.5
 NEAR_M = 1.0
-"""InstructScene's "closely", between footprints in place of centres: a nightstand touches a double
-bed whose centre is 1.3 m away."""
+"""InstructScene's threshold of "closely", applied to footprints in place of centres: the centres of
+a double bed and of a nightstand that touches it are 1.3 m apart."""
 FAR_M = 3.0
 """InstructScene's largest distance of a relation, between centres."""
 AT_WALL_M = 0.2
@@ -46,13 +48,13 @@ CORNER_M = 0.4
 SECTOR_RAD = np.pi / 4
 """Half the angle of a sector."""
 REACH_M = 0.5
-"""Depth of the floor that counts as under a window."""
+"""Largest distance from a window for `under`."""
 OUTWARD = np.array([(0.0, -1.0), (-1.0, 0.0), (0.0, 1.0), (1.0, 0.0)])
 """Direction (x, z) towards the sides low z, low x, high z and high x (`side_of`)."""
 
 
 class Items(NamedTuple):
-    """Things that relations hold between; all arrays have a row per thing."""
+    """Objects, doors or windows between which relations hold; all arrays have a row per item."""
 
     boxes_m: Float[np.ndarray, "items 6"]
     """Centre and full extents."""
@@ -61,12 +63,12 @@ class Items(NamedTuple):
     is_lamp: Bool[np.ndarray, " items"]
 
     def rows(self, rows: Int[np.ndarray, " some"] | Bool[np.ndarray, " items"]) -> "Items":
-        """The things of these rows."""
-        return Items(self.boxes_m[rows], self.front[rows], self.is_lamp[rows])
+        """The items of these rows."""
+        return Items(*(part[rows] for part in self))
 
 
 def opening_items(shape: RoomShape, kind: str) -> Items:
-    """The doors or windows of a room as flat boxes whose front points into the room."""
+    """The doors or windows of a room, as flat boxes whose front points into the room."""
     boxes, fronts = [], []
     for opening in shape.openings:
         if opening.kind == kind:
@@ -88,7 +90,7 @@ def _opening_box(opening: Opening) -> list[float]:
 def related(
     relation: str, subjects: Items, targets: Items, to_window: bool = False
 ) -> Bool[np.ndarray, "subjects targets"]:
-    """Which subjects stand in a relation of `OF_TWO` to which targets."""
+    """True where a relation of `TO_TARGET` holds between a subject and a target."""
     here, there = subjects.boxes_m[:, None], targets.boxes_m[None]
     offset = (here - there)[..., [0, 2]]
     gaps = np.abs(offset) - (here + there)[..., [3, 5]] / 2
@@ -121,6 +123,7 @@ def related(
 def _in_sector(
     away_m: Float[np.ndarray, "subjects targets 2"], front: Float[np.ndarray, "*batch 2"]
 ) -> Bool[np.ndarray, "subjects targets"]:
+    """True where an offset lies within `SECTOR_RAD` of the front."""
     ahead = (away_m * front).sum(axis=-1)
     return np.asarray(ahead >= np.cos(SECTOR_RAD) * np.linalg.norm(away_m, axis=-1) - 1e-9) & (
         ahead > 0
@@ -130,19 +133,23 @@ def _in_sector(
 def related_to_room(
     relation: str, subjects: Items, shape: RoomShape
 ) -> Bool[np.ndarray, " subjects"]:
-    """Which subjects stand in a relation of `OF_ONE` to the room."""
-    x, _, z, width, _, depth = subjects.boxes_m.T
-    footprints = shapely.box(x - width / 2, z - depth / 2, x + width / 2, z + depth / 2)
+    """True for subjects for which a relation of `TO_ROOM` holds."""
     if relation == "at a wall":
         walls, least = shape.polygon.exterior, AT_WALL_M
     else:
         assert relation == "in a corner", relation
         walls, least = shapely.MultiPoint(_convex_corners(shape.outline_m)), CORNER_M
-    return np.asarray(shapely.distance(footprints, walls) <= least)
+    return np.asarray(shapely.distance(footprints(subjects.boxes_m), walls) <= least)
+
+
+def footprints(boxes_m: Float[np.ndarray, "boxes 6"]) -> np.ndarray:
+    """Rectangles (x, z) of boxes on the floor, as an array of shapely polygons."""
+    x, _, z, width, _, depth = boxes_m.T
+    return np.asarray(shapely.box(x - width / 2, z - depth / 2, x + width / 2, z + depth / 2))
 
 
 def _convex_corners(outline_m: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "some 2"]:
-    """Corners of a floor at which two walls enclose less than 150 degrees of the room."""
+    """Corners of a floor with an interior angle below 150 degrees."""
     sides = sides_of(outline_m)
     along = [(side.end_m - side.start_m) / max(side.length_m, 1e-9) for side in sides]
     kept = []

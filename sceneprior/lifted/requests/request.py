@@ -1,4 +1,4 @@
-"""A request for rooms: floor, doors and windows, ceiling, wishes and given objects."""
+"""Requests for rooms: floor, doors and windows, ceiling, wishes and given objects."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -31,10 +31,10 @@ Want = str | Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Request:
-    """Conditions of the rooms to draw, checked; lengths in metres."""
+    """Conditions that sampled rooms must meet, validated; lengths in metres."""
 
     outline_m: np.ndarray | None = None
-    """Corners (x, z) of the floor; None draws a rectangle for each room."""
+    """Corners (x, z) of the floor; with None, a rectangle is drawn for each room."""
     openings: tuple[Opening | WantedOpening, ...] = ()
     ceiling_m: float | None = None
     wishes: Wishes = field(default_factory=Wishes)
@@ -56,13 +56,13 @@ def make_request(
     want: Want | None = None,
     objects: Sequence[SceneObject] = (),
 ) -> Request:
-    """A checked request.
+    """Validate the parts of a request, and put them together.
 
     Args:
         known: Classes that the prior draws.
-        label_set: Name of its label set.
-        floor: See `read_floor`. Unless there are objects, its coordinates are moved so that the
-            centre of its bounding box is the origin.
+        label_set: Name of the prior's label set.
+        floor: See `read_floor`. Unless there are objects, the floor is moved so that the centre of
+            its bounding box is the origin.
         openings: Doors and windows; see `read_openings`.
         ceiling_m: Height of the ceiling.
         want: A sentence (`read_sentence`), a mapping (`read_wishes`), or numbers of objects by
@@ -70,7 +70,7 @@ def make_request(
         objects: Given objects, in the coordinates of the floor.
 
     Raises:
-        InputError: a part cannot be used.
+        InputError: a part is invalid, or contradicts another.
     """
     placed = () if openings is None else read_openings(openings)
     if isinstance(want, str) and (counts := counts_of_text(want)) is not None:
@@ -89,7 +89,7 @@ def make_request(
     for item in objects:
         check_box("The request", item.label, item.center_m, item.size_m)
     targets = {wish.target for wish in wishes.relations}
-    for kind in OPENINGS:  # what a relation needs is there
+    for kind in OPENINGS:  # a relation to a door or a window needs one
         if kind in targets and all(each.kind != kind for each in placed):
             placed += read_openings(kind)
     outline_m = None if floor is None else read_floor(floor)

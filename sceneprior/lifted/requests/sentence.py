@@ -1,7 +1,7 @@
-"""Requests in English, read by a small grammar over class names, numbers and relations.
+"""Parser of requests in English: a small grammar over class names, numbers and relations.
 
-A sentence is a list of phrases: `[number] noun [relation noun]...`, with a floor's size or a room
-type where a noun can stand. What is not understood is an error, so that no wish is dropped.
+A sentence is a list of phrases `[number] noun [relation noun]...`. In place of a noun, it may have
+the size of the floor or a room type. Unknown words are an error, so that no wish is dropped.
 """
 
 import re
@@ -26,7 +26,7 @@ from sceneprior.lifted.requests.words import (
 )
 
 LONGEST = 2000
-"""Characters of a sentence."""
+"""Maximum number of characters of a sentence."""
 _UNIT = r"\s*(?:m|metres?|meters?)?"
 _SIZE = re.compile(rf"(\d+\.?\d*){_UNIT}\s*(?:x|×|by)\s*(\d+\.?\d*)\s*(?:m|metres?|meters?)?\b")
 _TOKEN = re.compile(r"[a-z_']+|\d+(?:\.\d+)?|\S")
@@ -34,37 +34,37 @@ _TOKEN = re.compile(r"[a-z_']+|\d+(?:\.\d+)?|\S")
 
 @dataclass
 class Sentence:
-    """The wishes, the floor and the openings that a sentence names."""
+    """The content of a sentence: wishes, floor and openings."""
 
     wishes: Wishes
     floor: str | None = None
     """Size such as `4x3`."""
     openings: list[str] = field(default_factory=list)
-    """Doors and windows, as `read_openings` takes them."""
+    """Doors and windows in the form that `read_openings` reads."""
 
 
 @dataclass
 class _Group:
-    """Objects that a phrase names."""
+    """The objects of one phrase."""
 
     noun: str
     number: int
     bound: str
     """`>=`, `<=`, or empty for exactly."""
     new: bool
-    """False for "the bed", which names one that is there."""
+    """False for "the bed", which refers to an object mentioned elsewhere."""
 
 
 def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
-    """The wishes, the floor's size and the doors and windows that a sentence asks for.
+    """Parse the wishes, the size of the floor, and the doors and windows of a sentence.
 
     Args:
         text: Such as "a 4 x 3 m bedroom with a door and two nightstands beside the bed".
         known: Classes that the prior draws.
-        label_set: Name of its label set, whose end is the room type.
+        label_set: Name of the prior's label set, which ends with the room type.
 
     Raises:
-        InputError: words are not understood; the message lists them.
+        InputError: there are unknown words; the message lists them.
     """
     if len(text) > LONGEST:
         raise InputError(f"The request has {len(text)} characters; expected at most {LONGEST}.")
@@ -76,8 +76,8 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
     reader = _Reader(tokens, known, label_set)
     reader.read()
     if reader.strange:
-        told = [word for word in reader.strange if word not in ARTICLES] or reader.strange
-        words = ", ".join(f"'{word[:40]}'" for word in dict.fromkeys(told))
+        listed = [word for word in reader.strange if word not in ARTICLES] or reader.strange
+        words = ", ".join(f"'{word[:40]}'" for word in dict.fromkeys(listed))
         raise InputError(
             f"The request has words that are not understood: {words}. It may name numbers, doors, "
             f"windows, the classes {', '.join(name.replace('_', ' ') for name in known)}, and "
@@ -89,7 +89,7 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
 
 
 class _Reader:
-    """Reads tokens from left to right; `strange` holds those without a meaning."""
+    """Reads tokens from left to right; `strange` collects those that it does not know."""
 
     def __init__(self, tokens: list[str], known: Sequence[str], label_set: str):
         self.tokens, self.at = tokens, 0
@@ -125,7 +125,7 @@ class _Reader:
         return found
 
     def wishes(self) -> Wishes:
-        """Counts of all groups, added up by class, and the relations."""
+        """Counts of all groups, summed by class, and the relations."""
         counts: list[CountWish] = []
         exact: Counter[str] = Counter()
         for group in self.groups:
@@ -149,7 +149,7 @@ class _Reader:
         return Wishes(tuple(counts), tuple(self.relations))
 
     def _phrase(self, words: Sequence[str]) -> str | None:
-        """The longest of some phrases that comes next, which is then read."""
+        """Read the longest of some phrases that matches the next tokens; None if none does."""
         for phrase in sorted(words, key=lambda each: -len(each.split())):
             parts = phrase.split()
             if self.tokens[self.at : self.at + len(parts)] == parts:
@@ -166,7 +166,9 @@ class _Reader:
             else:
                 self._relate(ROOM_WORDS[found], None)
             return True
-        if self._phrase(list(BOUNDS)) is not None:  # "at least" is no "at"
+        if (
+            self._phrase(list(BOUNDS)) is not None
+        ):  # "at least" does not begin with the relation "at"
             self.at = start
             return False
         if (found := self._phrase(list(RELATION_WORDS))) is None:
@@ -187,7 +189,7 @@ class _Reader:
         self.relations.append(RelationWish(self.subject.noun, relation, target, count))
 
     def _target(self) -> str | None:
-        """The class, door or window that a relation leads to."""
+        """Read the target of a relation: a class, `door` or `window`."""
         if self._phrase(PRONOUNS) is not None:
             others = [g.noun for g in self.groups if self.subject and g.noun != self.subject.noun]
             return others[-1] if others else None
@@ -226,7 +228,7 @@ class _Reader:
         return group
 
     def _room(self, number: int | None, bound: str | None) -> bool:
-        """Read a room type, and refuse one that the prior does not draw."""
+        """Read a room type, and refuse a type that the prior does not draw."""
         room = self._phrase(list(ROOMS))
         if room is None:
             return False
@@ -241,7 +243,7 @@ class _Reader:
         return True
 
     def _noun(self) -> tuple[bool, str | None]:
-        """The next noun: True for a plural, and its class; None if there is no noun."""
+        """Read a noun: whether it is a plural, and its class; (False, None) if there is none."""
         names = {noun: (False, noun) for noun in (*self.nouns, "door", "window")}
         names |= {plural: (True, noun) for noun in list(names) for plural in _plurals(noun)}
         found = self._phrase(list(names))
@@ -254,7 +256,7 @@ class _Reader:
         return plural, next((name for name in classes if name in self.known), classes[0])
 
     def _opening(self, group: _Group) -> None:
-        """Add the doors or windows of a group, on a named wall if one follows."""
+        """Add the doors or windows of a group, on the wall that is named next, if any."""
         wall = ""
         for direction in WALLS:
             words = [f"{word} the {direction}" for word in ("in", "on", "to", "at")]

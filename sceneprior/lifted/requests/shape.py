@@ -49,8 +49,8 @@ class RoomShape:
 
     @cached_property
     def rectangles_m(self) -> Float[np.ndarray, "rectangles 4"]:
-        """Axis-aligned rectangles in the floor (centre x, z and extents x, z), largest first,
-        each with floor that the larger ones lack (`NEW_SHARE`)."""
+        """Axis-aligned rectangles in the floor (centre x, z and extents x, z), the largest first.
+        Each covers a part of the floor that the larger ones do not (`NEW_SHARE`)."""
         return inner_rectangles(self.polygon)
 
     @property
@@ -70,8 +70,8 @@ class RoomShape:
 
     @property
     def extents_m(self) -> Float[np.ndarray, "2"]:
-        """Extents of the bounding rectangle, scaled to the area of the floor; the room's contents
-        are drawn given these."""
+        """Extents of the bounding rectangle, scaled to the floor's area. The room's contents are
+        drawn given these extents."""
         extents_m = self.rectangle_m[2:]
         return np.asarray(extents_m * np.sqrt(self.polygon.area / extents_m.prod()))
 
@@ -86,12 +86,12 @@ class Side(NamedTuple):
 
     @property
     def length_m(self) -> float:
-        """Its length."""
+        """Length of the side."""
         return float(np.linalg.norm(self.end_m - self.start_m))
 
 
 def sides_of(outline_m: Float[np.ndarray, "corners 2"]) -> list[Side]:
-    """The sides of an outline, in its order: the first leads from corner 0 to corner 1."""
+    """The sides of an outline, in order: the first leads from corner 0 to corner 1."""
     following = np.roll(outline_m, -1, axis=0)
     x, z = outline_m.T
     area = (x * following[:, 1] - following[:, 0] * z).sum()
@@ -103,8 +103,8 @@ def sides_of(outline_m: Float[np.ndarray, "corners 2"]) -> list[Side]:
 
 
 def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
-    """The outline (corners, 2) of a requested floor: `4x3` (metres along x and z, the origin at its
-    centre), or a list of corners x, z in order, as numbers or text (`0,0 4,0 4,3`).
+    """Outline (corners, 2) of a floor, from `4x3` (metres along x and z, centred at the origin) or
+    from a list of corners x, z in order, as numbers or text (`0,0 4,0 4,3`).
 
     Example:
 
@@ -114,7 +114,7 @@ def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
         [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]]
 
     Raises:
-        InputError: it is neither, intersects itself, or has less than `LEAST_AREA_M2`.
+        InputError: the floor is neither, intersects itself, or has less than `LEAST_AREA_M2`.
     """
     if isinstance(floor, str):
         floor = _floor_of_text(floor)
@@ -133,7 +133,7 @@ def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
     if not polygon.is_valid:
         raise InputError(
             f"The floor's outline intersects itself ({shapely.is_valid_reason(polygon)}); list "
-            "its corners in order round the room."
+            "its corners in order around the room."
         )
     if polygon.area < LEAST_AREA_M2:
         raise InputError(
@@ -158,8 +158,8 @@ def _floor_of_text(text: str) -> list[tuple[float, float]]:
 
 
 def inner_rectangles(polygon: shapely.Polygon) -> Float[np.ndarray, "rectangles 4"]:
-    """See `RoomShape.rectangles_m`. Rectangles end at corners and, on slanted sides, every
-    `SPACING_M`."""
+    """The rectangles of `RoomShape.rectangles_m`. Their sides lie at corners of the floor or, for
+    floors with slanted sides, at points every `SPACING_M` along the outline."""
     lines = shapely.segmentize(polygon, SPACING_M).exterior.coords
     points = np.array([*polygon.exterior.coords, *lines])
     slanted = ~_axis_aligned(polygon)

@@ -1,5 +1,5 @@
-"""One step of sequential Monte Carlo: the next object of each particle takes a place that the
-request allows."""
+"""One step of sequential Monte Carlo: the next object of each particle is placed where the request
+allows it."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -11,33 +11,33 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.core.mixtures import draw_index
-from sceneprior.lifted.requests.holding import furniture_in, furniture_of
-from sceneprior.lifted.requests.judge import Judge
 from sceneprior.lifted.requests.particles import PARTICLES, Particles
-from sceneprior.lifted.requests.search import Piece, search
+from sceneprior.lifted.requests.placement_rules import PlacementRules
+from sceneprior.lifted.requests.relation_checks import furniture_in, furniture_of
+from sceneprior.lifted.requests.search import Unplaced, search
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.places import Places
 from sceneprior.lifted.sampler.reading import Frame, Reading
 from sceneprior.lifted.sampler.violations import settled, violation
 
 TRIES = 4
-"""Places drawn for an object in each particle, which takes the first that fits."""
+"""Number of places drawn for an object in each particle; the first allowed one is taken."""
 SIZE_RANGE = 0.35
-"""Largest difference between the log extents of an object and of its look. Smaller than that of
-rooms without a request: where floor is scarce, particles with the smallest pieces survive."""
+"""Largest difference between the log extents of an object and of its look. The limit is tighter
+than without a request: in a small room, the particles with the smallest objects survive."""
 LOW_M = 0.15
-STANDING = 0.75
-"""An object whose bottom is below `LOW_M` with at least this probability stands on the floor: a bed
-drawn in mid-air would survive where floor is scarce."""
+ON_FLOOR = 0.75
+"""Probability of a bottom below `LOW_M` above which an object is set on the floor: in a small room,
+a particle with a bed in mid-air would survive."""
 HANGING = ("ceiling_lamp", "pendant_lamp")
-"""Classes that hang from the ceiling, where its height is known."""
+"""Classes that hang from a ceiling of known height."""
 
-Hurdles = Counter[tuple[int, str]]
-"""The number of times that an object of a class found no place, by the obstacle."""
+Rejections = Counter[tuple[int, str]]
+"""Number of places rejected for an object, by its class and the reason."""
 
 
 class Proposal(NamedTuple):
-    """Next objects of particles, and the distributions of their places."""
+    """The next objects of particles, and the distributions of their places."""
 
     rows: Int[Tensor, " some"]
     label: Int[Tensor, " some"]
@@ -45,48 +45,48 @@ class Proposal(NamedTuple):
     size_m: Float[Tensor, "some 3"]
     bottom_m: Float[Tensor, " some"]
     reading: Reading
-    """The encoder's outputs, with the rectangle in the floor that each object stands in as the
-    frame."""
+    """Outputs of the sampler's encoder, in the frame of the rectangle in the floor that was drawn
+    for each object."""
     places: Places
 
 
 def place_next(
     sampler: RoomSampler,
     particles: Particles,
-    judges: Sequence[Judge],
+    rules: Sequence[PlacementRules],
     step: int,
     draws: Sequence[np.random.Generator],
     hanging: Sequence[int],
-    hurdles: Hurdles,
+    rejections: Rejections,
 ) -> None:
-    """Place the next object in all living particles; those without a place die.
+    """Place the next object in all living particles; particles without a place for it die.
 
     Args:
-        judges, draws: One a room.
+        rules, draws: Placement rules and random numbers of each room.
         hanging: Indices of `HANGING`.
-        hurdles: What was in the way, added to.
+        rejections: Counts to which rejected places are added.
     """
     chance = np.concatenate([each.random((PARTICLES, 7 + 4 * TRIES)) for each in draws])
-    going = particles.alive & (particles.coming[:, step] != 0).numpy()
+    going = particles.alive & (particles.upcoming[:, step] != 0).numpy()
     rows = torch.from_numpy(np.flatnonzero(going))
     if not len(rows):
         return
     found = _propose(sampler, particles, rows, step, chance, hanging)
-    waiting = _draw_places(sampler, particles, judges, found, step, chance, hurdles)
+    waiting = _draw_places(sampler, particles, rules, found, step, chance, rejections)
     for at in waiting:
         row = int(found.rows[at])
         label = int(found.label[at])
         placed: tuple[int, Tensor] | str = "free floor"
-        if particles.plan(row).wanted[step]:
-            piece = Piece(label, int(found.look[at]), found.size_m[at], float(found.bottom_m[at]))
+        if particles.plan(row).required[step]:
+            item = Unplaced(label, int(found.look[at]), found.size_m[at], float(found.bottom_m[at]))
             room = row // PARTICLES
             placed = search(
-                sampler, found.reading.rows(torch.tensor([at])), piece, judges[room],
+                sampler, found.reading.rows(torch.tensor([at])), item, rules[room],
                 furniture_in(sampler, particles.rooms, row),
-                particles.plan(row).coming[step + 1 :], draws[room],
+                particles.plan(row).upcoming[step + 1 :], draws[room],
             )  # fmt: skip
         if isinstance(placed, str):
-            hurdles[label, placed] += 1
+            rejections[label, placed] += 1
             particles.alive[row] = False
         else:
             particles.place(row, label, *placed)
@@ -100,7 +100,8 @@ def _propose(
     chance: Float[np.ndarray, "rows numbers"],
     hanging: Sequence[int],
 ) -> Proposal:
-    label = particles.coming[rows, step]
+    """Draw the look, size and height of the next object of some particles."""
+    label = particles.upcoming[rows, step]
     reading = particles.read(sampler, rows, step)
     numbers = torch.from_numpy(chance)[rows].float()
     look = draw_index(sampler.look_logits(reading, label), numbers[:, 0])
@@ -108,8 +109,8 @@ def _propose(
     details = mixture.draw(numbers[:, 1], numbers[:, 2:6])
     off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)
     size_m = (sampler.look_shown[look, -3:] + off).exp()
-    standing = mixture.weight_logits.softmax(dim=-1) * (mixture.means[..., 3] < LOW_M)
-    on_floor = (standing.sum(dim=-1) > STANDING) & (details[:, 3] > LOW_M)
+    low = mixture.weight_logits.softmax(dim=-1) * (mixture.means[..., 3] < LOW_M)
+    on_floor = (low.sum(dim=-1) > ON_FLOOR) & (details[:, 3] > LOW_M)
     bottom_m = details[:, 3].clamp(min=0).masked_fill(on_floor, 0.0)
     shapes = [particles.plan(row).shape for row in rows.tolist()]
     for at, shape in enumerate(shapes):
@@ -129,7 +130,7 @@ def _propose(
 def _rectangle(
     rectangles_m: Float[np.ndarray, "rectangles 4"], size_m: Float[np.ndarray, "2"], chance: float
 ) -> Float[np.ndarray, "4"]:
-    """A random rectangle into which a footprint fits, in proportion to its area."""
+    """A random rectangle among those into which a footprint fits, in proportion to their areas."""
     fits = (rectangles_m[:, 2:] >= size_m).all(axis=1)
     if not fits.any():
         return rectangles_m[0]
@@ -140,14 +141,14 @@ def _rectangle(
 def _draw_places(
     sampler: RoomSampler,
     particles: Particles,
-    judges: Sequence[Judge],
+    rules: Sequence[PlacementRules],
     found: Proposal,
     step: int,
     chance: Float[np.ndarray, "rows numbers"],
-    hurdles: Hurdles,
+    rejections: Rejections,
 ) -> list[int]:
-    """Place objects at the first of `TRIES` drawn places that fits; returns the rows of `found`
-    without a place."""
+    """Place each object at the first allowed place of `TRIES` drawn ones, and return the rows of
+    `found` without one."""
     numbers = torch.from_numpy(chance[found.rows.numpy(), 7:]).float().unflatten(1, (TRIES, 4))
     x = found.places.draw_x(numbers[..., :2])
     waiting = torch.arange(len(found.rows))
@@ -168,15 +169,15 @@ def _draw_places(
             if is_free:
                 one = slice(at, at + 1)
                 candidates = furniture_of(sampler, box_m[None], found.label[one], found.look[one])
-                allowed, hurdle = judges[row // PARTICLES].allows(
+                allowed, reason = rules[row // PARTICLES].allowed(
                     int(found.label[at]), candidates,
                     furniture_in(sampler, particles.rooms, row),
-                    particles.plan(row).coming[step + 1 :], rectangle_m[None].double().numpy(), 1,
+                    particles.plan(row).upcoming[step + 1 :], rectangle_m[None].double().numpy(), 1,
                 )  # fmt: skip
                 if allowed[0]:
                     particles.place(row, int(found.label[at]), look, box_m)
                     continue
-                hurdles[int(found.label[at]), hurdle] += 1
+                rejections[int(found.label[at]), reason] += 1
             left.append(at)
         waiting = torch.tensor(left, dtype=torch.int64)
         if not left:

@@ -1,4 +1,4 @@
-"""Wishes for a room: how many objects of a class it has, and relations between them."""
+"""Wishes: constraints of a request on the numbers of objects in a room, and on their relations."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import Any
 
 from sceneprior.core.classes import unknown_class
 from sceneprior.core.errors import InputError
-from sceneprior.lifted.requests.relations import OF_ONE, OPENINGS, RELATIONS
+from sceneprior.lifted.requests.relations import OPENINGS, RELATIONS, TO_ROOM
 
 _COUNT = re.compile(r"\s*(>=|<=|=|)\s*(\d+)\s*")
 _ENTRY = re.compile(r"(\w+)\s*:\s*((?:>=|<=|=)?\d+)")
@@ -15,12 +15,12 @@ _ENTRY = re.compile(r"(\w+)\s*:\s*((?:>=|<=|=)?\d+)")
 
 @dataclass(frozen=True)
 class CountWish:
-    """A number of objects of a class in the whole room, given objects included."""
+    """Bounds on the number of objects of a class in a room, which includes the given objects."""
 
     label: str
     least: int
     most: int | None = None
-    """None if there may be any number more."""
+    """None for no upper bound."""
 
     def __str__(self) -> str:
         if self.most is None:
@@ -36,8 +36,8 @@ class CountWish:
 
 @dataclass(frozen=True)
 class RelationWish:
-    """At least `count` objects of a class stand in a relation to the room, or to any object of
-    another class, or to a door or a window."""
+    """A relation that at least `count` objects of a class have to the room, to some object of the
+    target's class, or to some door or window."""
 
     subject: str
     relation: str
@@ -58,14 +58,15 @@ class Wishes:
     relations: tuple[RelationWish, ...] = ()
 
     def bounds(self, label: str) -> tuple[int, int | None]:
-        """Least and largest number of objects of a class that all wishes allow together; what
-        relations need counts as well."""
+        """Least and largest number of objects of a class that fulfil all wishes. Relations need
+        their subjects and targets, too."""
         own = [wish for wish in self.counts if wish.label == label]
         least = max([0, *(wish.least for wish in own), *self._needed(label)])
         most = min((wish.most for wish in own if wish.most is not None), default=None)
         return least, most
 
     def _needed(self, label: str) -> list[int]:
+        """Number of objects of a class that each relation needs."""
         needed = []
         for wish in self.relations:
             alike = wish.subject == wish.target
@@ -91,7 +92,7 @@ def count_wish(label: str, value: Any) -> CountWish:
     ('at least 1 wardrobe', '2 nightstand')
 
     Raises:
-        InputError: it is no such number.
+        InputError: `value` is no such number.
     """
     found = None
     if isinstance(value, str):
@@ -145,8 +146,8 @@ def relation_wish(entry: Mapping[str, Any]) -> RelationWish:
     count = entry.get("count", 1)
     if relation not in RELATIONS:
         raise InputError(f"No relation is called '{relation}'; choose from {', '.join(RELATIONS)}.")
-    if (target is None) != (relation in OF_ONE):
-        needs = "takes no target" if relation in OF_ONE else "needs a target"
+    if (target is None) != (relation in TO_ROOM):
+        needs = "takes no target" if relation in TO_ROOM else "needs a target"
         raise InputError(f"The relation '{relation}' {needs}; the request has {target!r}.")
     if not isinstance(count, int) or isinstance(count, bool) or count < 1:
         raise InputError(f"A relation has count {count!r}; expected a whole number above 0.")

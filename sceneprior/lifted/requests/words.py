@@ -1,5 +1,4 @@
-"""Words of requests in English: synonyms of classes and relations, numbers, and words without a
-meaning of their own."""
+"""Vocabulary of requests in English: synonyms of classes and relations, numbers, and fillers."""
 
 NOUNS: dict[str, tuple[str, ...]] = {
     "bed": ("double_bed", "single_bed", "kids_bed", "bed"),
@@ -20,7 +19,7 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "lamp": ("ceiling_lamp", "pendant_lamp", "lamp"), "fridge": ("refridgerator",),
     "refrigerator": ("refridgerator",), "tv": ("television",), "tub": ("bathtub",),
 }  # fmt: skip
-"""Classes that a noun may mean; the first that a prior draws is taken."""
+"""Classes that a noun may mean. The first class that the prior draws is taken."""
 RELATION_WORDS = {
     "beside": "beside", "next to": "beside", "at the side of": "beside", "alongside": "beside",
     "in front of": "in front of", "before": "in front of", "facing": "facing",
@@ -54,7 +53,7 @@ ROOMS = {
     "dining room": ("dining", "all"), "library": ("library", "all"),
     "kitchen": ("kitchen", "all"), "room": (),
 }  # fmt: skip
-"""Room types and the ends of the label sets that have them; `room` is any."""
+"""Room types, each with the endings of the label sets that contain it; `room` matches any."""
 ARTICLES = ("a", "an", "the")
 BEFORE_ROOMS = ("in", "for", "of")
 FILLERS = (
@@ -63,5 +62,5 @@ FILLERS = (
     "standing", "placed", "put", "that", "which", "there", "has", "have", "having", "containing",
     "should",
 )  # fmt: skip
-"""Words that change nothing."""
+"""Words that are skipped."""
 PRONOUNS = ("it", "them")

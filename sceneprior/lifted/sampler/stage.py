@@ -88,10 +88,10 @@ class SamplerStage(lightning.LightningModule):
         return total
 
     def on_train_batch_end(self, outputs: Any, batch: RoomBoxes, batch_idx: int) -> None:
-        """Every few epochs, keep the learner if the val rooms' likelihood is the highest so far.
+        """Every few epochs, keep the network if the val rooms' likelihood is the highest so far.
 
-        Runs after the epoch's last batch rather than after the epoch, when its checkpoint is
-        already written.
+        This runs after the last batch of the epoch, because the epoch's checkpoint is written
+        before Lightning's end of the epoch.
         """
         done = self.current_epoch + 1
         looks = done % self.stage.val_every == 0 or done == self.stage.epochs

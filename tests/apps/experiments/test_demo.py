@@ -1,4 +1,5 @@
-"""Which steps of the demo are done again, with commands that only leave their results."""
+"""Steps of the demo that are repeated after a change; commands are replaced by ones that only write
+their results."""
 
 import json
 from pathlib import Path

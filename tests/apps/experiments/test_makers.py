@@ -1,4 +1,4 @@
-"""What made a row, from the settings of its run."""
+"""Columns that say how a row of a table was made, from the settings of its run."""
 
 import pytest
 

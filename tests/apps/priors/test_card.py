@@ -31,9 +31,7 @@ def test_data_scores_and_limits_stand_in_it(trained, tmp_path):
     data = trained.config.data.model_copy(update={"shards": str(tmp_path)})
     trained = replace(trained, config=trained.config.model_copy(update={"data": data}))
     card = model_card(trained, "tiny", "Made by **toys**, CC0.", SCORES, half=True)
-    assert (
-        "# tiny\n" in card and "learnt from 12 training rooms. New rooms come from: sampler" in card
-    )
+    assert "# tiny\n" in card and "on 12 rooms. Rooms are sampled from: sampler" in card
     assert "Made by **toys**, CC0." in card and UNSTATED not in card
     assert "| train | 12 | 96 | 40 |" in card  # of the shards' index
     lines = card.splitlines()
@@ -41,17 +39,19 @@ def test_data_scores_and_limits_stand_in_it(trained, tmp_path):
     assert head == "|  | generated (50 rooms) | real training (12 rooms) | real test (4 rooms) |"
     (row,) = [line for line in lines if line.startswith("| Category KL")]
     assert row.endswith("| 0.250, 0.125 to 0.500 | 0.062 | – |")
-    assert "seed 3, against test rooms" in card and "200 resamples" in card
-    assert "Latents of the training rooms are not in it" in card and "half precision" in card
-    assert "Shapes were lifted from training masks" in card
+    assert "seed 3, against test rooms" in card and "200 bootstrap resamples" in card
+    assert "does not contain the latents" in card and "half precision" in card
+    assert "found in training masks" in card
 
 
 def test_its_classes_are_those_that_can_be_asked_for(trained):
     card = model_card(trained, "tiny")
     names = label_set(trained.config.label_set)
     known = [names[row] for row in trained.sampler.drawn_classes]
-    assert f"Classes that it makes (label set front3d_bedroom): {', '.join(known)}. It" in card
-    (rest,) = (line for line in card.splitlines() if "the label set's other classes: " in line)
+    assert (
+        f"Classes of generated objects (label set front3d_bedroom): {', '.join(known)}. The" in card
+    )
+    (rest,) = (line for line in card.splitlines() if "label set's other classes" in line)
     others = rest.rsplit(": ", 1)[1].removesuffix(".").split(", ")
     assert others and {*known, *others} == {*label_set("front3d_bedroom")} - {"void"}
     class_rows(trained, known)
@@ -64,16 +64,16 @@ def test_its_classes_are_those_that_can_be_asked_for(trained):
 
 def test_it_says_once_where_rooms_come_from(trained, toy_run):
     words, _ = model_card(trained, "tiny").split("## Settings")
-    assert "New rooms come from: sampler." in words
+    assert "Rooms are sampled from: sampler." in words
     assert "sphere" not in words and "`paper`" not in words
     sphere = load_run(toy_run)
     near = sphere.config.sampling.model_copy(update={"distribution": "kernel"})
     kernel = replace(sphere, config=sphere.config.model_copy(update={"sampling": near}))
-    assert "New rooms come from: kernel." in model_card(kernel, "tiny", latents=True)
-    assert "New rooms come from: paper." in model_card(kernel, "tiny")
+    assert "Rooms are sampled from: kernel." in model_card(kernel, "tiny", latents=True)
+    assert "Rooms are sampled from: paper." in model_card(kernel, "tiny")
 
 
 def test_what_is_not_known_is_said(trained):
     card = model_card(trained, "tiny", latents=True)
     assert UNSTATED in card and "Not measured when this was packed" in card
-    assert "training rooms can be decoded from it" in card and "half precision" not in card
+    assert "these rooms can be decoded from it" in card and "half precision" not in card

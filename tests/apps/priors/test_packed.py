@@ -134,7 +134,7 @@ def test_no_path_of_the_machine_is_in_it(sampler_file, toy_shards):
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.name)
 def test_networks_have_the_same_shapes_without_memory(path):
-    """What `unpack` compares a file with before it builds anything."""
+    """`unpack` compares a file with these shapes before it builds anything."""
     config = load_config(str(path)).model_copy(update={"label_set": "front3d_bedroom"})
     stage = config.stage_names[-1]
     with torch.device("meta"):

@@ -1,4 +1,4 @@
-"""Where priors are found: paths first, then names, and repositories of the Hub."""
+"""Search for priors: paths first, then names, and repositories of the Hub."""
 
 import shutil
 import sys
@@ -26,7 +26,8 @@ def hub(tmp_path, monkeypatch):
 
 
 def test_a_repository_of_the_hub_is_a_prior(hub, sampler_run, tmp_path):
-    """As the Hub's own client keeps one: by commit, with the branch's name beside it."""
+    """The repository is stored as the Hub's own client does: by commit, with the name of the
+    branch."""
     trained = load_any_run(sampler_run)
     write_packed(pack(trained, "# a card"), tmp_path / "a.prior")
     repository = hub / "models--someone--bedrooms"

@@ -46,7 +46,7 @@ def test_models_are_closed_fill_their_box_and_have_three_styles(label):
 
 @pytest.mark.parametrize("label", ["armchair", "chair", "double_bed", "single_bed", "sofa"])
 def test_backs_are_at_low_z(label):
-    """What rises above seat or mattress is behind it."""
+    """Points above the seat or the mattress lie behind its centre on average."""
     for points in made_models().by_class[label].points:
         assert np.mean(points[points[:, 1] > 0.3][:, 2]) < -0.1
 

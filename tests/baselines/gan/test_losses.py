@@ -1,4 +1,4 @@
-"""What a GAN's players minimise beside the maps: values, slopes and what is left alone."""
+"""Losses of the GAN's generator and discriminator beside the maps: values and gradients."""
 
 import math
 

@@ -141,7 +141,7 @@ def test_an_untrained_network_gives_the_best_linear_guess(network, batch):
 
 
 def test_a_set_flow_learns_rooms_by_heart(toy_shards):
-    """Of three training rooms, most drawn rooms hold exactly the furniture of one."""
+    """After training on three rooms, most drawn rooms hold exactly the furniture of one of them."""
     model = {"max_objects": 6, "width": 64, "hidden": 128, "heads": 4, "layers": 2, "dropout": 0.0}
     config = tiny_baseline(toy_shards, "set_flow", model=model | {"steps": 20})
     dataset = TruthDataset(toy_shards, "train")

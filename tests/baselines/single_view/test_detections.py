@@ -1,4 +1,4 @@
-"""What networks are told of masks: crops, rays, and a frame that moves and turns with the room."""
+"""Inputs of single-view networks: crops, rays, and a frame that moves and turns with the room."""
 
 from dataclasses import replace
 

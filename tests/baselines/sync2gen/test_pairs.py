@@ -21,7 +21,7 @@ BED, STAND, LAMP = 1, 2, 3
 
 
 def room(*objects: tuple[int, float, float], pad: int = 0) -> RoomBoxes:
-    """One room of (class, x, z); boxes half a metre high and wide."""
+    """A room of objects (class, x, z); boxes are half a metre high and wide."""
     boxes_m = [[x, 0.25, z, 0.5, 0.5, 0.5] for _, x, z in objects] + [[9.0] * 6] * pad
     return RoomBoxes(
         torch.tensor([[label for label, _, _ in objects] + [0] * pad]),

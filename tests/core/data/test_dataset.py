@@ -25,7 +25,7 @@ def rooms(toy_shards) -> list[RoomViews]:
 
 
 def drawn_views(data: ViewDataset, rooms: list[RoomViews], row: int, epoch: int) -> list[int]:
-    """Which of the room's views a draw holds, told by their cameras."""
+    """Indices of the room's views that a draw contains, found by their cameras."""
     views = data.__getitems__([(row, epoch)])
     room = rooms[row // data.rotations]
     known = room.world_to_camera @ turn_about_up(row % data.rotations).T

@@ -18,7 +18,7 @@ def frame_points(cells=32, margin=1.1):
 
 
 def is_closed(faces) -> bool:
-    """Whether each edge is passed as often one way as the other."""
+    """True if each edge is passed as often in one direction as in the other."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()
     there, back = Counter(map(tuple, edges)), Counter((b, a) for a, b in map(tuple, edges))
     return there == back

@@ -141,7 +141,8 @@ def test_what_is_no_image_of_masks(read, data, said):
 
 
 def test_a_large_image_of_many_masks_takes_little_memory(read):
-    """One mask at a time: all 40 of 4 million pixels each were 160 MB, and polygons 128 MB more."""
+    """Masks are decoded one at a time: all 40 masks of 4 million pixels would take 160 MB, and
+    their polygons another 128 MB."""
     side = 2_000
     boxes = [[[0, 0, 90 * k, 0, 90 * k, 50, 0, 50]] for k in range(1, 21)]
     runs = [{"size": [side, side], "counts": [side * k, side, side * (side - k - 1)]}

@@ -161,7 +161,7 @@ def test_a_second_run_makes_only_what_is_missing(front, tmp_path):
 
 
 def test_houses_made_by_others(tmp_path):
-    """What is stored agrees with itself: the masks with the projected meshes of the furniture."""
+    """Stored masks agree with the projected meshes of the furniture."""
     folder = shared_front()
     recipe = load_recipe("bedroom", ("views.per_m2=0.5",))
     source = FrontSource(folder / "3D-FRONT", folder / "3D-FUTURE-model", recipe, only="0022c821")

@@ -94,7 +94,7 @@ def test_a_damaged_folder_is_not_taken_for_finished(front, tmp_path):
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill"])
 def test_the_command_is_stopped_and_gone_on_with(front, tmp_path, start, how):
-    """As a user meets it; after Ctrl-C with exit code 130 and nothing but whole shards."""
+    """The whole command is stopped; Ctrl-C gives exit code 130, and only whole shards remain."""
     front.house("house", *(bedroom(f"Bedroom-{k}") for k in range(40)))
     script = tmp_path / "run.py"
     script.write_text(

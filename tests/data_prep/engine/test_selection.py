@@ -1,4 +1,4 @@
-"""Which rooms are asked for, and the split each is in."""
+"""Selection of rooms, and the split of each room."""
 
 from collections import Counter
 

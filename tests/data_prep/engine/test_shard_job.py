@@ -1,4 +1,4 @@
-"""One shard: whatever goes wrong with a room is that room's, with its name and a sentence."""
+"""A shard: an error in a room concerns that room alone, and is reported with the room's name."""
 
 import csv
 import json

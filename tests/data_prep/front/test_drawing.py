@@ -1,4 +1,4 @@
-"""One room drawn: poor views are drawn again, so many times and no more."""
+"""Drawing of a room: poor views are drawn again, up to a limit."""
 
 import numpy as np
 import pytest

@@ -92,7 +92,7 @@ def test_rules(front, tmp_path, pieces, rule, said):
     ],
 )
 def test_a_piece_without_a_model_is_judged_as_the_others_are(front, tmp_path, piece, rule, said):
-    """Of `far` not even the release's list says anything."""
+    """The model `far` is not in the release's list."""
     front.list_model("piano", "Grand Piano")
     front.list_model("known", "Nightstand")
     rules = ["min_models_share=null", "allowed_categories=[king-size bed, nightstand, floor lamp]"]

@@ -1,4 +1,4 @@
-"""What is drawn for a room: how many pieces, and which groups of them."""
+"""Contents drawn for a room: the number of pieces, and their groups."""
 
 from dataclasses import replace
 

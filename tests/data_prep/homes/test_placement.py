@@ -1,4 +1,4 @@
-"""How pieces were placed."""
+"""Places of furniture in made homes."""
 
 import numpy as np
 import pytest

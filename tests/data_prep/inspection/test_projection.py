@@ -1,4 +1,4 @@
-"""Wires and boxes on the image, against corners projected by hand."""
+"""Wireframes and boxes in the image, compared with corners projected by hand."""
 
 import numpy as np
 import pytest

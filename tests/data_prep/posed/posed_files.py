@@ -48,7 +48,7 @@ def furniture(shift: float = 0.0) -> list[Thing]:
 
 @dataclass
 class PosedRoom:
-    """One room on disk; change what is below, then `write`."""
+    """A room on disk; change the attributes below, then call `write`."""
 
     folder: Path
     things: list[Thing] = field(default_factory=furniture)
@@ -63,7 +63,7 @@ class PosedRoom:
             self.look(eye, (0.1, 0.1, 0.3))
 
     def look(self, eye: Sequence[float], target: Sequence[float]) -> None:
-        """One more camera."""
+        """Add a camera."""
         back = np.subtract(eye, target).astype(float)
         back /= np.linalg.norm(back)
         right = np.cross((0.0, 0, 1), back)

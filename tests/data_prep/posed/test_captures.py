@@ -26,7 +26,8 @@ def room(tmp_path):
 
 
 def distorted_ids(room, view, model, keys):
-    """What the lens sees: OpenCV finds each pixel's ray, a wide pinhole picture what it meets."""
+    """The picture through a lens: OpenCV finds the ray of each pixel, and a wide pinhole picture
+    gives the value on that ray."""
     wide = PosedRoom(room.folder, room.things, (1200, 1600), 400.0, list(room.poses))
     height, width = room.size
     v, u = np.indices(room.size) + 0.5

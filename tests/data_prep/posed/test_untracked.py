@@ -89,7 +89,7 @@ def test_ids_of_single_frames_are_refused_as_tracks(room, cli):
 def test_what_untracked_masks_lack(room):
     shuffle(room, unique=False)
     room.png(3).with_suffix(".json").unlink()
-    with pytest.raises(InputError, match=r"classes\.json .*, or frame_00003\.json beside a PNG"):
+    with pytest.raises(InputError, match=r"put the classes of .* into frame_00003\.json"):
         prepared(room, tracks="auto")
     room.png(3).with_suffix(".json").write_text(json.dumps({"1": "bed"}))
     notes = prepared(room, tracks="auto").notes

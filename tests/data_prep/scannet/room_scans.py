@@ -21,7 +21,7 @@ ROOM_TABLE = [
 ]
 NOTHING, UNLABELLED = -1, 10_000
 _SHIFT = -0.4
-"""Of the voxels' first corner."""
+"""Offset of the first voxel's corner in metres."""
 
 
 @dataclass

@@ -89,7 +89,7 @@ def write_zip(path: Path, members: dict[str, bytes]) -> Path:
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
-    """As mLib writes it: coloured vertices, triangles as lists."""
+    """Write a mesh as mLib does: coloured vertices, triangles as lists."""
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment MLIB generated\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
@@ -129,7 +129,7 @@ class Box:
 
 @dataclass
 class ScanFolder:
-    """One scan on disk; `alignment` takes its own frame to the aligned one."""
+    """A scan on disk; `alignment` maps the scan's own frame to the aligned one."""
 
     folder: Path
     boxes: list[Box]

@@ -35,7 +35,7 @@ def right(tmp_path_factory):
 
 @pytest.fixture
 def checked(right, tmp_path):
-    """What `inspect --verify` says of a copy of the scan after a change to its files."""
+    """Output of `inspect --verify` for a copy of the scan after a change to its files."""
     scan, table = right
 
     def check(change=lambda folder: None):

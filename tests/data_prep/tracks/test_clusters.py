@@ -1,10 +1,10 @@
-"""Clusters of masks: against all partitions, and at a local optimum."""
+"""Clusters of masks are compared with all partitions, and are a local optimum."""
 
 import itertools
 
 import numpy as np
 
-from data_prep.tracks.clusters import cluster, total_weight
+from data_prep.tracks.clusters import cluster
 
 
 def partitions(count):
@@ -14,12 +14,9 @@ def partitions(count):
             yield np.array(labels)
 
 
-def weighed_by_hand(weights, labels):
-    return sum(
-        weights[a, b]
-        for a, b in itertools.combinations(range(len(labels)), 2)
-        if labels[a] == labels[b]
-    )
+def total_weight(weights, labels):
+    """The sum of the weights of all pairs of different masks in one cluster."""
+    return np.triu(weights * (labels[:, None] == labels), 1).sum()
 
 
 def noisy_weights(rng, truth, noise):
@@ -30,15 +27,14 @@ def noisy_weights(rng, truth, noise):
 
 
 def test_small_problems_are_solved_to_the_best_partition():
-    """Greedy contraction is no exact method: it is best in nearly all of these, and never far."""
+    """Greedy contraction is not exact, but optimal in at least 90% of these and never far off."""
     rng = np.random.default_rng(0)
     ratios = []
     for _ in range(40):
         weights = noisy_weights(rng, rng.integers(0, 3, 6), 1.0)
-        best = max(weighed_by_hand(weights, labels) for labels in partitions(6))
-        found = weighed_by_hand(weights, cluster(weights))
+        best = max(total_weight(weights, labels) for labels in partitions(6))
+        found = total_weight(weights, cluster(weights))
         ratios.append(found / best if best else 1.0)
-        assert np.isclose(found, total_weight(weights, cluster(weights)))
     assert np.mean(np.array(ratios) > 1 - 1e-9) >= 0.9 and min(ratios) > 0.8
 
 

@@ -1,4 +1,5 @@
-"""Who tells real from generated: chance on equal sets, certainty on unlike ones, never its own."""
+"""Classifier of real and generated rooms: accuracy 0.5 on equal sets, 1 on different ones, and no
+room classified by a model trained on it."""
 
 import numpy as np
 import pytest

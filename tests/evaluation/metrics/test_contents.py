@@ -1,4 +1,4 @@
-"""What rooms hold, by hand."""
+"""Metrics of rooms' contents, compared with values by hand."""
 
 import math
 

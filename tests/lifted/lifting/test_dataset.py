@@ -27,7 +27,8 @@ GRID = ShapeGrid(cells=8, margin=1.2)
 
 @pytest.fixture(scope="module")
 def shards(toy_shards, tmp_path_factory):
-    """Of its own, since boxes are kept beside the shards; one shard of six rooms, no truth."""
+    """A copy of the toy shards, since boxes are stored beside them: one shard of six rooms, without
+    3D ground truth."""
     folder = tmp_path_factory.mktemp("lifted") / "shards"
     shutil.copytree(toy_shards, folder)
     for path in sorted((folder / "train").iterdir())[1:]:

@@ -39,7 +39,7 @@ def test_a_ray_meets_a_part_where_points_along_it_are_inside(kind, mirrored):
 
 @pytest.mark.parametrize("mirrored", range(4))
 def test_a_face_goes_where_the_fewest_rays_are_wrong(mirrored):
-    """One face of a box is moved; each level is tried by itself."""
+    """A face of a box is moved; the levels are compared with trying each one."""
     fit = RayFit(rays_of(TABLE, 400, seed=mirrored), MARGIN)
     prices = fit.hit_price, fit.miss_price, 0.003, 0.002
     rng = np.random.default_rng(mirrored)

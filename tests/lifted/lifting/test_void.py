@@ -45,7 +45,7 @@ def room_of(chest_class: int):
 
 
 def lifted_bed(room):
-    """Its box and its volume in m3."""
+    """Centre, size and volume (m3) of the lifted bed."""
     boxes = lift_boxes(room)
     hulls = lift_shapes(room, boxes, GRID)
     rays = RayPool(*(part[0] for part in draw_rays(room, boxes, 1024, GRID.margin)))
@@ -79,7 +79,7 @@ def test_rays_through_void_tell_nothing():
 
 
 def test_rays_through_an_object_without_a_box_tell_nothing():
-    """One view alone does not tell where an object is; its box is a placeholder."""
+    """A single view does not determine the place of an object, so its box is a placeholder."""
     room = room_of(3)
     boxes = lift_boxes(room)
     visible = room.visible.copy()

@@ -97,7 +97,7 @@ def test_an_object_of_the_right_size_goes_where_it_stands(place):
 
 
 def test_a_hidden_half_costs_little():
-    """What reaches further than its mask where something hides it may well be right."""
+    """An object may extend beyond its mask behind an occluder."""
     size, center = torch.tensor([[1.0, 0.8, 0.6]]), torch.tensor([[0.2, 0.4, -1.5]])
     masks = seen(CUBE * size[:, None] + center[:, None])
     extents, clear = masks.extents.clone(), masks.clear.clone()
@@ -167,7 +167,7 @@ def test_answers_have_one_object_a_mask_of_its_class_with_its_mesh_in_its_box(tr
 
 
 def test_one_object_and_one_at_the_border(trained, images):
-    """Both have a defined answer: of the second only a corner is in the image."""
+    """The answer is finite for a single object, also if only a corner of it is in the image."""
     image = painted((40, 30, 60, 50))
     classes = images[0].object_class[:1]
     border = painted((90, 60, 96, 72))

@@ -8,8 +8,8 @@ import sceneprior
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
-from sceneprior.lifted.requests.holding import Furniture
-from sceneprior.lifted.requests.judge import backed_by_walls
+from sceneprior.lifted.requests.placement_rules import backed_by_walls
+from sceneprior.lifted.requests.relation_checks import Furniture
 from sceneprior.lifted.requests.shape import RoomShape, read_floor
 from sceneprior.lifted.sampled import scene_of
 from sceneprior.lifted.sampler.draw import draw_rooms
@@ -105,7 +105,10 @@ def test_nothing_reaches_through_the_ceiling_and_lamps_hang_from_it(prior):
             "lacked free floor",
         ),
         ({"want": {"piano": 1}}, "'piano' is not a class of this run's training rooms"),
-        ({"floor": "4x3", "distribution": "paper"}, "can be asked of a sampler alone"),
+        (
+            {"floor": "4x3", "distribution": "paper"},
+            "Requests for floors and wishes need a sampler",
+        ),
     ],
 )
 def test_impossible_requests_are_a_sentence(prior, request_, message):

@@ -1,10 +1,10 @@
-"""Relations: each where it holds and just where it does not, and what can still hold."""
+"""Relations at places where they barely hold and barely fail, and in partly furnished rooms."""
 
 import numpy as np
 import pytest
 
 from sceneprior.core.scene import Opening
-from sceneprior.lifted.requests.holding import Furniture, Relations
+from sceneprior.lifted.requests.relation_checks import Furniture, RelationChecks
 from sceneprior.lifted.requests.relations import (
     OUTWARD,
     Items,
@@ -89,7 +89,7 @@ def test_walls_and_corners_are_those_of_the_floor():
 
 def test_a_wish_can_hold_while_objects_come_that_may_meet_it():
     wish = RelationWish("nightstand", "beside", "bed", 2)
-    relations = Relations([wish], RoomShape(read_floor(FLOOR)), CLASSES)
+    relations = RelationChecks([wish], RoomShape(read_floor(FLOOR)), CLASSES)
 
     def furniture(*placed: tuple[int, list[float]]) -> Furniture:
         return Furniture(

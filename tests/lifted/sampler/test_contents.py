@@ -1,4 +1,4 @@
-"""What rooms hold: lists of classes, and what they may hang on."""
+"""Contents of rooms: lists of classes, and the inputs on which they depend."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ CLASSES, SLOTS = 5, 4
 
 @pytest.fixture
 def contents(torch_rng) -> Contents:
-    """Of four classes, of which one is unknown."""
+    """A model of four classes, one of which is unknown."""
     found = Contents(CLASSES, 16, 0.0).eval()
     found.known[[END, 1, 2, 4]] = True
     return found

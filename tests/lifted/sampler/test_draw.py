@@ -24,7 +24,7 @@ def sampler(rooms):
 
 
 def given(count: int, label: int, box: list[float]) -> RoomBoxes:
-    """One object in each room."""
+    """Rooms with one object each."""
     return RoomBoxes(
         torch.full((count, 1), label),
         torch.ones(count, 1, dtype=torch.bool),
@@ -124,7 +124,7 @@ def test_rooms_given_differently_many_objects_draw_together(sampler):
 
 
 def test_a_room_in_which_something_finds_no_place_is_furnished_again(sampler, monkeypatch):
-    """Where every second attempt is refused, rooms hold the same classes elsewhere."""
+    """If every second attempt is refused, rooms hold the same classes at other places."""
     plain = draw_rooms(sampler, 200, 4)
     refused = torch.zeros(200, dtype=torch.bool)
     kept = module._draw

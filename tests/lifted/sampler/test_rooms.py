@@ -1,4 +1,4 @@
-"""What the sampler learns from: sets of lifted objects, turned and mirrored exactly."""
+"""Training data of the sampler: sets of lifted objects, turned and mirrored exactly."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Where scenes end: targets written out, and decisions that undo them."""
+"""Completeness of scenes: targets written out, and decisions that invert them."""
 
 import itertools
 

@@ -78,7 +78,7 @@ def test_mask_loss_passes_gradcheck(batch):
 
 
 def test_certain_masks_pull_no_harder_than_doubtful_ones(batch):
-    """Where a float32 mask rounds to 0 or 1 and is wrong, torch alone would pull with 1e12."""
+    """If a float32 mask is rounded to 0 or 1 and wrong, torch alone has a gradient of 1e12."""
     rendered, matches = masks(batch)
     for value in (0.0, 1.0):
         certain = rendered.float()

@@ -1,4 +1,4 @@
-"""Both renderers: ids by hand, agreement, and what happens where there is no GL."""
+"""Both renderers: ids by hand, agreement, and errors on machines without GL."""
 
 import importlib.util
 import os

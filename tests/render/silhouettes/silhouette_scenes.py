@@ -53,7 +53,7 @@ def seen_ahead(vertices_m: torch.Tensor, faces: torch.Tensor, size=SIZE, focal_p
 
 
 def triangles(*corners) -> dict:
-    """One object a triangle, in camera space."""
+    """A triangle in camera space as the only object."""
     return seen_ahead(torch.tensor(corners, dtype=torch.float64), torch.tensor([[0, 1, 2]]))
 
 

@@ -29,7 +29,7 @@ def how(request) -> dict:
 
 
 def backends_agree(scene: dict, **options) -> tuple:
-    """What `reference` draws in float64, after comparing `cpu` in both precisions."""
+    """The float64 result of `reference`, after `cpu` is compared with it in both precisions."""
     wanted = render_and_grad(scene, backend="reference", **options)
     in_float64 = render_and_grad(scene, backend="cpu", **options)
     in_float32 = render_and_grad(cast(scene, torch.float32), backend="cpu", **options)

@@ -153,7 +153,7 @@ def drawing(draw, scene, how, dtype=torch.float64, device="cpu"):
 
 
 def agree(scene, how, dtype=torch.float64, masks_within=1e-12, grad_within=1e-7):
-    """What `cuda` draws, after comparing it to what `reference` makes of the same numbers."""
+    """The result of `cuda`, after it is compared with that of `reference` for the same numbers."""
     from sceneprior.render.silhouettes.cuda import backend as cuda
 
     got = drawing(cuda.draw, scene, how, dtype, DEVICE)

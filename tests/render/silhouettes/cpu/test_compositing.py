@@ -40,7 +40,7 @@ def test_a_face_that_contains_the_pixel_centre_decides_the_depth_before_a_nearer
 
 
 def gradients_of(way: str, **options) -> torch.Tensor:
-    """What it takes for more to be seen of the front object."""
+    """Gradient of the front object's visible area with respect to the vertices."""
     scene = one_triangle_over_another()
     vertices = scene["vertices_m"].clone().requires_grad_()
     scene["vertices_m"] = vertices

@@ -1,4 +1,4 @@
-"""Which wished relations hold in a room, and which can still hold in a partly furnished one."""
+"""Checks of requested relations, in furnished rooms and in partly furnished ones."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -29,12 +29,20 @@ class Furniture(NamedTuple):
     """Centre and full extents."""
     object_class: Int[np.ndarray, " objects"]
     back: Int[np.ndarray, " objects"]
-    """Side of the back, which is nearest to walls: 0 to 3 for low z, low x, high z, high x."""
+    """Side that is nearest to walls on average: 0 to 3 for low z, low x, high z, high x."""
     front: Int[np.ndarray, " objects"]
-    """Side of the front, in the same numbers; it need not be opposite to `back`."""
+    """Side of the front, numbered in the same way; it need not be opposite to `back`."""
+
+    def rows(self, rows: Int[np.ndarray, " some"] | slice) -> "Furniture":
+        """The objects of these rows."""
+        return Furniture(*(part[rows] for part in self))
+
+    def joined(self, others: "Furniture") -> "Furniture":
+        """These objects, followed by others."""
+        return Furniture(*map(np.concatenate, zip(self, others, strict=True)))
 
     def items(self, classes: Sequence[str]) -> Items:
-        """The objects as things that relations hold between."""
+        """The objects in the form that relations are computed from."""
         is_lamp = np.array(["lamp" in classes[index] for index in self.object_class], dtype=bool)
         return Items(self.boxes_m, OUTWARD[self.front], is_lamp)
 
@@ -45,24 +53,24 @@ def furniture_of(
     object_class: Int[Tensor, " objects"],
     looks: Int[Tensor, " objects"],
 ) -> Furniture:
-    """Objects with the sides at which their looks have back and front."""
+    """Objects with the sides at which their looks have the back and the front."""
     back, front = (side_of(looks, sides).numpy() for sides in (sampler.backs, sampler.fronts))
     return Furniture(boxes_m.double().numpy(), object_class.numpy(), back, front)
 
 
 def furniture_in(sampler: RoomSampler, rooms: RoomBoxes, row: int) -> Furniture:
-    """The objects of a room."""
+    """The objects of a room in a batch."""
     assert rooms.looks is not None
     here = rooms.is_object[row]
     parts = (part[row, here] for part in (rooms.boxes_m, rooms.object_class, rooms.looks))
     return furniture_of(sampler, *parts)
 
 
-class Relations:
-    """Wished relations of one room.
+class RelationChecks:
+    """Checks of the requested relations of one room.
 
     Args:
-        wishes: The wishes.
+        wishes: The requested relations.
         shape: Floor, doors and windows.
         classes: Names of the classes by index.
     """
@@ -72,7 +80,7 @@ class Relations:
         self.openings = {kind: opening_items(shape, kind) for kind in OPENINGS}
 
     def held(self, furniture: Furniture) -> list[bool]:
-        """True for each wish that holds in a furnished room."""
+        """True for each relation that holds in a furnished room."""
         items = furniture.items(self.classes)
         return [
             int(self._met(wish, items, furniture.object_class).sum()) >= wish.count
@@ -80,27 +88,21 @@ class Relations:
         ]
 
     def can_hold(
-        self, label: int, candidates: Furniture, standing: Furniture, coming: Sequence[int]
+        self, label: int, candidates: Furniture, placed: Furniture, upcoming: Sequence[int]
     ) -> Bool[np.ndarray, " candidates"]:
-        """Which places of the next object leave every wish possible.
-
-        A wish is possible while objects that come later could still meet it; which of them find
-        such a place is not known yet.
-        """
+        """True for places of the next object, of class `label`, after which every relation is still
+        possible. Upcoming objects are assumed to find places in which their relations hold."""
         possible = np.ones(len(candidates.back), dtype=bool)
         name = self.classes[label]
         for wish in self.wishes:
             if name not in (wish.subject, wish.target):
                 continue
-            later = [self.classes[index] for index in coming]
+            later = [self.classes[index] for index in upcoming]
             if wish.target in later:
                 continue
             needed = wish.count - later.count(wish.subject)
             for row in np.flatnonzero(possible):
-                joined = Furniture(*(
-                    np.concatenate([part, own[row : row + 1]])
-                    for part, own in zip(standing, candidates, strict=True)
-                ))  # fmt: skip
+                joined = placed.joined(candidates.rows(slice(row, row + 1)))
                 met = self._met(wish, joined.items(self.classes), joined.object_class)
                 possible[row] = met.sum() >= needed
         return possible
@@ -108,7 +110,7 @@ class Relations:
     def _met(
         self, wish: RelationWish, items: Items, object_class: Int[np.ndarray, " objects"]
     ) -> Bool[np.ndarray, " subjects"]:
-        """Which objects of the subject's class meet a wish."""
+        """True for each object of the subject's class for which the relation holds."""
         names = np.array([self.classes[index] for index in object_class], dtype=object)
         own = np.flatnonzero(names == wish.subject)
         subjects = items.rows(own)

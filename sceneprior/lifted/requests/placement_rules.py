@@ -1,4 +1,5 @@
-"""Places that a requested room allows: what stands where, checked for each candidate place."""
+"""Placement rules of a requested room: walls behind backs, ceiling, doors and windows, relations,
+and paths from the doors. Candidate places of an object are checked against all of them."""
 
 from collections.abc import Callable, Sequence
 
@@ -6,31 +7,32 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float
 
-from sceneprior.lifted.requests.holding import Furniture, Relations
 from sceneprior.lifted.requests.openings import zones_of
-from sceneprior.lifted.requests.relations import OUTWARD
+from sceneprior.lifted.requests.paths import Paths, needs_access
+from sceneprior.lifted.requests.relation_checks import Furniture, RelationChecks
+from sceneprior.lifted.requests.relations import OUTWARD, footprints
 from sceneprior.lifted.requests.shape import RoomShape
-from sceneprior.lifted.requests.ways import Ways, is_functional
 from sceneprior.lifted.requests.wishes import RelationWish
 
 FLUSH_M = 0.15
-"""Gap up to which a back counts as standing at a side of a rectangle in the floor."""
+"""Largest gap between the back of an object and a side of its rectangle in the floor for which the
+back counts as standing at this side."""
 WALL_M = 0.3
-"""Largest distance of such a back's middle from a real wall."""
+"""Largest distance of the middle of such a back from a wall."""
 BEFORE_WINDOWS = ("lamp", "plant")
 """Words in the names of classes that may stand or hang before a window."""
 
 Check = Callable[[], Bool[np.ndarray, " candidates"]]
 
 
-class Judge:
-    """The places that one requested room allows.
+class PlacementRules:
+    """The rules for places in one requested room.
 
     Args:
         shape: Floor, doors, windows and ceiling.
-        wishes: Wished relations.
+        wishes: Requested relations.
         classes: Names of the classes by index.
-        given: Objects that stay where they are, even where no way leads to them.
+        given: Objects that stay where they are, even if no path leads to them.
     """
 
     def __init__(
@@ -41,33 +43,33 @@ class Judge:
         given: Furniture,
     ):
         self.shape, self.classes = shape, classes
-        self.relations = Relations(wishes, shape, classes)
+        self.relations = RelationChecks(wishes, shape, classes)
         self._zones = zones_of(shape)
-        self._functional = is_functional(classes)
+        self._needs_access = needs_access(classes)
         has_door = any(each.kind == "door" for each in shape.openings)
-        self._ways = Ways(shape) if has_door else None
-        self._cut_off = ~self._reached(given)
+        self._paths = Paths(shape) if has_door else None
+        self._unreached_given = ~self._reached(given)
 
-    def allows(
+    def allowed(
         self,
         label: int,
         candidates: Furniture,
-        standing: Furniture,
-        coming: Sequence[int],
+        placed: Furniture,
+        upcoming: Sequence[int],
         rectangles_m: Float[np.ndarray, "candidates 4"],
         enough: int,
     ) -> tuple[Bool[np.ndarray, " candidates"], str]:
-        """Which places an object of a class may take, and what the first others lack.
+        """True for places that an object of a class may take, and the first reason for a rejection.
 
         Args:
             candidates: Places of the object.
-            standing: Objects that are there, the given ones first.
-            coming: Classes that come later.
-            rectangles_m: Rectangles in the floor that the places were drawn in.
-            enough: Places to allow at most: ways are slow to find.
+            placed: Objects in the room, the given ones first.
+            upcoming: Classes of objects that are placed later.
+            rectangles_m: Rectangle in the floor from which each place was drawn.
+            enough: Largest number of places to allow, since finding paths is slow.
         """
         allowed = np.ones(len(candidates.back), dtype=bool)
-        hurdle = ""
+        reason = ""
         checks: list[tuple[str, Check]] = [
             ("a wall behind it", lambda: backed_by_walls(self.shape, candidates, rectangles_m)),
             ("room below the ceiling", lambda: self._below_ceiling(candidates)),
@@ -75,27 +77,25 @@ class Judge:
             ("distance from a window", lambda: self._leaves_free("window", label, candidates)),
         ]
         for name, check in checks:
-            allowed, hurdle = _narrowed(allowed, check(), hurdle, name)
+            allowed, reason = _narrowed(allowed, check(), reason, name)
         rows = np.flatnonzero(allowed)
-        some = Furniture(*(part[rows] for part in candidates))
         possible = allowed.copy()
-        possible[rows] = self.relations.can_hold(label, some, standing, coming)
-        allowed, hurdle = _narrowed(allowed, possible, hurdle, "a place that its relations allow")
-        if self._ways is None:
-            return allowed, hurdle
+        possible[rows] = self.relations.can_hold(label, candidates.rows(rows), placed, upcoming)
+        allowed, reason = _narrowed(allowed, possible, reason, "a place that its relations allow")
+        if self._paths is None:
+            return allowed, reason
         for row in np.flatnonzero(allowed):
-            own = Furniture(*(part[row : row + 1] for part in candidates))
-            joined = Furniture(*map(np.concatenate, zip(standing, own, strict=True)))
-            allowed[row] = enough > 0 and self._reached(joined)[len(self._cut_off) :].all()
+            joined = placed.joined(candidates.rows(slice(row, row + 1)))
+            allowed[row] = enough > 0 and self._reached(joined)[len(self._unreached_given) :].all()
             if enough > 0 and not allowed[row]:
-                hurdle = hurdle or "a way from a door"
+                reason = reason or "a path from a door"
             enough -= int(allowed[row])
-        return allowed, hurdle
+        return allowed, reason
 
     def _reached(self, furniture: Furniture) -> Bool[np.ndarray, " objects"]:
-        if self._ways is None:
+        if self._paths is None:
             return np.ones(len(furniture.back), dtype=bool)
-        return self._ways.reached(furniture.boxes_m, self._functional[furniture.object_class])
+        return self._paths.reached(furniture.boxes_m, self._needs_access[furniture.object_class])
 
     def _below_ceiling(self, candidates: Furniture) -> Bool[np.ndarray, " candidates"]:
         if self.shape.ceiling_m is None:
@@ -111,29 +111,31 @@ class Judge:
         may = any(word in self.classes[label] for word in BEFORE_WINDOWS)
         if not self._zones[kind] or (kind == "window" and may):
             return free
-        x, y, z, width, height, depth = candidates.boxes_m.T
-        footprints = shapely.box(x - width / 2, z - depth / 2, x + width / 2, z + depth / 2)
+        floors = footprints(candidates.boxes_m)
+        low_m = candidates.boxes_m[:, 1] - candidates.boxes_m[:, 4] / 2
+        high_m = candidates.boxes_m[:, 1] + candidates.boxes_m[:, 4] / 2
         for zone in self._zones[kind]:
-            level = (y + height / 2 > zone.from_m + 0.01) & (y - height / 2 < zone.to_m)
-            free &= ~(level & shapely.intersects(footprints, zone.polygon))
+            level = (high_m > zone.from_m + 0.01) & (low_m < zone.to_m)
+            free &= ~(level & shapely.intersects(floors, zone.polygon))
         return free
 
 
 def _narrowed(
     allowed: Bool[np.ndarray, " candidates"],
     passed: Bool[np.ndarray, " candidates"],
-    hurdle: str,
+    reason: str,
     name: str,
 ) -> tuple[Bool[np.ndarray, " candidates"], str]:
-    """The allowed places that pass a check, and the first hurdle of all."""
+    """The allowed places that pass a check, and the reason of the first rejection so far."""
     failed = bool((allowed & ~passed).any())
-    return allowed & passed, hurdle or (name if failed else "")
+    return allowed & passed, reason or (name if failed else "")
 
 
 def backed_by_walls(
     shape: RoomShape, candidates: Furniture, rectangles_m: Float[np.ndarray, "candidates 4"]
 ) -> Bool[np.ndarray, " candidates"]:
-    """True for places whose back is at a wall, or not at a side of their rectangle in the floor."""
+    """False for places whose back is at a side of their rectangle in the floor, but not at a wall:
+    inner sides of rectangles in an L-shaped floor are not walls."""
     if shape.is_rectangle:
         return np.ones(len(candidates.back), dtype=bool)
     inward = -OUTWARD[candidates.back]

@@ -1,11 +1,11 @@
-"""Ways from doors to furniture, compared with a walk from cell to cell."""
+"""Paths from doors to furniture, compared with a walk from cell to cell."""
 
 import numpy as np
 import pytest
 
 from sceneprior.core.scene import Opening
+from sceneprior.lifted.requests.paths import CELL_M, PATH_M, Paths, needs_access
 from sceneprior.lifted.requests.shape import RoomShape, read_floor
-from sceneprior.lifted.requests.ways import CELL_M, WAY_M, Ways, is_functional
 
 DOOR = Opening("door", (-0.45, -1.5), (0.45, -1.5), 0.0, 2.0)
 SHAPE = RoomShape(read_floor("4x3"), [DOOR])
@@ -16,7 +16,7 @@ def box(x: float, z: float, width: float, depth: float, bottom: float = 0.0) -> 
 
 
 def reached(*boxes: list[float], shape: RoomShape = SHAPE) -> list[bool]:
-    found = Ways(shape).reached(np.array(boxes), np.ones(len(boxes), dtype=bool))
+    found = Paths(shape).reached(np.array(boxes), np.ones(len(boxes), dtype=bool))
     return [bool(each) for each in found]
 
 
@@ -32,15 +32,15 @@ def test_furniture_behind_a_barrier_is_not_reached():
 @pytest.mark.parametrize(("gap_m", "open_"), [(0.5, False), (0.56, False), (0.66, True)])
 def test_a_way_is_as_wide_as_it_says(gap_m, open_):
     barrier = box(-gap_m / 2, 0.3, 4 - gap_m, 0.3)
-    assert WAY_M == 0.6 and reached(box(-1, 1.2, 1, 0.5), barrier) == [open_, True]
+    assert PATH_M == 0.6 and reached(box(-1, 1.2, 1, 0.5), barrier) == [open_, True]
 
 
 def test_lamps_need_no_way_and_rooms_without_doors_none_at_all():
     desk, barrier = box(0, 1.2, 1, 0.5), box(0, 0.3, 4, 0.3)
-    found = Ways(SHAPE).reached(np.array([desk, barrier]), np.array([False, True]))
+    found = Paths(SHAPE).reached(np.array([desk, barrier]), np.array([False, True]))
     assert found.tolist() == [True, True]
     assert reached(desk, barrier, shape=RoomShape(read_floor("4x3"))) == [True, True]
-    assert is_functional(["desk", "floor_lamp", "plant"]).tolist() == [True, False, False]
+    assert needs_access(["desk", "floor_lamp", "plant"]).tolist() == [True, False, False]
 
 
 def test_ways_are_those_of_a_walk_from_cell_to_cell():
@@ -50,16 +50,16 @@ def test_ways_are_those_of_a_walk_from_cell_to_cell():
         boxes = np.array([
             box(*rng.uniform(-1.6, 1.6, 2), *rng.uniform(0.3, 1.6, 2)) for _ in range(5)
         ])  # fmt: skip
-        found = Ways(SHAPE).reached(boxes, np.ones(5, dtype=bool)).tolist()
+        found = Paths(SHAPE).reached(boxes, np.ones(5, dtype=bool)).tolist()
         assert found == walked_to(boxes)
         seen |= set(found)
     assert seen == {True, False}
 
 
 def walked_to(boxes: np.ndarray) -> list[bool]:
-    """A walk over cells whose middle is half a way from walls and boxes, as `Ways` has them."""
+    """A walk over cells whose middle is half a way from walls and boxes, as `Paths` has them."""
     nx, nz = round(4 / CELL_M), round(3 / CELL_M)
-    margin = WAY_M / 2 - CELL_M / 2
+    margin = PATH_M / 2 - CELL_M / 2
 
     def blocked(i: int, j: int, wide: float, row: np.ndarray) -> bool:
         return all(
@@ -74,7 +74,7 @@ def walked_to(boxes: np.ndarray) -> list[bool]:
             inside = abs(x) < 2 - margin - 1e-6 and abs(z) < 1.5 - margin - 1e-6
             if inside and not any(blocked(i, j, margin, row) for row in boxes):
                 free.add((i, j))
-    door = (int(2 / CELL_M), int((WAY_M / 2 + CELL_M / 2) / CELL_M))
+    door = (int(2 / CELL_M), int((PATH_M / 2 + CELL_M / 2) / CELL_M))
     walk = [cell for cell in free if max(abs(cell[0] - door[0]), abs(cell[1] - door[1])) <= 2]
     walked = set(walk)
     while walk:
@@ -83,5 +83,5 @@ def walked_to(boxes: np.ndarray) -> list[bool]:
             if cell in free and cell not in walked:
                 walked.add(cell)
                 walk.append(cell)
-    wide = WAY_M / 2 + 0.1
+    wide = PATH_M / 2 + 0.1
     return [any(blocked(i, j, wide, row) for i, j in walked) for row in boxes]
