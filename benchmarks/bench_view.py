@@ -14,6 +14,7 @@ import argparse
 import json
 import math
 import os
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -120,7 +121,7 @@ def dragged(page: Page, points: list[tuple[float, float]]) -> dict[str, float]:
     late = []
     for at, said, _ in came:
         if said:
-            x, y = map(float, said.removeprefix("map ").split(","))
+            x, y = map(float, said.split(","))
             late.append(at - sent[min(sent, key=lambda point: math.dist(point, (x, y)))])
     return {
         "events_per_s": round(len(points) / wall, 1),
@@ -139,7 +140,7 @@ def _read(client: ClientConnection, came: list[tuple[float, str, int]]) -> None:
         packed = int.from_bytes(data[8:16], "little")
         window = msgspec.msgpack.decode(unpack.decompress(data[16 : 16 + packed]))
         words = [text for m in window["messages"] for text in m.get("updates", {}).values()]
-        said = [text.split("**")[1] for text in words if str(text).startswith("**map")]
+        said = re.findall(r"<b>map ([-+.\d]+, [-+.\d]+)</b>", " ".join(map(str, words)))
         came.append((time.perf_counter(), said[-1] if said else "", len(data)))
 
 

@@ -6,7 +6,19 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.apps.cli.options import MODELS_HELP, OWN_HELP, CacheOption
+from sceneprior.apps.cli.options import (
+    MODELS_HELP,
+    OWN_HELP,
+    CacheOption,
+    CeilingOption,
+    FloorOption,
+    OpeningsOption,
+    RequestOption,
+    ShellOption,
+    WantOption,
+    checked_shell,
+    request_of,
+)
 
 
 def view(
@@ -17,19 +29,33 @@ def view(
         Path | None,
         typer.Option(help=f"Models that the page may show: {MODELS_HELP} {OWN_HELP}"),
     ] = None,
+    floor: FloorOption = None,
+    openings: OpeningsOption = None,
+    ceiling: CeilingOption = None,
+    want: WantOption = None,
+    request: RequestOption = None,
+    shell: ShellOption = None,
     host: Annotated[
         str, typer.Option(help="Address to serve on; 0.0.0.0 opens the page to your network.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
     cache: CacheOption = None,
 ) -> None:
-    """View rooms in the browser, and explore the latent space of a run; Ctrl-C ends it."""
+    """View rooms in the browser, request new ones, and explore the latent space of a run.
+
+    Ctrl-C ends it. The page begins with the request of the options, and with walls unless --shell
+    says otherwise.
+    """
     from sceneprior.apps.viewer.server import check_can_serve, serving
+    from sceneprior.core.errors import InputError
 
     check_can_serve(host, port)  # before seconds are spent on loading
+    drawn = checked_shell(shell or "walls")
+    asked = request_of(floor, openings, ceiling, want, request)
     import torch
 
     from sceneprior.apps.api import load
+    from sceneprior.apps.requests import with_floor_of_file
     from sceneprior.apps.retrieval.cad_models import open_models
     from sceneprior.apps.viewer.explorer import Explorer, Folder
     from sceneprior.apps.viewer.page import Page
@@ -40,10 +66,14 @@ def view(
     folder, stop = Path(where), threading.Event()
     is_folder = folder.is_dir() and not (folder / "config.yaml").is_file()
     try:
+        if asked and is_folder:
+            raise InputError(
+                f"{where} holds scenes, which are shown as they are; a request needs a prior."
+            )
         source = Folder(load_scene_folder(folder)) if is_folder else Explorer(load(where))
         bank = None if models is None else open_models(models, source.label_set, cache)
         with serving(host, port) as server:
-            Page(server, source, folder.name, bank)
+            Page(server, source, folder.name, bank, with_floor_of_file(asked), drawn)
             typer.echo(f"Open http://localhost:{port} in a browser. Ctrl-C ends it.")
             if isinstance(source, Explorer):
                 threading.Thread(target=source.find_meshes, args=(stop,)).start()

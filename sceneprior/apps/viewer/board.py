@@ -51,6 +51,12 @@ class BoardPlane:
         """Points of the map in scene coordinates, on the board's face."""
         return self.on_board(places, 0.0) @ self._turn.T + np.array(self.center_m)
 
+    def corners_m(self) -> Float[np.ndarray, "4 3"]:
+        """Corners of the board in scene coordinates."""
+        half = self.side_m / 2
+        flat = np.array([[x, y, 0.0] for x in (-half, half) for y in (-half, half)])
+        return flat @ self._turn.T + np.array(self.center_m)
+
     def hit(self, origin_m: Any, direction: Any) -> Point | None:
         """The map point hit by a ray of the scene, clamped to the board's edge.
 
@@ -76,7 +82,9 @@ class Board:
     ):
         self.plane, self._scene = plane, server.scene
         side, rooms = plane.side_m, plane.latent_map.rooms
-        self._scene.add_frame("/map", show_axes=False, wxyz=plane.wxyz, position=plane.center_m)
+        self.frame = self._scene.add_frame(
+            "/map", show_axes=False, wxyz=plane.wxyz, position=plane.center_m
+        )
         face = self._scene.add_box(
             "/map/board", color=_BOARD, dimensions=(side, side, 0.02), position=(0, 0, -0.01)
         )

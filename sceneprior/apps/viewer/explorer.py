@@ -1,9 +1,11 @@
 """The viewer's logic without its page: rooms of a prior, or of a folder."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +31,9 @@ SOME = 64
 """Largest number of training rooms for estimating room sizes; decoding all would take a second."""
 HERE = "here"
 """Name of the shown room as an end of a path."""
+
+
+NOTHING_ASKED: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -109,15 +114,33 @@ class Explorer:
         own = trained.distribution if trained.distribution in known else known[0]
         return (own, *(name for name in known if name != own))
 
-    def sample(self, seed: int, distribution: str | None = None) -> Shown:
+    @property
+    def takes_requests(self) -> bool:
+        """True if a sampler draws rooms, as requests need."""
+        return SAMPLER in self.distributions
+
+    def sample(
+        self,
+        seed: int,
+        distribution: str | None = None,
+        asked: Mapping[str, Any] = NOTHING_ASKED,
+    ) -> Shown:
         """Sample a new room, by default from the first of `distributions`.
 
-        It equals the room of `sceneprior synthesize -n 1 --seed SEED`.
+        It equals the room of `sceneprior synthesize -n 1 --seed SEED` with the same request.
+
+        Args:
+            asked: Arguments of `Prior.sample` for a requested room.
         """
         distribution = distribution or next(iter(self.distributions), None)
+        if asked and distribution != SAMPLER:
+            raise InputError(
+                f"Rooms from {distribution} answer no requests; choose {SAMPLER} under From, or "
+                "clear the request."
+            )
         origin = distribution or self.prior.trained.config.method
-        scene = self.prior.sample(1, seed, distribution)[0]
-        return Shown(scene, f"seed {seed}, from: {origin}")
+        scene = self.prior.sample(1, seed, distribution, **asked)[0]
+        return Shown(scene, f"seed {seed}, from: {origin}{', as requested' if asked else ''}")
 
     def training_room(self, row: int) -> Shown:
         """A training room as the prior decodes it."""
@@ -141,8 +164,8 @@ class Explorer:
     def draw_path(self, shown: Shown, start: str, end: str) -> Float[Tensor, "steps dimension"]:
         """Set the path of `step`, and return its latents from start to end.
 
-        An end is a training room's id, `seed:7` or `HERE`. Files are not accepted, since the text
-        comes from a browser, which may run on another machine.
+        An end is a training room's id, `paper:7` (New room's seed 7 from `paper`) or `HERE`. Files
+        are not accepted, since the text comes from a browser, which may run on another machine.
         """
         ends = [
             self.prior.latent(shown.scene)
@@ -159,9 +182,12 @@ class Explorer:
         name = f"step_{number:02d}"
         return self._decoded(self.path[number], name, f"path, step {number} of {PATH_STEPS - 1}")
 
-    def complete(self, shown: Shown, seed: int) -> Shown:
-        """Keep the kept objects, and complete the room around them."""
-        room = self.prior.complete(shown.given(), 1, seed)[0]
+    def complete(self, shown: Shown, seed: int, want: str = "") -> Shown:
+        """Keep the kept objects, and complete the room around them, with wishes if there are any.
+
+        The shown room's floor, doors, windows and ceiling stay as well.
+        """
+        room = self.prior.complete(shown.given(), 1, seed, want=want or None)[0]
         kept = frozenset(range(len(shown.kept)))
         return Shown(room, f"completed around {len(kept)} kept objects, seed {seed}", kept)
 

@@ -1,14 +1,15 @@
 """A room as viser scene nodes: meshes of objects, boxes as lines, names and sizes as labels."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
-from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.render.topdown import object_colors, object_mesh
+from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.shell import THICK_M, ShellName, shell_meshes, shell_of
+from sceneprior.render.topdown import object_colors, object_mesh, shell_color
 
 if TYPE_CHECKING:
     import viser
@@ -56,17 +57,24 @@ class RoomNodes:
         self._labels: list[Any] = []
         self._lines: Any = None
         self.frame = self._scene.add_frame(root, show_axes=False, position=(x_m, 0.0, 0.0))
-        self._scene.add_grid(
-            f"{root}/floor", floor_m, floor_m, plane="xz", position=(0.0, -0.005, 0.0),
+        self._walls: list[Any] = []
+        self._grid = self._scene.add_grid(
+            f"{root}/grid", floor_m, floor_m, plane="xz", position=(0.0, -0.005, 0.0),
             plane_color=(236, 233, 226), plane_opacity=1.0, cell_color=(222, 218, 208),
             section_color=(196, 190, 178),
         )  # fmt: skip
 
     def show(
-        self, scene: Scene, kept: Collection[int] = (), names: bool = False, boxes: bool = False
+        self,
+        scene: Scene,
+        kept: Collection[int] = (),
+        names: bool = False,
+        boxes: bool = False,
+        shell: ShellName = "none",
     ) -> None:
         """Show a scene in place of the previous one; objects that the user keeps get an orange box
-        and a name."""
+        and a name. Without floor and walls, a grid takes their place."""
+        self._show_shell(shown_shell(scene, shell))
         for row, (item, color) in enumerate(
             zip(scene.objects, object_colors(scene).tolist(), strict=True)
         ):
@@ -95,6 +103,19 @@ class RoomNodes:
             clicked = self._clicked
             handle.on_click(lambda _: clicked(row))
         self._nodes[row : row + 1] = [_Node(handle, unit, mesh.faces, color)]
+
+    def _show_shell(self, meshes: Mapping[str, Mesh]) -> None:
+        self._grid.visible = not meshes
+        for node in self._walls:
+            node.remove()
+        self._walls = [
+            self._scene.add_mesh_simple(
+                f"{self._root}/{name}", mesh.vertices_m, mesh.faces,
+                color=tuple(shell_color(name).tolist()),
+                flat_shading=True, side="front", cast_shadow=False,
+            )
+            for name, mesh in meshes.items()
+        ]  # fmt: skip
 
     def _show_labels(self, items: list[SceneObject]) -> None:
         for row, item in enumerate(items):
@@ -126,6 +147,37 @@ class RoomNodes:
                 np.repeat(colors, 2 * len(_EDGES), axis=0).reshape(-1, 2, 3), thickness=2,
                 thickness_units="screen",
             )  # fmt: skip
+
+
+def shown_shell(scene: Scene, shell: ShellName) -> dict[str, Mesh]:
+    """Floor, walls and ceiling as seen from inside the room, with the frames of its openings.
+
+    Only faces towards the room are left, and browsers draw faces from their front alone: of walls
+    between the camera and the room, no more is drawn than the frames of doors and windows.
+    """
+    meshes = shell_meshes(scene, shell)
+    if shell != "walls":
+        return meshes
+    room = shell_of(scene)
+    ceiling_m = room.height_m + THICK_M / 2
+    for row, wall in enumerate(room.walls):
+        mesh = meshes[f"wall_{row}"]
+        outward = _normals(mesh) @ np.insert(wall.outward, 1, 0.0)
+        # The inner face and the reveals of openings, without upper and lower edge and mitred ends.
+        y = mesh.vertices_m[mesh.faces].mean(axis=1)[:, 1]
+        reveal = (abs(outward) < 0.01) & (y > -THICK_M / 2) & (y < ceiling_m)
+        meshes[f"wall_{row}"] = Mesh(mesh.vertices_m, mesh.faces[(outward < -0.99) | reveal])
+    ceiling = meshes["ceiling"]
+    below = _normals(ceiling)[:, 1] < -0.99
+    meshes["ceiling"] = Mesh(ceiling.vertices_m, ceiling.faces[below])
+    return meshes
+
+
+def _normals(mesh: Mesh) -> np.ndarray:
+    """Unit normals of a mesh's faces."""
+    a, b, c = (mesh.vertices_m[mesh.faces[:, corner]] for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 
 
 def _alike(old: _Node, unit: np.ndarray, faces: np.ndarray, color: tuple[int, int, int]) -> bool:

@@ -2,39 +2,54 @@
 
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from markupsafe import Markup
+from jaxtyping import Float
 
 from sceneprior.apps.retrieval.cad_models import CadModels
 from sceneprior.apps.retrieval.made_models import made_models
 from sceneprior.apps.retrieval.retrieve import retrieve
 from sceneprior.apps.viewer.board import Board, BoardPlane, Point
-from sceneprior.apps.viewer.explorer import HERE, PATH_STEPS, Explorer, Folder, Shown, floor_side_m
-from sceneprior.apps.viewer.nodes import RoomNodes, name_and_size
+from sceneprior.apps.viewer.explorer import NOTHING_ASKED, Explorer, Folder, Shown, floor_side_m
+from sceneprior.apps.viewer.framing import (
+    ASPECT,
+    CORNER,
+    DOWN,
+    FOV_RAD,
+    FRONT,
+    box_points,
+    framed,
+    room_bounds,
+    viewing_direction,
+)
+from sceneprior.apps.viewer.nodes import RoomNodes
+from sceneprior.apps.viewer.panel import MODELS, Panel
+from sceneprior.apps.viewer.plan import Plan
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
-from sceneprior.render.scene_files import scene_to_glb
+from sceneprior.core.shell import ShellName, shell_of
 
 if TYPE_CHECKING:
     import viser
 
-FOV_RAD = 0.75
-"""Vertical field of view of the camera."""
 GAP = 0.06
 """Gap between the room and its neighbours, relative to the width of the room's floor."""
-FURNITURE = DECODED, MODELS = "decoded", "models"
-"""The choices of `Furniture`: meshes of the prior or the files, or CAD models."""
-_TEXT = Markup('<div style="padding: 0 0.8em 0.8em; font-size: 0.875em">{}</div>')
+AROUND_PLAN_M = 1.0
+"""Floor shown around a plan that is being drawn."""
+SMALL = 0.55
+"""A room with sides below this share of those of the framed box is framed anew."""
 
 
 class Page:
     """The page, whose single room is shared by all connected browsers.
 
-    Without `models`, the package's own furniture is the other choice of `Furniture`.
+    Args:
+        models: CAD models, the other choice of `Furniture`; by default the package's own.
+        asked: Request of the first room, as arguments of `Prior.sample`.
+        shell: Parts of the room itself that are shown at first.
     """
 
     def __init__(
@@ -43,83 +58,193 @@ class Page:
         source: Explorer | Folder,
         title: str,
         models: CadModels | None = None,
+        asked: Mapping[str, Any] = NOTHING_ASKED,
+        shell: ShellName = "walls",
     ):
         self.server, self.source, self.models = server, source, models or made_models()
         self.explorer = source if isinstance(source, Explorer) else None
-        self.shown = source.room(0) if isinstance(source, Folder) else source.sample(0)
+        self.shown = source.room(0) if isinstance(source, Folder) else source.sample(0, None, asked)
         self.scene = self.shown.scene
         """The displayed scene: the scene of `shown`, with CAD models if they are chosen."""
         # Callbacks come from many threads, and a callback may trigger another in its own thread.
         self._lock = threading.RLock()
         self._newest: Callable[[], None] | None = None
         self._follower = ThreadPoolExecutor(1)
-        floor_m = floor_side_m(source.some_layouts())
+        self._floor_m = floor_m = floor_side_m(source.some_layouts())
         self._room = RoomNodes(server, "/room", 0.0, floor_m, self._clicked)
         self._beside_m = floor_m * (1 + GAP)
         self._beside = RoomNodes(server, "/nearest", self._beside_m, floor_m)
         self._beside.frame.visible = False
         self.board: Board | None = None
         """The map's board; None if the source has no map."""
-        self._left_m, self._right_m = -floor_m / 2, floor_m / 2
         if self.explorer is not None and self.explorer.map is not None:
             side = 0.85 * floor_m
-            self._left_m -= floor_m * GAP + side
-            center = (self._left_m + side / 2, 0.4 * side, -0.1 * floor_m)
+            center = (-floor_m / 2 - GAP * floor_m - side / 2, 0.4 * side, -0.1 * floor_m)
             plane = BoardPlane(self.explorer.map, center, side)
             self.board = Board(server, plane, self._pointed)
+        self._bounds_m = np.zeros((2, 3))
+        """Lowest and highest corner of the room when it was framed."""
+        self._eyes: dict[int, np.ndarray] = {}
+        """Position that each browser's camera was given last."""
         server.scene.set_up_direction("+y")
-        eye, target = self._view(self._right_m)
         server.initial_camera.fov = FOV_RAD
-        server.initial_camera.position, server.initial_camera.look_at = eye, target
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.set_panel_label(title)
         server.gui.main_panel.dock_right()
-        self._add_controls()
+        self.panel = Panel(self, asked, shell)
         self.show(self.shown)
+        server.on_client_connect(self._connected)
 
     def show(self, shown: Shown, settled: bool = True) -> None:
         """Show a room; slow updates are skipped during a drag, when it is not `settled`."""
         with self._lock:
+            panel = self.panel
             self.shown = shown
             self.scene = shown.scene
-            if settled and self._furniture.value == MODELS:
+            if settled and panel.furniture.value == MODELS:
                 self.scene = retrieve(shown.scene, self.models)
             with self.server.atomic():
-                self._room.show(self.scene, shown.kept, self._names.value, self._boxes.value)
+                self._room.show(
+                    self.scene, shown.kept, panel.names.value, panel.boxes.value, panel.shell.value
+                )
                 if self.board is not None:
                     self.board.mark(shown.scene.latent)
-                self._said.content = _html(_words(shown, self.scene))
-            if settled and self._nearest is not None:
-                self._show_nearest(self.scene if self._nearest.value else None)
+                panel.describe(shown, self.scene)
+            if settled and panel.nearest is not None:
+                self._show_nearest(self.scene if panel.nearest.value else None)
+            if settled and self._is_framed_badly():
+                self.frame()
+
+    def draw(self, plan: Plan | None) -> None:
+        """Show a plan to draw on, from above, in place of the room; None shows the room again."""
+        self._room.frame.visible = plan is None
+        if self.board is not None:
+            self.board.frame.visible = plan is None
+        if plan is None:
+            self._beside.frame.visible = self.panel.nearest is not None and self.panel.nearest.value
+            self.frame(True)
+        else:
+            self._beside.frame.visible = False
+            self._look(self._plan_points(plan), DOWN)
+
+    # -- Cameras -----------------------------------------------------------------------------------
+
+    def frame(self, turned: bool = False) -> None:
+        """Move all cameras so that everything is seen.
+
+        Args:
+            turned: Look in the page's own direction, not in that of each camera.
+        """
+        self._bounds_m = self._room_bounds()
+        self._look(self._points(), self._direction if turned else None)
+
+    @property
+    def _direction(self) -> Float[np.ndarray, "3"]:
+        return CORNER if self.board is None else FRONT
+
+    def _look(
+        self, points_m: Float[np.ndarray, "points 3"], forward: Float[np.ndarray, "3"] | None
+    ) -> None:
+        eye, target = framed(points_m, self._direction, FOV_RAD, ASPECT)
+        self.server.initial_camera.position = eye
+        self.server.initial_camera.look_at = target
+        for client in self.server.get_clients().values():
+            self._place(client, points_m, forward)
+
+    def _place(
+        self,
+        client: "viser.ClientHandle",
+        points_m: Float[np.ndarray, "points 3"],
+        forward: Float[np.ndarray, "3"] | None,
+    ) -> None:
+        camera = client.camera
+        if forward is None:
+            forward = viewing_direction(np.asarray(camera.wxyz))
+            if abs(forward[1]) > 0.99:
+                forward = self._direction
+        eye, target = framed(points_m, forward, camera.fov, camera.aspect)
+        self._eyes[client.client_id] = eye
+        with client.atomic():
+            camera.position, camera.look_at = eye, target
+
+    def _connected(self, client: "viser.ClientHandle") -> None:
+        """Frame the room in a new browser's window, and again when the window changes its shape."""
+        aspect = 0.0
+
+        def update(camera: Any) -> None:
+            nonlocal aspect
+            own = self._eyes.get(client.client_id)
+            if own is None or (
+                abs(camera.aspect - aspect) > 0.01 and np.allclose(camera.position, own, atol=0.02)
+            ):
+                aspect = camera.aspect
+                plan = self.panel.plan
+                points_m = self._points() if plan is None else self._plan_points(plan)
+                self._place(client, points_m, DOWN if plan is not None else self._direction)
+            else:
+                aspect = camera.aspect
+
+        update(client.camera)
+        client.camera.on_update(update)
+
+    def _points(self) -> Float[np.ndarray, "points 3"]:
+        """What the cameras hold: the room, the map, and the nearest training room if shown."""
+        points = [box_points(self._room_bounds())]
+        half = self._floor_m / 2
+        if self.board is not None:
+            points.append(self.board.plane.corners_m())
+            points.append(np.array([[x, 0.0, z] for x in (-half, half) for z in (-half, half)]))
+        if self._beside.frame.visible:
+            beside = [[self._beside_m + x, y, z] for x in (-half, half) for z in (-half, half)
+                      for y in (0.0, 2.0)]  # fmt: skip
+            points.append(np.array(beside))
+        return np.concatenate(points)
+
+    def _plan_points(self, plan: Plan) -> Float[np.ndarray, "points 3"]:
+        low, high = plan.outline_m.min(axis=0), plan.outline_m.max(axis=0)
+        grown = np.array([low - AROUND_PLAN_M, high + AROUND_PLAN_M])
+        return box_points(np.insert(grown, 1, 0.0, axis=1))
+
+    def _room_bounds(self) -> Float[np.ndarray, "2 3"]:
+        return room_bounds(self.scene, shell_of(self.scene), self.panel.shell.value == "walls")
+
+    def _is_framed_badly(self) -> bool:
+        low, high = self._room_bounds()
+        framed_low, framed_high = self._bounds_m
+        outside = (low < framed_low - 0.05).any() or (high > framed_high + 0.05).any()
+        return bool(outside or ((high - low) < SMALL * (framed_high - framed_low))[[0, 2]].any())
+
+    # -- Events ------------------------------------------------------------------------------------
 
     def _show_nearest(self, scene: Scene | None) -> None:
         assert self.explorer is not None
-        if self._beside.frame.visible != (scene is not None):
-            self._beside.frame.visible = scene is not None
-            eye, target = self._view(self._right_m + (self._beside_m if scene else 0.0))
-            for client in self.server.get_clients().values():
-                client.camera.position, client.camera.look_at = eye, target
-        self._nearest_said.content = ""
-        if scene is not None:
-            room, distance_m = self.explorer.nearest(scene)
-            self._beside.show(room.scene, names=self._names.value, boxes=self._boxes.value)
-            said = f"Right: {room.origin}; {distance_m:.2f} m away in layout."
-            self._nearest_said.content = _html(said)
+        changed = self._beside.frame.visible != (scene is not None)
+        self._beside.frame.visible = scene is not None
+        room, distance_m = (None, 0.0) if scene is None else self.explorer.nearest(scene)
+        self.panel.describe_nearest(room, distance_m)
+        if room is not None:
+            panel = self.panel
+            self._beside.show(
+                room.scene, (), panel.names.value, panel.boxes.value, panel.shell.value
+            )
+        if changed:
+            self.frame()
 
     def _clicked(self, item: int) -> None:
         def keep() -> None:
             if item < len(self.shown.scene.objects):
                 self.show(self.shown.toggled(item))
 
-        self._safely(keep)
+        self.safely(keep)
 
     def _pointed(self, point: Point, how: str) -> None:
         explorer = self.explorer
         assert explorer is not None, "only a prior has a map"
-        self._follow(
+        self.follow(
             lambda: self.show(explorer.at(self.shown, point, how == "click"), how != "drag")
         )
 
-    def _follow(self, task: Callable[[], None]) -> None:
+    def follow(self, task: Callable[[], None]) -> None:
         """Queue a task, replacing one that has not started, so that the room keeps up with the
         pointer."""
         self._newest = task
@@ -128,9 +253,9 @@ class Page:
     def _do_newest(self) -> None:
         task, self._newest = self._newest, None
         if task is not None:
-            self._safely(task)
+            self.safely(task)
 
-    def _safely(self, task: Callable[[], None]) -> None:
+    def safely(self, task: Callable[[], None]) -> None:
         """Run a browser's request under the lock; errors are shown as notifications."""
         try:
             with self._lock:
@@ -142,145 +267,3 @@ class Page:
             title = "That does not work" if known else f"{type(error).__name__}: please report it"
             for client in self.server.get_clients().values():
                 client.add_notification(title, str(error), color="red", auto_close_seconds=20)
-
-    def _view(self, right_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Camera position and target that show everything from the left edge to `right_m`."""
-        width = right_m - self._left_m
-        middle = np.array([(right_m + self._left_m) / 2, 0.0, 0.0])
-        return middle + 1.02 * width * np.array([0.0, 0.6, 0.8]), middle
-
-    # -- The panel ---------------------------------------------------------------------------------
-
-    def _add_controls(self) -> None:
-        gui = self.server.gui
-        self._said = gui.add_html("")
-        if isinstance(self.source, Folder):
-            self._add_folder(self.source)
-        else:
-            self._add_sampling(self.source)
-            if self.source.map is not None:
-                share = f"{self.source.map.share:.0%}"
-                gui.add_markdown(
-                    "**Map**: drag over the board, or click a dot, which is a training room. The "
-                    "map shows the two directions in which the training rooms' latents differ "
-                    f"most ({share} of the variance); all other coordinates stay."
-                )
-            elif self.source.without_map:
-                gui.add_html(_html(self.source.without_map))
-            if self.source.has_latents:
-                self._add_path(self.source)
-                self._add_completion(self.source)
-        with gui.add_folder("Show"):
-            self._names = self._box("Names and sizes", False)
-            self._boxes = self._box("Boxes", False)
-            self._furniture: Any = gui.add_dropdown("Furniture", FURNITURE, initial_value=DECODED)
-            self._furniture.on_update(lambda _: self._safely(lambda: self.show(self.shown)))
-            self._nearest: Any = None
-            if self.board is not None:
-                self._nearest = self._box("Nearest training room", False)
-                self._nearest_said = gui.add_html("")
-        self._buttons({"Download GLB": self._download})
-
-    def _box(self, name: str, value: bool) -> Any:
-        box = self.server.gui.add_checkbox(name, value)
-        box.on_update(lambda _: self._safely(lambda: self.show(self.shown)))
-        return box
-
-    def _buttons(self, tasks: dict[str, Callable[[], None]]) -> None:
-        group = self.server.gui.add_button_group("", tuple(tasks))
-        group.on_click(lambda _: self._safely(tasks[group.value]))
-
-    def _add_folder(self, folder: Folder) -> None:
-        names = [scene.name for scene in folder.scenes]
-        if len(names) < 2:
-            return
-        gui = self.server.gui
-        number: Any = gui.add_slider("Room", min=1, max=len(names), step=1, initial_value=1)
-        number.on_update(lambda _: self._follow(lambda: self.show(folder.room(number.value - 1))))
-
-        def turn(by: int) -> None:
-            number.value = 1 + (number.value - 1 + by) % len(names)
-
-        self._buttons({"Previous": lambda: turn(-1), "Next": lambda: turn(1)})
-
-    def _add_sampling(self, explorer: Explorer) -> None:
-        gui = self.server.gui
-        with gui.add_folder("New room"):
-            known = explorer.distributions
-            origin = gui.add_dropdown("From", known, initial_value=known[0]) if known else None
-            seed: Any = gui.add_number("Seed", 0, min=0, step=1)
-
-            def sample() -> None:
-                self.show(explorer.sample(seed.value, None if origin is None else origin.value))
-
-            def another() -> None:
-                seed.value += 1  # the update triggers `sample`
-
-            for each in (seed, origin):
-                if each is not None:
-                    each.on_update(lambda _: self._safely(sample))
-            self._buttons({"Sample": sample, "Next seed": another})
-
-    def _add_path(self, explorer: Explorer) -> None:
-        gui = self.server.gui
-        with gui.add_folder("Path"):
-            hint = f"A training room's id, seed:7, or {HERE}"
-            start = gui.add_text("From", "seed:1", hint=hint)
-            end = gui.add_text("To", "seed:2", hint=hint)
-            step: Any = gui.add_slider(
-                "Step", min=0, max=PATH_STEPS - 1, step=1, initial_value=0, disabled=True
-            )
-
-            def draw() -> None:
-                z = explorer.draw_path(self.shown, start.value, end.value)
-                if self.board is not None:
-                    self.board.draw_path(z)
-                step.disabled = False
-                step.value = 0
-                self.show(explorer.step(0))
-
-            def walk() -> None:
-                settled = step.value in (0, PATH_STEPS - 1)
-                if explorer.path is not None:
-                    self.show(explorer.step(step.value), settled)
-
-            step.on_update(lambda _: self._follow(walk))
-            self._buttons({"Draw path": draw})
-
-    def _add_completion(self, explorer: Explorer) -> None:
-        gui = self.server.gui
-        with gui.add_folder("Complete"):
-            gui.add_markdown("Click objects to keep them; all others are replaced by new ones.")
-            seed: Any = gui.add_number("Seed ", 0, min=0, step=1)
-
-            def complete() -> None:
-                self.show(explorer.complete(self.shown, seed.value))
-                seed.value += 1
-
-            self._buttons({"Complete the rest": complete})
-
-    def _download(self) -> None:
-        self.server.send_file_download(f"{self.scene.name}.glb", scene_to_glb(self.scene))
-
-
-def _words(shown: Shown, scene: Scene) -> Markup:
-    """Panel text on the shown room: its origin and its objects, with kept objects in bold."""
-    lines = [
-        Markup("<li><b>{}</b></li>" if row in shown.kept else "<li>{}</li>").format(
-            name_and_size(item)
-        )
-        for row, item in enumerate(scene.objects)
-    ]
-    rows = Markup().join(lines) or Markup("<li>nothing: an empty room</li>")
-    return Markup('<b>{}</b><ul style="margin: 0.4em 0; padding-left: 1.4em">{}</ul>').format(
-        shown.origin, rows
-    )
-
-
-def _html(text: str) -> str:
-    """Text for the panel, escaped unless it is `Markup`.
-
-    Names from files are shown only by this function, never as Markdown: viser executes HTML in
-    Markdown, and reads its images from the server's files.
-    """
-    return str(_TEXT.format(text))

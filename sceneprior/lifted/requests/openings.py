@@ -130,7 +130,7 @@ def _placed(
     wanted: WantedOpening, sides: list[Side], there: list[Opening], draws: np.random.Generator
 ) -> Opening:
     width_m, bottom_m, top_m = DOOR_M if wanted.kind == "door" else WINDOW_M
-    choice = _walls(wanted, sides)
+    choice = walls_of(wanted, sides)
     room_m = np.array([max(side.length_m - width_m - 2 * MARGIN_M, 0.0) for side in choice])
     taken = [shapely.LineString([each.start_m, each.end_m]) for each in there]
     where = f"on {wanted.wall} " if wanted.wall is not None else ""
@@ -161,7 +161,7 @@ def _placed(
     )
 
 
-def _walls(wanted: WantedOpening, sides: list[Side]) -> list[Side]:
+def walls_of(wanted: WantedOpening, sides: list[Side]) -> list[Side]:
     """Sides on which an opening may lie. Walls of `COMPASS` run from west to east or from north to
     south."""
     if wanted.wall is None:

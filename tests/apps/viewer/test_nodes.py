@@ -1,5 +1,6 @@
 """A room's nodes: only what changed is sent."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -7,7 +8,8 @@ import numpy as np
 import pytest
 
 from sceneprior.apps.viewer.nodes import RoomNodes
-from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject
+from sceneprior.core.shell import shell_of
 
 BED = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
 LAMP = SceneObject("pendant_lamp", (1.0, 2.0, 0.0), (0.4, 0.6, 0.4))
@@ -77,4 +79,30 @@ def test_fewer_objects_leave_no_node_behind(room, fake):
     room.show(scene(LAMP), names=True)
     assert fake.nodes["/room/name_0"].text == "pendant lamp 0.40 x 0.60 x 0.40 m"
     room.show(scene())
-    assert set(fake.nodes) == {"/room", "/room/floor"}
+    assert set(fake.nodes) == {"/room", "/room/grid"}
+
+
+def test_of_walls_only_what_faces_the_room_is_drawn(room, fake):
+    outline = np.array([[-2.0, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]])
+    door = Opening("door", (-0.5, -1.5), (0.4, -1.5), 0.0, 2.0)
+    walled = replace(scene(BED), floor_m=outline, openings=(door,))
+    room.show(walled, shell="walls")
+    walls = [fake.nodes[f"/room/wall_{row}"] for row in range(4)]
+    assert all(node.side == "front" for node in walls) and not fake.nodes["/room/grid"].visible
+    for (vertices, faces), wall in zip(
+        (node.values for node in walls), shell_of(walled).walls, strict=True
+    ):
+        a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+        facing = np.cross(b - a, c - a) @ np.insert(wall.outward, 1, 0.0)
+        assert (facing < 1e-9).all() and (facing < -1e-3).any()
+        # The reveals of the door are the only other faces: two sides, and the head.
+        others = faces[facing > -1e-9]
+        assert bool(len(others)) == bool(wall.openings)
+        assert (vertices[others].mean(axis=1)[:, 1] < 2.1).all()
+    assert (fake.nodes["/room/ceiling"].values[0][:, 1] >= 2.6).all()
+    fake.added.clear()
+    room.show(walled, shell="floor")
+    assert fake.added == ["/room/floor"]
+    assert not {f"/room/wall_{row}" for row in range(4)} & set(fake.nodes)
+    room.show(walled, shell="none")
+    assert "/room/floor" not in fake.nodes and fake.nodes["/room/grid"].visible

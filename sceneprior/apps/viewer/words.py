@@ -1,0 +1,80 @@
+"""Texts of the panel as HTML: the shown room, its wishes, and a legend of its classes."""
+
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from sceneprior.apps.viewer.explorer import Shown
+from sceneprior.apps.viewer.nodes import name_and_size
+from sceneprior.core.scene import Scene
+from sceneprior.render.topdown import object_colors
+
+_TEXT = Markup('<div style="padding: 0 0.8em 0.8em; font-size: 0.875em">{}</div>')
+_LIST = Markup(
+    '<ul style="margin: 0.4em 0; padding: 0; list-style: none; max-height: 13.5em; '
+    'overflow-y: auto">{}</ul>'
+)
+_SWATCH = Markup(
+    '<span style="display: inline-block; width: 0.8em; height: 0.8em; margin-right: 0.5em; '
+    'border-radius: 2px; background: rgb({}, {}, {})"></span>'
+)
+_WORSE = Markup('<span style="color: #c02020">{}</span>')
+
+
+def html(text: str) -> str:
+    """Text for the panel, escaped unless it is `Markup`.
+
+    Names from files are shown only by this function, never as Markdown: viser executes HTML in
+    Markdown, and reads its images from the server's files.
+    """
+    return str(_TEXT.format(text))
+
+
+def room_words(shown: Shown, scene: Scene) -> Markup:
+    """The shown room: its origin, its floor, and its objects in the colours of their classes, with
+    kept objects in bold."""
+    lines = []
+    for row, (item, color) in enumerate(
+        zip(scene.objects, object_colors(scene).tolist(), strict=True)
+    ):
+        name = Markup("<b>{}</b>" if row in shown.kept else "{}").format(name_and_size(item))
+        lines.append(Markup("<li>{}{}</li>").format(_SWATCH.format(*color), name))
+    rows = Markup().join(lines) or Markup("<li>nothing: an empty room</li>")
+    return Markup("<b>{}</b>{}{}").format(shown.origin, floor_words(scene), _LIST.format(rows))
+
+
+def floor_words(scene: Scene) -> Markup:
+    """The extents of a room's floor, with its doors and windows; empty if it is not known."""
+    if scene.floor_m is None:
+        return Markup()
+    x, z = np.ptp(scene.floor_m, axis=0)
+    parts = [f"{x:.2f} x {z:.2f} m"]
+    for kind in ("door", "window"):
+        if count := sum(each.kind == kind for each in scene.openings):
+            parts.append(f"{count} {kind}{'s' * (count > 1)}")
+    return Markup("<br>Floor: {}").format(", ".join(parts))
+
+
+def wish_words(scene: Scene) -> Markup:
+    """The wishes of a requested room, each with a mark that says whether it holds."""
+    wishes: Any = scene.extra.get("wishes")
+    if not isinstance(wishes, list) or not wishes:  # a file may hold anything
+        return Markup()
+    lines = [
+        Markup("<li>✓ {}</li>").format(_wish(each))
+        if each.get("holds") is True
+        else Markup("<li>{}</li>").format(_WORSE.format(f"✗ {_wish(each)} does not hold"))
+        for each in wishes
+        if isinstance(each, dict)
+    ]
+    return Markup("<b>Wishes</b>{}").format(_LIST.format(Markup().join(lines)))
+
+
+def _wish(entry: dict[str, Any]) -> str:
+    return str(entry.get("wish")).replace("_", " ")
+
+
+def error_words(sentence: str) -> Markup:
+    """A sentence on what is in the way of a request."""
+    return _WORSE.format(sentence)
