@@ -12,6 +12,9 @@ from sceneprior.core.scene import SceneObject, Turned
 Triangles = Float[np.ndarray, "_ 3 3"]
 Points = Float[np.ndarray, "_ 3"]
 
+FLUSH_M = 1e-3
+"""Distance beyond the floor up to which furniture is flush with the wall: scenes give the outlines
+of floors to the millimetre."""
 AT_ONCE = 1_000_000
 """Largest number of pairs that are compared in one array."""
 

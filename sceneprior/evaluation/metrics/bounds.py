@@ -8,14 +8,12 @@ from sceneprior.core.floor import floor_polygon
 from sceneprior.core.geometry.surfaces import surface_points
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metric import USED, Counts, Metric
-from sceneprior.evaluation.surfaces import own_box, triangles_of
+from sceneprior.evaluation.surfaces import FLUSH_M, own_box, triangles_of
 
 INSIDE_SHARE = 0.99
 """Smallest share of an object's points over the floor for an object in bounds."""
 POINTS_PER_M3, FEWEST_POINTS = 5000, 1000
 """Points per cubic metre of the object's box, and their smallest number."""
-TOLERANCE_M = 1e-6
-"""Distance by which the floor grows, so that furniture flush with a wall is inside."""
 
 
 def out_of_bounds(scene: Scene) -> Bool[np.ndarray, " objects"] | None:
@@ -28,12 +26,12 @@ def out_of_bounds(scene: Scene) -> Bool[np.ndarray, " objects"] | None:
         3dlg-hcvc/SceneEval, metrics/out_of_bound.py. There the box is the smallest oriented one,
         and the floor lies at the lowest point of all objects, so that no point is below it; here
         the box is the object's own (axis-aligned if its yaw is unknown), and the floor counts
-        at any height, too.
+        at any height, too. Here the floor is 1 mm wider on all sides (`FLUSH_M`).
     """
     floor = floor_polygon(scene)
     if floor is None:
         return None
-    floor = floor.buffer(TOLERANCE_M, join_style="mitre")
+    floor = floor.buffer(FLUSH_M, join_style="mitre")
     shapely.prepare(floor)
     found = []
     for row, item in enumerate(scene.objects):

@@ -10,7 +10,7 @@ from sceneprior.core.floor import floor_polygon
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shell import shell_of
 from sceneprior.evaluation.metric import USED, Counts, Metric
-from sceneprior.evaluation.surfaces import Voxels, footprint, triangles_of, voxelize
+from sceneprior.evaluation.surfaces import FLUSH_M, Voxels, footprint, triangles_of, voxelize
 
 PITCH_M = 0.05
 VALID_M3 = 0.1
@@ -40,6 +40,9 @@ def voxel_loss(scene: Scene) -> VoxelLoss | None:
     of voxels, rounded down. The room is the prism over its floor. Voxels are counted only for
     objects whose box leaves the room, and for pairs whose boxes share volume.
 
+    A box leaves the room if it does so by more than 1 mm (`FLUSH_M`), since the grid would count a
+    whole layer of a wardrobe that is flush with a wall.
+
     Since surfaces fill the voxels that they touch, an object counts as up to one voxel larger, and
     objects that overlap by a millimetre may share a layer of voxels.
 
@@ -53,6 +56,7 @@ def voxel_loss(scene: Scene) -> VoxelLoss | None:
     if floor is None:
         return None
     top_m = shell_of(scene).height_m
+    wider = floor.buffer(FLUSH_M, join_style="mitre")
     plans = [shapely.Polygon(footprint(item)) for item in scene.objects]
     spans = [_span(item) for item in scene.objects]
     cells: dict[int, Voxels] = {}
@@ -64,7 +68,7 @@ def voxel_loss(scene: Scene) -> VoxelLoss | None:
 
     outside = shared = 0
     for row, (plan, (low, high)) in enumerate(zip(plans, spans, strict=True)):
-        kept = _area(plan, floor) * max(min(high, top_m) - max(low, 0.0), 0.0)
+        kept = _area(plan, wider) * max(min(high, top_m) - max(low, 0.0), 0.0)
         if plan.area * (high - low) - kept >= LEAST:
             outside += _outside(voxels(row), floor, top_m)
         for other in range(row + 1, len(plans)):

@@ -88,6 +88,8 @@ def test_a_chair_outside_is_out_of_bounds():
     poking = box(x=1.503)
     assert out_of_bounds(room(chair, flush, poking)).tolist() == [True, False, True]
     assert out_of_bounds(room(chair, floor=None)) is None
+    almost = box(x=1.5008)  # floors are given to the millimetre
+    assert out_of_bounds(room(almost)).tolist() == [False] and voxel_loss(room(almost)).oob_m3 == 0
 
 
 def test_one_percent_of_the_surface_may_be_outside():
