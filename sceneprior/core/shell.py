@@ -111,7 +111,7 @@ def shell_of(scene: Scene) -> Shell:
     for opening in scene.openings:
         row, span = _place_of(opening, walls)
         walls[row] = walls[row]._replace(openings=(*walls[row].openings, span))
-    height = _height(scene)
+    height = ceiling_height(scene)
     walls = [_within(wall, height) for wall in walls]
     return Shell(grown, height, tuple(walls), grown_m)
 
@@ -144,7 +144,9 @@ def panels(wall: Wall, height_m: float) -> list[Panel]:
     return found
 
 
-def _height(scene: Scene) -> float:
+def ceiling_height(scene: Scene) -> float:
+    """Height of a scene's ceiling: if it is not known, that of the top of the highest lamp, or else
+    2.6 m, and no less than furniture needs."""
     if scene.ceiling_m is not None:
         return scene.ceiling_m
     tops = scene.centers_m[:, 1] + scene.sizes_m[:, 1] / 2

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int
 
 from sceneprior.core.floor import floor_polygon
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.shell import shell_of
+from sceneprior.core.shell import ceiling_height
 from sceneprior.evaluation.metric import USED, Counts, Metric
 from sceneprior.evaluation.surfaces import FLUSH_M, Voxels, footprint, triangles_of, voxelize
 
@@ -50,12 +50,12 @@ def voxel_loss(scene: Scene) -> VoxelLoss | None:
         GradientSpaces/respace, src/eval.py, read in a copy of the file, since the repository's own
         is not in the index that was searched (Bucher and Armeni, arXiv 2506.02459). There a room
         is the voxelized mesh of its outline; here a voxel is in the room if the outline meets it.
-        The height is the ceiling's, or, if that is not known, as in `shell_of`.
+        The height is the ceiling's, or, if that is not known, as in `ceiling_height`.
     """
     floor = floor_polygon(scene)
     if floor is None:
         return None
-    top_m = shell_of(scene).height_m
+    top_m = ceiling_height(scene)
     wider = floor.buffer(FLUSH_M, join_style="mitre")
     plans = [shapely.Polygon(footprint(item)) for item in scene.objects]
     spans = [_span(item) for item in scene.objects]
