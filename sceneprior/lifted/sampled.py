@@ -12,6 +12,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject, quarter_turned
 from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.lifting.lifted import HANGS_M
 from sceneprior.lifted.looks import LookDecoder
 from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.sampler.draw import draw_rooms
@@ -67,8 +68,11 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
         look, index = int(rooms.looks[row, item]), int(rooms.object_class[row, item])
         # A given object whose class has no prototype gets no mesh.
         known = int(sampler.look_class[look]) == index
-        mesh = shapes.mesh(look, box) if known else None
-        solids = shapes.solids(look, box) if known else ()
+        if box[1] - box[4] / 2 < HANGS_M:
+            box[1] = box[4] / 2  # lifted boxes end a little above the floor that they stand on
+        filled = _down_to_floor(shapes, look, box) if known else box
+        mesh = shapes.mesh(look, filled) if known else None
+        solids = shapes.solids(look, filled) if known else ()
         label = classes[index]
         center, size = tuple(box[:3]), tuple(box[3:])
         # A front at high z, high x, low z or low x is turned by 0, 1, 2 or 3 quarters.
@@ -78,6 +82,20 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
         objects.append(SceneObject(label, center, size, mesh, turned if known else None, solids))
     floor_m = None if rooms.rectangle_m is None else _outline(rooms.rectangle_m[row])
     return Scene(name, trained.config.label_set, tuple(objects), floor_m)
+
+
+def _down_to_floor(
+    shapes: LookDecoder, look: int, box_m: Float[np.ndarray, "6"]
+) -> Float[np.ndarray, "6"]:
+    """The box to stretch a look into, such that its lowest part is at the bottom of `box_m` if that
+    is the floor; masks show too little of the lowest parts of some prototypes."""
+    bottom, top = box_m[1] - box_m[4] / 2, box_m[1] + box_m[4] / 2
+    lowest = min(solid.low_m[1] for solid in shapes.solids(look, box_m))
+    if bottom > 0 or lowest <= 0 or lowest >= top / 2:
+        return box_m
+    # Parts keep their order from bottom to top, so the share of empty height is lowest / top.
+    height = top / (1 - lowest / top)
+    return np.array([box_m[0], top - height / 2, box_m[2], box_m[3], height, box_m[5]])
 
 
 def _outline(rectangle_m: Float[Tensor, "4"]) -> Float[np.ndarray, "4 2"]:

@@ -11,6 +11,8 @@ from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.lifted.complete import complete
+from sceneprior.lifted.lifting.lifted import HANGS_M
+from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.paper.sampling import draw_latents
 
 BED = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
@@ -100,3 +102,22 @@ def test_all_chairs_that_were_wanted_stand_round_a_given_table():
     labels = [[item.label for item in room.objects] for room in rooms]
     assert labels == [["table", *["chair"] * 4]] * 8
     assert all(room.extra["no_place"] == [] for room in rooms)
+
+
+def test_furniture_stands_on_the_floor_and_what_hangs_stays_there():
+    prior = load("procthor-bedroom")
+    drawn = draw_rooms(prior.trained.sampler, 20, 1)
+    rooms = prior.sample(20, seed=1)
+    reaching = []
+    for row, room in enumerate(rooms):
+        boxes_m = drawn.boxes_m[row, drawn.is_object[row]].double().numpy()
+        for item, box_m in zip(room.objects, boxes_m, strict=True):
+            bottom, lowest = box_m[1] - box_m[4] / 2, item.mesh.vertices_m[:, 1].min()
+            assert item.size_m == pytest.approx(box_m[3:])
+            if bottom < HANGS_M:
+                assert item.center_m[1] == item.size_m[1] / 2
+                reaching.append(abs(lowest) < 0.005)
+            else:
+                assert item.center_m[1] == pytest.approx(box_m[1])
+                assert lowest >= bottom - 0.001
+    assert len(reaching) > 60 and np.mean(reaching) > 0.9

@@ -22,7 +22,7 @@ from sceneprior.core.geometry.turns import turn_boxes
 from sceneprior.core.parts import filled_cells
 from sceneprior.core.shards import RoomViews, Shard, iterate_rooms
 from sceneprior.core.views import LiftedRooms
-from sceneprior.lifted.lifting.lifted import LiftedBoxes, RayPool, ShapeGrid
+from sceneprior.lifted.lifting.lifted import HANGS_M, LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turned_looks
 
 VERSION = 1
@@ -30,8 +30,6 @@ VERSION = 1
 SHAPES_VERSION = 5
 """Version of the cached hulls and rays. Raise it, or `VERSION`, when the same views give others."""
 
-HANGS_M = 0.3
-"""Height of an object's bottom from which it hangs."""
 RAYS_KEPT = 1024
 """Rays per object from which shapes are found."""
 

@@ -6,6 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+HANGS_M = 0.3
+"""Height of an object's bottom from which it hangs; everything lower stands on the floor."""
+
 
 class LiftedBoxes(NamedTuple):
     """Axis-aligned boxes in the room frame, one per tracked object."""
