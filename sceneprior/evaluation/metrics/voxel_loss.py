@@ -10,7 +10,14 @@ from sceneprior.core.floor import floor_polygon
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shell import ceiling_height
 from sceneprior.evaluation.metric import USED, Counts, Metric
-from sceneprior.evaluation.surfaces import FLUSH_M, Voxels, footprint, triangles_of, voxelize
+from sceneprior.evaluation.surfaces import (
+    FLUSH_M,
+    Voxels,
+    bounds,
+    footprint,
+    triangles_of,
+    voxelize,
+)
 
 PITCH_M = 0.05
 VALID_M3 = 0.1
@@ -37,8 +44,9 @@ def voxel_loss(scene: Scene) -> VoxelLoss | None:
 
     Volumes are counted in voxels of 5 cm: all that a surface passes through, and those enclosed.
     An object is voxelized around the middle of its lower face, which is then put at a whole number
-    of voxels, rounded down. The room is the prism over its floor. Voxels are counted only for
-    objects whose box leaves the room, and for pairs whose boxes share volume.
+    of voxels, rounded down in plan, and to the nearest one in height. The room is the prism over
+    its floor. Voxels are counted only for objects whose box leaves the room, and for pairs whose
+    boxes share volume.
 
     A box leaves the room if it does so by more than 1 mm (`FLUSH_M`), since the grid would count a
     whole layer of a wardrobe that is flush with a wall.
@@ -50,6 +58,7 @@ def voxel_loss(scene: Scene) -> VoxelLoss | None:
         GradientSpaces/respace, src/eval.py, read in a copy of the file, since the repository's own
         is not in the index that was searched (Bucher and Armeni, arXiv 2506.02459). There a room
         is the voxelized mesh of its outline; here a voxel is in the room if the outline meets it.
+        There heights are rounded down, too, so that a bed 1 mm below the floor loses a layer.
         The height is the ceiling's, or, if that is not known, as in `ceiling_height`.
     """
     floor = floor_polygon(scene)
@@ -84,7 +93,9 @@ def _area(a: shapely.Geometry, b: shapely.Geometry) -> float:
 
 
 def _span(item: SceneObject) -> tuple[float, float]:
-    return item.center_m[1] - item.size_m[1] / 2, item.center_m[1] + item.size_m[1] / 2
+    """Heights of the lowest and the highest point of an object's surface."""
+    low, high = bounds(triangles_of(item))[:, 1].tolist()
+    return low, high
 
 
 def _placed(item: SceneObject) -> Voxels:
@@ -92,6 +103,7 @@ def _placed(item: SceneObject) -> Voxels:
     foot = np.array([item.center_m[0], _span(item)[0], item.center_m[2]])
     own = voxelize(triangles_of(item) - foot, PITCH_M)
     at = np.floor(foot / PITCH_M + 1e-9).astype(np.int64)
+    at[1] = round(foot[1] / PITCH_M)
     half = np.array(own.cells.shape) // 2
     return Voxels(own.cells, at - np.array([half[0], 0, half[2]]))
 

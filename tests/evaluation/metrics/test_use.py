@@ -218,6 +218,9 @@ def test_shared_and_outer_volumes():
     assert voxel_loss(room(box(), box(x=1.0), box(x=-1.5, z=1))).pbl_m3 == 0  # they touch
     assert voxel_loss(room(box(), floor=None)) is None
     assert voxel_loss(room(box(bottom=1.8), ceiling_m=2.4)).oob_m3 > 0.1
+    # Sunk by 2 mm it loses nothing, by 10 cm two layers.
+    assert voxel_loss(room(box(bottom=-0.002))).oob_m3 == 0
+    assert voxel_loss(room(box(bottom=-0.1))).oob_m3 == pytest.approx(2 * 21 * 21 * 0.05**3)
 
 
 # -- All of them -----------------------------------------------------------------------------------
