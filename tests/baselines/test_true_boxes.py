@@ -150,7 +150,7 @@ def test_only_baselines_with_3d_supervision_read_the_ground_truth():
                 for alias in node.names:
                     importers[alias.name].add(name)
     assert importers["read_ground_truth"] == {
-        "baselines/true_boxes.py", "core/ground_truth.py", "apps/retrieval/cad_models.py"
+        "baselines/true_boxes.py", "core/ground_truth.py", "apps/retrieval/model_folders.py"
     }  # fmt: skip
     trains = ("paper/", "lifted/", "training/", "baselines/")
     readers = {n for n in importers["sceneprior.core.ground_truth"] if n.startswith(trains)}

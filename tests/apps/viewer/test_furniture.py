@@ -7,7 +7,8 @@ from sceneprior.core.scene import Scene, SceneObject
 
 pytest.importorskip("viser", reason="the extra `view` is not installed")
 
-from sceneprior.apps.viewer.page import DECODED, MODELS, Page
+from sceneprior.apps.viewer.page import Page
+from sceneprior.apps.viewer.panel import DECODED, MODELS
 from sceneprior.apps.viewer.server import serving
 
 
@@ -16,11 +17,11 @@ def test_models_come_and_go():
     with serving("127.0.0.1", 0) as server:
         page = Page(server, Folder([Scene("room", "front3d_bedroom", (bed,))]), "rooms")
         assert page.scene.objects == (bed,)
-        page._furniture.value = MODELS
+        page.panel.furniture.value = MODELS
         page.show(page.shown)
         (found,) = page.scene.extra["retrieval"]
         assert found["model_id"].startswith("double_bed_")
         assert page.scene.objects[0].mesh is not None
-        page._furniture.value = DECODED
+        page.panel.furniture.value = DECODED
         page.show(page.shown)
         assert page.scene.objects == (bed,)
