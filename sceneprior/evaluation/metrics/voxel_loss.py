@@ -77,7 +77,7 @@ def voxel_loss(scene: Scene) -> VoxelLoss | None:
 
     outside = shared = 0
     for row, (plan, (low, high)) in enumerate(zip(plans, spans, strict=True)):
-        kept = _area(plan, wider) * max(min(high, top_m) - max(low, 0.0), 0.0)
+        kept = _area(plan, wider) * max(min(high, top_m + FLUSH_M) - max(low, -FLUSH_M), 0.0)
         if plan.area * (high - low) - kept >= LEAST:
             outside += _outside(voxels(row), floor, top_m)
         for other in range(row + 1, len(plans)):
