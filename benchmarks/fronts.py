@@ -57,9 +57,7 @@ def main() -> None:
     right = (found * np.stack([np.sin(yaw), np.cos(yaw)], axis=1)).sum(axis=1) > np.cos(np.pi / 4)
     known = (looks >= 0).numpy() & (sure > 0)
     names = np.array(label_set(trained.config.label_set))[lifted.object_classes]
-    has_front = np.array(
-        [name == "dressing_table" or not any(w in name for w in WITHOUT_FRONT) for name in names]
-    )
+    with_front = np.array([has_front(name) for name in names])
     print("| objects | number | front right | mean confidence |\n| --- | ---: | ---: | ---: |")
 
     def row(title: str, which: Bool[np.ndarray, " objects"]) -> None:
@@ -67,14 +65,19 @@ def main() -> None:
             share, confidence = right[which].mean(), sure[which].mean()
             print(f"| {title} | {which.sum()} | {share:.2f} | {confidence:.2f} |")
 
-    row("all with a front", known & has_front)
+    row("all with a front", known & with_front)
     for low, high in pairwise(RANGES):
         row(
             f"confidence {low:g} to {min(high, 1):g}",
-            known & has_front & (sure >= low) & (sure < high),
+            known & with_front & (sure >= low) & (sure < high),
         )
     for name in np.unique(names[known]):
         row(name.replace("_", " "), known & (names == name))
+
+
+def has_front(label: str) -> bool:
+    """True for classes with a front."""
+    return label == "dressing_table" or not any(word in label for word in WITHOUT_FRONT)
 
 
 if __name__ == "__main__":

@@ -2,13 +2,15 @@
 
     python benchmarks/requested_rooms.py --run procthor-bedroom --shards SHARDS [--doors] [--seed 0]
 
-Each request has the floor of a test room, half of the room's objects (rounded up) as exact counts
-of their classes, and two relations that hold between these objects, drawn by --seed from those of
-`sceneprior/lifted/requests/relations.py`. With --doors, it also has a door and a window at random
-places. One room is sampled for each request. Test rooms are reused with other halves until there
-are --requests requests. Objects of classes that the prior does not draw are ignored.
+Each request has the floor of a test room, half of the room's objects (rounded up) as the least
+number of each class, and two relations that hold between these objects, drawn by --seed from those
+of `sceneprior/lifted/requests/relations.py`: so the test room itself meets the request. Fronts are
+the true ones; objects of a class without a front have no relations that need it. With --doors, a
+request also has a door and a window at random places. One room is sampled for each request. Test
+rooms are reused with other halves until there are --requests requests. Objects of classes that the
+prior does not draw are ignored.
 
-`met` is the share of all counts and relations that hold. `classifier` is the accuracy of the
+`met` is the number of counts and relations that hold. `classifier` is the accuracy of the
 layout classifier (docs/evaluation.md) between requested and real rooms, and `unconditioned` its
 accuracy between as many rooms without a request and real ones; 0.5 is best. `seconds` is the CPU
 time per room, including meshes, after one room to warm up.
@@ -25,22 +27,25 @@ from typing import Any
 
 import numpy as np
 import torch
+from fronts import has_front
 
 import sceneprior
 from sceneprior.apps.api import Prior
+from sceneprior.core.classes import VOID
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import reference_scenes
-from sceneprior.core.scene import Scene
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.metrics.layout_classifier import METRICS
 from sceneprior.lifted.requests.relation_checks import Furniture, RelationChecks
-from sceneprior.lifted.requests.relations import TO_ROOM, TO_TARGET
+from sceneprior.lifted.requests.relations import OUTWARD, TO_ROOM, TO_TARGET
 from sceneprior.lifted.requests.shape import RoomShape
 from sceneprior.lifted.requests.wishes import RelationWish
 
 RELATIONS = 2
 """Relations of a request."""
-WITHOUT_FRONT = tuple(name for name in TO_TARGET if name not in ("beside", "in front of", "facing"))
-"""Relations that boxes without a known front have."""
+BY_FRONT_OF_TARGET = ("beside", "in front of")
+BY_FRONT_OF_SUBJECT = ("facing",)
 
 
 def main() -> None:
@@ -55,13 +60,14 @@ def main() -> None:
     torch.set_num_threads(1)
     prior = sceneprior.load(arguments.run)
     test = reference_scenes(arguments.shards, "test", meshes=False)
+    fronts = fronts_of(arguments.shards, "test")
     real = [
         scene
         for split in ("train", "val")
         for scene in reference_scenes(arguments.shards, split, meshes=False)
     ]
     rng = np.random.default_rng(arguments.seed)
-    requests = requests_of(prior, test, arguments.requests, arguments.doors, rng)
+    requests = requests_of(prior, test, fronts, arguments.requests, arguments.doors, rng)
     prior.sample(1, seed=0, floor="4x4")
     rooms, refused = [], []
     start = time.process_time()
@@ -76,9 +82,11 @@ def main() -> None:
         each["wish"] for room in rooms for each in room.extra["wishes"] if not each["holds"]
     )
     total = sum(len(r["want"]) - 1 + len(r["want"]["relations"]) for r in requests)
+    relations = Counter(each["relation"] for r in requests for each in r["want"]["relations"])
     plain = prior.sample(len(rooms), seed=arguments.seed)
     result = {
         "requests": len(requests), "refused": refused, "wishes": total, "met": sum(held),
+        "relations": dict(relations),
         "unmet": dict(unmet), "seconds": round(seconds, 3),
         "classifier": accuracy(rooms, real, test, arguments.seed),
         "unconditioned": accuracy(plain, real, test, arguments.seed),
@@ -88,23 +96,43 @@ def main() -> None:
         arguments.json.write_text(json.dumps(result, indent=1) + "\n")
 
 
+def fronts_of(shards: Path, split: str) -> list[np.ndarray]:
+    """The side of the true front of each object of `reference_scenes`, numbered as in
+    `Furniture`."""
+    fronts = []
+    for shard, room_id in iterate_rooms(shards, split):
+        truth = shard.read_ground_truth(room_id)
+        yaw_rad = truth.yaw_rad[truth.object_class != VOID]
+        ahead = np.stack([np.sin(yaw_rad), np.cos(yaw_rad)], axis=1)
+        fronts.append((ahead @ OUTWARD.T).argmax(axis=1))
+    return fronts
+
+
 def requests_of(
-    prior: Prior, test: Sequence[Scene], count: int, doors: bool, rng: np.random.Generator
+    prior: Prior,
+    test: Sequence[Scene],
+    fronts: Sequence[np.ndarray],
+    count: int,
+    doors: bool,
+    rng: np.random.Generator,
 ) -> list[dict[str, Any]]:
-    """Arguments of `Prior.sample` for requests made from test rooms."""
+    """Arguments of `Prior.sample` for requests made from test rooms, whose objects have these
+    fronts."""
     trained: Any = prior.trained
     known = {prior.classes[row] for row in trained.sampler.drawn_classes}
     requests: list[dict[str, Any]] = []
     for number in range(20 * count):
         room = test[number % len(test)]
-        objects = [item for item in room.objects if item.label in known]
+        objects = [row for row, item in enumerate(room.objects) if item.label in known]
         if len(objects) < 2 or room.floor_m is None:
             continue
-        rows = rng.permutation(len(objects))[: (len(objects) + 1) // 2]
-        half = [objects[row] for row in rows]
-        found = relations_of(room, half, prior.classes)
+        rows = rng.permutation(objects)[: (len(objects) + 1) // 2]
+        half = [room.objects[row] for row in rows]
+        front = fronts[number % len(test)][rows]
+        found = relations_of(room.floor_m, half, front, prior.classes)
         relations = [found[row] for row in rng.permutation(len(found))[:RELATIONS]]
-        want: dict[str, Any] = dict(Counter(item.label for item in half))
+        counts = Counter(item.label for item in half)
+        want: dict[str, Any] = {label: f">={times}" for label, times in counts.items()}
         want["relations"] = [
             {"subject": wish.subject, "relation": wish.relation, "target": wish.target}
             for wish in relations
@@ -116,8 +144,10 @@ def requests_of(
     return requests
 
 
-def relations_of(room: Scene, half: Sequence[Any], classes: tuple[str, ...]) -> list[RelationWish]:
-    """Relations between these objects that hold in the room; its boxes have no known front."""
+def relations_of(
+    floor_m: np.ndarray, half: Sequence[SceneObject], front: np.ndarray, classes: tuple[str, ...]
+) -> list[RelationWish]:
+    """Relations between these objects that hold in their room."""
     labels = sorted({item.label for item in half})
     wishes = [RelationWish(label, relation) for label in labels for relation in TO_ROOM]
     wishes += [
@@ -125,15 +155,17 @@ def relations_of(room: Scene, half: Sequence[Any], classes: tuple[str, ...]) -> 
         for label in labels
         for other in labels
         if label != other
-        for relation in WITHOUT_FRONT
+        for relation in TO_TARGET
+        if has_front(other) or relation not in BY_FRONT_OF_TARGET
+        if has_front(label) or relation not in BY_FRONT_OF_SUBJECT
     ]
-    assert room.floor_m is not None
     furniture = Furniture(
         np.array([[*item.center_m, *item.size_m] for item in half]),
         np.array([classes.index(item.label) for item in half]),
-        *np.zeros((2, len(half)), dtype=np.int64),
+        np.zeros(len(half), dtype=np.int64),  # backs, which relations do not read
+        front,
     )
-    held = RelationChecks(wishes, RoomShape(room.floor_m), classes).held(furniture)
+    held = RelationChecks(wishes, RoomShape(floor_m), classes).held(furniture)
     return [wish for wish, holds in zip(wishes, held, strict=True) if holds]
 
 

@@ -28,7 +28,12 @@ from sceneprior.lifted.requests.words import (
 LONGEST = 2000
 """Maximum number of characters of a sentence."""
 _UNIT = r"\s*(?:m|metres?|meters?)?"
-_SIZE = re.compile(rf"(\d+\.?\d*){_UNIT}\s*(?:x|×|by)\s*(\d+\.?\d*)\s*(?:m|metres?|meters?)?\b")
+_SIZE = re.compile(
+    rf"(\d+\.?\d*){_UNIT}\s*(?:x|×|by)\s*(\d+\.?\d*)\s*(?:m|metres?|meters?)?\b(?!\s*[cm]m\b)"
+)
+_LENGTH = re.compile(r"\d+\.?\d*\s*(?:mm|cm|m|metres?|meters?|centimetres?|centimeters?)\b")
+_SIZE_TOKEN = "#"
+"""Stands for the size of the floor, so that it is not taken for that of a piece of furniture."""
 _TOKEN = re.compile(r"[a-z_']+|\d+(?:\.\d+)?|\S")
 
 
@@ -64,7 +69,8 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
         label_set: Name of the prior's label set, which ends with the room type.
 
     Raises:
-        InputError: there are unknown words; the message lists them.
+        InputError: there are unknown words, which the message lists, or lengths other than the
+            floor's.
     """
     if len(text) > LONGEST:
         raise InputError(f"The request has {len(text)} characters; expected at most {LONGEST}.")
@@ -72,11 +78,16 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
     sizes = _SIZE.findall(lowered)
     if len(sizes) > 1:
         raise InputError(f"The request names {len(sizes)} sizes of floors; expected one.")
-    tokens = _TOKEN.findall(_SIZE.sub(" ", lowered))
+    rest = _SIZE.sub(f" {_SIZE_TOKEN} ", lowered.replace(_SIZE_TOKEN, "?"))
+    if (length := _LENGTH.search(rest)) is not None:
+        raise _other_length(length[0])
+    tokens = _TOKEN.findall(rest)
     reader = _Reader(tokens, known, label_set)
     reader.read()
     if reader.strange:
-        listed = [word for word in reader.strange if word not in ARTICLES] or reader.strange
+        # A relation is only listed if nothing else is: mostly its target is the unknown word.
+        fine = {*ARTICLES, *RELATION_WORDS}
+        listed = [word for word in reader.strange if word not in fine] or reader.strange
         words = ", ".join(f"'{word[:40]}'" for word in dict.fromkeys(listed))
         raise InputError(
             f"The request has words that are not understood: {words}. It may name numbers, doors, "
@@ -86,6 +97,13 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
         )
     floor = "x".join(sizes[0]) if sizes else None
     return Sentence(reader.wishes(), floor, reader.openings)
+
+
+def _other_length(length: str) -> InputError:
+    return InputError(
+        f"The request has a length ({length}), but only the floor can have a size, in metres, such "
+        "as 'a 4 x 3 m bedroom'; leave the length out."
+    )
 
 
 class _Reader:
@@ -113,7 +131,7 @@ class _Reader:
             self.at += 1
             if word in BEFORE_ROOMS and self._in_room():
                 continue
-            if word not in FILLERS:
+            if word not in (*FILLERS, _SIZE_TOKEN):
                 self.strange.append(word)
 
     def _in_room(self) -> bool:
@@ -210,12 +228,15 @@ class _Reader:
             if word == "without":
                 self._phrase(("a", "an", "any"))
         some = number is None and self._phrase(("some", "any")) is not None
+        sized = self._phrase((_SIZE_TOKEN,)) is not None
         if self._room(number, bound):
             return None
         plural, noun = self._noun()
         if noun is None:
             self.at = start
             return None
+        if sized:
+            raise _other_length(f"of the {noun.replace('_', ' ')}")
         sign = BOUNDS[bound] if bound else ""
         if number is None:
             number = 2 if plural and not definite and not some else 1

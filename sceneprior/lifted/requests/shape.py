@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening
-from sceneprior.core.scene_json import check_floor
+from sceneprior.core.scene_json import check_floor, unit_guess
 
 NARROWEST_M = 0.3
 """Minimum side of a rectangle in which furniture is placed."""
@@ -24,6 +24,8 @@ MOST_CELLS = 130**2
 the square of it in bytes."""
 LEAST_AREA_M2 = 1.0
 """Smallest floor that can be requested."""
+LONGEST_M = 60.0
+"""Largest extent of a floor that can be requested; larger ones are in another unit."""
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)")
 _SIZE = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(?:m\s*)?[xX×]\s*(\d+\.?\d*|\.\d+)\s*m?\s*")
 
@@ -114,7 +116,8 @@ def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
         [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]]
 
     Raises:
-        InputError: the floor is neither, intersects itself, or has less than `LEAST_AREA_M2`.
+        InputError: the floor is neither, intersects itself, or has less than `LEAST_AREA_M2`
+            or extents above `LONGEST_M`.
     """
     if isinstance(floor, str):
         floor = _floor_of_text(floor)
@@ -127,6 +130,12 @@ def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
             "The floor is no polygon; expected at least 3 corners [x, z] in metres, in order."
         )
     check_floor("The request", outline_m)
+    width_m, depth_m = np.ptp(outline_m, axis=0)
+    if (longest_m := max(width_m, depth_m)) > LONGEST_M:
+        raise InputError(
+            f"The floor is {width_m:g} x {depth_m:g} m large; expected at most {LONGEST_M:g} m. "
+            f"{unit_guess(longest_m)}"
+        )
     if (outline_m[0] == outline_m[-1]).all():
         outline_m = outline_m[:-1]
     polygon = shapely.Polygon(outline_m)

@@ -10,7 +10,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.lifted.requests.relations import OPENINGS, RELATIONS, TO_ROOM
 
 _COUNT = re.compile(r"\s*(>=|<=|=|)\s*(\d+)\s*")
-_ENTRY = re.compile(r"(\w+)\s*:\s*((?:>=|<=|=)?\d+)")
+_ENTRY = re.compile(r"(\w+)\s*:\s*(\S.*)")
 
 
 @dataclass(frozen=True)

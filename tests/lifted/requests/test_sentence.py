@@ -60,8 +60,9 @@ def test_sentences(text, floor, openings, counts, relations):
         ("beside the bed", "'beside'"),
         ("a bed beside", "'beside'"),
         ("a bed in the wardrobe", "'in', 'wardrobe'"),
+        ("a bed beside the wardrobe", "'wardrobe'"),
         ("two bedrooms", "'two', 'bedrooms'"),
-        ("a bed of 180 m", "'of', '180', 'm'"),
+        ("a bed # 3", "'\\?', '3'"),
     ],
 )
 def test_what_is_not_understood_is_said(text, words):
@@ -74,6 +75,10 @@ def test_what_is_not_understood_is_said(text, words):
     [
         ("a living room", "for a living room, but this prior draws rooms of 'front3d_bedroom'"),
         ("3x4 or 4x5", "names 2 sizes of floors"),
+        ("a 180 m bed", r"has a length \(180 m\), but only the floor can have a size"),
+        ("a bed of 180 x 200 cm", r"has a length \(200 cm\)"),
+        ("a 4x3 room with a 1.4 m desk", r"has a length \(1\.4 m\)"),
+        ("a 1.8 x 2 m bed", r"has a length \(of the double bed\)"),
         ("a bed " * 400, "has 2400 characters; expected at most 2000"),
     ],
 )

@@ -95,5 +95,7 @@ def test_counts_as_text_are_those_of_a_mapping():
     }  # fmt: skip
     for other in ("a bed", "two beds: 1", "bed: 1,", "bed 1", ""):
         assert counts_of_text(other) is None
+    with pytest.raises(InputError, match="wish for bed is '-1'; expected a number of objects"):
+        make_request(KNOWN, "toy", want="bed: -1")
     with pytest.raises(InputError, match="list bed twice"):
         counts_of_text("bed: 1, bed: 2")
