@@ -160,9 +160,7 @@ def prep_scannet(
 def prep_posed(
     rooms: Annotated[
         Path,
-        typer.Argument(
-            help="A room's folder (transforms.json, or COLMAP's sparse/0), or a folder of such."
-        ),
+        typer.Argument(help="A room's folder (its poses and masks), or a folder of such."),
     ],
     out: OutOption,
     label_set: Annotated[
@@ -171,11 +169,19 @@ def prep_posed(
             help="Classes: a file with one per line, a list (void,bed,chair), or a set's name."
         ),
     ],
+    tools: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--from",
+            help="The tool that wrote the poses: nerfstudio, colmap, polycam, record3d; give it "
+            "again for the masks: png, panoptic, sam2, grounded-sam2, coco (default: guessed).",
+        ),
+    ] = None,
     up: Annotated[
         str,
         typer.Option(
             help="Axis of the poses that points up: z or y. `cameras` finds it from upright "
-            "cameras; `auto` is z, or `cameras` for COLMAP's models."
+            "cameras; `auto` is z, y for Polycam, `cameras` for COLMAP and Record3D."
         ),
     ] = "auto",
     tracks: Annotated[
@@ -213,6 +219,7 @@ def prep_posed(
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
     from data_prep.engine.build import Job
+    from data_prep.posed.formats import read_formats
     from data_prep.posed.labels import read_label_set
     from data_prep.posed.source import PosedSource
     from data_prep.posed.views import PosedSettings
@@ -221,7 +228,10 @@ def prep_posed(
         up, floor_m, camera_height_m, metres_per_unit, max_side, tracks, max_views
     )
     classes = read_label_set(label_set)
-    source = PosedSource(rooms, classes, settings, test_share, seed, only)
+    formats = read_formats(tools or ())
+    source = PosedSource(rooms, classes, settings, test_share, seed, only, formats)
+    for sentence in source.found():
+        typer.echo(f"Found {sentence}", err=True)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
     run_job(Job(source, out, workers, scheduler, "auto", strict))

@@ -24,7 +24,7 @@ def upright_cameras(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotate cameras to a world whose y points up, in metres.
 
-    `up` is one of `UP`; `auto` is z, or `cameras` for a world without an axis that points up.
+    `up` is one of `UP`; `auto` is the recording's own.
 
     Returns:
         Camera-to-world matrices, (views, 4, 4) with OpenCV axes, and the (4, 4) transform from the
@@ -33,7 +33,7 @@ def upright_cameras(
     poses = np.stack([recording.frames[i].camera_to_world for i in frames])
     poses[:, :3, 3] *= recording.metres_per_unit or metres_per_unit
     if up == "auto":
-        up = "z" if recording.leveled else "cameras"
+        up = recording.up
     turn = _turn_of_cameras(recording, poses) if up == "cameras" else _Y_UP[up]
     upright = turn @ poses
     spread = np.ptp(upright[:, :3, 3], axis=0).max()

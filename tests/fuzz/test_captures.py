@@ -27,7 +27,6 @@ from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import read_house
 from data_prep.posed.source import PosedSource
-from data_prep.posed.transforms import read_recording
 from data_prep.posed.views import PosedSettings, prepare_posed
 from data_prep.scannet.labels import read_labels
 from data_prep.scannet.scans import ScanSettings, read_scan
@@ -124,7 +123,7 @@ def room(tmp_path):
         source = PosedSource(tmp_path / "rooms", LABELS)
         source.assumptions()
         source.settings(None)
-        prepare_posed(read_recording(made.folder), LABELS, PosedSettings())
+        prepare_posed(*source.open(made.folder), PosedSettings())
 
     read()
     return made, read

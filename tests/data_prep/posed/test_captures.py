@@ -335,7 +335,7 @@ def test_panoptic_masks_are_tracks_with_classes(room):
     [
         (
             lambda data: data["annotations"][1]["segments_info"][0].update(category_id=27),
-            r"segment 70001 is bed in 'frame_00000\.png', but backpack in 'frame_00001\.png'\. Ids",
+            r"segment 70001 is bed in 'frame_00000', but backpack in 'frame_00001'\. Ids",
         ),
         (
             lambda data: data["annotations"][0]["segments_info"][0].update(category_id=1),
