@@ -1,5 +1,6 @@
 """Formats of `--from`: which tools' poses and masks a room has, guessed from its files."""
 
+import contextlib
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -20,6 +21,11 @@ _MASKS: tuple[type[MaskFormat], ...] = (
 )  # fmt: skip
 MASKS = tuple(dict.fromkeys(masks.name for masks in _MASKS))
 """Names of the formats of masks."""
+
+
+def mask_files(folder: Path) -> list[Path]:
+    """The files of all masks of a room, of whatever format."""
+    return sorted({path for masks in _MASKS for path in masks.find(folder)})
 
 
 @dataclass(frozen=True)
@@ -59,9 +65,11 @@ class Formats:
             return []
         count: Counter[tuple[str, type[MaskFormat]]] = Counter()
         for room in rooms:
-            poses, files = pose_files(room, self.poses)
-            if files:
-                count[poses, self._mask_format(room)] += 1
+            with contextlib.suppress(InputError):  # the report will have the error
+                poses, files = pose_files(room, self.poses)
+                masks = self._mask_format(room)
+                if files:
+                    count[poses, masks] += 1
         return [
             f"{number} room{'s' * (number > 1)} with poses of {POSES[poses]} and masks of "
             f"{masks.title}, as with --from {poses} --from {masks.name}."

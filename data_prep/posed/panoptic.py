@@ -124,7 +124,8 @@ class PanopticIds:
                     raise InputError(
                         f"{path}: segment {self.segments[number - 1]} is {before} in '{where}', "
                         f"but {name} in '{stem}'. Ids must be tracked: the same object has the "
-                        "same id in all frames, as video segmenters write them; else pass --tracks auto."
+                        "same id in all frames, as video segmenters write them; else pass "
+                        "--tracks auto."
                     )
         return {number: name for number, (name, _) in first.items()}
 

@@ -10,7 +10,7 @@ from data_prep.engine.selection import house_may_match, seeded_split, select
 from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey, sentence_of
 from data_prep.engine.workers import Run
 from data_prep.posed.cameras import seems_up
-from data_prep.posed.formats import Formats
+from data_prep.posed.formats import Formats, mask_files
 from data_prep.posed.labels import TABLES
 from data_prep.posed.mask_format import MaskFormat
 from data_prep.posed.recording import INSTANCES, Recording, room_name
@@ -58,12 +58,16 @@ class PosedSource:
             room_name(room): digest_of_files(
                 pose_files(room, self.formats.poses)[1]
                 + [room / name for name in TABLES if (room / name).is_file()]
-                + self.formats.masks_of(room, self.label_set).find(room)
+                + mask_files(room)
             )
             for room in rooms
         }
         return {
-            "recipe": {"label_set": self.label_set, **asdict(self.posed_settings)},
+            "recipe": {
+                "label_set": self.label_set,
+                "from": asdict(self.formats),
+                **asdict(self.posed_settings),
+            },
             "seed": self.seed,
             "test_share": self.test_share,
             "rooms": digest(repr(sorted(files.items()))),
