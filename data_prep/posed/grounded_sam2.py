@@ -98,7 +98,7 @@ def _open(path: Path) -> np.ndarray:
     """An .npy of ids, (height, width), left on disk."""
     try:
         ids = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # numpy parses the header as Python, whose errors are of any type
         raise InputError(
             f"{path} cannot be read as an .npy of numbers ({plain(str(error), 120)}); it may be "
             "truncated: write it again."

@@ -3,8 +3,8 @@
 import json
 
 import capture_files as tools
-import pytestfrom capture_files import refusal
-
+import pytest
+from capture_files import refusal
 
 
 @pytest.mark.parametrize(
@@ -43,9 +43,7 @@ def test_coco_results_and_several_files(room):
     path.write_text(text[:-9])
     assert "coco.json is not JSON" in refusal(room)
     (room.folder / "instances.json").write_text(text)
-    assert "has several COCO files (coco.json, instances.json); a room has one:" in refusal(
-        room
-    )
+    assert "has several COCO files (coco.json, instances.json); a room has one:" in refusal(room)
 
 
 @pytest.mark.parametrize(
