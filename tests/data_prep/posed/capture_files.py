@@ -1,6 +1,7 @@
 """Writers of the files that other tools write, of the rooms of `posed_files`."""
 
 import json
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,8 @@ def write_polycam(room: PosedRoom, folder: str = "corrected_cameras") -> None:
         data |= {"fx": room.focal_px, "fy": room.focal_px, "cx": width / 2, "cy": height / 2}
         data |= {"width": width, "height": height, "blur_score": 112.5, "manual_keyframe": False}
         (place / f"{timestamp(view)}.json").write_text(json.dumps(data))
-        room.png(view).rename(room.folder / "instances" / f"{timestamp(view)}.png")
+        if room.png(view).is_file():
+            room.png(view).rename(room.folder / "instances" / f"{timestamp(view)}.png")
     write_room_keys(room)
 
 
@@ -142,8 +144,8 @@ def outlines(mask: np.ndarray) -> list[list[float]]:
     return [[float(value) for value in polygon] for polygon in found]
 
 
-def write_grounded_sam2_images(room: PosedRoom) -> None:
-    """The JSON of a demo of single images, for each frame."""
+def write_grounded_sam2_images(room: PosedRoom, name: Callable[[int], str] = stem) -> None:
+    """The JSON of a demo of single images, for each frame; `name` is the picture's."""
     remove_pngs(room)
     (room.folder / "json_data").mkdir()
     height, width = room.size
@@ -158,7 +160,7 @@ def write_grounded_sam2_images(room: PosedRoom) -> None:
             if (ids == thing.id).any()
         ]  # fmt: skip
         data = {
-            "image_path": f"images/{stem(view)}.jpg", "annotations": rows, "box_format": "xyxy",
+            "image_path": f"images/{name(view)}.jpg", "annotations": rows, "box_format": "xyxy",
             "img_width": width, "img_height": height,
         }  # fmt: skip
         (room.folder / f"json_data/results_{view}.json").write_text(json.dumps(data))
