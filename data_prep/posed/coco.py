@@ -181,8 +181,7 @@ class CocoMasks(SegmentedFrames):
         return coco
 
     @property
-    def tracked(self) -> bool:  # type: ignore[override]
-        """True if an object has one id in all frames."""
+    def tracked(self) -> bool:
         coco = self._content
         return isinstance(coco, _Videos) or all(row.track is not None for row in coco.annotations)
 

@@ -132,7 +132,10 @@ class GroundedSam2Images(SegmentedFrames):
 
     name = "grounded-sam2"
     title = f"Grounded-SAM-2 of single images ({LABELS}/)"
-    tracked = False
+
+    @property
+    def tracked(self) -> bool:
+        return False
 
     @classmethod
     def find(cls, folder: Path) -> list[Path]:

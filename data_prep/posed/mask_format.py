@@ -25,12 +25,15 @@ class MaskFormat(ABC):
     """Value of `--from`."""
     title: ClassVar[str]
     """Name and place of the masks, for messages."""
-    tracked = True
-    """False if the ids belong to single images, whatever the option `--tracks` says."""
 
     def __init__(self, folder: Path, label_set_name: str):
         self.folder, self.label_set_name = folder, label_set_name
         self.notes: list[str] = []
+
+    @property
+    def tracked(self) -> bool:
+        """False if the ids belong to single images, whatever the option `--tracks` says."""
+        return True
 
     @classmethod
     @abstractmethod
