@@ -27,9 +27,6 @@ OutOption = Annotated[Path, typer.Option(help="Folder for the shards.")]
 WorkersOption = Annotated[
     int | None, typer.Option(min=1, help="Processes on this machine (default: all cores).")
 ]
-SchedulerOption = Annotated[
-    str | None, typer.Option(help="Run on a Dask cluster instead: tcp://HOST:8786.")
-]
 SeedOption = Annotated[
     int, typer.Option(min=0, max=LARGEST_SEED, help="The same seed writes the same bytes.")
 ]
@@ -82,7 +79,6 @@ def prep_front(
         bool, typer.Option("--rgb", help="Also write shaded pictures, OUT/rgb/ROOM/VIEW.png.")
     ] = False,
     workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
     renderer: Annotated[str, typer.Option(help="auto, pyrender or software.")] = "auto",
     only: Annotated[
         str | None, typer.Option(help="One house or room only: HOUSE, HOUSE/ROOM or a room id.")
@@ -103,7 +99,7 @@ def prep_front(
         changes.append(f"views.per_m2={views_per_m2}")
     rules = load_recipe(recipe, tuple(changes))
     source = FrontSource(front, future, rules, splits, seed, only, rgb)
-    run_job(Job(source, out, workers, scheduler, renderer, strict, retry_failed))
+    run_job(Job(source, out, workers, renderer, strict, retry_failed))
 
 
 def recipe(
@@ -138,7 +134,6 @@ def prep_scannet(
     ] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
     only: Annotated[str | None, typer.Option(help="A scan, or a prefix of scans' names.")] = None,
     strict: StrictOption = False,
     retry_failed: RetryOption = False,
@@ -154,7 +149,7 @@ def prep_scannet(
     size = FULL_SIZE if full_size else QUARTER_SIZE
     settings = ScanSettings(frame_step, max_views, masks, size)
     source = ScanNetSource(scans, labels, settings, train_list, val_list, seed, only)
-    run_job(Job(source, out, workers, scheduler, "auto", strict, retry_failed))
+    run_job(Job(source, out, workers, "auto", strict, retry_failed))
 
 
 def prep_posed(
@@ -204,7 +199,6 @@ def prep_posed(
     test_share: Annotated[float, typer.Option(help="Share of rooms in the test split.")] = 0.1,
     seed: SeedOption = 0,
     workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
     only: Annotated[str | None, typer.Option(help="A room, or a prefix of rooms' names.")] = None,
     strict: StrictOption = False,
 ) -> None:
@@ -224,7 +218,7 @@ def prep_posed(
     source = PosedSource(rooms, classes, settings, test_share, seed, only)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
-    run_job(Job(source, out, workers, scheduler, "auto", strict))
+    run_job(Job(source, out, workers, "auto", strict))
 
 
 def inspect(

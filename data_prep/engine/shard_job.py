@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from data_prep.engine.output import writing
-from data_prep.engine.plan import PLAN_NAME, ShardPlan
+from data_prep.engine.plan import ShardPlan
 from data_prep.engine.report import line_of
 from data_prep.engine.source import Line, PreparedRoom, RoomTask, Source, sentence_of
 from sceneprior.core.errors import InputError
@@ -51,11 +51,6 @@ def make_shard(
     Models are written first, then the report, then the shard, so that a shard with a report is
     complete (`read_finished`). With `strict`, neither is written if a room fails.
     """
-    if not (out / PLAN_NAME).is_file():
-        raise InputError(
-            f"A worker finds no {PLAN_NAME} in {out}: workers must reach the folders of the data "
-            "and of the shards under the same paths as this machine."
-        )
     path = out / shard.name
     first, last = shard.rooms[0].room_id, shard.rooms[-1].room_id
     with writing(out, f"rooms {first} to {last}"):
