@@ -6,7 +6,6 @@ of all threads and wall-clock seconds are listed; on a busy machine only the for
 
 import argparse
 import json
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -57,11 +56,7 @@ def time_evaluation(run: Path, shards: Path | None, count: int, renderer: str) -
     warm = EvalOptions(renderer=screen, resamples=0)
     evaluate_synthesis(scenes[:2], folder, warm)  # compiles, loads, warms
     score("score")
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "reference.npz"
-        score("write_reference", reference=path)
-        score("score_with_reference", reference=path)
-        score("without_intervals", reference=path, resamples=0)
+    score("without_intervals", resamples=0)
     return seconds
 
 

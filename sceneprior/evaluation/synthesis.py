@@ -50,8 +50,6 @@ class EvalOptions:
     """NVIDIA's `inception-2015-12-05.pt`; None leaves the metrics of Inception features out."""
     alexnet: Path | None = None
     """torchvision's AlexNet weights; None leaves `sca` out."""
-    reference: Path | None = None
-    """File with the features of the real rooms' pictures; None draws them each time."""
     split: str = "test"
     """The split to compare with: `val` to choose settings, `test` to report. The keys of a result
     say "test" for either; its protocol names the split."""
@@ -104,7 +102,7 @@ def evaluate_synthesis(
     renderer = options.renderer
     renderer = open_renderer(renderer) if isinstance(renderer, str) else renderer
     drawing = Drawing(names, renderer, options.inception, small=options.alexnet is not None)
-    drawn, as_boxes = draw_rooms(rooms, shards, drawing, options.boxes, options.reference)
+    drawn, as_boxes = draw_rooms(rooms, shards, drawing, options.boxes)
     sets = room_sets(rooms, drawn, as_boxes, options.resamples)
     comparison = Comparison(
         test=sets["test"],

@@ -1,6 +1,5 @@
 """Scale, position and colours of top-down pictures."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from sceneprior.render.topdown import (
     perspective,
     topdown,
     topdown_protocol,
-    turntable,
 )
 
 BED, LAMP = 9, 14  # rows of double_bed and pendant_lamp in the bedroom label set
@@ -90,24 +88,6 @@ def test_the_whole_room_fits_into_the_perspective(renderer):
     assert max(fill) == pytest.approx(0.96, abs=0.02)
     assert rows.min() + rows.max() == pytest.approx(119, abs=2)
     assert columns.min() + columns.max() == pytest.approx(159, abs=2)
-
-
-def test_a_turntable_goes_once_round_at_one_scale(renderer):
-    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
-    lamp = SceneObject("pendant_lamp", (1.0, 2.0, 0.0), (0.3, 0.3, 0.3))
-    scene = Scene("room", "front3d_bedroom", (bed, lamp))
-    pictures = turntable(scene, renderer, count=4, image_size=(60, 80))
-    assert len(pictures) == 4 and {picture.shape for picture in pictures} == {(60, 80, 3)}
-    assert len({picture.tobytes() for picture in pictures}) == 4
-    # Nothing is cut off, and somewhere the room comes near the picture's edge.
-    shown = [np.argwhere((picture != 255).any(axis=-1)) for picture in pictures]
-    low, high = np.concatenate(shown).min(axis=0), np.concatenate(shown).max(axis=0)
-    assert (low >= 1).all() and (high <= [58, 78]).all()
-    assert min(low[0], low[1], 59 - high[0], 79 - high[1]) <= 3
-    # Half way round, what was in front of the bed is behind it: the same floor from the other side.
-    half = turntable(replace(scene, objects=(bed,)), renderer, count=2, image_size=(60, 80))
-    apart = np.abs(half[0].astype(int) - half[1]).max(axis=-1)
-    assert (apart > 40).mean() < 0.02  # the bed and its floor look the same from both sides
 
 
 def test_an_empty_room_is_background(renderer):

@@ -30,12 +30,6 @@ SomeRunOption = Annotated[
 AlexnetOption = Annotated[
     Path | None, typer.Option(help="The file alexnet-owt-7be5be79.pth, for the paper's SCA.")
 ]
-ReferenceOption = Annotated[
-    Path | None,
-    typer.Option(
-        help="File (.npz) that keeps the features of real rooms' pictures; read if it exists."
-    ),
-]
 SplitOption = Annotated[
     str, typer.Option(help="Rooms to compare with: test to report, val to choose settings.")
 ]
@@ -65,7 +59,6 @@ def eval_fid(
     shards: Annotated[
         Path | None, typer.Option(help="Shards with the test rooms (default: those of the run).")
     ] = None,
-    reference: ReferenceOption = None,
     split: SplitOption = "test",
     boxes: BoxesOption = False,
     resamples: ResamplesOption = 200,
@@ -84,7 +77,7 @@ def eval_fid(
     from sceneprior.evaluation.synthesis import EvalOptions
 
     _check_source(run, scenes, distribution)
-    options = EvalOptions(seed, inception, alexnet, reference, split, boxes, resamples, renderer)
+    options = EvalOptions(seed, inception, alexnet, split, boxes, resamples, renderer)
     if run is not None:
         target = result_file(run, out, "scores.json")
         found = evaluate_run(run, count or GENERATED, options, target, shards, distribution)
@@ -136,7 +129,6 @@ def evaluate(
     ] = "solids",
     inception: InceptionOption = None,
     alexnet: AlexnetOption = None,
-    reference: ReferenceOption = None,
     split: SplitOption = "test",
     boxes: BoxesOption = False,
     resamples: ResamplesOption = 200,
@@ -161,7 +153,7 @@ def evaluate(
 
     _check_source(run, scenes, distribution)
     asked: dict[str, Any] = request_of(floor, openings, ceiling, want, request)
-    options = EvalOptions(seed, inception, alexnet, reference, split, boxes, resamples, renderer)
+    options = EvalOptions(seed, inception, alexnet, split, boxes, resamples, renderer)
     use = UseOptions(settle, only_use, standing)
     if run is not None:
         target = result_file(run, out, "scores.json")

@@ -25,9 +25,7 @@ def compare(
         str,
         typer.Option(help="Comparison: your YAML, or a shipped one (compare/single_view.yaml)."),
     ] = "compare/new_rooms_small.yaml",
-    out: Annotated[Path, typer.Option(help="Folder for runs, tables and pictures.")] = Path(
-        "out/compare"
-    ),
+    out: Annotated[Path, typer.Option(help="Folder for runs and tables.")] = Path("out/compare"),
     methods: Annotated[str | None, typer.Option(help="Methods, such as lifted,lstm.")] = None,
     rooms: Annotated[str | None, typer.Option(help="Kinds of rooms, such as bedroom.")] = None,
     seeds: Annotated[str | None, typer.Option(help="Seeds, such as 0,1 (default: all).")] = None,

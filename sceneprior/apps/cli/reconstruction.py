@@ -60,7 +60,7 @@ def reconstruct(
 ) -> None:
     """Reconstruct rooms from the instance masks of single images: JSON, GLB and pictures."""
     from sceneprior.apps.api import load
-    from sceneprior.apps.reconstruction.export import write_reconstructions, write_turning
+    from sceneprior.apps.reconstruction.export import write_page, write_reconstructions
     from sceneprior.apps.reconstruction.own_image import read_own_image
     from sceneprior.apps.reconstruction.reconstruct import OBJECTS
     from sceneprior.apps.rooms import check_free
@@ -114,7 +114,7 @@ def reconstruct(
     artist = open_renderer(renderer)
     write_reconstructions(found, out, artist)
     if mask is not None:
-        write_turning(found[0], out, artist)
+        write_page(found[0], out, artist)
     typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
 
 

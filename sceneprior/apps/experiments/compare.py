@@ -1,4 +1,4 @@
-"""Trains and evaluates the runs of a comparison, and writes its tables and pictures.
+"""Trains and evaluates the runs of a comparison, and writes its tables.
 
 A run consists of `fit` and the commands that score it; for existing scenes, of the scoring commands
 alone. Finished commands are not repeated.
@@ -19,7 +19,6 @@ from sceneprior.apps.experiments.comparison import (
     shards_of,
     variants_of,
 )
-from sceneprior.apps.experiments.figure import write_figure
 from sceneprior.apps.experiments.rows import rows_of
 from sceneprior.apps.experiments.steps import Step, StepRunner, is_done, open_runner
 from sceneprior.apps.experiments.table import NEW_ROOMS, VIEWS, write_tables
@@ -60,14 +59,14 @@ class Compared:
 def compare(
     comparison: Comparison, part: Comparison, out: Path, options: CompareOptions
 ) -> Compared:
-    """Finish the runs of `part`, then write tables and pictures of all finished runs.
+    """Finish the runs of `part`, then write the tables of all finished runs.
 
-    The folder of a run is `<out>/<rooms>/<method>/seed<k>/`; tables and pictures are written to
-    `out`. Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
+    The folder of a run is `<out>/<rooms>/<method>/seed<k>/`; tables are written to `out`. Ctrl-C,
+    SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
     """
     if options.inception is not None:
         check_inception(options.inception)
-    renderer = open_renderer(options.renderer)
+    open_renderer(options.renderer)  # an unknown renderer raises here, too
     count = cache(partial(count_of, comparison))
     for rooms in part.rooms:
         count(rooms)  # unusable shards raise here, before anything is trained
@@ -86,10 +85,6 @@ def compare(
         if done:
             form = VIEWS if isinstance(comparison, ViewComparison) else NEW_ROOMS
             write_tables([row for run in done for row in rows_of(comparison, run)], out, form)
-        for rooms in comparison.rooms:
-            first = {run.method: run for run in reversed(done) if run.rooms == rooms}
-            if shown := [first[method] for method in comparison.methods if method in first]:
-                write_figure(comparison, shown, count(rooms), out / f"{rooms}.png", renderer)
     return Compared(out / "table.md" if done else None, failures, left_out)
 
 

@@ -18,21 +18,18 @@ from sceneprior.core.scene import Scene
 from sceneprior.evaluation.page import png_uri
 from sceneprior.evaluation.rooms_page import write_rooms_page
 from sceneprior.render.offscreen import Pinhole, Renderer
-from sceneprior.render.pictures import gif_bytes, paint_ids, png_bytes
+from sceneprior.render.pictures import paint_ids, png_bytes
 from sceneprior.render.topdown import (
     object_colors,
     scene_meshes,
     topdown,
     topdown_protocol,
-    turntable,
 )
 
 HEIGHT_PX = 360
 """Height of each panel, to which masks are scaled."""
 GAP_PX, LINE_PX = 8, 24
 PAPER, INK, FRAME = (255, 255, 255), (40, 40, 40), (200, 200, 200)
-TURN_MS = 3600
-"""Duration of the turntable animation."""
 MARGIN_M = 0.3
 """Smallest margin around the camera in the top view."""
 SIGHT_M = 0.8
@@ -64,17 +61,14 @@ def write_reconstructions(
         write_scene(replace(one.scene, extra=extra), folder, image.name, renderer)
 
 
-def write_turning(found: Reconstruction, folder: Path, renderer: Renderer) -> None:
-    """Write `<name>_turning.gif` and `rooms.html` to the folder of `write_reconstructions`."""
-    name, frames = found.image.name, turntable(found.scene, renderer)
-    gif = gif_bytes(frames, [TURN_MS // len(frames)] * len(frames))
-    write_whole(Path(folder) / f"{name}_turning.gif", gif)
+def write_page(found: Reconstruction, folder: Path, renderer: Renderer) -> None:
+    """Write `rooms.html` to the folder of `write_reconstructions`."""
     seen = png_uri(Image.fromarray(picture(found, renderer)))
     write_rooms_page(
         Path(folder) / PAGE_FILE,
         [found.scene],
         renderer,
-        title=name,
+        title=found.image.name,
         subtitle="A room from the masks of one image",
         pictures=[("The masks, the reconstruction from the same camera, and from above", seen)],
     )

@@ -72,10 +72,8 @@ def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):
     status, out, errors = command(*call, "--pose", "pose.json", "--out", "posed")
     assert (status, out) == (0, "Wrote 1 room to posed\n"), errors
     assert "without --pose" not in errors and "sofa" not in errors
-    made = {"mine_turning.gif", "rooms.html"}
-    assert {path.name for path in (tmp_path / "posed").iterdir()} == files_of("mine") | made
-    gif = Image.open(tmp_path / "posed" / "mine_turning.gif")
-    assert (gif.n_frames, gif.size, gif.info["duration"]) == (36, (320, 240), 100)
+    made = files_of("mine") | {"rooms.html"}
+    assert {path.name for path in (tmp_path / "posed").iterdir()} == made
     page = (tmp_path / "posed" / "rooms.html").read_text()
     assert page.count("<model-viewer ") == 1 and "the reconstruction from the same camera" in page
     status, _, errors = command(*call, *PAPER, "--out", "level", "--camera-height", 1.4)

@@ -1,4 +1,4 @@
-"""eval-fid from the command line: a run, the user's scenes, kept references, refusals."""
+"""eval-fid from the command line: a run, the user's scenes, refusals."""
 
 import json
 import re
@@ -27,20 +27,16 @@ from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.topdown import box_mesh
 
 
-def test_the_users_scenes_are_evaluated_and_again_with_the_reference(
-    command, scenes, toy_shards, tmp_path
-):
+def test_the_users_scenes_are_evaluated(command, scenes, toy_shards, tmp_path):
     call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
-    status, out, errors = command(*call, "--resamples", 20, "--reference", "reference.npz")
+    status, out, errors = command(*call, "--resamples", 20)
     assert status == 0, errors
     assert f"Wrote {scenes / 'scores.json'}" in out.replace("\n", "") and "4 rooms" in out
     first = json.loads((scenes / "scores.json").read_text())
     assert first["protocol"]["scenes"] == "scenes" and first["protocol"]["resamples"] == 20
     assert first["near_copy_share"] == 1 and first["out_of_bounds_share"] == 0
     # scores.json lies among the scenes now, and is none.
-    status, _, errors = command(
-        *call, "--resamples", 20, "--reference", "reference.npz", "--out", "b.json"
-    )
+    status, _, errors = command(*call, "--resamples", 20, "--out", "b.json")
     assert status == 0, errors
     assert json.loads((tmp_path / "b.json").read_text()) == first
     status, _, errors = command(*call, "-n", 2, "--seed", 3, "--resamples", 0, "--out", "c.json")
