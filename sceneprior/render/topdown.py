@@ -12,7 +12,7 @@ from sceneprior.core.geometry.corners import BOX_FACES, box_corners
 from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shell import rectangle, shell_of, slab
-from sceneprior.render.offscreen import Orthographic, Pinhole, Renderer
+from sceneprior.render.offscreen import Orthographic, Pinhole, SoftwareRenderer
 from sceneprior.render.pictures import paint_ids
 
 BACKGROUND = (255, 255, 255)
@@ -96,7 +96,6 @@ def linear_rgba(color: UInt8[np.ndarray, "3"]) -> list[float]:
 
 def topdown(
     scene: Scene,
-    renderer: Renderer,
     protocol: TopDownProtocol | None = None,
     outlines: bool = False,
 ) -> UInt8[np.ndarray, "height width 3"]:
@@ -116,7 +115,7 @@ def topdown(
         height = protocol.camera_height_m
         world_to_camera = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, height], [0, 0, 0, 1]])
         camera = Orthographic(world_to_camera, protocol.metres_per_pixel)
-        ids = renderer.instance_ids(scene_meshes(scene), camera, protocol.image_size)
+        ids = SoftwareRenderer().instance_ids(scene_meshes(scene), camera, protocol.image_size)
     if outlines:
         return paint_ids(ids, object_colors(scene), protocol.background)
     colors = class_colors(len(label_set(scene.label_set)))[scene.class_indices]
@@ -200,7 +199,6 @@ def _fitted(
 
 def perspective(
     scene: Scene,
-    renderer: Renderer,
     image_size: tuple[int, int] = (360, 480),
     view: CornerView | None = None,
     colors: UInt8[np.ndarray, "objects 3"] | None = None,
@@ -217,4 +215,6 @@ def perspective(
     meshes = [*scene_meshes(scene), view.floor, *view.walls]
     # Walls cast no shadows: they would darken the whole room.
     shadowed = len(meshes) - len(walls)
-    return renderer.shaded(meshes, colors, view.camera, view.image_size, BACKGROUND, shadowed)
+    return SoftwareRenderer().shaded(
+        meshes, colors, view.camera, view.image_size, BACKGROUND, shadowed
+    )

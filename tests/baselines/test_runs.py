@@ -74,9 +74,8 @@ def test_the_command_line_trains_generates_and_evaluates(baseline_config, method
     dump_settings(baseline_config(method, **dict.fromkeys(epochs, 1)), config)
     for words in (
         ["fit", "--config", str(config), "--run", str(run), "--accelerator", "cpu"],
-        ["synthesize", "--run", str(run), "-n", "3", "--out", str(tmp_path / "rooms"),
-         "--renderer", "software"],
-        ["eval-fid", "--run", str(run), "-n", "4", "--renderer", "software"],
+        ["synthesize", "--run", str(run), "-n", "3", "--out", str(tmp_path / "rooms")],
+        ["eval-fid", "--run", str(run), "-n", "4"],
     ):  # fmt: skip
         result = CliRunner().invoke(app, words)
         assert result.exit_code == 0, result.output
@@ -107,14 +106,14 @@ def test_new_rooms_depend_on_the_seed_alone(baseline_run, method):
 
 @pytest.mark.parametrize("method", WITHOUT_LATENTS)
 def test_a_run_is_evaluated_and_reported_by_its_new_rooms_alone(baseline_run, method, tmp_path):
-    run, options = baseline_run(method), EvalOptions(renderer="software")
+    run, options = baseline_run(method), EvalOptions()
     scores = evaluate_run(run, 4, options, tmp_path / "scores.json")
     assert scores["protocol"]["stage"] == method
     assert scores["protocol"]["latents"] == ("paper" if method == "gan" else "its own")
     rooms = [without_void(room) for room in sample_rooms(load_any_run(run), 4, 0)]
     assert "box_iou_3d" not in scores
     assert scores["mean_objects"] == sum(len(room.objects) for room in rooms) / 4
-    report_run(run, tmp_path / "scores.json", tmp_path / "page.html", 0, (), "software")
+    report_run(run, tmp_path / "scores.json", tmp_path / "page.html", 0, ())
     page = (tmp_path / "page.html").read_text()
     assert "New rooms beside real ones" in page and "Interpolation on the sphere" not in page
     if method != "gan":

@@ -11,7 +11,6 @@ from sceneprior.apps.cli.options import (
     FloorOption,
     InceptionOption,
     OpeningsOption,
-    RendererOption,
     RequestOption,
     ScenesOption,
     SeedOption,
@@ -64,7 +63,6 @@ def eval_fid(
     resamples: ResamplesOption = 200,
     out: OutOption = None,
     distribution: DistributionOption = None,
-    renderer: RendererOption = "auto",
 ) -> None:
     """Compare generated rooms with test rooms, by the distributions of docs/evaluation.md.
 
@@ -77,7 +75,7 @@ def eval_fid(
     from sceneprior.evaluation.synthesis import EvalOptions
 
     _check_source(run, scenes, distribution)
-    options = EvalOptions(seed, inception, alexnet, split, boxes, resamples, renderer)
+    options = EvalOptions(seed, inception, alexnet, split, boxes, resamples)
     if run is not None:
         target = result_file(run, out, "scores.json")
         found = evaluate_run(run, count or GENERATED, options, target, shards, distribution)
@@ -139,7 +137,6 @@ def evaluate(
     ceiling: CeilingOption = None,
     want: WantOption = None,
     request: RequestOption = None,
-    renderer: RendererOption = "auto",
 ) -> None:
     """Measure whether rooms can be used, and compare them with real rooms, as eval-fid does.
 
@@ -153,7 +150,7 @@ def evaluate(
 
     _check_source(run, scenes, distribution)
     asked: dict[str, Any] = request_of(floor, openings, ceiling, want, request)
-    options = EvalOptions(seed, inception, alexnet, split, boxes, resamples, renderer)
+    options = EvalOptions(seed, inception, alexnet, split, boxes, resamples)
     use = UseOptions(settle, only_use, standing)
     if run is not None:
         target = result_file(run, out, "scores.json")

@@ -26,7 +26,6 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.networks import check_inception
-from sceneprior.render.offscreen import open_renderer
 
 OF_SHARDS = "shards"
 """Value of `cad_models` that selects the CAD models of the training rooms."""
@@ -36,7 +35,6 @@ OF_SHARDS = "shards"
 class CompareOptions:
     """Options for training and evaluating all runs of a comparison."""
 
-    renderer: str = "auto"
     inception: Path | None = None
     """NVIDIA's `inception-2015-12-05.pt`; None leaves FID out."""
     accelerator: str = "auto"
@@ -66,7 +64,6 @@ def compare(
     """
     if options.inception is not None:
         check_inception(options.inception)
-    open_renderer(options.renderer)  # an unknown renderer raises here, too
     count = cache(partial(count_of, comparison))
     for rooms in part.rooms:
         count(rooms)  # unusable shards raise here, before anything is trained
@@ -173,11 +170,11 @@ def scoring_steps(
     """
     shards, state = str(shards_of(comparison, run.rooms)), []
     source = ["--run", str(run.folder / "run")]
-    seed, renderer = ["--seed", str(comparison.sampling_seed)], ["--renderer", options.renderer]
+    seed = ["--seed", str(comparison.sampling_seed)]
     if isinstance(comparison, ViewComparison):
         command, option = "eval-svr", "--fit"
         source += ["--shards", shards]
-        alike = ["--split", "test", "--views", str(comparison.views), *seed, *renderer]
+        alike = ["--split", "test", "--views", str(comparison.views), *seed]
         if count is not None:
             alike += ["--limit", str(count)]
         if (models := comparison.cad_models) is not None:
@@ -187,7 +184,7 @@ def scoring_steps(
         if run.scenes is not None:
             source, state = ["--scenes", str(run.scenes), "--shards", shards], [_state(run.scenes)]
         # Some methods decode meshes, others boxes only; --boxes compares the boxes of all methods.
-        alike = ["-n", str(count), *seed, "--boxes", *renderer]
+        alike = ["-n", str(count), *seed, "--boxes"]
         if options.inception is not None:
             alike += ["--inception", str(options.inception)]
     steps = []

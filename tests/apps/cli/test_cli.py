@@ -14,7 +14,6 @@ from tiny_runs import write_tiny_config
 
 from sceneprior.core import files
 from sceneprior.core.shards import list_shards
-from sceneprior.render import offscreen
 
 
 def test_bad_shards_are_sentences_and_leave_no_run(command, toy_shards, tmp_path):
@@ -44,20 +43,8 @@ def test_bad_shards_are_sentences_and_leave_no_run(command, toy_shards, tmp_path
     assert "model.max_objects is 2; raise it." in fit(toy_shards, "--set", "model.max_objects=2")
 
 
-def test_without_gl_pyrender_is_a_sentence_with_the_apt_line(
-    command, toy_run, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(offscreen.gl, "_pyrender", None)
-    monkeypatch.setattr(offscreen.gl, "_failure", "libEGL or libGL is not installed")
-    said = one_sentence(
-        command("synthesize", "--run", toy_run, "--out", "made", "--renderer", "pyrender")
-    )
-    assert offscreen.APT_LINE in said and "--renderer software" in said
-    assert not (tmp_path / "made").exists()
-
-
 def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
-    call = ["synthesize", "--run", toy_run, "-n", "3", "--seed", "5", "--renderer", "software"]
+    call = ["synthesize", "--run", toy_run, "-n", "3", "--seed", "5"]
     status, out, _ = command(*call, "--out", "made")
     assert (status, out) == (0, "Wrote 3 rooms to made (from: paper)\n")
     names = {f"seed5_000{k}.{kind}" for k in range(3) for kind in ("json", "glb", "png")}
@@ -81,7 +68,7 @@ def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
 
 
 def test_synthesize_writes_walls_if_asked(command, toy_run, tmp_path):
-    call = ["synthesize", "--run", toy_run, "-n", 1, "--renderer", "software", "--out"]
+    call = ["synthesize", "--run", toy_run, "-n", 1, "--out"]
     for shell, nodes in (("walls", {"floor", "wall_0", "ceiling"}), ("none", set())):
         assert command(*call, shell, "--shell", shell)[0] == 0
         found = set(trimesh.load_scene(tmp_path / shell / "seed0_0000.glb").graph.nodes_geometry)

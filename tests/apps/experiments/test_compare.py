@@ -27,7 +27,7 @@ from sceneprior.apps.experiments.rows import costs_of
 from sceneprior.apps.experiments.steps import StepRunner
 from sceneprior.core.errors import InputError
 
-SOFTWARE = CompareOptions("software")
+SOFTWARE = CompareOptions()
 METHODS = {
     "ours": {},
     "lstm": {
@@ -279,13 +279,6 @@ def test_a_folder_that_is_a_file_is_a_sentence(begun):
     comparison = load_comparison(str(begun / "compare.yaml"))
     with pytest.raises(InputError, match="file cannot be written"):
         compare(comparison, comparison, begun / "file", SOFTWARE)
-
-
-def test_a_renderer_that_is_none_is_said_before_anything_is_trained(begun, toy_shards, calls):
-    comparison = load_comparison(str(begun / "compare.yaml"))
-    with pytest.raises(InputError, match="vulkan"):
-        compare(comparison, comparison, begun / "out", CompareOptions("vulkan"))
-    assert calls.names == []
 
 
 def test_methods_without_latents_of_rooms_are_evaluated_once_by_their_own(written, tmp_path):

@@ -18,7 +18,7 @@ from sceneprior.apps.experiments.rows import rows_of
 from sceneprior.apps.experiments.table import VIEWS, Row, markdown
 from sceneprior.core.errors import ConfigError, InputError
 
-SOFTWARE = CompareOptions("software")
+SOFTWARE = CompareOptions()
 
 
 def write_comparison(folder: Path, shards: Path, **changes) -> str:
@@ -46,7 +46,7 @@ def write_comparison(folder: Path, shards: Path, **changes) -> str:
 def test_methods_are_trained_scored_and_tabulated(toy_shards, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     path, out = write_comparison(tmp_path, toy_shards), tmp_path / "out"
-    words = ["compare", "--config", path, "--out", str(out), "--renderer", "software"]
+    words = ["compare", "--config", path, "--out", str(out)]
     words += ["--methods", "usl"]  # a network that answers in one pass: ours has its own tests
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
@@ -119,7 +119,7 @@ def test_the_command_of_a_run_says_all_that_its_scores_depend_on(toy_shards, tmp
     words = " ".join(step.arguments)
     assert step.arguments[0] == "eval-svr" and f"--shards {toy_shards}" in words
     assert " ".join(step.depends_on) == (
-        f"--split test --views 2 --seed 3 --renderer software --limit 2 --models {toy_shards}"
+        f"--split test --views 2 --seed 3 --limit 2 --models {toy_shards}"
     )
     without = load_comparison(write_comparison(tmp_path, toy_shards, cad_models=None, count=None))
     (step,) = scoring_steps(without, runs_of(without, tmp_path)[0], None, SOFTWARE)
