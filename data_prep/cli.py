@@ -30,7 +30,6 @@ WorkersOption = Annotated[
 SeedOption = Annotated[
     int, typer.Option(min=0, max=LARGEST_SEED, help="The same seed writes the same bytes.")
 ]
-StrictOption = Annotated[bool, typer.Option("--strict", help="Stop at the first failed room.")]
 RetryOption = Annotated[
     bool, typer.Option("--retry-failed", help="Try rooms again that failed in an earlier run.")
 ]
@@ -83,7 +82,6 @@ def prep_front(
     only: Annotated[
         str | None, typer.Option(help="One house or room only: HOUSE, HOUSE/ROOM or a room id.")
     ] = None,
-    strict: StrictOption = False,
     retry_failed: RetryOption = False,
 ) -> None:
     """Turn houses in 3D-FRONT's format into view shards. The same command resumes a stopped run.
@@ -99,7 +97,7 @@ def prep_front(
         changes.append(f"views.per_m2={views_per_m2}")
     rules = load_recipe(recipe, tuple(changes))
     source = FrontSource(front, future, rules, splits, seed, only, rgb)
-    run_job(Job(source, out, workers, renderer, strict, retry_failed))
+    run_job(Job(source, out, workers, renderer, retry_failed))
 
 
 def recipe(
@@ -135,7 +133,6 @@ def prep_scannet(
     seed: SeedOption = 0,
     workers: WorkersOption = None,
     only: Annotated[str | None, typer.Option(help="A scan, or a prefix of scans' names.")] = None,
-    strict: StrictOption = False,
     retry_failed: RetryOption = False,
 ) -> None:
     """Turn ScanNet's recordings into view shards, straight from .sens and the zips.
@@ -149,7 +146,7 @@ def prep_scannet(
     size = FULL_SIZE if full_size else QUARTER_SIZE
     settings = ScanSettings(frame_step, max_views, masks, size)
     source = ScanNetSource(scans, labels, settings, train_list, val_list, seed, only)
-    run_job(Job(source, out, workers, "auto", strict, retry_failed))
+    run_job(Job(source, out, workers, "auto", retry_failed))
 
 
 def prep_posed(
@@ -200,7 +197,6 @@ def prep_posed(
     seed: SeedOption = 0,
     workers: WorkersOption = None,
     only: Annotated[str | None, typer.Option(help="A room, or a prefix of rooms' names.")] = None,
-    strict: StrictOption = False,
 ) -> None:
     """Turn posed pictures with instance masks into view shards (docs/posed_data.md).
 
@@ -218,7 +214,7 @@ def prep_posed(
     source = PosedSource(rooms, classes, settings, test_share, seed, only)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
-    run_job(Job(source, out, workers, "auto", strict))
+    run_job(Job(source, out, workers, "auto"))
 
 
 def inspect(
@@ -291,16 +287,12 @@ def run_job(job: "Job") -> None:
 
     from data_prep.engine.build import build_shards
     from data_prep.engine.report_tables import report_tables
-    from data_prep.engine.shard_job import RoomFailedError
 
     try:
         summary = build_shards(job)
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to continue.", err=True)
         raise typer.Exit(130) from None
-    except RoomFailedError as error:
-        typer.echo(f"Error: {error}", err=True)
-        raise typer.Exit(3) from None
     console = Console()
     for table in report_tables(summary.report):
         console.print(table)
