@@ -27,13 +27,9 @@ OutOption = Annotated[Path, typer.Option(help="Folder for the shards.")]
 WorkersOption = Annotated[
     int | None, typer.Option(min=1, help="Processes on this machine (default: all cores).")
 ]
-SchedulerOption = Annotated[
-    str | None, typer.Option(help="Run on a Dask cluster instead: tcp://HOST:8786.")
-]
 SeedOption = Annotated[
     int, typer.Option(min=0, max=LARGEST_SEED, help="The same seed writes the same bytes.")
 ]
-StrictOption = Annotated[bool, typer.Option("--strict", help="Stop at the first failed room.")]
 RetryOption = Annotated[
     bool, typer.Option("--retry-failed", help="Try rooms again that failed in an earlier run.")
 ]
@@ -82,12 +78,10 @@ def prep_front(
         bool, typer.Option("--rgb", help="Also write shaded pictures, OUT/rgb/ROOM/VIEW.png.")
     ] = False,
     workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
     renderer: Annotated[str, typer.Option(help="auto, pyrender or software.")] = "auto",
     only: Annotated[
         str | None, typer.Option(help="One house or room only: HOUSE, HOUSE/ROOM or a room id.")
     ] = None,
-    strict: StrictOption = False,
     retry_failed: RetryOption = False,
 ) -> None:
     """Turn houses in 3D-FRONT's format into view shards. The same command resumes a stopped run.
@@ -103,7 +97,7 @@ def prep_front(
         changes.append(f"views.per_m2={views_per_m2}")
     rules = load_recipe(recipe, tuple(changes))
     source = FrontSource(front, future, rules, splits, seed, only, rgb)
-    run_job(Job(source, out, workers, scheduler, renderer, strict, retry_failed))
+    run_job(Job(source, out, workers, renderer, retry_failed))
 
 
 def recipe(
@@ -138,9 +132,7 @@ def prep_scannet(
     ] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
     only: Annotated[str | None, typer.Option(help="A scan, or a prefix of scans' names.")] = None,
-    strict: StrictOption = False,
     retry_failed: RetryOption = False,
 ) -> None:
     """Turn ScanNet's recordings into view shards, straight from .sens and the zips.
@@ -154,7 +146,7 @@ def prep_scannet(
     size = FULL_SIZE if full_size else QUARTER_SIZE
     settings = ScanSettings(frame_step, max_views, masks, size)
     source = ScanNetSource(scans, labels, settings, train_list, val_list, seed, only)
-    run_job(Job(source, out, workers, scheduler, "auto", strict, retry_failed))
+    run_job(Job(source, out, workers, "auto", retry_failed))
 
 
 def prep_posed(
@@ -210,9 +202,7 @@ def prep_posed(
     test_share: Annotated[float, typer.Option(help="Share of rooms in the test split.")] = 0.1,
     seed: SeedOption = 0,
     workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
     only: Annotated[str | None, typer.Option(help="A room, or a prefix of rooms' names.")] = None,
-    strict: StrictOption = False,
 ) -> None:
     """Turn posed pictures with instance masks into view shards (docs/posed_data.md).
 
@@ -234,7 +224,7 @@ def prep_posed(
         typer.echo(f"Found {sentence}", err=True)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
-    run_job(Job(source, out, workers, scheduler, "auto", strict))
+    run_job(Job(source, out, workers, "auto"))
 
 
 def inspect(
@@ -307,16 +297,12 @@ def run_job(job: "Job") -> None:
 
     from data_prep.engine.build import build_shards
     from data_prep.engine.report_tables import report_tables
-    from data_prep.engine.shard_job import RoomFailedError
 
     try:
         summary = build_shards(job)
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to continue.", err=True)
         raise typer.Exit(130) from None
-    except RoomFailedError as error:
-        typer.echo(f"Error: {error}", err=True)
-        raise typer.Exit(3) from None
     console = Console()
     for table in report_tables(summary.report):
         console.print(table)

@@ -76,7 +76,6 @@ OWNERS = {
     "viser": ["sceneprior/apps/viewer/"],
     "mujoco": ["sceneprior/evaluation/metrics/stability.py"],
     "coacd": ["sceneprior/core/colliders.py"],
-    "distributed": ["data_prep/engine/cluster.py"],
 }  # fmt: skip
 
 
