@@ -4,6 +4,7 @@ import numpy as np
 
 from data_prep.scannet.labels import SHELL
 from sceneprior.core.errors import InputError
+from sceneprior.core.instances.tables import LARGEST_ID
 
 NYU40 = (
     "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf",
@@ -39,16 +40,20 @@ def ids_and_classes(
             f"{where}: a semantic id is {semantics.max()}, expected NYU40's 1 to {len(NYU40)}; "
             "it is another label set, or the file is damaged."
         )
-    semantics = np.maximum(semantics, 0).astype(np.int64)
+    if instances.max(initial=0) >= LARGEST_ID:
+        raise InputError(
+            f"{where}: an instance id is {instances.max()}, expected at most {LARGEST_ID - 1}; the "
+            "file is damaged."
+        )
     names = ("void", *NYU40)
     is_shell = np.array([name in SHELL for name in names])
-    numbers, index = np.unique(instances, return_inverse=True)
-    votes = np.zeros((len(numbers), len(names)), dtype=np.int64)
-    np.add.at(votes, (index.ravel(), semantics.ravel()), 1)
+    numbers = np.maximum(instances, -1).astype(np.int64) + 1
+    semantics = np.maximum(semantics, 0).astype(np.int64)
+    count = int(numbers.max(initial=0)) + 1
+    keys = (numbers * len(names) + semantics).ravel()
+    votes = np.bincount(keys, minlength=count * len(names)).reshape(count, len(names))
     best = votes.argmax(axis=1)
-    number_of = np.where(is_shell[best], 0, numbers.astype(np.int32) + 1)
-    ids = number_of[index].reshape(instances.shape)
-    ids[instances < 0] = np.where(is_shell[semantics[instances < 0]], 0, -1)
-    found = zip(numbers.tolist(), best, strict=True)
-    classes = {k + 1: names[name] for k, name in found if k >= 0 and not is_shell[name]}
-    return ids, classes
+    ids = np.where(is_shell[best], 0, np.arange(count)).astype(np.int32)[numbers]
+    ids[numbers == 0] = np.where(is_shell[semantics[numbers == 0]], 0, -1)
+    found = np.flatnonzero(votes.any(axis=1) & ~is_shell[best]).tolist()
+    return ids, {k: names[best[k]] for k in found if k}

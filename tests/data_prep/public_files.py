@@ -153,11 +153,11 @@ def write_hypersim(folder: Path, scene: str, room: PosedRoom, projection: np.nda
     count = max(thing.id for thing in room.things) + 1
     boxes = {"positions": (count, 3), "extents": (count, 3), "orientations": (count, 3, 3)}
     arrays = {name: np.full(shape, np.inf) for name, shape in boxes.items()}
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # the box's x axis is the world's y
+    turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # the box's axes are the world's y, z, x
     for thing in room.things:
         low, high = np.array(thing.low), np.array(thing.high)
         arrays["positions"][thing.id] = (low + high) / 2 / UNIT
-        arrays["extents"][thing.id] = (high - low)[[1, 0, 2]] / UNIT
+        arrays["extents"][thing.id] = (high - low)[[1, 2, 0]] / UNIT
         arrays["orientations"][thing.id] = turn
     start = "metadata_semantic_instance_bounding_box_object_aligned_2d_"
     for name, array in arrays.items():
@@ -187,9 +187,9 @@ def write_structured3d(folder: Path, scene: str, number: str, room: PosedRoom) -
     boxes = []
     for thing in room.things[:3]:
         low, high = np.array(thing.low) * 1000, np.array(thing.high) * 1000
-        basis = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
+        basis = [[0, 1, 0], [0, 0, -1], [-1, 0, 0]]
         boxes.append({
-            "ID": thing.id, "basis": basis, "coeffs": ((high - low) / 2)[[1, 0, 2]].tolist(),
+            "ID": thing.id, "basis": basis, "coeffs": ((high - low) / 2)[[1, 2, 0]].tolist(),
             "centroid": ((low + high) / 2).tolist(),
         })  # fmt: skip
     boxes.append({**boxes[0], "ID": 40, "coeffs": [0, 0, 0]})

@@ -1,10 +1,12 @@
 """Rooms of every public data set, from its files to shards: classes, masks, cameras, boxes."""
 
 import json
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from pages import ROOT, commands_of, first_block
 from public_files import (
     cam_from_uv,
     classes_of,
@@ -153,14 +155,21 @@ def test_masks_are_shrunk_with_their_cameras(room, tmp_path):
     check(made, room, (1, 2, 0), (-0.1, 0, 0.05))
 
 
-def test_a_command_writes_shards_that_verify(room, tmp_path, cli):
+def test_the_commands_of_public_data_md_write_shards_that_verify(room, tmp_path, cli, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     for k in range(3):
-        write_hypersim(tmp_path / "scenes", f"ai_001_00{k}", room, cam_from_uv(room, 0.1))
-    out = tmp_path / "shards"
-    made = cli("prep-dataset", "hypersim", tmp_path / "scenes", "--out", out, "--workers", 1)
-    assert made.exit_code == 0, made.output
-    assert "train 2 rooms, 8 views, 4 objects; test 1 rooms, 4 views, 2 objects" in made.stdout
-    checked = cli("inspect", out, "--verify")
-    assert checked.exit_code == 0, checked.output
-    again = cli("prep-dataset", "hypersim", tmp_path / "scenes", "--out", out, "--workers", 1)
-    assert "0 shards made, 2 already there" in " ".join(again.stdout.split())
+        write_blenderproc(Path("renderings"), f"house_{k}", room)
+        write_hypersim(Path("evermotion_dataset/scenes"), f"ai_001_00{k}", room, cam_from_uv(room))
+        write_structured3d(Path("Structured3D"), f"scene_0{k}100", "480", room)
+        write_scannetpp(Path("scannetpp/data"), f"{k}a5c01", room)
+    commands = commands_of(first_block(ROOT / "docs" / "public_data.md", "bash"))
+    for _, *words in commands:
+        done = cli(*words, "--workers", 1)
+        assert done.exit_code == 0, done.output
+        if words[0] == "prep-dataset":
+            said = " ".join(done.stdout.split())
+            assert "train 2 rooms" in said or words[1] == "structured3d", said
+            checked = cli("inspect", words[-1], "--verify")
+            assert checked.exit_code == 0, (words, checked.output)
+            again = " ".join(cli(*words, "--workers", 1).stdout.split())
+            assert "0 shards made" in again

@@ -42,6 +42,8 @@ def test_ids_and_classes_match_the_rule(numbers):
         assert classes == expected[1]
 
 
-def test_another_label_set_is_refused():
+def test_ids_of_other_images_are_refused():
     with pytest.raises(InputError, match="scene: a semantic id is 41, expected NYU40's 1 to 40"):
         ids_and_classes(np.zeros((1, 1), int), np.full((1, 1), 41), "scene")
+    with pytest.raises(InputError, match="scene: an instance id is 70000, expected at most 65534"):
+        ids_and_classes(np.full((1, 1), 70_000), np.zeros((1, 1), int), "scene")

@@ -78,3 +78,9 @@ def test_rooms_of_another_size_are_left_out(folder, tmp_path):
     assert len(found.rooms) == 4
     (line,) = found.left_out
     assert line.rule == "image_size" and "its views are 96 x 96 pixels" in line.reason
+
+
+def test_a_folder_of_test_scenes_alone_says_what_to_do(tmp_path):
+    write_structured3d(tmp_path / "s3d", "scene_03400", "480", furnished(tmp_path))
+    with pytest.raises(InputError, match=r"'train' split is empty: .* give one with --splits"):
+        survey(PublicSource(open_reader("structured3d", tmp_path / "s3d")))
