@@ -200,14 +200,14 @@ def write_structured3d(folder: Path, scene: str, number: str, room: PosedRoom) -
 def structure(number: str) -> dict:
     """A room with a floor and a ceiling of four lines each, and a door in a wall."""
     junctions = [(*corner, z) for z in (0.0, 2.6) for corner in FLOOR]
-    lines = [[0, 1], [2, 3], [1, 2], [3, 0], [4, 5], [6, 7], [5, 6], [7, 4]]
+    # The second line is the lower edge of the door, which lies in the floor's plane.
+    lines = [[0, 1], [1, 3], [2, 3], [1, 2], [3, 0], [4, 5], [6, 7], [5, 6], [7, 4]]
     planes = [{"type": "floor"}, {"type": "ceiling"}, {"type": "wall"}, {"type": "wall"}]
-    line_junction = np.zeros((len(lines) + 1, len(junctions)), dtype=int)
+    line_junction = np.zeros((len(lines), len(junctions)), dtype=int)
     for k, line in enumerate(lines):
         line_junction[k, line] = 1
-    line_junction[8, [0, 2]] = 1  # the lower edge of the door, which lies on the floor
-    plane_line = np.zeros((4, len(lines) + 1), dtype=int)
-    plane_line[0, [0, 1, 2, 3, 8]] = plane_line[1, 4:8] = plane_line[3, 8] = 1
+    plane_line = np.zeros((4, len(lines)), dtype=int)
+    plane_line[0, :5] = plane_line[1, 5:] = plane_line[3, 1] = 1
     return {
         "junctions": [
             {"ID": k, "coordinate": [1000 * x for x in point]} for k, point in enumerate(junctions)
