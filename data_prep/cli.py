@@ -240,9 +240,12 @@ def prep_dataset(
     folder: Annotated[Path, typer.Argument(help="Folder of its scenes (docs/public_data.md).")],
     out: OutOption,
     recipe: Annotated[
-        str,
-        typer.Option(help="Room types and classes of blenderproc: a recipe of prep-front."),
-    ] = "bedroom",
+        str | None,
+        typer.Option(
+            help="For blenderproc: a recipe of prep-front, its room types and classes "
+            "(default: bedroom)."
+        ),
+    ] = None,
     splits: Annotated[
         Path | None,
         typer.Option(

@@ -17,10 +17,10 @@ import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import BaseModel, TypeAdapter
+from pydantic import BaseModel, Field, TypeAdapter
 
 from data_prep.engine.plan import digest
 from data_prep.engine.source import RoomTask
@@ -44,7 +44,7 @@ _HINT = (
 class _Part(BaseModel):
     """A piece of furniture, or a part of one, in a frame."""
 
-    idx: int
+    idx: Annotated[int, Field(ge=0)]
     """Value in the frame's image of ids."""
     inst_mark: str
     """Name of the piece; its parts share it, and it is the same in all frames of a house."""
@@ -98,6 +98,11 @@ class BlenderProc:
         paths = (self.folder / scene).glob("*.hdf5")
         for path in sorted(paths, key=lambda path: (len(path.name), path.name)):
             image, parts = _read_frame(path)
+            if size not in ((0, 0), image.shape):
+                raise InputError(
+                    f"{path} is {image.shape[1]} x {image.shape[0]} pixels, but the frames before "
+                    f"it {size[1]} x {size[0]}; cam_K.npy is that of one size."
+                )
             size = image.shape
             pixels = np.bincount(image.ravel())
             areas = Counter[str]()

@@ -68,22 +68,28 @@ class Reader(Protocol):
         """Read one room with at most so many views, its images shrunk to `max_side`."""
 
 
-DATA_SETS = ("blenderproc", "hypersim", "structured3d", "scannetpp")
+_BLENDERPROC = "blenderproc"
+_READERS: dict[str, Callable[[Path], Reader]] = {
+    "hypersim": Hypersim, "structured3d": Structured3D, "scannetpp": ScanNetPP,
+}  # fmt: skip
+DATA_SETS = (_BLENDERPROC, *_READERS)
 
 
-def open_reader(name: str, folder: Path, recipe: str = "bedroom") -> Reader:
-    """Reader of a data set; `recipe` selects rooms and classes of BlenderProc's renders."""
+def open_reader(name: str, folder: Path, recipe: str | None = None) -> Reader:
+    """Reader of a data set; `recipe` selects rooms and classes of 3D-FRONT (None: bedroom)."""
     if not folder.is_dir():
         raise InputError(f"No folder at {folder}; expected the scenes of {name}.")
-    makers: dict[str, Callable[[], Reader]] = {
-        "blenderproc": lambda: BlenderProc(folder, load_recipe(recipe)),
-        "hypersim": lambda: Hypersim(folder),
-        "structured3d": lambda: Structured3D(folder),
-        "scannetpp": lambda: ScanNetPP(folder),
-    }
-    if name not in makers:
+    if name not in DATA_SETS:
         raise InputError(f"No data set is called '{name}'; choose from {', '.join(DATA_SETS)}.")
-    reader = makers[name]()
+    if recipe is not None and name != _BLENDERPROC:
+        raise InputError(
+            f"--recipe selects rooms of 3D-FRONT, so it is not for {name}; leave it out."
+        )
+    reader: Reader
+    if name == _BLENDERPROC:
+        reader = BlenderProc(folder, load_recipe(recipe or "bedroom"))
+    else:
+        reader = _READERS[name](folder)
     if not reader.scenes():
         raise InputError(f"{folder} holds no scene of {name}; docs/public_data.md shows the files.")
     return reader

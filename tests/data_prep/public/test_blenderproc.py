@@ -127,6 +127,12 @@ def test_a_truncated_frame_fails_its_house_by_name(renders, tmp_path, cli):
     assert made.exit_code == 3
 
 
+def test_frames_of_two_sizes_are_refused(renders):
+    rewrite(renders / "house" / "3.hdf5", instance_segmaps=np.zeros((50, 60), np.uint8))
+    with pytest.raises(InputError, match=r"3.hdf5 is 60 x 50 pixels, but the frames before it"):
+        read(renders)
+
+
 def test_a_foreign_table_of_classes_is_refused(renders):
     (renders / "model_info.json").unlink()
     (renders / "blender_label_mapping.csv").write_text("id;name\n1;bed\n")

@@ -23,6 +23,7 @@ from data_prep.inspection.projection import boxes_around, hull_of
 from data_prep.public.source import PublicSource, open_reader
 from data_prep.upright import own_sides
 from sceneprior.core.classes import label_set
+from sceneprior.core.ground_truth import reference_scenes
 
 NAMES = label_set("scannet")
 
@@ -173,3 +174,6 @@ def test_the_commands_of_public_data_md_write_shards_that_verify(room, tmp_path,
             assert checked.exit_code == 0, (words, checked.output)
             again = " ".join(cli(*words, "--workers", 1).stdout.split())
             assert "0 shards made" in again
+    for name in ("hypersim", "structured3d", "scannetpp"):
+        for scene in reference_scenes(Path("out") / name / "shards", "train"):
+            assert [item.label for item in scene.objects] == ["bed", "chair"]

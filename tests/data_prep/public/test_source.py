@@ -28,6 +28,8 @@ def test_unknown_names_and_foreign_folders_are_refused(tmp_path):
         open_reader("hypersim", tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"No data set is called 'kitti'; choose from blenderproc"):
         open_reader("kitti", tmp_path)
+    with pytest.raises(InputError, match=r"--recipe selects rooms of 3D-FRONT, so it is not"):
+        open_reader("hypersim", tmp_path, "living")
     for name in DATA_SETS:
         with pytest.raises(InputError, match=rf"holds no scene of {name}; docs/public_data.md"):
             open_reader(name, tmp_path)

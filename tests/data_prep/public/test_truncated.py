@@ -1,6 +1,5 @@
 """Every file of a made scene, cut in half, replaced by noise or emptied: one sentence, no crash."""
 
-import numpy as np
 import pytest
 from public_files import (
     cam_from_uv,
