@@ -75,11 +75,10 @@ class BlenderProc:
 
     def settings(self) -> dict[str, Any]:
         """See `Reader.settings`."""
-        categories = sorted(_categories(self.folder).items(), key=repr)
+        models = sorted(_categories(self.folder).items(), key=repr)
         return {
-            "recipe": self.recipe.name,
-            "classes": digest(repr(sorted(self.recipe.categories.items()))),
-            "categories": digest(repr(categories)),
+            **self.recipe.model_dump(include={"name", "label_set", "categories", "room_types"}),
+            "models": digest(repr(models)),
             "intrinsics": _intrinsics(self.folder).tolist(),
         }
 
@@ -108,7 +107,7 @@ class BlenderProc:
             areas = Counter[str]()
             for part in parts:
                 areas[part.room_id] += int(pixels[part.idx]) if part.idx < len(pixels) else 0
-            if areas:
+            if areas := +areas:  # those of furniture that is visible
                 room = max(sorted(areas), key=lambda name: areas[name])
                 frames.setdefault(room, []).append(path.name)
         return {
