@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.linalg import rq
 
 from data_prep.engine.source import RoomTask
 from data_prep.frames import GL_TO_CV, Y_UP
 from data_prep.public.hdf5 import read_hdf5
 from data_prep.public.nyu40 import ids_and_classes
 from data_prep.public.rooms import FoundRoom, FramedRoom, box_of, chosen_frames, sampled
+from data_prep.public.tilt import pinhole, straight_grid
 from data_prep.scannet.labels import LABEL_SET
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import plain
@@ -34,9 +34,6 @@ from sceneprior.core.instances.checked import plain
 CAMERAS = "metadata_camera_parameters.csv"
 _BOXES = "metadata_semantic_instance_bounding_box_object_aligned_2d_{}.hdf5"
 _HINT = "download the scene again"
-_LARGEST_SKEW_PX = 0.5
-"""Largest shift between the first and the last row of an image by the skew of its pixel grid.
-Shards have no skew, so scenes with more of it are refused."""
 
 
 @dataclass(frozen=True)
@@ -76,19 +73,17 @@ class Hypersim:
         row = _camera_row(self.folder / CAMERAS, task.house)
         size = _image_size(row)
         intrinsics, tilt = pinhole(_cam_from_uv(row), size)
-        skew = abs(intrinsics[0, 1] / intrinsics[1, 1]) * size[0]
-        if skew > _LARGEST_SKEW_PX:
-            raise InputError(
-                f"{scene.name}: its pixel grid is skewed by {skew:.1f} pixels, expected at most "
-                f"{_LARGEST_SKEW_PX:g}: both of its lens shifts differ from 0; leave it out."
-            )
-        intrinsics[0, 1] = 0
         unit = _metres_per_unit(scene / "_detail" / "metadata_scene.csv")
         images, poses = _trajectories(scene, unit)
         with_ids = [k for k, paths in enumerate(images) if all(path.is_file() for path in paths)]
         choice = chosen_frames(str(scene), poses, with_ids, max_views)
-        lines, intrinsics = sampled(size, max_side, intrinsics)
-        arrays = [[_image(path, size)[lines] for path in images[k]] for k in choice.frames]
+        lines, inside = straight_grid(sampled(size, max_side, intrinsics)[0], intrinsics, size)
+        intrinsics[0, 1] = 0
+        intrinsics = sampled(size, max_side, intrinsics)[1]
+        arrays = [
+            [np.where(inside, _image(path, size)[lines], -1) for path in images[k]]
+            for k in choice.frames
+        ]
         instances, semantics = (np.stack(kind) for kind in zip(*arrays, strict=True))
         del arrays
         ids, classes = ids_and_classes(instances, semantics, str(scene))
@@ -99,32 +94,6 @@ class Hypersim:
             ids, classes, cameras, intrinsics, boxes,
             notes=tuple(choice.notes("image of ids")),
         )  # fmt: skip
-
-
-def pinhole(cam_from_uv: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Split a projection of Hypersim into a pinhole's intrinsics and a rotation of the camera.
-
-    `cam_from_uv` (3, 3) maps (u, v, 1), both in [-1, 1] with v upwards, to a ray in OpenGL's camera
-    axes. A tilted image plane is that of a pinhole camera which is turned: any invertible matrix
-    is an upper triangular one times a rotation.
-
-    Returns:
-        Intrinsics, (3, 3), pixel centres at i + 0.5; and the rotation, (3, 3), from OpenCV's axes
-        of the scene's camera to those of the pinhole.
-
-    Example: no tilt, 90 degrees wide.
-
-        >>> intrinsics, tilt = pinhole(np.diag([1.0, 0.75, -1.0]), (768, 1024))
-        >>> intrinsics.round(6).tolist()
-        [[512.0, 0.0, 512.0], [0.0, 512.0, 384.0], [0.0, 0.0, 1.0]]
-    """
-    height, width = size
-    uv_from_pixel = np.array([[2 / width, 0, -1], [0, -2 / height, 1], [0, 0, 1.0]])
-    pixel_from_ray = np.linalg.inv(GL_TO_CV[:3, :3] @ cam_from_uv @ uv_from_pixel)
-    intrinsics, turn = rq(pixel_from_ray)
-    signs = np.diag(np.sign(np.diag(intrinsics)))
-    intrinsics, turn = intrinsics @ signs, signs @ turn
-    return intrinsics / intrinsics[2, 2], turn
 
 
 def _camera_rows(path: Path) -> dict[str, dict[str, str]]:

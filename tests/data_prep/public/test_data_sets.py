@@ -41,7 +41,7 @@ def room(tmp_path):
     return furnished(tmp_path / "unused")
 
 
-def check(made, room, axes, origin):
+def check(made, room, axes, origin, slack_px=0.0):
     """Boxes of bed and chair, projected, bound their masks; the ground truth has these boxes.
 
     A side of a mask that nothing hides is at most a pixel from that of the projection, since masks
@@ -55,8 +55,8 @@ def check(made, room, axes, origin):
     for k, points in enumerate(corners):
         boxes_px = boxes_around(hull_of(points), views.world_to_camera, views.intrinsics)
         within = (boxes_px - masks_px[:, k]) * (1, 1, -1, -1)
-        assert within[views.visible[:, k]].max() < 0.51
-        assert within[clear[:, k]].min() > -1.01
+        assert within[views.visible[:, k]].max() < 0.51 + slack_px
+        assert within[clear[:, k]].min() > -1.01 - slack_px
     if made.truth is not None:
         centers = [points.mean(axis=0) for points in corners]
         sizes = [np.ptp(points, axis=0) for points in corners]
@@ -101,10 +101,10 @@ def test_blenderproc_knows_classes_by_its_own_table_and_hides_other_rooms(room, 
     assert (made.views.instance_ids[0][chair] == void).all()
 
 
-@pytest.mark.parametrize("lens_shift", [0.0, 0.25])
-def test_hypersim_has_asset_units_and_tilted_image_planes(room, tmp_path, lens_shift):
+@pytest.mark.parametrize("shifts", [(0.0, 0.0), (0.25, 0.0), (-0.2, 0.3)])
+def test_hypersim_has_asset_units_and_tilted_image_planes(room, tmp_path, shifts):
     room.focal_px = 75.0
-    write_hypersim(tmp_path / "scenes", "ai_001_002", room, cam_from_uv(room, lens_shift))
+    write_hypersim(tmp_path / "scenes", "ai_001_002", room, cam_from_uv(room, *shifts))
     (made,) = prepared("hypersim", tmp_path / "scenes", max_side=None).values()
     assert made.views.room_id == "ai_001_002" and len(made.views.visible) == 4
     assert classes_of(made.views, NAMES) == ["bed", "chair"]
@@ -113,7 +113,8 @@ def test_hypersim_has_asset_units_and_tilted_image_planes(room, tmp_path, lens_s
         "classes outside the label set are void: pillow (1)",
     )
     # (x, y, z) -> (y, z, x); the origin is below the middle of bed and chair.
-    check(made, room, (1, 2, 0), (0.05, 0, 0.2))
+    # With both shifts the grid is skewed; straightening moves pixels by up to half of one.
+    check(made, room, (1, 2, 0), (0.05, 0, 0.2), slack_px=0.5 * all(shifts))
     assert made.truth.height_m == pytest.approx(2.5)
 
 
