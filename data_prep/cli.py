@@ -16,7 +16,15 @@ if TYPE_CHECKING:
 
 def add_commands(app: typer.Typer) -> None:
     """Mount the prep-* commands, inspect and make-homes."""
-    for command in (make_homes, prep_front, recipe, prep_scannet, prep_posed, inspect):
+    for command in (
+        make_homes,
+        prep_front,
+        recipe,
+        prep_scannet,
+        prep_posed,
+        prep_dataset,
+        inspect,
+    ):
         app.command()(command)
 
 
@@ -225,6 +233,49 @@ def prep_posed(
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
     run_job(Job(source, out, workers, "auto"))
+
+
+def prep_dataset(
+    name: Annotated[str, typer.Argument(help="blenderproc, hypersim, structured3d or scannetpp.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of its scenes (docs/public_data.md).")],
+    out: OutOption,
+    recipe: Annotated[
+        str | None,
+        typer.Option(
+            help="For blenderproc: a recipe of prep-front, its room types and classes "
+            "(default: bedroom)."
+        ),
+    ] = None,
+    splits: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV with rows `room or scene,split` (default: the data set's own for "
+            "structured3d, else a random 9:1 split of scenes)."
+        ),
+    ] = None,
+    max_side: Annotated[int, typer.Option(help="Longest side of stored masks in pixels.")] = 480,
+    max_views: Annotated[
+        int, typer.Option(help="Largest number of views per room; others are thinned out.")
+    ] = 100,
+    seed: SeedOption = 0,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    only: Annotated[
+        str | None, typer.Option(help="One scene or room only: SCENE, SCENE/ROOM or a room id.")
+    ] = None,
+    strict: StrictOption = False,
+    retry_failed: RetryOption = False,
+) -> None:
+    """Turn a public data set into view shards (docs/public_data.md).
+
+    Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
+    """
+    from data_prep.engine.build import Job
+    from data_prep.public.source import PublicSource, open_reader
+
+    reader = open_reader(name, folder, recipe)
+    source = PublicSource(reader, splits, max_side, max_views, seed, only)
+    run_job(Job(source, out, workers, scheduler, "auto", strict, retry_failed))
 
 
 def inspect(

@@ -2,12 +2,11 @@
 
 import numpy as np
 
-from data_prep.frames import is_pose, room_cameras
+from data_prep.frames import GL_TO_CV, is_pose, room_cameras
 from data_prep.posed.recording import Recording
 from sceneprior.core.errors import InputError
 
 UP = ("auto", "z", "y", "cameras")
-_GL_TO_CV = np.diag([1.0, -1, -1, 1])
 _Y_UP = {
     "y": np.eye(4),
     # (x, y, z) with z up -> (x, z, -y); stays right-handed.
@@ -42,7 +41,7 @@ def upright_cameras(
             f"{recording.path}: its cameras are spread over {spread:.0f} m; is "
             "metres_per_unit wrong?"
         )
-    return upright @ _GL_TO_CV, turn
+    return upright @ GL_TO_CV, turn
 
 
 def _turn_of_cameras(recording: Recording, poses: np.ndarray) -> np.ndarray:

@@ -1,12 +1,11 @@
 """Source for folders of posed pictures; a folder with poses and masks is a room."""
 
-from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
 from data_prep.engine.plan import digest, digest_of_files
-from data_prep.engine.selection import house_may_match, seeded_split, select
+from data_prep.engine.selection import house_may_match, of_one_size, seeded_split, select
 from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey, sentence_of
 from data_prep.engine.workers import Run
 from data_prep.posed.cameras import seems_up
@@ -85,16 +84,8 @@ class PosedSource:
                 left_out.append(Line(name, name, "failed", reason=found))
             else:
                 sizes[name] = found
-        # Batches hold images of several rooms, so all must have one size.
-        usual = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
-        for name, size in sizes.items():
-            if size != usual:
-                why = (
-                    f"its views are {size[1]} x {size[0]} pixels, those of most rooms {usual[1]} x "
-                    f"{usual[0]}, and all shards of a folder need one size; prepare it separately"
-                )
-                left_out.append(Line(name, name, "filtered", "image_size", why))
-        names = [name for name, size in sizes.items() if size == usual]
+        names, others = of_one_size(sizes)
+        left_out += others
         split_of = seeded_split(names, self.seed, self.test_share)
         tasks = tuple(RoomTask(name, name, split_of[name]) for name in names)
         survey = Survey(tasks, tuple(left_out))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_prep.engine.source import PreparedRoom
-from data_prep.frames import choose_frames, first_fault, room_cameras
+from data_prep.frames import choose_frames, first_fault, room_cameras, shrunk
 from data_prep.posed.cameras import UP, cameras_in_room, upright_cameras
 from data_prep.posed.floor import find_floor
 from data_prep.posed.mask_format import MaskFormat
@@ -75,9 +75,7 @@ def stored_size(
     recording: Recording, masks: MaskFormat, settings: PosedSettings
 ) -> tuple[int, int]:
     """Size, (height, width), at which a room is stored: its masks', limited by `max_side`."""
-    height, width = masks.size(usable_frames(recording, masks)[0])
-    shrink = 1.0 if settings.max_side is None else min(1, settings.max_side / max(height, width))
-    return max(1, round(height * shrink)), max(1, round(width * shrink))
+    return shrunk(masks.size(usable_frames(recording, masks)[0]), settings.max_side)
 
 
 def prepare_posed(
