@@ -28,6 +28,7 @@ from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
 from data_prep.inspection.pictures import draw_view
+from sceneprior.apps.viewer.latent_map import make_map
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.data.dataset import FlatViews
 from sceneprior.core.geometry.cameras import project
@@ -100,18 +101,15 @@ def draw_latent_space(prior: TrainedPrior, path: Path) -> None:
     """Anchors and training rooms on the map, one room's weights, and what it decodes to."""
     space = prior.prior.latent_space
     assert isinstance(space, LatentSphere)
-    z = space(prior.logits)
-    *_, directions = torch.linalg.svd(z - z.mean(dim=0), full_matrices=False)
-    largest = directions[:2].abs().argmax(dim=1, keepdim=True)
-    axes = directions[:2] * directions.gather(1, largest).sign()  # the signs are arbitrary
-    row, rooms = prior.room_ids.index(ROOM), z @ axes.T
-    weights, anchors = prior.logits[row].softmax(dim=-1), space.anchors @ axes.T
-    x, y = rooms[row].tolist()
+    latent_map = make_map(space, space(prior.logits))
+    row = prior.room_ids.index(ROOM)
+    weights, anchors = prior.logits[row].softmax(dim=-1), latent_map.place(space.anchors)
+    x, y = latent_map.rooms[row].tolist()
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.8, 3.9), layout="constrained")
     for weight, (u, v) in zip(weights.tolist(), anchors.tolist(), strict=True):
         left.plot((x, u), (y, v), "tab:red", linewidth=25 * weight)
     left.scatter(*anchors.T, s=18, c="0.55", marker="^", label="anchors, fixed")
-    left.scatter(*rooms.T, s=12, c="tab:blue", label="training rooms")
+    left.scatter(*latent_map.rooms.T, s=12, c="tab:blue", label="training rooms")
     left.scatter(x, y, s=130, c="tab:red", marker="*", zorder=3, label="a room; lines: its weights")
     left.legend(fontsize=7)
     left.set(aspect="equal", xticks=[], yticks=[], title="two directions of the sphere")

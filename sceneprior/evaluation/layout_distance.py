@@ -93,8 +93,16 @@ def nearest_distances(
         if as_copies:
             allowed &= rooms.hold_the_same(scene)
         if allowed.any():
-            nearest[row] = rooms.nearest(scene, allowed, as_copies)
+            nearest[row] = rooms.nearest(scene, allowed, as_copies)[1]
     return nearest
+
+
+def nearest_room(scene: Scene, training: Sequence[Scene]) -> tuple[int, float]:
+    """Index of the training room nearest to a scene, and its distance as in `nearest_distances`.
+
+    `training` must not be empty.
+    """
+    return _Rooms(training).nearest(scene, np.ones(len(training), dtype=bool))
 
 
 class _Rooms:
@@ -119,9 +127,9 @@ class _Rooms:
 
     def nearest(
         self, scene: Scene, allowed: Bool[np.ndarray, " rooms"], as_copies: bool = False
-    ) -> float:
-        """Distance of the nearest allowed room; at least one must be allowed."""
-        best, placed = np.inf, _rows(scene)
+    ) -> tuple[int, float]:
+        """Index and distance of the nearest allowed room; at least one must be allowed."""
+        best, found, placed = np.inf, 0, _rows(scene)
         smaller = np.minimum(self.counts, len(placed))
         larger = np.maximum(self.counts, len(placed))
         # distance = (total cost - free) / number; as copies, the unpaired object is free.
@@ -137,8 +145,10 @@ class _Rooms:
                     break
                 start = self.starts[room]
                 total = _total(costs[:, start : start + self.counts[room]])
-                best = min(best, float((total - free[room]) / number[room]))
-        return float(best)
+                distance = float((total - free[room]) / number[room])
+                if distance < best:
+                    best, found = distance, int(room)
+        return found, float(best)
 
 
 def _turned(rows: np.ndarray, turn: np.ndarray) -> np.ndarray:

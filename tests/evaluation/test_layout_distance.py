@@ -81,6 +81,16 @@ def eight(scene: Scene) -> list[Scene]:
     return found
 
 
+def test_the_nearest_room_is_found_among_all_turned_or_mirrored(rng):
+    # The last is empty: it has no object to start at.
+    training = [*(random_room(rng) for _ in range(30)), room()]
+    scenes = [*(random_room(rng, 6) for _ in range(15)), room()]
+    got = nearest_distances(scenes, training)
+    for scene, distance in zip(scenes, got, strict=True):
+        expected = min(by_all_pairings(turn, other) for turn in eight(scene) for other in training)
+        assert distance == pytest.approx(expected, abs=1e-9)
+
+
 def named(scenes: list[Scene]) -> list[Scene]:
     return [replace(scene, name=f"room_{row}") for row, scene in enumerate(scenes)]
 

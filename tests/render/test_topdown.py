@@ -1,5 +1,6 @@
 """Scale, position and colours of top-down pictures."""
 
+
 import numpy as np
 import pytest
 

@@ -41,7 +41,7 @@ def view(
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
     cache: CacheOption = None,
 ) -> None:
-    """View rooms in the browser, request new ones, and complete them.
+    """View rooms in the browser, request new ones, and explore the latent space of a run.
 
     Ctrl-C ends it. The page begins with the request of the options, and with walls unless --shell
     says otherwise.
@@ -75,6 +75,8 @@ def view(
         with serving(host, port) as server:
             Page(server, source, folder.name, bank, with_floor_of_file(asked), drawn)
             typer.echo(f"Open http://localhost:{port} in a browser. Ctrl-C ends it.")
+            if isinstance(source, Explorer):
+                threading.Thread(target=source.find_meshes, args=(stop,)).start()
             stop.wait()
     except KeyboardInterrupt:
         typer.echo("\nStopped: the page is closed.")

@@ -1,17 +1,37 @@
 """The viewer's logic without its page: rooms of a prior, or of a folder."""
 
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from sceneprior.apps.api import Prior
+from sceneprior.apps.viewer.latent_map import LatentMap, make_map
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
+from sceneprior.evaluation.layout_distance import nearest_room
 from sceneprior.evaluation.metrics.contents import common_label_set
+from sceneprior.lifted.looks import LookDecoder
 from sceneprior.lifted.trained import SAMPLER, TrainedLifted
-from sceneprior.paper.sampling import DISTRIBUTIONS
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.decode import decode_latents, to_rooms
+from sceneprior.paper.interpolate import path_latents
+from sceneprior.paper.sampling import DISTRIBUTIONS, named_latent
+from sceneprior.paper.trained import TrainedPrior, with_training_latents
+
+PATH_STEPS = 49
+"""Number of rooms of a path with both ends; neighbours are rarely more than 4 degrees apart."""
+SOME = 64
+"""Largest number of training rooms for estimating room sizes; decoding all would take a second."""
+HERE = "here"
+"""Name of the shown room as an end of a path."""
+
 
 NOTHING_ASKED: Mapping[str, Any] = MappingProxyType({})
 
@@ -47,6 +67,10 @@ class Folder:
         """The label set of all scenes; several are an InputError."""
         return common_label_set(self.scenes)
 
+    def some_layouts(self) -> tuple[Scene, ...]:
+        """The scenes from which the size of rooms is estimated: all scenes of the folder."""
+        return self.scenes
+
     def room(self, row: int) -> Shown:
         """The scene at an index."""
         scene = self.scenes[row]
@@ -54,16 +78,29 @@ class Folder:
 
 
 class Explorer:
-    """Rooms of a trained prior: sampled, or completed."""
+    """Rooms of a trained prior: sampled, at a map point, along a path, or completed."""
 
     def __init__(self, prior: Prior):
         self.prior = prior
         self.label_set = prior.label_set
+        self.map: LatentMap | None = None
+        self.without_map = ""
+        """The reason if there is no map, else empty."""
+        try:
+            self.map = make_map(prior.with_latents.prior.latent_space, self._training_z)
+        except InputError as error:
+            self.without_map = str(error)
+        self.path: Float[Tensor, "steps dimension"] | None = None
 
     @property
     def has_latents(self) -> bool:
-        """True if rooms are decoded from latents, as completion needs."""
+        """True if rooms are decoded from latents, as paths and completion need."""
         return isinstance(self.prior.trained, TrainedPrior)
+
+    @cached_property
+    def _training_z(self) -> Float[Tensor, "rooms dimension"]:
+        trained = with_training_latents(self.prior.with_latents, "The map")
+        return trained.prior.latent_space(trained.logits)
 
     @property
     def distributions(self) -> tuple[str, ...]:
@@ -105,6 +142,46 @@ class Explorer:
         scene = self.prior.sample(1, seed, distribution, **asked)[0]
         return Shown(scene, f"seed {seed}, from: {origin}{', as requested' if asked else ''}")
 
+    def training_room(self, row: int) -> Shown:
+        """A training room as the prior decodes it."""
+        room_id = self.prior.trained.room_ids[row]
+        return self._decoded(self._training_z[row], room_id, f"training room {room_id}, decoded")
+
+    def at(self, shown: Shown, point: tuple[float, float], click: bool = False) -> Shown:
+        """The room at a map point, which keeps the shown room's other latent coordinates.
+
+        A click on a training room's dot gives that room.
+        """
+        assert self.map is not None, "there is a map to point at"
+        if click and (row := self.map.room_at(point)) is not None:
+            return self.training_room(row)
+        latent = shown.scene.latent
+        start = self._training_z[0] if latent is None else self.prior.latent(latent)
+        z = self.map.moved(start, point)
+        x, y = self.map.place(z.unsqueeze(0))[0].tolist()
+        return self._decoded(z, "from_the_map", f"map {x:+.3f}, {y:+.3f}")
+
+    def draw_path(self, shown: Shown, start: str, end: str) -> Float[Tensor, "steps dimension"]:
+        """Set the path of `step`, and return its latents from start to end.
+
+        An end is a training room's id, `paper:7` (New room's seed 7 from `paper`) or `HERE`. Files
+        are not accepted, since the text comes from a browser, which may run on another machine.
+        """
+        ends = [
+            self.prior.latent(shown.scene)
+            if text.strip() == HERE
+            else named_latent(self.prior.with_latents, text.strip(), f"{HERE}, the shown room")
+            for text in (start, end)
+        ]
+        self.path = path_latents(self.prior.with_latents, ends[0], ends[1], PATH_STEPS)
+        return self.path
+
+    def step(self, number: int) -> Shown:
+        """The room at a step of the path, counted from 0."""
+        assert self.path is not None, "a path is drawn first"
+        name = f"step_{number:02d}"
+        return self._decoded(self.path[number], name, f"path, step {number} of {PATH_STEPS - 1}")
+
     def complete(self, shown: Shown, seed: int, want: str = "") -> Shown:
         """Keep the kept objects, and complete the room around them, with wishes if there are any.
 
@@ -113,3 +190,55 @@ class Explorer:
         room = self.prior.complete(shown.given(), 1, seed, want=want or None)[0]
         kept = frozenset(range(len(shown.kept)))
         return Shown(room, f"completed around {len(kept)} kept objects, seed {seed}", kept)
+
+    def nearest(self, scene: Scene) -> tuple[Shown, float]:
+        """The decoded training room with the nearest layout, and its `layout_distance` (metres)."""
+        row, distance_m = nearest_room(scene, self._layouts)
+        return self.training_room(row), distance_m
+
+    @cached_property
+    def _layouts(self) -> list[Scene]:
+        return self._boxes_of(range(len(self._training_z)))
+
+    def _boxes_of(self, rows: Sequence[int]) -> list[Scene]:
+        """Training rooms as the prior decodes them, without shapes."""
+        trained = self.prior.with_latents
+        with torch.no_grad():
+            decoded = trained.prior.decode(self._training_z[list(rows)], with_shape=False)
+        names = [trained.room_ids[row] for row in rows]
+        target = trained.config.model.completeness_target
+        rooms = to_rooms(decoded, trained.prior, self.label_set, names, target)
+        return [room.scene for room in rooms]
+
+    def some_layouts(self) -> list[Scene]:
+        """Rooms without shapes, from which the size of rooms is estimated."""
+        if self.map is not None:
+            most = len(self._training_z)
+            return self._boxes_of(range(0, most, -(-most // SOME)))
+        return self.prior.sample(16, 0, next(iter(self.distributions), None))
+
+    def find_meshes(self, stop: threading.Event) -> None:
+        """Extract the meshes of all shape prototypes in advance, so that no room has to wait."""
+        trained = self.prior.trained
+        if isinstance(trained, TrainedPrior) and isinstance(trained.prior.shape, LookDecoder):
+            for prototype in trained.prior.shape.known:
+                if stop.is_set():
+                    return
+                trained.prior.shape.surface(prototype)
+
+    def _decoded(self, z: Float[Tensor, " dimension"], name: str, origin: str) -> Shown:
+        rooms = decode_latents(self.prior.with_latents, z.unsqueeze(0), [name])
+        return Shown(rooms[0], origin)
+
+
+def floor_side_m(scenes: Sequence[Scene]) -> float:
+    """Side of a square floor around the origin that holds the furniture of most rooms.
+
+    It is the 80% quantile over rooms, rounded up to whole metres, at least 4.
+    """
+    reach = [
+        np.abs(scene.centers_m[:, [0, 2]]).max() + scene.sizes_m[:, [0, 2]].max() / 2
+        for scene in scenes
+        if scene.objects
+    ]
+    return max(4.0, float(np.ceil(2 * np.quantile(reach, 0.8)))) if reach else 4.0

@@ -12,7 +12,9 @@ FOV_RAD = 0.75
 ASPECT = 1.3
 """Width of a window by its height, as long as no browser has told its own."""
 CORNER = np.array([-0.42, -0.62, -0.66])
-"""Viewing direction onto a room, as in the pictures of rooms."""
+"""Viewing direction onto a room alone, as in the pictures of rooms."""
+FRONT = np.array([0.0, -0.6, -0.8])
+"""Viewing direction onto a room beside the map, which faces it."""
 DOWN = np.array([0.0, -1.0, -0.01])
 """Viewing direction onto a plan; straight down would leave open which side is up."""
 MARGIN = 0.92

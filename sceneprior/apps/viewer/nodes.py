@@ -18,8 +18,6 @@ _BOX, _KEPT = (120, 120, 120), (230, 120, 20)
 _SAME = 1e-4
 """Largest difference of vertices, relative to the box, up to which meshes count as equal."""
 _EDGES = np.array(BOX_EDGES)
-GRID_M = 10.0
-"""Side of the grid under a room whose floor is not shown."""
 
 
 def name_and_size(item: SceneObject) -> str:
@@ -43,18 +41,25 @@ class _Node:
 class RoomNodes:
     """The nodes of one room, updated in place: only changes are sent to browsers.
 
-    `clicked` is called with the index of the clicked object.
+    The nodes' names begin with `root`; `clicked` is called with the index of the clicked object.
     """
 
-    def __init__(self, server: "viser.ViserServer", clicked: Callable[[int], None]):
-        self._scene, self._clicked = server.scene, clicked
+    def __init__(
+        self,
+        server: "viser.ViserServer",
+        root: str,
+        x_m: float,
+        floor_m: float,
+        clicked: Callable[[int], None] | None = None,
+    ):
+        self._scene, self._root, self._clicked = server.scene, root, clicked
         self._nodes: list[_Node] = []
         self._labels: list[Any] = []
         self._lines: Any = None
-        self.frame = self._scene.add_frame("/room", show_axes=False)
+        self.frame = self._scene.add_frame(root, show_axes=False, position=(x_m, 0.0, 0.0))
         self._walls: list[Any] = []
         self._grid = self._scene.add_grid(
-            "/room/grid", GRID_M, GRID_M, plane="xz", position=(0.0, -0.005, 0.0),
+            f"{root}/grid", floor_m, floor_m, plane="xz", position=(0.0, -0.005, 0.0),
             plane_color=(236, 233, 226), plane_opacity=1.0, cell_color=(222, 218, 208),
             section_color=(196, 190, 178),
         )  # fmt: skip
@@ -91,10 +96,12 @@ class RoomNodes:
             old.handle.position, old.handle.scale = center, tuple(size.tolist())
             return
         handle = self._scene.add_mesh_simple(
-            f"/room/object_{row}", unit, mesh.faces, color=color, flat_shading=True,
+            f"{self._root}/object_{row}", unit, mesh.faces, color=color, flat_shading=True,
             side="double", position=center, scale=tuple(size.tolist()),
         )  # fmt: skip
-        handle.on_click(lambda _: self._clicked(row))
+        if self._clicked is not None:
+            clicked = self._clicked
+            handle.on_click(lambda _: clicked(row))
         self._nodes[row : row + 1] = [_Node(handle, unit, mesh.faces, color)]
 
     def _show_shell(self, meshes: Mapping[str, Mesh]) -> None:
@@ -103,7 +110,7 @@ class RoomNodes:
             node.remove()
         self._walls = [
             self._scene.add_mesh_simple(
-                f"/room/{name}", mesh.vertices_m, mesh.faces,
+                f"{self._root}/{name}", mesh.vertices_m, mesh.faces,
                 color=tuple(shell_color(name).tolist()),
                 flat_shading=True, side="front", cast_shadow=False,
             )
@@ -119,7 +126,7 @@ class RoomNodes:
             else:
                 self._labels.append(
                     self._scene.add_label(
-                        f"/room/name_{row}", name_and_size(item), position=top,
+                        f"{self._root}/name_{row}", name_and_size(item), position=top,
                         anchor="bottom-center",
                     )
                 )  # fmt: skip
@@ -136,7 +143,7 @@ class RoomNodes:
             corners = box_corners(scene.centers_m[drawn], scene.sizes_m[drawn])
             colors = np.array([_KEPT if row in kept else _BOX for row in drawn], dtype=np.uint8)
             self._lines = self._scene.add_line_segments(
-                "/room/boxes", corners[:, _EDGES].reshape(-1, 2, 3),
+                f"{self._root}/boxes", corners[:, _EDGES].reshape(-1, 2, 3),
                 np.repeat(colors, 2 * len(_EDGES), axis=0).reshape(-1, 2, 3), thickness=2,
                 thickness_units="screen",
             )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The viewer's page: a room, its cameras, and the requests of browsers."""
+"""The viewer's page: a room, the map to its left, the nearest training room to its right."""
 
 import threading
 import traceback
@@ -12,12 +12,14 @@ from jaxtyping import Float
 from sceneprior.apps.retrieval.cad_models import CadModels
 from sceneprior.apps.retrieval.made_models import made_models
 from sceneprior.apps.retrieval.retrieve import retrieve
-from sceneprior.apps.viewer.explorer import NOTHING_ASKED, Explorer, Folder, Shown
+from sceneprior.apps.viewer.board import Board, BoardPlane, Point
+from sceneprior.apps.viewer.explorer import NOTHING_ASKED, Explorer, Folder, Shown, floor_side_m
 from sceneprior.apps.viewer.framing import (
     ASPECT,
     CORNER,
     DOWN,
     FOV_RAD,
+    FRONT,
     box_points,
     framed,
     room_bounds,
@@ -27,11 +29,14 @@ from sceneprior.apps.viewer.nodes import RoomNodes
 from sceneprior.apps.viewer.panel import MODELS, Panel
 from sceneprior.apps.viewer.plan import Plan
 from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Scene
 from sceneprior.core.shell import ShellName, shell_of
 
 if TYPE_CHECKING:
     import viser
 
+GAP = 0.06
+"""Gap between the room and its neighbours, relative to the width of the room's floor."""
 AROUND_PLAN_M = 1.0
 """Floor shown around a plan that is being drawn."""
 SMALL = 0.55
@@ -57,6 +62,7 @@ class Page:
         shell: ShellName = "walls",
     ):
         self.server, self.source, self.models = server, source, models or made_models()
+        self.explorer = source if isinstance(source, Explorer) else None
         self.shown = source.room(0) if isinstance(source, Folder) else source.sample(0, None, asked)
         self.scene = self.shown.scene
         """The displayed scene: the scene of `shown`, with CAD models if they are chosen."""
@@ -64,7 +70,18 @@ class Page:
         self._lock = threading.RLock()
         self._newest: Callable[[], None] | None = None
         self._follower = ThreadPoolExecutor(1)
-        self._room = RoomNodes(server, self._clicked)
+        self._floor_m = floor_m = floor_side_m(source.some_layouts())
+        self._room = RoomNodes(server, "/room", 0.0, floor_m, self._clicked)
+        self._beside_m = floor_m * (1 + GAP)
+        self._beside = RoomNodes(server, "/nearest", self._beside_m, floor_m)
+        self._beside.frame.visible = False
+        self.board: Board | None = None
+        """The map's board; None if the source has no map."""
+        if self.explorer is not None and self.explorer.map is not None:
+            side = 0.85 * floor_m
+            center = (-floor_m / 2 - GAP * floor_m - side / 2, 0.4 * side, -0.1 * floor_m)
+            plane = BoardPlane(self.explorer.map, center, side)
+            self.board = Board(server, plane, self._pointed)
         self._bounds_m = np.zeros((2, 3))
         """Lowest and highest corner of the room when it was framed."""
         self._eyes: dict[int, np.ndarray] = {}
@@ -78,28 +95,36 @@ class Page:
         self.show(self.shown)
         server.on_client_connect(self._connected)
 
-    def show(self, shown: Shown) -> None:
-        """Show a room."""
+    def show(self, shown: Shown, settled: bool = True) -> None:
+        """Show a room; slow updates are skipped during a drag, when it is not `settled`."""
         with self._lock:
             panel = self.panel
             self.shown = shown
             self.scene = shown.scene
-            if panel.furniture.value == MODELS:
+            if settled and panel.furniture.value == MODELS:
                 self.scene = retrieve(shown.scene, self.models)
             with self.server.atomic():
                 self._room.show(
                     self.scene, shown.kept, panel.names.value, panel.boxes.value, panel.shell.value
                 )
+                if self.board is not None:
+                    self.board.mark(shown.scene.latent)
                 panel.describe(shown, self.scene)
-            if self._is_framed_badly():
+            if settled and panel.nearest is not None:
+                self._show_nearest(self.scene if panel.nearest.value else None)
+            if settled and self._is_framed_badly():
                 self.frame()
 
     def draw(self, plan: Plan | None) -> None:
         """Show a plan to draw on, from above, in place of the room; None shows the room again."""
         self._room.frame.visible = plan is None
+        if self.board is not None:
+            self.board.frame.visible = plan is None
         if plan is None:
+            self._beside.frame.visible = self.panel.nearest is not None and self.panel.nearest.value
             self.frame(True)
         else:
+            self._beside.frame.visible = False
             self._look(self._plan_points(plan), DOWN)
 
     # -- Cameras -----------------------------------------------------------------------------------
@@ -111,12 +136,16 @@ class Page:
             turned: Look in the page's own direction, not in that of each camera.
         """
         self._bounds_m = self._room_bounds()
-        self._look(box_points(self._bounds_m), CORNER if turned else None)
+        self._look(self._points(), self._direction if turned else None)
+
+    @property
+    def _direction(self) -> Float[np.ndarray, "3"]:
+        return CORNER if self.board is None else FRONT
 
     def _look(
         self, points_m: Float[np.ndarray, "points 3"], forward: Float[np.ndarray, "3"] | None
     ) -> None:
-        eye, target = framed(points_m, CORNER, FOV_RAD, ASPECT)
+        eye, target = framed(points_m, self._direction, FOV_RAD, ASPECT)
         self.server.initial_camera.position = eye
         self.server.initial_camera.look_at = target
         for client in self.server.get_clients().values():
@@ -132,7 +161,7 @@ class Page:
         if forward is None:
             forward = viewing_direction(np.asarray(camera.wxyz))
             if abs(forward[1]) > 0.99:
-                forward = CORNER
+                forward = self._direction
         eye, target = framed(points_m, forward, camera.fov, camera.aspect)
         self._eyes[client.client_id] = eye
         with client.atomic():
@@ -150,15 +179,26 @@ class Page:
             ):
                 aspect = camera.aspect
                 plan = self.panel.plan
-                if plan is None:
-                    self._place(client, box_points(self._room_bounds()), CORNER)
-                else:
-                    self._place(client, self._plan_points(plan), DOWN)
+                points_m = self._points() if plan is None else self._plan_points(plan)
+                self._place(client, points_m, DOWN if plan is not None else self._direction)
             else:
                 aspect = camera.aspect
 
         update(client.camera)
         client.camera.on_update(update)
+
+    def _points(self) -> Float[np.ndarray, "points 3"]:
+        """What the cameras hold: the room, the map, and the nearest training room if shown."""
+        points = [box_points(self._room_bounds())]
+        half = self._floor_m / 2
+        if self.board is not None:
+            points.append(self.board.plane.corners_m())
+            points.append(np.array([[x, 0.0, z] for x in (-half, half) for z in (-half, half)]))
+        if self._beside.frame.visible:
+            beside = [[self._beside_m + x, y, z] for x in (-half, half) for z in (-half, half)
+                      for y in (0.0, 2.0)]  # fmt: skip
+            points.append(np.array(beside))
+        return np.concatenate(points)
 
     def _plan_points(self, plan: Plan) -> Float[np.ndarray, "points 3"]:
         low, high = plan.outline_m.min(axis=0), plan.outline_m.max(axis=0)
@@ -176,12 +216,33 @@ class Page:
 
     # -- Events ------------------------------------------------------------------------------------
 
+    def _show_nearest(self, scene: Scene | None) -> None:
+        assert self.explorer is not None
+        changed = self._beside.frame.visible != (scene is not None)
+        self._beside.frame.visible = scene is not None
+        room, distance_m = (None, 0.0) if scene is None else self.explorer.nearest(scene)
+        self.panel.describe_nearest(room, distance_m)
+        if room is not None:
+            panel = self.panel
+            self._beside.show(
+                room.scene, (), panel.names.value, panel.boxes.value, panel.shell.value
+            )
+        if changed:
+            self.frame()
+
     def _clicked(self, item: int) -> None:
         def keep() -> None:
             if item < len(self.shown.scene.objects):
                 self.show(self.shown.toggled(item))
 
         self.safely(keep)
+
+    def _pointed(self, point: Point, how: str) -> None:
+        explorer = self.explorer
+        assert explorer is not None, "only a prior has a map"
+        self.follow(
+            lambda: self.show(explorer.at(self.shown, point, how == "click"), how != "drag")
+        )
 
     def follow(self, task: Callable[[], None]) -> None:
         """Queue a task, replacing one that has not started, so that the room keeps up with the

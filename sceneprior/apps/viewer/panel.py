@@ -1,11 +1,11 @@
-"""The panel of the page: new rooms and requests, completion, what is shown, downloads."""
+"""The panel of the page: new rooms and requests, paths, completion, what is shown, downloads."""
 
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from sceneprior.apps.viewer.asking import RequestFields
 from sceneprior.apps.viewer.downloads import FORMATS, download
-from sceneprior.apps.viewer.explorer import Explorer, Folder, Shown
+from sceneprior.apps.viewer.explorer import HERE, PATH_STEPS, Explorer, Folder, Shown
 from sceneprior.apps.viewer.plan import Plan
 from sceneprior.apps.viewer.words import error_words, html, room_words, wish_words
 from sceneprior.core.errors import InputError
@@ -34,8 +34,12 @@ class Panel:
             self._add_sampling(source, asked)
         self._add_show(shell)
         self._add_download()
-        if isinstance(source, Explorer) and source.has_latents:
-            self._add_completion(source)
+        if isinstance(source, Explorer):
+            if source.has_latents:
+                self._add_completion(source)
+            self._add_map(source)
+            if source.has_latents:
+                self._add_path(source)
 
     @property
     def plan(self) -> Plan | None:
@@ -47,6 +51,11 @@ class Panel:
         self._said.content = html(room_words(shown, scene))
         if self._answer is not None:
             self._answer.content = html(wish_words(scene))
+
+    def describe_nearest(self, room: Shown | None, distance_m: float) -> None:
+        """Describe the nearest training room; None if it is not shown."""
+        told = "" if room is None else f"Right: {room.origin}; {distance_m:.2f} m away in layout."
+        self._nearest_said.content = html(told) if told else ""
 
     def _add_folder(self, folder: Folder) -> None:
         names = [scene.name for scene in folder.scenes]
@@ -98,6 +107,42 @@ class Panel:
             raise
         self._page.show(shown)
 
+    def _add_map(self, explorer: Explorer) -> None:
+        if explorer.map is None:
+            self._gui.add_html(html(explorer.without_map))
+            return
+        self._gui.add_markdown(
+            "**Map**: drag over the board, or click a dot, which is a training room. The map shows "
+            "the two directions in which the training rooms' latents differ most "
+            f"({explorer.map.share:.0%} of the variance); all other coordinates stay."
+        )
+
+    def _add_path(self, explorer: Explorer) -> None:
+        gui, page = self._gui, self._page
+        with gui.add_folder("Path", expand_by_default=False):
+            hint = f"A training room's id, {HERE}, or paper:7 (New room's seed 7 from paper)"
+            start = gui.add_text("From", "paper:1", hint=hint)
+            end = gui.add_text("To", "paper:2", hint=hint)
+            step: Any = gui.add_slider(
+                "Step", min=0, max=PATH_STEPS - 1, step=1, initial_value=0, disabled=True
+            )
+
+            def draw() -> None:
+                z = explorer.draw_path(page.shown, start.value, end.value)
+                if page.board is not None:
+                    page.board.draw_path(z)
+                step.disabled = False
+                step.value = 0
+                page.show(explorer.step(0))
+
+            def walk() -> None:
+                settled = step.value in (0, PATH_STEPS - 1)
+                if explorer.path is not None:
+                    page.show(explorer.step(step.value), settled)
+
+            step.on_update(lambda _: page.follow(walk))
+            self._buttons({"Draw path": draw})
+
     def _add_completion(self, explorer: Explorer) -> None:
         gui, page = self._gui, self._page
         with gui.add_folder("Complete"):
@@ -126,6 +171,10 @@ class Panel:
             self.boxes = self._box("Boxes", False)
             self.furniture: Any = gui.add_dropdown("Furniture", FURNITURE, initial_value=DECODED)
             self.furniture.on_update(lambda _: page.safely(lambda: page.show(page.shown)))
+            self.nearest: Any = None
+            if page.board is not None:
+                self.nearest = self._box("Nearest training room", False)
+                self._nearest_said = gui.add_html("")
             self._buttons({"Whole room in view": lambda: page.frame(True)})
 
     def _box(self, name: str, value: bool) -> Any:

@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+import torch
 from browser import picture, wait_for
 
 import sceneprior
@@ -31,6 +32,12 @@ def on_screen(page, point_m) -> tuple[float, float]:
     )
 
 
+def canvas(browser) -> np.ndarray:
+    """What is drawn left of the panel."""
+    shown = picture(browser.get_screenshot_as_png)
+    return np.asarray(shown.crop((0, 0, int(0.65 * shown.width), shown.height))).astype(int)
+
+
 def click(browser, text: str) -> None:
     browser.find_element("xpath", f"//*[text()='{text}']").click()
 
@@ -53,6 +60,51 @@ def page(browser, toy_run):
         browser.get("about:blank")
 
 
+def test_the_room_follows_the_pointer(browser, page, monkeypatch):
+    from selenium.webdriver import ActionChains
+
+    assert "seed 0, from: paper" in words(browser)
+    wait_for(lambda: len(np.unique(canvas(browser) // 32)) > 4, "nothing is drawn")
+    # viser warns that WebGL is drawn in software, right over the board.
+    close = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(x => x.click())"
+    browser.execute_script(close)
+    before = canvas(browser)
+    latent_map = page.board.plane.latent_map
+    places = [
+        (latent_map.middle[0] + t * latent_map.side, latent_map.middle[1] - t * latent_map.side)
+        for t in np.linspace(-0.3, 0.3, 7)
+    ]
+    shown = []
+    show = page.show
+
+    def noted(room, settled=True):
+        show(room, settled)
+        shown.append((room, settled))
+
+    monkeypatch.setattr(page, "show", noted)
+    points = [on_screen(page, point) for point in page.board.plane.in_scene(torch.tensor(places))]
+    # Step by step: of a browser that is slow to draw, a gesture at once is over before it is seen.
+    for number, (x, y) in enumerate(points):
+        mouse = ActionChains(browser, duration=50)
+        mouse.w3c_actions.pointer_action.move_to_location(int(x), int(y))
+        if number == 0:
+            mouse.w3c_actions.pointer_action.pointer_down()
+        mouse.perform()
+        time.sleep(0.1)
+    wait_for(lambda: shown, "no room followed the pointer")
+    ActionChains(browser).release().perform()
+    wait_for(lambda: shown[-1][1], "the drag did not end in a room")
+    last = shown[-1][0]
+    found = latent_map.place(torch.from_numpy(last.scene.latent)[None])[0]
+    # A pixel is 0.3% of the board; the room is where the pointer was let go.
+    np.testing.assert_allclose(found, places[-1], atol=0.02 * latent_map.side)
+    wait_for(lambda: last.origin in words(browser), "the panel does not say so")
+    wait_for(lambda: (np.abs(canvas(browser) - before).max(axis=-1) > 40).any(), "nothing moved")
+    # viser's own way of handling touches makes chromium complain, once a drag.
+    log = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    assert [said for said in log if "passive event listener" not in said] == []
+
+
 def test_objects_are_kept_by_a_click_and_the_rest_is_completed(browser, page):
     from selenium.webdriver import ActionChains
 
@@ -67,6 +119,21 @@ def test_objects_are_kept_by_a_click_and_the_rest_is_completed(browser, page):
     click(browser, "Complete the rest")
     wait_for(lambda: "completed around 1 kept objects" in words(browser), "it was not completed")
     assert page.shown.scene.objects[0].center_m == kept.center_m
+
+
+def test_what_does_not_work_is_said(browser, page):
+    click(browser, "Path")  # the folder opens
+    wait_for(lambda: "Draw path" in words(browser), "the folder stays closed")
+    end = browser.find_element("css selector", "input[value='paper:2']")
+    end.send_keys("000x")
+
+    def asked_again():
+        # The page sends what is typed at most every 50 ms: a click at once can overtake it.
+        click(browser, "Draw path")
+        time.sleep(1)
+        return "'paper:2000x' is neither" in words(browser)
+
+    wait_for(asked_again, "no sentence came")
 
 
 def drag(browser, page, start_m, end_m) -> None:

@@ -6,6 +6,7 @@ import pytest
 from sceneprior.apps.viewer.framing import (
     CORNER,
     DOWN,
+    FRONT,
     MARGIN,
     box_points,
     framed,
@@ -16,7 +17,7 @@ from sceneprior.core.shell import shell_of
 from sceneprior.render.topdown import look_at
 
 
-@pytest.mark.parametrize("forward", [CORNER, DOWN])
+@pytest.mark.parametrize("forward", [CORNER, FRONT, DOWN])
 @pytest.mark.parametrize("aspect", [0.4, 1.3, 3.0])
 def test_all_points_just_fit(forward, aspect, rng):
     points = rng.uniform([-4, 0, -2], [3, 2.6, 5], (40, 3))

@@ -42,7 +42,7 @@ def fake():
 
 @pytest.fixture
 def room(fake):
-    return RoomNodes(SimpleNamespace(scene=fake), lambda item: None)
+    return RoomNodes(SimpleNamespace(scene=fake), "/room", 0.0, 6.0, lambda item: None)
 
 
 def test_what_moves_or_grows_is_not_sent_again(room, fake):

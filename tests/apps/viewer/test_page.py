@@ -73,7 +73,7 @@ def test_a_request_is_answered_or_refused_in_the_panel(prior):
         assert "The request of the command has more: want." in fields._rest_said.content
         assert "✓ 2 nightstand" in panel._answer.content
         fields.want.value, fields.openings.value = "double_bed: 1", "door@south"
-        panel._sample(page.source, 1, None)
+        panel._sample(page.explorer, 1, None)
         assert page.shown.origin == "seed 1, from: sampler, as requested"
         assert "✓ 1 double bed" in panel._answer.content
         same = prior.sample(
@@ -84,7 +84,7 @@ def test_a_request_is_answered_or_refused_in_the_panel(prior):
         assert "Floor: 4.00 x 3.00 m, 1 door" in panel._said.content
         shown = page.shown
         fields.want.value = "a purple bed"
-        page.safely(lambda: panel._sample(page.source, 1, None))
+        page.safely(lambda: panel._sample(page.explorer, 1, None))
         assert "not understood: &#39;purple&#39;" in panel._answer.content
         assert page.shown is shown
         fields._emptied()
@@ -95,7 +95,7 @@ def test_a_request_is_answered_or_refused_in_the_panel(prior):
         fields.ceiling.value = "2.4 m"
         assert fields.asked() == {"ceiling_m": 2.4}
         with pytest.raises(InputError, match="Rooms from paper answer no requests; choose sampler"):
-            page.source.sample(0, "paper", fields.asked())
+            page.explorer.sample(0, "paper", fields.asked())
 
 
 def test_the_drawing_fills_the_fields_and_follows_them(prior):
