@@ -11,17 +11,17 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from sceneprior.core.classes import label_set
+from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.instances.checked import checked
 from sceneprior.core.instances.pngs import read_rgb
-from sceneprior.core.instances.tables import LARGEST_ID, tidy
+from sceneprior.core.instances.tables import LARGEST_ID, stuff_of, tidy
 
 FILE_NAME = "panoptic.json"
 _CROWD = "crowd"
 """Class of segments that are not a single object."""
-_STUFF = "background"
+_BACKGROUND = "background"
 
 _Id = Annotated[int, Field(ge=0, lt=2**24)]
 
@@ -59,7 +59,8 @@ class PanopticIds:
     segments: np.ndarray
     """(n,) segment ids, ascending."""
     classes: dict[int, str]
-    """Class by new id: k + 1 for the k-th segment; "background" for stuff (walls, floors)."""
+    """Class by new id: k + 1 for the k-th segment; stuff is of a class of `STUFF`, or
+    "background"."""
     of_frame: dict[str, dict[int, str]]
     """The same for the segments of each frame alone, by the stem of its PNG."""
 
@@ -77,17 +78,20 @@ class PanopticIds:
 
 
 def read_panoptic(path: Path, label_set_name: str, tracked: bool = True) -> PanopticIds:
-    """Read a room's annotations. Stuff is background, unless the label set has its class.
+    """Read a room's annotations. Stuff is no object, unless the label set has its class.
 
-    Segments that are not `tracked` may have another class in each frame.
+    Segments that are not `tracked` may have another class in each frame. A tracked segment of stuff
+    with several classes is background.
     """
     room = checked(_Panoptic, read_json(path), str(path))
-    names = {
-        item.id: item.name
-        if item.isthing or tidy(item.name) in map(tidy, label_set(label_set_name))
-        else _STUFF
-        for item in room.categories
-    }
+    own = {tidy(name) for name in label_set(label_set_name)}
+    names, stuff = {}, {_BACKGROUND, *STUFF[1:]}
+    for item in room.categories:
+        if item.isthing or tidy(item.name) in own:
+            names[item.id] = item.name
+        else:
+            name = STUFF[stuff_of(item.name)]
+            names[item.id] = name if name in stuff - own else _BACKGROUND
     of_id: dict[int, tuple[str, str]] = {}
     by_frame: dict[str, dict[int, str]] = {}
     for frame in room.annotations:
@@ -100,7 +104,9 @@ def read_panoptic(path: Path, label_set_name: str, tracked: bool = True) -> Pano
             name = _CROWD if segment.iscrowd else names[segment.category_id]
             by_frame.setdefault(Path(frame.file_name).stem, {})[segment.id] = name
             before, where = of_id.setdefault(segment.id, (name, frame.file_name))
-            if tracked and before != name:
+            if before != name and {before, name} <= stuff:
+                of_id[segment.id] = _BACKGROUND, where
+            elif tracked and before != name:
                 raise InputError(
                     f"{path}: segment {segment.id} is {before} in '{where}', but {name} in "
                     f"'{frame.file_name}'. Ids must be tracked: the same object has the same id "
