@@ -127,9 +127,7 @@ def _between(
     middles = cells.middles_m
     everything = np.concatenate([sides(points_m), sides(middles), sides(cameras_m)])
     face_of = np.unique(everything, axis=0, return_inverse=True)[1].ravel()
-    of_faces, of_cells, of_cameras = np.split(
-        face_of, np.cumsum([len(points_m), len(middles)])
-    )
+    of_faces, of_cells, of_cameras = np.split(face_of, np.cumsum([len(points_m), len(middles)]))
     count = int(face_of.max()) + 1
     floor = np.bincount(of_cells[cells.seen.ravel()], minlength=count)
     outside = np.bincount(of_cells[cells.outside.ravel()], minlength=count)

@@ -194,6 +194,11 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
         with self._group(room_id) as group:
             return "ground_truth" in group
 
+    def has_stuff(self, room_id: str) -> bool:
+        """Test whether a room has images of floor, walls and doors."""
+        with self._group(room_id) as group:
+            return "stuff" in group
+
     def read_checksum(self, room_id: str) -> str | None:
         """Read the `room_checksum` stored with a room; None in shards of earlier releases."""
         with self._group(room_id) as group:

@@ -3,6 +3,7 @@
 The floor is the plane y = 0, so a pixel on the lower edge of a wall is one point of the room.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,9 +12,9 @@ from jaxtyping import Bool, Float, Int
 from sceneprior.core.classes import STUFF
 from sceneprior.core.shards import RoomViews, stuff_step, thinned_intrinsics
 
-COARSE_M = 0.08
+COARSE_M = 0.15
 """Length on the floor of a pixel, along its ray, above which the pixel is not used."""
-NEAR_M = 0.05
+NEAR_M = 0.1
 """Largest distance of a point from its wall."""
 SHORTEST_M = 0.3
 """Length of the shortest visible part of a wall."""
@@ -27,6 +28,8 @@ _DIRECTIONS, _OFFSET_M = 180, 0.04
 """Directions of normals, and widths of offsets, among which walls are searched."""
 _MOST_LINES, _MOST_POINTS, _LEAST_POINTS = 24, 6000, 12
 _BIN_M = 0.05
+_ERROR_PX = 2.0
+"""Pixels by which a point may be off and still be one of a line that was found."""
 _PIXEL_ERROR_M = 0.01
 
 FLOOR, DOOR = STUFF.index("floor"), STUFF.index("door")
@@ -58,7 +61,8 @@ class _Edges(NamedTuple):
     points_m: Float[np.ndarray, "points 2"]
     towards_camera: Float[np.ndarray, "points 2"]
     weight: Float[np.ndarray, " points"]
-    """Inverse length on the floor of the pixel."""
+    """Inverse square of the length on the floor of the pixel, to which errors of poses and masks are
+    proportional."""
     view: Int[np.ndarray, " points"]
     is_door: Bool[np.ndarray, " points"]
 
@@ -72,18 +76,24 @@ class _Line(NamedTuple):
     normal: Float[np.ndarray, "2"]
     offset_m: float
 
-    def has(self, edges: _Edges) -> Bool[np.ndarray, " points"]:
-        near = np.abs(edges.points_m @ self.normal - self.offset_m) < NEAR_M
-        return near & (edges.towards_camera @ self.normal > 0)
+    def has(self, edges: _Edges, pixels: float = 0.0) -> Bool[np.ndarray, " points"]:
+        """True for points that face the line, within `NEAR_M` and so many pixels along their
+        ray."""
+        facing = edges.towards_camera @ self.normal
+        within_m = NEAR_M + pixels * edges.weight**-0.5 * facing
+        near = np.abs(edges.points_m @ self.normal - self.offset_m) < within_m
+        return near & (facing > 0)
 
 
-def find_walls(room: RoomViews) -> tuple[tuple[Wall, ...], tuple[Door, ...]]:
-    """Find the visible bases of walls and doors of a room that has `stuff`.
+def find_walls(
+    room: RoomViews, views: Sequence[int] | np.ndarray | None = None
+) -> tuple[tuple[Wall, ...], tuple[Door, ...]]:
+    """Find the bases of walls and doors that some `views`, or all, of a room with `stuff` show.
 
     Lines are found one after another, each where most points lie (a Hough transform), and fitted to
     the points near them. Walls may have any direction.
     """
-    edges = _edges(room)
+    edges = _edges(room, range(len(room.world_to_camera)) if views is None else views)
     edges = edges.take(slice(None, None, max(1, len(edges.view) // _MOST_POINTS)))
     walls: list[Wall] = []
     doors: list[Door] = []
@@ -94,14 +104,13 @@ def find_walls(room: RoomViews) -> tuple[tuple[Wall, ...], tuple[Door, ...]]:
         on = line.has(edges)
         walls += _parts(edges.take(on), line)
         doors += _doors(edges.take(on), line)
-        edges = edges.take(~on)
+        edges = edges.take(~line.has(edges, _ERROR_PX))
     return tuple(walls), tuple(doors)
 
 
-def _edges(room: RoomViews) -> _Edges:
-    """Collect the points of all views."""
-    assert room.stuff is not None
-    parts = [_edges_of_view(room, view) for view in range(len(room.stuff))]
+def _edges(room: RoomViews, views: Sequence[int] | np.ndarray) -> _Edges:
+    """Collect the points of some views."""
+    parts = [_edges_of_view(room, int(view)) for view in views]
     return _Edges(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
@@ -119,11 +128,11 @@ def _edges_of_view(room: RoomViews, view: int) -> _Edges:
     kinds = image[rows, columns]
     along = len(image) - rows - 1 if upside_down else rows + 1
     # The base is at the boundary of the two pixels.
-    pixels = np.stack([columns + 0.5, along], axis=1)[:, ::-1 if sideways else 1]
+    pixels = np.stack([columns + 0.5, along], axis=1)[:, :: -1 if sideways else 1]
     points_m, length_m, towards = on_floor(pixels, pose, K)
     near = length_m < COARSE_M
     return _Edges(
-        points_m[near], towards[near], 1 / length_m[near], np.full(near.sum(), view),
+        points_m[near], towards[near], length_m[near] ** -2, np.full(near.sum(), view),
         kinds[near] == DOOR,
     )  # fmt: skip
 
@@ -174,7 +183,7 @@ def _fitted(edges: _Edges, line: _Line) -> _Line:
         if len(near.view) < _LEAST_POINTS:
             break
         middle = np.average(near.points_m, axis=0, weights=near.weight)
-        apart = (near.points_m - middle) * near.weight[:, None]
+        apart = (near.points_m - middle) * near.weight[:, None] ** 0.5
         normal = np.linalg.svd(apart.T @ apart)[0][:, 1]
         normal = normal * np.sign(normal @ line.normal)
         line = _Line(normal, float(middle @ normal))
@@ -198,8 +207,14 @@ def _parts(on: _Edges, line: _Line) -> list[Wall]:
         if len(views) < LEAST_VIEWS or ends[1] - ends[0] < SHORTEST_M:
             continue
         off = part.points_m @ line.normal - line.offset_m
-        means = np.array([off[part.view == view].mean() for view in views])
-        error = np.sqrt((means.var(ddof=1) + _PIXEL_ERROR_M**2) / len(views))
+        weights = np.array([part.weight[part.view == view].sum() for view in views])
+        means = np.array(
+            [np.average(off[part.view == v], weights=part.weight[part.view == v]) for v in views]
+        )
+        spread = weights**2 @ (
+            (means - np.average(means, weights=weights)) ** 2 + _PIXEL_ERROR_M**2
+        )
+        error = spread**0.5 / weights.sum()
         start, end = (end * along + line.offset_m * line.normal for end in ends)
         found.append(Wall(start, end, line.normal, float(error)))
     return found
@@ -212,7 +227,9 @@ def _doors(on: _Edges, line: _Line) -> list[Door]:
     first = along_m.min(initial=0.0)
     bins = np.floor((along_m - first) / _BIN_M).astype(np.int64)
     count = int(bins.max(initial=0)) + 1
-    doors, others = (np.bincount(bins[which], minlength=count) for which in (on.is_door, ~on.is_door))
+    doors, others = (
+        np.bincount(bins[which], minlength=count) for which in (on.is_door, ~on.is_door)
+    )
     is_door = on.is_door & (doors > others)[bins]
     found = []
     for run in _runs(along_m[is_door]) if is_door.any() else ():
