@@ -160,7 +160,7 @@ def rows(scores: list[Score]) -> Iterator[str]:
             f"| {np.mean([each.beyond_m2 for each in chosen]):.3f} "
             f"| {np.mean([each.iou_seen for each in chosen]):.3f} | {iou.mean():.3f} "
             f"| {np.median(iou):.3f} | {np.mean(iou >= 0.9):.2f} "
-            f"| {np.median(errors) * 100:.1f}, {np.quantile(errors, 0.95) * 100:.1f} "
+            f"| {np.median(errors) * 100:.1f}, {np.quantile(errors, 0.95, method='higher') * 100:.1f} "
             f"| {np.mean(errors <= NEAR_M):.3f} | {np.median(stated) * 100:.1f} "
             f"| {sums['sides_found']} / {sums['sides']} "
             f"| {sums['doors_found']} / {sums['doors_true']} ({sums['doors']}) "

@@ -19,6 +19,9 @@ CELL_M = 0.03
 SEEN_SHARE = 0.1
 """Share of a region between walls that must be seen floor for the region to be floor."""
 
+OPENED = 4
+"""Half the width in cells of the strips that do not count as being behind a wall."""
+
 
 class FoundFloor(NamedTuple):
     """Floor, walls and doors in the plane y = 0; (x, z) in metres."""
@@ -38,7 +41,7 @@ class _Cells(NamedTuple):
     seen: Bool[np.ndarray, "x z"]
     """True where some view shows floor."""
     outside: Bool[np.ndarray, "x z"]
-    """True where walls hide the cell from some view, and nothing else from any."""
+    """True where a wall hides the cell from some view, and none shows floor."""
 
     @property
     def middles_m(self) -> Float[np.ndarray, "cells 2"]:
@@ -49,7 +52,7 @@ def find_floor(room: RoomViews) -> FoundFloor:
     """Find the floor of a room that was read with its images and has `stuff`."""
     walls, doors = find_walls(room)
     cells = _look_at_cells(room)
-    seen = _polygon_of(cells)
+    seen = _polygon_of(cells, cells.seen)
     eyes = -np.einsum("tij,ti->tj", room.world_to_camera[:, :3, :3], room.world_to_camera[:, :3, 3])
     return FoundFloor(seen, _between(walls, cells, seen, eyes[:, ::2]), walls, doors)
 
@@ -71,7 +74,7 @@ def _look_at_cells(room: RoomViews) -> _Cells:
     empty = np.zeros(shape, dtype=bool)
     middles = _Cells(low, empty, empty).middles_m
     ground = np.insert(middles, 1, 0.0, axis=1)
-    floor, wall, other = (np.zeros(len(ground), dtype=bool) for _ in range(3))
+    floor, wall = (np.zeros(len(ground), dtype=bool) for _ in range(2))
     for stuff, pose, K in views:
         camera = ground @ pose[:3, :3].T + pose[:3, 3]
         depth = np.maximum(camera[:, 2], 1e-6)
@@ -84,16 +87,14 @@ def _look_at_cells(room: RoomViews) -> _Cells:
         # A pixel at the edge of the floor shows something else, too.
         inner = ndimage.binary_erosion(stuff == FLOOR, border_value=1)
         floor[there] |= inner[at]
-        values = stuff[at]
-        wall[there] |= BARRIER[values]
-        other[there] |= values == 0
-    seen, outside = floor.reshape(shape), (wall & ~floor & ~other).reshape(shape)
+        wall[there] |= BARRIER[stuff[at]]
+    seen, outside = floor.reshape(shape), (wall & ~floor).reshape(shape)
     return _Cells(low, seen, outside)
 
 
-def _polygon_of(cells: _Cells) -> shapely.Geometry:
-    """Union of the seen cells."""
-    edges = np.diff(np.pad(cells.seen, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+def _polygon_of(cells: _Cells, which: Bool[np.ndarray, "x z"]) -> shapely.Geometry:
+    """Union of some cells."""
+    edges = np.diff(np.pad(which, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     rows, starts = np.nonzero(edges == 1)
     _, ends = np.nonzero(edges == -1)
     low = cells.low_m[:, None] + CELL_M * np.stack([rows, starts])
@@ -134,4 +135,9 @@ def _between(
     has_camera = np.bincount(of_cameras, minlength=count) > 0
     shares = floor[of_faces] * CELL_M**2 / shapely.area(faces)
     is_floor = (shares > SEEN_SHARE) & (floor > outside)[of_faces] | has_camera[of_faces]
-    return shapely.union_all(faces[is_floor])
+    # Narrow strips beside walls come from the size of pixels and cells.
+    beyond = ndimage.binary_opening(cells.outside, iterations=OPENED)
+    whole = (shapely.union_all(faces[is_floor]) - _polygon_of(cells, beyond)) | seen
+    parts = shapely.get_parts(whole)
+    shown = shapely.area(shapely.intersection(parts, seen)) > SEEN_SHARE * shapely.area(parts)
+    return shapely.union_all(parts[shown])

@@ -16,6 +16,9 @@ COARSE_M = 0.15
 """Length on the floor of a pixel, along its ray, above which the pixel is not used."""
 NEAR_M = 0.1
 """Largest distance of a point from its wall."""
+FACED = 0.4
+"""Sine of the angle with the wall at which some ray must meet each of its parts. Where a wall hides
+the floor beyond its corner, the border of the two runs along a ray, and is no wall."""
 SHORTEST_M = 0.3
 """Length of the shortest visible part of a wall."""
 GAP_M = 0.3
@@ -45,7 +48,7 @@ class Wall(NamedTuple):
     inward: Float[np.ndarray, "2"]
     """Unit normal, into the room."""
     error_m: float
-    """Standard error of the wall's offset along its normal, from the differences between views."""
+    """Standard error of the wall's offset along its normal, by the differences between views."""
 
 
 class Door(NamedTuple):
@@ -193,6 +196,8 @@ def _fitted(edges: _Edges, line: _Line) -> _Line:
 def _runs(along_m: Float[np.ndarray, " points"]) -> list[Int[np.ndarray, " points"]]:
     """Split points along a line where there is a gap; indices of the points of each part."""
     order = np.argsort(along_m, kind="stable")
+    if not len(order):
+        return []
     return np.split(order, np.flatnonzero(np.diff(along_m[order]) > GAP_M) + 1)
 
 
@@ -204,7 +209,8 @@ def _parts(on: _Edges, line: _Line) -> list[Wall]:
         ends = along_m[run].min(), along_m[run].max()
         part = on.take(run)
         views = np.unique(part.view)
-        if len(views) < LEAST_VIEWS or ends[1] - ends[0] < SHORTEST_M:
+        faced = (part.towards_camera @ line.normal).max() > FACED
+        if not faced or len(views) < LEAST_VIEWS or ends[1] - ends[0] < SHORTEST_M:
             continue
         off = part.points_m @ line.normal - line.offset_m
         weights = np.array([part.weight[part.view == view].sum() for view in views])
@@ -232,7 +238,7 @@ def _doors(on: _Edges, line: _Line) -> list[Door]:
     )
     is_door = on.is_door & (doors > others)[bins]
     found = []
-    for run in _runs(along_m[is_door]) if is_door.any() else ():
+    for run in _runs(along_m[is_door]):
         ends = along_m[is_door][run].min(), along_m[is_door][run].max()
         views = np.unique(on.view[is_door][run])
         if len(views) >= LEAST_VIEWS and ends[1] - ends[0] >= NARROWEST_M:

@@ -87,7 +87,7 @@ class SamplerRooms:
             _walls_of(*each)
             for each in zip(lifted.walls(), rectangles_of(self.rooms).numpy(), strict=True)
         ]
-        self.rooms = replace(self.rooms, walls_m=torch.tensor(walls))
+        self.rooms = replace(self.rooms, walls_m=torch.tensor(walls, dtype=torch.float32))
         return self
 
     def __len__(self) -> int:
