@@ -86,7 +86,8 @@ class RoomMasks:
             notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
         return notes + self._pixels.notes
 
-    def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray]:
-        """Read a frame's uint32 ids for `observe`, at the stored size, and their intrinsics."""
+    def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Read a frame's uint32 ids for `observe` and its stuff, at the stored size, and their
+        intrinsics."""
         values, intrinsics = self._pixels.read(frame)
-        return self.table.ids(values), intrinsics
+        return self.table.ids(values), self.table.stuff(values), intrinsics

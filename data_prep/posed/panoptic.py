@@ -15,15 +15,15 @@ from pydantic import BaseModel, ConfigDict, Field
 from data_prep.posed.labels import PANOPTIC, find_table
 from data_prep.posed.mask_format import MaskFormat
 from data_prep.posed.recording import INSTANCES, PosedFrame
-from sceneprior.core.classes import label_set
+from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.instances.checked import checked
 from sceneprior.core.instances.coco import CROWD
 from sceneprior.core.instances.pngs import mask_size, read_rgb
-from sceneprior.core.instances.tables import LARGEST_ID, tidy
+from sceneprior.core.instances.tables import LARGEST_ID, stuff_of, tidy
 
-_STUFF = "background"
+_BACKGROUND = "background"
 
 _Id = Annotated[int, Field(ge=0, lt=2**24)]
 
@@ -96,7 +96,9 @@ class PanopticIds:
     """(n,) segment ids, ascending."""
     of_frame: dict[str, dict[int, str]]
     """Class of each new id, k + 1 for the k-th segment, in each frame, by the stem of its PNG;
-    "background" for stuff (walls, floors)."""
+    stuff is of a class of `STUFF`, or "background"."""
+    stuff: frozenset[str]
+    """Classes of stuff that the label set does not have, "background" included."""
 
     def read(self, path: Path) -> np.ndarray:
         """Read a PNG as new ids, (height, width) int32.
@@ -113,6 +115,8 @@ class PanopticIds:
     def tracked_classes(self, path: Path) -> dict[int, str]:
         """Class by new id; `path` is the JSON's.
 
+        A segment of stuff with several classes is background.
+
         Raises:
             InputError: A segment has different classes in two frames, so ids are not tracked.
         """
@@ -120,7 +124,9 @@ class PanopticIds:
         for stem, classes in self.of_frame.items():
             for number, name in classes.items():
                 before, where = first.setdefault(number, (name, stem))
-                if before != name:
+                if before != name and {before, name} <= self.stuff:
+                    first[number] = _BACKGROUND, where
+                elif before != name:
                     raise InputError(
                         f"{path}: segment {self.segments[number - 1]} is {before} in '{where}', "
                         f"but {name} in '{stem}'. Ids must be tracked: the same object has the "
@@ -131,14 +137,17 @@ class PanopticIds:
 
 
 def read_panoptic(path: Path, label_set_name: str) -> PanopticIds:
-    """Read a room's annotations. Stuff is background, unless the label set has its class."""
+    """Read a room's annotations. Stuff is no object, unless the label set has its class."""
     room = checked(_Panoptic, read_json(path), str(path))
-    names = {
-        item.id: item.name
-        if item.isthing or tidy(item.name) in map(tidy, label_set(label_set_name))
-        else _STUFF
-        for item in room.categories
-    }
+    own = {tidy(name) for name in label_set(label_set_name)}
+    stuff = frozenset({_BACKGROUND, *STUFF[1:]} - own)
+    names = {}
+    for item in room.categories:
+        if item.isthing or tidy(item.name) in own:
+            names[item.id] = item.name
+        else:
+            name = STUFF[stuff_of(item.name)]
+            names[item.id] = name if name in stuff else _BACKGROUND
     by_frame: dict[str, dict[int, str]] = {}
     for frame in room.annotations:
         for segment in frame.segments_info:
@@ -157,4 +166,4 @@ def read_panoptic(path: Path, label_set_name: str) -> PanopticIds:
         stem: {number[segment]: name for segment, name in names.items() if segment}
         for stem, names in by_frame.items()
     }
-    return PanopticIds(np.array(segments), of_frame)
+    return PanopticIds(np.array(segments), of_frame, stuff)

@@ -19,8 +19,11 @@ class UntrackedMasks:
         self.notes: list[str] = []
         self._pixels = MaskPixels(masks, size, stored)
 
-    def read(self, frames: list[PosedFrame]) -> tuple[FrameMasks, np.ndarray, np.ndarray]:
-        """Masks of all frames, their original ids, (masks,), and intrinsics, (frames, 3, 3)."""
+    def read(
+        self, frames: list[PosedFrame]
+    ) -> tuple[FrameMasks, np.ndarray, np.ndarray, np.ndarray]:
+        """Masks of all frames, their original ids, (masks,), the stuff in all frames, and
+        intrinsics, (frames, 3, 3)."""
         images, intrinsics = (
             np.stack(arrays)
             for arrays in zip(*(self._pixels.read(frame) for frame in frames), strict=True)
@@ -57,7 +60,7 @@ class UntrackedMasks:
         if unlisted:
             self.notes.append(f"{unlisted} masks have no class in their frame's table: void")
         masks = FrameMasks(ids, table.classes[kept - 1].astype(np.int64))
-        return masks, np.array(original_ids)[number_of_id[1:]], intrinsics
+        return masks, np.array(original_ids)[number_of_id[1:]], table.stuff(numbers), intrinsics
 
 
 def track(

@@ -1,7 +1,7 @@
 """Labels the views of one posed room and returns the arrays stored in shards."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from data_prep.posed.untracked import UntrackedMasks, track
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import shown
 from sceneprior.core.instances.observations import Observations, observe
+from sceneprior.core.shards import stuff_step, thinned
 
 TRACKS = ("given", "auto")
 _MANY_IDS, _MANY_FRAMES, _ONCE = 12, 5, 0.8
@@ -103,13 +104,13 @@ def prepare_posed(
     try:
         if settings.tracks == "auto" or not masks.tracked:
             untracked = UntrackedMasks(masks, size, stored)
-            given, ids, intrinsics = untracked.read(frames)
+            given, ids, stuff, intrinsics = untracked.read(frames)
             cameras = room_cameras(upright, np.eye(4))
             images, classes, said = track(given, ids, cameras, intrinsics)
             notes += [*untracked.notes, said]
         else:
             tracked = RoomMasks(masks, size, stored)
-            images, intrinsics = (
+            images, stuff, intrinsics = (
                 np.stack(arrays)
                 for arrays in zip(*(tracked.read(frame) for frame in frames), strict=True)
             )
@@ -127,6 +128,9 @@ def prepare_posed(
         notes.append(said)
     world_to_camera = cameras_in_room(recording, upright, turn, floor)
     views = seen.room_views(room_name(recording.folder), world_to_camera, intrinsics)
+    if stuff.any():
+        small = (..., *thinned(stuff_step(views.image_size)))
+        views = replace(views, stuff=stuff[small] * (seen.instance_ids[small] == 0))
     return PreparedRoom(views, notes=tuple(notes))
 
 
