@@ -259,11 +259,9 @@ def prep_dataset(
     ] = 100,
     seed: SeedOption = 0,
     workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
     only: Annotated[
         str | None, typer.Option(help="One scene or room only: SCENE, SCENE/ROOM or a room id.")
     ] = None,
-    strict: StrictOption = False,
     retry_failed: RetryOption = False,
 ) -> None:
     """Turn a public data set into view shards (docs/public_data.md).
@@ -275,7 +273,7 @@ def prep_dataset(
 
     reader = open_reader(name, folder, recipe)
     source = PublicSource(reader, splits, max_side, max_views, seed, only)
-    run_job(Job(source, out, workers, scheduler, "auto", strict, retry_failed))
+    run_job(Job(source, out, workers, "auto", retry_failed))
 
 
 def inspect(

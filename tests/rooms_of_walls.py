@@ -26,7 +26,7 @@ def shell_room(
     cameras are rolled by `roll` quarter turns.
     """
     corners = np.array(outline)
-    walls = [_quad(a, b, HEIGHT_M) for a, b in zip(corners, np.roll(corners, -1, axis=0))]
+    walls = [_quad(a, b, HEIGHT_M) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     x1, z1 = corners.min(axis=0)
     x2, z2 = corners.max(axis=0)
     ground = np.array([[x1, 0, z1], [x2, 0, z1], [x2, 0, z2], [x1, 0, z2]])
