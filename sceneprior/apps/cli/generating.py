@@ -134,7 +134,7 @@ def complete(
     check_free(out, overwrite)
     drawn = checked_shell(shell or "none")
     asked = request_of(floor, openings, ceiling, want, request)
-    scene = load_scene(given)
+    scene = load_scene(given, with_materials=True)
     scene = replace(scene, objects=(*scene.objects, *asked.pop("objects", ())))
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
     prior = load(run)

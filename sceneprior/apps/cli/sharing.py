@@ -139,7 +139,7 @@ def export(
     else:
         if (label_set, classes, sizes) != (None, None, None):
             raise InputError("--label-set, --classes and --sizes apply only with --to scenes.")
-        rooms = load_scene_folder(source)
+        rooms = load_scene_folder(source, with_materials=True)
         asked = None if shell is None else checked_shell(shell)
         for note in export_scenes(rooms, to, out, asked):
             typer.echo(f"Note: {note}", err=True)
