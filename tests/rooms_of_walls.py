@@ -1,8 +1,11 @@
 """Empty rooms with a known floor, and what views of them show of floor, walls and doors."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from sceneprior.core.classes import STUFF
+from sceneprior.core.instances.observations import observe
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shards import RoomViews, stuff_size, stuff_step, thinned_intrinsics
 from sceneprior.render.offscreen import Pinhole, SoftwareRenderer
@@ -20,17 +23,23 @@ def shell_room(
     roll: int = 0,
     size: tuple[int, int] = SIZE,
 ) -> RoomViews:
-    """Views around every eye (x, z), at a height of 1.5 m, of an empty room.
+    """Views around every eye (x, z), at a height of 1.5 m, of an empty room; `L_SHAPE` has a door.
 
     `block` is the footprint (x, z, x, z) of a box of 0.5 m, whose pixels are an object's. The
     cameras are rolled by `roll` quarter turns.
     """
     corners = np.array(outline)
-    walls = [_quad(a, b, HEIGHT_M) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    walls = [
+        _quad(a, b, HEIGHT_M) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    ]
     x1, z1 = corners.min(axis=0)
     x2, z2 = corners.max(axis=0)
     ground = np.array([[x1, 0, z1], [x2, 0, z1], [x2, 0, z2], [x1, 0, z2]])
-    parts = {"floor": [ground], "wall": walls, "door": [_quad(*DOOR, 2.0)]}
+    parts = {
+        "floor": [ground],
+        "wall": walls,
+        "door": [_quad(*DOOR, 2.0)] if outline == L_SHAPE else [],
+    }
     meshes = [_mesh(parts.get(name, [])) for name in STUFF[1:]]
     poses = np.stack([_pose(eye, yaw, roll) for eye in eyes for yaw in np.arange(8) * np.pi / 4])
     focal = size[1] / 2
@@ -44,20 +53,8 @@ def shell_room(
 
     body = [] if block is None else [_box(*block)]
     stuff = draw(meshes, small, stuff_size(size)) * (draw(body, small, stuff_size(size)) == 0)
-    views, objects = len(poses), len(body)
-    return RoomViews(
-        room_id="shell",
-        object_class=np.ones(objects, dtype=np.int16),
-        world_to_camera=poses.astype(np.float32),
-        intrinsics=np.tile(K.astype(np.float32), (views, 1, 1)),
-        boxes=np.zeros((views, objects, 4), np.float32),
-        visible=np.ones((views, objects), bool),
-        mask_pixels=np.ones((views, objects), np.int32),
-        sides_clear=np.ones((views, objects, 4), bool),
-        instance_ids=draw(body, K, size),
-        image_size=size,
-        stuff=stuff,
-    )
+    seen = observe(draw(body, K, size), [1] * len(body))
+    return replace(seen.room_views("shell", poses, K), stuff=stuff)
 
 
 def _quad(a, b, height: float) -> np.ndarray:

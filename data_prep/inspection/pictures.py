@@ -32,8 +32,8 @@ LEGEND = (
     "Filled: instance masks in class colours. Coloured frames: their 2D boxes, with the object's "
     "number, the same in all views. Black wires: 3D "
     "boxes of the ground truth, with a bar ahead of the piece's front. Grid: the floor y = 0, "
-    "metres, with the room's axes x, y, z. From above, found in masks of floor, walls and doors: the "
-    "floor that some view shows (filled), walls (brown) and doors (orange)."
+    "metres, with the room's axes x, y, z. From above, found in masks of floor, walls and doors: "
+    "the floor that some view shows (filled), walls (brown) and doors (orange)."
 )
 _TILE = (480, 360)
 _GAP_PX, _LINE_PX = 8, 15

@@ -115,14 +115,14 @@ def check_views(where: str, views: RoomViews) -> None:
     height, width = views.image_size
     sizes = {"T": count, "n": objects, "H": height, "W": width}
     sizes |= dict(zip("hw", stuff_size(views.image_size), strict=True))
-    images = _images(views)
-    shapes = {name: shape for name, (_, shape) in VIEW_ARRAYS.items()}
-    shapes |= {name: IMAGES[name] for name in images}
+    shapes = {name: shape for name, (_, shape) in VIEW_ARRAYS.items()} | IMAGES
+    if views.stuff is None:
+        del shapes["stuff"]
     for name, sides in shapes.items():
         came, shape = getattr(getattr(views, name), "shape", None), shape_of(sides, sizes)
         if came != shape:
             raise ShardError(f"{where}: {name} has shape {came}, expected {shape}.")
-    highest = int(images["instance_ids"].max(initial=0))
+    highest = int(_images(views)["instance_ids"].max(initial=0))
     if highest > objects + 1:
         raise ShardError(
             f"{where}: an instance id is {highest}, but the room has {objects} objects, and "

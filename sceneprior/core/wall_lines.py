@@ -64,7 +64,7 @@ class _Edges(NamedTuple):
     points_m: Float[np.ndarray, "points 2"]
     towards_camera: Float[np.ndarray, "points 2"]
     weight: Float[np.ndarray, " points"]
-    """Inverse square of the length on the floor of the pixel, to which errors of poses and masks are
+    """Inverse square of the pixel's length on the floor, to which errors of poses and masks are
     proportional."""
     view: Int[np.ndarray, " points"]
     is_door: Bool[np.ndarray, " points"]
@@ -193,7 +193,7 @@ def _fitted(edges: _Edges, line: _Line) -> _Line:
     return line
 
 
-def _runs(along_m: Float[np.ndarray, " points"]) -> list[Int[np.ndarray, " points"]]:
+def _runs(along_m: Float[np.ndarray, " points"]) -> list[Int[np.ndarray, " run"]]:
     """Split points along a line where there is a gap; indices of the points of each part."""
     order = np.argsort(along_m, kind="stable")
     if not len(order):
