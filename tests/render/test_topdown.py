@@ -1,6 +1,5 @@
 """Scale, position and colours of top-down pictures."""
 
-
 import numpy as np
 import pytest
 
