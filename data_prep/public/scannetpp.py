@@ -6,8 +6,8 @@
     <folder>/scannetv2-labels.combined.tsv     optional: ScanNet's table of labels
 
 Meshes are in metres, z up. COLMAP's models and `aligned_pose` of the iPhone are in the mesh's
-world; nerfstudio's files have OpenGL's camera axes, in a world whose x and y are swapped and whose z
-is reversed. Masks are those of a pinhole without distortion: no pixel of a picture is read.
+world; nerfstudio's files have OpenGL's camera axes, in a world whose x and y are swapped and whose
+z is reversed. Masks are those of a pinhole without distortion: no pixel of a picture is read.
 
 Source: common/scene_release.py, common/utils/anno.py, semantic/transforms/mesh.py and
 iphone/arkit_pcl.py of scannetpp/scannetpp; its issue 160, and nerfstudio's colmap_to_json.
