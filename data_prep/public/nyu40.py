@@ -1,4 +1,4 @@
-"""Classes by NYU40 ids, for data sets with images of both instance ids and NYU40 ids."""
+"""NYU40 classes: by id, for data sets with images of NYU40 ids, and by free labels."""
 
 import numpy as np
 
@@ -14,6 +14,25 @@ NYU40 = (
     "bathtub", "bag", "otherstructure", "otherfurniture", "otherprop",
 )  # fmt: skip
 """Names of the ids 1 to 40, in the spelling of ScanNet's nyu40class and of its label set."""
+
+LIKE_NYU40 = {
+    "wall": "wall", "floor": "floor", "ceiling": "ceiling", "door": "door", "door frame": "door",
+    "doorframe": "door", "window": "window", "window frame": "window", "windowsill": "window",
+    "window sill": "window", "blinds": "blinds", "mirror": "mirror", "picture": "picture",
+    "painting": "picture", "poster": "picture", "carpet": "floor mat", "rug": "floor mat",
+    "office chair": "chair", "armchair": "chair", "dining chair": "chair", "stool": "chair",
+    "couch": "sofa", "storage cabinet": "cabinet", "kitchen cabinet": "cabinet",
+    "cupboard": "cabinet", "wardrobe": "cabinet", "file cabinet": "cabinet",
+    "bathroom cabinet": "cabinet", "bookcase": "bookshelf", "book shelf": "bookshelf",
+    "shelf": "shelves", "wall shelf": "shelves", "kitchen counter": "counter",
+    "office desk": "desk", "coffee table": "table", "dining table": "table",
+    "side table": "table", "bedside table": "night stand", "nightstand": "night stand",
+    "chest of drawers": "dresser", "ceiling lamp": "lamp", "table lamp": "lamp",
+    "floor lamp": "lamp", "desk lamp": "lamp", "tv": "television", "tv screen": "television",
+    "refrigerator": "refridgerator", "fridge": "refridgerator", "bath tub": "bathtub",
+    "blackboard": "whiteboard", "washbasin": "sink",
+}  # fmt: skip
+"""NYU40 class of common free labels, such as those of ScanNet++."""
 
 
 def ids_and_classes(

@@ -1,12 +1,13 @@
 """Reads ScanNet++: ids are drawn from the annotated mesh, at the poses of the pictures.
 
     <folder>/<scene>/scans/{mesh_aligned_0.05.ply, segments.json, segments_anno.json}
-    <folder>/<scene>/{dslr,iphone}/nerfstudio/transforms.json, or iphone/pose_intrinsic_imu.json
+    <folder>/<scene>/dslr/colmap/{cameras,images}.txt, or dslr/nerfstudio/transforms.json, or the
+        same of the iphone, or iphone/pose_intrinsic_imu.json
     <folder>/scannetv2-labels.combined.tsv     optional: ScanNet's table of labels
 
-Meshes are in metres, z up. Nerfstudio's files have OpenGL's camera axes, in a world whose x and y
-are swapped and whose z is reversed; `aligned_pose` of the iPhone has OpenCV's axes in the mesh's
-world. Masks are those of a pinhole without the lens distortion: no pixel of a picture is read.
+Meshes are in metres, z up. COLMAP's models and `aligned_pose` of the iPhone are in the mesh's
+world; nerfstudio's files have OpenGL's camera axes, in a world whose x and y are swapped and whose
+z is reversed. Masks are those of a pinhole without distortion: no pixel of a picture is read.
 
 Source: common/scene_release.py, common/utils/anno.py, semantic/transforms/mesh.py and
 iphone/arkit_pcl.py of scannetpp/scannetpp; its issue 160, and nerfstudio's colmap_to_json.
@@ -22,8 +23,10 @@ from pydantic import BaseModel, Field, RootModel
 from data_prep.engine.plan import digest
 from data_prep.engine.source import RoomTask
 from data_prep.frames import GL_TO_CV, Y_UP, shrunk
-from data_prep.posed.recording import frame_intrinsics
+from data_prep.posed.colmap import read_model
+from data_prep.posed.recording import Camera, PosedFrame, frame_intrinsics
 from data_prep.posed.transforms import FILE_NAME, read_recording
+from data_prep.public.nyu40 import LIKE_NYU40
 from data_prep.public.rooms import FoundRoom, FramedRoom, chosen_frames
 from data_prep.scannet.annotations import (
     Group,
@@ -41,7 +44,6 @@ from sceneprior.core.scene import Mesh
 from sceneprior.render.offscreen.zbuffer import rasterize
 
 TABLE = "scannetv2-labels.combined.tsv"
-_NERFSTUDIO = ("dslr/nerfstudio", "iphone/nerfstudio")
 _IPHONE = "iphone/pose_intrinsic_imu.json"
 _IPHONE_SIZE = (1440, 1920)
 """(height, width) of the iPhone's pictures, which its file does not give."""
@@ -49,26 +51,6 @@ _FROM_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0,
 _OUTSIDE_M = 1.0
 """Distance from the mesh's bounding box from which on a camera is outside of the scene."""
 _MESH = "scans/mesh_aligned_0.05.ply"
-
-_LIKE_NYU40 = {
-    "wall": "wall", "floor": "floor", "ceiling": "ceiling", "door": "door", "door frame": "door",
-    "doorframe": "door", "window": "window", "window frame": "window", "windowsill": "window",
-    "window sill": "window", "blinds": "blinds", "mirror": "mirror", "picture": "picture",
-    "painting": "picture", "poster": "picture", "carpet": "floor mat", "rug": "floor mat",
-    "office chair": "chair", "armchair": "chair", "dining chair": "chair", "stool": "chair",
-    "couch": "sofa", "storage cabinet": "cabinet", "kitchen cabinet": "cabinet",
-    "cupboard": "cabinet", "wardrobe": "cabinet", "file cabinet": "cabinet",
-    "bathroom cabinet": "cabinet", "bookcase": "bookshelf", "book shelf": "bookshelf",
-    "shelf": "shelves", "wall shelf": "shelves", "kitchen counter": "counter",
-    "office desk": "desk", "coffee table": "table", "dining table": "table",
-    "side table": "table", "bedside table": "night stand", "nightstand": "night stand",
-    "chest of drawers": "dresser", "ceiling lamp": "lamp", "table lamp": "lamp",
-    "floor lamp": "lamp", "desk lamp": "lamp", "tv": "television", "tv screen": "television",
-    "refrigerator": "refridgerator", "fridge": "refridgerator", "bath tub": "bathtub",
-    "blackboard": "whiteboard", "washbasin": "sink",
-}  # fmt: skip
-"""NYU40 class of common labels of ScanNet++. Labels with the name of a class need no entry; other
-labels are void, unless ScanNet's table has them."""
 
 
 class _Frame(BaseModel):
@@ -161,31 +143,27 @@ class ScanNetPP:
 
 def _cameras(scene: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Camera to world, (n, 4, 4), OpenCV axes in the mesh's world; intrinsics, (n, 3, 3); and the
-    (height, width) of the pictures: of the DSLR if it is there, else of the iPhone."""
-    for name in _NERFSTUDIO:
-        if not (scene / name / FILE_NAME).is_file():
-            continue
-        recording = read_recording(scene / name)
-        poses = np.stack([frame.camera_to_world for frame in recording.frames])
-        lenses, size = [], (0, 0)
-        for frame in recording.frames:
-            if frame.camera.w is None or frame.camera.h is None:
-                raise InputError(f"{recording.path} has no w and h, the size of the pictures.")
-            K, size = frame_intrinsics(frame, (1, 1))
-            lenses.append(K)
-        return _FROM_NERFSTUDIO @ poses @ GL_TO_CV, np.stack(lenses), size
+    (height, width) of the pictures: those of the DSLR if its poses are there."""
+    for device in ("dslr", "iphone"):
+        model = [scene / device / "colmap" / f"{name}.txt" for name in ("cameras", "images")]
+        poses_path = scene / device / "nerfstudio" / FILE_NAME
+        if all(path.is_file() for path in model):
+            images = [(image.camera_to_world, image.camera) for image in read_model(*model)]
+            return _in_mesh(model[1], np.eye(4), images)
+        if poses_path.is_file():
+            frames = read_recording(poses_path.parent).frames
+            images = [(frame.camera_to_world, frame.camera.model_dump()) for frame in frames]
+            return _in_mesh(poses_path, _FROM_NERFSTUDIO, images)
     path = scene / _IPHONE
     if not path.is_file():
         raise InputError(
-            f"{scene} has no poses; expected {_NERFSTUDIO[0]}/{FILE_NAME}, "
-            f"{_NERFSTUDIO[1]}/{FILE_NAME} or {_IPHONE}. Download one of them."
+            f"{scene} has no poses; expected dslr/colmap, dslr/nerfstudio, iphone/colmap, "
+            f"iphone/nerfstudio or {_IPHONE}. Download one of them."
         )
-    frames = [
-        frame for _, frame in sorted(checked(_Frames, read_json(path), str(path)).root.items())
-    ]
+    rows = [frame for _, frame in sorted(checked(_Frames, read_json(path), str(path)).root.items())]
     try:
-        aligned = np.array([frame.aligned_pose for frame in frames]).reshape(-1, 4, 4)
-        matrices = np.array([frame.intrinsic for frame in frames]).reshape(-1, 3, 3)
+        aligned = np.array([row.aligned_pose for row in rows]).reshape(-1, 4, 4)
+        matrices = np.array([row.intrinsic for row in rows]).reshape(-1, 3, 3)
     except ValueError:
         raise InputError(
             f"{path}: aligned_pose and intrinsic are not 4 x 4 and 3 x 3 numbers in all frames; "
@@ -194,10 +172,30 @@ def _cameras(scene: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     return aligned, matrices, _IPHONE_SIZE
 
 
+def _in_mesh(
+    path: Path, mesh_from_world: np.ndarray, images: list[tuple[np.ndarray, dict[str, Any]]]
+) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+    """Result of `_cameras`, from camera to world with OpenGL's axes, and keys of cameras."""
+    lenses, size = [], (0, 0)
+    for pose, keys in images:
+        if keys.get("w") is None or keys.get("h") is None:
+            raise InputError(f"{path} has no w and h, the size of the pictures.")
+        frame = PosedFrame(path.name, pose, path, None, checked(Camera, keys, str(path)))
+        K, size = frame_intrinsics(frame, (1, 1))
+        lenses.append(K)
+    if not lenses:
+        raise InputError(f"{path} has no image with a pose; download it again.")
+    return (
+        mesh_from_world @ np.stack([pose for pose, _ in images]) @ GL_TO_CV,
+        np.stack(lenses),
+        size,
+    )
+
+
 def _labels(folder: Path) -> Labels:
     """NYU40 classes of labels: of ScanNet's table, if it is there, and of ours."""
     table = folder / TABLE
-    own = {name: name for name in label_set(LABEL_SET)[1:]} | _LIKE_NYU40
+    own = {name: name for name in label_set(LABEL_SET)[1:]} | LIKE_NYU40
     listed = read_labels(table).nyu40 if table.is_file() else {}
     return Labels(listed | own, TABLE)
 

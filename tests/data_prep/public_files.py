@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 from posed_files import PosedRoom, Thing
 from scan_files import BOX_FACES
+from scipy.spatial.transform import Rotation
 from trimesh import Trimesh
 
 from data_prep.public.nyu40 import NYU40
@@ -227,8 +228,11 @@ FROM_MESH = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]
 """From the mesh's world to nerfstudio's: x and y swapped, z reversed."""
 
 
-def write_scannetpp(folder: Path, scene: str, room: PosedRoom, iphone: bool = False) -> None:
-    """Poses of the DSLR or of the iPhone; the furniture is also annotated as one large object."""
+def write_scannetpp(folder: Path, scene: str, room: PosedRoom, poses: str = "nerfstudio") -> None:
+    """Poses of the DSLR (nerfstudio, colmap) or of the iPhone (iphone).
+
+    The furniture is also annotated as one large object.
+    """
     root = folder / scene
     (root / "scans").mkdir(parents=True)
     vertices = np.concatenate([thing.corners for thing in room.things])
@@ -250,14 +254,17 @@ def write_scannetpp(folder: Path, scene: str, room: PosedRoom, iphone: bool = Fa
     groups.insert(0, {"id": 9, "objectId": 9, "label": "furniture", "segments": [0, 10, 20]})
     (root / "scans" / "segments_anno.json").write_text(json.dumps({"segGroups": groups}))
     height, width = room.size
-    if iphone:
+    if poses == "colmap":
+        write_colmap_text(root / "dslr" / "colmap", room)
+        return
+    if poses == "iphone":
         K = [[room.focal_px, 0, width / 2], [0, room.focal_px, height / 2], [0, 0, 1]]
         K = (np.diag([1920 / width, 1440 / height, 1]) @ K).tolist()
-        poses = [pose @ np.diag([1.0, -1, -1, 1]) for pose in room.poses]
+        aligned = [pose @ np.diag([1.0, -1, -1, 1]) for pose in room.poses]
         frames = {
             f"frame_{k:06d}": {"timestamp": k / 60, "aligned_pose": pose.tolist(), "intrinsic": K,
                                "pose": np.eye(4).tolist(), "imu": []}
-            for k, pose in enumerate(poses)
+            for k, pose in enumerate(aligned)
         }  # fmt: skip
         (root / "iphone").mkdir()
         (root / "iphone" / "pose_intrinsic_imu.json").write_text(json.dumps(frames))
@@ -275,6 +282,21 @@ def write_scannetpp(folder: Path, scene: str, room: PosedRoom, iphone: bool = Fa
     path = root / "dslr" / "nerfstudio" / "transforms.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(data))
+
+
+def write_colmap_text(folder: Path, room: PosedRoom) -> None:
+    """A COLMAP model of a fisheye camera as text, whose world is the mesh's."""
+    folder.mkdir(parents=True)
+    (height, width), f = room.size, room.focal_px
+    lens = f"{f} {f} {width / 2} {height / 2} 0.04 -0.01 0.001 -0.0002"
+    (folder / "cameras.txt").write_text(f"# made\n1 OPENCV_FISHEYE {width} {height} {lens}\n")
+    lines = ["# made"]
+    for k, pose in enumerate(room.poses):
+        inverse = np.linalg.inv(pose @ np.diag([1.0, -1, -1, 1]))
+        x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat()
+        numbers = " ".join(f"{value:.12g}" for value in (w, x, y, z, *inverse[:3, 3]))
+        lines += [f"{k + 1} {numbers} 1 DSC{k:05d}.JPG", ""]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
 
 
 def expected_corners(room: PosedRoom, axes: tuple[int, int, int], origin: np.ndarray) -> list:

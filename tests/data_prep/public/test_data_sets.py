@@ -135,9 +135,10 @@ def test_structured3d_has_millimetres_a_floor_and_the_authors_split(room, tmp_pa
     assert splits == ["train", "val", "test"]
 
 
-@pytest.mark.parametrize("iphone", [False, True])
-def test_scannetpp_is_drawn_from_its_annotated_mesh(room, tmp_path, iphone):
-    write_scannetpp(tmp_path / "data", "0a5c013435", room, iphone)
+@pytest.mark.parametrize("poses", ["colmap", "nerfstudio", "iphone"])
+def test_scannetpp_is_drawn_from_its_annotated_mesh(room, tmp_path, poses):
+    write_scannetpp(tmp_path / "data", "0a5c013435", room, poses)
+    iphone = poses == "iphone"
     side = 640 if iphone else None
     (made,) = prepared("scannetpp", tmp_path / "data", max_side=side).values()
     assert made.views.image_size == ((480, 640) if iphone else (96, 128))

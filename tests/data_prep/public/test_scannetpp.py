@@ -78,7 +78,7 @@ DAMAGE = {
     "poses of another scene": (
         lambda s: move(s, 50), r"5 of 5 cameras are more than 1 m outside of mesh_aligned_0.05.ply",
     ),
-    "no poses": (lambda s: (s / POSES).unlink(), r"has no poses; expected dslr/nerfstudio/trans"),
+    "no poses": (lambda s: (s / POSES).unlink(), r"has no poses; expected dslr/colmap, dslr"),
     "no size": (lambda s: change(s / POSES, w=None), r"transforms.json has no w and h, the size"),
     "no frames": (lambda s: change(s / POSES, frames=[]), r"has no list `frames` with a frame"),
     "a truncated mesh": (
@@ -109,7 +109,7 @@ def test_damaged_files_are_named_in_one_sentence(scene, damage):
 
 
 def test_damaged_poses_of_the_iphone_are_named(tmp_path):
-    write_scannetpp(tmp_path / "data", SCENE, furnished(tmp_path), iphone=True)
+    write_scannetpp(tmp_path / "data", SCENE, furnished(tmp_path), "iphone")
     scene = tmp_path / "data" / SCENE
     frame = json.loads((scene / IPHONE).read_text())["frame_000000"]
     change(scene / IPHONE, frame_000000=frame | {"aligned_pose": [[1.0]] * 4})
@@ -118,6 +118,13 @@ def test_damaged_poses_of_the_iphone_are_named(tmp_path):
     change(scene / IPHONE, frame_000000={"pose": []})
     with pytest.raises(InputError, match=r"pose_intrinsic_imu.json: frame_000000.aligned_pose is"):
         read(scene)
+
+
+def test_a_model_without_images_is_refused(tmp_path):
+    write_scannetpp(tmp_path / "data", SCENE, furnished(tmp_path), "colmap")
+    (tmp_path / "data" / SCENE / "dslr/colmap/images.txt").write_text("# nothing\n")
+    with pytest.raises(InputError, match=r"images.txt has no image with a pose; download it again"):
+        read(tmp_path / "data" / SCENE)
 
 
 def test_a_lost_frame_is_skipped(scene):

@@ -25,7 +25,8 @@ WRITERS = {
     "hypersim": hypersim,
     "structured3d": lambda folder, room: write_structured3d(folder, "scene_00001", "480", room),
     "scannetpp": lambda folder, room: write_scannetpp(folder, "0a5c", room),
-    "scannetpp of an iPhone": lambda folder, room: write_scannetpp(folder, "0a5c", room, True),
+    "scannetpp of COLMAP": lambda folder, room: write_scannetpp(folder, "0a5c", room, "colmap"),
+    "scannetpp of an iPhone": lambda folder, room: write_scannetpp(folder, "0a5c", room, "iphone"),
 }
 DAMAGES = {
     "cut": lambda data, numbers: data[: len(data) // 2],
