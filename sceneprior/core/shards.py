@@ -169,7 +169,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
             sizes = {"H": height, "W": width}
             arrays = read_arrays(group, VIEW_ARRAYS, sizes, self._classes)
             sizes |= dict(zip("hw", stuff_size((height, width)), strict=True))
-            read: dict[str, np.ndarray | None] = {"stuff": None}
+            read: dict[str, Any] = {"stuff": None}
             for name, check in (("instance_ids", known_ids), ("stuff", known_stuff)):
                 if name == "stuff" and name not in group:
                     continue
