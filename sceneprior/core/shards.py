@@ -34,7 +34,7 @@ VERSION = 2
 READABLE = (1, VERSION)
 """Versions that can be read; in version 1, void pixels are 0, like the background."""
 INDEX_NAME = "index.json"
-PREPARE = "`sceneprior prep-front`, `prep-scannet` or `prep-posed`"
+PREPARE = "`sceneprior prep-front`, `prep-scannet`, `prep-posed` or `prep-dataset`"
 """Commands that write shards, for messages."""
 MODELS_FOLDER = "models"
 STUFF_SIDE_PX = 240

@@ -125,17 +125,17 @@ def stuff_of(name: str) -> int:
 class IdTable:
     """Maps values of masks to consecutive ids for `observe`.
 
-    The k-th instance of the table gets the id k + 1. Values that the table does not list get the id
-    after the last instance's; they are void, and may occlude objects. Classes outside the label set
-    become void, except those of `SHELL` and `STUFF`, which become background. `of_id` is the result
-    of `read_class_table`, and `where` is the beginning of error messages.
+    The k-th instance of the table, `objects[k]`, gets the id k + 1. Values that the table does not
+    list get the id after the last instance's; they are void, and may occlude objects. Classes
+    outside the label set become void, except those of `SHELL` and `STUFF`, which become background.
+    `of_id` is the result of `read_class_table`, and `where` is the beginning of error messages.
     """
 
     def __init__(self, of_id: dict[int, str], label_set_name: str, where: str):
         names = {tidy(name): i for i, name in enumerate(label_set(label_set_name))}
         stuff = {key: stuff_of(name) for key, name in of_id.items() if tidy(name) not in names}
         shell = [key for key in stuff if stuff[key] or tidy(of_id[key]) in SHELL]
-        objects = sorted(set(of_id) - set(shell))
+        self.objects = objects = sorted(set(of_id) - set(shell))
         indices = [names.get(tidy(of_id[key]), VOID) for key in objects]
         self.classes = np.array([*indices, VOID], dtype=np.int16)
         if not self.classes.any():

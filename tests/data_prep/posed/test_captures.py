@@ -353,7 +353,7 @@ def test_a_stuff_segment_of_several_classes_is_background(room):
     [
         (
             lambda data: data["annotations"][1]["segments_info"][0].update(category_id=27),
-            r"segment 70001 is bed in 'frame_00000\.png', but backpack in 'frame_00001\.png'\. Ids",
+            r"segment 70001 is bed in 'frame_00000', but backpack in 'frame_00001'\. Ids",
         ),
         (
             lambda data: data["annotations"][0]["segments_info"][0].update(category_id=1),
