@@ -94,6 +94,6 @@ def _draw_stuff(room: Room, views: RoomViews, renderer: Renderer) -> np.ndarray:
         for turn, K in zip(views.world_to_camera, views.intrinsics, strict=True)
     ]
     stuff = renderer.instance_ids_of_views(meshes, cameras, stuff_size(views.image_size))
-    assert views.instance_ids is not None, "just drawn"
+    assert views.instance_ids is not None
     free = views.instance_ids[(..., *thinned(step))] == 0
     return np.where(free, stuff, 0).astype(np.uint8)
