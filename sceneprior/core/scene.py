@@ -240,10 +240,9 @@ class Scene:
         >>> Scene("empty", "front3d_bedroom").picture().shape
         (360, 480, 3)
         """
-        from sceneprior.render.offscreen import open_renderer
         from sceneprior.render.topdown import perspective
 
-        return perspective(self, open_renderer())
+        return perspective(self)
 
     def show(self) -> None:
         """Display the scene from any line of a notebook's cell; elsewhere an `InputError`."""

@@ -19,7 +19,6 @@ from sceneprior.core.scene_json import FORMAT, read_scene, scene_to_json
 from sceneprior.core.shell import ShellName, is_shell, shell_meshes
 from sceneprior.render.floor_plans import floor_plan
 from sceneprior.render.model_files import joined, load_parts
-from sceneprior.render.offscreen import Renderer, open_renderer
 from sceneprior.render.pictures import png_bytes
 from sceneprior.render.scene_usd import scene_to_usd
 from sceneprior.render.topdown import (
@@ -35,9 +34,7 @@ PACKAGE_FORMATS = "sceneprior-"
 """Prefix of the names of the package's formats."""
 
 
-def save_scene(
-    scene: Scene, path: Path, renderer: Renderer | None = None, shell: ShellName = "none"
-) -> None:
+def save_scene(scene: Scene, path: Path, shell: ShellName = "none") -> None:
     """Write a scene to one file, atomically, in the format of its suffix.
 
     `.json`: classes and boxes. `.glb`: one node per object, called `<index>_<class>`, in the class
@@ -47,7 +44,6 @@ def save_scene(
     of the whole room. 3D formats keep the axes and the unit of the room frame: y up, metres.
 
     Args:
-        renderer: Renderer of the picture; None opens one.
         shell: With `walls`, models have nodes `floor`, `wall_0` and so on, and `ceiling`; with
             `floor`, the first alone.
 
@@ -68,7 +64,7 @@ def save_scene(
         case ".usda":
             write_whole(path, scene_to_usd(scene, shell_meshes(scene, shell)))
         case ".png":
-            write_whole(path, png_bytes(floor_plan(scene, renderer or open_renderer())))
+            write_whole(path, png_bytes(floor_plan(scene)))
         case suffix:
             raise InputError(
                 f"{path} ends with '{suffix}', which is not a scene format; end it with one of "

@@ -21,7 +21,6 @@ from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
 from sceneprior.interchange.export import export_scenes
 from sceneprior.render.model_files import LARGEST_PX
-from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.scene_files import load_scene, scene_to_obj
 
 SEAT = (2.0, 0.4, 0.8)
@@ -80,7 +79,7 @@ def retrieved(models) -> Scene:
 
 def test_a_glb_has_the_images_and_colours_of_the_model(models, tmp_path):
     scene = retrieved(models)
-    write_scenes([scene], tmp_path / "out", SoftwareRenderer())
+    write_scenes([scene], tmp_path / "out")
     glb = (tmp_path / "out" / "room.glb").read_bytes()
     (image,), told = images_of(glb), json_of(glb)
     np.testing.assert_array_equal(np.asarray(image), PIXELS)
