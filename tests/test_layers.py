@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,7 @@ OWNERS = {
 }  # fmt: skip
 
 
+@cache
 def imports(path: Path) -> set[str]:
     """Full names of every module a file imports, wherever in the file."""
     found = set()

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from toy_metrics import without_classifiers
 
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.ground_truth import reference_scenes
@@ -17,3 +18,9 @@ def scenes(toy_shards, tmp_path_factory) -> Path:
     plain = [replace(room.without_meshes(), name=f"room_{k}") for k, room in enumerate(rooms)]
     write_scenes(plain, folder)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def no_classifier(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evaluations in this process answer without classifiers, which take most of their time."""
+    without_classifiers(monkeypatch)
