@@ -41,6 +41,7 @@ def line_of(result: PreparedRoom | Line, task: RoomTask, label_set_name: str) ->
         notes=list(result.notes),
         classes=dict(Counter(names[index] for index in views.object_class)),
         unknown_categories=dict(result.unknown_categories),
+        cameras=dict(result.cameras),
     )
 
 

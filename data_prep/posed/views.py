@@ -125,7 +125,12 @@ def prepare_posed(
         notes.append(said)
     world_to_camera = cameras_in_room(recording, upright, turn, floor)
     views = seen.room_views(room_name(recording.folder), world_to_camera, intrinsics)
-    return PreparedRoom(views, notes=tuple(notes))
+    room_from_world = np.linalg.inv(upright[0] @ world_to_camera[0]) @ turn
+    origin = {
+        "file": recording.path.relative_to(recording.folder).as_posix(),
+        "room_from_world": room_from_world.round(9).tolist(),
+    }
+    return PreparedRoom(views, notes=tuple(notes), cameras=origin)
 
 
 def _check_tracked(images: np.ndarray, void: int) -> None:
